@@ -19,7 +19,7 @@ from torchmetrics import Metric
 from torchmetrics.utilities.data import dim_zero_cat
 
 from bpnp.geometry import angle_between, bearings, camera_centre, is_finite, rotation_angle, transform
-from bpnp.types import Batch, Pose
+from bpnp.types import Batch, Pose, Prediction
 
 
 @dataclass(frozen=True)
@@ -112,6 +112,11 @@ def pose_errors(pose: Pose, batch: Batch) -> PoseErrors:
         reprojection_deg=reprojection,
         index=batch.index,
     )
+
+
+def prediction_errors(prediction: Prediction, batch: Batch) -> dict[str, PoseErrors]:
+    """Return the `pose_errors` of each estimate of a prediction."""
+    return {name: pose_errors(pose, batch) for name, pose in prediction.poses.items()}
 
 
 Limits = Sequence[float | int]

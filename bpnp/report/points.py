@@ -2,7 +2,7 @@
 see."""
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from bpnp.cameras import Camera
 from bpnp.files import written_whole
-from bpnp.metrics import rotation_error
+from bpnp.metrics import PoseErrors, prediction_errors
 from bpnp.types import Batch, Prediction
 
 FORMAT = 2
@@ -65,19 +65,28 @@ def utf8(name: str) -> str:
     return name.encode("utf-8", "replace").decode()
 
 
-def points_from(prediction: Prediction, batch: Batch) -> list[ProblemPoints]:
-    """The points of a batch. Of larger sets `MOST` are kept on each side, evenly spaced, matched ones first."""
+def points_from(
+    prediction: Prediction, batch: Batch, errors: Mapping[str, PoseErrors] | None = None
+) -> list[ProblemPoints]:
+    """Return the points of each problem, at most `MOST` of each side, evenly spaced, matched ones first.
+
+    Args:
+        prediction: of the batch.
+        batch: problems, with or without their true poses.
+        errors: `prediction_errors`, if they are known.
+    """
     points2d, points3d, mask2d, mask3d = map(_host, (batch.points2d, batch.points3d, batch.mask2d, batch.mask3d))
     unknown = np.full(mask3d.shape, -1)
     match3d = unknown if batch.match3d is None else _host(batch.match3d)
     assignment = prediction.assignment if prediction.rematched is None else prediction.rematched
     assigned3d = unknown if assignment is None else _host(assignment.argmax(-2))
     poses = {name: (_host(pose.rotation), _host(pose.translation)) for name, pose in prediction.poses.items()}
-    truth, errors = None, [180.0] * len(batch)
+    truth, rotation_errors = None, [180.0] * len(batch)
     if batch.rotation is not None and batch.translation is not None:
         truth = (_host(batch.rotation), _host(batch.translation))
-        for pose in list(prediction.poses.values())[:1]:
-            errors = rotation_error(pose.rotation, batch.rotation).where(pose.found, 180.0).tolist()
+        errors = prediction_errors(prediction, batch) if errors is None else errors
+        for name in list(prediction.poses)[:1]:
+            rotation_errors = errors[name].rotation_deg.tolist()
     problems = []
     for i in range(len(batch)):
         problem = ProblemPoints(
@@ -89,7 +98,7 @@ def points_from(prediction: Prediction, batch: Batch) -> list[ProblemPoints]:
             assigned3d=assigned3d[i][mask3d[i]].astype(np.int32),
             pose=None if truth is None else (truth[0][i], truth[1][i]),
             estimates={name: (rotation[i], translation[i]) for name, (rotation, translation) in poses.items()},
-            error=errors[i],
+            error=rotation_errors[i],
         )
         problems.append(thin(problem))
     return problems

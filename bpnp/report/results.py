@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from bpnp import __version__
 from bpnp.files import write_text, written_whole
 from bpnp.geometry import project, transform
-from bpnp.metrics import PoseErrors, pose_errors, pose_quartiles, pose_recalls
+from bpnp.metrics import PoseErrors, pose_quartiles, pose_recalls, prediction_errors
 from bpnp.types import Batch, Pose, Prediction
 
 if TYPE_CHECKING:
@@ -119,13 +119,16 @@ class Results:
         return DataFrame([asdict(row) | {"cause": row.cause} for row in self.rows])
 
 
-def rows_from(prediction: Prediction, batch: Batch, seconds: float) -> list[ProblemRow]:
+def rows_from(
+    prediction: Prediction, batch: Batch, seconds: float, errors: Mapping[str, PoseErrors] | None = None
+) -> list[ProblemRow]:
     """Return one row per problem and estimate.
 
     Args:
         prediction: of the batch. Where it has the seconds until an estimate was found, these count.
         batch: problems with their true poses.
         seconds: time of the whole batch. Each problem has an equal share.
+        errors: `prediction_errors`, if they are known.
 
     Raises:
         ValueError: The batch has no true pose.
@@ -133,16 +136,17 @@ def rows_from(prediction: Prediction, batch: Batch, seconds: float) -> list[Prob
     matches = torch.zeros_like(batch.index) if batch.match3d is None else (batch.match3d >= 0).sum(-1)
     sizes = torch.stack([batch.count2d, batch.count3d, matches], -1).tolist()
     indices = batch.index.tolist()
+    errors = prediction_errors(prediction, batch) if errors is None else errors
     rows = []
     for estimate, pose in prediction.poses.items():
-        known, stats = pose_errors(pose, batch), pose.stats
+        known, stats = errors[estimate], pose.stats
         columns = (known.rotation_deg, known.translation, known.centre, known.reprojection_deg)
-        errors, inliers = torch.stack(columns, -1).tolist(), count_inliers(pose, batch)
+        figures, inliers = torch.stack(columns, -1).tolist(), count_inliers(pose, batch)
         told = (stats.iterations, stats.residual.double(), stats.converged, pose.found)
         states = zip(*(values.tolist() for values in told), strict=True)
         share = prediction.seconds.get(estimate, seconds) / len(batch)
         for i, state in enumerate(states):
-            values: Any = (indices[i], batch.ids[i], estimate, *errors[i], inliers[i], *sizes[i], *state, share)
+            values: Any = (indices[i], batch.ids[i], estimate, *figures[i], inliers[i], *sizes[i], *state, share)
             rows.append(ProblemRow(*values))
     return rows
 

@@ -219,8 +219,9 @@ class ResultsWriter(Callback):
     ) -> None:
         if not isinstance(outputs, dict) or not {"prediction", "seconds", "losses"} <= outputs.keys():
             return  # of a task of the user's own
-        self.rows += rows_from(outputs["prediction"], batch, outputs["seconds"])
-        self.points += points_from(outputs["prediction"], batch)
+        errors = outputs.get("errors")  # which a task of the user's own may leave out
+        self.rows += rows_from(outputs["prediction"], batch, outputs["seconds"], errors)
+        self.points += points_from(outputs["prediction"], batch, errors)
         if outputs["losses"] is not None:
             self.losses |= dict(zip(batch.index.tolist(), outputs["losses"].tolist(), strict=True))
 

@@ -20,7 +20,7 @@ from torchmetrics import MetricCollection
 from bpnp.checks import check_within
 from bpnp.layers.implicit import BackwardStats
 from bpnp.layers.pnp import WeightedPnP
-from bpnp.metrics import MeanOverProblems, PoseQuartiles, PoseRecall, pose_errors
+from bpnp.metrics import MeanOverProblems, PoseQuartiles, PoseRecall, prediction_errors
 from bpnp.models.bpnpnet import BPnPNet
 from bpnp.models.evaluation import REFINED, refinement_enabled
 from bpnp.models.older_checkpoints import upgrade
@@ -234,7 +234,7 @@ class BlindPnPTask(LightningModule):
         return self._evaluate(batch, "val", first=batch_idx == 0)
 
     def test_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
-        """The prediction, its seconds, and the correspondence loss of each problem; for the results writer."""
+        """Return the prediction and its seconds, the loss of each problem, and the errors of each estimate."""
         return self._evaluate(batch, "test", first=batch_idx == 0)
 
     def predict_step(self, batch: Batch, batch_idx: int) -> Prediction:
@@ -434,13 +434,13 @@ class BlindPnPTask(LightningModule):
         if first:
             check_prediction(prediction, batch, self.estimates[stage], type(self.solver).__name__)
         with exact_products(self.device):
+            errors = prediction_errors(prediction, batch)
             for name in self.estimates[stage]:
-                errors = pose_errors(prediction.poses[name], batch)
-                self.metrics[f"{stage}_{name}"].update(errors)  # type: ignore[operator]
+                self.metrics[f"{stage}_{name}"].update(errors[name])  # type: ignore[operator]
             losses = correspondence_losses(prediction, batch, angle=self.correspondence_angle)
         if losses is not None:
             self.metrics[stage].update(losses, batch.index)  # type: ignore[operator]
-        return {"prediction": prediction, "seconds": seconds, "losses": losses}
+        return {"prediction": prediction, "seconds": seconds, "losses": losses, "errors": errors}
 
     def _log_train(self, **values: Tensor | float) -> None:
         for name, value in values.items():

@@ -2,6 +2,7 @@ import math
 import warnings
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from small_data import quiet_trainer, small_meshes, small_net
 from torch import nn
 from torch.utils.data import DataLoader
 
+import bpnp.metrics
 import bpnp.training.task
 from bpnp import Batch, Matcher, Prediction
 from bpnp.report import read_results
@@ -211,6 +213,15 @@ def test_a_pose_loss_without_its_pose_is_refused(tmp_path: Path) -> None:
         BlindPnPTask(Matching(), pose_weight=1.0)
     with pytest.raises(ValueError, match="The pose loss needs the pose 'pnp', and Matching returns 'ransac'"):
         fit(tmp_path, BlindPnPTask(Matching()), max_steps=1, callbacks=[PoseLossWarmup(start_epoch=100)])
+
+
+def test_the_errors_of_a_pose_are_computed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the metrics, the rows of the results and the points of the page, for two batches and three estimates."""
+    counted = Mock(side_effect=bpnp.metrics.pose_errors)
+    monkeypatch.setattr(bpnp.metrics, "pose_errors", counted)
+    run = quiet_trainer(tmp_path, callbacks=[ResultsWriter()])
+    run.test(BlindPnPTask(small_net()), datamodule=small_meshes(tmp_path, eval_batch_size=4), verbose=False)
+    assert counted.call_count == 2 * 3
 
 
 def test_results_of_a_test_and_poses_of_a_prediction(tmp_path: Path) -> None:
