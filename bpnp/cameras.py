@@ -28,6 +28,7 @@ FISHEYE = {  # models with the radius t (1 + k1 t^2 + ...) at the angle t from t
 }
 EDGES, STEPS = 1024, 5  # of a fisheye's angles, between which Newton's steps find one to the last digit
 CENTRE = 0.5  # of the first pixel in COLMAP's coordinates; OpenCV and hloc count from 0
+SLIGHTLY, FEW_OUTSIDE = 0.01, 0.02  # larger sides outside an image; fraction of points that may be farther outside
 MOST_PIXELS = 2**31  # of a side of an image; more is a file that is none
 
 
@@ -176,6 +177,28 @@ def image_size(camera: Camera) -> tuple[int, int] | None:
 def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
     """Whether images of two sizes are one scaled, to a pixel of rounding on a side."""
     return abs(size[0] * other[1] - size[1] * other[0]) <= max(*size, *other)
+
+
+def far_outside(pixels: Array, sides: Any) -> npt.NDArray[np.bool_]:
+    """Return which pixels tell that an image has another size.
+
+    Detectors put some keypoints slightly outside: by a hundredth of the larger side, or a pixel, all may be, and by
+    more one in 50.
+
+    Args:
+        pixels: (m, 2); NaN is inside.
+        sides: Width and height, pixels.
+
+    Returns:
+        (m,) those that lie farther outside; none of them where they are few.
+
+    >>> far_outside(np.array([[101.8, 20.0], [50, 50], [10, 20]]), (100, 100)).tolist()
+    [True, False, False]
+    """
+    sides = np.asarray(sides, np.float64)
+    slack = max(SLIGHTLY * float(sides.max()), 1.0)
+    outside = ((pixels < -slack) | (pixels > sides + slack)).any(-1)
+    return np.asarray(outside & (outside.mean() > FEW_OUTSIDE))
 
 
 def scaled_camera(camera: Camera, size: tuple[int, int]) -> Camera:
@@ -336,4 +359,10 @@ def _pinhole(values: Any) -> Pinhole:
     singular = np.linalg.svd(matrix[:2, :2], compute_uv=False)
     if not singular[1] > 1e-9 * singular[0]:
         raise ValueError(f"expected an invertible `camera` matrix, got the singular {matrix.tolist()}")
+    (fx, _), (_, fy) = matrix[:2, :2].tolist()
+    if np.linalg.det(matrix[:2, :2]) < 0 or min(fx, fy) < 0:
+        raise ValueError(
+            f"`camera` has the focal lengths {fx:g} and {fy:g}, which mirror the image; give positive ones, and points "
+            "of the scene with z forward and y down in the camera"
+        )
     return Pinhole(matrix)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.cameras import CENTRE, same_shape
+from bpnp.cameras import CENTRE, far_outside, same_shape
 
 Array = NDArray[np.float64]
 Size = tuple[int, int]  # width and height, pixels
@@ -139,7 +139,8 @@ def read_features(file: Path, photo: str, size: Size | None = None) -> Keypoints
     """The keypoints of a photo in an HDF5 file of hloc: `<photo>/keypoints` (m, 2), `scores` (m,) if there are some.
 
     size: of the photo in pixels, to check them by; by default `<photo>/image_size`, if the file has it.
-    Raises ValueError, naming file and photo, if it is not in the file, of another size, or a keypoint lies outside it.
+    Raises ValueError, naming file and photo, if it is not in the file or of another size, or if keypoints lie outside
+    it (`far_outside`).
     """
     try:
         h5py = importlib.import_module("h5py")  # optional
@@ -198,12 +199,11 @@ def read_database(file: Path, photo: str, size: Size | None = None) -> Keypoints
 
 
 def _checked(keypoints: Keypoints, size: Size | None, where: str) -> Keypoints:
-    """The keypoints of a photo of this size. Raises ValueError if theirs is another one, or one lies outside it."""
+    """The keypoints of a photo of this size. Raises ValueError if theirs is another one, or they lie outside it."""
     if None not in (keypoints.size, size) and keypoints.size != size:
         raise ValueError(f"expected keypoints of {where} at the size {size} of the photo, got them at {keypoints.size}")
     known = size or keypoints.size
-    outside = ((keypoints.pixels < 0) | (keypoints.pixels > np.array(known or np.inf))).any(-1)
-    if known is not None and outside.any():
+    if known is not None and (outside := far_outside(keypoints.pixels, known)).any():
         raise ValueError(
             f"expected keypoints inside the {known[0]} x {known[1]} pixels of {where}, got {int(outside.sum())} "
             f"outside, such as {keypoints.pixels[outside][0].round(1).tolist()}; try features of this size"

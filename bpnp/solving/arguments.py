@@ -12,7 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import nn
 
-from bpnp.cameras import CENTRE, Camera, is_opencv
+from bpnp.cameras import CENTRE, Camera, far_outside, is_opencv
 from bpnp.checks import check_normalised
 from bpnp.search.starts import GravityPrior, PosePrior
 
@@ -182,17 +182,25 @@ def checked_size(image_size: Any) -> tuple[int, int]:
 
 
 def check_inside(points2d: Any, size: Any) -> None:
-    """Pixels (m, 2) within an image of this width and height, to a pixel."""
+    """Check that pixels lie in an image.
+
+    Args:
+        points2d: (m, 2) pixels; NaN is left aside.
+        size: Width and height of the image, pixels.
+
+    Raises:
+        ValueError: For another shape, or where `far_outside` tells another size.
+    """
     pixels, sides = image_points(points2d), np.array(checked_size(size))
     if pixels.ndim != 2 or pixels.shape[1] != 2:
         raise ValueError(f"expected pixels `points2d` of shape (m, 2) with an `image_size`, got {pixels.shape}")
-    outside = ~((pixels >= -1) & (pixels <= sides + 1) | ~np.isfinite(pixels)).all(-1)
+    outside = far_outside(pixels, sides)
     if outside.any():
-        fits_swapped = (pixels <= sides[::-1] + 1).all()
+        fits_swapped = not far_outside(pixels, sides[::-1]).any()
         hint = "are width and height swapped?" if fits_swapped else "try the size of the image in which they are"
         raise ValueError(
             f"expected `points2d` inside the {sides[0]} x {sides[1]} pixels of `image_size`, got "
-            f"{pixels[outside][0].round(1).tolist()}; {hint}"
+            f"{int(outside.sum())} of {len(pixels)} outside, such as {pixels[outside][0].round(1).tolist()}; {hint}"
         )
 
 

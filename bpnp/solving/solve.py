@@ -1,7 +1,6 @@
 """Pose from two point sets in one call: `solve`, and `solve_many` for many problems."""
 
-from collections.abc import Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from bpnp.loops.parallel import Clock, Deadline
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.point_sets import UnknownFocal
 from bpnp.solving.arguments import (
+    Labels,
     Prior,
     about,
     check_inside,
@@ -245,10 +245,24 @@ def solve_many(
         unknown = [unknown_camera(one, image_size, focal_error, distortion) for one in cameras]
         for points in pixels if image_size is not None else ():
             check_inside(points, image_size)
-        return [solved_with_focal_length(partial(problem, i), one, options) for i, one in enumerate(unknown)]
-    problems = {i: problem(i, None if one is None else camera_from(one)) for i, one in enumerate(cameras)}
-    solutions = solutions_of(problems, options)
-    share_points(problems, solutions, options)
+        problems = {i: problem(i, one.reference, one.focal(one.reference)) for i, one in enumerate(unknown)}
+
+        def again(i: int, taken: Labels | None = None) -> Solution:
+            def at(lens: Camera, focal: UnknownFocal) -> Problem:
+                whole = problem(i, lens, focal)
+                return whole if taken is None else whole.without(taken)
+
+            return solved_with_focal_length(at, unknown[i], options)
+
+        solutions = {i: again(i) for i in problems}
+    else:
+        problems = {i: problem(i, None if one is None else camera_from(one)) for i, one in enumerate(cameras)}
+
+        def again(i: int, taken: Labels | None = None) -> Solution:
+            return solutions_of({i: problems[i] if taken is None else problems[i].without(taken)}, options)[i]
+
+        solutions = solutions_of(problems, options)
+    share_points(problems, solutions, again)
     return [solutions[i] for i in range(count)]
 
 
@@ -257,11 +271,18 @@ def _axes_of_labels(labels: Any) -> int:
     return 2 if getattr(labels, "ndim", 1) == 2 and "float" in str(labels.dtype) else 1
 
 
-def share_points(problems: Mapping[int, Problem], solutions: dict[int, Solution], options: Options) -> None:
-    """Where few-point problems have the same image points, leave each point to one of them; `solutions` is changed.
+def share_points(
+    problems: Mapping[int, Problem], solutions: dict[int, Solution], again: Callable[[int, Labels], Solution]
+) -> None:
+    """Leave each image point to one of the few-point problems that have the same image points.
 
     The problem with the fewest false alarms keeps its matches. A later one that claimed one of their points is solved
-    again without these; its `stats.taken2d` says how many points that are. A failed pose keeps none.
+    again without these; its `stats.taken2d` counts them. A failed pose keeps none.
+
+    Args:
+        problems: By their numbers.
+        solutions: Of the problems; changed in place.
+        again: Solves a problem, given its number, without some of its 2D points, given their indices (k,).
     """
     groups: dict[bytes, list[int]] = {}
     for i, problem in problems.items():
@@ -271,6 +292,6 @@ def share_points(problems: Mapping[int, Problem], solutions: dict[int, Solution]
         taken: set[int] = set()
         for i in sorted(members, key=lambda i: (solutions[i].log10_false_alarms, i)):
             if taken.intersection(solutions[i].matches[:, 0].tolist()):
-                solutions |= solutions_of({i: problems[i].without(np.array(sorted(taken)))}, options)
+                solutions[i] = again(i, np.array(sorted(taken)))
             if solutions[i].verdict != "failed":
                 taken.update(solutions[i].matches[:, 0].tolist())

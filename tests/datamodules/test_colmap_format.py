@@ -18,10 +18,34 @@ def test_a_truncated_file_is_one_error_that_names_it(name: str, suffix: str, tmp
     cuts = {0, 1, 4, 8, 9, 20, len(content) - 1, *np.linspace(0, len(content) - 1, 60).astype(int).tolist()}
     if suffix == "txt":  # also between lines, where every line that is left is whole
         cuts |= {i + 1 for i, byte in enumerate(content[:-1]) if byte == ord("\n")}
+        cuts |= {len(content) - 2, len(content) - 3}
+        # Fewer digits of the last parameter of a camera, and fewer keypoints without a point, are whole records too.
+        whole = content.rstrip().rfind(b" ") if name == "cameras" else content.rfind(b"\n", 0, -1)
+        cuts = {cut for cut in cuts if cut < (len(content) - 1 if name == "points3D" else whole)}
+        inside = content.rfind(b" 57 ")  # a keypoint of the last image with a point: others with points follow
+        cuts |= {inside + 4, inside + 2, inside - 3} if name == "images" else set()
     for cut in sorted(cuts):
         path.write_bytes(content[:cut])
         with pytest.raises(ColmapError, match=f"{name}.{suffix}"):
             read_reconstruction(tmp_path)
+
+
+@pytest.mark.parametrize("header", [True, False])
+def test_a_text_model_whose_last_line_has_no_break_is_read_if_its_header_has_the_count(
+    header: bool, tmp_path: Path
+) -> None:
+    plant_model(tmp_path, text=True)
+    expected = read_reconstruction(tmp_path)
+    for path in tmp_path.glob("*.txt"):
+        lines = [line for line in path.read_bytes().splitlines(keepends=True) if header or not line.startswith(b"#")]
+        path.write_bytes(b"".join(lines)[:-1])
+    if not header:
+        with pytest.raises(ColmapError, match="cameras.txt ends without a line break, .* looks truncated"):
+            read_reconstruction(tmp_path)
+        return
+    read = read_reconstruction(tmp_path)
+    np.testing.assert_array_equal(read.points3d, expected.points3d)
+    assert [image.name for image in read.images] == [image.name for image in expected.images]
 
 
 @pytest.mark.parametrize(

@@ -123,3 +123,15 @@ def test_two_devices_in_one_picture_share_no_light() -> None:
     assert not lights[0] & lights[1]
     assert sorted(solution.stats.taken2d > 0 for solution in solutions) == [False, True]
     assert solve(image, **search).stats.taken2d == 0
+
+
+def test_two_devices_share_no_light_where_the_focal_length_is_rough() -> None:
+    rng = np.random.default_rng(8)
+    points = rng.uniform(-0.1, 0.1, (14, 3))
+    poses = [Rotation.random(random_state=k).as_matrix() for k in range(2)]
+    image = np.concatenate([pixels(points, pose, np.array([0.3 * k - 0.15, 0, 0.5])) for k, pose in enumerate(poses)])
+    solutions = solve_many([image] * 2, points, CAMERA, focal_error=0.02, time_limit=60)
+    assert [solution.verdict for solution in solutions] == ["confident"] * 2
+    lights = [set(solution.matches[:, 0].tolist()) for solution in solutions]
+    assert sorted(map(sorted, lights)) == [list(range(14)), list(range(14, 28))]
+    assert sorted(solution.stats.taken2d for solution in solutions) == [0, 14]

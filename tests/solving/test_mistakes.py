@@ -8,6 +8,7 @@ import pytest
 from planted import plant
 
 from bpnp import GravityPrior, PosePrior, solve, solve_many, verify
+from bpnp.solving.arguments import check_inside
 
 K = np.array([[520.0, 1.5, 405.0], [0.0, 500.0, 290.0], [0.0, 0.0, 1.0]])
 CAMERA = ("SIMPLE_PINHOLE", [500.0, 320.0, 240.0])
@@ -84,6 +85,8 @@ NO_PRIOR = PosePrior(np.eye(3), np.zeros(3), 5.0, 1.0)
         ("pixels", {"image_size": SIZE, "camera": K}, "a `camera` or the `image_size` .*, got both"),
         ("pixels", {"image_size": (480, 640)}, "inside the 480 x 640 pixels .* are width and height swapped"),
         ("pixels", {"image_size": (320, 200)}, "inside the 320 x 200 pixels .* try the size of the image"),
+        ("pixels", {"camera": K * [[-1], [1], [1]]}, "focal lengths -.* and .*, which mirror the image; give positive"),
+        ("pixels", {"camera": K * [[-1], [-1], [1]]}, "focal lengths -.* and -.*, which mirror the image"),
         ("pixels", {"image_size": (640.5, 480)}, "`image_size` as .width, height. in whole pixels"),
         ("pixels", {"image_size": 640}, "`image_size` as .width, height. in whole pixels"),
         ("pixels", {"image_size": SIZE, "focal_error": 0.1}, "`focal_error` beside a `camera`"),
@@ -144,3 +147,17 @@ def test_a_mistake_is_one_clear_error(call: str, change: Any, message: str) -> N
         call, change = "points", {"points2d": PIXELS} | change
     with pytest.raises((ValueError, FileNotFoundError), match=message):
         CALLS[call](**change)
+
+
+@pytest.mark.parametrize(
+    ("outside", "count", "refused"), [(1.8, 1, False), (1.8, 20, False), (30.0, 1, False), (30.0, 5, True)]
+)
+def test_the_fraction_of_points_outside_tells_a_wrong_image_size(outside: float, count: int, refused: bool) -> None:
+    """Detectors put keypoints slightly outside; of a hundred, one may be far outside."""
+    pixels = np.random.default_rng(0).uniform(0, 100, (100, 2)) * (6.4, 4.8)
+    pixels[:count, 0] = 640 + outside
+    if refused:
+        with pytest.raises(ValueError, match="5 of 100 outside, such as \\[670.0"):
+            check_inside(pixels, (640, 480))
+    else:
+        check_inside(pixels, (640, 480))

@@ -118,16 +118,15 @@ def _rewrite_text(paths: list[Path], contents: list[bytes], target: str) -> None
     """Write the model of three text files as binary files into a folder.
 
     Notices what pycolmap does not: that a file was cut between two records, or in the last number. The count in
-    COLMAP's header, where there is one, and the line break at the end show it.
+    COLMAP's header, where there is one, and the line break at the end show it. Where the line break lacks, the header
+    has to have the count, and the last track of a point has to agree with the keypoint that it names, and the reverse.
     """
+    unended = [path for path, content in zip(paths, contents, strict=True) if not content.endswith(b"\n")]
     for path, content in zip(paths, contents, strict=True):
-        if not content.endswith(b"\n"):
-            raise ColmapError(
-                f"expected {path} to end with a line break, got {content[-20:]!r}: it looks truncated; try copying the "
-                "model again, or add the line break if it is whole"
-            )
         header = re.search(rb"^# Number of \w+: (\d+)", content, re.MULTILINE)
         records = sum(not line.startswith(b"#") for line in content.splitlines()) // FILES[path.stem]
+        if path in unended and (not header or int(header[1]) != records):
+            raise _truncated(path, content)
         if header and int(header[1]) > records:
             raise ColmapError(
                 f"expected {int(header[1])} records in {path} as its header says, got {records}: it is truncated; try "
@@ -135,15 +134,55 @@ def _rewrite_text(paths: list[Path], contents: list[bytes], target: str) -> None
             )
     try:
         model = read_text_model(paths[0].parent)
-        lines = (line for line in contents[1].splitlines() if not line.startswith(b"#"))
-        for line in filter(bytes.strip, lines):
-            image_id, *_, name = line.split(maxsplit=9)
-            model.image(int(image_id)).name = name.rstrip().decode(errors="backslashreplace")
-            next(lines, None)  # its keypoints
+        names = dict(_names(contents[1]))
+        for image_id, name in names.items():
+            model.image(image_id).name = name
+        for path in unended:
+            content = contents[paths.index(path)]
+            if not _last_record_agrees(model, path.stem, list(names), content.splitlines()[-1].split()):
+                raise _truncated(path, content)
         model.write_binary(target)
     except ValueError as error:
+        if isinstance(error, ColmapError):
+            raise
         files = f"{paths[0]}, {paths[1].name} and {paths[2].name}"
         raise ColmapError(f"expected a COLMAP model in {files}, got one that pycolmap refuses: {error}") from error
+
+
+def _truncated(path: Path, content: bytes) -> "ColmapError":
+    return ColmapError(
+        f"{path} ends without a line break, at {content[-20:]!r}, and looks truncated; copy the model again, or add "
+        "the line break if the file is whole"
+    )
+
+
+def _names(images: bytes) -> Iterator[tuple[int, str]]:
+    """Yield the id and name of each image of a text file, in its order."""
+    lines = (line for line in images.splitlines() if not line.startswith(b"#"))
+    for line in filter(bytes.strip, lines):
+        image_id, *_, name = line.split(maxsplit=9)
+        yield int(image_id), name.rstrip().decode(errors="backslashreplace")
+        next(lines, None)  # its keypoints
+
+
+def _last_record_agrees(model: Any, file: str, image_ids: list[int], fields: list[bytes]) -> bool:
+    """Return whether the last line of a text file, split into fields, is whole.
+
+    The keypoints of the last image and the tracks of the points have to name each other. Keypoints without a point that
+    are missing at the end, and digits that are missing in the last parameter of a camera, cannot be noticed.
+    """
+    if file == "images":
+        if len(fields) % 3 or not re.fullmatch(rb"-1|\d+", fields[-1]):
+            return False
+        tracks = (point.track.elements for point in model.points3D.values())
+        named = {one.point2D_idx for track in tracks for one in track if one.image_id == image_ids[-1]}
+        keypoints = model.image(image_ids[-1]).points2D
+        return named == {k for k in range(len(keypoints)) if keypoints[k].has_point3D()}
+    if file == "points3D":
+        number, image_id, index = int(fields[0]), int(fields[-2]), int(fields[-1])
+        keypoints = model.image(image_id).points2D if image_id in image_ids else []
+        return index < len(keypoints) and keypoints[index].point3D_id == number
+    return True
 
 
 class _Cursor:
