@@ -11,13 +11,16 @@ from typing import Any
 import pytest
 import torch
 from lightning import Callback, Trainer
+from small_data import SMALL_FEATURES
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torch import Tensor
 from trainer_observer import Observer, command, fit, flat
 
+from bpnp import Batch, BPnPNet
 from bpnp.cli import main
 from bpnp.models.weights import read_checkpoint
 from bpnp.report import read_results
-from bpnp.training import SafeCheckpointIO
+from bpnp.training import BlindPnPTask, SafeCheckpointIO
 
 pytestmark = pytest.mark.slow
 TWO_STEPS = ["--trainer.limit_train_batches=2", "--trainer.max_epochs=1", "--trainer.limit_val_batches=0"]
@@ -214,3 +217,33 @@ def test_a_run_resumed_after_the_switch_has_the_pose_loss_from_its_first_step(tm
     later = ["--pose_loss.start_epoch=90", "--pose_loss.weight=0.5", "--trainer.max_epochs=3"]
     fit(tmp_path, *TWO_EPOCHS, *later, f"--ckpt_path={tmp_path}/run/checkpoints/last.ckpt")
     assert Observer.pose_weights == [0.5]
+
+
+def test_predict_writes_the_poses_of_a_limited_number_of_batches(tmp_path: Path) -> None:
+    fit(tmp_path, *TWO_STEPS)
+    last = f"--ckpt_path={tmp_path}/run/checkpoints/last.ckpt"
+    main(command(tmp_path, "--trainer.limit_predict_batches=1", "--data.eval_batch_size=3", last, word="predict"))
+    with (tmp_path / "run" / "predictions.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len({row["id"] for row in rows}) == 3
+    assert {row["estimate"] for row in rows} == {"ransac", "pnp", "refined"}
+
+
+class Derived(BPnPNet):
+    """A user's own network, and one that derives from it."""
+
+
+class Twice(Derived):
+    def cost(self, batch: Batch) -> Tensor:
+        return 2 * super().cost(batch)
+
+
+def test_a_network_two_classes_below_ours_comes_back_from_its_checkpoint(tmp_path: Path) -> None:
+    fit(tmp_path, *TWO_STEPS, "--model.solver=test_trainer_options.Twice", *SMALL_FEATURES)
+    net = BPnPNet.from_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")
+    assert type(net) is Twice
+    batch = Batch.from_arrays(torch.rand(9, 2), torch.rand(12, 3))
+    task = BlindPnPTask.load_from_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt").eval()
+    for found in (net, task.solver, Observer.task.solver.eval()):
+        expected = 2 * BPnPNet.cost(net, batch)
+        torch.testing.assert_close(found.cost(batch), expected)
