@@ -2,6 +2,7 @@
 
 import ctypes
 import difflib
+import importlib.util
 import logging
 import os
 import re
@@ -30,6 +31,7 @@ LIGHTNING_MISTAKES = {
     "MisconfigurationException",
     "TrainingDivergedError",
 }  # of which Lightning is imported for runs only
+OTHER_SCRIPT = "lightning-sdk is installed, which has a script named `lightning` too"
 WIDTH = 80  # columns of the help
 
 
@@ -77,6 +79,8 @@ def _run(arguments: list[str]) -> None:
     elif arguments[0] == "--version":
         print(f"bpnp {version('bpnp')}")
     elif arguments[0] in LIGHTNING:
+        if importlib.util.find_spec("lightning_sdk") is not None:
+            print(f"bpnp: {OTHER_SCRIPT}; `bpnp {arguments[0]}` is this program", file=sys.stderr)
         if arguments[1:] == ["--help", "all"]:
             arguments = arguments[:2]
         elif {"-h", "--help"} & set(arguments):

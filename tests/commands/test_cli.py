@@ -132,6 +132,17 @@ def test_a_printed_configuration_and_that_of_a_run_can_be_used_again(
     assert (tmp_path / "again" / "checkpoints" / "last.ckpt").is_file()
 
 
+def test_another_script_named_lightning_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(["fit", "--help"])
+    assert capsys.readouterr().err == ""
+    (tmp_path / "lightning_sdk.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    main(["fit", "--help"])
+    assert capsys.readouterr().err.startswith("bpnp: lightning-sdk is installed, which has a script named `lightning`")
+
+
 def test_two_trainings_do_not_write_to_one_folder(tmp_path: Path, fails: Callable[..., str]) -> None:
     arguments = ["fit", *MESHES, f"--trainer.default_root_dir={tmp_path}", f"--data.cache_dir={tmp_path}"]
     with claimed(tmp_path):
