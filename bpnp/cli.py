@@ -53,9 +53,8 @@ def main(args: Sequence[str] | None = None) -> None:
     except Exception as error:
         if os.environ.get("BPNP_TRACEBACK") or not _is_mistake(error):
             raise
-        message = plain(str(error)) if arguments[:1] and arguments[0] in LIGHTNING else error
         # Names of files that are not UTF-8 reach us as surrogates, which a terminal cannot show.
-        print(f"bpnp: error: {message}".encode("utf-8", "replace").decode(), file=sys.stderr)
+        print(f"bpnp: error: {plain(str(error))}".encode("utf-8", "replace").decode(), file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt:
         print(f"bpnp: interrupted{AFTER_CTRL_C.get(arguments[0], '')}", file=sys.stderr)

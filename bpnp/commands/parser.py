@@ -34,29 +34,32 @@ class OneLineParser(ArgumentParser):
                 command = f"{self.prog} {parent}".rstrip()
                 options.append(f"--{name}" if parent or f"--{name}" in known else name)
             raise ValueError(f"expected {', '.join(options)}, got none; try: {command} --help") from ex
-        close = difflib.get_close_matches(re.split("[= ]", unknown)[0], known, n=1) if found else []
-        if old := re.search(r"Option '(\w+)' is not accepted$", text):
-            raise ValueError(text + (f"; it is now {RENAMED[old[1]]}" if old[1] in RENAMED else "")) from ex
+        close = difflib.get_close_matches(unknown.split("=")[0].split(" ")[0], known, n=1) if found else []
         hint = f"; did you mean {close[0]}?" if close else f"; try: {self.prog} --help" if found else ""
+        renamed = (new for old, new in RENAMED.items() if text.endswith(f"Option '{old}' is not accepted"))
+        if new := next(renamed, None):
+            hint = f"; it is now {new}"
         raise ValueError(text + hint) from ex
 
 
+# Lines of jsonargparse's messages that list what an option may be besides, and the value that it was made from.
+NOISE = (
+    "Does not validate against",
+    "Subtypes:",
+    "Errors:",
+    "Given value type:",
+    "Given value: Namespace(",
+    "Given value: NestedArg(",
+    "- Does not validate against",
+    "- Expected a <class 'NoneType'>",
+    "- Expected a path but",
+)
+
+
 def plain(message: str) -> str:
-    """A message of jsonargparse in a line, without the None that is allowed as well and the value it was made from."""
-    text = " ".join(message.split())
-    key = re.match(r'Parser key "([\w.]+)"[^:]*: ', text)
-    name, text = (key[1], text[key.end() :]) if key else ("", text)
-    union = re.search(r"Errors: (.*) Given value type: .*? Given value: (.*)$", text)
-    told = []
-    for part in dict.fromkeys(re.split(r"(?:^| )- ", union[1]) if union else [text]):
-        kind = re.fullmatch(r"Expected an? (?:<class '([\w.]+)'>|typing.Literal\[(.*)\])(?:. Got value: (.*))?", part)
-        if kind and name and kind[1] != "NoneType":
-            words = (kind[1] or kind[2]).replace("'", "").replace(", ", " or ")
-            told.append(f"expected {name} as {words}, got {kind[3] or (union and union[2])!r}")
-        elif part and not kind:
-            told.append(plain(part) if union else part)
-    reason = "; ".join(told)
-    return f"{name}: {reason}" if name and f"expected {name} as" not in reason else reason
+    """Join the lines of a message, without those of jsonargparse that are no reason."""
+    lines = (line.strip() for line in message.splitlines())
+    return " ".join(dict.fromkeys(line.removeprefix("- ") for line in lines if line and not line.startswith(NOISE)))
 
 
 def parsed_arguments(name: str, command: Callable[..., None], arguments: Sequence[str]) -> dict[str, Any]:

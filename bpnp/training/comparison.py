@@ -227,8 +227,6 @@ def _parsed(
     try:
         return parser, parser.parse_args([f"--{name}={json.dumps(settings)}", *overrides])
     except Exception as error:
-        told = re.search(r"Errors:\n\s*- (.*?)\n\s*(?:- |Given value)", str(error), re.DOTALL)
-        reason = " ".join(told[1].split()) if told else str(error).strip().splitlines()[-1].strip()
         raise ValueError(
-            f"expected {settings.get('class_path')} as a {base.__name__} and arguments of its own, got: {reason}"
+            f"expected {settings.get('class_path')} as a {base.__name__} and arguments of its own, got: {error}"
         ) from error

@@ -94,7 +94,10 @@ def test_options_and_columns_reach_the_search_as_they_are_written(tmp_path: Path
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda files: [*files, "--up_camera", "0", "-1", "x", "--up_scene", "0", "0", "1"], "up_camera as float, got"),
+        (
+            lambda files: [*files, "--up_camera", "0", "-1", "x", "--up_scene", "0", "0", "1"],
+            "element 3: Expected a <class",
+        ),
         (lambda files: files[::-1], "are the two files swapped?"),
         (lambda files: [files[0], "nowhere.npy"], "got no file nowhere.npy"),
         (lambda files: [*files, *CAMERA], "look normalised"),

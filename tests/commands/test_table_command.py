@@ -122,8 +122,14 @@ class Poseless(nn.Module):
     ("method", "error"),
     [
         ("Poseless", "expected a pose from 'it', got predictions without one"),
-        ("Nowhere", "got: Problem with given class_path 'test_table_command.Nowhere': module .* has no attribute"),
-        ("functools.partial", "as a Module and arguments of its own, got: Import path functools.partial does not"),
+        (
+            "Nowhere",
+            "Problem with given class_path 'test_table_command.Nowhere': module .* has no attribute",
+        ),
+        (
+            "functools.partial",
+            'as a Module and arguments of its own, got: Parser key "solver": Import path functools.partial does not',
+        ),
     ],
 )
 def test_a_class_that_is_no_method_is_named(
@@ -189,7 +195,7 @@ def test_a_table_of_several_seeds_has_their_mean_and_spread(recipes: list[str], 
         (["--methods", "bpnp.models.baselines.Nothing"], "bpnp.models.baselines.Nothing"),
         (["--data.nonsense=3"], "nonsense"),
         (["--seed=3"], "nrecognized arguments: --seed=3"),
-        (["--limit=x"], "expected limit as int, got 'x'"),
+        (["--limit=x"], "Parser key \"limit\": Expected a <class 'int'> Given value: x"),
         (["--limit=0"], "expected --limit of 1 or more, got 0"),
         (["--rho", "0", "-1"], "expected --rho of 0 or more, got -1"),
         (["--data=nowhere.yaml"], "got no file nowhere.yaml"),
