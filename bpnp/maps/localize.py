@@ -10,21 +10,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.cameras import camera_from
+from bpnp.cameras import Camera, camera_from
+from bpnp.geometry import MIN_POINTS
 from bpnp.loops.parallel import one_blas_thread
 from bpnp.maps.views import Cones, View
 from bpnp.search.annealing import finish, polished
 from bpnp.search.candidates import Candidates, in_user_frame
 from bpnp.search.evidence.alternatives import Alternative, fits_as_well
 from bpnp.search.evidence.rivals import against_rivals, doubted, other_camera
-from bpnp.search.point_sets import UnknownFocal
+from bpnp.search.evidence.settings import Evidence
+from bpnp.search.point_sets import UnknownFocal, faces
 from bpnp.search.raster_search import search_beside
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import judged
 from bpnp.solving.arguments import checked_prior
-from bpnp.solving.focal_length import UnknownCamera, solved_with_focal_length
+from bpnp.solving.focal_length import AROUND, UnknownCamera, fit_camera, solved_with_focal_length
 from bpnp.solving.matches import finished
 from bpnp.solving.problem import Problem, problem_from
 from bpnp.solving.solution import Candidate, Solution
@@ -61,23 +63,38 @@ class Region:
         return PosePrior(self.view.rotation, self.view.translation, VIEW_DEGREES, VIEW_SHARE * self.distance)
 
 
-def problem_near(region: Region, keypoints: Any, camera: Any, prior: Any, focal: UnknownFocal | None = None) -> Problem:
-    """A photo's keypoints and the points of one region, with their cones."""
+def problem_near(
+    region: Region, keypoints: Any, camera: Any, prior: Any, focal: UnknownFocal | None = None, *, views: int = 1
+) -> Problem:
+    """Return the problem of a photo's keypoints and the points of one region, of so many `views` that are tried."""
     lens, (axes, cosines) = camera_from(camera), region.cones
-    return problem_from(keypoints, region.points3d, lens, normals3d=axes, cosines3d=cosines, prior=prior, focal=focal)
+    known: dict[str, Any] = {"normals3d": axes, "cosines3d": cosines, "prior": prior, "focal": focal}
+    problem = problem_from(keypoints, region.points3d, lens, **known)
+    return replace(problem, sets=replace(problem.sets, log10_views=math.log10(views)))
 
 
-def near_view(region: Region, keypoints: Any, camera: Any, prior: PosePrior | None, options: Options) -> Solution:
-    """The best pose of a photo among the points of one region; its matches have their ids in the map."""
+def near_view(
+    region: Region, keypoints: Any, camera: Any, prior: PosePrior | None, options: Options, *, views: int = 1
+) -> Solution:
+    """Return the best pose of a photo among the points of one region.
+
+    Args:
+        region: Points, and the view to search near.
+        keypoints: (m, 2) pixels.
+        camera: Camera, or an `UnknownCamera`.
+        prior: Of the photo's pose; None for the view's pose.
+        options: Of the search.
+        views: Number of views that are tried; each is as many tests again, which the NFA counts.
+    """
     expected = checked_prior(region.prior() if prior is None else prior)
     if isinstance(camera, UnknownCamera):
 
         def problem_at(lens: Any, focal: UnknownFocal) -> Problem:
-            return problem_near(region, keypoints, lens, expected, focal)
+            return problem_near(region, keypoints, lens, expected, focal, views=views)
 
         solution = solved_with_focal_length(problem_at, camera, options)
     else:
-        solution = solutions_of({0: problem_near(region, keypoints, camera, expected)}, options)[0]
+        solution = solutions_of({0: problem_near(region, keypoints, camera, expected, views=views)}, options)[0]
     return with_ids(solution, region)
 
 
@@ -111,20 +128,21 @@ def in_picture(problem: Problem, pose: Solution | Candidate) -> NDArray[np.bool_
     return np.asarray(inside.all(-1))
 
 
+def points_in_view(place: Region, camera: Any, pose: Solution, keypoints: Array) -> NDArray[np.int64]:
+    """Return the indices of the points of a place that a pose sees between the keypoints (m, 2), pixels."""
+    in_camera = place.points3d @ pose.rotation.T + pose.translation
+    ahead = (in_camera[:, 2] > 0) & faces(place.cones.axes, place.cones.cosines, in_camera, pose.rotation)
+    indices = np.flatnonzero(ahead)
+    seen = camera_from(camera).project(in_camera[indices])
+    inside = ((seen >= keypoints.min(0)) & (seen <= keypoints.max(0))).all(-1)  # not NaN
+    return indices[inside]
+
+
 def strongest_of(scores: Any, shape: tuple[int, ...]) -> NDArray[np.int64]:
     """Places of the strongest keypoints, ascending. Raises ValueError unless each of the keypoints has a score."""
     if np.shape(scores) != shape:
         raise ValueError(f"expected `scores` of shape {shape}, one a keypoint, got {np.shape(scores)}")
     return np.sort(np.argsort(-np.asarray(scores), kind="stable")[:MOST_KEYPOINTS])
-
-
-def counted(solution: Solution, tries: int) -> Solution:
-    """The solution with the false alarms of so many views: each is as many tests again."""
-    alarms, most = solution.log10_false_alarms + math.log10(tries), DEFAULT.evidence.false_alarms
-    if solution.verdict != "confident" or alarms <= most:
-        return replace(solution, log10_false_alarms=alarms)
-    reason = f"after {tries} views, 10^{alarms:.1f} poses are expected to fit unrelated points as well"
-    return replace(solution, log10_false_alarms=alarms, verdict="ambiguous", reason=reason)
 
 
 def among_all(solution: Solution, used: NDArray[np.int64], keypoints: Any) -> Solution:
@@ -140,41 +158,76 @@ def rank(solution: Solution) -> tuple[int, float]:
 
 
 @one_blas_thread
-def on_all_points(solution: Solution, photo: Photo, tries: int) -> Solution:
-    """A confident solution after so many views, fitted to all points of a photo's place that its camera sees, and
-    judged by them; as it was but for a doubt where they explain the keypoints no better."""
-    place, seen = photo.place, in_picture(photo.problem, solution)
+def on_all_points(solution: Solution, photo: Photo, lens: Camera | UnknownCamera, views: int) -> Solution:
+    """Refine a pose on all map points that its camera sees, and judge it on them.
+
+    An unknown lens is fitted to them too. That no better pose was missed near a pose which is not confident yet is
+    excluded by searches around it; `without_twins` searches for others.
+
+    Args:
+        solution: Pose that was found with the points of one view.
+        photo: The keypoints and all points of the map.
+        lens: Camera that was given, or what is known of it.
+        views: Number of views that are tried.
+
+    Returns:
+        The refined solution if its NFA is smaller, else the given one, or the given one with a doubt that all points
+        raise.
+    """
+    place, camera, rule = photo.place, solution.camera, DEFAULT.evidence
+    if not solution.found:
+        return solution
+    seen = points_in_view(place, camera, solution, photo.keypoints)
+    if len(seen) < max(len(solution.matches), MIN_POINTS):
+        return solution
     cones = Cones(place.cones.axes[seen], place.cones.cosines[seen])
     region = replace(place, points3d=place.points3d[seen], point_ids=place.point_ids[seen], cones=cones)
-    if len(region.points3d) < len(solution.matches):
-        return solution
-    problem = problem_near(region, photo.keypoints, photo.camera, None)
-    scene = Scene(problem.sets, photo.seed, DEFAULT)
-    rotation, shift = solution.rotation, solution.translation + solution.rotation @ problem.origin
-    scale = max(solution.stats.residual, problem.sets.image.scales[0])
-    ends = polished(scene, rotation[None], shift[None], scale)
-    if ends.scale[0] > solution.stats.residual:  # a coarse optimum: a finer one may be beside it
-        start = Candidates.unscored(*scene.enter(rotation[None], shift[None]))
+
+    def problem_at(lens: Any, focal: UnknownFocal | None = None) -> Problem:
+        return problem_near(region, photo.keypoints, lens, None, focal, views=views)
+
+    pose, scale = (solution.rotation, solution.translation), solution.stats.residual
+    if isinstance(lens, UnknownCamera):
+        lens = lens.seen_by(problem_at(lens.reference))
+        fitted = fit_camera(problem_at, lens, camera_from(camera), pose, scale, photo.seed, AROUND)
+        problem, ends = fitted.problem, fitted.poses
+        rotation, shift = ends.rotation[0], ends.translation[0]
+    else:
+        problem = problem_at(lens)
+        rotation, shift = pose[0], pose[1] + pose[0] @ problem.origin
+        least = problem.sets.image.scales[0]
+        ends = polished(Scene(problem.sets, photo.seed, DEFAULT), rotation[None], shift[None], max(scale, least))
+    scene, sure = Scene(problem.sets, photo.seed, DEFAULT), solution.verdict == "confident"
+    # A coarse optimum may have a finer one beside it.
+    looks = int(ends.scale[0] > scale) if sure else looks_for_certainty(rule)
+    start = Candidates.unscored(*scene.enter(rotation[None], shift[None]))
+    for _ in range(looks):
         beside = finish(scene, search_beside(scene, start, DEFAULT.beside), DEFAULT.finished)
         ends = Candidates.concatenated([ends, in_user_frame(beside, scene)])
-    # That no better pose was missed is known of the one that is refined.
-    rule = DEFAULT.evidence
-    alone = judged(ends, problem.sets, batches=1, exhaustive=True)
+    alone = judged(ends, problem.sets, batches=1, exhaustive=True, rule=rule)
     result = against_rivals(alone, problem.sets, lambda: scene, rule, exhaustive=True)
     rotations, shifts = np.stack([rotation, result.best[0]]), np.stack([shift, result.best[1]])
-    if not problem.sets.same_pose(rotations, shifts, rule.other_deg, rule.other_shift)[1]:
-        behind = result.log10_false_alarms - solution.log10_false_alarms
+    behind = result.log10_false_alarms - solution.log10_false_alarms
+    if sure and not problem.sets.same_pose(rotations, shifts, rule.other_deg, rule.other_shift)[1]:
         return solution if behind >= rule.lead else _doubted(solution, fits_as_well(rotation, result.best[0], behind))
-    if result.log10_false_alarms < solution.log10_false_alarms:
-        fitted = finished(problem, result, solution.seconds, None)
-        stats = replace(fitted.stats, iterations=solution.stats.iterations)
-        candidates = (*fitted.candidates, *solution.candidates[1:])
-        return counted(with_ids(replace(fitted, stats=stats, candidates=candidates), region), tries)
+    if behind < 0:
+        found = finished(problem, result, solution.seconds, None)
+        stats = replace(found.stats, iterations=solution.stats.iterations)
+        candidates = (*found.candidates, *solution.candidates[1:])
+        return with_ids(replace(found, stats=stats, candidates=candidates), region)
+    if not sure:
+        return solution
     if alone.verdict != "confident":  # which other cameras have not been asked of
         other = other_camera(alone, problem.sets, lambda: scene, rule)
         return solution if other is None else _doubted(solution, other)
     confident = result.verdict == "confident"
     return solution if confident else replace(solution, verdict=result.verdict, reason=result.reason)
+
+
+def looks_for_certainty(rule: Evidence) -> int:
+    """Return how many searches around a pose exclude a better one beside it, whatever starts led to it."""
+    again = (rule.missed - math.log10(rule.look_fails)) / math.log10(rule.again_fails)
+    return 1 + max(math.ceil(again), 0)
 
 
 def _doubted(solution: Solution, other: Alternative) -> Solution:

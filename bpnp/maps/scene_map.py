@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,7 +27,6 @@ from bpnp.maps.localize import (
     Photo,
     Region,
     among_all,
-    counted,
     near_view,
     on_all_points,
     rank,
@@ -47,6 +46,7 @@ from bpnp.maps.views import (
     scores_of_views,
     viewing_cones,
 )
+from bpnp.search.settings import SearchSettings
 from bpnp.search.starts import PosePrior
 from bpnp.solving.arguments import check_inside, pixels_from, positive, source_from
 from bpnp.solving.focal_length import UnknownCamera, unknown_camera
@@ -263,34 +263,51 @@ class SceneMap:
         used = pixels if strongest is None else np.asarray(pixels)[strongest]
         module, places = source_from(solver), self.places(views, used, lens)
         met, tries = list[Solution](), len(places)
+        whole = cache(lambda: self._region(places[0].view, np.arange(len(self.points3d))))
+
+        def options_for(settings: SearchSettings) -> Options:
+            limit = max(deadline.at - Clock.now(), 1e-3)
+            asks = solver == "auto" and settings is LONGER  # not of every view of the map
+            return Options(module, asks, seed=seed, time_limit=limit, settings=settings, until=deadline)
 
         def near(camera: Any, options: Options, region: Region, expected: PosePrior | None) -> Solution:
-            return counted(near_view(region, used, camera, expected, options), tries)
+            return near_view(region, used, camera, expected, options, views=tries)
+
+        def in_map(place: Place, solution: Solution, options: Options) -> Solution:
+            """Judge a pose on all points of the map in view and, if it is significant, beside its twins."""
+            regions = partial(self._regions, views, solution.camera)
+            photo = Photo(used, solution.camera, replace(whole(), view=place.view), regions, seed)
+            solution = on_all_points(solution, photo, lens, tries)
+            if prior is None and solution.verdict == "confident":  # a prior would tell twins apart
+                photo = Photo(used, solution.camera, photo.place, regions, seed)
+                search = partial(near, solution.camera, options)
+                photo = photo if views is None else replace(photo, place=self._region(place.view, place.points))
+                solution = without_twins(photo, solution, met, search)
+            return solution
 
         waiting, longer = deque((place, rule) for rule in (BRIEF, ONCE) for place in places), set[str]()
         while waiting:
             place, settings = waiting.popleft()
-            limit = deadline.at - Clock.now()
-            if best and limit <= 0:
+            if best and deadline.passed():
+                best = [(one, in_map(one, found, options_for(settings))) for one, found in best[:1]]
                 break
-            asks = solver == "auto" and settings is LONGER  # not of every view of the map
-            options = Options(module, asks, seed=seed, time_limit=max(limit, 1e-3), settings=settings, until=deadline)
-            region = self._region(place.view, place.points)
-            solution = near(place.lens, options, region, prior)
-            if solution.verdict == "confident":
-                every = self._region(place.view, np.arange(len(self.points3d)))
-                regions = partial(self._regions, views, solution.camera)
-                photo = Photo(used, solution.camera, every, regions, seed)
-                if isinstance(lens, Camera):
-                    solution = on_all_points(solution, photo, tries)
-                if prior is None and solution.verdict == "confident":  # a prior would tell twins apart
-                    search = partial(near, photo.camera, options)
-                    photo = photo if views is None else replace(photo, place=region)
-                    solution = without_twins(photo, solution, met, search)
+            options = options_for(settings)
+            solution = near(place.lens, options, self._region(place.view, place.points), prior)
+            decided = solution.verdict == "confident"
+            if decided or solution.log10_false_alarms < 0:
+                solution = in_map(place, solution, options)
+                decided = decided or solution.verdict == "confident"
+            if not decided:
+                met.append(solution)
+                best = sorted([*best, (place, solution)], key=lambda item: rank(item[1]), reverse=True)[:PROMISING]
+                if not waiting:  # chance explains the others, but perhaps not with all points of the map
+                    best = [(one, in_map(one, found, options)) for one, found in best]
+                    best.sort(key=lambda item: rank(item[1]), reverse=True)
+                    place, solution = best[0]
+                    decided = solution.verdict == "confident"
+            if decided:
                 best = [(place, solution)]
                 break
-            met.append(solution)
-            best = sorted([*best, (place, solution)], key=lambda item: rank(item[1]), reverse=True)[:PROMISING]
             likely = solution.log10_false_alarms < LIKELY and len(longer) < PROMISING
             again = best if not waiting else [(place, solution)] if likely else []
             for one, found in reversed(again):

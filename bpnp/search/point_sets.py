@@ -117,6 +117,7 @@ class PointSets:
     the image points without a partner, if it is known.
     prior: what is known of the pose. log10_tried: of the number of poses that were tried; None for as many as triples
     of matches give. focal: what is known of the focal length with which the bearings were made; None if it is given.
+    log10_views: of the number of sets of scene points, such as the views of a map, that are tried with these bearings.
     """
 
     bearings: Array
@@ -135,6 +136,7 @@ class PointSets:
     odds2d: Array | None = None
     classes3d: Array | None = None
     focal: UnknownFocal | None = None
+    log10_views: float = 0.0
 
     @property
     def cones3d(self) -> Array | None:

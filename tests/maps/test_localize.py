@@ -13,8 +13,11 @@ from scipy.spatial.transform import Rotation
 
 import bpnp
 from bpnp import PosePrior, SceneMap, Solution
-from bpnp.maps.localize import BRIEF
+from bpnp.cameras import camera_from
+from bpnp.maps import scene_map
+from bpnp.maps.localize import BRIEF, Photo, on_all_points, problem_near
 from bpnp.search.evidence.alternatives import Alternative
+from bpnp.search.evidence.false_alarms import alarms_of
 from bpnp.search.verdict import SearchResult, judged
 
 
@@ -201,3 +204,53 @@ def test_bad_input_is_one_clear_error(planted: tuple[SceneMap, Planted]) -> None
         scene.localize(keypoints, PINHOLE, scores=[1, 2, 3])
     with pytest.raises(ValueError, match="expected a positive `time_limit`, got 0"):
         scene.localize(keypoints, PINHOLE, time_limit=0)
+
+
+def found_with_few_points(found: Solution) -> Solution:
+    """As chance explains the few points of a view, though their pose is right."""
+    return replace(found, verdict="failed", reason="no pose fits better than chance", log10_false_alarms=3.0)
+
+
+@pytest.mark.parametrize("known", [{"camera": PINHOLE}, {"image_size": (800, 600)}], ids=["camera", "focal length"])
+def test_a_pose_that_one_view_does_not_decide_is_judged_on_all_points(
+    planted: tuple[SceneMap, Planted], monkeypatch: pytest.MonkeyPatch, known: dict[str, Any]
+) -> None:
+    scene, truth = planted
+    pixels = 520 * seen(truth.points3d, truth.rotations[1], truth.translations[1]) + [400, 300]
+    pixels = pixels[((pixels > 0) & (pixels < [800, 600])).all(1)]
+    pixels += np.random.default_rng(0).normal(0, 0.3, pixels.shape)
+    near = scene_map.near_view
+    monkeypatch.setattr(scene_map, "near_view", lambda *a, **o: found_with_few_points(near(*a, **o)))
+    solution = scene.localize(pixels, **known, views=["photo 1.jpg"], solver="search", time_limit=1e5)
+    assert solution.verdict == "confident"
+    assert degrees_between(solution.rotation, truth.rotations[1]) < 0.2
+    assert (~np.isin(solution.matches[:, 1], truth.seen[1] + 1)).sum() > 4
+
+
+def test_an_unknown_lens_is_fitted_to_all_points(planted: tuple[SceneMap, Planted]) -> None:
+    scene, truth = planted
+    in_camera = truth.points3d @ truth.rotations[1].T + truth.translations[1]
+    lens = camera_from(("SIMPLE_RADIAL", (520.0, 400.0, 300.0, -0.15)))
+    pixels = lens.project(in_camera)
+    pixels = pixels[((pixels > 0) & (pixels < [800, 600])).all(1)]
+    pixels += np.random.default_rng(0).normal(0, 0.5, pixels.shape)
+    half = replace(scene.views[1], points=scene.views[1].points[::2])
+    part = replace(scene, views=(scene.views[0], half, scene.views[2]))
+    solution = part.localize(pixels, image_size=(800, 600), views=["photo 1.jpg"], solver="search", time_limit=1e5)
+    assert abs(solution.focal_length - 520) < 3 * solution.focal_length_std < 50
+    assert (~np.isin(solution.matches[:, 1], scene.point_ids[half.points])).sum() > 10
+
+
+def test_each_view_that_is_tried_counts_once(planted: tuple[SceneMap, Planted]) -> None:
+    scene, truth = planted
+    keypoints, _ = photo_of(truth, 1)
+    alone = scene.localize(keypoints, PINHOLE, views=["photo 1.jpg"], solver="search")
+    region = scene._region(scene.views[1], np.arange(len(scene.points3d)))
+    place = Photo(keypoints, PINHOLE, region, lambda _: ())
+    lens = camera_from(PINHOLE)
+    counts = [on_all_points(alone, place, lens, views) for views in (1, 100)]
+    # With 100 views the NFA of the refined pose is not smaller than that of the given one, which counts one.
+    assert counts[1].log10_false_alarms == alone.log10_false_alarms
+    first, other = (problem_near(region, keypoints, PINHOLE, None, views=views).sets for views in (1, 100))
+    pose = alone.rotation[None], alone.translation[None]
+    assert alarms_of(other, *pose).own[0] - alarms_of(first, *pose).own[0] == pytest.approx(2)

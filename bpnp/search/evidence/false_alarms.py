@@ -66,7 +66,8 @@ class Alarms(NamedTuple):
 def alarms_of(sets: PointSets, rotations: Array, translations: Array, scales: Array | None = None) -> Alarms:
     """Of poses (c, 3, 3), (c, 3) with residuals of `scales` (c,), radians; all s are a pose's own if that is None.
 
-    A pose under which three points or fewer are seen has as many as there are tests: no evidence at all.
+    A pose under which three points or fewer are seen has as many as there are tests: no evidence at all. With each of
+    several sets of scene points (`PointSets.log10_views`) there are as many tests again.
 
     >>> import numpy as np
     >>> points = np.random.default_rng(0).uniform(-1, 1, (12, 3))
@@ -89,7 +90,7 @@ def alarms_of(sets: PointSets, rotations: Array, translations: Array, scales: Ar
         own, rough = log_evidence_of(sets, seen, scale, [_fixing(sets)], fewer)[0]
         result.own[k] -= own / math.log(10)
         result.rough[k] -= rough / math.log(10)
-    return result
+    return Alarms(result.own + sets.log10_views, result.rough + sets.log10_views)
 
 
 def log10_tests(sets: PointSets) -> float:
