@@ -19,7 +19,7 @@ quickstart: install
 	$(BIN)/bpnp test --config quickstart --results.folder $(RUN)/untrained
 	$(BIN)/bpnp fit --config quickstart
 	$(BIN)/bpnp test --config quickstart --ckpt_path $(RUN)/checkpoints/best.ckpt
-	$(BIN)/bpnp report $(RUN)/untrained $(RUN)/test
+	$(BIN)/bpnp report $(RUN)/untrained $(RUN)/test --html $(RUN)/report.html --curves $(RUN)/curves.png
 
 lint: install
 	$(BIN)/ruff check .
