@@ -16,8 +16,9 @@ from bpnp.loops.parallel import one_blas_thread
 from bpnp.maps.views import Cones, View
 from bpnp.search.annealing import finish, polished
 from bpnp.search.candidates import Candidates, in_user_frame
+from bpnp.search.evidence import reasons
 from bpnp.search.evidence.alternatives import Alternative, fits_as_well
-from bpnp.search.evidence.rivals import against_rivals, doubted, other_camera
+from bpnp.search.evidence.rivals import against_rivals, other_camera
 from bpnp.search.evidence.settings import Evidence
 from bpnp.search.point_sets import UnknownFocal, faces
 from bpnp.search.raster_search import search_beside
@@ -231,4 +232,4 @@ def looks_for_certainty(rule: Evidence) -> int:
 
 
 def _doubted(solution: Solution, other: Alternative) -> Solution:
-    return replace(solution, verdict="ambiguous", reason=doubted(solution.reason, other))
+    return replace(solution, verdict="ambiguous", reason=reasons.against(other.what, solution.log10_false_alarms))

@@ -18,7 +18,7 @@ from bpnp.maps.localize import Photo, Region, in_picture, problem_near
 from bpnp.maps.views import Array
 from bpnp.search.annealing import finish, polished
 from bpnp.search.candidates import Candidates, in_user_frame
-from bpnp.search.evidence.alternatives import number
+from bpnp.search.evidence.reasons import number
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
 from bpnp.search.kernels.raster import Raster
 from bpnp.search.raster_search import search_beside, search_near

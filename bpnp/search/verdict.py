@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.search.candidates import Candidates
-from bpnp.search.evidence.alternatives import Seen, contesting, log10_missed, misfit, number, other_pose, rougher
+from bpnp.search.evidence import reasons
+from bpnp.search.evidence.alternatives import Seen, contesting, log10_missed, misfit, other_pose, rougher
 from bpnp.search.evidence.false_alarms import alarms_of
 from bpnp.search.evidence.repetitions import registered
 from bpnp.search.evidence.settings import Evidence
@@ -186,39 +187,39 @@ def judged(
         return no_pose("no pose was found", batches, settled=exhaustive)
     candidates = weighed(candidates, sets, rule)
     alarms = float(candidates.log10_false_alarms[0])
-    chance = f"unrelated points are expected to fit as well under {number(alarms)} of all poses"
     settled = exhaustive or missed(candidates, sets, looks, rule, independent=False) <= rule.missed
     if alarms > 0:
-        return SearchResult(candidates, "failed", f"no pose fits better than chance: {chance}", batches, settled)
+        reason = reasons.against("no pose fits better than chance", alarms)
+        return SearchResult(candidates, "failed", reason, batches, settled)
     unseen = -math.inf if exhaustive else missed(candidates, sets, looks, rule)
     # What costs more is asked only where the verdict depends on it.
     seen = rig or [(candidates, sets)]
     against = [*(other_pose(*each, rule) for each in seen), rougher(candidates)]
     certain = alarms <= rule.false_alarms and unseen <= rule.missed
-    known = ""
+    reason = ""
     if certain and all(one is None or one.decades >= rule.lead for one in against):
         count = match_count(candidates, sets)
         linear = linearised(sets, candidates.rotation[0], candidates.translation[0], float(candidates.scale[0]))
         off = math.degrees(rotation_bound(sets, linear, count))
         if off >= HALF_TURN or not (rig or is_redundant(sets, count)):
-            reason = f"{chance}, but its {count:.0f} matches do not fix the rotation"
+            reason = reasons.against(f"its {count:.0f} matches do not fix the rotation", alarms)
             return SearchResult(candidates, "ambiguous", reason, batches, settled)
         if sets.focal is not None and (share := focal_bound(sets, linear, count)) > rule.focal:
             off_by = f"{100 * share:.0f} % off" if share < 10 else "anything"
-            reason = f"{chance}, but the points do not fix the focal length: it and the distance may be {off_by}"
+            what = f"the points do not fix the focal length: it and the distance may be {off_by}"
+            reason = reasons.against(what, alarms)
             return SearchResult(candidates, "ambiguous", reason, batches, settled)
-        bound = f"{off:.1g}" if off < 9.5 else f"{off:.0f}"
-        known = f"; its rotation is known to {bound} deg, but for one case in a thousand"
+        reason = reasons.confident(alarms, rule.lead, off)
         against += [misfit(linear, count, rule), contesting(seen, rule)]
     doubts = [one for one in against if one is not None and one.decades < rule.lead]
     if certain and not doubts:
-        return SearchResult(candidates, "confident", f"{chance}, and no alternative comes near{known}", batches, True)
+        return SearchResult(candidates, "confident", reason, batches, True)
     if doubts:
-        reason = f"{chance}, but {min(doubts).what}"
+        reason = reasons.against(min(doubts).what, alarms)
     elif alarms > rule.false_alarms:
-        reason = f"{chance}: too many to be sure"
+        reason = reasons.insignificant(alarms, rule.false_alarms)
     else:
-        reason = f"{chance}, but a better pose was missed with a probability of up to {number(min(unseen, 0.0))}"
+        reason = reasons.against(reasons.incomplete(unseen), alarms)
     return SearchResult(candidates, "ambiguous", reason, batches, settled)
 
 

@@ -19,7 +19,7 @@ from bpnp.loops.parallel import Clock, one_blas_thread
 from bpnp.search.annealing import polished
 from bpnp.search.candidates import Candidates
 from bpnp.search.enumeration.search import is_enumerable
-from bpnp.search.evidence.alternatives import number
+from bpnp.search.evidence.reasons import number
 from bpnp.search.evidence.settings import OtherFocal
 from bpnp.search.point_sets import UnknownFocal
 from bpnp.search.propose.lens import fit_lens

@@ -1,5 +1,7 @@
 """`solve` and `solve_many` on planted problems."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pycolmap
@@ -9,7 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from bpnp import PosePrior, Solution, solve, solve_many
 from bpnp.examples import load
+from bpnp.loops.parallel import Deadline
 from bpnp.models import Search
+from bpnp.search.search import search_poses
+from bpnp.solving import sources
+from bpnp.solving.problem import problem_from
 
 FISHEYE = ("OPENCV_FISHEYE", [300.0, 310.0, 400.0, 300.0, 0.05, -0.02, 0.01, 0.001])
 K = np.array([[520.0, 1.5, 405.0], [0.0, 500.0, 290.0], [0.0, 0.0, 1.0]])
@@ -234,3 +240,14 @@ def test_what_detectors_return_is_taken(form: str) -> None:
     solution = solve(given, example.points3d[:, None] if form == "opencv" else example.points3d, example.camera)
     assert example.rotation_error_deg(solution.rotation) < 0.2
     assert solution.points2d.shape == (200, 2)
+
+
+def test_a_pose_that_the_time_limit_left_open_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The search returns an open verdict, with its deadline passed or not."""
+    planted = plant(2, 40)
+    points = planted.points2d[0].numpy(), planted.points3d[0].numpy()
+    result = replace(search_poses(problem_from(*points, None).sets), verdict="ambiguous", settled=False)
+    monkeypatch.setattr(sources, "search_poses", lambda *_, **__: result)
+    assert "not decided" not in solve(*points, time_limit=60).reason
+    monkeypatch.setattr(sources.Options, "deadline", lambda *_: Deadline.after(-1.0))
+    assert "not decided in 7 s" in solve(*points, time_limit=7).reason

@@ -43,7 +43,8 @@ def test_a_pose_as_it_is_stays_as_it_is(view: Any) -> None:
     turned = moved(*pose, points, 1.0)
     off = bpnp.verify(bearings, points, *turned, refine=False)
     assert off.verdict == "ambiguous"
-    assert "the optimum beside it, fits better" in off.reason
+    assert "optimum beside it" in off.reason
+    assert "fits better" in off.reason
     assert np.array_equal(off.rotation, turned[0])
     assert off.rotation_std_deg == pytest.approx(1.0, abs=0.1)  # the way to the optimum
 
@@ -55,7 +56,7 @@ def test_another_pose_fails_with_a_reason_and_stays(view: Any, degrees: float, r
     turned = moved(*pose, points, degrees)
     solution = bpnp.verify(bearings, points, *turned, refine=refine)
     assert solution.verdict == "failed"
-    assert "chance" in solution.reason or f"a pose {degrees:.0f} deg away fits better" in solution.reason
+    assert "chance" in solution.reason or f"pose {degrees:.0f} deg away fits better" in solution.reason
     assert np.array_equal(solution.rotation, turned[0])
 
 

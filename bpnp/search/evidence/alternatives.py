@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from bpnp.geometry import turned_by
 from bpnp.search.candidates import Candidates
+from bpnp.search.evidence import reasons
 from bpnp.search.evidence.false_alarms import directions_of, own_evidence
 from bpnp.search.evidence.settings import Evidence
 from bpnp.search.evidence.uncertainty import Linearised, Misfit, systematic_misfit
@@ -26,7 +27,12 @@ Seen = Sequence[tuple[Candidates, PointSets]]
 
 
 class Alternative(NamedTuple):
-    """decades: by which the best pose is likelier. what: the alternative in words, as the end of "..., but"."""
+    """A competing explanation.
+
+    Attributes:
+        decades: by which the best pose is likelier (log10).
+        what: the explanation in words, a clause.
+    """
 
     decades: float
     what: str
@@ -50,7 +56,7 @@ def other_pose(candidates: Candidates, sets: PointSets, rule: Evidence) -> Alter
 def fits_as_well(rotation: Array, other: Array, decades: float) -> Alternative:
     """A different pose, whose false alarms are so many decades above those of the first one."""
     off = math.degrees(turned_by(rotation, other))
-    return Alternative(decades, f"a pose {off:.0f} deg away fits about as well ({number(decades)} times the number)")
+    return Alternative(decades, reasons.competing(off, decades))
 
 
 def rougher(candidates: Candidates) -> Alternative | None:
@@ -128,14 +134,9 @@ def contesting(seen: Seen, rule: Evidence) -> Alternative | None:
         decades = max(float(gap.sum()), 0.0) ** 2 / max(squared, 1e-300) / (2 * math.log(10))
         if decades < rule.lead and (apart or (same & first.near & other.near).sum() < limits.same * other.near.sum()):
             degrees = math.degrees(turned_by(candidates.rotation[0], candidates.rotation[k]))
-            what = f"a pose {degrees:.0f} deg away explains so many other points that both may be chance"
+            what = f"a pose {degrees:.0f} deg away explains other points, as many as two unrelated poses do by chance"
             return Alternative(decades, what)
     return None
-
-
-def number(log10: float) -> str:
-    """10^x in words that can be read at a glance."""
-    return f"{10**log10:.2g}" if -3 < log10 < 5 else f"1e{log10:.0f}"
 
 
 class _Partners(NamedTuple):

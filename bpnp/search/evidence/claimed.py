@@ -17,7 +17,7 @@ from bpnp.geometry import turned_by
 from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
 from bpnp.search.annealing import anneal_on_points, finish
 from bpnp.search.candidates import Candidates, in_scene_frame, in_user_frame, merged
-from bpnp.search.evidence.alternatives import number
+from bpnp.search.evidence import reasons
 from bpnp.search.evidence.false_alarms import likeliest_scale, log10_tests
 from bpnp.search.evidence.partners import explained
 from bpnp.search.evidence.rivals import against_rivals
@@ -86,8 +86,9 @@ def judge_claim(
     lead = float(claim.log10_false_alarms[0] - optimum.log10_false_alarms[0]) if better else 0.0
     if not refine and result.verdict == "confident" and 2 * math.log(10) * lead > WITHIN:  # likelihoods, Wilks 1938
         off = math.degrees(turned_by(rotation, optimum.rotation[0]))
-        reason = f"a pose {off:.2g} deg away, the optimum beside it, fits better ({number(-lead)} times the number)"
-        result = replace(result, verdict="ambiguous", reason=f"{_chance(claim)}, but {reason}")
+        what = f"the optimum beside it, {off:.2g} deg away, fits better (by {lead:.1f} decades)"
+        reason = reasons.against(what, float(claim.log10_false_alarms[0]))
+        result = replace(result, verdict="ambiguous", reason=reason)
     refined = refine and result.verdict == "confident"
     return replace(result, batches=int(refined)), optimum  # no last fit to the matches
 
@@ -153,16 +154,12 @@ def _of_claim(result: SearchResult, claim: Candidates) -> SearchResult:
     ordered = candidates[np.r_[place, np.delete(np.arange(len(candidates)), place)]]
     alarms = float(claim.log10_false_alarms[0])
     if alarms > 0:
-        reason = f"the pose fits no better than chance: {_chance(claim)}"
+        reason = reasons.against("the pose fits no better than chance", alarms)
         result = replace(result, verdict="failed", reason=reason)
     elif place:
         off = math.degrees(turned_by(candidates.rotation[0], claim.rotation[0]))
-        times = number(float(candidates.log10_false_alarms[0]) - alarms)
-        reason = f"{_chance(claim)}, but a pose {off:.0f} deg away fits better ({times} times the number)"
+        margin = alarms - float(candidates.log10_false_alarms[0])
+        reason = reasons.against(f"a pose {off:.0f} deg away fits better (by {margin:.1f} decades)", alarms)
         refuted = result.verdict == "confident"  # of the other pose, which explains the claim away
         result = replace(result, verdict="failed" if refuted else "ambiguous", reason=reason)
     return replace(result, candidates=ordered)
-
-
-def _chance(claim: Candidates) -> str:
-    return f"unrelated points are expected to fit as well under {number(float(claim.log10_false_alarms[0]))} poses"

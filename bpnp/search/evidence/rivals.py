@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from bpnp.search.annealing import polished
 from bpnp.search.candidates import Candidates, in_user_frame
+from bpnp.search.evidence import reasons
 from bpnp.search.evidence.alternatives import Alternative, of_misfit
 from bpnp.search.evidence.false_alarms import alarms_of
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
@@ -45,12 +46,9 @@ def against_rivals(
     if result.verdict != "confident":
         return result
     other = other_camera(result, sets, entered, rule)
-    return result if other is None else replace(result, verdict="ambiguous", reason=doubted(result.reason, other))
-
-
-def doubted(reason: str, other: Alternative) -> str:
-    """The reason of a confident pose with what speaks against it."""
-    return f"{reason.split(', and no alternative')[0]}, but {other.what}"
+    if other is None:
+        return result
+    return replace(result, verdict="ambiguous", reason=reasons.against(other.what, result.log10_false_alarms))
 
 
 def other_camera(

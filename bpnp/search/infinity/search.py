@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from scipy.special import betaln
 
 from bpnp.loops.parallel import NEVER, Deadline
-from bpnp.search.evidence.alternatives import number
+from bpnp.search.evidence import reasons
 from bpnp.search.infinity.evidence import (
     FIXING,
     Array,
@@ -349,9 +349,8 @@ def _judged(found: list[Rotated], sight: Sight, turns: int) -> RotationResult:
         return RotationResult(found, "failed", "no rotation was found", turns)
     best = found[0]
     alarms = best.log10_false_alarms
-    chance = f"unrelated points are expected to fit as well under {number(alarms)} of all rotations"
     if alarms > 0:
-        return RotationResult(found, "failed", f"no rotation fits better than chance: {chance}", turns)
+        return RotationResult(found, "failed", reasons.against("no rotation fits better than chance", alarms), turns)
     hit = np.flatnonzero(best.match >= 0)
     worth = best.decades[hit]
     most = float(worth.mean() + 2 * worth.std() / math.sqrt(len(hit)))  # that a match of an alternative may be worth
@@ -361,21 +360,21 @@ def _judged(found: list[Rotated], sight: Sight, turns: int) -> RotationResult:
     lead = found[1].log10_false_alarms - alarms if len(found) > 1 else math.inf
     doubt = known = None
     if alarms > rule.false_alarms:
-        doubt = ": too many to be sure"
-    elif lead < rule.lead:
-        doubt = f", but another rotation fits almost as well ({number(found[1].log10_false_alarms)})"
+        return RotationResult(found, "ambiguous", reasons.insignificant(alarms, rule.false_alarms), turns)
+    if lead < rule.lead:
+        doubt = f"another rotation fits about as well (margin {lead:.1f} decades)"
     elif missed > rule.missed:
-        doubt = f", but a better rotation was missed with a probability of up to {number(missed)}"
+        doubt = f"a better rotation may exist (miss probability up to {reasons.number(missed)})"
     else:  # what costs more is asked only where the verdict depends on it
         seen, bearings, pixel = _matches(sight, best)
         some = np.linspace(0, len(hit) - 1, min(len(hit), sight.settings.strained)).astype(np.int64)
         known = how_well_known(seen, bearings, pixel)
         strain = strain_of(seen[some], bearings[some], pixel[some], sight.image.bearings)
         if strain > sight.reach:
-            doubt = f", but a camera other than the given one, by {strain:.2g} pixels, explains the points better"
+            doubt = f"a camera other than the given one, by {strain:.2g} pixels, explains the points better"
         elif not math.isfinite(known.bound):
-            doubt = f", but its {len(hit)} matches do not fix it"
+            doubt = f"its {len(hit)} matches do not fix it"
     if doubt is not None or known is None:
-        return RotationResult(found, "ambiguous", f"{chance}{doubt}", turns)
-    off = f"it is known to {math.degrees(known.bound):.1g} deg, but for one case in a thousand"
-    return RotationResult(found, "confident", f"{chance}, and no alternative comes near; {off}", turns)
+        return RotationResult(found, "ambiguous", reasons.against(doubt or "", alarms), turns)
+    reason = reasons.confident(alarms, rule.lead, math.degrees(known.bound))
+    return RotationResult(found, "confident", reason, turns)

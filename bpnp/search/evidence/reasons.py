@@ -1,0 +1,62 @@
+"""The sentences that give the reason of a verdict (`Solution.reason`)."""
+
+LEAST_SHOWN = 0.05  # decades that are shown as 0.0
+
+
+def confident(log10_false_alarms: float, lead: float, bound_deg: float) -> str:
+    """Return the reason of a confident pose.
+
+    Args:
+        log10_false_alarms: of the pose.
+        lead: decades within which no competing pose lies.
+        bound_deg: 99.9 % bound of the rotation, degrees.
+
+    Examples:
+        >>> confident(-69.1, 3.0, 0.213)
+        'No competing pose within 3 decades; log10 NFA -69.1; rotation known to 0.2 deg (99.9 %)'
+    """
+    bound = f"{bound_deg:.1g}" if bound_deg < 9.5 else f"{bound_deg:.0f}"
+    return (
+        f"No competing pose within {lead:g} decades; {nfa(log10_false_alarms)}; rotation known to {bound} deg (99.9 %)"
+    )
+
+
+def against(what: str, log10_false_alarms: float) -> str:
+    """Return a reason that says what speaks against a pose.
+
+    Examples:
+        >>> against("its 4 matches do not fix the rotation", -5.02)
+        'Its 4 matches do not fix the rotation; log10 NFA -5.0'
+    """
+    return f"{what[0].upper()}{what[1:]}; {nfa(log10_false_alarms)}"
+
+
+def insignificant(log10_false_alarms: float, most: float) -> str:
+    """Return the reason of a pose that chance may explain; `most` is the largest logarithm that is significant."""
+    return f"Not significant: {nfa(log10_false_alarms)}, and at most {most:g} is needed"
+
+
+def competing(degrees: float, margin: float) -> str:
+    """Return what a competing pose says: so many degrees away, less likely by `margin` decades (log10)."""
+    return f"a competing pose {degrees:.0f} deg away fits about as well (margin {margin:.1f} decades)"
+
+
+def incomplete(log10_missed: float) -> str:
+    """Return what an unfinished search says: the probability that a better pose was missed, as its logarithm."""
+    return f"a better pose may exist (miss probability up to {number(min(log10_missed, 0.0))})"
+
+
+def undecided(reason: str, seconds: float) -> str:
+    """Return the reason of a pose that a search could not decide before its time limit."""
+    return f"{reason}; not decided in {seconds:.3g} s, a longer time limit may decide it"
+
+
+def nfa(log10_false_alarms: float) -> str:
+    """Return the logarithm of a number of false alarms."""
+    shown = 0.0 if abs(log10_false_alarms) < LEAST_SHOWN else log10_false_alarms
+    return f"log10 NFA {shown:.1f}"
+
+
+def number(log10: float) -> str:
+    """Return 10^x as a short number."""
+    return f"{10**log10:.2g}" if -3 < log10 < 5 else f"1e{log10:.0f}"
