@@ -101,7 +101,7 @@ def not_sure(*known: Any, **options: Any) -> SearchResult:
     [
         ({"against_rivals": lambda result, *_, **__: replace(result, verdict="ambiguous", reason="a twin")}, "a twin"),
         ({"against_rivals": elsewhere}, "A competing pose 10 deg away fits about as well"),
-        ({"judged": not_sure, "other_camera": of_another_camera}, "but with 1.30 times the focal length"),
+        ({"judged": not_sure, "other_camera": of_another_camera}, "With 1.30 times the focal length"),
     ],
     ids=["a rival", "another pose", "another camera of a pose that is in doubt"],
 )

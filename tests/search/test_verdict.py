@@ -78,7 +78,7 @@ def test_matches_that_say_little_ask_for_starts_that_end_alike(hits: int, looks:
     found = judged(pose, PointSets(rays, points), batches=1, looks=looks)
     assert -10 > found.log10_false_alarms > -60
     assert found.verdict == verdict
-    assert ("missed" in found.reason) == (verdict == "ambiguous")
+    assert ("miss probability" in found.reason) == (verdict == "ambiguous")
 
 
 @pytest.mark.parametrize(("degrees", "verdict"), [(1.0, "confident"), (4.0, "ambiguous")])
@@ -92,7 +92,7 @@ def test_starts_that_end_beside_a_pose_met_it(degrees: float, verdict: str) -> N
     poses = replace(poses, matched=np.array([0.8, 0.5]), scale=np.array([5e-3, 5e-3]), hits=np.array([0, 10]))
     found = judged(poses, PointSets(rays, points), batches=1, looks=1)
     assert found.verdict == verdict
-    assert ("missed" in found.reason) == (verdict == "ambiguous")
+    assert ("miss probability" in found.reason) == (verdict == "ambiguous")
 
 
 @pytest.mark.parametrize(("others", "verdict"), [(16, "ambiguous"), (2, "confident")])

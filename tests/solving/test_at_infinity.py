@@ -62,7 +62,7 @@ def test_a_constellation_that_the_catalogue_has_twice_is_ambiguous() -> None:
         part, turn = directions[star[star >= 0]], Rotation.random(random_state=seed).as_matrix()
         solution = look(image, np.concatenate([part, part @ turn.T]), lens(40.0).model)
         assert solution.verdict == "ambiguous"
-        assert "another rotation" in solution.reason
+        assert "Another rotation" in solution.reason
         either = [
             min(degrees_between(one.rotation, r) for r in (rotation, rotation @ turn.T))
             for one in solution.candidates[:2]

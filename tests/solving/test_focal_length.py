@@ -64,7 +64,7 @@ def test_the_verdict_names_a_wrong_focal_length() -> None:
     pixels, scene, _ = planted(800.0, points=150)
     right, wrong = (solve(pixels, scene, ("SIMPLE_PINHOLE", (focal, 320.0, 240.0))) for focal in (800.0, 1000.0))
     assert (right.verdict, wrong.verdict) == ("confident", "ambiguous")
-    named = re.search(r"with ([\d.]+) times the focal length", wrong.reason)
+    named = re.search(r"With ([\d.]+) times the focal length", wrong.reason)
     assert named is not None
     assert float(named[1]) == pytest.approx(0.8, rel=0.03)
 
