@@ -1,5 +1,5 @@
-"""What the benchmarks of the paper's tables share: trainings and tests that go on where they were stopped, rows with
-intervals, and the tables of a page."""
+"""Shared parts of the benchmarks of the paper's tables: trainings and tests that go on where they were stopped, rows
+with intervals, and the tables of a page."""
 
 import argparse
 import json
@@ -76,7 +76,7 @@ class Method:
 
 @dataclass(frozen=True)
 class Training:
-    """A `bpnp fit` of so many steps, in epochs of `epoch` steps with a checkpoint each.
+    """A `bpnp fit` of a number of steps, in epochs of `epoch` steps with a checkpoint each.
 
     start: checkpoint to go on from where the folder has none of its own.
     """

@@ -103,7 +103,7 @@ def _draws(count: int, seed: int) -> NDArray[np.int64]:
 def _checked(values: NDArray[np.float64]) -> NDArray[np.float64]:
     array = np.asarray(values, np.float64)
     if not len(array) or np.isnan(array).any():
-        raise ValueError(f"a bootstrap needs numbers, got {len(array)} of which {int(np.isnan(array).sum())} are NaN")
+        raise ValueError(f"a bootstrap needs numbers, got {len(array)} with {int(np.isnan(array).sum())} NaN")
     return np.clip(array, -FINITE, FINITE)
 
 
