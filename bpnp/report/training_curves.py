@@ -60,7 +60,7 @@ def read_curves(run: Path | str) -> "DataFrame":
             curves = concat([earlier, log]) if len(earlier) else log
     if curves.empty:
         raise ValueError(f"{run} has no logs/version_*/{METRICS} of a training")
-    return curves.groupby("step").mean(numeric_only=True).reset_index()
+    return curves.copy().groupby("step").mean(numeric_only=True).reset_index()
 
 
 def switch_step(curves: "DataFrame") -> int | None:
@@ -92,6 +92,9 @@ def training_curves(run: Path | str) -> "Figure":
     losses.set(ylabel="loss")
     rotation.set(ylabel="median rotation error, degrees", yscale="log")
     translation.set(ylabel="median translation error", yscale="log")
+    for axes in (rotation, translation):
+        axes.yaxis.set_major_formatter(_plain)
+        axes.yaxis.set_minor_formatter(_plain)
     joined = switch_step(curves)
     for axes in (losses, rotation, translation):
         axes.set_xlabel("step")
@@ -101,6 +104,11 @@ def training_curves(run: Path | str) -> "Figure":
         if axes.get_legend_handles_labels()[0]:
             axes.legend(fontsize=8, frameon=False)
     return figure
+
+
+def _plain(value: float, _: int) -> str:
+    """A tick of a logarithmic axis without powers of ten."""
+    return f"{value:g}"
 
 
 def _estimates(curves: "DataFrame") -> list[str]:
@@ -117,4 +125,4 @@ def _draw(
     values = known[key]
     if smooth:
         values = values.rolling(max(1, int(SMOOTH * len(values))), min_periods=1).mean()
-    axes.plot(known["step"], values, label=label, **line_style(place, 0), **style)
+    axes.plot(known["step"], values, label=label, **line_style(place, place), **style)
