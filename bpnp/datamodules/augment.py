@@ -1,6 +1,7 @@
 """Problems as they are trained and tested on: subsets, clutter, occlusion, outliers, rotation, a random order."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple
 
@@ -12,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from bpnp.checks import check_within
-from bpnp.datamodules.keyed_random import Purpose, permutations, rotations, stream, uniform
+from bpnp.datamodules.keyed_random import Generators, Key, Purpose, generators, permutations, rotations, uniform
 from bpnp.datamodules.problem import Counts
 from bpnp.geometry import MIN_POINTS
 from bpnp.types import Batch
@@ -107,32 +108,38 @@ class SideCounts(NamedTuple):
     outliers: Tensor
 
 
-def augment(batch: Batch, how: Augmentation, keys: Int[Tensor, " b"]) -> Batch:
+def augment(batch: Batch, how: Augmentation, keys: Sequence[Key]) -> Batch:
     """Choose the points of each problem, add outliers, and put both sides into random order.
 
-    batch: problems as `stacked` makes them, on any device. keys: one a problem, which depends on its key alone,
-    whatever batch it is in and however it is padded. Rotations and translations keep their dtype.
+    Rotations and translations keep their dtype.
+
+    Args:
+        batch: problems as `stacked` makes them, on the CPU.
+        how: what is chosen and added.
+        keys: of each problem, which depends on its key alone, whatever batch it is in and however it is padded.
+
+    Raises:
+        ValueError: the problems have no `match3d` or no pose.
     """
     if batch.match3d is None or batch.rotation is None:
         raise ValueError("expected problems with `match3d` and a pose to augment, got none")
     matched = batch.match3d >= 0
     total = matched.sum(-1, keepdim=True)
-    true, side2d, side3d = _amounts(how, total, batch, stream(keys, Purpose.AMOUNTS))
+    true, side2d, side3d = _amounts(how, total, batch, generators(keys, Purpose.AMOUNTS))
     # On both sides the matches in one random order, then the points without a partner.
-    choice = stream(keys, Purpose.CHOICE)
-    order3d = _matched_first(choice, matched, batch.mask3d)
+    order3d = _matched_first(generators(keys, Purpose.CHOICE), matched, batch.mask3d)
     alike = torch.equal(batch.mask2d, batch.mask3d)
     matched2d = pad(matched, (0, batch.points2d.shape[1] - matched.shape[1]))
-    order2d = order3d if alike else _matched_first(choice, matched2d, batch.mask2d)
-    points2d = _chosen(batch.points2d, order2d, true, total, side2d, stream(keys, Purpose.OUTLIERS2D))
-    points3d = _chosen(batch.points3d, order3d, true, total, side3d, stream(keys, Purpose.OUTLIERS3D))
-    points2d, mask2d, place2d = _shuffled(points2d, side2d, stream(keys, Purpose.ORDER2D))
-    points3d, mask3d, place3d = _shuffled(points3d, side3d, stream(keys, Purpose.ORDER3D))
+    order2d = order3d if alike else _matched_first(generators(keys, Purpose.CHOICE), matched2d, batch.mask2d)
+    points2d = _chosen(batch.points2d, order2d, true, total, side2d, generators(keys, Purpose.OUTLIERS2D))
+    points3d = _chosen(batch.points3d, order3d, true, total, side3d, generators(keys, Purpose.OUTLIERS3D))
+    points2d, mask2d, place2d = _shuffled(points2d, side2d, generators(keys, Purpose.ORDER2D))
+    points3d, mask3d, place3d = _shuffled(points3d, side3d, generators(keys, Purpose.ORDER3D))
     slots2d = torch.arange(place2d.shape[1], device=place2d.device).expand_as(place2d)
     seen_as = torch.empty_like(place2d).scatter_(1, place2d, slots2d).gather(1, place3d.clamp(max=len(slots2d[0]) - 1))
     rotation, origin = batch.rotation, batch.origin
     if how.rotate:  # a scene whose points p are turned: turn p
-        turn = rotations(stream(keys, Purpose.TURN))
+        turn = rotations(generators(keys, Purpose.TURN))
         points3d = (points3d.double() @ turn.mT).to(points3d)
         rotation = rotation @ turn.mT.to(rotation)
         origin = None if origin is None else (turn.to(origin) @ origin[..., None]).squeeze(-1)
@@ -160,9 +167,11 @@ def bounds(value: Drawn) -> tuple[float, float]:
     return low, high
 
 
-def _amounts(how: Augmentation, total: Tensor, batch: Batch, keys: Tensor) -> tuple[Tensor, SideCounts, SideCounts]:
+def _amounts(
+    how: Augmentation, total: Tensor, batch: Batch, random: Generators
+) -> tuple[Tensor, SideCounts, SideCounts]:
     """Matches (b, 1) that are left of `total`, and the points of either side."""
-    ratio, side, occlusion, occluded = uniform(keys, 4).unsqueeze(-1).unbind(1)
+    ratio, side, occlusion, occluded = uniform(random, 4).unsqueeze(-1).unbind(1)
     chosen = total if how.max_points is None else total.clamp(max=how.max_points)
     hidden = (_drawn(how.outliers.occlusion, occlusion) * chosen).round().long()
     hidden = torch.minimum(hidden, chosen - MIN_POINTS).clamp(min=0)
@@ -193,13 +202,13 @@ def _on_sides(side: DrawnSide, share: Tensor) -> tuple[Bool[Tensor, "b 1"], Bool
     return number < 2, number > 0
 
 
-def _matched_first(keys: Tensor, matched: Tensor, mask: Tensor) -> Int[Tensor, "b n"]:
+def _matched_first(random: Generators, matched: Tensor, mask: Tensor) -> Int[Tensor, "b n"]:
     """Places of the matches in random order, then those of the other points in random order, then padding."""
-    return permutations(keys, mask.shape[1], group=2 - mask.long() - matched.long())
+    return permutations(random, mask.shape[1], group=2 - mask.long() - matched.long())
 
 
 def _chosen(
-    points: Float[Tensor, "b n d"], order: Tensor, true: Tensor, total: Tensor, side: SideCounts, keys: Tensor
+    points: Float[Tensor, "b n d"], order: Tensor, true: Tensor, total: Tensor, side: SideCounts, random: Generators
 ) -> Float[Tensor, "b k d"]:
     """The matches' points first, then those without a partner, then outliers; meaningless beyond their number."""
     natural = side.matched + side.extra
@@ -211,15 +220,15 @@ def _chosen(
     is_match = (slot < true)[..., None]
     low = chosen.where(is_match, math.inf).amin(1, keepdim=True)
     high = chosen.where(is_match, -math.inf).amax(1, keepdim=True)
-    share = uniform(keys, chosen[0].numel()).view_as(chosen).to(chosen)
+    share = uniform(random, chosen[0].numel()).view_as(chosen).to(chosen)
     return torch.where((slot < natural)[..., None], chosen, low + (high - low) * share)
 
 
-def _shuffled(points: Tensor, side: SideCounts, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _shuffled(points: Tensor, side: SideCounts, random: Generators) -> tuple[Tensor, Tensor, Tensor]:
     """The points in random order, zero beyond their number; which are real; and where each comes from."""
     slot = torch.arange(points.shape[1], device=points.device)
     mask = slot < side.matched + side.extra + side.outliers
-    place = permutations(keys, len(slot), group=1 - mask.long())
+    place = permutations(random, len(slot), group=1 - mask.long())
     return picked(points, place) * mask[..., None], mask, place
 
 

@@ -1,95 +1,63 @@
-"""Random numbers that are a function of a key and a place, in torch: the same on every device and in every batch.
+"""Random numbers of a problem, a function of its key alone: numpy Generators, the same in every batch.
 
-SplitMix64 (Steele, Lea, Flood, OOPSLA 2014) as a hash of (key, place): nothing is kept between calls, so a batch is
-drawn in parallel and each of its rows depends on its own key alone. torch's int64 wraps around as the hash wants it.
+A generator for each problem and purpose, seeded by (seeds, index, purpose). The first numbers of a generator do not
+depend on how many are drawn, so padding changes nothing.
 """
 
-import math
+from collections.abc import Sequence
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 
 from bpnp.geometry import quaternion_rotation
 
-GOLDEN, FIRST, SECOND = (value - 2**64 for value in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
-PLACE_BITS = 22  # of a number to be sorted: four million points; 39 random bits are left above them
+Key = tuple[int, ...]  # seeds and index of a problem
+Generators = Sequence[np.random.Generator]  # one a problem
 
-
-# What random numbers of a problem are for; see `stream`.
+# What random numbers of a problem are for; see `generators`.
 Purpose = IntEnum("Purpose", "SUBSET POSE NOISE AMOUNTS CHOICE OUTLIERS2D OUTLIERS3D TURN ORDER2D ORDER3D", start=0)
 
 
-def row_keys(index: Int[Tensor, " b"], *seeds: int) -> Int[Tensor, " b"]:
-    """A key for each row, of its index and of all `seeds`, in their order."""
-    key = 0
-    for seed in seeds:
-        key = int(_mixed(torch.tensor(_wrapped(key + (seed + 1) * GOLDEN))))
-    return _mixed(key + index * GOLDEN)
+def row_keys(index: Int[Tensor, " b"], *seeds: int) -> list[Key]:
+    """Return a key for each index, of all `seeds` in their order."""
+    return [(*seeds, i) for i in index.tolist()]
 
 
-def stream(keys: Int[Tensor, " b"], purpose: Purpose) -> Int[Tensor, " b"]:
-    """A key of its own for each purpose."""
-    return _mixed(keys + _wrapped((purpose + 1) * FIRST))
+def generators(keys: Sequence[Key], purpose: Purpose) -> list[np.random.Generator]:
+    """Return a generator for each key, with numbers of its own for each purpose."""
+    return [np.random.default_rng([*key, purpose]) for key in keys]
 
 
-def rotations(keys: Int[Tensor, " b"]) -> Float[Tensor, "b 3 3"]:
-    """A uniformly random rotation for each row, float64: a normal 4-vector has a uniform direction."""
-    return quaternion_rotation(normal(keys, 4))
+def rotations(generators: Generators) -> Float[Tensor, "b 3 3"]:
+    """Draw a uniformly random rotation a generator, float64: a normal 4-vector has a uniform direction."""
+    return quaternion_rotation(normal(generators, 4))
 
 
-def random_bits(keys: Int[Tensor, " b"], count: int) -> Int[Tensor, "b count"]:
-    """`count` numbers a row, uniform over all int64."""
-    places = torch.arange(1, count + 1, device=keys.device).mul_(GOLDEN)
-    return _mixed(keys[:, None] + places)
+def uniform(generators: Generators, count: int) -> Float[Tensor, "b count"]:
+    """Draw `count` numbers a generator, uniform in [0, 1), float64."""
+    return torch.from_numpy(_uniform(generators, count))
 
 
-def uniform(keys: Int[Tensor, " b"], count: int) -> Float[Tensor, "b count"]:
-    """`count` numbers a row, uniform in (0, 1), float64."""
-    return (_shifted(random_bits(keys, count), 11).double() + 0.5) * 2.0**-53
-
-
-def normal(keys: Int[Tensor, " b"], count: int) -> Float[Tensor, "b count"]:
-    """`count` standard normal numbers a row by the Box-Muller transform, float64."""
-    half = (count + 1) // 2
-    radius, angle = uniform(keys, 2 * half).unflatten(-1, (half, 2)).unbind(-1)
-    radius, angle = (-2 * radius.log()).sqrt(), 2 * math.pi * angle
-    return torch.stack([radius * angle.cos(), radius * angle.sin()], -1).flatten(1)[:, :count]
+def normal(generators: Generators, count: int) -> Float[Tensor, "b count"]:
+    """Draw `count` standard normal numbers a generator, float64."""
+    return torch.from_numpy(np.stack([generator.standard_normal(count) for generator in generators]))
 
 
 def permutations(
-    keys: Int[Tensor, " b"], count: int, group: Int[Tensor, "b count"] | None = None
+    generators: Generators, count: int, group: Int[Tensor, "b count"] | None = None
 ) -> Int[Tensor, "b count"]:
-    """A random order of range(count) for each row; with `group` (0 to 3) all of group 0 come first, and so on.
+    """Draw an order of range(count) a generator; with `group`, all of group 0 come first, and so on.
 
-    The order of a group does not depend on the places of later groups, so padding in the last group changes nothing.
+    The order of a group does not depend on the indices of later groups, so padding in the last group changes nothing.
     """
-    if count >= 1 << PLACE_BITS:
-        raise ValueError(f"expected fewer than {1 << PLACE_BITS} points in a set, got {count}; try `max_points`")
-    numbers = _shifted(random_bits(keys, count), 3 + PLACE_BITS) << PLACE_BITS
-    numbers += torch.arange(count, device=keys.device)
-    if group is not None:
-        numbers += group << 61
-    if numbers.device.type == "cpu":
-        numbers = torch.from_numpy(np.sort(numbers.numpy(), axis=-1))  # 15 times faster than torch's
-    else:
-        numbers = numbers.sort(-1).values
-    return numbers & ((1 << PLACE_BITS) - 1)
+    numbers = _uniform(generators, count)
+    return torch.from_numpy(np.argsort(numbers if group is None else numbers + group.numpy(), axis=-1))
 
 
-def _wrapped(value: int) -> int:
-    """The int64 that is `value` modulo 2^64."""
-    return (value + 2**63) % 2**64 - 2**63
-
-
-def _shifted(value: Tensor, bits: int) -> Tensor:
-    """Shift right and fill with zeros; torch fills with the sign."""
-    return (value >> bits).bitwise_and_((1 << (64 - bits)) - 1)
-
-
-def _mixed(value: Tensor) -> Tensor:
-    value = (_shifted(value, 30).bitwise_xor_(value)).mul_(FIRST)
-    value = (_shifted(value, 27).bitwise_xor_(value)).mul_(SECOND)
-    return _shifted(value, 31).bitwise_xor_(value)
+def _uniform(generators: Generators, count: int) -> NDArray[Any]:
+    return np.stack([generator.random(count) for generator in generators])

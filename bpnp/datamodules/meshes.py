@@ -17,7 +17,16 @@ from torch import Tensor
 from bpnp.checks import check_positive, check_within
 from bpnp.datamodules.augment import picked
 from bpnp.datamodules.clouds import open_shapes
-from bpnp.datamodules.keyed_random import Purpose, normal, permutations, rotations, row_keys, stream, uniform
+from bpnp.datamodules.keyed_random import (
+    Generators,
+    Purpose,
+    generators,
+    normal,
+    permutations,
+    rotations,
+    row_keys,
+    uniform,
+)
 from bpnp.datamodules.loader import STAGES, ProblemDataModule, hold_out
 from bpnp.datamodules.problem import Counts
 from bpnp.datamodules.shapes import MeshError, Normalisation, Sampler, Shapes, normalise, procedural_shapes
@@ -54,11 +63,11 @@ class RandomCameras:
         check_within(0, math.inf, **lengths)
         check_positive(focal=self.focal)
 
-    def poses(self, keys: Int[Tensor, " b"]) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"]]:
-        """A random camera = R p + t for each key; float64."""
-        numbers = uniform(keys, 6)
+    def poses(self, random: Generators) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"]]:
+        """Draw camera = R p + t from each generator; float64."""
+        numbers = uniform(random, 6)
         if self.rotation == "so3":
-            rotation = rotations(stream(keys, Purpose.POSE))
+            rotation = rotations(random)
         else:
             low, high = (math.radians(angle) for angle in self.euler_range)
             rotation = roma.euler_to_rotmat("xyz", low + (high - low) * numbers[:, :3])
@@ -119,8 +128,8 @@ class MeshSource:
         views = [divmod(i, len(self.rows)) for i in index.tolist()]
         rows = [int(self.rows[mesh]) for _, mesh in views]
         ids = tuple(f"{self.store.name(row)}#{view}" for row, (view, _) in zip(rows, views, strict=True))
-        points3d = self._drawn_points(rows, stream(keys, Purpose.SUBSET))
-        rotation, translation = self.cameras.poses(stream(keys, Purpose.POSE))
+        points3d = self._drawn_points(rows, generators(keys, Purpose.SUBSET))
+        rotation, translation = self.cameras.poses(generators(keys, Purpose.POSE))
         camera = transform(rotation, translation, points3d.double())
         seen = camera[..., 2] > MIN_DEPTH
         if not self.sees_all and bool((few := seen.sum(-1) < MIN_POINTS).any()):
@@ -129,7 +138,7 @@ class MeshSource:
                 f"expected at least {MIN_POINTS} points in front of the camera, got {int(seen[first].sum())} in "
                 f"{ids[first]}; try normalisation unit_sphere or a larger `distance`"
             )
-        noise = normal(stream(keys, Purpose.NOISE), 2 * count).view(size, count, 2)
+        noise = normal(generators(keys, Purpose.NOISE), 2 * count).view(size, count, 2)
         points2d = project(camera) + noise * (self.cameras.noise_px / self.cameras.focal)
         return Batch(
             points2d=(points2d.where(seen[..., None], 0.0)).float(),
@@ -145,15 +154,15 @@ class MeshSource:
             origin=torch.zeros(size, 3, dtype=torch.float64),
         )
 
-    def _drawn_points(self, rows: Sequence[int], keys: Int[Tensor, " b"]) -> Float[Tensor, "b n 3"]:
+    def _drawn_points(self, rows: Sequence[int], random: Generators) -> Float[Tensor, "b n 3"]:
         """Draw `num_points` of the first `pool_size` points of each shape; shapes may have different numbers."""
         pools = [self.store.row(row)[POINTS][: self.pool_size] for row in rows]
-        points = keys.new_empty((len(rows), self.num_points, 3), dtype=torch.float32)
+        points = torch.empty((len(rows), self.num_points, 3), dtype=torch.float32)
         sizes = np.array([len(pool) for pool in pools])
         for size in np.unique(sizes).tolist():
-            same = torch.from_numpy(np.flatnonzero(sizes == size))
-            order = permutations(keys[same], size)[:, : self.num_points]
-            points[same] = picked(torch.from_numpy(np.stack([pools[i] for i in same.tolist()])), order)
+            same = np.flatnonzero(sizes == size).tolist()
+            order = permutations([random[i] for i in same], size)[:, : self.num_points]
+            points[same] = picked(torch.from_numpy(np.stack([pools[i] for i in same])), order)
         return points
 
 
