@@ -1,4 +1,4 @@
-"""Did a change cost anything? One line for each kind of problem, compared problem by problem with an earlier run.
+"""Compare a run over problems of all kinds with an earlier run, problem by problem: did a change cost anything.
 
     python -m benchmarks guard --seed 71 --output before.json
     python -m benchmarks guard --seed 71 --output after.json --against before.json

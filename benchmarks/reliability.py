@@ -5,7 +5,9 @@
 Rows: leds (the settings of `leds.py`), shapes (0, 0.25 and 0.5 outliers a match), photos (against the points of one
 view, 0 to 100 % outliers a side), maps (photos left out of their map, which view is not told), hard (`hard_scenes.py`),
 wrong focal (of photos and planes, 5 to 33 %; photos in whole maps, by each of --factors), labels (LEDs of three colours
-that a classifier of Gaussian noise sees: without labels, with its likeliest class, and with its probabilities).
+that a classifier of Gaussian noise sees: without labels, with its likeliest class, and with its probabilities),
+symmetric (`symmetric.py`; of exactly symmetric objects every confident pose is wrong), devices (LEDs that a half turn
+nearly maps onto each other), pitch (crossings of lines of a playing field, gravity known to 2 degrees).
 --limit: problems of each row. Photos are of scenes on which no constant was chosen (`--scenes`).
 
 Right: within 3 degrees, the middle of the scene moved by less than a tenth of its distance; with a wrong focal length
@@ -21,6 +23,7 @@ from typing import Any
 import leds
 import numpy as np
 import shapes
+import symmetric
 from hard_scenes import CAMERA, SCENES, Drawn, wrong_focal_plane
 from record import TIME_LIMIT, Array, Pose, Problem, Row, parser, run
 from scipy.special import softmax
@@ -55,6 +58,14 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
         yield near(f"wrong focal, one view, {error}", partial(photos, 0.5, "view", [factors[::2], factors[1::2]]))
         yield near(f"wrong focal, whole map, {error}", partial(photos, 1.0, "map", [factors]))
     yield near("wrong focal, planes", partial(with_lens, wrong_focal_plane, [options.seed, 1], options))
+    for parts in symmetric.KINDS:
+        drawn = partial(symmetric.problems, parts, *count, options.time_limit)
+        yield right(f"symmetric, {parts.label}", drawn)
+    for normals in (True, False):
+        drawn = partial(symmetric.device_problems, *count, normals=normals)
+        yield right(f"devices, {'with' if normals else 'without'} normals", drawn)
+    for tilt in (0.0, 30.0, 60.0):
+        yield right(f"pitch with gravity, tilt {tilt:g} deg", partial(symmetric.pitch_problems, tilt, *count))
     for kind in ("none", "likeliest", "probabilities"):
         yield right(f"labels, {kind}", partial(of_classes, kind, options))
 

@@ -78,7 +78,8 @@ def problems(kind: Kind, limit: int, seed: int, time_limit: float | None = None)
             image = np.concatenate([shown, rng.uniform(shown.min(0), shown.max(0), (count, 2))])
         known: dict[str, Any] = {"seed": k, "time_limit": time_limit}
         search = partial(bpnp.solve, rng.permutation(image), rng.permutation(points), **known)
-        yield Problem(f"{kind.label} #{k}", search, [(rotation, translation)], points)
+        # Of an exactly symmetric object no pose is right: its copies fit as well.
+        yield Problem(f"{kind.label} #{k}", search, [(rotation, translation)] if kind.unique else [], points)
 
 
 def near_symmetric_device(rng: np.random.Generator, pairs: int = 14, unique: int = 4) -> tuple[Array, Array]:
@@ -113,3 +114,37 @@ def device_problems(limit: int, seed: int, *, normals: bool = True, frames: int 
         search = partial(bpnp.solve, pixels, points, camera, **known)
         name = f"device {k // frames}, {'' if normals else 'no '}normals #{k}"
         yield Problem(name, search, [(rotation, translation)], points)
+
+
+def pitch_problems(tilt_deg: float, limit: int, seed: int) -> Iterator[Problem]:
+    """Yield pictures of a part of a playing field from the stands: crossings of its lines with a pixel of noise.
+
+    Gravity is known to 2 degrees, the camera rolled by up to 3 degrees and tilted down by some 15 degrees and up to
+    `tilt_deg` more. Either side of the field may be meant.
+    """
+    camera = np.array([[1000.0, 0, 640], [0, 1000, 360], [0, 0, 1]])
+    half = [(0, 0), (0, 68), (16.5, 13.84), (16.5, 54.16), (5.5, 24.84), (5.5, 43.16), (0, 13.84), (0, 54.16)]
+    middle = [(52.5, 0), (52.5, 68), (52.5, 24.85), (52.5, 43.15), (0, 24.84), (0, 43.16), (11, 34)]
+    field = np.array([*half, *middle])
+    field = np.concatenate([field, field[field[:, 0] < 52] * (-1, 1) + (105, 0)])
+    points = np.column_stack([field - (52.5, 34), np.zeros(len(field))])
+    for k in range(limit):
+        rng = np.random.default_rng([seed, 3, k])
+        seen = np.empty((0, 2))
+        while len(seen) < 9:
+            down = np.radians(15 + rng.uniform(0, tilt_deg))
+            at = np.array([rng.uniform(-40, 40), -60.0, rng.uniform(12, 30)])
+            aim = Rotation.from_euler("x", np.pi / 2 + down) * Rotation.from_euler("z", rng.uniform(-0.4, 0.4))
+            rotation = (Rotation.from_euler("z", np.radians(rng.uniform(-3, 3))) * aim).as_matrix()
+            translation = -rotation @ at
+            there = points @ rotation.T + translation
+            pixels = there[:, :2] / there[:, 2:] * 1000 + (640, 360)
+            inside = (there[:, 2] > 0) & (pixels > 0).all(1) & (pixels < (1280, 720)).all(1)
+            seen = pixels[inside]
+        up = Rotation.from_rotvec(np.radians(1.0) * rng.normal(size=3)).as_matrix() @ rotation[:, 2]
+        prior = bpnp.GravityPrior(up, np.array([0.0, 0.0, 1.0]), 2.0)
+        known: dict[str, Any] = {"prior": prior, "seed": k, "time_limit": 10}
+        search = partial(bpnp.solve, rng.permutation(seen + rng.normal(size=seen.shape)), points, camera, **known)
+        half_turn = np.diag([-1.0, -1.0, 1.0])  # which maps the field onto itself
+        poses = [(rotation, translation), (rotation @ half_turn, translation)]
+        yield Problem(f"pitch, tilt {tilt_deg:g} #{k}", search, poses, points)
