@@ -13,6 +13,7 @@ from unittest.mock import Mock
 import bench_city
 import bench_layers
 import bench_left_out
+import guard
 import numpy as np
 import pytest
 import rebuilt_maps
@@ -21,6 +22,7 @@ import reliability
 import results
 import roma
 import shapes
+import symmetric
 import torch
 from paper_layers import PaperPnP, PaperSinkhorn
 from planted_model import plant_model
@@ -165,7 +167,8 @@ def test_the_list_has_every_benchmark_and_a_sentence_for_each(monkeypatch, capsy
     monkeypatch.setattr("sys.argv", ["benchmarks"])
     start()
     lines = dict(line.strip().split(maxsplit=1) for line in capsys.readouterr().out.splitlines()[2:])
-    assert set(lines) == {"city", "focal", "layers", "left_out", "reliability", "results", "rigs", "stars"}
+    search = {"city", "completeness", "focal", "guard", "left_out", "reliability", "results", "rigs", "stars"}
+    assert set(lines) == search | {"finetune", "layers", "paper_weights", "table1", "table2"}
     assert all(sentence.endswith((".", ":")) or "`" in sentence for sentence in lines.values())
     for name, code in (("serch", "expected a name of this list, got 'serch'"), ("stars", 0)):
         monkeypatch.setattr("sys.argv", ["benchmarks", name, "--help"])
@@ -292,3 +295,23 @@ def test_photos_of_a_city_are_seen_where_their_poses_put_them(tmp_path: Path) ->
         camera = larger.points3d[view.points] @ view.rotation.T + view.translation
         np.testing.assert_allclose(np.linalg.det(view.rotation), 1)
         assert (np.abs(camera[:, :2] / camera[:, 2:]) < 1).all()
+
+
+def test_the_guard_notices_a_lost_pose_a_wrong_one_and_slower_code() -> None:
+    pose = {"rotation": np.eye(3).tolist(), "translation": [0.0, 0, 4]}
+    row = {"problem": "a", "verdict": "confident", "right": True, "wrong": False, "cpu_seconds": 1.0} | pose
+    assert guard.compare("kind", [row], [row])[1]
+    for change in ({"cpu_seconds": 1.2}, {"right": False}, {"wrong": True}):
+        assert not guard.compare("kind", [row | change], [row])[1]
+    assert guard.compare("kind", [row | {"verdict": "ambiguous"}], [row])[0].count("confident +0 -1") == 1
+    assert "1 other poses" in guard.compare("kind", [row | {"translation": [0.0, 0, 5]}], [row])[0]
+
+
+@pytest.mark.parametrize("kind", [symmetric.KINDS[1], symmetric.KINDS[20], symmetric.KINDS[-1]])
+def test_symmetric_objects_have_equal_parts(kind: symmetric.Kind) -> None:
+    """A turn by one part maps each part onto the next one, about the object's axis."""
+    points = symmetric.points_of(kind, np.random.default_rng(0))
+    assert len(points) == kind.fold * kind.each + kind.unique
+    angle = 2 * np.pi / kind.fold
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    np.testing.assert_allclose(points[: kind.each] @ turn.T, points[kind.each : 2 * kind.each], atol=1e-12)
