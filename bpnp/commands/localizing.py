@@ -27,6 +27,8 @@ def localize(
     photos: list[Path],
     *,
     camera: str | None = None,
+    focal_error: float | None = None,
+    distortion: bool = False,
     views: Path | None = None,
     keypoints: Path | None = None,
     leave_one_out: bool = False,
@@ -49,6 +51,9 @@ def localize(
         camera: of the photos, a file with a 3x3 matrix or COLMAP's MODEL,PARAMETERS; or a COLMAP model, such as MAP
             itself, for that of its images, scaled to the photo's size; or unknown, to find the focal length with the
             pose. By default that of EXIF, else of images of the map that have the photo's size, else unknown.
+        focal_error: relative standard deviation of the focal length of the camera, such as 0.1; it is then found with
+            the pose. No effect on photos whose camera is unknown.
+        distortion: fit a radial coefficient with an unknown focal length even where it is not significantly better.
         views: text file of lines "photo view", the views of the map to try; the whole map by default.
         keypoints: hloc's HDF5 file of features or COLMAP's database; SIFT is detected by default.
         leave_one_out: the photos are views of the map, and each is taken out of it first.
@@ -74,6 +79,8 @@ def localize(
         raise ValueError(f"expected hloc's or COLMAP's file of keypoints, got {keypoints}, which is no file")
     source_from(solver)  # raises, where each photo would
     positive("time_limit", time_limit)
+    if focal_error is not None and not 0 < focal_error < 1:
+        raise ValueError(f"`focal_error` is {focal_error}; it is a fraction of the focal length, above 0 and below 1")
     files, scene = photo_files(photos, besides=output), SceneMap.from_colmap(map)
     attempts, lens = _attempts(cluster), None if camera is None else _camera(camera, map, scene)
     tried = None if views is None else read_views(views)
@@ -87,6 +94,8 @@ def localize(
             pictures=not no_pictures,
             done=lambda name: shown.update(bar, description=f"localized {name}", advance=1),
             camera=lens,
+            focal_error=focal_error,
+            distortion=distortion or None,
             views=tried,
             keypoints=keypoints,
             leave_one_out=leave_one_out,

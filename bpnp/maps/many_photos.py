@@ -60,7 +60,8 @@ def photo_task(
     """What to localise a photo with.
 
     camera, keypoints, solver: as for `SceneMap.localize_photo`. views: those to try by the name of the photo, None for
-    the whole map. leave_one_out: the photo is a view of the map and is taken out of it. search: seed and time_limit.
+    the whole map. leave_one_out: the photo is a view of the map and is taken out of it. search: focal_error,
+    distortion, seed and time_limit.
     Raises ValueError for what is wrong with the photo, its camera, keypoints or views.
     """
     photo_content, source = content_of(photo), "--camera"

@@ -350,7 +350,8 @@ class SceneMap:
             size; "unknown" for an unknown focal length whatever EXIF says.
         keypoints: HDF5 file of hloc or COLMAP's database, which has those of the photo under its `name`, by default
             that of the file; None to detect SIFT keypoints.
-        options: views, prior, solver, seed and time_limit, as for `localize`.
+        options: focal_error, distortion, views, prior, solver, seed and time_limit, as for `localize`; the first one
+            has no effect on a photo whose camera is unknown.
         Raises ValueError for a photo that cannot be read, or of another size than its camera or keypoints, and as
         `localize`.
         """
@@ -364,7 +365,9 @@ class SceneMap:
                 f"{size[1]}; try a camera with the focal length and the centre of this size, or that of the map"
             )
         points = photo_keypoints(path, keypoints, path.name if name is None else name)
+        options = {option: value for option, value in options.items() if value is not None}
         if lens is None:
+            options.pop("focal_error", None)
             return self.localize(points.pixels, image_size=size, scores=points.scores, **options)
         pixels = points.pixels - (CENTRE if is_opencv(camera) else 0.0)
         return self.localize(pixels, lens, scores=points.scores, **options)

@@ -7,15 +7,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from matplotlib.transforms import BboxBase
 from PIL import Image
-from planted_model import plant_model
+from planted import degrees_between
+from planted_model import HEIGHT, WIDTH, plant_model
 from scipy.spatial.transform import Rotation
 
 import bpnp
 from bpnp import SceneMap, Solution
+from bpnp.cameras import camera_from
 from bpnp.cli import main
 from bpnp.examples import load
 from bpnp.maps.photos import photo_files
@@ -147,3 +150,26 @@ def test_ctrl_c_while_a_picture_is_drawn_ends_the_run_and_keeps_the_photo(
     assert sorted(map(str, kept)) == ["pictures/a.png.png", "poses.txt", "results.json", "solutions/a.png.json"]
     assert "a.png" in (tmp_path / "out/poses.txt").read_text()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_rough_focal_length_and_distortion_are_found(tmp_path: Path, fails: Callable[..., str]) -> None:
+    pinhole = ("PINHOLE", [520.0, 520.0, WIDTH / 2, HEIGHT / 2])
+    truth = plant_model(tmp_path / "map", camera=pinhole, images=2, points=140, seen=90, clutter=0)
+    lens = camera_from(("SIMPLE_RADIAL", (520.0, WIDTH / 2, HEIGHT / 2, -0.2)))
+    pixels = lens.project(np.c_[truth.points2d[0], np.ones(90)])
+    Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "new.png")
+    with h5py.File(tmp_path / "features.h5", "w") as file:
+        file["new.png/keypoints"] = pixels - 0.5  # OpenCV's pixels
+    command = ["localize", str(tmp_path / "map"), str(tmp_path / "new.png"), "--no_pictures", "--solver", "search"]
+    command += ["--camera", f"SIMPLE_PINHOLE,550,{WIDTH / 2},{HEIGHT / 2}", "--output", str(tmp_path / "out")]
+    command += ["--keypoints", str(tmp_path / "features.h5")]
+    found = []
+    for options in ([], ["--focal_error", "0.1"], ["--focal_error", "0.1", "--distortion"]):
+        main([*command, *options])
+        found.append(Solution.from_json(tmp_path / "out/solutions/new.png.json"))
+    assert found[0].focal_length == 550  # a camera that is given is never changed
+    for solution in found[1:]:
+        assert solution.focal_length == pytest.approx(520, rel=0.01)
+        assert degrees_between(solution.rotation, truth.rotations[0]) < 0.1
+    assert "`focal_error` is 2.0; it is a fraction of the focal length" in fails(*command, "--focal_error", "2")
+    assert "`distortion=True` needs" in fails(*command, "--distortion")
