@@ -182,5 +182,6 @@ def _quieten() -> None:
         "LeafSpec",
         "logs directory .* exists and is not empty",
         "smaller than the logging interval",
+        "`BlindPnPTask.configure_optimizers` will be overridden",
     ):
         warnings.filterwarnings("ignore", message=f".*{part}.*")

@@ -20,6 +20,7 @@ from lightning import Callback, LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar, RichProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.loggers import CSVLogger, Logger
+from lightning.pytorch.utilities.rank_zero import rank_zero_info
 from lightning.pytorch.utilities.types import LRSchedulerTypeUnion
 from torch.optim import Optimizer
 
@@ -175,8 +176,14 @@ class BpnpCLI(LightningCLI):
         lightning_module: LightningModule, optimizer: Optimizer, lr_scheduler: LRSchedulerTypeUnion | None = None
     ) -> Any:
         """Use `--optimizer` and `--lr_scheduler`; without the latter, the schedule of the task."""
-        if lr_scheduler is None and isinstance(lightning_module, BlindPnPTask):
-            return lightning_module.with_schedule(optimizer)
+        if isinstance(lightning_module, BlindPnPTask):
+            rates = ", ".join(f"{group['lr']:g}" for group in optimizer.param_groups)
+            rank_zero_info(
+                f"{type(optimizer).__name__} with learning rate {rates}; model.learning_rate and model.weight_decay "
+                "are not used"
+            )
+            if lr_scheduler is None:
+                return lightning_module.with_schedule(optimizer)
         return LightningCLI.configure_optimizers(lightning_module, optimizer, lr_scheduler)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:

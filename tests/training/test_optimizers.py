@@ -39,6 +39,15 @@ def test_a_step_with_a_nan_gradient_is_skipped_and_counted(name: str, tmp_path: 
     assert Observer.task.skipped_steps == 1
 
 
+def test_the_rate_of_an_optimizer_is_printed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """It is that of torch where the command has none, not that of the model."""
+    caplog.set_level("INFO")
+    fit(tmp_path, *SHORT, "--optimizer=torch.optim.AdamW", "--model.learning_rate=1e-5", "--trainer.max_steps=1")
+    assert "AdamW with learning rate 0.001; model.learning_rate and model.weight_decay are not used" in caplog.text
+    assert Observer.rates == [1e-3]
+    assert not [record for record in caplog.records if "will be overridden" in record.getMessage()]
+
+
 def test_the_first_step_of_sgd_is_the_rate_times_the_gradient(tmp_path: Path) -> None:
     fit(tmp_path, *SHORT, "--optimizer=torch.optim.SGD", "--optimizer.lr=0.25", "--trainer.max_steps=1")
     moved = Observer.weights[0] - Observer.weights[1]
