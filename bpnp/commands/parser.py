@@ -145,7 +145,7 @@ LIGHTNING = {
 }
 OPTIONS = {
     "--config NAME": "packaged configuration or a YAML file; of several, later ones override",
-    "--ckpt_path FILE": "checkpoint, `last`, or the name of packaged weights",
+    "--ckpt_path FILE": "checkpoint, `last` or `best` of the run, or the name of packaged weights",
     "--print_config": "print all options with their values, to use as --config",
     "--seed_everything N": "seed",
     "--data CLASS": "class path of the data, such as bpnp.datamodules.MeshDataModule",

@@ -128,8 +128,11 @@ class BpnpCLI(LightningCLI):
         self.config = parser.parse_args([word for word in args if not word.startswith("--print_config")])
         config = self.config[self.command]
         path = config.get("ckpt_path")
+        folder = Path(_checkpoint_folder(config["trainer.default_root_dir"]))
         if path == "last":
-            path = str(newest_checkpoint(Path(_checkpoint_folder(config["trainer.default_root_dir"]))))
+            path = str(newest_checkpoint(folder))
+        elif path == "best" and (folder / "best.ckpt").is_file():
+            path = str(folder / "best.ckpt")
         named = config.get("model.class_path")
         solver = None
         if named is None or issubclass(_located(named), BlindPnPTask):

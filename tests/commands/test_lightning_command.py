@@ -14,6 +14,7 @@ import pytest
 import torch
 import yaml
 from lightning import Callback, LightningDataModule, Trainer
+from lightning.pytorch.cli import LightningCLI
 from lightning.pytorch.loggers import Logger
 from planted import plant, posed
 from small_data import MESHES, SMALL_FEATURES, SMALL_NET, quiet_trainer
@@ -22,6 +23,7 @@ from torch.utils.data import DataLoader
 
 from bpnp import Batch, BPnPNet, Prediction
 from bpnp.cli import main
+from bpnp.datamodules import MeshDataModule
 from bpnp.datamodules.problem import Problem, stacked
 from bpnp.geometry import quaternion_rotation
 from bpnp.report import read_results
@@ -73,6 +75,7 @@ def test_the_checkpoint_says_which_network_is_tested(trained: Path, tmp_path: Pa
         "widths": SMALL_NET,
         "file": [f"--config={config}"],
         "task": ["--model=bpnp.training.BlindPnPTask"],
+        "best": ["--ckpt_path=best"],
     }.items():
         assert loss_of_test(trained, name, *options) == pytest.approx(own, abs=1e-6), name
     recorded = read_results(trained / "nothing").settings["solver"]
@@ -92,6 +95,21 @@ def test_an_option_that_contradicts_the_checkpoint_is_an_error(trained: Path, fa
     assert "expected a checkpoint of Matcher, got one of BPnPNet" in fails(
         *words("test", trained, checkpoint, "--model.solver=bpnp.models.Matcher")
     )
+
+
+def test_a_command_line_of_the_users_own_keeps_its_options(trained: Path, tmp_path: Path) -> None:
+    """Lightning's CLI applies what it finds under `hyper_parameters` in a checkpoint after its command line."""
+    cli = LightningCLI(
+        BlindPnPTask,
+        MeshDataModule,
+        save_config_callback=None,
+        args=[
+            "validate", f"--ckpt_path={trained}/run/checkpoints/last.ckpt", "--model.learning_rate=0.25",
+            *SMALL_NET, *OTHERS, *MESHES[1:], f"--data.cache_dir={tmp_path}", "--trainer.logger=false",
+        ],
+    )  # fmt: skip
+    assert cli.model.learning_rate == cli.model.hparams.learning_rate == 0.25
+    assert cli.model.solver.features2d.scale == 4
 
 
 def test_a_setting_of_the_evaluation_is_changed_and_printed(trained: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -195,6 +213,7 @@ def test_everything_of_a_run_is_in_its_folder_and_in_its_logger(
     fit, test = Recording.made
     assert Path(fit.folder) == tmp_path / "run"
     assert fit.params["learning_rate"] == 1e-4
+    assert test.params["ckpt_path"] == f"{tmp_path}/run/checkpoints/last.ckpt"
     assert fit.params["data"]["init_args"]["num_points"] == 24
     assert fit.params["solver"]["settings"]["features2d"]["settings"]["channels"] == 16
     json.dumps(fit.params)
