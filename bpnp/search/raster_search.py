@@ -33,6 +33,7 @@ from bpnp.search.settings import RasterSearch, RasterShape
 from bpnp.search.starts import PosePrior, Prior, aim_of, draw_poses
 
 WIDE = 5.0  # standard deviations of a smoothing beyond which its kernel is 0
+WIDEST = 2 * math.tan(math.radians(60))  # half a raster's side: 120 degrees off the axis, where a view is all around
 NARROW = 4.0  # cells of the raster, of the standard deviation of a smoothing that is added up cell by cell
 
 
@@ -176,14 +177,15 @@ def raster_of(scene: Scene, shape: RasterShape, scale: float) -> Raster:
 
 def _drawn_raster(scene: Scene, shape: RasterShape, scale: float) -> Raster:
     d = scene.offsets.astype(np.float64)
-    at = 2 * d[:, :2] / (2 + d[:, 2:])
+    at = 2 * d[:, :2] / np.maximum(2 + d[:, 2:], 1e-9)
     scale *= scene.spread
-    half = float(np.abs(at).max()) + 3 * scale
+    half = min(float(np.abs(at).max()) + 3 * scale, WIDEST)
     cells = min(math.ceil(2 * half * shape.cells / scale), shape.most_cells)
     per_cell = cells / (2 * half)
-    place = np.minimum(((at + half) * per_cell).astype(np.int64), cells - 1)
+    within = (np.abs(at) < half).all(1)
+    place = np.minimum(((at[within] + half) * per_cell).astype(np.int64), cells - 1)
     place = place[:, 1] * cells + place[:, 0]
-    counts = np.bincount(place, scene.image.weights, cells**2).reshape(cells, cells).astype(np.float32)
+    counts = np.bincount(place, scene.image.weights[within], cells**2).reshape(cells, cells).astype(np.float32)
     wide = shape.background * scale * per_cell
     near, around = _smoothed(counts, scale * per_cell), _smoothed(counts, wide)
     inside = around > shape.inside * around.max()

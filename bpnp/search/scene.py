@@ -74,7 +74,8 @@ class Scene:
         self.spread, self.solid_angle = sets.image.spread, sets.image.solid_angle
         self.shift_weight = np.array([1, 1, min(1, SHIFT_ALONG * self.spread)], np.float32)
         fine = settings.fine
-        self.smallest_scale = min(fine.smallest_scale, fine.relative_smallest * self.spread)
+        floor = math.inf if sets.floor is None else sets.floor
+        self.smallest_scale = min(fine.smallest_scale, fine.relative_smallest * self.spread, floor)
 
     def outlier_density(self, share: float) -> np.float32:
         """o / s^2, o = 2 pi s^2 w / ((1 - w) A): the density of outliers against that of a kernel (Myronenko, Song)."""

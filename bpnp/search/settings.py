@@ -50,7 +50,7 @@ class FineStage:
 
     bearings: used before the last stage, which uses all; more cost time and hardly change which pose is best.
     smallest_scale: radians, a tenth of a pixel at a focal length of 500 pixels; relative_smallest: in spreads of the
-        bearings, for narrow views. The smaller of both is the end of the annealing.
+        bearings, for narrow views. The smallest of both and of `PointSets.floor` is the end of the annealing.
     cooling: factor from one scale to the next. patience: scales after the likeliest one before a pose is left.
     """
 

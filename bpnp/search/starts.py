@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from bpnp.search.settings import Recipe
 
 Array = NDArray[np.float32]
+ALL_AROUND = 0.95  # spread of bearings above which they fill some 220 degrees or more
 AIM_STEP = 0.16  # spreads of the bearings; a spiral of places with radii of so much times sqrt(k) leaves no gaps
 
 
@@ -92,6 +93,8 @@ def draw_poses(
     along = np.einsum("si,ij,sj->s", rotation[:, 2], covariance, rotation[:, 2])  # variance along the view
     extent = np.sqrt(np.maximum(np.trace(covariance) - along, 0))
     depth = extent / spread * np.exp(recipe.log_depth * rng.uniform(-1, 1, count))
+    if spread > ALL_AROUND:  # the camera is among the points
+        depth *= rng.random(count)
     seen = middle + recipe.off_centre * rng.random((count, 1)) * (
         points3d[rng.integers(len(points3d), size=count)] - middle
     )

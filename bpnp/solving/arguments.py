@@ -288,7 +288,8 @@ def checked_labels(labels2d: Any, labels3d: Any, counts: tuple[int, int]) -> dic
     if missing:
         raise ValueError(f"expected both `labels2d` and `labels3d`, or neither, got no `{missing[0]}`")
     if all(getattr(values, "ndim", 1) < 2 for values in labels.values()):
-        return {name: _integers(name, labels[name], count) for name, count in zip(labels, counts, strict=True)}
+        integers = [_integers(name, labels[name], count) for name, count in zip(labels, counts, strict=True)]
+        return dict(zip(labels, compact_labels(*integers), strict=True))
     image, scene = (_classes(name, labels[name], count) for name, count in zip(labels, counts, strict=True))
     if image.shape[1] != scene.shape[1]:
         raise ValueError(
@@ -298,6 +299,27 @@ def checked_labels(labels2d: Any, labels3d: Any, counts: tuple[int, int]) -> dic
     odds /= np.maximum(odds @ scene.mean(0), 1e-12)[:, None]
     sure = [np.where(shares.max(1) >= SURE, shares.argmax(1), -1) for shares in (image, scene)]
     return {"labels2d": sure[0], "labels3d": sure[1], "odds2d": odds, "classes3d": scene}
+
+
+def compact_labels(labels2d: Labels, labels3d: Labels) -> tuple[Labels, Labels]:
+    """Number labels by their order in the scene.
+
+    Args:
+        labels2d: (m,) labels of any size; -1 fits any.
+        labels3d: (n,) the same.
+
+    Returns:
+        Labels (m,) and (n,) from 0 to the number k of those in the scene; k for an image point whose label no scene
+        point has. -1 stays. The numbers of scene points do not depend on the image.
+
+    >>> [labels.tolist() for labels in compact_labels(np.array([-1, 2**40, 9, 3]), np.array([9, -1, 2**40]))]
+    [[-1, 1, 0, 2], [0, -1, 1]]
+    """
+    values = np.unique(labels3d[labels3d >= 0])
+    places = [np.searchsorted(values, side) for side in (labels2d, labels3d)]
+    known = np.isin(labels2d, values)
+    image = np.where(labels2d < 0, -1, np.where(known, places[0], len(values)))
+    return image.astype(np.int64), np.where(labels3d < 0, -1, places[1]).astype(np.int64)
 
 
 def _classes(name: str, values: Any, count: int) -> Array:

@@ -349,17 +349,18 @@ def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = 
     free = 2 * min(count, float(linear.probability.sum())) - POSE
     zoomed = lens_columns(linear.seen, 0.0)[..., :1] / linear.scale
     strained = linear.jacobian[:, :, 3:POSE] @ (linear.points @ STRAINS).transpose(1, 2, 0)
-    columns = np.concatenate([linear.jacobian[:, :, :POSE], zoomed, strained, linear.residual[..., None]], -1)
+    distance = max(float(np.linalg.norm(linear.middle)), 1e-300)  # the unit of the shift, as a radian is of the turn
+    posed = linear.jacobian[:, :, :POSE] * np.repeat([1.0, distance], 3)
+    columns = np.concatenate([posed, zoomed, strained, linear.residual[..., None]], -1)
     weighed = (np.sqrt(linear.probability)[:, None, None] * columns).reshape(-1, columns.shape[-1])
     products = weighed.T @ weighed
     pose = np.linalg.pinv(products[:POSE, :POSE], hermitian=True)
-    distance = max(float(np.linalg.norm(linear.middle)), 1e-300)
     found = []
     strains = slice(POSE + 1, POSE + 1 + len(STRAINS))
     for fitted, chance in ((slice(POSE, POSE + 1), rule.focal_chance), (strains, EXCEEDED)):
         moved, step = _moved(products, pose, fitted, free, chance)
         zoom = math.exp(float(step[0])) if len(step) == 1 else 1.0
-        found.append(Misfit(float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:])) / distance, zoom))
+        found.append(Misfit(float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:])), zoom))
     pose_of = linear.sets, linear.rotation, linear.middle, linear.scale
     other = fit_lens(*pose_of) if found[0].zoom != 1 else None
     if other is not None:

@@ -162,7 +162,8 @@ def _take_step(sets: PointSets, chosen: Labels, scale: float, at: LensFit) -> Le
         products, gradient = products.copy(), gradient.copy()
         products[6, 6] += (scale / focal.sigma) ** 2
         gradient[6] -= (scale / focal.sigma) ** 2 * (focal.offset + math.log(at.zoom))
-    damped = products + np.diag(1e-6 * np.diag(products) + 1e-15)
+    size = np.diag(products)  # of turn, shift and lens, each in a unit of its own
+    damped = products + np.diag(np.where(size > 0, 1e-6 * size, 1.0))
     step = np.linalg.solve(damped, gradient)
     zoom = at.zoom * math.exp(float(np.clip(step[6], -MOST_ZOOM, MOST_ZOOM)))
     radial = at.radial
