@@ -21,7 +21,7 @@ M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h: bytes from w
 AFTER_CTRL_C = {
     "localize": "; run it again to go on",
     "table": "; run it again to go on",
-    "prepare": "; nothing was written, run it again to start anew",
+    "prepare": "; nothing was written, run it again",
 }
 LIBRARIES = sys.stdlib_module_names | {
     "beartype", "bpnp", "cv2", "filelock", "fsspec", "h5py", "jaxtyping", "jsonargparse", "lightning", "numpy",
@@ -30,7 +30,7 @@ LIBRARIES = sys.stdlib_module_names | {
 LIGHTNING_MISTAKES = {
     "MisconfigurationException",
     "TrainingDivergedError",
-}  # of which Lightning is imported for runs only
+}  # named, since Lightning is imported for its own commands only
 OTHER_SCRIPT = "lightning-sdk is installed, which has a script named `lightning` too"
 WIDTH = 80  # columns of the help
 
@@ -62,7 +62,7 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 def _is_mistake(error: Exception) -> bool:
-    """Whether an exception is a message to the user, raised by this package or a library that it uses.
+    """Return True for an exception that is a message to the user, raised by this package or a library that it uses.
 
     The exceptions of a user's own class, such as a callback or a data module, keep their traceback.
     """
@@ -133,7 +133,7 @@ def _known(name: str, names: Sequence[str], what: str) -> str:
 
 
 def help_text() -> str:
-    """What `bpnp --help` shows: every command in a line."""
+    """Return the text of `bpnp --help`: every command in a line."""
     commands = {
         name: "Pack a data set, once: " + ", ".join(command) if isinstance(command, Mapping) else first_line(command)
         for name, command in COMMANDS.items()
@@ -143,7 +143,7 @@ def help_text() -> str:
         [
             "usage: bpnp COMMAND [options]",
             "",
-            "Camera pose from 2D and 3D points that nobody has matched.",
+            "Camera pose from 2D and 3D points without correspondences.",
             "",
             *lines,
             "",

@@ -33,7 +33,7 @@ class OneLineParser(ArgumentParser):
                 parent, _, name = path.rpartition(".")  # `fit.data` is an option of `bpnp fit`
                 command = f"{self.prog} {parent}".rstrip()
                 options.append(f"--{name}" if parent or f"--{name}" in known else name)
-            raise ValueError(f"expected {', '.join(options)}, got none; try: {command} --help") from ex
+            raise ValueError(f"missing {', '.join(options)}; try: {command} --help") from ex
         close = difflib.get_close_matches(unknown.split("=")[0].split(" ")[0], known, n=1) if found else []
         hint = f"; did you mean {close[0]}?" if close else f"; try: {self.prog} --help" if found else ""
         renamed = (new for old, new in RENAMED.items() if text.endswith(f"Option '{old}' is not accepted"))
@@ -124,7 +124,7 @@ def at_least(least: int, **options: float | int | None) -> None:
 
 
 def first_line(command: Callable[..., None]) -> str:
-    """What a command does, in a line."""
+    """Return the first line of a command's docstring."""
     return (inspect.getdoc(command) or "").splitlines()[0]
 
 
@@ -170,7 +170,7 @@ COLUMN = 36
 
 
 def short_help(command: str) -> str:
-    """What `bpnp COMMAND --help` shows, for a command of `LIGHTNING`."""
+    """Return the text of `bpnp COMMAND --help` for a command of `LIGHTNING`."""
     options = [f"  {option:<{COLUMN}}{text}" for option, text in OPTIONS.items()]
     return "\n".join(
         [

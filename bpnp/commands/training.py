@@ -90,7 +90,7 @@ class BpnpCLI(LightningCLI):
         return self.__dict__ | {"held": None}
 
     def subcommands(self) -> dict[str, set[str]]:  # type: ignore[override]
-        """Return the one that was asked for: its parser alone takes a second to build."""
+        """Return the command that is run: the parser of each takes a second to build."""
         return {self.command: super().subcommands()[self.command]}
 
     def init_parser(self, **kwargs: Any) -> LightningArgumentParser:
@@ -243,7 +243,7 @@ class BpnpCLI(LightningCLI):
     def after_test(self) -> None:
         """Raise ValueError if there was nothing to test: Lightning is silent."""
         if not sum(self.trainer.num_test_batches):
-            raise ValueError(f"expected problems to test on, got none from {type(self.datamodule).__name__}")
+            raise ValueError(f"{type(self.datamodule).__name__} has no problems to test on.")
 
 
 def _solver_options(path: str, model: Namespace) -> dict[str, Any] | None:
@@ -327,7 +327,7 @@ def run_training(arguments: Sequence[str]) -> None:
 
 
 def _names_a_task(arguments: Sequence[str]) -> bool:
-    """Whether the options or a configuration file name a LightningModule in place of BlindPnPTask."""
+    """Return True if the options or a configuration file name a LightningModule in place of BlindPnPTask."""
     words = [word for text in arguments for word in text.split("=", 1)]
     files = [Path(value) for name, value in pairwise(words) if name in ("-c", "--config")]
     models = [config_content(file).get("model") for file in files if file.is_file()]

@@ -48,7 +48,7 @@ def upgrade(content: dict[str, Any]) -> dict[str, Any]:
     parameters, which the state of an optimizer depends on, is the same.
 
     Args:
-        content: of a checkpoint of any version, or of another program, which stays as it is.
+        content: of a checkpoint of any version; that of another program is returned unchanged.
 
     Returns:
         The content with today's settings under "solver" and today's names under "state_dict".

@@ -90,7 +90,7 @@ def pretrained_names() -> list[str]:
 
 
 def checkpoint_path(name: str | Path) -> Path:
-    """The file of a checkpoint: a path that is a file as it is, or that of packaged weights by their name.
+    """Return the file of a checkpoint: a path to a file, or the file of packaged weights by their name.
 
     Raises FileNotFoundError for anything else.
     """
@@ -147,7 +147,7 @@ def build_solver(content: Mapping[str, Any], parts: Iterable[type[nn.Module]] = 
     Raises:
         ValueError: the checkpoint describes no network, or a class that is neither of this package nor in `parts`.
     """
-    return built(content.get("solver"), (*networks(), *PARTS, *parts))
+    return build_module(content.get("solver"), (*networks(), *PARTS, *parts))
 
 
 def networks(base: type[nn.Module] = TrainedNet) -> Iterator[type[nn.Module]]:
@@ -173,7 +173,7 @@ def fitting_state(
     Raises:
         ValueError: the class, another setting or the shape of a weight differs.
     """
-    saved, wanted = content.get("solver", {}), described(solver)
+    saved, wanted = content.get("solver", {}), describe_module(solver)
     state, weights = solver_state(content), solver.state_dict()
     if saved.get("class") != wanted["class"]:
         raise ValueError(
@@ -202,7 +202,9 @@ def _with_defaults(description: Mapping[str, Any], solver: nn.Module) -> Mapping
     """The description with the settings that it leaves out, which an older version wrote."""
     try:
         with torch.device("meta"):
-            return described(built(description, (*networks(), *PARTS, *{type(part) for part in solver.modules()})))
+            return describe_module(
+                build_module(description, (*networks(), *PARTS, *{type(part) for part in solver.modules()}))
+            )
     except (ValueError, RuntimeError, NotImplementedError):  # of a module that cannot be built from its description
         return description
 
@@ -231,7 +233,7 @@ def chosen(module: AnyModule | None, default: type[nn.Module]) -> nn.Module:
     return module
 
 
-def described(module: nn.Module) -> dict[str, Any]:
+def describe_module(module: nn.Module) -> dict[str, Any]:
     """``{"class": name, "settings": {argument: value}}`` of a module.
 
     The settings are None where the module does not keep its arguments: such a module has weights, and cannot be built.
@@ -242,15 +244,15 @@ def described(module: nn.Module) -> dict[str, Any]:
             continue
         value = getattr(module, name, parameter.empty)
         if isinstance(value, nn.Module):
-            value = described(value)
+            value = describe_module(value)
         elif not is_plain(value):
             return {"class": class_name(type(module)), "settings": None}
         settings[name] = value
     return {"class": class_name(type(module)), "settings": settings}
 
 
-def built(description: Any, classes: Iterable[type[nn.Module]]) -> nn.Module:
-    """The module of a description. Raises ValueError for a class that is not among `classes`, or unusable settings."""
+def build_module(description: Any, classes: Iterable[type[nn.Module]]) -> nn.Module:
+    """Build the module of a description. Raises ValueError for a class not among `classes`, or unusable settings."""
     if not is_description(description):
         raise ValueError(f"expected the class and the settings of a module, got {description!r:.80}")
     known = {class_name(cls): cls for cls in classes}
@@ -259,10 +261,12 @@ def built(description: Any, classes: Iterable[type[nn.Module]]) -> nn.Module:
         raise ValueError(f"expected a class among {', '.join(sorted(known))}, got {name!r}; try it in `parts`")
     if settings is None:
         raise ValueError(
-            f"expected the settings of {name}, got none; try a class that keeps each constructor argument as an "
-            "attribute of its name"
+            f"The checkpoint has no settings of {name}. Write a class that keeps each constructor argument as an "
+            "attribute of that name."
         )
-    arguments = {key: built(value, classes) if is_description(value) else value for key, value in settings.items()}
+    arguments = {
+        key: build_module(value, classes) if is_description(value) else value for key, value in settings.items()
+    }
     try:
         return known[name](**arguments)
     except TypeError as error:
@@ -290,12 +294,12 @@ def class_name(cls: type) -> str:
 
 
 def is_description(value: Any) -> bool:
-    """Whether a value has the form of a module's description."""
+    """Return True for a value in the form of a module's description."""
     return isinstance(value, Mapping) and set(value) == {"class", "settings"}
 
 
 def is_plain(value: Any) -> bool:
-    """Whether a value is made of strings, numbers, lists, tuples and dicts only."""
+    """Return True for a value made of strings, numbers, lists, tuples and dicts only."""
     if isinstance(value, (list, tuple)):
         return all(map(is_plain, value))
     if isinstance(value, dict):

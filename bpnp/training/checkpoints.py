@@ -29,7 +29,7 @@ def newest_checkpoint(folder: Path) -> Path:
     """
     files = [*folder.glob("last*.ckpt"), *folder.glob(f"{INTERRUPTED}.ckpt")]
     if not files:
-        raise ValueError(f"expected a checkpoint for --ckpt_path last in {folder}, got none; try without it")
+        raise ValueError(f"{folder} has no checkpoint to continue. Leave out --ckpt_path last.")
     return max(files, key=lambda file: file.stat().st_mtime_ns)
 
 
@@ -80,7 +80,7 @@ class InterruptedCheckpoint(Callback):
 class BestCheckpoint(ModelCheckpoint):
     """The checkpoint with the best `monitor`, chosen among epochs of one objective.
 
-    When the pose loss joins the correspondence loss, the choice starts anew: values from before the switch are of
+    When the pose loss joins the correspondence loss, the choice starts again: values from before the switch are of
     another objective. The network at the switch is kept as `before_pose_loss.ckpt`. Arguments are those of Lightning's
     `ModelCheckpoint`.
     """

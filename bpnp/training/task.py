@@ -27,10 +27,10 @@ from bpnp.models.older_checkpoints import upgrade
 from bpnp.models.weights import (
     AnyModule,
     TrainedNet,
+    build_module,
     build_solver,
-    built,
     chosen,
-    described,
+    describe_module,
     fitting_state,
     is_description,
     is_plain,
@@ -107,7 +107,7 @@ class BlindPnPTask(LightningModule):
         self.loss = None if loss is None else chosen(loss, nn.Module)
         self.save_hyperparameters(
             {
-                "solver": described(self.solver),
+                "solver": describe_module(self.solver),
                 "weights": weights,
                 "learning_rate": learning_rate,
                 "weight_decay": weight_decay,
@@ -117,7 +117,7 @@ class BlindPnPTask(LightningModule):
                 "pose_weight": pose_weight,
                 "matching_loss": matching_loss,
                 "correspondence_angle": correspondence_angle,
-                "loss": None if self.loss is None else described(self.loss),
+                "loss": None if self.loss is None else describe_module(self.loss),
                 "refine_validation": refine_validation,
             }
         )
@@ -193,7 +193,7 @@ class BlindPnPTask(LightningModule):
         options = {key: value for key, value in content.get("task", {}).items() if key in known} | kwargs
         try:
             if is_description(options.get("loss")):
-                options["loss"] = built(options["loss"], parts)
+                options["loss"] = build_module(options["loss"], parts)
             if options.get("solver") is None:
                 options["solver"] = build_solver(content, parts)
             task = cls(**options)
@@ -382,7 +382,7 @@ class BlindPnPTask(LightningModule):
 
         A LightningCLI overwrites options of the command line by what it finds under Lightning's "hyper_parameters".
         """
-        checkpoint["solver"] = described(self.solver)
+        checkpoint["solver"] = describe_module(self.solver)
         saved = checkpoint.pop(self.CHECKPOINT_HYPER_PARAMS_KEY, {})
         checkpoint.pop(self.CHECKPOINT_HYPER_PARAMS_NAME, None)
         checkpoint["task"] = {

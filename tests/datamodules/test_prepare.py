@@ -173,7 +173,7 @@ def test_ctrl_c_says_that_nothing_was_written(
     with pytest.raises(SystemExit) as ended:
         main(["prepare", "modelnet40", str(meshes), "--output", str(tmp_path / "store"), "--processes", "1"])
     assert ended.value.code == 130
-    assert "bpnp: interrupted; nothing was written, run it again to start anew" in capsys.readouterr().err
+    assert "bpnp: interrupted; nothing was written, run it again" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["ModelNet40"]
 
 

@@ -13,7 +13,7 @@ from small_data import small_net
 from bpnp import Batch, BPnPNet, Matcher, solve
 from bpnp.datamodules import MeshDataModule, Outliers, SyntheticMapDataModule
 from bpnp.metrics import rotation_error
-from bpnp.models.weights import LEARNED, checkpoint_path, described
+from bpnp.models.weights import LEARNED, checkpoint_path, describe_module
 
 ROOT = Path(__file__).parents[2]
 
@@ -124,7 +124,7 @@ def test_packing_keeps_the_net_in_half_the_space(
     pack = importlib.import_module("pack_weights").pack
     net = small_net(normalise=True).eval()
     content = {
-        "solver": described(net),
+        "solver": describe_module(net),
         "state_dict": {f"solver.{key}": value for key, value in net.state_dict().items()} | {"skipped": torch.zeros(2)},
         "optimizer_states": [torch.zeros(1000)],
     }

@@ -13,7 +13,7 @@ from bpnp import Batch, BPnPNet, Matcher
 from bpnp.layers import RansacPnP, Sinkhorn, WeightedPnP
 from bpnp.models import Refinement, TrainedNet
 from bpnp.models.nets import ImageFeatures, SceneFeatures
-from bpnp.models.weights import PARTS, built, described, differences, fitting_state
+from bpnp.models.weights import PARTS, build_module, describe_module, differences, fitting_state
 
 
 class Flat(nn.Module):
@@ -34,7 +34,7 @@ def pair() -> Batch:
 
 def content(net: nn.Module, **more: Any) -> dict[str, Any]:
     state = {f"solver.{name}": value for name, value in net.state_dict().items()}
-    return {"solver": described(net), "state_dict": state | more}
+    return {"solver": describe_module(net), "state_dict": state | more}
 
 
 def save(net: nn.Module, path: Path, **more: Any) -> Path:
@@ -45,7 +45,7 @@ def save(net: nn.Module, path: Path, **more: Any) -> Path:
 def test_a_checkpoint_brings_the_network_back(tmp_path: Path) -> None:
     net = small_net(transport=Sinkhorn(learn_mu=True), centre=True, normalise=True, rounds=2)
     again = BPnPNet.from_checkpoint(save(net, tmp_path / "net.ckpt", **{"other.weight": torch.ones(1)}))
-    assert described(again) == described(net)
+    assert describe_module(again) == describe_module(net)
     assert not again.training
     with torch.no_grad():
         assert torch.equal(again.match(pair()).assignment, net.eval().match(pair()).assignment)
@@ -74,7 +74,7 @@ def test_a_part_of_the_users_comes_back_only_if_the_user_names_its_class(tmp_pat
 
 @pytest.mark.parametrize("name", ["os.system", "subprocess.Popen", "torch.nn.modules.linear.Linear", "BPnPNet.forward"])
 def test_a_checkpoint_names_no_class_that_is_not_known(name: str, tmp_path: Path) -> None:
-    solver = described(small_net())
+    solver = describe_module(small_net())
     solver["settings"]["transport"] = {"class": name, "settings": {"command": "true"}}
     torch.save({"solver": solver, "state_dict": {}}, tmp_path / "evil.ckpt")
     with pytest.raises(ValueError, match=rf"evil.ckpt: expected a class among .*, got '{name}'"):
@@ -92,12 +92,12 @@ def test_every_part_of_the_package_is_described_by_its_arguments() -> None:
         Matcher(channels=8, depth=1, heads=2, neighbours=0, mu=0.2, tolerance=1e-5, ransac=RansacPnP(threshold=0.2)),
     ]
     for module in given:
-        description = described(module)
-        again = built(description, (*PARTS, BPnPNet, Matcher))
-        assert described(again) == description
+        description = describe_module(module)
+        again = build_module(description, (*PARTS, BPnPNet, Matcher))
+        assert describe_module(again) == description
         assert type(again) is type(module)
-    assert described(given[2])["settings"]["mu"] == 0.3
-    assert described(given[-1])["settings"]["ransac"]["settings"]["threshold"] == 0.2
+    assert describe_module(given[2])["settings"]["mu"] == 0.3
+    assert describe_module(given[-1])["settings"]["ransac"]["settings"]["threshold"] == 0.2
 
 
 def test_a_checkpoint_of_another_shape_is_refused_with_what_differs() -> None:
@@ -115,7 +115,7 @@ def test_a_checkpoint_of_another_shape_is_refused_with_what_differs() -> None:
     assert adjusted == ["rounds=2 (saved: 0)"]
     with pytest.raises(ValueError, match="expected a checkpoint of BPnPNet, got one of another program"):
         fitting_state({"state_dict": {}}, own)
-    assert list(differences(described(Flat(2)), described(Flat(3)))) == [("coordinates", 2, 3)]
+    assert list(differences(describe_module(Flat(2)), describe_module(Flat(3)))) == [("coordinates", 2, 3)]
 
 
 OLD_FORM = {"class": "BPnPNet", "settings": {"channels": 16, "blocks": 2, "nonsense": 0.2}}
