@@ -1,7 +1,4 @@
-"""What a solver is trained with (paper Eqs. 11 to 15): the true matches of an assignment, and the true pose.
-
-Every loss is one value per sample; the mean over a batch is the caller's.
-"""
+"""Losses of an assignment and of a pose (paper Eqs. 11 to 15), one value a sample."""
 
 import math
 from dataclasses import dataclass
@@ -54,38 +51,56 @@ class Losses:
 
 
 def matching_losses(prediction: Prediction, batch: Batch, *, kind: MatchingLoss, angle: float | None) -> Losses:
-    """The loss of each sample's assignment. angle: as in `correspondence_losses`.
+    """Return the loss of each sample's assignment.
 
-    Raises ValueError for a prediction without an assignment, or a batch without the labels that the kind needs.
+    Args:
+        prediction: with an assignment.
+        batch: with the labels that the kind needs.
+        kind: correspondence for `correspondence_losses`, likelihood for `matching_likelihood_loss`.
+        angle: as in `correspondence_losses`.
+
+    Raises:
+        ValueError: the prediction has no assignment, or the batch no labels.
     """
     if prediction.assignment is None:
-        raise ValueError("expected a solver with an assignment to train, got none; try bpnp.models.BPnPNet")
-    everyone = torch.ones(len(batch), dtype=torch.bool, device=prediction.assignment.device)
+        raise ValueError("the solver returns no assignment to train; use one that does, such as bpnp.models.BPnPNet")
+    matched = torch.ones(len(batch), dtype=torch.bool, device=prediction.assignment.device)
     if kind == "likelihood":
-        return Losses(matching_likelihood_loss(prediction, batch), everyone)
-    known = correspondence_losses(prediction, batch, angle=angle)
-    if known is None:
+        return Losses(matching_likelihood_loss(prediction, batch), matched)
+    losses = correspondence_losses(prediction, batch, angle=angle)
+    if losses is None:
         raise ValueError(
-            "expected problems with `match3d` for matching_loss correspondence, got none; try correspondence_angle"
+            "matching_loss correspondence needs problems with `match3d`; set model.correspondence_angle to train with "
+            "true poses alone"
         )
-    return Losses(known, everyone)
+    return Losses(losses, matched)
 
 
 def own_losses(loss: nn.Module, prediction: Prediction, batch: Batch) -> Losses:
-    """The values of a user's loss. Raises ValueError unless they are one number a problem."""
+    """Return the values of a user's loss; NaN marks a sample without one.
+
+    Raises:
+        ValueError: the loss does not return one number a problem.
+    """
     values = loss(prediction, batch)
     if not isinstance(values, Tensor) or values.shape != (len(batch),):
-        got = tuple(values.shape) if isinstance(values, Tensor) else type(values).__name__
-        raise ValueError(f"expected a tensor of shape ({len(batch)},) from {type(loss).__name__}, got {got}")
+        found = f"shape {tuple(values.shape)}" if isinstance(values, Tensor) else type(values).__name__
+        raise ValueError(f"{type(loss).__name__} returned {found}; a tensor of shape ({len(batch)},) is needed")
     matched = ~values.isnan()
     return Losses(torch.where(matched, values, 0), matched)
 
 
 def correspondence_losses(prediction: Prediction, batch: Batch, *, angle: float | None) -> Float[Tensor, " b"] | None:
-    """L_c per sample (paper Eq. 11); None if there is no assignment, or nothing to compare it with.
+    """Return L_c of each sample (paper Eq. 11).
 
-    angle: None for the true matches; else all points within it of each other, radians, under the true pose: supervision
-        by the pose alone, with C_ij = [angle(f_i, R_gt p_j + t_gt) <= angle], of which several may be of one point.
+    Args:
+        prediction: with or without an assignment.
+        batch: with true matches, or true poses for an `angle`.
+        angle: None for the true matches. Else, in radians, supervision by the pose alone with
+            C_ij = [angle(f_i, R_gt p_j + t_gt) <= angle]; a point may then have several correspondences.
+
+    Returns:
+        L_c (b,); None without an assignment, or without true matches.
     """
     if prediction.assignment is None:
         return None
@@ -106,31 +121,42 @@ def pose_losses(pose: Pose, batch: Batch) -> dict[str, Float[Tensor, " b"]]:
 
 def _true_pose(batch: Batch) -> tuple[Tensor, Tensor]:
     if batch.rotation is None or batch.translation is None:
-        raise ValueError("expected a batch with its true `rotation` and `translation`, got None; try Batch.from_arrays")
+        raise ValueError("the batch has no true `rotation` and `translation`; give them to Batch.from_arrays")
     return batch.rotation, batch.translation
 
 
 def correspondence_loss(assignment: Float[Tensor, "b m n"], match3d: Int[Tensor, "b n"]) -> Float[Tensor, " b"]:
-    """L_c = sum_ij P_ij (1 - 2 C_ij) (paper Eq. 11) with C from indices; in [-1, 1) where P sums to one.
+    """Return L_c = sum_ij P_ij (1 - 2 C_ij) (paper Eq. 11) with C from indices; in [-1, 1) where P sums to one.
 
-    match3d: index of the 2D point that 3D point j was seen as, -1 for none (padding included).
+    Args:
+        assignment: P.
+        match3d: index of the 2D point of each 3D point, -1 for none and for padding.
     """
     matched = assignment.gather(1, match3d.clamp_min(0).unsqueeze(1)).squeeze(1)
     return assignment.sum((-2, -1)) - 2 * (matched * (match3d >= 0)).sum(-1)
 
 
 def matching_likelihood_loss(prediction: Prediction, batch: Batch) -> Float[Tensor, " b"]:
-    """Negative log likelihood of the true partner of each point, -log P(j | i) and -log P(i | j), in nats.
+    """Return the negative log likelihood of the true correspondence of each point, -log P(j | i) and -log P(i | j).
 
-    A mean over the true matches (both directions) plus, where the assignment has bins, a mean over the points without a
-    partner of -log P(bin | i): balanced, whatever their numbers. Its gradient does not vanish where the probability of
-    the true match is small, as that of `correspondence_loss` does; otherwise it asks for the same optimum. Raises
-    ValueError for a prediction without an assignment or a batch without its matches.
+    The mean over the true matches, in both directions, plus, with bins, the mean of -log P(bin | i) over the points
+    without a match, so that the numbers of either do not matter. Unlike that of `correspondence_loss`, the gradient
+    does not vanish where the probability of the true match is small.
+
+    Args:
+        prediction: with an assignment; with bins, `unmatched2d` and `unmatched3d`.
+        batch: with `match3d`.
+
+    Returns:
+        Losses (b,) in nats.
+
+    Raises:
+        ValueError: there is no assignment or no `match3d`.
     """
     assignment, match3d = prediction.assignment, batch.match3d
     if assignment is None or match3d is None:
-        missing = "assignment" if assignment is None else "match3d"
-        raise ValueError(f"expected an assignment and a batch with `match3d`, got no {missing}; try Batch.from_arrays")
+        missing = "the solver returns no assignment" if assignment is None else "the batch has no `match3d`"
+        raise ValueError(f"{missing}; matching_loss likelihood needs both")
     partner = match3d.clamp_min(0)
     paired = (match3d >= 0).to(assignment.dtype)
     # Several 3D points may have been seen as one 2D point.
@@ -160,7 +186,7 @@ def within_angle(
     translation: Float[Tensor, "b 3"],
     angle: float,
 ) -> Bool[Tensor, "b m n"]:
-    """[angle(f_i, R p_j + t) <= angle] (paper Eq. 3), by the chord between unit vectors."""
+    """Return [angle(f_i, R p_j + t) <= angle] (paper Eq. 3) from the chord between unit vectors; angle in radians."""
     return chords(bearings(points2d), points3d, rotation, translation) <= 2 * math.sin(angle / 2)
 
 

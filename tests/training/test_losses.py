@@ -147,9 +147,9 @@ def test_matching_likelihood_loss_ignores_padding_and_has_its_derivative() -> No
 
 def test_says_what_is_missing() -> None:
     batch = plant(1, 6).batch()
-    with pytest.raises(ValueError, match="expected a solver with an assignment to train, got none"):
+    with pytest.raises(ValueError, match="returns no assignment to train"):
         matching_losses(Prediction(), batch, kind="likelihood", angle=None)
-    with pytest.raises(ValueError, match="expected problems with `match3d` for matching_loss correspondence"):
+    with pytest.raises(ValueError, match="matching_loss correspondence needs problems with `match3d`"):
         matching_losses(
             Prediction(plant(1, 6).permutation()), replace(batch, match3d=None), kind="correspondence", angle=None
         )
