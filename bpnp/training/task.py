@@ -1,4 +1,4 @@
-"""Training and evaluation of a blind PnP solver: losses, metrics and the optimiser around any `Batch -> Prediction`."""
+"""Training and evaluation of a blind PnP solver: losses, metrics and the optimizer around any `Batch -> Prediction`."""
 
 import inspect
 import math
@@ -10,7 +10,7 @@ from typing import Any, Literal, cast
 
 import torch
 from lightning import LightningModule
-from lightning.pytorch.utilities.rank_zero import rank_zero_info, rank_zero_warn
+from lightning.pytorch.utilities.rank_zero import rank_zero_info
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 from torch.optim import Adam, Optimizer
@@ -42,17 +42,16 @@ from bpnp.training.predictions import in_scene_frame
 from bpnp.types import Batch, Prediction
 
 Stage = Literal["val", "test"]
-REBUILT = {"solver", "weights"}  # options that are not kept under "task": the checkpoint has what they made
+REBUILT = {"solver", "weights"}  # options that are not saved under "task": the checkpoint has their result
 POSED = "pnp"  # the estimate that has a derivative, for the pose loss
-WARMUP = "PoseLossWarmup"  # the callback that raises `pose_weight`, which imports this module
-DECAYED = 0.02  # of the learning rate, after its fall
+WARMUP = "PoseLossWarmup"  # the callback that sets `pose_weight`; its module imports this one
+DECAYED = 0.02  # factor on the learning rate after the decay
 WIDEST_MATCH = 0.5  # radians; every point matches many others beyond it, and degrees are mistaken for radians
-POSED = "pnp"  # the estimate that has a derivative, for the pose loss
 MOST_SKIPPED = 20  # consecutive steps without a finite gradient that end the run
 
 
 class TrainingDivergedError(RuntimeError):
-    """Too many optimiser steps in a row had no finite loss or gradient."""
+    """`MOST_SKIPPED` consecutive optimizer steps without a finite loss and gradient."""
 
 
 class BlindPnPTask(LightningModule):
@@ -64,21 +63,21 @@ class BlindPnPTask(LightningModule):
             callback may also monitor the first without its name (`val/rotation_q2_deg`). If the solver has a method
             `match(batch)` for a prediction without poses, a training step without a pose calls it.
         weights: packaged weights (a name of `docs/model-card.md`) or a checkpoint that the solver starts from; none for
-            those that it was built with. Optimiser and step start anew, other than with `--ckpt_path`.
-        learning_rate: of Adam; the paper has 1e-5.
-        weight_decay: of Adam; the paper has 0, the authors' code 1e-3.
-        warmup_steps: optimiser steps in which the learning rate rises from zero.
-        decay_start: step at which it begins to fall, by a half cosine to a fiftieth; none for never.
-        decay_steps: steps of the fall.
+            those of the solver. The optimizer and the step start from zero; `--ckpt_path` continues them.
+        learning_rate: of Adam; 1e-5 in the paper.
+        weight_decay: of Adam; 0 in the paper, 1e-3 in the authors' code.
+        warmup_steps: optimizer steps in which the learning rate rises from zero.
+        decay_start: first step of the decay, a half cosine to a fiftieth of the learning rate; none for no decay.
+        decay_steps: steps of the decay.
         pose_weight: gamma_p of Eq. 15, for the pose "pnp". While it is 0 no pose is solved in training;
             `PoseLossWarmup` sets it from an epoch on.
-        matching_loss: what trains the assignment: correspondence for the paper's L_c (Eq. 11); likelihood for the
-            negative log likelihood of each point's partner (`matching_likelihood_loss`).
-        correspondence_angle: with L_c, supervise by the pose alone: points within this angle (radians) count as
-            correspondences; null for the true ones.
-        loss: module in place of `matching_loss`, from (Prediction, Batch) to a value a problem (b,); NaN for one that
-            has none. With its attribute `needs_pose = False`, a training step gives it a prediction without poses.
-        refine_validation: whether validation refines poses, as tests do; it takes most of the time of a validation.
+        matching_loss: loss of the assignment: correspondence for the paper's L_c (Eq. 11); likelihood for the negative
+            log likelihood of each point's correspondence (`matching_likelihood_loss`).
+        correspondence_angle: with L_c, supervision by the pose alone: points within this angle (radians, at most 0.5)
+            count as correspondences; null for the true ones.
+        loss: module in place of `matching_loss`, from (Prediction, Batch) to a value a problem (b,), NaN for a problem
+            without a loss. With its attribute `needs_pose = False` it gets a prediction without poses in training.
+        refine_validation: whether validation refines poses as tests do, which takes most of its time.
     """
 
     def __init__(
@@ -136,7 +135,6 @@ class BlindPnPTask(LightningModule):
         self.skipped_steps = 0
         self.consecutive_skipped_steps = 0
         self.optimizer_names: list[str] | None = None  # classes of the optimizers of this run or of its checkpoint
-        self.resumed_pose_weight = 0.0  # `pose_weight` at the time of the checkpoint
         self.optimizer_settings: list[list[dict[str, Any]]] = []  # configured settings by optimizer and group
         self.refine_validation = refine_validation
         self.numbers: set[int] = set()  # of the problems of this epoch of evaluation
@@ -206,15 +204,6 @@ class BlindPnPTask(LightningModule):
     def forward(self, batch: Batch) -> Prediction:
         return self.solver(batch)
 
-    def on_train_epoch_start(self) -> None:
-        """Warn once if a resumed run has lost the pose loss of its checkpoint."""
-        if self.resumed_pose_weight > 0 and self.pose_weight == 0:
-            rank_zero_warn(
-                f"The checkpoint was trained with a pose loss of weight {self.resumed_pose_weight:g}, and this run "
-                f"continues without it. Set --pose_loss.start_epoch 0 --pose_loss.weight {self.resumed_pose_weight:g}."
-            )
-        self.resumed_pose_weight = 0.0
-
     def on_train_batch_start(self, batch: object, batch_idx: int) -> None:
         check_batch(batch)
 
@@ -227,7 +216,7 @@ class BlindPnPTask(LightningModule):
             figures = self._figures(losses, prediction, batch)
         loss = losses.total
         self._log_train(loss=loss, skipped_steps=float(self.skipped_steps), **figures)
-        # A loss that is not finite makes every gradient NaN, in every process, and so leaves out the step.
+        # A loss that is not finite makes every gradient NaN, in every process, and the step is skipped.
         return loss * torch.where(loss.isfinite(), 1.0, torch.nan)
 
     def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
@@ -245,7 +234,7 @@ class BlindPnPTask(LightningModule):
         self.numbers.clear()
 
     def on_validation_batch_start(self, batch: Any, batch_idx: int, dataloader_idx: int = 0) -> None:
-        """A data module that collates with `Batch.from_arrays` numbers the problems of each batch from 0 on."""
+        """Number the problems: a data module that collates with `Batch.from_arrays` counts each batch from 0."""
         check_batch(batch)
         number_globally(batch, self.numbers, processes=self.trainer.world_size)
 
@@ -279,8 +268,8 @@ class BlindPnPTask(LightningModule):
         counts = [each for each in stats if isinstance(each, BackwardStats)]
         samples = sum(each.samples for each in counts)
         if samples:
-            share = sum(each.unconverged for each in counts) / samples
-            self.log("train/backward_failed", share, on_epoch=True, sync_dist=True)
+            failed = sum(each.unconverged for each in counts) / samples
+            self.log("train/backward_failed", failed, on_epoch=True, sync_dist=True)
         for each in counts:
             each.reset()
         # In the last epoch of StochasticWeightAveraging, which only updates batch norms, Lightning steps without a
@@ -295,7 +284,7 @@ class BlindPnPTask(LightningModule):
     def on_before_optimizer_step(self, optimizer: Optimizer) -> None:
         """Log the gradient norm; without a finite gradient, count the step and drop all gradients.
 
-        Every optimizer of torch leaves a parameter without a gradient, and its state, as they are.
+        No optimizer of torch changes a parameter without a gradient, or its state.
 
         Raises:
             TrainingDivergedError: `MOST_SKIPPED` consecutive steps had no finite gradient.
@@ -370,7 +359,7 @@ class BlindPnPTask(LightningModule):
                 scheduler.base_lrs = [group["initial_lr"] for group in scheduler.optimizer.param_groups]
 
     def rate_factor(self, step: int) -> float:
-        """Factor on the learning rate: a linear rise, one, and a half cosine down to `DECAYED`."""
+        """Return the factor on the learning rate: a linear rise, one, and a half cosine down to `DECAYED`."""
         rise = min(1.0, (step + 1) / (self.warmup_steps + 1))
         if self.decay_start is None:
             return rise
@@ -395,20 +384,21 @@ class BlindPnPTask(LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint |= upgrade(checkpoint)  # of a Trainer without SafeCheckpointIO
         self._adopt(checkpoint)
-        self._check_pose_loss_goes_on(checkpoint)
+        self._check_pose_loss_continues(checkpoint)
         self.skipped_steps, self.consecutive_skipped_steps = checkpoint.get("skipped_steps", (0, 0))
         self.optimizer_names = checkpoint.get("optimizer_names", ["Adam"])  # of versions that had no other
-        self.resumed_pose_weight = checkpoint.get("pose_weight", 0.0)
 
-    def _check_pose_loss_goes_on(self, checkpoint: Mapping[str, Any]) -> None:
-        """Raise ValueError if a training with the callback `PoseLossWarmup` is resumed without it and a pose loss."""
+    def _check_pose_loss_continues(self, checkpoint: Mapping[str, Any]) -> None:
+        """Raise ValueError if a training with a pose loss, now or later, is resumed without one."""
         if self._trainer is None or self.trainer.state.fn != "fit" or self.pose_weight > 0:
             return
         names = {type(callback).__name__ for callback in self.trainer.callbacks}  # type: ignore[attr-defined]
-        if WARMUP in checkpoint.get("callbacks", {}) and WARMUP not in names:
+        trained = checkpoint.get("pose_weight", 0.0)
+        if WARMUP not in names and (WARMUP in checkpoint.get("callbacks", {}) or trained > 0):
+            how = WARMUP if WARMUP in checkpoint.get("callbacks", {}) else f"model.pose_weight {trained:g}"
             raise ValueError(
-                f"The checkpoint was trained with {WARMUP}, and this run has neither it nor a model.pose_weight. Use "
-                "the configuration of its training, --pose_loss.start_epoch, or --model.weights for a new training."
+                f"The checkpoint was trained with {how}, and this run has neither {WARMUP} nor a model.pose_weight. "
+                "Use the configuration of its training, --pose_loss.start_epoch, or --model.weights for a new training."
             )
 
     def _adopt(self, content: Mapping[str, Any], *, grown: bool = False) -> None:
@@ -448,7 +438,7 @@ class BlindPnPTask(LightningModule):
             self.log(f"train/{name}", value, on_step=True, on_epoch=False, prog_bar=shown, batch_size=1)
 
     def _figures(self, losses: Losses, prediction: Prediction, batch: Batch) -> dict[str, Tensor]:
-        """What a training step logs beside its loss."""
+        """Return the values that a training step logs in addition to its loss."""
         figures: dict[str, Tensor] = {}
         known = correspondence_losses(prediction, batch, angle=self.correspondence_angle)
         if known is not None:
@@ -492,7 +482,7 @@ class BlindPnPTask(LightningModule):
 
 
 def check_batch(batch: object) -> None:
-    """Raise ValueError for what a data module gives in place of a Batch."""
+    """Raise ValueError if a data module gives something other than a Batch."""
     if not isinstance(batch, Batch):
         raise ValueError(
             f"expected a Batch from the loaders of the data module, got {type(batch).__name__}; try a `collate_fn` "
@@ -501,7 +491,7 @@ def check_batch(batch: object) -> None:
 
 
 def check_prediction(prediction: object, batch: Batch, estimates: tuple[str, ...], solver: str) -> None:
-    """Raise ValueError for what a solver returns in place of a Prediction with its estimates, a pose a problem."""
+    """Raise ValueError unless a solver returns a Prediction with all its estimates, one pose a problem."""
     if not isinstance(prediction, Prediction):
         raise ValueError(
             f"expected a Prediction from {solver}, got {type(prediction).__name__}; try "
@@ -509,8 +499,8 @@ def check_prediction(prediction: object, batch: Batch, estimates: tuple[str, ...
         )
     if absent := [name for name in estimates if name not in prediction.poses]:
         raise ValueError(
-            f"expected all `estimates` of {solver} in Prediction.poses, got none named {', '.join(absent)} among "
-            f"{list(prediction.poses)}; try one name in both"
+            f"Prediction.poses of {solver} has no {', '.join(absent)}, which its `estimates` name, among "
+            f"{list(prediction.poses)}; use one name in both"
         )
     wanted = (len(batch), 3, 3), (len(batch), 3)
     for name, pose in prediction.poses.items():
@@ -523,9 +513,15 @@ def check_prediction(prediction: object, batch: Batch, estimates: tuple[str, ...
 
 
 def number_globally(batch: Batch, numbers: set[int], *, processes: int) -> None:
-    """Number the problems of a batch after all `numbers` so far if one of its own has been seen, and note its numbers.
+    """Number the problems of a batch after all earlier ones if one of its own numbers was used before.
 
-    Raises ValueError among several processes, which do not know the numbers of the others.
+    Args:
+        batch: whose `index`, and `ids` made from it, may be replaced.
+        numbers: of all earlier problems; those of the batch are added.
+        processes: that evaluate together.
+
+    Raises:
+        ValueError: numbers repeat among several processes, which do not have the numbers of the others.
     """
     index = batch.index.tolist()
     if len(set(index)) < len(index) or not numbers.isdisjoint(index):

@@ -80,13 +80,15 @@ def test_the_weight_of_the_task_is_that_after_the_switch_or_refused(tmp_path: Pa
         fit(tmp_path, task, callbacks=[PoseLossWarmup(start_epoch=1, weight=2.0)])
 
 
-def test_a_pose_loss_that_never_joins_or_is_lost_on_resuming_brings_a_warning(tmp_path: Path) -> None:
+def test_a_pose_loss_that_never_joins_brings_a_warning_and_one_that_is_lost_an_error(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="joins at epoch 5, and the training ends after 1 epochs without it"):
         fit(tmp_path, BlindPnPTask(CountingSolver()), limit_train_batches=1, callbacks=[PoseLossWarmup(start_epoch=5)])
     run = fit(tmp_path, BlindPnPTask(CountingSolver(), pose_weight=0.5), limit_train_batches=1)
     run.save_checkpoint(file := str(tmp_path / "posed.ckpt"))
-    with pytest.warns(UserWarning, match="trained with a pose loss of weight 0.5, and this run continues without it"):
+    with pytest.raises(ValueError, match="trained with model.pose_weight 0.5, and this run has neither"):
         fit(tmp_path, BlindPnPTask(CountingSolver()), file, max_epochs=2, limit_train_batches=1)
+    switched = [PoseLossWarmup(start_epoch=0)]
+    fit(tmp_path, BlindPnPTask(CountingSolver()), file, max_epochs=2, limit_train_batches=1, callbacks=switched)
 
 
 def test_the_switch_survives_resuming_with_another_start(tmp_path: Path) -> None:
@@ -104,7 +106,7 @@ def test_a_training_does_not_lose_its_pose_loss(tmp_path: Path, caplog: pytest.L
         tmp_path, BlindPnPTask(CountingSolver()), callbacks=[PoseLossWarmup(0, weight=0.1)], limit_train_batches=1
     )
     run.save_checkpoint(file)
-    with pytest.raises(ValueError, match="trained with PoseLossWarmup, and this run has neither it nor"):
+    with pytest.raises(ValueError, match="trained with PoseLossWarmup, and this run has neither PoseLossWarmup nor"):
         fit(tmp_path, BlindPnPTask(CountingSolver()), file, **options)
     weighted = BlindPnPTask(CountingSolver(), pose_weight=0.1)
     fit(tmp_path, weighted, file, **options)
@@ -265,7 +267,7 @@ def test_problems_that_are_numbered_within_their_batch_are_all_counted(tmp_path:
         (
             lambda batch: Prediction(poses={"b": posed(batch.rotation, batch.translation)}),
             ("a",),
-            r"got none named a among \['b'\]",
+            r"of Answering has no a, which its `estimates` name, among \['b'\]",
         ),
         (
             lambda batch: Prediction(poses={"a": posed(batch.rotation, batch.translation)}),
