@@ -19,7 +19,7 @@ from lightning import LightningDataModule
 from record import DATA, ROOT, write
 from torch import nn
 
-from bpnp.files import written_whole
+from bpnp.files import fingerprint, written_whole
 from bpnp.layers import RansacPnP, WeightedPnP
 from bpnp.models import BPnPNet, TrainedNet
 from bpnp.models.evaluation import round_widths
@@ -137,13 +137,14 @@ def solve_problems(
 ) -> list[ProblemRow]:
     """Test a solver on the first `limit` problems of a fixed random order, each by itself, and return the rows.
 
-    Rows are appended to a file as they come. Those of the same `identity` that are there already are not measured
-    again; those of another are dropped. Seconds are of one thread's CPU time.
+    Rows are appended to a file as they come. Those of the same `identity` and the same problems that are there already
+    are not measured again; others are dropped. Seconds are of one thread's CPU time.
     """
     data.setup("test")
     problems = data.datasets["test"]  # type: ignore[attr-defined]
     order = problem_order(len(problems))[:limit]
-    head = json.dumps({"identity": identity}, sort_keys=True)
+    drawn = fingerprint(problems.problem(order[0]).points2d.tolist()) if order else ""
+    head = json.dumps({"identity": dict(identity), "problems": drawn}, sort_keys=True)
     lines = file.read_text().splitlines() if file.is_file() else []
     if not lines or lines[0] != head:
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -75,8 +75,10 @@ def test_a_test_that_was_stopped_measures_what_is_missing_and_another_solver_all
     assert solve_problems(file, lambda: pytest.fail("built again"), data, 4, {"steps": 1}) == [
         r for r in rows if r.index in set(paper_tables.problem_order(6)[:4])
     ]
-    with pytest.raises(KeyboardInterrupt):
-        solve_problems(file, lambda: Known(4), data, 5, {"steps": 2})
+    others = MeshDataModule(**SHAPES, cache_dir=str(tmp_path), seed=1)
+    for other, steps in ((data, 2), (others, 1)):
+        with pytest.raises(KeyboardInterrupt):
+            solve_problems(file, lambda: Known(4), other, 5, {"steps": steps})
 
 
 def test_the_figures_are_those_of_the_rows() -> None:
