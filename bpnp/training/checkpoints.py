@@ -68,6 +68,8 @@ class InterruptedCheckpoint(Callback):
         self.path = Path(folder) / f"{INTERRUPTED}.ckpt"
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        if trainer.world_size > 1 and not isinstance(exception, KeyboardInterrupt):
+            return  # processes without the error would not take part in the saving
         if trainer.state.fn == "fit" and trainer.global_step > 0 and not trainer.fast_dev_run:  # type: ignore[attr-defined]
             trainer.save_checkpoint(self.path, weights_only=False)
             rank_zero_info(f"stopped in epoch {trainer.current_epoch}; continue with --ckpt_path {self.path}")

@@ -41,7 +41,24 @@ def test_an_interrupted_training_keeps_its_checkpoint(tmp_path: Path) -> None:
     kept = tmp_path / "run" / "checkpoints" / "interrupted.ckpt"
     assert kept.is_file()
     main([*arguments("fit", tmp_path), f"--ckpt_path={kept}", "--trainer.max_epochs=1"])
-    assert (tmp_path / "run" / "checkpoints" / "last.ckpt").is_file()
+    assert {file.name for file in kept.parent.iterdir()} == {"best.ckpt", "last.ckpt"}  # it is not needed any more
+
+
+class Broken(Callback):
+    """A bug in the second batch."""
+
+    def on_train_batch_end(self, trainer: Any, module: Any, outputs: Any, batch: Any, batch_idx: int, *_: int) -> None:
+        if batch_idx == 1:
+            raise RuntimeError("a bug of the user's")
+
+
+def test_a_training_that_an_error_stops_is_continued(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match="a bug of the user's"):
+        main([*arguments("fit", tmp_path), "--trainer.callbacks=test_interruptions.Broken"])
+    folder = tmp_path / "run" / "checkpoints"
+    assert torch.load(folder / "interrupted.ckpt", weights_only=True)["global_step"] == 2
+    main([*arguments("fit", tmp_path), "--ckpt_path=last", "--trainer.max_epochs=1"])
+    assert torch.load(folder / "last.ckpt", weights_only=True)["global_step"] == 6
 
 
 def test_an_interrupted_test_keeps_its_finished_pairs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
