@@ -1,4 +1,4 @@
-"""Problems as they are trained and tested on: subsets, clutter, occlusion, outliers, rotation, a random order."""
+"""Augmentation of problems: subsets, clutter, occlusion, outliers, rotation, a random order."""
 
 import math
 from collections.abc import Sequence
@@ -26,16 +26,16 @@ SIDES = ("2d", "both", "3d")  # in this order, a side is numbered
 
 @dataclass(frozen=True)
 class Outliers:
-    """What is added to and taken from a problem. The defaults change nothing.
+    """Synthetic outliers and occlusion of a problem. The defaults change nothing.
 
     Args:
         ratio: rho, synthetic outliers as a ratio to the matches: int(rho * matches) points, uniform in the
             axis-aligned bounding box of the matched points of that side; 1 makes half of the points outliers. Two
             numbers, [low, high], draw it for each problem, uniformly.
         side: the side that gets them, both, 2d or 3d, or random for one of the three in each problem.
-        occlusion: share of the matches that lose one of their two points, so that the other has no partner; a number
-            or [low, high], as ratio. At least 4 matches are left.
-        occluded_side: where they lose it, 2d, 3d, or both for half of them here and half there; or random.
+        occlusion: fraction of the matches that lose one of their two points, so that the other has no correspondence; a
+            number or [low, high], as ratio. At least 4 matches are left.
+        occluded_side: side of the lost points, 2d, 3d, or both for half of the matches on each side; or random.
     """
 
     ratio: Drawn = 0.0
@@ -55,15 +55,18 @@ class Outliers:
 
 @dataclass(frozen=True)
 class Augmentation:
-    """What `augment` does to the problems of a source.
+    """Options of `augment`.
 
-    max_points: at most this many matches of a problem, a random subset of more; None for all.
-    clutter: points without a partner to keep, as a ratio to the matches kept, or as many as there are; inf for all.
-    clutter_side: which sides keep them, "both", "2d" or "3d".
-    rotate: turn the 3D points by a uniformly random rotation about their origin.
-    outliers: synthetic outliers and occlusion.
+    Args:
+        max_points: largest number of matches, a random subset of more; None for all.
+        clutter: points without a correspondence to keep, as a ratio to the matches kept, or all if there are fewer;
+            inf for all.
+        clutter_side: side that keeps them, "both", "2d" or "3d".
+        rotate: rotate the 3D points about their origin by a uniformly random rotation.
+        outliers: synthetic outliers and occlusion.
 
-    Raises ValueError for a value out of range.
+    Raises:
+        ValueError: a value is out of range.
     """
 
     max_points: int | None = None
@@ -85,7 +88,7 @@ class Augmentation:
         return 0.0 if self.clutter_side == "3d" else self.clutter, 0.0 if self.clutter_side == "2d" else self.clutter
 
     def sizes(self, counts: Counts) -> NDArray[np.int64]:
-        """Most points of the larger side of each augmented problem (k,)."""
+        """Return an upper bound of the points on the larger side of each augmented problem (k,)."""
         matched = counts.matched if self.max_points is None else np.minimum(counts.matched, self.max_points)
         extra2d, extra3d = (
             np.minimum(count - counts.matched, np.rint(ratio * np.maximum(matched, 1)))
@@ -96,10 +99,13 @@ class Augmentation:
 
 
 class SideCounts(NamedTuple):
-    """Points of one side of each augmented problem (b, 1).
+    """Numbers of points on one side of each augmented problem, (b, 1) each.
 
-    matched: of the matches that were chosen, those whose point on this side is left. hidden: those after the matches
-    that are left whose point is hidden. extra: clutter. outliers: synthetic ones.
+    Attributes:
+        matched: points of the chosen matches that are left on this side.
+        hidden: chosen matches whose point on this side is hidden.
+        extra: clutter.
+        outliers: synthetic outliers.
     """
 
     matched: Tensor
@@ -122,11 +128,11 @@ def augment(batch: Batch, how: Augmentation, keys: Sequence[Key]) -> Batch:
         ValueError: the problems have no `match3d` or no pose.
     """
     if batch.match3d is None or batch.rotation is None:
-        raise ValueError("expected problems with `match3d` and a pose to augment, got none")
+        raise ValueError("the problems have no `match3d` or no pose, which the augmentation needs")
     matched = batch.match3d >= 0
     total = matched.sum(-1, keepdim=True)
     true, side2d, side3d = _amounts(how, total, batch, generators(keys, Purpose.AMOUNTS))
-    # On both sides the matches in one random order, then the points without a partner.
+    # On both sides the matches in one random order, then the points without a correspondence.
     order3d = _matched_first(generators(keys, Purpose.CHOICE), matched, batch.mask3d)
     alike = torch.equal(batch.mask2d, batch.mask3d)
     matched2d = pad(matched, (0, batch.points2d.shape[1] - matched.shape[1]))
@@ -156,13 +162,13 @@ def augment(batch: Batch, how: Augmentation, keys: Sequence[Key]) -> Batch:
 
 
 def check_clutter(clutter: float) -> None:
-    """Raises ValueError for a ratio below 0, or NaN."""
+    """Raise ValueError for a ratio below 0, or NaN."""
     if not clutter >= 0:
         raise ValueError(f"expected `clutter` of 0 or more, got {clutter}; 0.5 adds half as many points")
 
 
 def bounds(value: Drawn) -> tuple[float, float]:
-    """(low, high) of a number that may be drawn."""
+    """Return (low, high) of a number or of the limits of a drawn number."""
     low, high = value if isinstance(value, (tuple, list)) else (value, value)
     return low, high
 
@@ -170,7 +176,7 @@ def bounds(value: Drawn) -> tuple[float, float]:
 def _amounts(
     how: Augmentation, total: Tensor, batch: Batch, random: Generators
 ) -> tuple[Tensor, SideCounts, SideCounts]:
-    """Matches (b, 1) that are left of `total`, and the points of either side."""
+    """Return the number of matches that are left of `total`, (b, 1), and the numbers of points of both sides."""
     ratio, side, occlusion, occluded = uniform(random, 4).unsqueeze(-1).unbind(1)
     chosen = total if how.max_points is None else total.clamp(max=how.max_points)
     hidden = (_drawn(how.outliers.occlusion, occlusion) * chosen).round().long()
@@ -197,20 +203,20 @@ def _drawn(value: Drawn, share: Tensor) -> Tensor:
 
 
 def _on_sides(side: DrawnSide, share: Tensor) -> tuple[Bool[Tensor, "b 1"], Bool[Tensor, "b 1"]]:
-    """Whether it is on the 2D side, and on the 3D side; for "random" 2d, both and 3d are equally likely."""
+    """Return masks of the 2D side and of the 3D side; for "random", 2d, both and 3d are equally likely."""
     number = (3 * share).long() if side == "random" else torch.full_like(share, SIDES.index(side)).long()
     return number < 2, number > 0
 
 
 def _matched_first(random: Generators, matched: Tensor, mask: Tensor) -> Int[Tensor, "b n"]:
-    """Places of the matches in random order, then those of the other points in random order, then padding."""
+    """Return the indices of the matches in random order, then of the other points in random order, then padding."""
     return permutations(random, mask.shape[1], group=2 - mask.long() - matched.long())
 
 
 def _chosen(
     points: Float[Tensor, "b n d"], order: Tensor, true: Tensor, total: Tensor, side: SideCounts, random: Generators
 ) -> Float[Tensor, "b k d"]:
-    """The matches' points first, then those without a partner, then outliers; meaningless beyond their number."""
+    """Return the points of matches, then those without a correspondence, then outliers, then arbitrary ones."""
     natural = side.matched + side.extra
     slot = torch.arange(int((natural + side.outliers).max()), device=points.device)
     rank = torch.where(slot < side.matched, slot + side.hidden * (slot >= true), total + slot - side.matched)
@@ -225,7 +231,7 @@ def _chosen(
 
 
 def _shuffled(points: Tensor, side: SideCounts, random: Generators) -> tuple[Tensor, Tensor, Tensor]:
-    """The points in random order, zero beyond their number; which are real; and where each comes from."""
+    """Return the points in random order with zeros as padding, the mask of real points, and the order."""
     slot = torch.arange(points.shape[1], device=points.device)
     mask = slot < side.matched + side.extra + side.outliers
     place = permutations(random, len(slot), group=1 - mask.long())
@@ -233,6 +239,6 @@ def _shuffled(points: Tensor, side: SideCounts, random: Generators) -> tuple[Ten
 
 
 def picked(points: Float[Tensor, "b n d"], order: Int[Tensor, "b k"]) -> Float[Tensor, "b k d"]:
-    """The points at the places `order` of each row."""
+    """Return the points at the indices `order` of each row."""
     rows = torch.arange(len(points), device=points.device)[:, None] * points.shape[1]
     return points.flatten(0, 1).index_select(0, (order + rows).flatten()).view(*order.shape, points.shape[2])

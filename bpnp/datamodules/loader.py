@@ -1,5 +1,4 @@
-"""From a source of problems to batches: which are in a batch, in any number of processes, exact resuming, and the data
-module of all sources."""
+"""Batches of a source of problems: sampling in any number of processes, exact resuming, the base data module."""
 
 import math
 from abc import abstractmethod
@@ -25,10 +24,13 @@ POOL_BATCHES = 50  # training batches are cut from pools of this many, sorted by
 
 
 class ProblemDataset(Dataset[Batch]):
-    """Maps a list of (epoch, index) keys to a batch, so that workers, resuming and order change nothing.
+    """Map a list of (epoch, index) keys to a batch, so that workers, resuming and order change nothing.
 
-    augmentation: what is done to the problems of `source`. seed: a problem is a function of (seed, index), and of the
-    epoch too if `fresh`.
+    Args:
+        source: of the problems.
+        augmentation: of the problems; none by default.
+        seed: a problem is a function of (seed, index).
+        fresh: whether it is a function of the epoch too.
     """
 
     def __init__(
@@ -52,23 +54,24 @@ class ProblemDataset(Dataset[Batch]):
         return replace(problems, **{name: getattr(problems, name).float() for name in ("rotation", "translation")})
 
     def problem(self, index: int, epoch: int = 0) -> Batch:
-        """One problem alone."""
+        """Return a batch of one problem."""
         return self[[(epoch, index)]]
 
 
 class BucketSampler(DistributedSampler[list[Key]]):
-    """Yields the keys of one batch after the other, this process's share of it.
+    """Give the keys of this process's part of each batch.
 
-    `batch_size` counts the problems of one step over all processes: any number of processes sees the same problems in
-    a step, each a contiguous slice of equal length. Training (`shuffle`) draws new batches for every (seed, epoch) and
-    gives the epoch in the keys; evaluation always visits every problem, in the same batches, as epoch 0.
-    As a `DistributedSampler` it is left alone by Lightning, which calls `set_epoch`.
+    `batch_size` counts the problems of a step over all processes: any number of processes has the same problems in a
+    step, each a contiguous slice of equal length. Training (`shuffle`) draws new batches for every (seed, epoch);
+    evaluation visits every problem, in the same batches, as epoch 0. Lightning does not replace a `DistributedSampler`,
+    and calls its `set_epoch`.
 
-    Problems of a batch are of similar sizes, and the batches in random order, so that the first few, all that a limited
-    run sees, are a fair sample. Problems are repeated where the processes do not divide the last batch.
+    The problems of a batch have similar sizes. The order of the batches is random, so that the first few, all that a
+    limited run has, are a fair sample. Problems are repeated if the processes do not divide the last batch.
 
-    Raises ValueError for an empty set, a `batch_size` that the processes do not divide, or `max_cells` in training
-    (a step keeps its number of problems; a source bounds the size of its training problems instead).
+    Raises:
+        ValueError: the set is empty, the processes do not divide `batch_size`, or `max_cells` is set in training, where
+            a step keeps its number of problems.
     """
 
     def __init__(
@@ -99,16 +102,16 @@ class BucketSampler(DistributedSampler[list[Key]]):
         self._length = max(1, len(self.sizes) // batch_size) if shuffle else len(self.batches(0))
 
     def batches(self, epoch: int) -> list[NDArray[np.int64]]:
-        """The batches of an epoch over all processes, as indices."""
+        """Return the batches of an epoch over all processes, as indices."""
         rng = np.random.default_rng([self.seed, epoch])
         order = rng.permutation(len(self.sizes))
         batches = self._training_batches(order) if self.shuffle else self._evaluation_batches(order)
         return [batches[i] for i in rng.permutation(len(batches))]
 
     def _training_batches(self, order: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-        """The shuffled set is cut into pools of 50 batches, each pool is sorted by size and cut into batches.
+        """Cut the shuffled set into pools of 50 batches, sort each pool by size and cut it into batches.
 
-        The problems left over by `batch_size` sit out the epoch. A set smaller than one batch is one batch.
+        The remainder by `batch_size` is left out of the epoch. A set smaller than one batch is one batch.
         """
         whole = len(order) - len(order) % self.batch_size
         if whole == 0:
@@ -118,8 +121,10 @@ class BucketSampler(DistributedSampler[list[Key]]):
         return list(np.concatenate([self._largest_first(pool) for pool in pools]).reshape(-1, self.batch_size))
 
     def _evaluation_batches(self, order: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-        """A batch has at most `batch_size` problems, as few as b * size^2 <= `max_cells` asks for (size: the larger
-        side of its largest problem), at least one for each process."""
+        """Cut the set into batches of at most `batch_size` problems with b * size^2 <= `max_cells`.
+
+        The size is the larger side of the largest problem. A batch has at least one problem for each process.
+        """
         order = self._largest_first(order)
         batches: list[NDArray[np.int64]] = []
         start = 0
@@ -136,7 +141,7 @@ class BucketSampler(DistributedSampler[list[Key]]):
         return order[np.argsort(-self.sizes[order], kind="stable")]
 
     def _filled(self, batch: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The batch, repeated from its start up to a multiple of the number of processes."""
+        """Repeat a batch from its start up to a multiple of the number of processes."""
         return np.resize(batch, -(-len(batch) // self.num_replicas) * self.num_replicas)
 
     def __len__(self) -> int:
@@ -150,10 +155,10 @@ class BucketSampler(DistributedSampler[list[Key]]):
 
 
 class ProblemLoader(DataLoader[Batch]):
-    """A DataLoader of whole batches that resumes exactly, also inside an epoch.
+    """A DataLoader of whole batches that resumes exactly, also within an epoch.
 
-    Its workers start at the first `next`, not at `iter`: Lightning calls `set_epoch` in between when it resumes.
-    The state is (epoch, batches served); it applies to that epoch only.
+    The workers start at the first `next`, not at `iter`: Lightning calls `set_epoch` between the two when it resumes.
+    The state is (epoch, batches served) and applies to that epoch only.
     """
 
     served = 0
@@ -180,9 +185,10 @@ STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "pre
 
 
 class ProblemDataModule(LightningDataModule):
-    """Stages and loaders over a source of problems. A child says what the problems of each part are: `_source`.
+    """Stages and loaders over a source of problems; a subclass implements `_source`.
 
-    Works without a Trainer: `setup()`, then the loaders. datasets: by part (train, val, test, predict), after `setup`.
+    Works without a Trainer: `setup()`, then the loaders. After `setup`, `datasets` has those of the parts train, val,
+    test and predict.
 
     Args:
         train_outliers: synthetic outliers and occlusion in training and validation; none for none.
@@ -191,10 +197,10 @@ class ProblemDataModule(LightningDataModule):
         eval_batch_size: problems per step in validation, testing and prediction; none for batch_size.
         max_cells: limit of problems x 2D points x 3D points of such a step, to bound the memory; none for no limit.
         num_workers: loader processes.
-        seed: of all that is drawn at random, and of the order.
+        seed: of all random numbers and of the order.
     """
 
-    fresh = False  # whether the training problems are drawn anew in every epoch
+    fresh = False  # whether each epoch draws new training problems
 
     def __init__(
         self,
@@ -221,10 +227,14 @@ class ProblemDataModule(LightningDataModule):
 
     @abstractmethod
     def _source(self, split: str, seed: tuple[int, int]) -> ProblemSource | None:
-        """The problems to train, val or test on; None if there are none and the stage can do without them."""
+        """Return the problems of train, val or test; None if there are none and the stage does not need them."""
 
     def setup(self, stage: str | None = None) -> None:
-        """Open the problems of a stage (fit, validate, test, predict; none for all). Raises ValueError for bad data."""
+        """Open the problems of a stage: fit, validate, test, predict; None for all.
+
+        Raises:
+            ValueError: the data are unusable.
+        """
         for part in STAGES[stage]:
             split = "test" if part == "predict" else part  # prediction has the problems of testing
             seed = (self.seed, PARTS.index(split))
@@ -247,7 +257,7 @@ class ProblemDataModule(LightningDataModule):
 
     def _loader(self, part: str) -> DataLoader[Batch]:
         if part not in self.datasets:
-            raise ValueError(f"expected `setup` before the {part} loader, got no call; try `setup()`")
+            raise ValueError(f"the {part} loader needs `setup()` first")
         training, dataset = part == "train", self.datasets[part]
         group = distributed.is_available() and distributed.is_initialized()
         sampler = BucketSampler(
@@ -269,7 +279,7 @@ class ProblemDataModule(LightningDataModule):
             num_workers=self.num_workers,
             persistent_workers=self.num_workers > 0,
             pin_memory=torch.cuda.is_available(),
-            generator=torch.Generator().manual_seed(self.seed),  # else every epoch draws from the global generator
+            generator=torch.Generator().manual_seed(self.seed),  # in place of the global generator
         )
 
 

@@ -1,8 +1,8 @@
-"""The data store: a folder of .npy columns, memory-mapped, and a manifest; and how a data set is made one.
+"""The data store: a folder of memory-mapped .npy columns and a manifest; recipes that make one from a data set.
 
-A row is one problem or one mesh. Its points lie in the bulk columns, one row after the other; `<bulk>_start.npy` says
-where the rows begin. All other columns have one entry a row. A store is complete or not there at all, and every file is
-compared with the manifest's checksum when the store is opened.
+A row is one problem or one mesh. Its points are in the bulk columns, row after row; `<bulk>_start.npy` has the first
+index of each row. Every other column has one entry a row. A store is written whole or not at all, and every file is
+compared with the checksum in the manifest when the store is opened.
 """
 
 import json
@@ -34,20 +34,26 @@ Made = tuple[list[Row], dict[str, str]]  # rows, and by name what was left out a
 
 
 class StoreError(ValueError):
-    """A store that cannot be used or made; the message names its folder."""
+    """Unusable store, or a store that cannot be made; the message names its folder."""
 
 
 def is_store(folder: str | Path) -> bool:
-    """Whether there is a manifest of a store in this folder."""
+    """Return whether a folder has the manifest of a store."""
     return (Path(folder) / MANIFEST).is_file()
 
 
 @dataclass(frozen=True)
 class Store:
-    """An open store, see `open_store`.
+    """An open store, as `open_store` returns it.
 
-    bulk: the columns of points (total, width), float32. columns: those with one entry a row; `starts` (k + 1,) is where
-    the rows of each bulk column begin. parameters: how the store was made. skipped: what was left out, and why.
+    Args:
+        folder: of the files.
+        kind: of the rows.
+        bulk: columns of points (total, width), float32.
+        starts: first index of each row of a bulk column, and its length, (k + 1,).
+        columns: those with one entry a row.
+        parameters: with which the store was made.
+        skipped: reason for each item that is not in the store.
     """
 
     folder: Path
@@ -65,22 +71,23 @@ class Store:
         return _mapped, (self.folder, self.kind)  # another process maps the files itself
 
     def counts(self, bulk: str) -> NDArray[np.int64]:
-        """Points of each row (k,) in a bulk column."""
+        """Return the number of points of each row (k,) in a bulk column."""
         return np.diff(self.starts[bulk])
 
     def name(self, row: int) -> str:
         return bytes(self.columns["name"][row]).decode()
 
     def row(self, row: int) -> dict[str, NDArray[np.float32]]:
-        """The points of a row, views of the mapped files."""
+        """Return the points of a row, views of the mapped files."""
         return {name: self.bulk[name][start[row] : start[row + 1]] for name, start in self.starts.items()}
 
 
 def open_store(folder: str | Path, kind: str) -> Store:
-    """Open what `new_store` wrote, and read it once, to compare it with its checksums.
+    """Open a store, and read it once to compare it with its checksums.
 
-    Raises StoreError that names the folder or the file: no manifest, another kind or format, a file that is missing,
-    cut, or not the one that was written.
+    Raises:
+        StoreError: there is no manifest, the kind or the format is another one, or a file is missing or changed. The
+            message names the folder or the file.
     """
     path = Path(folder)
     for name, (size, checksum) in _manifest(path, kind)["files"].items():
@@ -89,7 +96,7 @@ def open_store(folder: str | Path, kind: str) -> Store:
             got = f"{file.stat().st_size} bytes" if file.is_file() else "no such file"
             raise StoreError(f"expected {file} of {size} bytes, got {got}; try copying or preparing again")
         if _checksum(file) != checksum:
-            raise StoreError(f"expected {file} as it was written, got other bytes; try copying or preparing again")
+            raise StoreError(f"{file} has changed since it was written; copy or prepare it again")
     return _mapped(path, kind)
 
 
@@ -102,7 +109,11 @@ def _mapped(folder: Path, kind: str) -> Store:
 
 
 def _manifest(folder: Path, kind: str) -> dict[str, Any]:
-    """The manifest of a store. Raises StoreError if it is missing, cut or edited, or of another kind or format."""
+    """Read the manifest of a store.
+
+    Raises:
+        StoreError: it is missing, cut or edited, of another kind or format, or names other files than the columns.
+    """
     try:
         manifest = dict(json.loads((folder / MANIFEST).read_text(encoding="utf-8")))
         whole = manifest.pop("checksum") == fingerprint(manifest)
@@ -130,9 +141,11 @@ def _checksum(file: Path) -> int:
 
 
 class StoreWriter:
-    """Appends rows to the columns of a new store; made by `new_store`.
+    """Append rows to the columns of a new store; `new_store` makes one.
 
-    parameters: kept in the manifest, must be JSON. skipped: what was left out, and why; may be added to.
+    Attributes:
+        parameters: JSON content for the manifest.
+        skipped: reason for each item that is left out.
     """
 
     def __init__(self, files: Mapping[str, BinaryIO], widths: Mapping[str, int]) -> None:
@@ -156,7 +169,7 @@ class StoreWriter:
             self._columns[key].append(value.encode() if isinstance(value, str) else value)
 
     def finish(self, folder: Path, kind: str) -> None:
-        """Write what is left: the small columns, and the manifest last."""
+        """Write the small columns, and the manifest last."""
         for key, file in self._files.items():
             file.seek(0)
             _write_header(file, BULK, (self._columns[f"{key}_start"][-1], self._widths[key]))
@@ -176,10 +189,16 @@ class StoreWriter:
 
 @contextmanager
 def new_store(folder: Path, kind: str, widths: Mapping[str, int]) -> Iterator[StoreWriter]:
-    """A writer of the new `folder`, which is there, complete, when the block has ended without an error.
+    """Give a writer of a new folder, which appears, complete, when the block ends without an error.
 
-    widths: coordinates of a point in each bulk column. Points are written as they come; memory holds the other columns.
-    Raises StoreError if the folder exists, OSError that names it if the disk is full.
+    Args:
+        folder: of the store.
+        kind: of its rows.
+        widths: coordinates of a point in each bulk column. Points are written at once; memory holds the other columns.
+
+    Raises:
+        StoreError: the folder exists.
+        OSError: the disk is full; the message names the folder.
     """
     if folder.exists():
         raise StoreError(f"expected a new folder to write to, got {folder}, which exists; try another or remove it")
@@ -199,10 +218,16 @@ def _write_header(file: BinaryIO, dtype: np.dtype[Any], shape: tuple[int, ...]) 
 
 @dataclass(frozen=True)
 class Recipe(Dataset[Made]):
-    """How a store is made: of the rows that `work(*job)` gives for one job after the other.
+    """The jobs that make a store; `work(*job)` returns rows.
 
-    kind, widths: as in `new_store`. parameters: kept in the store; what was made with others is another store.
-    work and the jobs must be picklable if there are several processes. what, source: for messages.
+    Args:
+        kind: as in `new_store`.
+        widths: as in `new_store`.
+        parameters: saved in the store; other parameters make another store.
+        jobs: arguments of `work`; picklable for several processes.
+        work: picklable for several processes.
+        what: an item, for messages.
+        source: of the items, for messages.
     """
 
     kind: str
@@ -223,8 +248,8 @@ class Recipe(Dataset[Made]):
 def prepare(recipe: Recipe, output: Path, *, processes: int = 1, wait_for_others: bool = False) -> Store:
     """Open the store `output`, or make it; a run that is stopped leaves nothing.
 
-    The store is made in a folder beside `output`, which only this function writes to; what a killed process has left
-    there is removed.
+    The store is made in the folder `.<output>.unfinished` of the same parent, which only this function writes to. Files
+    that a killed process has left there are removed.
 
     Args:
         recipe: how the store is made.
@@ -258,9 +283,9 @@ def prepare(recipe: Recipe, output: Path, *, processes: int = 1, wait_for_others
 
 
 def cached(recipe: Recipe, label: str, cache_dir: str | None) -> Store:
-    """The store of a recipe in the cache folder, made if it is not there, and made again if it is damaged.
+    """Return the store of a recipe in the cache folder; make it if it is missing or damaged.
 
-    Warns once about what was left out. Raises as `prepare`.
+    Warns of items that are left out. Raises as `prepare`.
     """
     folder = Path(cache_dir) if cache_dir is not None else cache_folder()
     output = folder / f"{label}-{fingerprint([recipe.kind, dict(recipe.parameters)])[:16]}"
@@ -301,7 +326,7 @@ def _make(recipe: Recipe, output: Path, processes: int) -> None:
 
 
 def _made(recipe: Recipe, processes: int) -> Iterator[Made]:
-    """What the jobs give, in their order. A loader's workers end with this process, however it ends."""
+    """Run the jobs and give their results in order. The workers of a loader end with this process, even if killed."""
     workers = 0 if processes == 1 else min(processes, len(recipe))
     generator = torch.Generator()  # else the seeds of the workers are drawn from the global one
     loader = DataLoader(recipe, batch_size=None, num_workers=workers, collate_fn=tuple, generator=generator)

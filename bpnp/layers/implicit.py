@@ -68,7 +68,7 @@ def first_derivative(backward: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def refuse_second_derivative(gradient: Tensor) -> None:
-    """In a backward pass: raise ValueError under `create_graph=True`, whose gradient would lack the graph asked for."""
+    """In a backward pass, raise ValueError under `create_graph=True`: the gradient would have no graph."""
     if torch.is_grad_enabled():
         raise ValueError(
             "expected a first derivative, got create_graph=True: the layers have no second derivative; "

@@ -47,10 +47,14 @@ def _pool(process: int) -> ThreadPoolExecutor:
 
 
 def in_processes(work: Callable[[int], Result], items: Sequence[int], count: int) -> Iterator[tuple[int, Result]]:
-    """Items and work(item) in `count` forks of this process, each with one thread; in the order they end.
+    """Give items and work(item) from `count` forks of this process, each with one thread, in the order they end.
 
-    For work that is mostly Python, which threads would do one after the other.
-    Raises what a worker raises, and RuntimeError if one is killed; all of them end with the iteration.
+    For work that is mostly Python, which threads would run one after the other. The forks, and no other children of
+    the process, end with the iteration.
+
+    Raises:
+        Exception: what a worker raises.
+        RuntimeError: a worker was killed.
     """
     context = _Recording()
     pool = ProcessPoolExecutor(min(count, len(items)), context, initializer=_begin, initargs=(work,))
@@ -143,7 +147,7 @@ class Deadline:
 
     @classmethod
     def after(cls, seconds: float | None) -> "Deadline":
-        """So many seconds from now; None: never."""
+        """Return the deadline after a number of seconds; None for no deadline."""
         return cls() if seconds is None else cls(Clock.now() + seconds)
 
     def passed(self) -> bool:

@@ -140,7 +140,7 @@ def test_a_broken_model_among_others_is_skipped_and_counted(tmp_path: Path) -> N
 def test_a_stage_without_scenes_is_one_error(tmp_path: Path) -> None:
     plant_scenes(tmp_path, 1)
     data = ColmapDataModule(str(tmp_path))
-    with pytest.raises(ValueError, match="expected `setup` before the test loader"):
+    with pytest.raises(ValueError, match=r"the test loader needs `setup\(\)` first"):
         data.test_dataloader()
     data.setup("test")
     for stage in ("fit", "validate"):

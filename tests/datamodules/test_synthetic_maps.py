@@ -97,7 +97,7 @@ def test_the_module_is_configured_by_yaml(tmp_path: Path) -> None:
     parser = ArgumentParser()
     parser.add_class_arguments(SyntheticMapDataModule, "data")
     data = parser.instantiate_classes(parser.parse_args([f"--data={tmp_path / 'data.yaml'}"])).data
-    with pytest.raises(ValueError, match="expected `setup` before the train loader"):
+    with pytest.raises(ValueError, match=r"the train loader needs `setup\(\)` first"):
         data.train_dataloader()
     data.setup()
     assert data.options.outliers == (0.0, 0.5)
