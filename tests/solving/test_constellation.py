@@ -9,7 +9,7 @@ from leds import Camera, Frame, Setting, device, frame, picture
 from planted import degrees_between
 from scipy.spatial.transform import Rotation
 
-from bpnp import GravityPrior, PosePrior, solve, solve_many
+from bpnp import GravityPrior, PosePrior, solve, solve_many, verify
 
 CAMERA = Camera().model
 UP = np.array([0.0, 0, 1])
@@ -66,6 +66,24 @@ def test_three_points_are_enough_with_gravity() -> None:
     assert min(degrees_between(candidate.rotation, rotation) for candidate in solution.candidates) < 1
     with pytest.raises(ValueError, match="expected 4 or more points in `points2d`, got 3"):
         solve(pixels(points, rotation, translation), points, CAMERA)
+
+
+def test_a_confident_pose_of_a_ring_is_confident_when_it_is_verified_and_its_half_turn_is_not() -> None:
+    """A half turn of a ring maps many of its LEDs near others."""
+    rng, checked = np.random.default_rng(45), 0
+    for seed in range(12):
+        seen = picture(Setting("ring, 3 lights", "ring", 3), seed, rng)
+        known = {"camera": CAMERA, "normals3d": seen.device.normals3d, "time_limit": 60}
+        solution = solve(seen.pixels, seen.device.points3d, **known)
+        if solution.verdict != "confident":
+            continue
+        checked += 1
+        again = verify(seen.pixels, seen.device.points3d, solution.rotation, solution.translation, **known)
+        assert again.verdict == "confident", again.reason
+        for other in again.candidates[1:]:
+            wrong = verify(seen.pixels, seen.device.points3d, other.rotation, other.translation, **known)
+            assert wrong.verdict != "confident"
+    assert checked >= 10
 
 
 def pitch_from_the_stand(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -15,11 +15,13 @@ from numpy.typing import NDArray
 
 from bpnp.geometry import turned_by
 from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
-from bpnp.search.annealing import anneal_on_points, finish
+from bpnp.search.annealing import anneal_on_points, finish, polished
 from bpnp.search.candidates import Candidates, in_scene_frame, in_user_frame, merged
+from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.evidence import reasons
 from bpnp.search.evidence.false_alarms import likeliest_scale, log10_tests
 from bpnp.search.evidence.partners import explained
+from bpnp.search.evidence.repetitions import competing_poses, registered
 from bpnp.search.evidence.rivals import against_rivals
 from bpnp.search.evidence.settings import Evidence
 from bpnp.search.evidence.uncertainty import linearised, local_covariance
@@ -63,7 +65,14 @@ def judge_claim(
     rule = DEFAULT.evidence
     one = replace(sets, log10_tried=0.0)
     claim = _unrefined(one, rotation, translation)
-    others = _weighed_anew(_proposed(claim, Scene(sets, seed, DEFAULT, deadline)), one)
+    scene, few = Scene(one, seed, DEFAULT, deadline), is_enumerable(sets)
+    others = _proposed(claim, scene)
+    if few:  # as in an enumeration, whose candidates have been refined
+        motions = registered(one, rotation, translation, float(claim.scale[0]), rule)
+        copies = competing_poses(one, rotation, translation, motions, rule)
+        if len(copies[0]):
+            others = Candidates.concatenated([others, polished(scene, *copies, float(claim.scale[0]))])
+    others = _weighed_anew(others, one)
     others = others[np.argsort(others.log10_false_alarms, kind="stable")]
     same = np.array([_is_same(one, claim, others[k : k + 1], rule) for k in range(len(others))], np.bool_)
     optimum = others[same][:1]
@@ -78,8 +87,7 @@ def judge_claim(
     competing = others[~same & (others.log10_false_alarms <= 0)]  # chance explains the rest
     candidates = _weighed_anew(Candidates.concatenated([claim, competing]), one)
     result = judged(candidates, one, batches=0, exhaustive=True, rule=rule)
-    scene = Scene(one, seed, DEFAULT, deadline)
-    result = against_rivals(result, one, lambda: scene, rule, exhaustive=True)
+    result = against_rivals(result, one, lambda: scene, rule, exhaustive=True, contested=few)
     result = _of_claim(result, candidates[:1])
     if result.verdict == "confident":
         result = replace(result, reason=f"{result.reason}; {ONE_POSE}")
