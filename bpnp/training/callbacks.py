@@ -257,15 +257,21 @@ class ResultsWriter(Callback):
             rank_zero_info(f"{'' if complete else 'interrupted: '}results of {count} problems in {folder}")
 
     def _check_replaced(self, trainer: Trainer) -> None:
-        """Raises ValueError if results of a checkpoint would be replaced by those of a test without one."""
+        """Raise ValueError if results of a checkpoint would be replaced by those of a test without one.
+
+        Print the checkpoint whose results are replaced by those of another.
+        """
         summary = self._folder(trainer) / SUMMARY
-        if self.settings is None and trainer.ckpt_path is None and summary.is_file():
-            checkpoint = json.loads(summary.read_bytes()).get("settings", {}).get("checkpoint")
-            if checkpoint is not None:
-                raise ValueError(
-                    f"expected --ckpt_path, since {summary.parent} has the results of {checkpoint}, got none, which "
-                    "would replace them; try --ckpt_path last, or --results.folder for another folder"
-                )
+        if self.settings is not None or not summary.is_file():
+            return
+        checkpoint = json.loads(summary.read_bytes()).get("settings", {}).get("checkpoint")
+        if checkpoint is not None and trainer.ckpt_path is None:
+            raise ValueError(
+                f"expected --ckpt_path, since {summary.parent} has the results of {checkpoint}, got none, which "
+                "would replace them; try --ckpt_path last, or --results.folder for another folder"
+            )
+        if checkpoint != (None if trainer.ckpt_path is None else str(trainer.ckpt_path)):
+            rank_zero_info(f"the results of {checkpoint} in {summary.parent} are replaced")
 
     def _folder(self, trainer: Trainer) -> Path:
         return Path(self.folder) if self.folder else Path(trainer.default_root_dir) / "test"

@@ -169,7 +169,11 @@ def test_a_broken_configuration_is_named(content: str, message: str, fails: Call
 
 
 def test_fit_test_report(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], fails: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    fails: Callable[..., str],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     meshes = write_mesh_tree(tmp_path / "meshes")
     common = [
@@ -189,7 +193,9 @@ def test_fit_test_report(
     monkeypatch.setenv("TERM", "xterm")
     main(["test", *common, "--ckpt_path=last"])
     assert "━" in capsys.readouterr().out
+    caplog.set_level("INFO")
     main(["test", *common, f"--ckpt_path={tmp_path}/run/checkpoints/best.ckpt", "--trainer.enable_progress_bar=false"])
+    assert f"the results of {tmp_path}/run/checkpoints/last.ckpt in {tmp_path}/run/test are replaced" in caplog.messages
     assert "━" not in capsys.readouterr().out
     trained = (tmp_path / "run" / "test" / "summary.json").read_bytes()
     assert "best.ckpt, got none, which would replace them; try --ckpt_path last" in fails("test", *common)
