@@ -334,6 +334,8 @@ class BlindPnPTask(LightningModule):
                 f"{', '.join(names)}. Use the same optimizer, or start a new training with --model.weights."
             )
         self.optimizer_names = names
+        for config in self.trainer.lr_scheduler_configs:
+            _scale_schedule(config.scheduler)
         self.optimizer_settings = [
             [{key: value for key, value in group.items() if key != "params"} for group in optimizer.param_groups]
             for optimizer in optimizers
@@ -479,6 +481,14 @@ class BlindPnPTask(LightningModule):
             self.log(f"{stage}/correspondence_loss", loss.compute().float())
             self.tabled.add(f"{stage}/correspondence_loss")
             loss.reset()
+
+
+def _scale_schedule(scheduler: Any) -> None:
+    """Use a rate that was set after the scheduler was made, as by `LearningRateFinder`, as the initial one."""
+    groups, rates = scheduler.optimizer.param_groups, getattr(scheduler, "base_lrs", ())
+    for group, last, initial in zip(groups, scheduler.get_last_lr(), rates, strict=False):
+        if initial and group["lr"] != last:
+            group.update(initial_lr=group["lr"], lr=group["lr"] * last / initial)
 
 
 def check_batch(batch: object) -> None:

@@ -90,14 +90,16 @@ def test_a_checkpoint_callback_of_the_user_writes_beside_ours(tmp_path: Path) ->
     assert saved(tmp_path)["global_step"] == 2
 
 
-def test_the_rate_finder_sets_the_rate_of_the_training(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("warmup_steps", "factors"), [(0, [1, 1]), (9, [0.1, 0.2])])
+def test_the_rate_finder_sets_the_rate_of_the_training(warmup_steps: int, factors: list[float], tmp_path: Path) -> None:
     find = ["--trainer.callbacks+=LearningRateFinder", "--trainer.callbacks.num_training_steps=20"]
     find += ["--trainer.callbacks.min_lr=1e-6", "--trainer.callbacks.max_lr=0.1"]
+    find += [f"--model.warmup_steps={warmup_steps}"]
     fit(tmp_path, *find, "--trainer.max_steps=2", "--trainer.limit_val_batches=0", "--data.train_problems=88")
     finder = next(each for each in Observer.trainer.callbacks if type(each).__name__ == "LearningRateFinder")
     suggested = finder.optimal_lr.suggestion()
     assert suggested not in (None, 1e-4)  # the rate of the quickstart
-    assert Observer.rates == [suggested] * 2
+    assert Observer.rates == pytest.approx([suggested * factor for factor in factors])
 
 
 def test_stochastic_weight_averaging_ends_at_the_mean_of_the_epochs(tmp_path: Path) -> None:
