@@ -292,9 +292,9 @@ def markdown(table: Table, record: Mapping[str, Any]) -> dict[str, str]:
         (seed, one["switch"], *(one.get(label, 0) for label in BRANCHES), f"{one['learning_rate']:g}")
         for seed, one in record["training"].items()
     ]
-    result["training"] = "".join(
-        f"| {' | '.join(map(str, row))} |\n" for row in (names, ["---"] * len(names), *trained)
-    )
+    if trained:
+        lines_of_trainings = (names, ["---"] * len(names), *trained)
+        result["training"] = "".join(f"| {' | '.join(map(str, cells))} |\n" for cells in lines_of_trainings)
     return result
 
 
