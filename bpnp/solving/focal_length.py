@@ -63,7 +63,7 @@ class FocalSettings:
     rounds: int = 12
     same: float = 5e-4
     bend_sigma: float = 0.05
-    most_bend: float = 0.5
+    most_bend: float = OtherFocal.bend
     fewest_bent: int = 24
     centre_sigma: float = 0.004
 

@@ -12,7 +12,7 @@ from planted_model import HEIGHT, WIDTH, plant_model
 from scipy.spatial.transform import Rotation
 
 from bpnp import SceneMap, Solution, solve
-from bpnp.cameras import camera_from
+from bpnp.cameras import camera_from, plain_camera
 from bpnp.cli import main
 
 Array = NDArray[np.float64]
@@ -158,3 +158,17 @@ def test_the_command_takes_the_size_of_the_image(tmp_path: Path, capsys: pytest.
     solution = Solution.from_json(capsys.readouterr().out)
     assert degrees_between(solution.rotation, rotation) < 0.5
     assert solution.focal_length == pytest.approx(900, rel=0.05)
+
+
+@pytest.mark.parametrize("radial", [-0.3, 0.3])
+def test_a_given_camera_is_never_changed_and_a_better_lens_makes_the_pose_ambiguous(radial: float) -> None:
+    camera = ("SIMPLE_PINHOLE", (600.0, 320.0, 240.0))
+    pixels, scene, _ = planted(600.0, points=150, radial=radial, distance=3.0)
+    solution = solve(pixels, scene, camera, solver="search", time_limit=LIMIT)
+    assert solution.verdict == "ambiguous"
+    named = re.search(r"a radial distortion of (\S+)", solution.reason)
+    assert named is not None
+    assert float(named[1]) == pytest.approx(radial, abs=0.05)
+    assert json.loads(solution.to_json())["camera"] == plain_camera(camera_from(camera))
+    known = solve(pixels, scene, ("SIMPLE_RADIAL", (600.0, 320.0, 240.0, radial)), solver="search", time_limit=LIMIT)
+    assert known.verdict == "confident"

@@ -22,6 +22,7 @@ from bpnp.search.evidence.settings import Evidence
 from bpnp.search.evidence.uncertainty import Linearised, Misfit, systematic_misfit
 from bpnp.search.point_sets import PointSets, label_groups
 
+SAME_ZOOM = 0.005  # change of the focal length that is not worth a word
 Array = NDArray[np.float64]
 Seen = Sequence[tuple[Candidates, PointSets]]
 
@@ -80,11 +81,15 @@ def misfit(linear: Linearised | None, count: float, rule: Evidence) -> Alternati
 
 def of_misfit(off: Misfit, rule: Evidence) -> Alternative | None:
     """The alternative that is so far off; None where it is the same pose."""
-    if math.degrees(off.turn) <= rule.other_deg and off.shift <= rule.other_shift:
+    limits = (rule.zoomed.bend_deg, rule.zoomed.bend_shift) if off.radial else (rule.other_deg, rule.other_shift)
+    if math.degrees(off.turn) <= limits[0] and off.shift <= limits[1]:
         return None
     other = f"{off.zoom:.2f} times the focal length" if off.zoom != 1 else "other proportions of the scene"
+    if off.radial:
+        zoomed = f" and {off.zoom:.2f} times the focal length" if abs(off.zoom - 1) > SAME_ZOOM else ""
+        other = f"a radial distortion of {off.radial:.2g}{zoomed}"
     away = f"{math.degrees(off.turn):.0f} deg and {100 * off.shift:.0f} % of the distance away"
-    return Alternative(-math.inf, f"with {other} they fit significantly better, {away}")
+    return Alternative(-math.inf, f"with {other} the points fit significantly better, by a pose {away}")
 
 
 def contesting(seen: Seen, rule: Evidence) -> Alternative | None:

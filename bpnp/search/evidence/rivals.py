@@ -16,9 +16,9 @@ from bpnp.search.evidence.alternatives import Alternative, of_misfit
 from bpnp.search.evidence.false_alarms import alarms_of
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
 from bpnp.search.evidence.settings import Evidence, OtherFocal
-from bpnp.search.evidence.uncertainty import misfit_of
+from bpnp.search.evidence.uncertainty import bends_significantly, linearised, misfit_of
 from bpnp.search.point_sets import PointSets, UnknownFocal
-from bpnp.search.propose.lens import LensFit, fit_lens
+from bpnp.search.propose.lens import LensFit, fit_lens, undistort
 from bpnp.search.raster_search import search_beside
 from bpnp.search.scene import Scene
 from bpnp.search.verdict import SearchResult, is_symmetric, judged, match_count, with_false_alarms
@@ -54,28 +54,28 @@ def against_rivals(
 def other_camera(
     result: SearchResult, sets: PointSets, entered: Callable[[], Scene], rule: Evidence
 ) -> Alternative | None:
-    """Another focal length with which a different pose fits better than the best one, by the factor `focal_chance`
-    though it is paid for as an unknown; None if there is none, or too few matches to tell.
+    """Return another lens with which a different pose fits better than the best one, or None.
 
-    Of Gauss-Newton steps from the best pose itself; and, where three matches may be coincidences, so that these miss
-    what there is, from the likeliest pose that is found beside it at other focal lengths. That there was no time for
-    these speaks against it too.
+    Better is a smaller number of false alarms, by the factor `focal_chance`, though it counts the focal length and the
+    radial coefficient as unknowns. The lens is fitted from the best pose; and, where three matches may be coincidences,
+    from the likeliest pose beside it at other focal lengths. If there was no time for these, that is returned.
     """
     count = match_count(result.candidates, sets)
     if sets.focal is not None or count < rule.zoomed.fewest:
         return None
     (rotation, translation), scale = result.best, max(result.residual, sets.image.scales[0])
     middle = rotation @ sets.middle + translation
+    linear = linearised(sets, rotation, translation, scale)
+    starts = (None, 0.0) if bends_significantly(linear, count, rule) else (None,)
 
     def better(found: AtZoom) -> Alternative | None:
         least = max(found.scale, found.sets.image.scales[0])
-        fitted = fit_lens(found.sets, found.rotation, found.middle, least)
-        if fitted is None:
+        fits = (fit_lens(found.sets, found.rotation, found.middle, least, start) for start in starts)
+        others = [fit._replace(zoom=found.zoom * fit.zoom) for fit in fits if fit is not None]
+        alarms = [_alarms(sets, other, rule) for other in others]
+        if min(alarms, default=math.inf) >= result.log10_false_alarms + math.log10(rule.focal_chance):
             return None
-        other = fitted._replace(zoom=found.zoom * fitted.zoom)
-        if _alarms(sets, other, rule) >= result.log10_false_alarms + math.log10(rule.focal_chance):
-            return None
-        return of_misfit(misfit_of(rotation, middle, other), rule)
+        return of_misfit(misfit_of(rotation, middle, others[int(np.argmin(alarms))]), rule)
 
     known = AtZoom(1.0, sets, rotation, middle, scale)
     other = better(known)
@@ -129,8 +129,14 @@ def beside(found: AtZoom, zoom: float, scene: Scene) -> AtZoom:
 
 
 def _alarms(sets: PointSets, other: LensFit, rule: Evidence) -> float:
-    """log10 of the false alarms of a pose whose focal length is a seventh unknown."""
-    zoomed = replace(at_focal_length(sets, other.zoom), focal=UnknownFocal(2 * math.log(rule.zoomed.widest)))
+    """Return log10 of the number of false alarms of a pose whose lens is unknown too."""
+    lens = UnknownFocal(2 * math.log(rule.zoomed.widest))
+    zoomed = replace(at_focal_length(sets, other.zoom), focal=lens)
+    if other.radial is not None:
+        bearings = undistort(sets.bearings, other.zoom, other.radial)
+        outermost = float(((bearings[:, :2] / bearings[:, 2:]) ** 2).sum(-1).max())
+        lens = lens._replace(radial_sigma=math.inf, radial_range=2 * rule.zoomed.bend / outermost)
+        zoomed = replace(sets, bearings=bearings, focal=lens)
     translation = other.middle - other.rotation @ sets.middle
     return float(alarms_of(zoomed, other.rotation[None], translation[None]).own[0])
 

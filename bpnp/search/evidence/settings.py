@@ -74,13 +74,18 @@ class OtherFocal:
     """Where another focal length is looked for beside a confident pose (`bpnp.search.evidence.rivals`).
 
     step: factor from one that is tried to the next; widest: the last one. bearings: that most steps of the focal length
-    are fitted to. fewest: matches; of fewer a seventh unknown explains too much.
+    are fitted to. fewest: matches; of fewer a seventh unknown explains too much. bend: largest radial distortion, as
+    a fraction of the distance of the outermost image point from the axis. bend_deg, bend_shift: with radial distortion,
+    poses farther apart are different, in degrees and in distances of the scene.
     """
 
     step: float = 1.08
     widest: float = 1.6
     bearings: int = 400
     fewest: int = 24
+    bend: float = 0.5
+    bend_deg: float = 1.0
+    bend_shift: float = 0.02
 
 
 @dataclass(frozen=True)

@@ -319,12 +319,13 @@ class Misfit(NamedTuple):
     """How far the pose would be if the camera and the scene were free.
 
     turn: radians. shift: of the middle of the scene, in distances from the camera. zoom: the focal length over the
-    given one, 1 if not that is wrong.
+    given one, 1 if not that is wrong. radial: radial coefficient, 0 if not that is wrong.
     """
 
     turn: float
     shift: float
     zoom: float = 1.0
+    radial: float = 0.0
 
 
 def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = DEFAULT.evidence) -> Misfit:
@@ -342,7 +343,7 @@ def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = 
     >>> seen = points + [0, 0, 5] + 1e-3 * rng.standard_normal((40, 3))
     >>> sets = PointSets(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
     >>> systematic_misfit(linearised(sets, np.eye(3), np.array([0, 0, 5.0]), 2e-4), 40.0)
-    Misfit(turn=0.0, shift=0.0, zoom=1.0)
+    Misfit(turn=0.0, shift=0.0, zoom=1.0, radial=0.0)
     """
     if linear is None:
         return Misfit(0.0, 0.0)
@@ -375,7 +376,29 @@ def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = 
 def misfit_of(rotation: Array, middle: Array, other: LensFit) -> Misfit:
     """How far a pose with another focal length is from a pose that sees the middle of the scene at (3,)."""
     shift = float(np.linalg.norm(other.middle - middle)) / max(float(np.linalg.norm(middle)), 1e-300)
-    return Misfit(turned_by(rotation, other.rotation), shift, other.zoom)
+    return Misfit(turned_by(rotation, other.rotation), shift, other.zoom, other.radial or 0.0)
+
+
+def bends_significantly(linear: Linearised | None, count: float, rule: Evidence = DEFAULT.evidence) -> bool:
+    """Return whether radial distortion explains the residuals of a pose significantly better, beside a focal length.
+
+    The F test of the radial coefficient, with pose and focal length eliminated, at `focal_chance`.
+
+    Args:
+        linear: The pose and its possible matches.
+        count: Number of matches.
+        rule: Settings.
+    """
+    if linear is None or not (linear.sets.bearings[:, 2] > 0).all():
+        return False
+    free = 2 * min(count, float(linear.probability.sum())) - POSE - 2
+    lens = lens_columns(linear.seen, 0.0) / linear.scale
+    columns = [linear.jacobian[:, :, :POSE], lens, linear.residual[..., None]]
+    rows = (np.sqrt(linear.probability)[:, None, None] * np.concatenate(columns, -1)).reshape(-1, POSE + 3)
+    # The last two values of R are the radial column and the residuals, without what the columns before explain.
+    triangle = np.asarray(np.linalg.qr(rows, mode="r"))
+    gain, rest = float(triangle[-2, -1] ** 2), float(triangle[-1, -1] ** 2)
+    return bool(free > 0 and fdtrc(1, free, gain * free / max(rest, free, 1.0)) < rule.focal_chance)
 
 
 def _moved(products: Array, pose: Array, fitted: slice, free: float, chance: float) -> tuple[Array, Array]:

@@ -22,6 +22,7 @@ FEW_PARTNERS = 2  # scene points that may correspond to each image point
 MOST_ZOOM, MOST_BEND = 0.2, 0.1  # largest step of log zoom, and of the shift of the outermost point, of its radius
 SAME_ZOOM = 0.01  # change of log zoom below which no other round of steps is taken
 LEAST_SLOPE = 0.2  # of the seen over the true radius; a lens that is flatter at a point does not see it
+UNDISTORTED = 20  # Newton steps
 MOST_ROUNDS = 4
 SETTLED_ZOOM, MOST_STEPS = 2e-5, 40  # the same for the last steps, with all points; steps at most
 WIDTHS = (4.0, 2.0, 2.0, 1.0, 1.0)  # scales of the residuals, of the Gauss-Newton steps of a round
@@ -89,6 +90,28 @@ def fit_lens(
         if last is None or step is None or abs(math.log(step.zoom / last.zoom)) < SETTLED_ZOOM:
             break
     return step
+
+
+def undistort(bearings: Array, zoom: float, radial: float) -> Array:
+    """Return the bearings (m, 3) of a lens, given as a pinhole camera of 1 / zoom times its focal length saw them.
+
+    Newton steps solve r (1 + k r^2) = r_seen / zoom; a point beyond the largest radius of the lens stays at that.
+
+    >>> x = np.array([[0.6, 0.3, 1.0]])
+    >>> bent = x * [[1.2 * (1 - 0.2 * 0.45)] * 2 + [1]]
+    >>> back = undistort(bent / np.linalg.norm(bent), 1.2, -0.2)
+    >>> np.round(back / back[:, 2:], 9).tolist()
+    [[0.6, 0.3, 1.0]]
+    """
+    seen = bearings[:, :2] / bearings[:, 2:] / zoom
+    radius = np.linalg.norm(seen, axis=-1)
+    most = math.sqrt((1 - LEAST_SLOPE) / (-3 * radial)) if radial < 0 else math.inf
+    true = np.minimum(radius, most)
+    for _ in range(UNDISTORTED):
+        slope = np.maximum(1 + 3 * radial * true**2, LEAST_SLOPE)
+        true = np.clip(true - (true * (1 + radial * true**2) - radius) / slope, 0.0, most)
+    rays = np.column_stack([seen * (true / np.maximum(radius, 1e-300))[:, None], np.ones(len(seen))])
+    return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
 
 
 def lens_columns(seen: Array, radial: float) -> Array:
