@@ -42,7 +42,7 @@ def registered(sets: PointSets, rotation: Array, translation: Array, scale: floa
         return Motions.none()
     noise = scale * float(np.median(depth[matched]))
     labels, normals = sets.labels3d, sets.normals3d if sets.cosines3d is None else None
-    if len(points) <= limits.whole and 2 * len(matched) >= limits.share * len(points):
+    if len(points) <= limits.whole:
         tolerance = matching_tolerance(points, np.arange(len(points)), noise)
         motions = _of_scene(*(_frozen(x) for x in (points, labels, normals)), tolerance)
         return motions.of(points, matched, tolerance, limits.share)
@@ -76,8 +76,14 @@ def _of_scene(points: Frozen, labels: Frozen, normals: Frozen, tolerance: float)
     """Return the motions of a whole scene, which all problems of it share."""
     arrays = [None if x is None else np.frombuffer(x[0], x[1]).reshape(x[2]) for x in (points, labels, normals)]
     assert arrays[0] is not None
-    least = DEFAULT.share_of_scene
-    return self_motions(arrays[0], tolerance, labels3d=arrays[1], normals3d=arrays[2], least=least)
+    return self_motions(
+        arrays[0],
+        tolerance,
+        labels3d=arrays[1],
+        normals3d=arrays[2],
+        least=DEFAULT.share_of_scene,
+        bases=DEFAULT.bases_of_scene,
+    )
 
 
 def competing_poses(sets: PointSets, rotation: Array, translation: Array, motions: Motions, rule: Evidence) -> Pose:

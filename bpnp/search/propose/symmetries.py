@@ -3,14 +3,13 @@
 If p -> S p + d maps scene points onto other scene points, the pose (R S^T, t - R S^T d) projects the images of these
 points to where (R, t) projects the points themselves. Every such pose is a competitor of (R, t).
 
-The motions are found by registering the scene with itself. A base of four points is matched with every congruent base
-of the scene: three edges of a triangle decide the motion, the fourth point and a sample of the scene confirm it.
-Bases lie in a neighbourhood of some points, so that the cost of a base grows linearly with the scene.
-A motion that maps a fraction x of the points is found by a base with a probability of at least x^3, by all B bases but
-with (1 - x^3)^B; a part that is connected in space is found sooner.
+The motions are found by registering the scene with itself. A base of three points is matched with every congruent
+triangle of the scene: its edges decide the motion, and a sample of the points confirms it. Bases lie in a neighbourhood
+of some points, so that the cost of a base grows linearly with the scene. A motion that maps a fraction x of the points
+is missed by B bases with a probability of (1 - x^3)^B, and of less if the part is connected in space.
 
 Source: D. Aiger, N. J. Mitra, D. Cohen-Or, 4-points congruent sets for robust pairwise surface registration, ACM TOG
-2008, whose coplanar bases are replaced by triangles.
+2008, with triangles in place of coplanar bases.
 """
 
 import math
@@ -226,7 +225,7 @@ def _bases(points: Array, moved: Indices, count: int) -> Indices:
     around = tree.query(points[first], min(_neighbours(points) + 1, len(moved)))[1]
     bases = []
     for k, (a, near) in enumerate(zip(first.tolist(), np.atleast_2d(around), strict=True)):
-        # The widest of several draws has the most accurate motion; but a part may be small, and one base of two is too.
+        # The widest of several triangles decides the motion best. Every other base is compact, for small parts.
         last = len(near) if k % 2 else max(len(near) // COMPACT, min(len(near), 4))
         draws = moved[near[rng.integers(1, last, (WIDEST, 2))]]
         edges = points[draws] - points[a]
