@@ -13,6 +13,7 @@ from torch import nn
 from bpnp.loops.parallel import Clock, Deadline, in_processes
 from bpnp.search.enumeration.search import exceeds_enumeration
 from bpnp.search.evidence import reasons
+from bpnp.search.propose.mirror import mirrored_alarms
 from bpnp.search.search import search_poses, search_proposed
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.solving.matches import finished, without_pose
@@ -113,6 +114,8 @@ def _by_search(i: int, problem: Problem, options: Options) -> Solution:
         result = replace(result, reason=f"no pose was found in {limit:.3g} s; try a longer time limit")
     elif result.verdict == "ambiguous" and not result.settled and deadline.passed():
         result = replace(result, reason=reasons.undecided(result.reason, options.time_limit or seconds))
+    if result.verdict == "failed" and mirrored_alarms(problem.sets, deadline) <= options.settings.evidence.false_alarms:
+        result = replace(result, reason=f"{result.reason}; {reasons.MIRRORED}")
     return finished(problem, result, seconds, options.inlier_threshold)
 
 

@@ -1,4 +1,4 @@
-"""Known matches make a PnP problem: poses against OpenCV's, planted poses, and the options of few points."""
+"""Known matches, options of few points, and mirrored scenes, against OpenCV's poses and planted ones."""
 
 from typing import Any
 
@@ -107,3 +107,15 @@ def test_clutter_and_scores_count_for_few_points() -> None:
     likely = np.where(np.arange(14) < 8, 1.0, 0.1)
     assert alarms(scores2d=likely) < alarms() < alarms(scores2d=1.1 - likely)
     assert alarms(scores3d=likely) < alarms() < alarms(scores3d=1.1 - likely)
+
+
+def test_a_scene_whose_mirror_image_fits_is_named() -> None:
+    """Axes of the wrong handedness: no pose fits, and the reason names it; not for points that are unrelated."""
+    named = []
+    for seed in range(6):
+        points, image, *_ = known(seed, 12, 0.3)
+        for scene in (points * [1, 1, -1], np.random.default_rng(seed).permutation(points.ravel()).reshape(-1, 3)):
+            solution = bpnp.solve(image[::-1], scene, CAMERA, solver="search", time_limit=30)
+            assert solution.verdict != "confident"
+            named.append("mirror image of the scene has a significant pose" in solution.reason)
+    assert named == [True, False] * 6

@@ -1,5 +1,6 @@
 """The sentences that give the reason of a verdict (`Solution.reason`)."""
 
+MIRRORED = "the mirror image of the scene has a significant pose: check the directions of its axes"
 LEAST_SHOWN = 0.05  # decades that are shown as 0.0
 
 

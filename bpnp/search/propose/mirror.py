@@ -1,0 +1,41 @@
+"""The mirror image of a scene: coordinates of the wrong handedness have no pose, but their mirror image has one."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from bpnp.loops.parallel import Deadline
+from bpnp.search.enumeration.search import enumerate_poses, is_enumerable
+from bpnp.search.enumeration.settings import DEFAULT
+from bpnp.search.evidence.false_alarms import alarms_of
+from bpnp.search.point_sets import PointSets
+
+HYPOTHESES = 20_000  # that are tried, some 10 ms: a right pose of clean points is among the first thousands
+MIRROR = np.array([1.0, 1.0, -1.0])
+
+
+def mirrored_alarms(sets: PointSets, deadline: Deadline) -> float:
+    """Compute log10 of the false alarms of a mirrored scene.
+
+    Args:
+        sets: Points of a problem without a significant pose.
+        deadline: When to stop.
+
+    Returns:
+        Logarithm for the best pose of a short enumeration; infinite where the points are too many to be enumerated,
+        where a prior of the pose is given, or where no pose was found.
+
+    >>> points = np.random.default_rng(0).uniform(-1, 1, (9, 3))
+    >>> seen = points * MIRROR + [0, 0, 6]
+    >>> sets = PointSets(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
+    >>> mirrored_alarms(sets, Deadline()) < -5
+    True
+    """
+    if sets.prior is not None or not is_enumerable(sets) or deadline.passed():
+        return np.inf
+    normals = None if sets.normals3d is None or sets.cosines3d is not None else sets.normals3d * MIRROR
+    mirrored = replace(sets, points3d=sets.points3d * MIRROR, normals3d=normals, cosines3d=None)
+    found = enumerate_poses(mirrored, deadline=deadline.at, settings=replace(DEFAULT, most=HYPOTHESES))
+    if not len(found.rotation):
+        return np.inf
+    return float(alarms_of(mirrored, found.rotation[:1], found.translation[:1]).own[0])
