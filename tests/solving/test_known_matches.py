@@ -19,7 +19,7 @@ def pixels(points: np.ndarray, rotation: np.ndarray, translation: np.ndarray) ->
 
 
 def known(seed: int, count: int, noise: float, *, flat: bool = False) -> Any:
-    """Points, their pixels with noise of so many, and the planted pose."""
+    """Return points, their pixels with noise (pixels), and the planted pose."""
     rng = np.random.default_rng([seed, count])
     points = rng.uniform(-1, 1, (count, 3)) * (1, 1, not flat)
     rotation, translation = Rotation.random(random_state=seed).as_matrix(), np.array([0, 0, 6.0])

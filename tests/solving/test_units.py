@@ -13,7 +13,7 @@ from bpnp.search.point_sets import PointSets
 
 
 def view(focal: float, noise: float, count: int = 90) -> Any:
-    """Points, their pixels with noise of so many, and the planted pose."""
+    """Return points, their pixels with noise (pixels), and the planted pose."""
     rng = np.random.default_rng(5)
     points, rotation = rng.uniform(-1, 1, (count, 3)), Rotation.random(random_state=5).as_matrix()
     camera = points @ rotation.T + [0.1, -0.05, 5.0]

@@ -47,19 +47,19 @@ def judge_claim(
     seed: int = 0,
     deadline: Deadline = NEVER,
 ) -> tuple[SearchResult, Candidates]:
-    """Judge a given pose, or the optimum beside it.
+    """Judge a given pose, or the optimum near it.
 
     Args:
         sets: Points of the problem.
         rotation: (3, 3) of the pose.
         translation: (3,) of the pose, scene units.
-        refine: Judge the optimum beside the pose. It is the same pose: turned and moved by no more than the verdict
+        refine: Judge the optimum near the pose. It is the same pose: turned and moved by no more than the verdict
             takes for one pose, or than the points leave open.
-        seed: Of the copies beside the pose.
+        seed: Of the copies near the pose.
         deadline: When to stop proposing poses.
 
     Returns:
-        The verdict, with the judged pose as the first candidate; and the optimum (1,) beside the given pose, or (0,)
+        The verdict, with the judged pose as the first candidate; and the optimum (1,) near the given pose, or (0,)
         if there is none.
     """
     rule = DEFAULT.evidence
@@ -102,7 +102,7 @@ def judge_claim(
 
 
 def _proposed(claim: Candidates, scene: Scene) -> Candidates:
-    """Return the distinct poses that annealing reaches from a pose (1,), from copies of it a little beside it, and from
+    """Return the distinct poses that annealing reaches from a pose (1,), from copies of it near it, and from
     its mirror image before a flat scene."""
     start = in_scene_frame(claim, scene)
     wide = scene.settings.middle[-1].last_scale * scene.spread
@@ -130,7 +130,7 @@ def _mirrored(scene: Scene, pose: Candidates) -> Candidates:
 
 
 def _unrefined(sets: PointSets, rotation: Array, translation: Array) -> Candidates:
-    """A pose as it is (1,), at the scale of residuals at which chance explains it least."""
+    """Return a pose (1,) without refinement, at the scale of residuals with the fewest false alarms."""
     scale = likeliest_scale(sets, rotation, translation)
     score, matched = explained(sets, rotation, translation, scale)
     pose = Candidates.unscored(rotation[None], translation[None])
@@ -139,7 +139,7 @@ def _unrefined(sets: PointSets, rotation: Array, translation: Array) -> Candidat
 
 
 def _is_same(sets: PointSets, claim: Candidates, pose: Candidates, rule: Evidence) -> bool:
-    """Whether a pose (1,) is the claimed one, or within what its points leave open of it."""
+    """Return whether a pose (1,) is the given one, or within what its points leave open of it."""
     rotations = np.concatenate([claim.rotation, pose.rotation])
     translations = np.concatenate([claim.translation, pose.translation])
     if sets.same_pose(rotations, translations, rule.other_deg, rule.other_shift)[1]:
@@ -156,7 +156,7 @@ def _is_same(sets: PointSets, claim: Candidates, pose: Candidates, rule: Evidenc
 
 
 def _of_claim(result: SearchResult, claim: Candidates) -> SearchResult:
-    """A verdict on several poses as one on the claimed one (1,) of them, which becomes the first."""
+    """Turn a verdict on several poses into one on the given pose (1,), which becomes the first."""
     candidates = result.candidates
     place = int(np.flatnonzero((candidates.translation == claim.translation[0]).all(-1))[0])
     ordered = candidates[np.r_[place, np.delete(np.arange(len(candidates)), place)]]
