@@ -128,13 +128,14 @@ class ProgressLines(Callback):
 
 
 class TrainingMonitor(Callback):
-    """Logs, of the first few validation problems, "val/true_match_mass", the probability that the assignment gives to
-    their true matches, "val/<estimate>_iterations" of each pose, and "val/feature_spread_2d" and "_3d"
-    (`feature_spreads`). A spread below 0.05 brings a warning: where all points of a set have the same feature the
-    assignment is uniform, and the loss stays where it is.
+    """Log values of the first few validation problems that show how a training goes.
+
+    "val/true_match_mass" is the probability of the true matches in the assignment, "val/<estimate>_iterations" are
+    those of each pose, "val/feature_spread_2d" and "val/feature_spread_3d" are `feature_spreads`. A spread below 0.05
+    brings a warning: if all points of a set have one feature, the assignment is uniform and the loss does not change.
 
     Args:
-        problems: how many validation problems are watched.
+        problems: number of validation problems.
     """
 
     def __init__(self, problems: int = 4) -> None:
@@ -160,15 +161,19 @@ class TrainingMonitor(Callback):
         pl_module.log_dict(values, batch_size=len(batch), sync_dist=True)
         if any(spread < COLLAPSED for spread in spreads.values()):
             rank_zero_warn(
-                f"expected features that differ from point to point, got spreads of {min(spreads.values()):.2g} and "
-                f"{max(spreads.values()):.2g} at step {trainer.global_step}: the features have collapsed; try a lower "
-                "model.learning_rate, a warm-up, or `centre` of the solver's features"
+                f"The features of all points are nearly the same (spreads {min(spreads.values()):.2g} and "
+                f"{max(spreads.values()):.2g} at step {trainer.global_step}): the features have collapsed. Use a lower "
+                "model.learning_rate, model.warmup_steps, or `centre` of the solver's features."
             )
 
 
 def feature_spreads(solver: nn.Module, batch: Batch) -> dict[str, Tensor]:
-    """Mean distance of the unit features of each set from their mean: 1 for vectors in all directions, 0 for one
-    vector; empty for a solver without a method `features`."""
+    """Return the mean distance of the unit features of each set from their mean.
+
+    Returns:
+        "feature_spread_2d" and "feature_spread_3d": 1 for vectors in all directions, 0 for equal vectors. Empty for a
+        solver without a method `features`.
+    """
     features = solver.features(batch) if hasattr(solver, "features") else ()  # type: ignore[operator]
     spreads = {}
     for side, z, mask in zip(("2d", "3d"), features, (batch.mask2d, batch.mask3d), strict=False):
@@ -178,7 +183,7 @@ def feature_spreads(solver: nn.Module, batch: Batch) -> dict[str, Tensor]:
 
 
 def watched_values(prediction: Prediction, batch: Batch) -> dict[str, Tensor]:
-    """Mean over the problems of the probability on true matches, and of the iterations of each pose."""
+    """Return the mean over the problems of the probability of true matches, and of the iterations of each pose."""
     values = {f"{name}_iterations": pose.stats.iterations.float().mean() for name, pose in prediction.poses.items()}
     if prediction.assignment is not None and batch.match3d is not None:
         matched = batch.match3d >= 0
@@ -188,10 +193,10 @@ def watched_values(prediction: Prediction, batch: Batch) -> dict[str, Tensor]:
 
 
 class ResultsWriter(Callback):
-    """Writes `problems.csv`, `summary.json` and points of every problem after a test.
+    """Write `problems.csv`, `summary.json` and the points of every problem after a test.
 
     Args:
-        folder: where; null for `test` in the trainer's default_root_dir.
+        folder: of the files; null for `test` in the trainer's default_root_dir.
     """
 
     rows: list[ProblemRow]
@@ -199,7 +204,7 @@ class ResultsWriter(Callback):
     points: list[ProblemPoints]
     numbers: set[int]  # of the problems so far
 
-    settings: Mapping[str, Any] | None = None  # what is recorded in place of the command line's; no table is printed
+    settings: Mapping[str, Any] | None = None  # recorded in place of those of the command; then no table is printed
 
     def __init__(self, folder: str | None = None) -> None:
         self.folder = folder
@@ -238,7 +243,7 @@ class ResultsWriter(Callback):
             rank_zero_info(f"logged: {logged or 'nothing'}; no results folder: `test_step` does not return {RETURNED}")
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Of an interrupted test the problems that are finished; of several processes those of the first."""
+        """Write the finished problems of an interrupted test; of several processes, those of the first."""
         if isinstance(exception, KeyboardInterrupt) and trainer.state.fn == "test" and self.rows:
             self._write_test(trainer, [(self.rows, self.losses, self.points)], complete=False)
 
@@ -278,7 +283,7 @@ class ResultsWriter(Callback):
 
 
 def _settings(trainer: Trainer) -> dict[str, Any]:
-    """The checkpoint; of a test from the command line also its data and solver."""
+    """Return the checkpoint and, for a test of the command line, its data and solver."""
     saved = next((each.config for each in trainer.callbacks if isinstance(each, SaveConfigCallback)), None)  # type: ignore[attr-defined]
     config = {} if saved is None else saved.as_dict()
     checkpoint = str(trainer.ckpt_path) if trainer.ckpt_path else None
@@ -286,7 +291,7 @@ def _settings(trainer: Trainer) -> dict[str, Any]:
 
 
 def _gather(value: Any) -> list[Any]:
-    """The value of every process, in the order of their ranks."""
+    """Return the value of every process, in the order of their ranks."""
     if not dist.is_initialized():
         return [value]
     values = [None] * dist.get_world_size()

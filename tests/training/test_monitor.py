@@ -69,7 +69,7 @@ def fit(folder: Path, monitor: TrainingMonitor, logger: object, epochs: int = 3)
 def test_a_planted_collapse_is_reported(tmp_path: Path) -> None:
     loader = DataLoader([planted(6)], batch_size=None)  # type: ignore[arg-type]
     trainer = quiet_trainer(tmp_path, max_epochs=1, callbacks=[TrainingMonitor()])
-    with pytest.warns(UserWarning, match="features have collapsed; try a lower model.learning_rate"):
+    with pytest.warns(UserWarning, match="features have collapsed. Use a lower model.learning_rate"):
         trainer.fit(PlantedModule(feature=0.0), loader, loader)
     assert float(trainer.callback_metrics["val/feature_spread_3d"]) < 1e-6
     assert float(trainer.callback_metrics["val/feature_spread_2d"]) > 0.1
