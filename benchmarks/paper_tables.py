@@ -229,7 +229,10 @@ def measure(
         for estimate in ("pnp", "ransac"):
             before, after = (found.get(f"paper|{label}|{estimate}") for label in BRANCHES)
             if before and after:
-                record["effects"][f"{name}|{options.seed}|{estimate}"] = effect(before, after, table.recall)
+                keys = (f"{name}|{options.seed}|paper|{label}|{estimate}" for label in BRANCHES)
+                compared = [record["rows"][key]["steps"] for key in keys]
+                found_effect = effect(before, after, table.recall) | {"steps": compared}
+                record["effects"][f"{name}|{options.seed}|{estimate}"] = found_effect
         write(options.output, record)
         curves = {
             label + ESTIMATES[estimate]: found[f"paper|{label}|{estimate}"]
@@ -281,10 +284,15 @@ def markdown(table: Table, record: Mapping[str, Any]) -> dict[str, str]:
         beside = printed[3:] if title.endswith("-paper") else printed[:3] if title.endswith("-baselines") else []
         ours = [text for _, text in sorted(rows, key=lambda row: row[0])]
         result[title] = "".join([head(table.recall), *ours, *beside])
-    named = {"pnp": "Lc Lp minus Lc", "ransac": "Lc Lp R minus Lc R"}
+    named = {"pnp": "", "ransac": " R"}
     for name in table.sets:
         keys = {estimate: f"{name}|{lowest}|{estimate}" for estimate in named}
-        texts = [effect_text(named[e], record["effects"][k]) for e, k in keys.items() if k in record["effects"]]
+        texts = []
+        for estimate, key in keys.items():
+            if (one := record["effects"].get(key)) is not None:
+                before, after = one["steps"]
+                label = f"Lc Lp{named[estimate]} ({after:,} steps) minus Lc{named[estimate]} ({before:,} steps)"
+                texts.append(effect_text(label, one))
         if texts:
             result[f"{name}-effect"] = effect_head(table.recall) + "".join(texts)
     names = ("training", "steps until the switch", "steps of Lc", "steps of Lc Lp", "learning rate")

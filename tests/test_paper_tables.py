@@ -126,7 +126,7 @@ def test_a_record_becomes_the_tables_of_the_page() -> None:
     keys = ("paper|Lc|ransac", "paper|Lc|pnp", "paper, our inference|Lc|refined", "baselines|search|search")
     record = {
         "rows": {f"modelnet10|0|{key}": one for key in keys},
-        "effects": {"modelnet10|0|pnp": effect(rows, rows, table1.TABLE.recall)},
+        "effects": {"modelnet10|0|pnp": effect(rows, rows, table1.TABLE.recall) | {"steps": [500, 400]}},
         "training": {"seed 0": {"Lc": 500, "Lc Lp": 500, "learning_rate": 1e-4, "switch": 400}},
     }
     tables = paper_tables.markdown(table1.TABLE, record)
@@ -137,7 +137,7 @@ def test_a_record_becomes_the_tables_of_the_page() -> None:
     assert "| Lc, refined |" in tables["modelnet10-paper-our-inference"]
     assert "| *paper: GOSMA* |" in tables["modelnet10-baselines"]
     assert "| seed 0 | 400 | 500 | 500 | 0.0001 |" in tables["training"]
-    assert "| Lc Lp minus Lc | 10 | +0 [+0, +0]" in tables["modelnet10-effect"]
+    assert "| Lc Lp (400 steps) minus Lc (500 steps) | 10 | +0 [+0, +0]" in tables["modelnet10-effect"]
 
 
 def test_the_picture_has_a_curve_a_row_and_the_papers_quartiles() -> None:
