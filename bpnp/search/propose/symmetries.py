@@ -77,7 +77,7 @@ class Motions(NamedTuple):
         near = np.isfinite(tree.query(moved, distance_upper_bound=tolerance)[0])
         fraction = near.mean(-1) if len(sources) else np.zeros(len(near))
         order = np.argsort(-fraction, kind="stable")
-        order = order[fraction[order] >= least]
+        order = order[fraction[order] >= max(least, FEWEST / max(len(sources), 1))]
         return Motions(self.rotation[order], self.shift[order], fraction[order], self.complete)
 
 
@@ -133,8 +133,9 @@ def self_motions(
         >>> part = np.random.default_rng(0).uniform(-1, 1, (20, 3))
         >>> third = np.array([[-0.5, -(3**0.5) / 2, 0], [3**0.5 / 2, -0.5, 0], [0, 0, 1]])
         >>> motions = self_motions(np.concatenate([part, part @ third.T, part @ third]), 0.02)
-        >>> np.degrees(np.arccos((np.trace(motions.rotation[0]) - 1) / 2)).round(), motions.fraction[:2]
-        (120.0, array([1., 1.]))
+        >>> cosines = (np.trace(motions.rotation, axis1=1, axis2=2) - 1) / 2
+        >>> np.degrees(np.arccos(cosines)).round(), motions.fraction
+        (array([120., 120.]), array([1., 1.]))
     """
     points = np.ascontiguousarray(points3d, np.float64)
     moved = np.arange(len(points)) if sources is None else np.asarray(sources, np.int64)
