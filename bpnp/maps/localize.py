@@ -41,6 +41,7 @@ VIEW_SHARE = 0.2  # the same of the shift of what they look at, in distances to 
 # A search of a fourth of the time meets four fifths as many poses: near one view after the other that is more.
 BRIEF = replace(DEFAULT, near=(DEFAULT.everywhere,)).limited(1)
 ONCE, LONGER = DEFAULT.limited(1), DEFAULT.limited(16)
+COMPETITORS = 4  # poses of an ambiguous solution that are judged with it on all points
 PROMISING = 3  # views that are tried longer if none is confident
 LIKELY = -20.0  # log10 of the false alarms below which a view is tried longer before the next one
 RANKS = {"failed": 0, "ambiguous": 1, "confident": 2}
@@ -162,8 +163,8 @@ def rank(solution: Solution) -> tuple[int, float]:
 def on_all_points(solution: Solution, photo: Photo, lens: Camera | UnknownCamera, views: int) -> Solution:
     """Refine a pose on all map points that its camera sees, and judge it on them.
 
-    An unknown lens is fitted to them too. That no better pose was missed near a pose which is not confident yet is
-    excluded by searches around it; `without_twins` searches for others.
+    An unknown lens is fitted to them too. A pose that is not confident yet is judged beside its competing poses, and
+    beside those that searches around it find; `without_twins` searches for others.
 
     Args:
         solution: Pose that was found with the points of one view.
@@ -172,8 +173,8 @@ def on_all_points(solution: Solution, photo: Photo, lens: Camera | UnknownCamera
         views: Number of views that are tried.
 
     Returns:
-        The refined solution if its NFA is smaller, else the given one, or the given one with a doubt that all points
-        raise.
+        The refined solution if its NFA is smaller, or if it is confident where the given one was not. Else the given
+        one, or the given one with a doubt that all points raise.
     """
     place, camera, rule = photo.place, solution.camera, DEFAULT.evidence
     if not solution.found:
@@ -202,6 +203,11 @@ def on_all_points(solution: Solution, photo: Photo, lens: Camera | UnknownCamera
     # A coarse optimum may have a finer one beside it.
     looks = int(ends.scale[0] > scale) if sure else looks_for_certainty(rule)
     start = Candidates.unscored(*scene.enter(rotation[None], shift[None]))
+    others = [] if sure else [one for one in solution.candidates[1:] if one.log10_false_alarms < 0][:COMPETITORS]
+    if others:
+        turns = np.stack([one.rotation for one in others])
+        shifts = np.stack([one.translation + one.rotation @ problem.origin for one in others])
+        ends = Candidates.concatenated([ends, polished(scene, turns, shifts, max(scale, problem.sets.image.scales[0]))])
     for _ in range(looks):
         beside = finish(scene, search_beside(scene, start, DEFAULT.beside), DEFAULT.finished)
         ends = Candidates.concatenated([ends, in_user_frame(beside, scene)])
@@ -211,7 +217,7 @@ def on_all_points(solution: Solution, photo: Photo, lens: Camera | UnknownCamera
     behind = result.log10_false_alarms - solution.log10_false_alarms
     if sure and not problem.sets.same_pose(rotations, shifts, rule.other_deg, rule.other_shift)[1]:
         return solution if behind >= rule.lead else _doubted(solution, fits_as_well(rotation, result.best[0], behind))
-    if behind < 0:
+    if behind < 0 or (not sure and result.verdict == "confident"):
         found = finished(problem, result, solution.seconds, None)
         stats = replace(found.stats, iterations=solution.stats.iterations)
         candidates = (*found.candidates, *solution.candidates[1:])

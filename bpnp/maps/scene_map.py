@@ -275,14 +275,14 @@ class SceneMap:
 
         def in_map(place: Place, solution: Solution, options: Options) -> Solution:
             """Judge a pose on all points of the map in view and, if it is significant, beside its twins."""
-            regions = partial(self._regions, views, solution.camera)
+            regions, own = partial(self._regions, views, solution.camera), solution
             photo = Photo(used, solution.camera, replace(whole(), view=place.view), regions, seed)
             solution = on_all_points(solution, photo, lens, tries)
             if prior is None and solution.verdict == "confident":  # a prior would tell twins apart
                 photo = Photo(used, solution.camera, photo.place, regions, seed)
                 search = partial(near, solution.camera, options)
                 photo = photo if views is None else replace(photo, place=self._region(place.view, place.points))
-                solution = without_twins(photo, solution, met, search)
+                solution = without_twins(photo, solution, [*met, own], search)
             return solution
 
         waiting, longer = deque((place, rule) for rule in (BRIEF, ONCE) for place in places), set[str]()

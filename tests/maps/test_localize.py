@@ -254,3 +254,21 @@ def test_each_view_that_is_tried_counts_once(planted: tuple[SceneMap, Planted]) 
     first, other = (problem_near(region, keypoints, PINHOLE, None, views=views).sets for views in (1, 100))
     pose = alone.rotation[None], alone.translation[None]
     assert alarms_of(other, *pose).own[0] - alarms_of(first, *pose).own[0] == pytest.approx(2)
+
+
+def test_a_competing_pose_of_one_view_competes_on_all_points(planted: tuple[SceneMap, Planted]) -> None:
+    """An ambiguous solution whose second candidate is the true pose, and whose first one is far from it."""
+    scene, truth = planted
+    keypoints, _ = photo_of(truth, 1)
+    right = scene.localize(keypoints, PINHOLE, views=["photo 1.jpg"], solver="search", time_limit=1e5)
+    turn = Rotation.from_euler("y", 10, degrees=True).as_matrix()
+    wrong = replace(right.candidates[0], rotation=turn @ right.rotation, translation=turn @ right.translation)
+    given = replace(
+        right, rotation=wrong.rotation, translation=wrong.translation, verdict="ambiguous",
+        log10_false_alarms=-5.0, candidates=(wrong, right.candidates[0]),
+    )  # fmt: skip
+    region = scene._region(scene.views[1], np.arange(len(scene.points3d)))
+    place = Photo(keypoints, PINHOLE, region, lambda _: ())
+    solution = on_all_points(replace(given, matches=given.matches[:4]), place, camera_from(PINHOLE), 1)
+    assert degrees_between(solution.rotation, right.rotation) < 0.5
+    assert solution.verdict == "confident"
