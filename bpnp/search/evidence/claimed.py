@@ -144,15 +144,17 @@ def _is_same(sets: PointSets, claim: Candidates, pose: Candidates, rule: Evidenc
     translations = np.concatenate([claim.translation, pose.translation])
     if sets.same_pose(rotations, translations, rule.other_deg, rule.other_shift)[1]:
         return True
+    turn = claim.rotation[0] @ pose.rotation[0].T
+    if pose.log10_false_alarms[0] > rule.false_alarms or np.trace(turn) <= 1:  # over 90 degrees away
+        return False
     linear = linearised(sets, pose.rotation[0], pose.translation[0], float(pose.scale[0]))
     covariance = local_covariance(linear)
-    if covariance is None or pose.log10_false_alarms[0] > rule.false_alarms:
+    if covariance is None:
         return False
-    turn = claim.rotation[0] @ pose.rotation[0].T
     vector = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
     middles = rotations @ sets.middle + translations
     step = np.r_[vector, middles[0] - middles[1]]
-    return bool(np.trace(turn) > 1 and step @ np.linalg.solve(covariance, step) < WITHIN)
+    return bool(step @ np.linalg.solve(covariance, step) < WITHIN)
 
 
 def _of_claim(result: SearchResult, claim: Candidates) -> SearchResult:
