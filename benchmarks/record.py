@@ -26,7 +26,8 @@ ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("BPNP_SHARED_DATA", ROOT.parent / "shared" / "data"))
 TIME_LIMIT = 60.0  # seconds: so many that a search ends by its own rules, also on a busy machine
 NO_POSE_DEG = 180.0
-NEAR_FOCAL = 0.03  # of a focal length that counts as right
+NEAR_FOCAL = 0.03  # of a focal length that counts as right, and of the depth, of a camera's centre
+MOST_SIGMAS = 3.0  # standard deviations that the error of a focal length may have
 FAR_DEG = 3.0  # from which a confident pose with an unknown focal length is counted, whatever its bound
 BOUND = 0.999  # share of the confident poses that are within their bound
 
@@ -92,6 +93,7 @@ class Outcome:
     outside: bool = True  # whether the true poses lie beyond the bound that the solution claims (`beyond_bound`)
     focal: float = np.nan  # the focal length that was found, of the true one; NaN where it was known
     moved: float = 0.0  # of the middle of the scene as the camera sees it, in its distances
+    focal_sigmas: float = np.nan  # error of the focal length that was found, in its standard deviations
     sigmas: Sequence[float] = ()  # errors in their own standard deviations (`sigmas`), of a pose that is near
 
 
@@ -119,7 +121,8 @@ def solved(problem: Problem) -> Outcome:
     outside = all(beyond_bound(found, one) for one in problem.poses)
     off = sigmas(found, pose, np.median(problem.points3d, 0)) if turn < FAR_DEG else []
     focal = float(found.focal_length / problem.focal)
-    return Outcome(problem.name, turn, shift, found.verdict, seconds, outside, focal, moved, off)
+    error = abs(found.focal_length - problem.focal) / max(found.focal_length_std, np.finfo(float).tiny)
+    return Outcome(problem.name, turn, shift, found.verdict, seconds, outside, focal, moved, error, off)
 
 
 def nearest(problem: Problem, rotation: Array, translation: Array) -> tuple[float, float, float, Any]:
@@ -194,6 +197,9 @@ def summary(found: Sequence[Outcome], row: Row) -> dict[str, Any]:
     if np.isfinite(focal).any():
         result["focal_near"] = round(float((np.abs(focal - 1) < NEAR_FOCAL).mean()), 4)
         result["confident_and_far"] = int((sure & (turn > FAR_DEG)).sum())
+        beyond = np.array([o.focal_sigmas > MOST_SIGMAS or o.shift > NEAR_FOCAL for o in found])
+        result["confident_and_off"] = int((sure & beyond).sum())
+        result["right_and_confident"] = round(float((right & sure & ~beyond).mean()), 4)
     return result
 
 
