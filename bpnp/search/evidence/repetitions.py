@@ -74,7 +74,7 @@ def _frozen(array: NDArray[Any] | None) -> Frozen:
 @lru_cache(maxsize=64)
 def _of_scene(points: Frozen, labels: Frozen, normals: Frozen, tolerance: float) -> Motions:
     """Return the motions of a whole scene, which all problems of it share."""
-    arrays = [None if x is None else np.frombuffer(x[0], x[1]).reshape(x[2]) for x in (points, labels, normals)]
+    arrays = [None if x is None else np.frombuffer(x[0], x[1]).reshape(x[2]).copy() for x in (points, labels, normals)]
     assert arrays[0] is not None
     return self_motions(
         arrays[0],
