@@ -117,7 +117,9 @@ class RepeatedPoses(NamedTuple):
     complete: bool
 
 
-def repeated_poses(sets: PointSets, rotation: Array, translation: Array, scale: float, rule: Evidence) -> RepeatedPoses:
+def repeated_poses(
+    sets: PointSets, rotation: Array, translation: Array, scale: float, rule: Evidence, *, least: float = 0.0
+) -> RepeatedPoses:
     """Return the poses that the scene's own motions confuse with one.
 
     Args:
@@ -125,6 +127,7 @@ def repeated_poses(sets: PointSets, rotation: Array, translation: Array, scale: 
         rotation: (3, 3), translation: (3,) of the pose.
         scale: standard deviation of its residuals, radians.
         rule: constants of the verdict.
+        least: smallest fraction of the matched points that a motion maps.
 
     Returns:
         Those poses that a verdict takes for different from the given one (`Evidence.other_deg`), at most
@@ -141,7 +144,7 @@ def repeated_poses(sets: PointSets, rotation: Array, translation: Array, scale: 
         >>> sorted(repeated.translation[best, 0].round(6).tolist())
         [-4.0, -2.0]
     """
-    motions = registered(sets, rotation, translation, scale, rule)
+    motions = registered(sets, rotation, translation, scale, rule).mapping(least)
     rotations, translations = competing_poses(sets, rotation, translation, motions, rule)
     alarms = alarms_of(sets, rotations, translations, np.full(len(rotations), scale)).own
     best = np.argsort(alarms, kind="stable")[: rule.repetitions.kept]

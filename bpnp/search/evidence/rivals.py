@@ -166,7 +166,8 @@ def _against_repetitions(
     if contested and not is_symmetric(result.candidates, sets, rule):
         return result
     best, scale = result.best, max(result.residual, sets.image.scales[0])
-    repeated = repeated_poses(sets, *best, scale, rule)
+    least = rule.repetitions.symmetric if contested else 0.0
+    repeated = repeated_poses(sets, *best, scale, rule, least=least)
     if not len(repeated.rotation):
         return result
     poses, limits = (repeated.rotation, repeated.translation), rule.repetitions
@@ -179,6 +180,8 @@ def _against_repetitions(
     others = rivals.rotation, rivals.translation
     behind = decades_behind(sets, best, poses, others, scale, limits, fraction=repeated.fraction)
     behind = np.maximum(behind, 0) if repeated.complete else np.zeros(len(rivals))
+    if contested and (behind >= rule.lead).all():
+        return result
     alarms = np.minimum(rivals.log10_false_alarms, result.log10_false_alarms + behind)
     candidates = Candidates.concatenated([result.candidates, replace(rivals, log10_false_alarms=alarms)])
     beside = judged(candidates, sets, batches=result.batches, looks=looks, exhaustive=exhaustive, rule=rule)

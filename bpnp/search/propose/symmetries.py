@@ -70,6 +70,11 @@ class Motions(NamedTuple):
         rotations = rotation @ self.rotation.transpose(0, 2, 1)
         return rotations, translation - np.einsum("kij,kj->ki", rotations, self.shift)
 
+    def mapping(self, least: float) -> "Motions":
+        """Return the motions that map at least this fraction."""
+        kept = self.fraction >= least
+        return Motions(self.rotation[kept], self.shift[kept], self.fraction[kept], self.complete)
+
     def of(self, points3d: Array, sources: Indices, tolerance: float, least: float) -> "Motions":
         """Return those motions of a scene that map at least a fraction `least` of some of its points (k,)."""
         tree = cKDTree(points3d)
@@ -224,15 +229,17 @@ def _bases(points: Array, moved: Indices, count: int) -> Indices:
     tree = cKDTree(points[moved])
     first = moved[rng.permutation(len(moved))[np.arange(count) % len(moved)]]
     around = tree.query(points[first], min(_neighbours(points) + 1, len(moved)))[1]
-    bases = []
-    for k, (a, near) in enumerate(zip(first.tolist(), np.atleast_2d(around), strict=True)):
-        # The widest of several triangles decides the motion best. Every other base is compact, for small parts.
-        last = len(near) if k % 2 else max(len(near) // COMPACT, min(len(near), 4))
-        draws = moved[near[rng.integers(1, last, (WIDEST, 2))]]
-        edges = points[draws] - points[a]
-        area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=-1)
-        bases.append([a, *draws[area.argmax()]])
-    return np.array(bases, np.int64).reshape(-1, 3)
+    around = around.reshape(count, -1)
+    # The widest of several triangles decides the motion best. Every other base is compact, for small parts.
+    size = around.shape[1]
+    last = np.where(np.arange(count) % 2, size, max(size // COMPACT, min(size, 4)))
+    drawn = 1 + (rng.random((count, WIDEST, 2)) * (last - 1)[:, None, None]).astype(np.int64)
+    draws = moved[np.take_along_axis(around[:, None], drawn.reshape(count, 1, -1), 2).reshape(drawn.shape)]
+    u, v = np.moveaxis(points[draws] - points[first][:, None, None], 2, 0)
+    # Twice the area, squared: |u|^2 |v|^2 - (u v)^2.
+    area = (u * u).sum(-1) * (v * v).sum(-1) - (u * v).sum(-1) ** 2
+    widest = draws[np.arange(count), area.argmax(1)]
+    return np.ascontiguousarray(np.column_stack([first, widest]))
 
 
 def _neighbours(points: Array) -> int:
