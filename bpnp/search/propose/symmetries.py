@@ -34,7 +34,7 @@ WIDEST = 4  # triangles of which a base is the largest
 FEWEST = 5  # moved points that lie on others: three fix a motion and are no evidence of it
 FIRST = 7  # sampled points of which at least one confirms: one of 12 motions of a third of the points fails
 CHECKED = 32  # sampled points that confirm a motion before all points do
-MOST_WORK = 30_000_000  # pairs of points that are compared for all bases together: some 0.1 s
+MOST_WORK = 30_000_000  # pairs of points that are compared for all bases together, some 0.1 s; the rest is left out
 CONFIRMING = 8  # pairs that take as long as a sampled point
 MOST_FOUND = 4096  # motions of all bases together that are ranked
 REFINED = 48  # motions, those of the largest fraction first, that are refined
@@ -52,7 +52,7 @@ class Motions(NamedTuple):
         rotation: (k, 3, 3).
         shift: (k, 3), in the unit of the scene.
         fraction: (k,) of the source points that come to lie within the tolerance of a scene point.
-        complete: False where the scene has more motions than were ranked, as a lattice has.
+        complete: False where the scene has more motions than are kept, as a lattice has.
     """
 
     rotation: Array
@@ -173,7 +173,7 @@ def self_motions(
     rotation, shift, fraction = (np.array(part) for part in zip(*motions, strict=True))
     offsets = rotation @ middle + shift
     unique = distinct(rotation, offsets / size, fraction, REFINED, SAME_DEG, max(4 * tolerance / size, 1e-6))
-    return Motions(rotation[unique], shift[unique], fraction[unique], total <= MOST_FOUND)
+    return Motions(rotation[unique], shift[unique], fraction[unique], len(unique) < REFINED)
 
 
 def extent(points: Array) -> float:
@@ -294,9 +294,9 @@ def _register(
     scene: Any, bases: Any, sample: Any, tolerance: float, least: int, most: int, found: Any, work: Any
 ) -> Any:
     """Write the motions that match a base with a congruent one and that at least `least` of the sample confirm; return
-    their number, which exceeds the room for them too where a base takes more work than `most`.
+    their number, which may exceed the room for them.
 
-    work: (4, 3, 3), overwritten."""
+    most: work of a base. work: (4, 3, 3), overwritten."""
     points, count = scene.points, 0
     frame, target, rotation, shift = work[0], work[1], work[2], work[3, 0]
     for base in range(len(bases)):
@@ -307,7 +307,6 @@ def _register(
         work_done = 0
         for i in range(len(points)):
             if work_done > most:
-                count += len(found.score)
                 break
             if not _fits(scene, a, i):
                 continue
