@@ -75,7 +75,7 @@ def test_photos_left_out_of_their_map_are_found_and_a_broken_one_is_named(
 def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, fails: Callable[..., str]) -> None:
     model, photos = place
     out = ("--output", str(tmp_path / "out"))
-    assert "expected map, photos, got none" in fails("localize")
+    assert "missing map, photos" in fails("localize")
     assert "expected photos, got none" in fails("localize", str(model), *out)
     assert "a.jpg, which does not exist" in fails("localize", str(model), "a.jpg", *out)
     Image.new("RGB", (64, 48)).save(tmp_path / "plain.jpg")
