@@ -76,7 +76,8 @@ class DescribedMap:
         pose, stats = poselib.estimate_absolute_pose(pixels[keypoints], self.points3d[points], lens, accepted, {})
         verdict = "confident" if stats["num_inliers"] >= LEAST_INLIERS else "ambiguous"
         return SimpleNamespace(
-            rotation=np.asarray(pose.R), translation=np.asarray(pose.t), verdict=verdict, focal_length=np.nan, focal_length_std=np.nan,
+            rotation=np.asarray(pose.R), translation=np.asarray(pose.t), verdict=verdict, focal_length=np.nan,
+            focal_length_std=np.nan,
             covariance=np.full((6, 6), np.nan), matches=np.column_stack([keypoints, points]),
         )  # fmt: skip
 

@@ -204,7 +204,8 @@ def judged(
         if off >= HALF_TURN or not (rig or is_redundant(sets, count)):
             reason = reasons.against(f"its {count:.0f} matches do not fix the rotation", alarms)
             return SearchResult(candidates, "ambiguous", reason, batches, settled)
-        if sets.focal is not None and (share := focal_bound(sets, linear, count)) > rule.focal:
+        most = rule.focal if count >= rule.zoomed.fewest else rule.focal_few
+        if sets.focal is not None and (share := focal_bound(sets, linear, count)) > most:
             off_by = f"{100 * share:.0f} % off" if share < 10 else "anything"
             what = f"the points do not fix the focal length: it and the distance may be {off_by}"
             reason = reasons.against(what, alarms)

@@ -46,8 +46,9 @@ class FocalSettings:
     sigmas: of the error of a rough focal length within which it is looked for.
     turns: of the first search with each. alternations: searches and refinements, in turns, from each. rounds: of a
     refinement, until the logarithm moves by less than `same`.
-    bend_sigma: standard deviation of what an unknown radial distortion moves the outermost image point by, a share of
-    its distance from the principal point; most_bend: the largest. fewest_bent: matches from which it is fitted.
+    bend_sigma: standard deviation of what an unknown radial distortion moves a point at the corner of the image by, a
+    fraction of its distance from the principal point; most_bend: the largest. fewest_bent: matches from which it is
+    fitted.
     centre_sigma: standard deviation of the principal point, a share of the same distance: about a quarter of a per
     cent of the larger side of the image.
     """
@@ -84,7 +85,8 @@ class UnknownCamera(NamedTuple):
         distorted: Whether a radial coefficient is fitted even where it is not significantly better.
         radial: Radial coefficient to start with; None to start without distortion.
         alone: Whether to start with no other focal length than the usual one.
-        reach: Distance of the outermost image point from the principal point, in focal lengths of the reference.
+        reach: Distance of the corner of the image, or of the outermost image point where the size of the image is not
+            known, from the principal point, in focal lengths of the reference.
     """
 
     reference: Camera
@@ -96,7 +98,7 @@ class UnknownCamera(NamedTuple):
     distorted: bool = False
     radial: float | None = None
     alone: bool = False
-    reach: float = 1.0
+    reach: float = 0.0
 
     def at(self, zoom: float, radial: float | None = None) -> Camera:
         """Return the camera with `zoom` times the focal length of the reference and a radial coefficient."""
@@ -111,7 +113,7 @@ class UnknownCamera(NamedTuple):
         return zoom, float(camera.camera.params[RADIAL_PLACES[camera.camera.model.name]])
 
     def outermost(self, zoom: float) -> float:
-        """Return the distance of the outermost image point from the principal point, in focal lengths."""
+        """Return the reach in focal lengths of the camera with `zoom` times that of the reference."""
         return max(self.reach / zoom, LEAST_REACH)
 
     def focal(self, camera: Camera) -> UnknownFocal:
@@ -141,7 +143,8 @@ class UnknownCamera(NamedTuple):
 
     def seen_by(self, problem: Problem) -> "UnknownCamera":
         """Return the same with the reach of the image points of a problem, whose camera is the reference."""
-        return self._replace(reach=float(np.linalg.norm(problem.points2d[problem.usable], axis=-1).max()))
+        outermost = float(np.linalg.norm(problem.points2d[problem.usable], axis=-1).max())
+        return self._replace(reach=max(self.reach, outermost))
 
 
 def unknown_camera(
@@ -170,7 +173,15 @@ def unknown_camera(
             raise ValueError("expected `focal_error` beside a `camera`, got it beside `image_size`; try without")
         width, height = checked_size(image_size)
         reference = camera_from(("SIMPLE_PINHOLE", width, height, (max(width, height), width / 2, height / 2)))
-        return UnknownCamera(reference, RULE.smallest, RULE.largest, RULE.usual, bends=True, distorted=bool(distortion))
+        return UnknownCamera(
+            reference,
+            RULE.smallest,
+            RULE.largest,
+            RULE.usual,
+            bends=True,
+            distorted=bool(distortion),
+            reach=math.hypot(width, height) / 2 / max(width, height),
+        )
     if camera is None:
         raise ValueError("expected a `camera` whose focal length has the `focal_error`, got none; try image_size")
     if focal_error is None or not 0 < focal_error < 1:

@@ -76,7 +76,7 @@ def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, 
     model, photos = place
     out = ("--output", str(tmp_path / "out"))
     assert "missing map, photos" in fails("localize")
-    assert "expected photos, got none" in fails("localize", str(model), *out)
+    assert "missing photos" in fails("localize", str(model), *out)
     assert "a.jpg, which does not exist" in fails("localize", str(model), "a.jpg", *out)
     Image.new("RGB", (64, 48)).save(tmp_path / "plain.jpg")
     plain = ("localize", str(model), str(tmp_path / "plain.jpg"))

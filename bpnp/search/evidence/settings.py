@@ -107,8 +107,10 @@ class Evidence:
     focal_chance: with which another focal length may be significantly better by chance; with 0.001 a camera that is a
         tenth wrong is believed half as often again.
     contested, repetitions, zoomed: constants of these alternatives.
-    focal: share by which a focal length that is fitted may be off, once in a thousand; with it the distance is off, and
-        by `other_shift` the pose is a different one. scale: the same of the scale of a rig's scene.
+    focal: fraction by which a focal length that is fitted may be off, once in a thousand; with it the distance is off,
+        and by `other_shift` the pose is a different one. focal_few: the same with fewer matches than
+        `OtherFocal.fewest`, as LEDs have: their rotation is right long before their distance, whose standard deviation
+        says how far it may be off. scale: the same of the scale of a rig's scene.
     """
 
     false_alarms: float = -2.0
@@ -126,4 +128,5 @@ class Evidence:
     repetitions: Repetitions = Repetitions()
     zoomed: OtherFocal = OtherFocal()
     focal: float = 0.05
+    focal_few: float = 0.25
     scale: float = 0.2
