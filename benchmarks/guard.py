@@ -25,7 +25,7 @@ import leds
 import numpy as np
 import shapes
 import symmetric
-from record import Problem, machine, nearest, parser, solved
+from record import Problem, command, machine, nearest, parser, solved
 from scipy.spatial.transform import Rotation
 from view_problems import photos
 
@@ -175,7 +175,7 @@ def main() -> None:
     options.add_argument("--time-limit", type=float, default=10.0, help="seconds a problem (default: %(default)s)")
     args = options.parse_args()
     bpnp.warm_up()
-    record: dict[str, Any] = {"machine": machine(), "command": sys.argv, "kinds": {}}
+    record: dict[str, Any] = {"machine": machine(), "command": command(sys.argv), "kinds": {}}
     before = json.loads(args.against.read_text())["kinds"] if args.against else {}
     held = True
     for kind, draw in KINDS.items():

@@ -235,10 +235,19 @@ def write(path: Path, record: dict[str, Any]) -> None:
     commit = subprocess.run(
         ["git", "-C", ROOT, "describe", "--always", "--dirty"], capture_output=True, text=True, check=False
     )
-    head = {"commit": commit.stdout.strip() or "unknown", "command": " ".join(sys.argv), "machine": machine()}
+    head = {"commit": commit.stdout.strip() or "unknown", "command": command(sys.argv), "machine": machine()}
     path.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(path) as temporary:
         temporary.write_text(json.dumps(head | record, indent=1) + "\n")
+
+
+def command(words: Sequence[str]) -> str:
+    """Return a command line in which paths from the root are their last part, since they say nothing elsewhere.
+
+    >>> command(["python -m benchmarks table1", "--run", "/tmp/runs/table1", "--steps", "3"])
+    'python -m benchmarks table1 --run table1 --steps 3'
+    """
+    return " ".join(Path(word).name if word.startswith("/") else word for word in words)
 
 
 def machine() -> dict[str, Any]:
