@@ -17,11 +17,11 @@ from bpnp.search.enumeration.search import exceeds_enumeration, is_enumerable, s
 from bpnp.search.evidence.rivals import against_rivals
 from bpnp.search.infinity.kernels import Image
 from bpnp.search.infinity.search import search_rotation
-from bpnp.search.kernels.neighbours import hashed
 from bpnp.search.kernels.sides import FORWARD
 from bpnp.search.point_sets import PointSets
 from bpnp.search.pool import Pool
 from bpnp.search.propose.known_matches import known_matches, poses_of_matches
+from bpnp.search.propose.symmetries import self_motions
 from bpnp.search.raster_search import around_each, looked_up
 from bpnp.search.scene import Scene, degenerate
 from bpnp.search.schedule import Proposals, only_proposed, turns
@@ -239,7 +239,7 @@ def warm_up() -> None:
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     sets = PointSets(rays, points)
     search_by_enumeration(sets, NEVER, DEFAULT)
-    hashed(points, 0.1).count_on(points, points, 1)
+    self_motions(points, 0.1)
     search_rotation(Image(rays, np.full(WARMING, 1e-3)), rays)
     scene = Scene(sets, 0, DEFAULT)
     start = Candidates.unscored(*scene.enter(np.eye(3)[None], np.array([[0, 0, 6.0]])))

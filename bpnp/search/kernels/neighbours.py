@@ -1,5 +1,5 @@
 """Points that are near others: sums over the directions near each image point, at several scales in one pass, and
-scene points in a hash table, which tells how many of other points many shifts take onto one."""
+scene points in a hash table, which tells whether a place is near one of them."""
 
 import math
 from typing import Any, NamedTuple
@@ -76,13 +76,6 @@ class HashedPoints(NamedTuple):
     heads: NDArray[np.int64]
     links: NDArray[np.int64]
 
-    def count_on(self, moved: Array, shifts: Array, least: int) -> NDArray[np.int64]:
-        """(s,) how many of `moved` (k, 3) each shift (s, 3) takes to within the tolerance of a point; of a shift with
-        fewer than `least` any number below it."""
-        counts = np.empty(len(shifts), np.int64)
-        _count_on(self, moved, shifts, least, counts)
-        return counts
-
 
 def hashed(points: Array, tolerance: float) -> HashedPoints:
     slots = 8 * len(points)
@@ -121,14 +114,3 @@ def lies_on(table: Any, x: Any, y: Any, z: Any) -> Any:
             return True
         e = links[e]
     return False
-
-
-@compiled
-def _count_on(table: Any, moved: Any, shifts: Any, least: int, counts: Any) -> None:
-    for s in range(len(shifts)):
-        counts[s] = 0
-        for k in range(len(moved)):
-            if counts[s] + len(moved) - k < least:
-                break
-            x, y, z = moved[k, 0] + shifts[s, 0], moved[k, 1] + shifts[s, 1], moved[k, 2] + shifts[s, 2]
-            counts[s] += lies_on(table, x, y, z)
