@@ -10,10 +10,7 @@ from small_data import is_written
 from bpnp.report.charts import recall_chart
 from bpnp.report.dashboards import log_results, scalars
 
-
-@pytest.fixture(autouse=True)
-def _offline(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("WANDB_MODE", raising=False)
+pytestmark = pytest.mark.usefixtures("wandb_session")
 
 
 def test_scalars_are_those_of_the_summary(tmp_path: Path) -> None:
