@@ -19,7 +19,7 @@ from lightning import LightningDataModule
 from record import DATA, ROOT, write
 from torch import nn
 
-from bpnp.files import fingerprint, written_whole
+from bpnp.files import fingerprint, write_atomically
 from bpnp.layers import RansacPnP, WeightedPnP
 from bpnp.models import BPnPNet, TrainedNet
 from bpnp.models.evaluation import round_widths
@@ -476,7 +476,7 @@ def fill_pages(pages: Iterable[Path], marker: str, tables: Mapping[str, str], *,
         if (new := filled(text, marker, tables)) != text:
             stale.append(page.name)
             if not check:
-                with written_whole(page) as temporary:
+                with write_atomically(page) as temporary:
                     temporary.write_text(new, encoding="utf-8")
     if check and stale:
         sys.exit(f"tables of {', '.join(stale)} are not those of the record; run without --check")

@@ -15,7 +15,7 @@ import torch
 from paper_tables import Training
 from record import ROOT
 
-from bpnp.files import written_whole
+from bpnp.files import write_atomically
 from bpnp.models.weights import PREFIX, WEIGHTS, read_checkpoint
 
 PACKED = ("solver", "epoch", "global_step", "pytorch-lightning_version")  # the last three for `bpnp test --ckpt_path`
@@ -34,7 +34,7 @@ def pack(checkpoint: Path, out: Path) -> None:
             state[key] = value.half() if value.is_floating_point() else value
             if not state[key].isfinite().all():
                 raise ValueError(f"{key} of {checkpoint} has weights beyond the range of float16")
-    with written_whole(out) as temporary, temporary.open("wb") as file:  # a path would become part of the file
+    with write_atomically(out) as temporary, temporary.open("wb") as file:  # a path would become part of the file
         torch.save({key: content[key] for key in PACKED if key in content} | {"state_dict": state}, file)
 
 

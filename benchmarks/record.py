@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import fdtri, stdtrit
 
 from bpnp import Solution, warm_up
-from bpnp.files import written_whole
+from bpnp.files import write_atomically
 from bpnp.search.evidence.uncertainty import ONE_SIGMA
 
 ROOT = Path(__file__).parents[1]
@@ -237,7 +237,7 @@ def write(path: Path, record: dict[str, Any]) -> None:
     )
     head = {"commit": commit.stdout.strip() or "unknown", "command": command(sys.argv), "machine": machine()}
     path.parent.mkdir(parents=True, exist_ok=True)
-    with written_whole(path) as temporary:
+    with write_atomically(path) as temporary:
         temporary.write_text(json.dumps(head | record, indent=1) + "\n")
 
 

@@ -174,12 +174,12 @@ def image_size(camera: Camera) -> tuple[int, int] | None:
     return size if all(size) else None
 
 
-def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+def same_aspect_ratio(size: tuple[int, int], other: tuple[int, int]) -> bool:
     """Whether images of two sizes are one scaled, to a pixel of rounding on a side."""
     return abs(size[0] * other[1] - size[1] * other[0]) <= max(*size, *other)
 
 
-def far_outside(pixels: Array, sides: Any) -> npt.NDArray[np.bool_]:
+def outside_image(pixels: Array, sides: Any) -> npt.NDArray[np.bool_]:
     """Return which pixels tell that an image has another size.
 
     Detectors put some keypoints slightly outside: by a hundredth of the larger side, or a pixel, all may be, and by
@@ -192,7 +192,7 @@ def far_outside(pixels: Array, sides: Any) -> npt.NDArray[np.bool_]:
     Returns:
         (m,) those that lie farther outside; none of them where they are few.
 
-    >>> far_outside(np.array([[101.8, 20.0], [50, 50], [10, 20]]), (100, 100)).tolist()
+    >>> outside_image(np.array([[101.8, 20.0], [50, 50], [10, 20]]), (100, 100)).tolist()
     [True, False, False]
     """
     sides = np.asarray(sides, np.float64)
@@ -201,32 +201,32 @@ def far_outside(pixels: Array, sides: Any) -> npt.NDArray[np.bool_]:
     return np.asarray(outside & (outside.mean() > FEW_OUTSIDE))
 
 
-def scaled_camera(camera: Camera, size: tuple[int, int]) -> Camera:
+def resize_camera(camera: Camera, size: tuple[int, int]) -> Camera:
     """The camera of images that were scaled to `size`, width and height in pixels; itself where they have that size.
 
-    >>> scaled_camera(camera_from(("PINHOLE", 1000, 800, [900, 880, 500, 400])), (500, 400)).matrix.tolist()
+    >>> resize_camera(camera_from(("PINHOLE", 1000, 800, [900, 880, 500, 400])), (500, 400)).matrix.tolist()
     [[450.0, 0.0, 250.0], [0.0, 440.0, 200.0], [0.0, 0.0, 1.0]]
     """
     known = image_size(camera)
-    if known is None or not same_shape(known, size):
+    if known is None or not same_aspect_ratio(known, size):
         raise ValueError(f"expected a camera with images of the shape {size[0]} x {size[1]}, got {known}")
     if known == size:
         return camera
-    scaled = camera_from(plain_camera(camera))
+    scaled = camera_from(camera_to_json(camera))
     assert isinstance(scaled, Lens)
     scaled.camera.rescale(*size)
     return scaled
 
 
-def zoomed_camera(camera: Camera, zoom: float) -> Camera:
+def scale_focal_length(camera: Camera, zoom: float) -> Camera:
     """The camera with so many times the focal length.
 
-    >>> zoomed_camera(camera_from(("SIMPLE_RADIAL", 1000, 800, [900, 500, 400, 0.1])), 2.0).focal
+    >>> scale_focal_length(camera_from(("SIMPLE_RADIAL", 1000, 800, [900, 500, 400, 0.1])), 2.0).focal
     1800.0
     """
     if isinstance(camera, Pinhole):
         return Pinhole(camera.matrix * [[zoom, zoom, 1.0], [zoom, zoom, 1.0], [1.0, 1.0, 1.0]])
-    zoomed = camera_from(plain_camera(camera))
+    zoomed = camera_from(camera_to_json(camera))
     assert isinstance(zoomed, Lens)
     params = zoomed.camera.params
     params[list(zoomed.camera.focal_length_idxs())] *= zoom
@@ -235,16 +235,16 @@ def zoomed_camera(camera: Camera, zoom: float) -> Camera:
 
 
 def is_pinhole(camera: Camera) -> bool:
-    """Whether a camera is a pinhole camera without skew, to which `bent_camera` can add distortion."""
+    """Whether a camera is a pinhole camera without skew, to which `with_radial_distortion` can add distortion."""
     if isinstance(camera, Pinhole):
         return bool(camera.matrix[0, 1] == camera.matrix[1, 0] == 0)
     return camera.camera.model.name in ("SIMPLE_PINHOLE", "PINHOLE")
 
 
-def bent_camera(camera: Camera, radial: float) -> Lens:
+def with_radial_distortion(camera: Camera, radial: float) -> Lens:
     """Return a pinhole camera with a radial coefficient: SIMPLE_RADIAL, or OPENCV with two focal lengths.
 
-    >>> bent_camera(camera_from(("SIMPLE_PINHOLE", 1000, 800, [900, 500, 400])), 0.1).camera.params.tolist()
+    >>> with_radial_distortion(camera_from(("SIMPLE_PINHOLE", 1000, 800, [900, 500, 400])), 0.1).camera.params.tolist()
     [900.0, 500.0, 400.0, 0.1]
     """
     (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
@@ -254,7 +254,7 @@ def bent_camera(camera: Camera, radial: float) -> Lens:
     return colmap_camera("OPENCV", [fx, fy, cx, cy, radial, 0.0, 0.0, 0.0], size)
 
 
-def plain_camera(camera: Camera) -> list[list[float]] | dict[str, Any]:
+def camera_to_json(camera: Camera) -> list[list[float]] | dict[str, Any]:
     """A camera as JSON can hold it, which `camera_from` reads again."""
     if isinstance(camera, Pinhole):
         return camera.matrix.tolist()

@@ -15,7 +15,7 @@ Arrays = Any  # one array, or a sequence of arrays of different sizes; numpy or 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 
-def checked_shapes(function: _F) -> _F:
+def check_shapes(function: _F) -> _F:
     """Raise ValueError if a tensor argument has not the shape or the kind of numbers that its annotation names, and
     within a transform of `torch.func`.
 
@@ -25,7 +25,7 @@ def checked_shapes(function: _F) -> _F:
 
     >>> import torch
     >>> from jaxtyping import Float
-    >>> @checked_shapes
+    >>> @check_shapes
     ... def mean(points2d: Float[Tensor, "b m 2"]) -> Float[Tensor, "b 2"]:
     ...     return points2d.mean(1)
     >>> mean(torch.zeros(5, 2))
@@ -123,7 +123,7 @@ def _check(name: str, value: Any, kind: Any, sizes: dict[str, tuple[int, str]]) 
         raise ValueError(f"expected `{name}` of type {numbers}, got {value.dtype}; try .{numbers}()")
 
 
-def listed(name: str, values: Arrays, ndim: int) -> list[Tensor]:
+def as_tensor_list(name: str, values: Arrays, ndim: int) -> list[Tensor]:
     """One array of `ndim` axes, a stack of them, or a sequence of them, as a list of CPU tensors."""
     if isinstance(values, (list, tuple)) and values and np.ndim(values[0]) == ndim:
         return [as_tensor(name, v) for v in values]
@@ -143,7 +143,7 @@ def as_tensor(name: str, values: Arrays) -> Tensor:
         raise ValueError(f"expected `{name}` as an array of numbers or a list of them, got {values!r:.80}") from error
 
 
-def checked_points(name: str, i: int | str, points: Tensor, dim: int) -> Tensor:
+def check_points(name: str, i: int | str, points: Tensor, dim: int) -> Tensor:
     """The points of problem i, (k, dim). Raises ValueError for another shape, none of them, NaN or infinity."""
     if points.ndim != 2 or points.shape[1] != dim:
         hint = " (are points2d and points3d swapped?)" if points.ndim == 2 and points.shape[1] in (2, 3) else ""
@@ -171,7 +171,7 @@ def check_normalised(points2d: Any, remedy: str) -> None:
         )
 
 
-def checked_match(i: int | str, match: Tensor, m: int, n: int) -> Tensor:
+def check_match3d(i: int | str, match: Tensor, m: int, n: int) -> Tensor:
     """The match3d of problem i, (n,). Raises ValueError for another shape, no integers, or what is no 2D point."""
     if match.shape != (n,):
         raise ValueError(f"expected `match3d` of shape ({n},), one a 3D point, got {tuple(match.shape)} in problem {i}")
@@ -185,7 +185,7 @@ def checked_match(i: int | str, match: Tensor, m: int, n: int) -> Tensor:
     return match.long()
 
 
-def stacked(name: str, values: list[Tensor], shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+def stack_values(name: str, values: list[Tensor], shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
     """One tensor of the values of all problems. Raises ValueError for another shape, NaN or infinity."""
     for i, value in enumerate(values):
         if value.shape != shape:

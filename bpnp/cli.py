@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 
 from bpnp.commands import COMMANDS
-from bpnp.commands.parser import LIGHTNING, first_line, parsed_arguments, plain, short_help
+from bpnp.commands.parser import LIGHTNING, first_line, parse_arguments, plain, short_help
 from bpnp.files import config_names, packaged_config
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h: bytes from which memory is given back to the system
@@ -98,7 +98,7 @@ def _run(arguments: list[str]) -> None:
                 return
             word, *rest = rest
             name, command = f"{name} {word}", command[_known(word, list(command), f"one of bpnp {name}")]
-        command(**parsed_arguments(name, command, rest))
+        command(**parse_arguments(name, command, rest))
 
 
 def keep_freed_memory() -> None:

@@ -18,7 +18,7 @@ CONFIGS = Path(__file__).parent / "configs"  # in a checkout a link to the folde
 
 
 @contextmanager
-def written_whole(path: Path) -> Iterator[Path]:
+def write_atomically(path: Path) -> Iterator[Path]:
     """A temporary name beside `path` for a file or a folder; renamed to `path` on success, deleted on error.
 
     Makes the folders above it. An error of the disk names `path`.
@@ -41,13 +41,13 @@ def written_whole(path: Path) -> Iterator[Path]:
 
 def write_text(path: Path, text: str) -> Path:
     """Write a text whole or not at all, with line ends as they are."""
-    with written_whole(path) as temporary:
+    with write_atomically(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="")
     return path
 
 
 @contextmanager
-def claimed(folder: Path, *, wait: bool = False) -> Iterator[None]:
+def lock_folder(folder: Path, *, wait: bool = False) -> Iterator[None]:
     """Hold a folder for this process; it is made if it is not there.
 
     Raises ValueError if it is a file, or if another process holds it, unless told to wait. The lock ends with the
@@ -73,7 +73,7 @@ def claimed(folder: Path, *, wait: bool = False) -> Iterator[None]:
 
 
 @contextmanager
-def interruptions_later() -> Iterator[None]:
+def delay_interrupts() -> Iterator[None]:
     """Hold Ctrl-C back until the block ends; a thread other than the main one never gets it."""
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -93,7 +93,7 @@ def fingerprint(content: Any) -> str:
     return hashlib.blake2b(json.dumps(content, sort_keys=True).encode(), digest_size=16).hexdigest()
 
 
-def files_as_they_are(files: Iterable[Path]) -> list[tuple[str, int, int]]:
+def file_states(files: Iterable[Path]) -> list[tuple[str, int, int]]:
     """Names, sizes and times of files, for a `fingerprint` that changes when one of them does."""
     return [(file.name, (stat := file.stat()).st_size, stat.st_mtime_ns) for file in files]
 

@@ -14,13 +14,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from bpnp.checks import Arrays, check_normalised, checked_match, checked_points, listed, stacked
+from bpnp.checks import Arrays, as_tensor_list, check_match3d, check_normalised, check_points, stack_values
 from bpnp.geometry import is_finite
 
 _T = TypeVar("_T")
 
 
-def unpadded(mask: Bool[Tensor, "b k"]) -> bool:
+def has_no_padding(mask: Bool[Tensor, "b k"]) -> bool:
     """Whether every point is known to be real, so that masks need not be applied.
 
     False for a mask on a GPU, whose values the host would have to wait for, and in a graph that is to serve any mask.
@@ -39,7 +39,7 @@ class Tensors:
             # A dtype is for numbers: half precision has no index 257.
             return moved if x.is_floating_point() or moved.dtype == x.dtype else x.to(moved.device)
 
-        return mapped(self, move)
+        return map_tensors(self, move)
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class Batch(Tensors):
         return self.mask3d.sum(-1)
 
     def pin_memory(self) -> "Batch":
-        return mapped(self, lambda x: x.pin_memory())
+        return map_tensors(self, lambda x: x.pin_memory())
 
     @classmethod
     def from_arrays(
@@ -165,17 +165,17 @@ class Batch(Tensors):
         >>> tuple(batch.points2d.shape), batch.count2d.tolist(), batch.count3d.tolist()
         ((2, 7, 2), [5, 7], [9, 6])
         """
-        sets2d, sets3d = listed("points2d", points2d, 2), listed("points3d", points3d, 2)
+        sets2d, sets3d = as_tensor_list("points2d", points2d, 2), as_tensor_list("points3d", points3d, 2)
         size = len(sets2d)
         dtype = torch.float64 if any(x.dtype == torch.float64 for x in sets2d) else torch.float32
-        sets2d = [checked_points("points2d", i, x, 2).to(dtype) for i, x in enumerate(sets2d)]
+        sets2d = [check_points("points2d", i, x, 2).to(dtype) for i, x in enumerate(sets2d)]
         for points in sets2d:
             check_normalised(points.detach(), "(points2d - principal point) / focal length")
-        sets3d = [checked_points("points3d", i, x, 3).to(dtype) for i, x in enumerate(sets3d)]
-        rotations = None if rotation is None else listed("rotation", rotation, 2)
-        translations = None if translation is None else listed("translation", translation, 1)
-        matches = None if match3d is None else listed("match3d", match3d, 1)
-        focals = [torch.ones(())] if focal is None else listed("focal", focal, 0)
+        sets3d = [check_points("points3d", i, x, 3).to(dtype) for i, x in enumerate(sets3d)]
+        rotations = None if rotation is None else as_tensor_list("rotation", rotation, 2)
+        translations = None if translation is None else as_tensor_list("translation", translation, 1)
+        matches = None if match3d is None else as_tensor_list("match3d", match3d, 1)
+        focals = [torch.ones(())] if focal is None else as_tensor_list("focal", focal, 0)
         focals = focals * size if len(focals) == 1 else focals
         for name, values in (
             ("points3d", sets3d),
@@ -190,28 +190,28 @@ class Batch(Tensors):
                 raise ValueError(f"expected `{name}` for {size} problems as in `points2d`, got {len(values)}")
         m, n = max(map(len, sets2d)), max(map(len, sets3d))
         if matches is not None:
-            matches = [checked_match(i, x, len(sets2d[i]), len(sets3d[i])) for i, x in enumerate(matches)]
+            matches = [check_match3d(i, x, len(sets2d[i]), len(sets3d[i])) for i, x in enumerate(matches)]
         return cls(
             points2d=pad_sequence(sets2d, batch_first=True),
             points3d=pad_sequence(sets3d, batch_first=True),
             mask2d=torch.stack([torch.arange(m) < len(x) for x in sets2d]),
             mask3d=torch.stack([torch.arange(n) < len(x) for x in sets3d]),
-            focal=stacked("focal", focals, (), dtype),
+            focal=stack_values("focal", focals, (), dtype),
             index=torch.arange(size) if index is None else torch.as_tensor(index, dtype=torch.long),
             ids=tuple(map(str, range(size))) if ids is None else tuple(ids),
-            rotation=None if rotations is None else stacked("rotation", rotations, (3, 3), dtype),
-            translation=None if translations is None else stacked("translation", translations, (3,), dtype),
+            rotation=None if rotations is None else stack_values("rotation", rotations, (3, 3), dtype),
+            translation=None if translations is None else stack_values("translation", translations, (3,), dtype),
             match3d=None if matches is None else pad_sequence(matches, batch_first=True, padding_value=-1),
         )
 
 
-def mapped(value: _T, function: Callable[[Tensor], Tensor]) -> _T:
+def map_tensors(value: _T, function: Callable[[Tensor], Tensor]) -> _T:
     """The value with a function applied to every tensor in dataclasses and dicts of them; the rest stays."""
     if isinstance(value, Tensor):
         return cast(_T, function(value))
     if isinstance(value, dict):
-        return cast(_T, {k: mapped(v, function) for k, v in value.items()})
+        return cast(_T, {k: map_tensors(v, function) for k, v in value.items()})
     if is_dataclass(value) and not isinstance(value, type):
-        changed = {f.name: mapped(getattr(value, f.name), function) for f in fields(value)}
+        changed = {f.name: map_tensors(getattr(value, f.name), function) for f in fields(value)}
         return cast(_T, type(value)(**changed))
     return value

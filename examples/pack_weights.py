@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 
-from bpnp.files import written_whole
+from bpnp.files import write_atomically
 from bpnp.models.weights import PREFIX, read_checkpoint
 
 PACKED = ("solver", "epoch", "global_step", "pytorch-lightning_version")  # the last three for `bpnp test --ckpt_path`
@@ -23,7 +23,7 @@ def pack(checkpoint: str | Path, out: str | Path) -> None:
         state[key] = value.half() if value.is_floating_point() else value
         if not state[key].isfinite().all():
             raise ValueError(f"expected weights within float16's range, got others in {key} of {checkpoint}")
-    with written_whole(Path(out)) as temporary, temporary.open("wb") as file:  # a path would be part of the file
+    with write_atomically(Path(out)) as temporary, temporary.open("wb") as file:  # a path would be part of the file
         torch.save({key: content[key] for key in PACKED if key in content} | {"state_dict": state}, file)
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import bpnp
-from bpnp.cameras import camera_from, scaled_camera
+from bpnp.cameras import camera_from, resize_camera
 
 K = np.array([[520.0, 1.5, 405.0], [0.0, 500.0, 290.0], [0.0, 0.0, 1.0]])
 OPENCV = ("OPENCV", [520.0, 500.0, 405.0, 290.0, -0.28, 0.09, 0.004, -0.006])
@@ -101,14 +101,14 @@ def test_a_broken_camera_is_refused(given: object, message: str) -> None:
 
 def test_a_scaled_camera_sees_the_same_rays_at_scaled_pixels() -> None:
     camera = camera_from(("OPENCV", 800, 600, OPENCV[1]))
-    smaller = scaled_camera(camera, (400, 300))
+    smaller = resize_camera(camera, (400, 300))
     np.testing.assert_allclose(smaller.project(RAYS), camera.project(RAYS) / 2, atol=1e-9)
-    assert scaled_camera(camera, (800, 600)) is camera
+    assert resize_camera(camera, (800, 600)) is camera
     for size in ((400, 225), (300, 400)):
         with pytest.raises(ValueError, match=f"of the shape {size[0]} x {size[1]}, got"):
-            scaled_camera(camera, size)
+            resize_camera(camera, size)
     with pytest.raises(ValueError, match="got None"):
-        scaled_camera(camera_from(K), (800, 600))
+        resize_camera(camera_from(K), (800, 600))
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.text import Text
 
-from bpnp.files import claimed
+from bpnp.files import lock_folder
 from bpnp.report.terminal import console, progress, say
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def localize(
     files, scene = photo_files(photos, besides=output), SceneMap.from_colmap(map)
     attempts, lens = _attempts(cluster), None if camera is None else _camera(camera, map, scene)
     tried = None if views is None else read_views(views)
-    with claimed(output), progress() as shown:
+    with lock_folder(output), progress() as shown:
         folder, bar = SolutionFolder(output, content_of_map(map)), shown.add_task("localizing", total=len(files))
         outcome = localize_photos(
             scene,

@@ -62,7 +62,7 @@ def plain(message: str) -> str:
     return " ".join(dict.fromkeys(line.removeprefix("- ") for line in lines if line and not line.startswith(NOISE)))
 
 
-def parsed_arguments(name: str, command: Callable[..., None], arguments: Sequence[str]) -> dict[str, Any]:
+def parse_arguments(name: str, command: Callable[..., None], arguments: Sequence[str]) -> dict[str, Any]:
     """The arguments of a command by name. Raises ValueError for arguments that it does not take.
 
     A hyphen in the name of an option is read as an underscore.

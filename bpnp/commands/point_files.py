@@ -25,7 +25,7 @@ def read_points2d(path: Path) -> tuple[Array, Labels | None]:
     _check_suffix(path, ARRAYS)
     values, names = _columns(path)
     if names:
-        points, _, labels = _annotated(path, values, names, ("x", "y", "z") if "z" in names else ("x", "y"))
+        points, _, labels = _read_annotation(path, values, names, ("x", "y", "z") if "z" in names else ("x", "y"))
         return points, labels
     if values.shape[1] < 2:
         raise ValueError(f"expected points with 2 or 3 columns in {path}, got shape {values.shape}")
@@ -56,7 +56,7 @@ def read_points3d(
     _check_suffix(path, ARRAYS)
     if surface is not None:
         raise ValueError(f"expected a mesh to draw {surface} points from, got {path}; try without --surface")
-    return _annotated(path, *_columns(path), ("x", "y", "z"))
+    return _read_annotation(path, *_columns(path), ("x", "y", "z"))
 
 
 def read_camera(text: str, image: str | None = None) -> Any:
@@ -125,7 +125,7 @@ def _check_suffix(path: Path, known: tuple[str, ...]) -> None:
         raise ValueError(f"expected a file that ends in {', '.join(known)}, got {path}")
 
 
-def _annotated(
+def _read_annotation(
     path: Path, values: Array, names: list[str], coordinates: tuple[str, ...]
 ) -> tuple[Array, Array | None, Labels | None]:
     hint = " (are the two files swapped?)" if values.shape[1] == 2 else ""
@@ -179,7 +179,7 @@ def _columns(path: Path) -> tuple[Array, list[str]]:
     if not rows:
         raise ValueError(f"expected lines of numbers in {path}, got none")
     try:
-        values = np.loadtxt(rows, np.float64, delimiter=_mark(rows[0]), ndmin=2)
+        values = np.loadtxt(rows, np.float64, delimiter=_separator(rows[0]), ndmin=2)
     except ValueError as error:
         count = len(_words(rows[0]))
         wrong = (row for row in rows if len(_words(row)) != count or None in map(_number, _words(row)))
@@ -187,13 +187,13 @@ def _columns(path: Path) -> tuple[Array, list[str]]:
     return values, names if len(names) == values.shape[1] else []
 
 
-def _mark(line: str) -> str | None:
+def _separator(line: str) -> str | None:
     """What separates the words of a line; None for spaces and tabs."""
     return next((mark for mark in ",;" if mark in line), None)
 
 
 def _words(line: str) -> list[str]:
-    return [word.strip().lower() for word in line.split(_mark(line))]
+    return [word.strip().lower() for word in line.split(_separator(line))]
 
 
 def _number(word: str) -> float | None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from bpnp.commands.parser import at_least
-from bpnp.files import written_whole
+from bpnp.files import write_atomically
 from bpnp.report.terminal import say
 
 if TYPE_CHECKING:
@@ -119,6 +119,6 @@ def convert_weights(file: Path, out: Path, *, ransac: Literal["poselib", "opencv
         "state_dict": task.state_dict(),
     }
     task.on_save_checkpoint(checkpoint)
-    with written_whole(out) as temporary:
+    with write_atomically(out) as temporary:
         torch.save(checkpoint, temporary)
     say(f"wrote {out}")

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from bpnp.commands.parser import at_least
-from bpnp.files import claimed, packaged_config, write_text
+from bpnp.files import lock_folder, packaged_config, write_text
 from bpnp.report.terminal import Paper, console, say
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ def view(
         folder, *others = named_runs([run]).values()
         if others:
             raise ValueError(f"expected the results of one test, got several below {run}; try {folder}")
-        drawn = chosen_problems(folder, names)
+        drawn = read_problems(folder, names)
     for problem in drawn:
         name = run.stem if run.is_file() else re.sub(r"[^A-Za-z0-9._-]+", "_", problem.id) or str(problem.index)
         if photo is None or camera is None:
@@ -137,7 +137,7 @@ def _solution(path: Path) -> "ProblemPoints":
         raise ValueError(f"{path}: {error}{there}") from error
 
 
-def chosen_problems(folder: Path, names: Sequence[str]) -> list["ProblemPoints"]:
+def read_problems(folder: Path, names: Sequence[str]) -> list["ProblemPoints"]:
     """The problems of these names; the worst if there is none. Raises ValueError for a name of none or of several."""
     from bpnp.report.points import read_points
 
@@ -228,7 +228,7 @@ def table(
     out = console()
     with ExitStack() as held:
         for test in every:
-            held.enter_context(claimed(test.folder))
+            held.enter_context(lock_folder(test.folder))
         missing = [test for test in every if test.results() is None]
         if len(missing) < len(every):
             say(f"{len(every) - len(missing)} of {len(every)} tests are finished, in {output}", to=out)

@@ -26,7 +26,7 @@ from torch.optim import Optimizer
 
 import bpnp.datamodules
 from bpnp.commands.parser import OneLineParser
-from bpnp.files import claimed, config_content, write_text
+from bpnp.files import config_content, lock_folder, write_text
 from bpnp.models.weights import PARTS, class_name, is_description, networks, read_checkpoint
 from bpnp.report.terminal import console, say
 from bpnp.training.callbacks import PoseLossWarmup, ProgressLines, ResultsWriter
@@ -34,8 +34,8 @@ from bpnp.training.checkpoints import (
     BestCheckpoint,
     InterruptedCheckpoint,
     SafeCheckpointIO,
-    interruptible,
     newest_checkpoint,
+    raise_on_interrupt,
 )
 from bpnp.training.predictions import PredictionWriter
 from bpnp.training.task import BlindPnPTask
@@ -135,7 +135,7 @@ class BpnpCLI(LightningCLI):
             path = str(folder / "best.ckpt")
         named = config.get("model.class_path")
         solver = None
-        if named is None or issubclass(_located(named), BlindPnPTask):
+        if named is None or issubclass(_find_class(named), BlindPnPTask):
             weights = path or config.get("model.weights" if named is None else "model.init_args.weights")
             solver = _solver_options(weights, config["model"]) if weights else None
         if solver is not None:
@@ -144,7 +144,7 @@ class BpnpCLI(LightningCLI):
         self.config = parser.parse_args(args)
         config = self.config[self.command]
         config["ckpt_path"] = path
-        for logger in _listed(config.get("trainer.logger")):
+        for logger in _as_list(config.get("trainer.logger")):
             _log_in(logger, config["trainer.default_root_dir"])
 
     def before_instantiate_classes(self) -> None:
@@ -195,28 +195,28 @@ class BpnpCLI(LightningCLI):
         root = options["default_root_dir"]
         callbacks: list[Callback] = [InterruptedCheckpoint(_checkpoint_folder(root))]
         bar = options["enable_progress_bar"] is not False and console().is_interactive
-        if not any(isinstance(callback, ProgressBar) for callback in _listed(options["callbacks"])):
+        if not any(isinstance(callback, ProgressBar) for callback in _as_list(options["callbacks"])):
             callbacks.append(RichProgressBar() if bar else ProgressLines())
             kwargs["enable_progress_bar"] = bar
         self.trainer_defaults["callbacks"] = callbacks
         # Not a default of the trainer: an object among the defaults could not be written to config.yaml.
-        kwargs["plugins"] = [*_listed(options["plugins"]), SafeCheckpointIO()]
+        kwargs["plugins"] = [*_as_list(options["plugins"]), SafeCheckpointIO()]
         chosen = options["logger"]
-        loggers = [logger for logger in _listed(chosen) if isinstance(logger, Logger)]
+        loggers = [logger for logger in _as_list(chosen) if isinstance(logger, Logger)]
         if chosen is not False and not any(isinstance(logger, CSVLogger) for logger in loggers):
             loggers = [*loggers, CSVLogger(root, name="logs")]
         return super().instantiate_trainer(**{"logger": loggers} | kwargs)
 
     def after_instantiate_classes(self) -> None:
         """Let Ctrl-C end the run as it ends other commands."""
-        self.held.enter_context(interruptible(self.trainer))
+        self.held.enter_context(raise_on_interrupt(self.trainer))
 
     def before_fit(self) -> None:
         """Hold the run folder. Raises ValueError if another process does, or if a training would be overwritten."""
         root = Path(self.trainer.default_root_dir)
         if self.trainer.fast_dev_run or self.trainer.global_rank != 0:  # type: ignore[attr-defined]
             return
-        self.held.enter_context(claimed(root))
+        self.held.enter_context(lock_folder(root))
         folder, path = Path(_checkpoint_folder(str(root))), self.config[self.command]["ckpt_path"]
         continued = path is not None and Path(path).resolve().parent == folder.resolve()
         if not continued and any(folder.glob("*.ckpt")):
@@ -252,7 +252,7 @@ def _solver_options(path: str, model: Namespace) -> dict[str, Any] | None:
     Classes are those of this package and those that the options of the model name: a checkpoint imports nothing.
     """
     description = read_checkpoint(path).get("solver")
-    named = [_located(name) for name in _class_paths(model.as_dict())]
+    named = [_find_class(name) for name in _class_paths(model.as_dict())]
     classes = {class_name(cls): cls for cls in (*networks(), *PARTS, *named)}
 
     def options_of(value: Any) -> Any:
@@ -279,7 +279,7 @@ def _class_paths(options: Any) -> Iterator[str]:
             yield from _class_paths(value)
 
 
-def _located(class_path: str) -> type[Any]:
+def _find_class(class_path: str) -> type[Any]:
     """The class of a path that the parser has accepted."""
     found = locate(class_path)
     return found if isinstance(found, type) else object
@@ -288,12 +288,12 @@ def _located(class_path: str) -> type[Any]:
 def _log_in(logger: Any, root: str) -> None:
     """Set the folder of a configured logger to that of the run where it is still the working directory."""
     if isinstance(logger, Namespace) and "save_dir" in logger.get("init_args", {}):
-        option = signature(_located(logger.class_path)).parameters["save_dir"]
+        option = signature(_find_class(logger.class_path)).parameters["save_dir"]
         if logger.init_args.save_dir in (None, option.default):
             logger.init_args.save_dir = root
 
 
-def _listed(value: Any) -> list[Any]:
+def _as_list(value: Any) -> list[Any]:
     return value if isinstance(value, list) else [] if value is None else [value]
 
 

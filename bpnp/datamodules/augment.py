@@ -83,7 +83,7 @@ class Augmentation:
             raise ValueError(f'expected `clutter_side` "both", "2d" or "3d", got {self.clutter_side!r}')
 
     @property
-    def clutters(self) -> tuple[float, float]:
+    def clutter_by_side(self) -> tuple[float, float]:
         """`clutter` of the 2D side and of the 3D side."""
         return 0.0 if self.clutter_side == "3d" else self.clutter, 0.0 if self.clutter_side == "2d" else self.clutter
 
@@ -92,7 +92,7 @@ class Augmentation:
         matched = counts.matched if self.max_points is None else np.minimum(counts.matched, self.max_points)
         extra2d, extra3d = (
             np.minimum(count - counts.matched, np.rint(ratio * np.maximum(matched, 1)))
-            for count, ratio in zip((counts.points2d, counts.points3d), self.clutters, strict=True)
+            for count, ratio in zip((counts.points2d, counts.points3d), self.clutter_by_side, strict=True)
         )
         added = np.floor(bounds(self.outliers.ratio)[1] * matched)
         return (matched + np.maximum(extra2d, extra3d) + added).astype(np.int64)
@@ -120,7 +120,7 @@ def augment(batch: Batch, how: Augmentation, keys: Sequence[Key]) -> Batch:
     Rotations and translations keep their dtype.
 
     Args:
-        batch: problems as `stacked` makes them, on the CPU.
+        batch: problems as `stack_problems` makes them, on the CPU.
         how: what is chosen and added.
         keys: of each problem, which depends on its key alone, whatever batch it is in and however it is padded.
 
@@ -133,14 +133,14 @@ def augment(batch: Batch, how: Augmentation, keys: Sequence[Key]) -> Batch:
     total = matched.sum(-1, keepdim=True)
     true, side2d, side3d = _amounts(how, total, batch, generators(keys, Purpose.AMOUNTS))
     # On both sides the matches in one random order, then the points without a correspondence.
-    order3d = _matched_first(generators(keys, Purpose.CHOICE), matched, batch.mask3d)
+    order3d = _matches_first_order(generators(keys, Purpose.CHOICE), matched, batch.mask3d)
     alike = torch.equal(batch.mask2d, batch.mask3d)
     matched2d = pad(matched, (0, batch.points2d.shape[1] - matched.shape[1]))
-    order2d = order3d if alike else _matched_first(generators(keys, Purpose.CHOICE), matched2d, batch.mask2d)
-    points2d = _chosen(batch.points2d, order2d, true, total, side2d, generators(keys, Purpose.OUTLIERS2D))
-    points3d = _chosen(batch.points3d, order3d, true, total, side3d, generators(keys, Purpose.OUTLIERS3D))
-    points2d, mask2d, place2d = _shuffled(points2d, side2d, generators(keys, Purpose.ORDER2D))
-    points3d, mask3d, place3d = _shuffled(points3d, side3d, generators(keys, Purpose.ORDER3D))
+    order2d = order3d if alike else _matches_first_order(generators(keys, Purpose.CHOICE), matched2d, batch.mask2d)
+    points2d = _choose_points(batch.points2d, order2d, true, total, side2d, generators(keys, Purpose.OUTLIERS2D))
+    points3d = _choose_points(batch.points3d, order3d, true, total, side3d, generators(keys, Purpose.OUTLIERS3D))
+    points2d, mask2d, place2d = _shuffle_points(points2d, side2d, generators(keys, Purpose.ORDER2D))
+    points3d, mask3d, place3d = _shuffle_points(points3d, side3d, generators(keys, Purpose.ORDER3D))
     slots2d = torch.arange(place2d.shape[1], device=place2d.device).expand_as(place2d)
     seen_as = torch.empty_like(place2d).scatter_(1, place2d, slots2d).gather(1, place3d.clamp(max=len(slots2d[0]) - 1))
     rotation, origin = batch.rotation, batch.origin
@@ -179,16 +179,16 @@ def _amounts(
     """Return the number of matches that are left of `total`, (b, 1), and the numbers of points of both sides."""
     ratio, side, occlusion, occluded = uniform(random, 4).unsqueeze(-1).unbind(1)
     chosen = total if how.max_points is None else total.clamp(max=how.max_points)
-    hidden = (_drawn(how.outliers.occlusion, occlusion) * chosen).round().long()
+    hidden = (_draw_amount(how.outliers.occlusion, occlusion) * chosen).round().long()
     hidden = torch.minimum(hidden, chosen - MIN_POINTS).clamp(min=0)
     true = chosen - hidden
     hidden2d, hidden3d = _on_sides(how.outliers.occluded_side, occluded)
     hidden2d = torch.where(hidden3d, torch.where(hidden2d, hidden // 2, 0), hidden)
-    added = (_drawn(how.outliers.ratio, ratio) * true).long()
+    added = (_draw_amount(how.outliers.ratio, ratio) * true).long()
     added2d, added3d = _on_sides(how.outliers.side, side)
     extra2d, extra3d = (
         torch.minimum((clutter * chosen.clamp(min=1)).round().clamp(max=2**31).long(), count[:, None] - total)
-        for clutter, count in zip(how.clutters, (batch.count2d, batch.count3d), strict=True)
+        for clutter, count in zip(how.clutter_by_side, (batch.count2d, batch.count3d), strict=True)
     )
     return (
         true,
@@ -197,7 +197,7 @@ def _amounts(
     )
 
 
-def _drawn(value: Drawn, share: Tensor) -> Tensor:
+def _draw_amount(value: Drawn, share: Tensor) -> Tensor:
     low, high = bounds(value)
     return low + (high - low) * share
 
@@ -208,19 +208,19 @@ def _on_sides(side: DrawnSide, share: Tensor) -> tuple[Bool[Tensor, "b 1"], Bool
     return number < 2, number > 0
 
 
-def _matched_first(random: Generators, matched: Tensor, mask: Tensor) -> Int[Tensor, "b n"]:
+def _matches_first_order(random: Generators, matched: Tensor, mask: Tensor) -> Int[Tensor, "b n"]:
     """Return the indices of the matches in random order, then of the other points in random order, then padding."""
     return permutations(random, mask.shape[1], group=2 - mask.long() - matched.long())
 
 
-def _chosen(
+def _choose_points(
     points: Float[Tensor, "b n d"], order: Tensor, true: Tensor, total: Tensor, side: SideCounts, random: Generators
 ) -> Float[Tensor, "b k d"]:
     """Return the points of matches, then those without a correspondence, then outliers, then arbitrary ones."""
     natural = side.matched + side.extra
     slot = torch.arange(int((natural + side.outliers).max()), device=points.device)
     rank = torch.where(slot < side.matched, slot + side.hidden * (slot >= true), total + slot - side.matched)
-    chosen = picked(points, order.gather(1, rank.clamp(max=order.shape[1] - 1)))
+    chosen = gather_points(points, order.gather(1, rank.clamp(max=order.shape[1] - 1)))
     if not side.outliers.any():
         return chosen
     is_match = (slot < true)[..., None]
@@ -230,15 +230,15 @@ def _chosen(
     return torch.where((slot < natural)[..., None], chosen, low + (high - low) * share)
 
 
-def _shuffled(points: Tensor, side: SideCounts, random: Generators) -> tuple[Tensor, Tensor, Tensor]:
+def _shuffle_points(points: Tensor, side: SideCounts, random: Generators) -> tuple[Tensor, Tensor, Tensor]:
     """Return the points in random order with zeros as padding, the mask of real points, and the order."""
     slot = torch.arange(points.shape[1], device=points.device)
     mask = slot < side.matched + side.extra + side.outliers
     place = permutations(random, len(slot), group=1 - mask.long())
-    return picked(points, place) * mask[..., None], mask, place
+    return gather_points(points, place) * mask[..., None], mask, place
 
 
-def picked(points: Float[Tensor, "b n d"], order: Int[Tensor, "b k"]) -> Float[Tensor, "b k d"]:
+def gather_points(points: Float[Tensor, "b n d"], order: Int[Tensor, "b k"]) -> Float[Tensor, "b k d"]:
     """Return the points at the indices `order` of each row."""
     rows = torch.arange(len(points), device=points.device)[:, None] * points.shape[1]
     return points.flatten(0, 1).index_select(0, (order + rows).flatten()).view(*order.shape, points.shape[2])

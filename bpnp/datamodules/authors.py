@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from bpnp.datamodules.loader import hold_out
 from bpnp.datamodules.problem import Problem
-from bpnp.datamodules.store import Made, Recipe, Row, Store, cached, is_store, open_store
+from bpnp.datamodules.store import Made, Recipe, Row, Store, is_store, open_or_prepare, open_store
 from bpnp.datamodules.stored import PROBLEMS, WIDTHS, StoredDataModule, problem_row, scene_rows
-from bpnp.files import files_as_they_are, fingerprint
+from bpnp.files import file_states, fingerprint
 from bpnp.geometry import MIN_POINTS
 
 PREPROCESSED = ("p2d", "p3d", "R_gt", "t_gt", "W_gt", "num_points_2d", "num_points_3d")
@@ -65,7 +65,7 @@ class AuthorsDataModule(StoredDataModule):
                 self.store = open_store(self.root, PROBLEMS)
             else:
                 recipe = authors_recipe(Path(self.root), self.dataset)
-                self.store = cached(recipe, str(recipe.parameters["dataset"]), self.cache_dir)
+                self.store = open_or_prepare(recipe, str(recipe.parameters["dataset"]), self.cache_dir)
         rows = split_rows(self.store, "train")
         training, held_out = hold_out(len(rows), self.held_out, seed=self.seed)
         return {"train": rows[training], "val": rows[held_out], "test": split_rows(self.store, "test")}
@@ -81,9 +81,9 @@ def authors_recipe(source: Path, dataset: str | None) -> Recipe:
     return Recipe(
         kind=PROBLEMS,
         widths=WIDTHS,
-        parameters={"dataset": name, "source": fingerprint(files_as_they_are(files))},
+        parameters={"dataset": name, "source": fingerprint(file_states(files))},
         jobs=[(scene, part, FOCAL.get(name, 1.0)) for scene, part in parts],
-        work=_converted,
+        work=_convert,
         what="sample",
         source=str(source),
     )
@@ -122,7 +122,7 @@ def _find_parts(root: Path, dataset: str | None) -> tuple[str, list[tuple[str, l
     return chosen, parts
 
 
-def _converted(scene: str, files: Sequence[Path], focal: float) -> Made:
+def _convert(scene: str, files: Sequence[Path], focal: float) -> Made:
     """Every sample of a scene, or the reason why it cannot be used.
 
     Copies that fill small sets up to 1000 points are dropped. W_gt may hold the 2D point of each 3D point or, as for
@@ -135,7 +135,7 @@ def _converted(scene: str, files: Sequence[Path], focal: float) -> Made:
         if columns[file.stem].keys() != set(keys):
             raise PickleError(f"expected the {len(keys)} samples of {files[0].name} in {file} too, got others")
     samples = {f"{scene}/{key:06d}": {name: column[key] for name, column in columns.items()} for key in keys}
-    by_2d = "W_gt" in columns and _indexed_by_2d(files[0].parent, list(samples.values())[:PROBED])
+    by_2d = "W_gt" in columns and _index_by_2d(files[0].parent, list(samples.values())[:PROBED])
     rows: list[Row] = []
     skipped = {}
     for name, sample in samples.items():
@@ -159,7 +159,7 @@ def _column(file: Path) -> dict[int, Any]:
     return column
 
 
-def _indexed_by_2d(folder: Path, samples: Sequence[Mapping[str, Any]]) -> bool:
+def _index_by_2d(folder: Path, samples: Sequence[Mapping[str, Any]]) -> bool:
     """Whether W_gt is an m-vector: which reading projects the 3D points nearer to their 2D points."""
     direct, inverse = (float(np.median([_error(sample, by_2d) for sample in samples])) for by_2d in (False, True))
     if AGREEMENT < min(direct, inverse) < np.inf:

@@ -10,8 +10,16 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from bpnp.datamodules.shapes import SUFFIXES, MeshError, Sampler, Shapes, mesh_shapes, shape_files, training_first
-from bpnp.files import files_as_they_are, fingerprint
+from bpnp.datamodules.shapes import (
+    SUFFIXES,
+    MeshError,
+    Sampler,
+    Shapes,
+    mesh_shapes,
+    shape_files,
+    training_meshes_first,
+)
+from bpnp.files import file_states, fingerprint
 
 TEXTS = (".txt", ".xyz")
 CLOUD_SUFFIXES = (".npy", *TEXTS)
@@ -39,10 +47,10 @@ def read_cloud(path: Path) -> NDArray[np.float64]:
             values = np.asarray(getattr(trimesh.load(path, process=False), "vertices", ()), np.float64).reshape(-1, 3)
     except Exception as error:
         raise MeshError(f"{path}: not a point cloud ({' '.join(str(error).split())})") from error
-    return _checked(values, path)
+    return _check_cloud(values, path)
 
 
-def _checked(values: NDArray[Any], source: object) -> NDArray[np.float64]:
+def _check_cloud(values: NDArray[Any], source: object) -> NDArray[np.float64]:
     if values.ndim != 2 or values.shape[1] < 3 or not len(values) or values.dtype.kind not in "fiu":
         raise MeshError(f"{source}: rows of x, y, z are needed, the file has {values.dtype} of shape {values.shape}")
     points = values[:, :3].astype(np.float64)
@@ -97,13 +105,13 @@ def open_shapes(source: Path) -> Shapes:
     if len(parts) == 1:
         return next(iter(parts.values()))
     samplers = {f"{folder}/{name}": make for folder, shapes in parts.items() for name, make in shapes.samplers.items()}
-    ordered = {name: samplers[name] for name in sorted(samplers, key=training_first)}
+    ordered = {name: samplers[name] for name in sorted(samplers, key=training_meshes_first)}
     return Shapes(ordered, fingerprint([[folder, shapes.identity] for folder, shapes in parts.items()]))
 
 
 def _shapes_in(folder: Path) -> Shapes | None:
     """Find the shapes of one folder in any of the layouts of `open_shapes`; None if it has none."""
-    if found := _hdf5_shapes(folder) or _listed_shapes(folder):
+    if found := _hdf5_shapes(folder) or _read_shape_list(folder):
         return found
     files = shape_files(folder, (*SUFFIXES, *CLOUD_SUFFIXES))
     meshes = {name: path for name, path in files.items() if not is_cloud(path)}
@@ -113,14 +121,14 @@ def _shapes_in(folder: Path) -> Shapes | None:
 
 
 def _identity(files: Mapping[str, Path]) -> str:
-    return fingerprint([list(files), files_as_they_are(files.values())])
+    return fingerprint([list(files), file_states(files.values())])
 
 
 def _cloud_samples(name: str, path: Path, count: int) -> NDArray[np.float64]:
     return draw_points(read_cloud(path), count, name)
 
 
-def _listed_shapes(folder: Path) -> Shapes | None:
+def _read_shape_list(folder: Path) -> Shapes | None:
     """The shapes of `modelnet40_normal_resampled`: <class>/<name>.txt and lists of the names in each split."""
     samplers: dict[str, Sampler] = {}
     files: dict[str, Path] = {}
@@ -161,7 +169,7 @@ def _hdf5_shapes(folder: Path) -> Shapes | None:
 
 def _hdf5_samples(name: str, path: Path, row: int, count: int) -> NDArray[np.float64]:
     with _h5py(path).File(path, "r") as file:
-        return draw_points(_checked(np.asarray(file["data"][row]), f"{path}, shape {row}"), count, name)
+        return draw_points(_check_cloud(np.asarray(file["data"][row]), f"{path}, shape {row}"), count, name)
 
 
 def _h5py(needed_for: Path) -> Any:

@@ -115,7 +115,7 @@ class BucketSampler(DistributedSampler[list[Key]]):
         """
         whole = len(order) - len(order) % self.batch_size
         if whole == 0:
-            return [self._filled(order)]
+            return [self._fill_batches(order)]
         span = POOL_BATCHES * self.batch_size
         pools = np.split(order[:whole], range(span, whole, span))
         return list(np.concatenate([self._largest_first(pool) for pool in pools]).reshape(-1, self.batch_size))
@@ -133,14 +133,14 @@ class BucketSampler(DistributedSampler[list[Key]]):
             if self.max_cells is not None:
                 fitting = min(fitting, self.max_cells // int(self.sizes[order[start]]) ** 2)
             stop = start + max(self.num_replicas, fitting - fitting % self.num_replicas)
-            batches.append(self._filled(order[start:stop]))
+            batches.append(self._fill_batches(order[start:stop]))
             start = stop
         return batches
 
     def _largest_first(self, order: NDArray[np.int64]) -> NDArray[np.int64]:
         return order[np.argsort(-self.sizes[order], kind="stable")]
 
-    def _filled(self, batch: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _fill_batches(self, batch: NDArray[np.int64]) -> NDArray[np.int64]:
         """Repeat a batch from its start up to a multiple of the number of processes."""
         return np.resize(batch, -(-len(batch) // self.num_replicas) * self.num_replicas)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bpnp.checks import check_positive, check_within
-from bpnp.datamodules.augment import picked
+from bpnp.datamodules.augment import gather_points
 from bpnp.datamodules.clouds import open_shapes
 from bpnp.datamodules.keyed_random import (
     Generators,
@@ -30,7 +30,7 @@ from bpnp.datamodules.keyed_random import (
 from bpnp.datamodules.loader import STAGES, ProblemDataModule, hold_out
 from bpnp.datamodules.problem import Counts
 from bpnp.datamodules.shapes import MeshError, Normalisation, Sampler, Shapes, normalise, procedural_shapes
-from bpnp.datamodules.store import Made, Recipe, Row, Store, StoreError, cached, is_store, open_store
+from bpnp.datamodules.store import Made, Recipe, Row, Store, StoreError, is_store, open_or_prepare, open_store
 from bpnp.geometry import MIN_POINTS, project, transform
 from bpnp.types import Batch
 
@@ -128,7 +128,7 @@ class MeshSource:
         views = [divmod(i, len(self.rows)) for i in index.tolist()]
         rows = [int(self.rows[mesh]) for _, mesh in views]
         ids = tuple(f"{self.store.name(row)}#{view}" for row, (view, _) in zip(rows, views, strict=True))
-        points3d = self._drawn_points(rows, generators(keys, Purpose.SUBSET))
+        points3d = self._draw_points(rows, generators(keys, Purpose.SUBSET))
         rotation, translation = self.cameras.poses(generators(keys, Purpose.POSE))
         camera = transform(rotation, translation, points3d.double())
         seen = camera[..., 2] > MIN_DEPTH
@@ -154,7 +154,7 @@ class MeshSource:
             origin=torch.zeros(size, 3, dtype=torch.float64),
         )
 
-    def _drawn_points(self, rows: Sequence[int], random: Generators) -> Float[Tensor, "b n 3"]:
+    def _draw_points(self, rows: Sequence[int], random: Generators) -> Float[Tensor, "b n 3"]:
         """Draw `num_points` of the first `pool_size` points of each shape; shapes may have different numbers."""
         pools = [self.store.row(row)[POINTS][: self.pool_size] for row in rows]
         points = torch.empty((len(rows), self.num_points, 3), dtype=torch.float32)
@@ -162,7 +162,7 @@ class MeshSource:
         for size in np.unique(sizes).tolist():
             same = np.flatnonzero(sizes == size).tolist()
             order = permutations([random[i] for i in same], size)[:, : self.num_points]
-            points[same] = picked(torch.from_numpy(np.stack([pools[i] for i in same])), order)
+            points[same] = gather_points(torch.from_numpy(np.stack([pools[i] for i in same])), order)
         return points
 
 
@@ -287,10 +287,10 @@ class MeshDataModule(ProblemDataModule):
         """The surface samples of a part, opened once, and made now if they are not there."""
         split = "all" if self.root is not None else "test" if part == "predict" else part
         if split not in self._stores:
-            self._stores[split] = self._opened(split)
+            self._stores[split] = self._open_store(split)
         return self._stores[split]
 
-    def _opened(self, split: str) -> Store:
+    def _open_store(self, split: str) -> Store:
         if self.root is None:
             shapes = procedural_shapes(split, self.num_shapes[split], seed=self.seed)
             label = f"procedural-{split}"
@@ -305,7 +305,7 @@ class MeshDataModule(ProblemDataModule):
                 )
             return store
         recipe = surfaces_recipe(shapes, points=self.pool_size, normalisation=self.normalisation, label=label)
-        return cached(recipe, label, self.cache_dir)
+        return open_or_prepare(recipe, label, self.cache_dir)
 
 
 def surfaces_recipe(shapes: Shapes, *, points: int, normalisation: Normalisation, label: str) -> Recipe:
@@ -317,13 +317,13 @@ def surfaces_recipe(shapes: Shapes, *, points: int, normalisation: Normalisation
         widths={POINTS: 3},
         parameters={"points": points, "normalisation": normalisation, "source": shapes.identity},
         jobs=[(samplers[start : start + MESHES_A_PART], points, normalisation) for start in starts],
-        work=_sampled_rows,
+        work=_sample_rows,
         what="mesh",
         source=label,
     )
 
 
-def _sampled_rows(samplers: Sequence[tuple[str, Sampler]], count: int, mode: Normalisation) -> Made:
+def _sample_rows(samplers: Sequence[tuple[str, Sampler]], count: int, mode: Normalisation) -> Made:
     rows: list[Row] = []
     skipped = {}
     for name, sampler in samplers:

@@ -10,7 +10,7 @@ from jaxtyping import Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bpnp.checks import as_tensor, checked_match, checked_points
+from bpnp.checks import as_tensor, check_match3d, check_points
 from bpnp.types import Batch
 
 
@@ -51,9 +51,9 @@ class Problem:
         integers, an index that is no 2D point, or one 2D point twice.
         """
         which = repr(name)
-        set2d = checked_points("points2d", which, as_tensor("points2d", points2d), 2).numpy()
-        set3d = checked_points("points3d", which, as_tensor("points3d", points3d), 3).numpy()
-        match = checked_match(which, as_tensor("match3d", match3d), len(set2d), len(set3d)).numpy()
+        set2d = check_points("points2d", which, as_tensor("points2d", points2d), 2).numpy()
+        set3d = check_points("points3d", which, as_tensor("points3d", points3d), 3).numpy()
+        match = check_match3d(which, as_tensor("match3d", match3d), len(set2d), len(set3d)).numpy()
         origins = () if origin is None else (origin,)
         if not all(np.isfinite(values).all() for values in (rotation, translation, focal, *origins)):
             raise ValueError(f"expected a finite pose, focal and origin, got NaN or infinity in problem {which}")
@@ -90,10 +90,10 @@ class ProblemSource(Protocol):
         """Points of each problem."""
 
     def batch(self, index: Int[Tensor, " b"], epoch: int) -> Batch:
-        """Problems as `stacked` makes them: each a function of its index, the epoch and the source's seed."""
+        """Problems as `stack_problems` makes them: each a function of its index, the epoch and the source's seed."""
 
 
-def stacked(problems: Sequence[Problem], index: Int[Tensor, " b"]) -> Batch:
+def stack_problems(problems: Sequence[Problem], index: Int[Tensor, " b"]) -> Batch:
     """Pad and mask problems: 3D point j of the batch was seen as 2D point j, or (match3d -1) not at all.
 
     Points are float32, poses float64.

@@ -63,7 +63,7 @@ def read_mesh(path: Path) -> Mesh:
     Raises MeshError that names the file: truncated, foreign or empty file, no faces, no area, NaN, a face of missing
     vertices.
     """
-    with _opened(path) as (content, suffix):
+    with _open_mesh(path) as (content, suffix):
         if suffix == ".off":
             return _parse_off(content)
         mesh = _load(content, suffix)
@@ -74,7 +74,7 @@ def read_mesh(path: Path) -> Mesh:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[tuple[bytes, str]]:
+def _open_mesh(path: Path) -> Iterator[tuple[bytes, str]]:
     """The bytes and the suffix of a file, which a MeshError of the block names."""
     try:
         yield path.read_bytes(), path.suffix.lower()
@@ -87,7 +87,7 @@ def read_vertices(path: Path) -> NDArray[np.float64]:
 
     Reads the files of `read_mesh`. Raises MeshError that names the file: truncated, foreign or empty.
     """
-    with _opened(path) as (content, suffix):
+    with _open_mesh(path) as (content, suffix):
         mesh = _parse_off(content) if suffix == ".off" else _load(content, suffix)
         vertices = np.asarray(mesh.vertices, np.float64)
         vertices = vertices[np.sort(np.unique(vertices, axis=0, return_index=True)[1])]
@@ -273,10 +273,10 @@ def shape_files(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> dict[str, P
     files = {
         name if len(paths) == 1 else f"{name}{path.suffix}": path for name, paths in named.items() for path in paths
     }
-    return {name: files[name] for name in sorted(files, key=training_first)}
+    return {name: files[name] for name in sorted(files, key=training_meshes_first)}
 
 
-def training_first(name: str) -> tuple[bool, str]:
+def training_meshes_first(name: str) -> tuple[bool, str]:
     """Sort key of the name of a shape."""
     return "/test/" in name, name
 

@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.progress import track
 from torch.utils.data import DataLoader, Dataset
 
-from bpnp.files import cache_folder, claimed, fingerprint, interruptions_later, written_whole
+from bpnp.files import cache_folder, delay_interrupts, fingerprint, lock_folder, write_atomically
 
 MANIFEST = "manifest.json"
 FORMAT = 4  # raised whenever a column changes its meaning
@@ -68,7 +68,7 @@ class Store:
         return len(self.columns["name"])
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _mapped, (self.folder, self.kind)  # another process maps the files itself
+        return _map_file, (self.folder, self.kind)  # another process maps the files itself
 
     def counts(self, bulk: str) -> NDArray[np.int64]:
         """Return the number of points of each row (k,) in a bulk column."""
@@ -97,10 +97,10 @@ def open_store(folder: str | Path, kind: str) -> Store:
             raise StoreError(f"expected {file} of {size} bytes, got {got}; try copying or preparing again")
         if _checksum(file) != checksum:
             raise StoreError(f"{file} has changed since it was written; copy or prepare it again")
-    return _mapped(path, kind)
+    return _map_file(path, kind)
 
 
-def _mapped(folder: Path, kind: str) -> Store:
+def _map_file(folder: Path, kind: str) -> Store:
     manifest = _manifest(folder, kind)
     bulk = {name: np.asarray(np.load(folder / f"{name}.npy", mmap_mode="r")) for name in manifest["bulk"]}
     starts = {name: np.load(folder / f"{name}_start.npy") for name in manifest["bulk"]}
@@ -202,7 +202,7 @@ def new_store(folder: Path, kind: str, widths: Mapping[str, int]) -> Iterator[St
     """
     if folder.exists():
         raise StoreError(f"expected a new folder to write to, got {folder}, which exists; try another or remove it")
-    with written_whole(folder) as temporary:
+    with write_atomically(folder) as temporary:
         temporary.mkdir()
         with ExitStack() as stack:
             files = {name: stack.enter_context((temporary / f"{name}.npy").open("wb")) for name in widths}
@@ -266,7 +266,7 @@ def prepare(recipe: Recipe, output: Path, *, processes: int = 1, wait_for_others
             raise StoreError(f"expected a new folder as output, got {output}, which is no store of bpnp; try another")
         work = output.with_name(f".{output.name}.unfinished")
         try:
-            with claimed(work, wait=wait_for_others):
+            with lock_folder(work, wait=wait_for_others):
                 if not is_store(output):  # another process may have made it
                     _make(recipe, work / "store", processes)
                     os.replace(work / "store", output)
@@ -282,7 +282,7 @@ def prepare(recipe: Recipe, output: Path, *, processes: int = 1, wait_for_others
     return store
 
 
-def cached(recipe: Recipe, label: str, cache_dir: str | None) -> Store:
+def open_or_prepare(recipe: Recipe, label: str, cache_dir: str | None) -> Store:
     """Return the store of a recipe in the cache folder; make it if it is missing or damaged.
 
     Warns of items that are left out. Raises as `prepare`.
@@ -310,7 +310,7 @@ def cached(recipe: Recipe, label: str, cache_dir: str | None) -> Store:
 def _make(recipe: Recipe, output: Path, processes: int) -> None:
     for left in (output, *output.parent.glob(f".{output.name}.[0-9]*")):  # by a process that was killed
         shutil.rmtree(left, ignore_errors=True)
-    made, console = _made(recipe, processes), Console(stderr=True)
+    made, console = _make_store(recipe, processes), Console(stderr=True)
     with new_store(output, recipe.kind, recipe.widths) as writer:
         writer.parameters |= recipe.parameters
         for rows, skipped in track(made, f"reading {recipe.source}", len(recipe), console=console, transient=True):
@@ -325,12 +325,12 @@ def _make(recipe: Recipe, output: Path, processes: int) -> None:
             )
 
 
-def _made(recipe: Recipe, processes: int) -> Iterator[Made]:
+def _make_store(recipe: Recipe, processes: int) -> Iterator[Made]:
     """Run the jobs and give their results in order. The workers of a loader end with this process, even if killed."""
     workers = 0 if processes == 1 else min(processes, len(recipe))
     generator = torch.Generator()  # else the seeds of the workers are drawn from the global one
     loader = DataLoader(recipe, batch_size=None, num_workers=workers, collate_fn=tuple, generator=generator)
-    with interruptions_later():  # the workers leave Ctrl-C to this process
+    with delay_interrupts():  # the workers leave Ctrl-C to this process
         made = iter(loader)
     try:
         yield from made

@@ -15,7 +15,7 @@ from torch import Tensor
 from bpnp.checks import check_within
 from bpnp.datamodules.augment import Augmentation, Side
 from bpnp.datamodules.loader import STAGES, ProblemDataModule
-from bpnp.datamodules.problem import Counts, Problem, ProblemSource, stacked
+from bpnp.datamodules.problem import Counts, Problem, ProblemSource, stack_problems
 from bpnp.datamodules.store import Row, Store, StoreError, new_store, open_store
 from bpnp.geometry import MIN_POINTS
 from bpnp.types import Batch
@@ -60,11 +60,11 @@ def scene_rows(store: Store) -> dict[str, NDArray[np.int64]]:
 
 
 class StoredProblems:
-    """A `ProblemSource`: rows of a store of problems. Raises ValueError as `large_enough`."""
+    """A `ProblemSource`: rows of a store of problems. Raises ValueError as `has_enough_matches`."""
 
     def __init__(self, store: Store, rows: NDArray[np.int64], *, min_points: int) -> None:
         self.store = store
-        self.rows = rows[large_enough(store.columns["matched"][rows], min_points, str(store.folder))]
+        self.rows = rows[has_enough_matches(store.columns["matched"][rows], min_points, str(store.folder))]
 
     @property
     def counts(self) -> Counts:
@@ -72,7 +72,7 @@ class StoredProblems:
         return Counts(matched, *(self.store.counts(name)[self.rows] for name in WIDTHS))
 
     def batch(self, index: Int[Tensor, " b"], epoch: int) -> Batch:
-        return stacked([stored_problem(self.store, int(self.rows[i])) for i in index.tolist()], index)
+        return stack_problems([stored_problem(self.store, int(self.rows[i])) for i in index.tolist()], index)
 
 
 class StoredDataModule(ProblemDataModule):
@@ -205,7 +205,7 @@ def split_scenes(
     return {"train": sorted(rest), **split}
 
 
-def large_enough(matched: NDArray[np.int64], min_points: int, where: str) -> NDArray[np.int64]:
+def has_enough_matches(matched: NDArray[np.int64], min_points: int, where: str) -> NDArray[np.int64]:
     """Which problems have `min_points` matches or more; the others are warned about.
 
     Raises StoreError if there are none.

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from bpnp.checks import checked_shapes
+from bpnp.checks import check_shapes
 from bpnp.layers.implicit import BackwardStats
 from bpnp.layers.laplacian import entropic_plan
 from bpnp.layers.transport import solve_plan
@@ -17,7 +17,7 @@ from bpnp.precision import full_precision
 from bpnp.types import SolveStats
 
 
-@checked_shapes
+@check_shapes
 @full_precision
 def sinkhorn(
     cost: Float[Tensor, "b m n"],

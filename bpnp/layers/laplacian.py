@@ -50,7 +50,7 @@ def solve_laplacian(
     if rhs.dtype != torch.float64 or bool(solved.all()):
         return b, mean, solved
     hard = (~solved).nonzero().squeeze(-1)
-    exact = _factorised(plan.samples(hard).formed(), rows[hard], cols[hard], rhs[hard])
+    exact = _solve_by_cholesky(plan.samples(hard).dense(), rows[hard], cols[hard], rhs[hard])
     b, mean, solved = (old.index_copy(0, hard, new) for old, new in zip((b, mean, solved), exact, strict=True))
     return b, mean, solved
 
@@ -83,7 +83,7 @@ def conjugate_gradients(
     return x, mean, solved
 
 
-def _factorised(plan: Float[Tensor, "b m n"], rows: Tensor, cols: Tensor, rhs: Tensor) -> Solution:
+def _solve_by_cholesky(plan: Float[Tensor, "b m n"], rows: Tensor, cols: Tensor, rhs: Tensor) -> Solution:
     """The solution by a Cholesky factorisation of S and one refinement, in float64.
 
     The diagonal is the sum of the other entries of its row: as a difference from `cols` it would be noise when P is
@@ -147,12 +147,12 @@ class _EntropicPlan(torch.autograd.Function):
         plan, mu = ctx.saved_tensors
         a, b, converged = solve_multipliers(plan, gradient)
         record(ctx.stats, "sinkhorn", converged)
-        to_cost = _projected(plan, gradient, a, b, -1 / mu)
+        to_cost = _project_gradient(plan, gradient, a, b, -1 / mu)
         to_mu = torch.special.xlogy(to_cost, plan).sum() if ctx.needs_input_grad[2] else None
         return None, to_cost, to_mu, a, b, None
 
 
-def _projected(
+def _project_gradient(
     plan: Tensor, gradient: Tensor, a: Tensor, b: Tensor, factor: float | Tensor = 1.0
 ) -> Float[Tensor, "b m n"]:
     """factor P.(V - a1^T - 1b^T)."""
@@ -196,6 +196,6 @@ def _solve(plan: Tensor, gradient: Tensor, tolerance: float) -> tuple[Tensor, Te
     if plan.dtype == torch.float64 and not bool(solved.all()):
         # Links between groups of columns may be so weak that the whole right-hand side is rounding, which nothing
         # solves to a relative precision: it is enough that the projected gradient's column sums are rounding too.
-        sums, size = _projected(plan, gradient, a, b).sum(-2), (plan * gradient.square()).sum((-2, -1))
+        sums, size = _project_gradient(plan, gradient, a, b).sum(-2), (plan * gradient.square()).sum((-2, -1))
         solved = solved | ((divide(sums.square(), cols).sum(-1) <= ROUNDING**2 * size) & size.isfinite())
     return a, b, solved, solved & (cols.sum(-1) <= SHARP * degree.sum(-1))

@@ -39,7 +39,7 @@ class Plan:
     def col_sums(self) -> Float[Tensor, "b n"]:
         return self.beta * transpose_times(self.kernel, self.alpha)
 
-    def formed(self) -> Float[Tensor, "b m n"]:
+    def dense(self) -> Float[Tensor, "b m n"]:
         return self.kernel * self.alpha.unsqueeze(-1) * self.beta.unsqueeze(-2)
 
     def samples(self, some: Int[Tensor, " s"]) -> "Plan":
@@ -60,7 +60,7 @@ class Plan:
         degree = cols - self.beta**2 * squares
         weak = (degree < LOST * torch.finfo(cols.dtype).eps * cols).any(-1)
         if bool(weak.any()):
-            plan = self.formed()
+            plan = self.dense()
             exact = (plan * (1 - plan * weight.unsqueeze(-1))).sum(-2)
             degree = torch.where(weak.unsqueeze(-1), exact, degree)
         # A column whose links are below rounding still has an equation, which zero would hide.

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from bpnp.checks import checked_shapes
+from bpnp.checks import check_shapes
 from bpnp.geometry import choose, hat, is_finite, retract
 from bpnp.layers.implicit import first_derivative, refuse_second_derivative
 from bpnp.layers.lbfgs import lbfgs
@@ -184,7 +184,7 @@ def newton(
 SOLVERS = {"newton": newton, "lbfgs": lbfgs}
 
 
-@checked_shapes
+@check_shapes
 @full_precision
 def weighted_pnp(
     assignment: Float[Tensor, "b m n"],
@@ -250,13 +250,13 @@ def weighted_pnp(
         total = _lengths(q).sum(-1, keepdim=True).clamp_min(torch.finfo(q.dtype).tiny)
         q = q / total
         weight = _lengths(q)
-    points, centre, scale = _normalised(points3d.double().mT.contiguous(), weight)
+    points, centre, scale = _normalise(points3d.double().mT.contiguous(), weight)
     with torch.no_grad():
         found = is_finite(rotation, translation)
         # The rotation nearest to a rounded one; any pose for samples that have none.
         r = torch.where(found[:, None, None], rotation.double(), torch.eye(3).to(q))
         r = roma.special_procrustes(r)
-        t = (torch.where(found[:, None], translation.double(), 1) + _turned(r, centre)) / scale
+        t = (torch.where(found[:, None], translation.double(), 1) + _rotate(r, centre)) / scale
         r, t, iterations = SOLVERS[solver](q, points, r, t, tolerance=tolerance, max_iterations=max_iterations)
         residual, well_posed, factor = _judge(derivatives(q, points, r, t))
         converged = found & (residual <= tolerance) & well_posed & (t.norm(dim=-1) < FARTHEST)
@@ -279,7 +279,7 @@ def weighted_pnp(
         step.register_hook(refuse_second_derivative)
     # The step is zero: exp([w]x) R = R + [w]x R is exact, in the derivative too.
     moved_r = r + hat(step[:, :3]) @ r
-    moved_t = (t + step[:, 3:]) * scale - _turned(moved_r, centre)
+    moved_t = (t + step[:, 3:]) * scale - _rotate(moved_r, centre)
     moved_r = torch.where(found[:, None, None], moved_r, torch.nan).to(assignment.dtype)
     moved_t = torch.where(found[:, None], moved_t, torch.nan).to(assignment.dtype)
     return moved_r, moved_t, SolveStats(iterations, torch.where(found, residual, torch.inf), converged)
@@ -300,7 +300,7 @@ def _scene_step(rotation: Rotations, centre: Translations, scale: Float[Tensor, 
     inverse = eye - turn / 2 + torch.where(angle > 1e-3, bend, 1 / 12) * (turn @ turn)
     zero = torch.zeros_like(inverse)
     top = torch.cat([inverse, zero], -1)
-    bottom = torch.cat([hat(_turned(rotation, centre)), scale[:, :, None] * eye], -1)
+    bottom = torch.cat([hat(_rotate(rotation, centre)), scale[:, :, None] * eye], -1)
     return torch.cat([top, bottom], -2)
 
 
@@ -331,11 +331,11 @@ def _lengths(columns: Columns) -> Float[Tensor, "b 1 n"]:
     return columns.square().sum(-2, keepdim=True).sqrt()
 
 
-def _turned(rotation: Rotations, vector: Translations) -> Translations:
+def _rotate(rotation: Rotations, vector: Translations) -> Translations:
     return (rotation @ vector.unsqueeze(-1)).squeeze(-1)
 
 
-def _normalised(points: Columns, weight: Float[Tensor, "b 1 n"]) -> tuple[Columns, Translations, Float[Tensor, "b 1"]]:
+def _normalise(points: Columns, weight: Float[Tensor, "b 1 n"]) -> tuple[Columns, Translations, Float[Tensor, "b 1"]]:
     """Points p' with weighted mean zero and mean square one, centre and scale in p = scale p' + centre.
 
     The Hessian is well scaled in these coordinates.

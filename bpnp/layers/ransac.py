@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from bpnp.checks import check_positive, checked_shapes
+from bpnp.checks import check_positive, check_shapes
 from bpnp.geometry import MIN_POINTS
 from bpnp.precision import full_precision
 from bpnp.robust.matches import Matches, in_scene, normalised, residuals
@@ -36,7 +36,7 @@ def top_matches(
     return flat // n, flat % n, torch.arange(k, device=flat.device) < count.unsqueeze(-1)
 
 
-@checked_shapes
+@check_shapes
 @full_precision
 @torch.no_grad()
 def ransac_pnp(

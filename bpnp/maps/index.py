@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.cameras import camera_from, plain_camera
+from bpnp.cameras import camera_from, camera_to_json
 from bpnp.datamodules.colmap.model_files import FILES
-from bpnp.files import files_as_they_are, fingerprint, written_whole
+from bpnp.files import file_states, fingerprint, write_atomically
 from bpnp.maps.views import MARGIN_DEG, RANK, Array, Cones, Pictures, View
 
 FILE = "bpnp_index.npz"
@@ -32,7 +32,7 @@ class Index(NamedTuple):
 def _stamp(folder: Path) -> str:
     """Of the files of a model, and of the constants with which its index is computed."""
     files = [folder / f"{name}.{suffix}" for name in FILES for suffix in ("bin", "txt")]
-    model = files_as_they_are(file for file in files if file.is_file())
+    model = file_states(file for file in files if file.is_file())
     return fingerprint([FORMAT, MARGIN_DEG, repr(RANK), model])
 
 
@@ -41,7 +41,7 @@ def write_index(folder: Path, index: Index) -> None:
     views = index.views
     cameras = list({id(view.camera): view.camera for view in views}.values())
     number = {id(camera): k for k, camera in enumerate(cameras)}
-    texts = {"stamp": _stamp(folder), "cameras": json.dumps([plain_camera(camera) for camera in cameras])}
+    texts = {"stamp": _stamp(folder), "cameras": json.dumps([camera_to_json(camera) for camera in cameras])}
     texts["names"] = json.dumps([view.name for view in views])
     arrays: dict[str, NDArray[Any]] = {name: np.frombuffer(text.encode(), np.uint8) for name, text in texts.items()}
     arrays |= index.pictures._asdict() | index.cones._asdict()
@@ -54,7 +54,7 @@ def write_index(folder: Path, index: Index) -> None:
         "counts": np.array([len(view.points) for view in views]),
     }
     try:
-        with written_whole(folder / FILE) as temporary, temporary.open("wb") as file:
+        with write_atomically(folder / FILE) as temporary, temporary.open("wb") as file:
             np.savez(
                 file,
                 **arrays,  # type: ignore[arg-type]

@@ -14,9 +14,9 @@ from typing import Any
 
 from scipy.spatial.transform import Rotation
 
-from bpnp.cameras import camera_from, plain_camera
+from bpnp.cameras import camera_from, camera_to_json
 from bpnp.datamodules.colmap.model_files import FILES, model_format
-from bpnp.files import fingerprint, interruptions_later, write_text
+from bpnp.files import delay_interrupts, fingerprint, write_text
 from bpnp.maps.localized_picture import localized_picture
 from bpnp.maps.photos import photo_keypoints
 from bpnp.maps.scene_map import UNKNOWN, SceneMap
@@ -67,7 +67,7 @@ def photo_task(
     photo_content, source = content_of(photo), "--camera"
     if camera is None or isinstance(camera, SceneMap):
         camera, source = (camera or scene).camera_for(photo, exif=camera is None)
-    lens = UNKNOWN if camera is None or isinstance(camera, str) else plain_camera(camera_from(camera))
+    lens = UNKNOWN if camera is None or isinstance(camera, str) else camera_to_json(camera_from(camera))
     shown = None if views is None else list(views.get(name, ()))
     if shown is not None and not shown:
         raise ValueError(f"expected views for {name} in the file of views, got none; try without --views")
@@ -154,7 +154,7 @@ def localize_photos(
     try:
         for task, solution in attempts(scene, tasks()):
             try:
-                with interruptions_later():
+                with delay_interrupts():
                     folder.keep(task, solution, draw_in=scene if pictures else None)
                 done(task.name)
             except (ValueError, OSError) as error:

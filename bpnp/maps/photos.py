@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.cameras import CENTRE, far_outside, same_shape
+from bpnp.cameras import CENTRE, outside_image, same_aspect_ratio
 
 Array = NDArray[np.float64]
 Size = tuple[int, int]  # width and height, pixels
@@ -78,7 +78,7 @@ def focal_from_exif(photo: Path) -> float | None:
     """
     size, tags = _opened(photo)
     taken = int(tags.get(PIXELS_X, 0)), int(tags.get(PIXELS_Y, 0))
-    if all(taken) and not same_shape((max(taken), min(taken)), (max(size), min(size))):
+    if all(taken) and not same_aspect_ratio((max(taken), min(taken)), (max(size), min(size))):
         return None
     equivalent = float(tags.get(FOCAL_LENGTH_35MM, 0))
     if equivalent > 0:
@@ -140,7 +140,7 @@ def read_features(file: Path, photo: str, size: Size | None = None) -> Keypoints
 
     size: of the photo in pixels, to check them by; by default `<photo>/image_size`, if the file has it.
     Raises ValueError, naming file and photo, if it is not in the file or of another size, or if keypoints lie outside
-    it (`far_outside`).
+    it (`outside_image`).
     """
     try:
         h5py = importlib.import_module("h5py")  # optional
@@ -203,7 +203,7 @@ def _checked(keypoints: Keypoints, size: Size | None, where: str) -> Keypoints:
     if None not in (keypoints.size, size) and keypoints.size != size:
         raise ValueError(f"expected keypoints of {where} at the size {size} of the photo, got them at {keypoints.size}")
     known = size or keypoints.size
-    if known is not None and (outside := far_outside(keypoints.pixels, known)).any():
+    if known is not None and (outside := outside_image(keypoints.pixels, known)).any():
         raise ValueError(
             f"expected keypoints inside the {known[0]} x {known[1]} pixels of {where}, got {int(outside.sum())} "
             f"outside, such as {keypoints.pixels[outside][0].round(1).tolist()}; try features of this size"

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import nn
 
-from bpnp.cameras import CENTRE, Camera, camera_from, is_opencv, same_shape, scaled_camera
+from bpnp.cameras import CENTRE, Camera, camera_from, is_opencv, resize_camera, same_aspect_ratio
 from bpnp.cameras import image_size as image_size_of
 from bpnp.datamodules.colmap.model_files import ColmapError
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
@@ -385,9 +385,9 @@ class SceneMap:
         owners = {id(view.camera): view for view in reversed(self.views)}  # the first view of each camera
         sizes = {key: image_size_of(view.camera) for key, view in owners.items()}
         fitting = [
-            (scaled_camera(owners[key].camera, size), f"view {owners[key].name} of the map")
+            (resize_camera(owners[key].camera, size), f"view {owners[key].name} of the map")
             for key, known in sizes.items()
-            if known == size or (not exif and known is not None and same_shape(known, size))
+            if known == size or (not exif and known is not None and same_aspect_ratio(known, size))
         ]
         fitting.sort(key=lambda item: item[0].focal)
         if fitting and fitting[-1][0].focal <= SAME_FOCAL * fitting[0][0].focal:

@@ -20,7 +20,7 @@ from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import Backend, RansacPnP
 from bpnp.models.evaluation import Clock, Refinement, match_again, pnp_pose, ransac_pose, round_widths
 from bpnp.models.nets import ImageFeatures, SceneFeatures
-from bpnp.models.weights import AnyModule, TrainedNet, chosen
+from bpnp.models.weights import AnyModule, TrainedNet, module_or_default
 from bpnp.precision import full_precision
 from bpnp.types import Batch, Prediction
 
@@ -83,11 +83,11 @@ class BPnPNet(TrainedNet):
         rounds: int = 0,
     ) -> None:
         super().__init__()
-        self.features2d = chosen(features2d, ImageFeatures)
-        self.features3d = chosen(features3d, SceneFeatures)
-        self.transport = chosen(transport, Sinkhorn)
-        self.ransac = chosen(ransac, RansacPnP)
-        self.pnp = chosen(pnp, WeightedPnP)
+        self.features2d = module_or_default(features2d, ImageFeatures)
+        self.features3d = module_or_default(features3d, SceneFeatures)
+        self.transport = module_or_default(transport, Sinkhorn)
+        self.ransac = module_or_default(ransac, RansacPnP)
+        self.pnp = module_or_default(pnp, WeightedPnP)
         self.refinement = Refinement() if refinement is None else refinement
         self.rounds = rounds
         self.widths = round_widths(rounds, self.ransac)

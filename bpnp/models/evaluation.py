@@ -241,7 +241,7 @@ class Refinement(nn.Module):
         doubtful = log_support(prediction, batch, refined) < 0
         if self.hypotheses and bool(doubtful.any()):
             again = refine(batch, rotation, torch.where(doubtful[:, None, None], translation, torch.nan))
-            refined = _chosen(doubtful & (log_support(prediction, batch, again) > 0), again, refined)
+            refined = _choose_pose(doubtful & (log_support(prediction, batch, again) > 0), again, refined)
         return replace(prediction, poses=prediction.poses | {REFINED: refined})
 
 
@@ -259,7 +259,7 @@ def refinement_enabled(solver: nn.Module, enabled: bool) -> Iterator[None]:
             module.enabled = was
 
 
-def _chosen(chosen: Bool[Tensor, " b"], first: Pose, second: Pose) -> Pose:
+def _choose_pose(chosen: Bool[Tensor, " b"], first: Pose, second: Pose) -> Pose:
     """The first pose of the chosen samples, the second of the others."""
     fields = ((pose.rotation, pose.translation, *vars(pose.stats).values()) for pose in (first, second))
     rotation, translation, *stats = (choose(chosen, *both) for both in zip(*fields, strict=True))

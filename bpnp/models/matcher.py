@@ -14,8 +14,8 @@ from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import RansacPnP
 from bpnp.models.bpnpnet import pairwise_distance
 from bpnp.models.evaluation import Clock, Refinement, pnp_pose, ransac_pose
-from bpnp.models.nets import ExchangeBlock, Neighbourhood, centred
-from bpnp.models.weights import AnyModule, TrainedNet, chosen
+from bpnp.models.nets import ExchangeBlock, Neighbourhood, subtract_mean
+from bpnp.models.weights import AnyModule, TrainedNet, module_or_default
 from bpnp.types import Batch, Prediction, SolveStats
 
 WIDEST = 4.0  # distance from the middle of a view's image over the focal length, 76 degrees
@@ -86,8 +86,8 @@ class Matcher(TrainedNet):
         self.leave = nn.Linear(channels, 1)
         self.bin_cost = nn.Parameter(torch.ones(()))
         self.log_mu = nn.Parameter(torch.tensor(math.log(mu)))
-        self.ransac = chosen(ransac, RansacPnP)
-        self.pnp = chosen(pnp, WeightedPnP)
+        self.ransac = module_or_default(ransac, RansacPnP)
+        self.pnp = module_or_default(pnp, WeightedPnP)
         self.refinement = Refinement() if refinement is None else refinement
 
     def forward(self, batch: Batch) -> Prediction:
@@ -153,7 +153,7 @@ class Matcher(TrainedNet):
 
     def _unit(self, z: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
         """Projected, centred over the set, of unit length: a set's features cannot all be the same."""
-        return nn.functional.normalize(centred(self.project(z), mask), dim=-1)
+        return nn.functional.normalize(subtract_mean(self.project(z), mask), dim=-1)
 
 
 def robust_frame(

@@ -15,12 +15,12 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
-from bpnp.types import unpadded
+from bpnp.types import has_no_padding
 
 CONTEXT_EPS = 1e-3  # as in the authors' code
 
 
-def centred(x: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
+def subtract_mean(x: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
     """x - mean over the real points of each set, per channel."""
     weight = mask.unsqueeze(-1).to(x.dtype)
     return x - (x * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True)
@@ -56,9 +56,9 @@ class _LinearContextNorm(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor, mask: Tensor | None, skip: Tensor | None) -> Tensor:
         z = functional.linear(x, weight, bias)
-        y = _hidden(z if z.dtype == torch.float64 else z.float(), mask)
+        y = _zero_padding(z if z.dtype == torch.float64 else z.float(), mask)
         count = y.new_full((1, 1, 1), y.shape[1]) if mask is None else mask.sum(1)[:, None, None].to(y.dtype)
-        y = _hidden(y.sub_(y.sum(1, keepdim=True) / count), mask)
+        y = _zero_padding(y.sub_(y.sum(1, keepdim=True) / count), mask)
         scale = torch.rsqrt(y.square().sum(1, keepdim=True) / (count - 1).clamp_min(1) + CONTEXT_EPS)
         y = y.mul_(scale).to(x.dtype)
         ctx.rectified = skip is not None
@@ -70,20 +70,20 @@ class _LinearContextNorm(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         x, weight, y, scale, count, mask = ctx.saved_tensors
         g = gradient.to(y.dtype)
-        g = _hidden(torch.ops.aten.threshold_backward(g, y, 0) if ctx.rectified else g, mask)
+        g = _zero_padding(torch.ops.aten.threshold_backward(g, y, 0) if ctx.rectified else g, mask)
         wide = y.to(scale.dtype)
         dz = g * wide
         along = dz.sum(1, keepdim=True) / (count - 1).clamp_min(1)
         mean = g.sum(1, keepdim=True, dtype=scale.dtype) / count
         torch.mul(wide, along, out=dz).add_(mean).sub_(g).mul_(-scale)
-        dz = _hidden(dz, mask).to(x.dtype)
+        dz = _zero_padding(dz, mask).to(x.dtype)
         to_x, to_weight = ctx.needs_input_grad[:2]
         dx = dz @ weight if to_x else None
         dw = dz.flatten(0, 1).mT @ x.flatten(0, 1) if to_weight else None
         return dx, dw, torch.zeros_like(dz[0, 0]), None, gradient if ctx.rectified else None
 
 
-def _hidden(x: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"] | None) -> Float[Tensor, "b k c"]:
+def _zero_padding(x: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"] | None) -> Float[Tensor, "b k c"]:
     """Zero at padded points."""
     return x if mask is None else x.masked_fill(~mask.unsqueeze(-1), 0)
 
@@ -167,10 +167,10 @@ class PointFeatures(nn.Module):
         self.blocks = nn.ModuleList(ResidualBlock(channels) for _ in range(depth))
 
     def forward(self, points: Float[Tensor, "b k d"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
-        z, seen = self.enter(points), None if unpadded(mask) else mask
+        z, seen = self.enter(points), None if has_no_padding(mask) else mask
         for block in self.blocks:
             z = block(z, seen)
-        return functional.normalize(centred(z, mask) if self.centre else z, dim=-1)
+        return functional.normalize(subtract_mean(z, mask) if self.centre else z, dim=-1)
 
 
 class ImageFeatures(PointFeatures):
@@ -219,7 +219,7 @@ class InputTransform(nn.Module):
         self.out = nn.Linear(256, 9)
 
     def forward(self, points: Float[Tensor, "b n 3"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b n 3"]:
-        z, seen = points, None if unpadded(mask) else mask
+        z, seen = points, None if has_no_padding(mask) else mask
         for linear, norm in zip(self.linears[:3], self.norms[:3], strict=True):
             z = torch.relu(norm(linear(z), seen))
         z = (z if seen is None else z.masked_fill(~seen.unsqueeze(-1), 0)).amax(1)
@@ -232,7 +232,7 @@ class InputTransform(nn.Module):
 def normalise_points3d(points3d: Float[Tensor, "b n 3"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b n 3"]:
     """Centred at the mean, root mean square distance one: features that do not depend on the scene's units."""
     weight = mask.unsqueeze(-1).to(points3d.dtype)
-    around = centred(points3d, mask) * weight
+    around = subtract_mean(points3d, mask) * weight
     radius = ((around**2).sum((1, 2), keepdim=True) / weight.sum(1, keepdim=True)).sqrt()
     return around / torch.where(radius > 0, radius, 1)
 

@@ -187,7 +187,7 @@ def fitting_state(
     wrong: list[str] = []
     for place, ours, theirs in differences(wanted, _with_defaults(saved, solver)):
         changed = adjusted if ADJUSTABLE & set(place.split(".")) else wrong
-        changed.append(f"{place}={_shown(ours)} (saved: {_shown(theirs)})")
+        changed.append(f"{place}={_setting_text(ours)} (saved: {_setting_text(theirs)})")
     if wrong and (misfits or not added):
         raise ValueError(
             f"the checkpoint is of another {wanted['class']}: {', '.join(wrong)}. Leave these settings out, or give "
@@ -213,7 +213,7 @@ def _shape(weight: Tensor | None) -> tuple[int, ...] | None:
     return None if weight is None else tuple(weight.shape)
 
 
-def _shown(setting: Any) -> Any:
+def _setting_text(setting: Any) -> Any:
     return setting["class"] if is_description(setting) else setting
 
 
@@ -224,7 +224,7 @@ class AnyModule(Protocol):
     def __call__(self, *arguments: Any, **options: Any) -> Any: ...
 
 
-def chosen(module: AnyModule | None, default: type[nn.Module]) -> nn.Module:
+def module_or_default(module: AnyModule | None, default: type[nn.Module]) -> nn.Module:
     """The module that was given, or the default class with its default options."""
     if module is None:
         return default()

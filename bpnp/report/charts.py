@@ -127,7 +127,7 @@ def figures() -> dict[str, dict[str, Any]]:
     directions = {"xaxis": "right", "yaxis": "forward", "zaxis": "up"}  # of the true camera
     axes = {axis: {"title": {"text": direction}} for axis, direction in directions.items()}
     view = {"aspectmode": "data", "dragmode": "orbit", "camera": {"eye": {"x": 1.3, "y": -2.1, "z": 0.9}}}
-    space: list[dict[str, Any]] = [_marks(size=3.5, line={"width": 0}), _picked(18)]
+    space: list[dict[str, Any]] = [_marks(size=3.5, line={"width": 0}), _selected_point(18)]
     scene = (
         [mark | {"type": "scatter3d"} for mark in space],
         {"margin": dict.fromkeys("lrtb", 0), "scene": axes | view},
@@ -135,7 +135,7 @@ def figures() -> dict[str, dict[str, Any]]:
     axis: dict[str, Any] = {"constrain": "domain", "zeroline": False}
     lines = [_lines(color=INK["quiet"]), _lines(color=INK["wrong"], dash="dot")]
     image = (
-        [*lines, _marks(symbol="circle-open"), _marks(symbol="x-thin"), _picked(16)],
+        [*lines, _marks(symbol="circle-open"), _marks(symbol="x-thin"), _selected_point(16)],
         {
             "margin": {"l": 40, "r": 10, "t": 10, "b": 30},
             "dragmode": "pan",
@@ -151,7 +151,7 @@ def _marks(**marker: Any) -> dict[str, Any]:
     return {"type": "scatter", "mode": "markers", "marker": marker, "hovertemplate": "%{text}<extra></extra>"}
 
 
-def _picked(size: int) -> dict[str, Any]:
+def _selected_point(size: int) -> dict[str, Any]:
     marker = {"symbol": "circle-open", "color": INK["wrong"], "line": {"width": 2}, "size": size}
     return {"mode": "markers", "hoverinfo": "skip", "marker": marker}
 

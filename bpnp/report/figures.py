@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from bpnp.cameras import Camera, image_size, in_front, same_shape
-from bpnp.files import interruptions_later, written_whole
+from bpnp.cameras import Camera, image_size, in_front, same_aspect_ratio
+from bpnp.files import delay_interrupts, write_atomically
 from bpnp.report.charts import RECALLS, Error, recall_of
 from bpnp.report.points import Array, ProblemPoints, utf8
 from bpnp.report.results import Results
@@ -171,7 +171,7 @@ def plot_image(
     from matplotlib.collections import LineCollection
     from matplotlib.patheffects import withStroke
 
-    seen, projected, targets, colour = _drawn(problem, estimate, lines)
+    seen, projected, targets, colour = _prepare_drawing(problem, estimate, lines)
     if photo is not None and problem.camera is None:
         raise ValueError("expected a camera to draw a photo under the points, got none")
     left, top, right, bottom = _extent(seen) if photo is None else (0, 0, *size_in_camera(photo, problem.camera))
@@ -204,7 +204,7 @@ def plot_residuals(
     axes: "Axes", problem: ProblemPoints, *, estimate: str | None = None, lines: Lines = "match3d"
 ) -> "Axes":
     """A close-up: image point minus reprojected 3D point of each match; arguments as for `plot_image`."""
-    seen, projected, targets, colour = _drawn(problem, estimate, lines)
+    seen, projected, targets, colour = _prepare_drawing(problem, estimate, lines)
     matched = targets >= 0
     residuals = seen[targets[matched]] - projected[matched]
     if not np.isfinite(residuals).any():
@@ -241,7 +241,7 @@ def save_figure(figure: "Figure", path: Path | str, *, dpi: int = 110) -> Path:
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
         raise ValueError(f"expected a file name that ends in {', '.join(SUFFIXES)}, got {path.name!r}")
-    with written_whole(path) as temporary, interruptions_later():  # matplotlib takes Ctrl-C for an error of its input
+    with write_atomically(path) as temporary, delay_interrupts():  # matplotlib takes Ctrl-C for an error of its input
         figure.savefig(temporary, format=path.suffix[1:].lower(), dpi=dpi)
     return path
 
@@ -254,7 +254,9 @@ def _estimate(problem: ProblemPoints, estimate: str | None) -> tuple[str, tuple[
     return name, problem.estimates.get(name, (np.full((3, 3), np.nan), np.full(3, np.nan)))
 
 
-def _drawn(problem: ProblemPoints, estimate: str | None, lines: Lines | None) -> tuple[Array, Array, Array, str]:
+def _prepare_drawing(
+    problem: ProblemPoints, estimate: str | None, lines: Lines | None
+) -> tuple[Array, Array, Array, str]:
     """Image points and projected 3D points (NaN without a pose) in the units of the axes, the image point that each 3D
     point is joined to, and the colour of the estimate."""
     name, (rotation, translation) = _estimate(problem, estimate)
@@ -318,7 +320,7 @@ def size_in_camera(photo: Array, camera: Camera | None) -> tuple[int, int]:
     known = None if camera is None else image_size(camera)
     if known is None:
         return width, height
-    if not same_shape((width, height), known):
+    if not same_aspect_ratio((width, height), known):
         raise ValueError(
             f"expected a photo of {known[0]} x {known[1]} pixels as its camera has, or of that shape, got {width} x "
             f"{height}; try the photo of this camera"

@@ -92,11 +92,11 @@ def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None) -> str
     return page.from_string(_asset("page.html")).render(
         style=Markup(_asset("page.css")),
         script=Markup("\n".join(map(_asset, SCRIPTS))),
-        data=compressed(json.dumps(numbers)),
+        data=compress_text(json.dumps(numbers)),
         points=page_points(runs, points),
         plotly=plotly_script(),
         runs={
-            name: (described(results), json.dumps({key: getattr(results, key) for key in FACTS}, indent=2))
+            name: (describe_run(results), json.dumps({key: getattr(results, key) for key in FACTS}, indent=2))
             for name, results in runs.items()
         },
         folders=", ".join(folders),
@@ -145,7 +145,7 @@ def quartile_rows(runs: Mapping[str, Results], paper: Paper | None) -> list[Tabl
     return shown
 
 
-def described(results: Results) -> str:
+def describe_run(results: Results) -> str:
     """What was tested, with which settings and with which outcome."""
     rows = results.of(next(iter(results.estimates)))
     spans = {what: sorted(getattr(row, key) for row in rows) for key, what in SIZES.items()}
@@ -183,14 +183,14 @@ def plotly_script() -> str:
     """plotly.js, compressed, in base64."""
     from plotly.offline import get_plotlyjs
 
-    return compressed(get_plotlyjs())
+    return compress_text(get_plotlyjs())
 
 
 def _asset(name: str) -> str:
     return (files("bpnp.report") / "assets" / name).read_text(encoding="utf-8")
 
 
-def compressed(text: str) -> str:
+def compress_text(text: str) -> str:
     """gzip in base64, which the page's `inflated` reads."""
     return base64.b64encode(gzip.compress(text.encode(), 6, mtime=0)).decode()
 
@@ -230,7 +230,7 @@ def page_points(runs: Mapping[str, Results], points: Mapping[str, Sequence[Probl
         for name, results in runs.items()
     }
     lines = [json.dumps(_line(shared[key]), separators=(",", ":")) for key in worst]
-    return compressed("\n".join([json.dumps(places), *lines]))
+    return compress_text("\n".join([json.dumps(places), *lines]))
 
 
 def _key(problem: ProblemPoints) -> Hashable:
@@ -241,13 +241,13 @@ def _key(problem: ProblemPoints) -> Hashable:
 
 def _columns(rows: Sequence[ProblemRow]) -> dict[str, list[Any]]:
     return {
-        **{key: [_shortened(getattr(row, key)) for row in rows] for key in ERRORS},
+        **{key: [_shorten_number(getattr(row, key)) for row in rows] for key in ERRORS},
         **{key: [getattr(row, key) for row in rows] for key in COUNTS},
         "cause": [CAUSES.index(row.cause) for row in rows],
     }
 
 
-def _shortened(value: float) -> float | str:
+def _shorten_number(value: float) -> float | str:
     """`DIGITS` significant digits; of what JSON has no number for, the name that JavaScript's `Number` reads."""
     if math.isfinite(value):
         return float(f"{value:.{DIGITS}g}")

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from torch import Tensor
 
 from bpnp.cameras import Camera
-from bpnp.files import written_whole
+from bpnp.files import write_atomically
 from bpnp.metrics import PoseErrors, prediction_errors
 from bpnp.types import Batch, Prediction
 
@@ -114,8 +114,8 @@ def thin(problem: ProblemPoints, most: int = MOST) -> ProblemPoints:
         problem,
         points2d=problem.points2d[keep2d],
         points3d=problem.points3d[keep3d],
-        match3d=_renumbered(problem.match3d[keep3d], keep2d, count2d),
-        assigned3d=_renumbered(problem.assigned3d[keep3d], keep2d, count2d),
+        match3d=_renumber_targets(problem.match3d[keep3d], keep2d, count2d),
+        assigned3d=_renumber_targets(problem.assigned3d[keep3d], keep2d, count2d),
         ids2d=ids2d[keep2d].astype(np.int32),
         ids3d=ids3d[keep3d].astype(np.int32),
     )
@@ -140,13 +140,13 @@ def write_points(folder: Path | str, problems: Iterable[ProblemPoints]) -> None:
         "error": np.array([problem.error for problem in ordered], np.float64),
         "count2d": np.array([len(problem.points2d) for problem in ordered], np.int64),
         "count3d": np.array([len(problem.points3d) for problem in ordered], np.int64),
-        "pose": _stacked([problem.pose for problem in ordered]),
+        "pose": _stack_poses([problem.pose for problem in ordered]),
     }
     for name, (kind, *width) in POINTS.items():
         parts = [problem.numbers()[name == "ids3d"] if name in IDS else getattr(problem, name) for problem in ordered]
         arrays[name] = np.concatenate([np.empty((0, *width), kind), *parts]).astype(kind)
-    arrays |= {f"estimate.{name}": _stacked([problem.estimates[name] for problem in ordered]) for name in names}
-    with written_whole(Path(folder) / FILE) as temporary, temporary.open("wb") as file:
+    arrays |= {f"estimate.{name}": _stack_poses([problem.estimates[name] for problem in ordered]) for name in names}
+    with write_atomically(Path(folder) / FILE) as temporary, temporary.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)  # type: ignore[arg-type, unused-ignore]
 
 
@@ -160,13 +160,13 @@ def read_points(folder: Path | str) -> tuple[ProblemPoints, ...]:
             arrays = dict(archive)
         version = int(arrays["format"])
         if version == FORMAT:
-            return tuple(_unpacked(arrays))
+            return tuple(_unpack_problems(arrays))
     except Exception as error:  # noqa: BLE001 - zipfile, numpy and json each have errors of their own
         raise ValueError(f"expected points of a test in {path}, got {error}; try `bpnp test` again") from error
     raise ValueError(f"expected points of format {FORMAT} in {path}, got {version}; try the bpnp that wrote them")
 
 
-def _unpacked(arrays: dict[str, Array]) -> Iterable[ProblemPoints]:
+def _unpack_problems(arrays: dict[str, Array]) -> Iterable[ProblemPoints]:
     ends = {side: arrays[f"count{side}"].cumsum()[:-1] for side in ("2d", "3d")}
     points: dict[str, Any] = {name: np.split(arrays[name], ends[name[-2:]]) for name in POINTS}
     prefix = "estimate."
@@ -182,7 +182,7 @@ def _unpacked(arrays: dict[str, Array]) -> Iterable[ProblemPoints]:
         )
 
 
-def _stacked(poses: Sequence[tuple[Array, Array] | None]) -> Array:
+def _stack_poses(poses: Sequence[tuple[Array, Array] | None]) -> Array:
     """[R | t] of each problem, (k, 3, 4), NaN for none."""
     missing = np.full((3, 4), np.nan)
     return np.array([missing if pose is None else np.c_[pose] for pose in poses], np.float64).reshape(-1, 3, 4)
@@ -198,17 +198,17 @@ def _host(values: Tensor) -> Array:
 
 def _first_then_rest(first: Array, most: int) -> Array:
     """Indices where `first` holds and then of the rest, each thinned evenly where there is no room; ascending."""
-    head = _thinned(np.flatnonzero(first), most)
-    return np.sort(np.r_[head, _thinned(np.flatnonzero(~first), most - len(head))]).astype(np.int64)
+    head = _thin_rows(np.flatnonzero(first), most)
+    return np.sort(np.r_[head, _thin_rows(np.flatnonzero(~first), most - len(head))]).astype(np.int64)
 
 
-def _thinned(values: Array, most: int) -> Array:
+def _thin_rows(values: Array, most: int) -> Array:
     if len(values) <= most:
         return values
     return values[np.linspace(0, len(values) - 1, most).astype(np.int64)] if most else values[:0]
 
 
-def _renumbered(targets: Array, chosen: Array, count: int) -> Array:
+def _renumber_targets(targets: Array, chosen: Array, count: int) -> Array:
     """Positions of `targets` in `chosen`, both indices of `count` points; -1 for those that are not among them."""
     place = np.full(count + 1, -1, np.int32)  # the last for targets of -1
     place[chosen] = np.arange(len(chosen))

@@ -18,7 +18,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from bpnp import __version__
-from bpnp.files import write_text, written_whole
+from bpnp.files import write_atomically, write_text
 from bpnp.geometry import project, transform
 from bpnp.metrics import PoseErrors, pose_quartiles, pose_recalls, prediction_errors
 from bpnp.types import Batch, Pose, Prediction
@@ -215,7 +215,7 @@ def write_results(
     """
     from pandas import DataFrame
 
-    ordered = _ordered(rows)
+    ordered = _sort_rows(rows)
     written = datetime.now(UTC).isoformat(timespec="seconds")
     results = Results(
         ordered, summarise(ordered), correspondence_loss, plain(dict(settings or {})), __version__, written
@@ -226,7 +226,7 @@ def write_results(
     folder = Path(folder)
     # Old aggregates must not stand beside new rows, should the process end between the two files.
     (folder / SUMMARY).unlink(missing_ok=True)
-    with written_whole(folder / ROWS) as temporary:
+    with write_atomically(folder / ROWS) as temporary:
         # File names that are not UTF-8 reach us, and leave, as surrogates.
         frame.to_csv(temporary, index=False, na_rep="nan", lineterminator="\r\n", errors="surrogateescape")
     write_text(folder / SUMMARY, json.dumps(plain(summary), indent=2, allow_nan=False) + "\n")
@@ -281,7 +281,7 @@ def _read_rows(path: Path) -> tuple[ProblemRow, ...]:
     return tuple(ProblemRow(*values) for values in zip(*columns, strict=True))
 
 
-def _ordered(rows: Iterable[ProblemRow]) -> tuple[ProblemRow, ...]:
+def _sort_rows(rows: Iterable[ProblemRow]) -> tuple[ProblemRow, ...]:
     """The first row of each problem and estimate, sorted."""
     problems: dict[int, tuple[str, int, int]] = {}
     first: dict[tuple[int, str], ProblemRow] = {}

@@ -12,7 +12,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import nn
 
-from bpnp.cameras import CENTRE, Camera, far_outside, is_opencv
+from bpnp.cameras import CENTRE, Camera, is_opencv, outside_image
 from bpnp.checks import check_normalised
 from bpnp.search.starts import GravityPrior, PosePrior
 
@@ -189,14 +189,14 @@ def check_inside(points2d: Any, size: Any) -> None:
         size: Width and height of the image, pixels.
 
     Raises:
-        ValueError: For another shape, or where `far_outside` tells another size.
+        ValueError: For another shape, or where `outside_image` tells another size.
     """
     pixels, sides = image_points(points2d), np.array(checked_size(size))
     if pixels.ndim != 2 or pixels.shape[1] != 2:
         raise ValueError(f"expected pixels `points2d` of shape (m, 2) with an `image_size`, got {pixels.shape}")
-    outside = far_outside(pixels, sides)
+    outside = outside_image(pixels, sides)
     if outside.any():
-        fits_swapped = not far_outside(pixels, sides[::-1]).any()
+        fits_swapped = not outside_image(pixels, sides[::-1]).any()
         hint = "are width and height swapped?" if fits_swapped else "try the size of the image in which they are"
         raise ValueError(
             f"expected `points2d` inside the {sides[0]} x {sides[1]} pixels of `image_size`, got "

@@ -13,7 +13,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bpnp.cameras import Camera, Lens, bent_camera, camera_from, is_pinhole, plain_camera, zoomed_camera
+from bpnp.cameras import (
+    Camera,
+    Lens,
+    camera_from,
+    camera_to_json,
+    is_pinhole,
+    scale_focal_length,
+    with_radial_distortion,
+)
 from bpnp.geometry import same_pose, turned_by
 from bpnp.loops.parallel import Clock, one_blas_thread
 from bpnp.search.annealing import polished
@@ -102,8 +110,8 @@ class UnknownCamera(NamedTuple):
 
     def at(self, zoom: float, radial: float | None = None) -> Camera:
         """Return the camera with `zoom` times the focal length of the reference and a radial coefficient."""
-        camera = zoomed_camera(self.reference, zoom)
-        return camera if radial is None else bent_camera(camera, radial)
+        camera = scale_focal_length(self.reference, zoom)
+        return camera if radial is None else with_radial_distortion(camera, radial)
 
     def parts(self, camera: Camera) -> tuple[float, float | None]:
         """Return the zoom and the radial coefficient, None for none, of one of these cameras."""
@@ -188,7 +196,9 @@ def unknown_camera(
         raise ValueError(f"expected `focal_error` above 0 and below 1, a share of the focal length, got {focal_error}")
     widest, lens = math.exp(RULE.sigmas * focal_error), camera_from(camera)
     if distortion and not is_pinhole(lens):
-        raise ValueError(f"`distortion=True` needs a pinhole `camera`; the distortion of {plain_camera(lens)} is known")
+        raise ValueError(
+            f"`distortion=True` needs a pinhole `camera`; the distortion of {camera_to_json(lens)} is known"
+        )
     bends = is_pinhole(lens)
     return UnknownCamera(lens, 1 / widest, widest, 1.0, focal_error, bends=bends, distorted=bool(distortion))
 

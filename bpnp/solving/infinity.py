@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.special import stdtrit
 
-from bpnp.cameras import Camera, camera_from, in_front, zoomed_camera
+from bpnp.cameras import Camera, camera_from, in_front, scale_focal_length
 from bpnp.loops.parallel import Clock, Deadline, one_blas_thread
 from bpnp.search.evidence.uncertainty import ONE_SIGMA
 from bpnp.search.infinity.evidence import how_well_known, noise_of
@@ -89,17 +89,19 @@ def _fitted(camera: Camera, image: Array, scene: Array, solution: Solution) -> C
     pixels, seen = image[solution.matches[:, 0]], scene[solution.matches[:, 1]] @ solution.rotation.T
 
     def residuals(step: Array) -> Array:
-        bearings, _, pixel = _bearings(pixels, zoomed_camera(camera, math.exp(step[3])))
+        bearings, _, pixel = _bearings(pixels, scale_focal_length(camera, math.exp(step[3])))
         off = bearings - Rotation.from_rotvec(step[:3]).apply(seen)
         return np.asarray((off / pixel[:, None]).ravel())
 
-    return zoomed_camera(camera, math.exp(least_squares(residuals, np.zeros(4), loss="soft_l1", x_scale=0.01).x[3]))
+    return scale_focal_length(
+        camera, math.exp(least_squares(residuals, np.zeros(4), loss="soft_l1", x_scale=0.01).x[3])
+    )
 
 
 def _with_focal_length(camera: Camera, pixels: Array, seen: Array, noise: float) -> Array:
     """Covariance (4, 4) of the turn and of the focal length, pixels, of matches with directions `seen` (k, 3)."""
     step = 1e-5
-    ends = [_bearings(pixels, zoomed_camera(camera, math.exp(sign * step))) for sign in (1, -1)]
+    ends = [_bearings(pixels, scale_focal_length(camera, math.exp(sign * step))) for sign in (1, -1)]
     turned = np.cross(np.eye(3)[None], seen[:, None]).swapaxes(1, 2)
     rows = np.concatenate([turned, (ends[1][0] - ends[0][0])[:, :, None] / (2 * step)], -1) / ends[0][2][:, None, None]
     rows = rows.reshape(-1, 4) * [1, 1, 1, 1 / camera.focal]

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 import numpy.typing as npt
 
-from bpnp.cameras import Camera, camera_from, plain_camera
+from bpnp.cameras import Camera, camera_from, camera_to_json
 from bpnp.search.evidence.uncertainty import centre_covariance
 from bpnp.search.verdict import Verdict
 from bpnp.solving.problem import Unit
@@ -325,7 +325,7 @@ def _plain(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
     if isinstance(value, Camera):
-        return plain_camera(value)
+        return camera_to_json(value)
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

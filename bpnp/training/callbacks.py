@@ -19,13 +19,13 @@ from torch import Tensor, nn
 
 from bpnp.checks import check_within
 from bpnp.models.evaluation import refinement_enabled
-from bpnp.models.nets import centred
+from bpnp.models.nets import subtract_mean
 from bpnp.report.points import ProblemPoints, points_from, write_points
 from bpnp.report.results import SUMMARY, ProblemRow, rows_from, write_results
 from bpnp.report.tables import read_runs, results_table
 from bpnp.report.terminal import console, say
 from bpnp.training.task import BlindPnPTask, number_globally
-from bpnp.types import Batch, Prediction, mapped
+from bpnp.types import Batch, Prediction, map_tensors
 
 COLLAPSED = 0.05  # spread of unit features below which an assignment is all but uniform
 LINE = ("train/loss", "val/correspondence_loss", "val/pnp/rotation_q2_deg", "val/pnp/translation_q2")  # of an epoch
@@ -147,7 +147,7 @@ class TrainingMonitor(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
     ) -> None:
         if batch_idx == 0 and self.watched is None:
-            some = mapped(batch, lambda values: values[: self.problems].cpu())
+            some = map_tensors(batch, lambda values: values[: self.problems].cpu())
             self.watched = replace(some, ids=batch.ids[: self.problems])
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -177,7 +177,7 @@ def feature_spreads(solver: nn.Module, batch: Batch) -> dict[str, Tensor]:
     features = solver.features(batch) if hasattr(solver, "features") else ()  # type: ignore[operator]
     spreads = {}
     for side, z, mask in zip(("2d", "3d"), features, (batch.mask2d, batch.mask3d), strict=False):
-        away = torch.linalg.vector_norm(centred(nn.functional.normalize(z, dim=-1), mask), dim=-1) * mask
+        away = torch.linalg.vector_norm(subtract_mean(nn.functional.normalize(z, dim=-1), mask), dim=-1) * mask
         spreads[f"feature_spread_{side}"] = (away.sum(1) / mask.sum(1)).mean()
     return spreads
 

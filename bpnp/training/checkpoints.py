@@ -13,7 +13,7 @@ from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
 
-from bpnp.files import written_whole
+from bpnp.files import write_atomically
 from bpnp.models.weights import read_checkpoint, read_data
 
 INTERRUPTED = "interrupted"
@@ -43,7 +43,7 @@ class SafeCheckpointIO(TorchCheckpointIO):
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
         content = io.BytesIO()
         torch.save(checkpoint if "state_dict" in checkpoint else {WEIGHTS_ALONE: dict(checkpoint)}, content)
-        with written_whole(Path(path)) as temporary:
+        with write_atomically(Path(path)) as temporary:
             temporary.write_bytes(content.getbuffer())
 
     def load_checkpoint(
@@ -108,7 +108,7 @@ class BestCheckpoint(ModelCheckpoint):
 
 
 @contextmanager
-def interruptible(trainer: Trainer) -> Iterator[None]:
+def raise_on_interrupt(trainer: Trainer) -> Iterator[None]:
     """Raise KeyboardInterrupt after Ctrl-C in a run of the trainer, where Lightning ends the process with status 1."""
     try:
         yield

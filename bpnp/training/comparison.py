@@ -20,7 +20,7 @@ from bpnp.models import TrainedNet
 from bpnp.models.weights import checkpoint_path
 from bpnp.report.results import SUMMARY, Results, plain, read_results, summarise
 from bpnp.training.callbacks import ProgressLines, ResultsWriter
-from bpnp.training.checkpoints import interruptible
+from bpnp.training.checkpoints import raise_on_interrupt
 from bpnp.training.task import BlindPnPTask
 
 SHORT_NAMES = {
@@ -98,7 +98,7 @@ def parse_methods(texts: Sequence[str], *, time_limit: float | None = None) -> l
             raise ValueError(f"expected a label for each method, got {label!r} twice; try LABEL=METHOD")
         methods[method.folder_name] = method
         if class_path not in TRAINED or weights is None:
-            _parsed(nn.Module, "solver", method.settings)  # before any test runs
+            _parse_settings(nn.Module, "solver", method.settings)  # before any test runs
     return list(methods.values())
 
 
@@ -126,7 +126,7 @@ def read_data(recipe: Path, overrides: Sequence[str]) -> dict[str, Any]:
     if not data:
         raise ValueError(f"expected `data` in {recipe}, got none; try --data psb")
     settings = data if isinstance(data, dict) else {"class_path": data}
-    return dict(_parsed(LightningDataModule, "data", settings, overrides)[1].as_dict()["data"])
+    return dict(_parse_settings(LightningDataModule, "data", settings, overrides)[1].as_dict()["data"])
 
 
 def _recipe(path: Path, what: str) -> dict[str, Any]:
@@ -198,7 +198,7 @@ class MethodTest:
             enable_progress_bar=progress_bar, enable_model_summary=False,
         )  # fmt: skip
         try:
-            with interruptible(trainer):
+            with raise_on_interrupt(trainer):
                 trainer.test(BlindPnPTask(self.method.build()), loader, verbose=False)
         finally:
             messages.setLevel(level)
@@ -214,12 +214,12 @@ def problem_order(size: int) -> list[int]:
 
 def build(base: type, name: str, settings: Mapping[str, Any]) -> Any:
     """A subclass of `base`. Raises ValueError for settings that its class does not accept, and as its constructor."""
-    parser, chosen = _parsed(base, name, settings)
+    parser, chosen = _parse_settings(base, name, settings)
     instantiate = parser.instantiate if hasattr(parser, "instantiate") else parser.instantiate_classes  # by release
     return instantiate(chosen)[name]
 
 
-def _parsed(
+def _parse_settings(
     base: type, name: str, settings: Mapping[str, Any], overrides: Sequence[str] = ()
 ) -> tuple[ArgumentParser, Namespace]:
     parser = ArgumentParser(exit_on_error=False)

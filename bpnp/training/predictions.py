@@ -35,11 +35,11 @@ def in_scene_frame(prediction: Prediction, batch: Batch) -> Prediction:
     """
     poses = prediction.poses
     if batch.origin is not None:
-        poses = {name: _translated(pose, batch.origin) for name, pose in poses.items()}
+        poses = {name: _translate(pose, batch.origin) for name, pose in poses.items()}
     return replace(prediction, poses=poses, ids=batch.ids, index=batch.index)
 
 
-def _translated(pose: Pose, origin: Tensor) -> Pose:
+def _translate(pose: Pose, origin: Tensor) -> Pose:
     # The origin multiplies the rounding of a float32 rotation, so the rotation is made exact first.
     rotation = quaternion_rotation(roma.rotmat_to_unitquat(pose.rotation.double()))
     return replace(

@@ -29,11 +29,11 @@ from bpnp.models.weights import (
     TrainedNet,
     build_module,
     build_solver,
-    chosen,
     describe_module,
     fitting_state,
     is_description,
     is_plain,
+    module_or_default,
     read_checkpoint,
 )
 from bpnp.precision import exact_products
@@ -98,12 +98,12 @@ class BlindPnPTask(LightningModule):
     ) -> None:
         super().__init__()
         if weights is None:
-            self.solver = chosen(solver, BPnPNet)
+            self.solver = module_or_default(solver, BPnPNet)
         else:
             content = read_checkpoint(weights)
-            self.solver = build_solver(content) if solver is None else chosen(solver, BPnPNet)
+            self.solver = build_solver(content) if solver is None else module_or_default(solver, BPnPNet)
             self._adopt(content, grown=True)
-        self.loss = None if loss is None else chosen(loss, nn.Module)
+        self.loss = None if loss is None else module_or_default(loss, nn.Module)
         self.save_hyperparameters(
             {
                 "solver": describe_module(self.solver),

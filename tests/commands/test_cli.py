@@ -12,7 +12,7 @@ import pytest
 from small_data import MESHES, SMALL_NET, write_mesh_tree
 
 from bpnp.cli import COMMANDS, main
-from bpnp.files import claimed
+from bpnp.files import lock_folder
 
 
 def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
@@ -151,7 +151,7 @@ def test_another_script_named_lightning_is_told(
 
 def test_two_trainings_do_not_write_to_one_folder(tmp_path: Path, fails: Callable[..., str]) -> None:
     arguments = ["fit", *MESHES, f"--trainer.default_root_dir={tmp_path}", f"--data.cache_dir={tmp_path}"]
-    with claimed(tmp_path):
+    with lock_folder(tmp_path):
         assert "expected a folder that no other process writes to" in fails(*arguments)
 
 

@@ -24,7 +24,7 @@ from torch.utils.data import DataLoader
 from bpnp import Batch, BPnPNet, Prediction
 from bpnp.cli import main
 from bpnp.datamodules import MeshDataModule
-from bpnp.datamodules.problem import Problem, stacked
+from bpnp.datamodules.problem import Problem, stack_problems
 from bpnp.geometry import quaternion_rotation
 from bpnp.report import read_results
 from bpnp.training import BlindPnPTask
@@ -277,7 +277,9 @@ class FarScenes(LightningDataModule):
                 )
             )
         order = [[2, 0], [3, 1]]
-        return DataLoader([stacked([problems[i] for i in part], torch.tensor(part)) for part in order], batch_size=None)
+        return DataLoader(
+            [stack_problems([problems[i] for i in part], torch.tensor(part)) for part in order], batch_size=None
+        )
 
 
 def truth() -> list[tuple[np.ndarray, np.ndarray]]:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from bpnp.cli import COMMANDS, LIGHTNING, main
-from bpnp.commands.parser import parsed_arguments
+from bpnp.commands.parser import parse_arguments
 
 ROOT = Path(__file__).parents[2]
 TEXTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -50,7 +50,7 @@ def test_commands_are_parsed(text: str, line: str, capsys: pytest.CaptureFixture
     command = COMMANDS[name]
     if isinstance(command, Mapping):
         name, command, rest = f"{name} {rest[0]}", command[rest[0]], rest[1:]
-    assert parsed_arguments(name, command, rest)
+    assert parse_arguments(name, command, rest)
 
 
 @pytest.mark.parametrize("text", TEXTS, ids=lambda path: path.name)

@@ -12,7 +12,7 @@ from small_data import small_net
 from torch import nn
 
 from bpnp.cli import main
-from bpnp.files import claimed
+from bpnp.files import lock_folder
 from bpnp.models.baselines import RandomRansac
 from bpnp.report import read_points, read_results
 from bpnp.report.tables import Row, as_latex, paper_rows
@@ -93,7 +93,7 @@ def test_finished_methods_are_skipped_and_longer_tables_run_again(
     assert all(errors[row.index] == row.rotation_error_deg for row in first["blind"])
     main([*recipes, "--limit=1"])
     assert read_results(tmp_path / "out" / "blind").rows == longer
-    with claimed(tmp_path / "out" / "blind"):
+    with lock_folder(tmp_path / "out" / "blind"):
         assert "expected a folder that no other process writes to" in fails(*recipes, "--limit=1")
     rows = list(csv.DictReader((tmp_path / "out" / "table.csv").open()))
     assert {row["problems"] for row in rows if row["source"] == "here"} == {"1"}

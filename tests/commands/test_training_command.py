@@ -165,7 +165,7 @@ def test_ctrl_c_tells_how_to_go_on(monkeypatch: pytest.MonkeyPatch, capsys: pyte
     def interrupted(*_: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "parsed_arguments", interrupted)
+    monkeypatch.setattr(cli, "parse_arguments", interrupted)
     for command, told in (("localize", "interrupted; run it again to go on"), ("solve", "interrupted")):
         with pytest.raises(SystemExit) as ended:
             main([command])

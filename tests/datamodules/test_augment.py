@@ -12,7 +12,7 @@ from small_data import check_pairs
 
 from bpnp.datamodules.augment import Augmentation, Outliers, augment
 from bpnp.datamodules.keyed_random import row_keys
-from bpnp.datamodules.problem import Problem, stacked
+from bpnp.datamodules.problem import Problem, stack_problems
 from bpnp.geometry import transform
 from bpnp.types import Batch
 
@@ -28,7 +28,7 @@ def planted(count: int = 60, *, free2d: int = 0, free3d: int = 0, seed: int = 0)
 
 
 def raw(*problems: Problem) -> Batch:
-    return stacked(problems, torch.arange(len(problems)))
+    return stack_problems(problems, torch.arange(len(problems)))
 
 
 def augmented(batch: Batch, *seeds: int, **options: Any) -> Batch:

@@ -10,7 +10,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from small_data import recorded
 
 from bpnp.datamodules.loader import BucketSampler, ProblemDataModule, ProblemDataset
-from bpnp.datamodules.problem import Counts, Problem, stacked
+from bpnp.datamodules.problem import Counts, Problem, stack_problems
 from bpnp.types import Batch
 
 
@@ -25,7 +25,7 @@ class Numbered:
         return Counts(self.sizes, self.sizes, self.sizes)
 
     def batch(self, index: torch.Tensor, epoch: int) -> Batch:
-        return stacked([self.problem(i, epoch) for i in index.tolist()], index)
+        return stack_problems([self.problem(i, epoch) for i in index.tolist()], index)
 
     def problem(self, index: int, epoch: int) -> Problem:
         rng = np.random.default_rng([epoch, index])

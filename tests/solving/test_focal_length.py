@@ -12,7 +12,7 @@ from planted_model import HEIGHT, WIDTH, plant_model
 from scipy.spatial.transform import Rotation
 
 from bpnp import SceneMap, Solution, solve
-from bpnp.cameras import camera_from, plain_camera
+from bpnp.cameras import camera_from, camera_to_json
 from bpnp.cli import main
 
 Array = NDArray[np.float64]
@@ -169,6 +169,6 @@ def test_a_given_camera_is_never_changed_and_a_better_lens_makes_the_pose_ambigu
     named = re.search(r"a radial distortion of (\S+)", solution.reason)
     assert named is not None
     assert float(named[1]) == pytest.approx(radial, abs=0.05)
-    assert json.loads(solution.to_json())["camera"] == plain_camera(camera_from(camera))
+    assert json.loads(solution.to_json())["camera"] == camera_to_json(camera_from(camera))
     known = solve(pixels, scene, ("SIMPLE_RADIAL", (600.0, 320.0, 240.0, radial)), solver="search", time_limit=LIMIT)
     assert known.verdict == "confident"

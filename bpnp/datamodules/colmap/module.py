@@ -14,10 +14,10 @@ from torch import Tensor
 from bpnp.datamodules.augment import check_clutter
 from bpnp.datamodules.colmap.model_files import FILES, ColmapError, find_scenes
 from bpnp.datamodules.colmap.reconstruction import ImagePoints, Reconstruction, read_reconstruction
-from bpnp.datamodules.problem import Counts, Problem, ProblemSource, stacked
+from bpnp.datamodules.problem import Counts, Problem, ProblemSource, stack_problems
 from bpnp.datamodules.store import Made, Recipe, StoreError, is_store
-from bpnp.datamodules.stored import PROBLEMS, WIDTHS, StoredDataModule, large_enough, problem_row
-from bpnp.files import files_as_they_are, fingerprint
+from bpnp.datamodules.stored import PROBLEMS, WIDTHS, StoredDataModule, has_enough_matches, problem_row
+from bpnp.files import file_states, fingerprint
 from bpnp.types import Batch
 
 FAR = 100.0  # median distances of the points from their median; further off float32 steps by 1e-5 of that distance
@@ -95,7 +95,7 @@ class ColmapSource:
         images = [(scene, image) for scene in reconstructions for image in scene.images]
         names = ", ".join(scene.name for scene in reconstructions)
         matched = np.array([len(image.seen) for _, image in images])
-        self.images = [images[i] for i in large_enough(matched, min_points, names)]
+        self.images = [images[i] for i in has_enough_matches(matched, min_points, names)]
         self.clutter, self.seed = clutter, tuple(seed)
         self.origins = [_origin(scene.points3d[image.seen]) for scene, image in self.images]
         if moved := sum(bool(origin.any()) for origin in self.origins):
@@ -114,7 +114,7 @@ class ColmapSource:
         return Counts(matched, matched + free[:, 0], matched + free[:, 1])
 
     def batch(self, index: Int[Tensor, " b"], epoch: int) -> Batch:
-        return stacked([self.problem(i, epoch) for i in index.tolist()], index)
+        return stack_problems([self.problem(i, epoch) for i in index.tolist()], index)
 
     def problem(self, index: int, epoch: int = 0) -> Problem:
         """The points of image `index`."""
@@ -165,7 +165,7 @@ def colmap_recipe(source: Path, *, min_points: int, clutter: float) -> Recipe:
         parameters={
             "min_points": min_points,
             "clutter": clutter,
-            "source": fingerprint([names, files_as_they_are(file for file in files if file.is_file())]),
+            "source": fingerprint([names, file_states(file for file in files if file.is_file())]),
         },
         jobs=[(*model, min_points, clutter) for model in models],
         work=model_rows,

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.cameras import Camera, Lens, camera_from, colmap_camera
 from bpnp.datamodules.colmap.model_files import ColmapError, ImageRecord, read_records
-from bpnp.files import written_whole
+from bpnp.files import write_atomically
 
 NEAR = 1e-4  # of the median depth; float32 cannot tell in front from behind much below
 NOMINAL_FOCAL = 1000.0  # pixels, of points without a camera
@@ -180,7 +180,7 @@ def write_image(
         added = model.add_point3D(point, track, np.full(3, 128, np.uint8))
         if j in partner:
             model.points3D[added].error = float(np.linalg.norm(pixels[partner[j]] - reprojected[j]))
-    with written_whole(folder) as temporary:
+    with write_atomically(folder) as temporary:
         temporary.mkdir()
         model.write_text(temporary)
     return folder

@@ -14,7 +14,7 @@ from torch import Tensor
 from bpnp.checks import check_positive, check_within
 from bpnp.datamodules.augment import Augmentation, Drawn, bounds
 from bpnp.datamodules.loader import PARTS, ProblemDataModule
-from bpnp.datamodules.problem import Counts, Problem, stacked
+from bpnp.datamodules.problem import Counts, Problem, stack_problems
 from bpnp.datamodules.synthetic_maps.kinds import facades, statue, street
 from bpnp.datamodules.synthetic_maps.scene import (
     Array,
@@ -226,7 +226,9 @@ class MapSource:
 
     def batch(self, index: Int[Tensor, " b"], epoch: int) -> Batch:
         rngs = ((i, np.random.default_rng([*self.seed, epoch, i])) for i in index.tolist())
-        return stacked([draw_map_problem(f"map/{self.label}/{i:06d}", self.options, rng) for i, rng in rngs], index)
+        return stack_problems(
+            [draw_map_problem(f"map/{self.label}/{i:06d}", self.options, rng) for i, rng in rngs], index
+        )
 
 
 class SyntheticMapDataModule(ProblemDataModule):
