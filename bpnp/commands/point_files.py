@@ -1,6 +1,11 @@
 """Files of points, cameras and rough poses, as arrays."""
 
+import csv
+import io
 import json
+import re
+import sys
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +19,29 @@ COLMAP_POINTS, COLMAP_CAMERAS = "points3D", "cameras"  # the files of a COLMAP m
 NORMAL, LABEL = ("nx", "ny", "nz"), "label"
 # After x, y, z in a file that does not name its columns, by their number.
 COLUMNS: dict[int, tuple[str, ...]] = {3: (), 4: (LABEL,), 6: NORMAL, 7: (*NORMAL, LABEL)}
+IMAGE_COLUMNS = (("x", "y", "z"), ("x", "y"), ("u", "v"))
+STANDARD_INPUT = Path("-")
+NUMPY = b"\x93NUMPY"  # the first bytes of a .npy file
 
 
 def read_points2d(path: Path) -> tuple[Array, Labels | None]:
-    """Image points (m, 2) or unit bearings (m, 3), and labels (m,) where a column is named label.
+    """Read image points.
 
-    path: .npy or text as for `read_points3d`. The columns x and y are taken, and z if there is one, or the first two
-    where they have no names: a detector's rows go on with scale and angle. Raises ValueError as `read_points3d`.
+    Args:
+        path: .npy or text as for `read_points3d`. Of named columns x and y are taken, and z if there is one, or u and
+            v; of others the first two: a detector's rows go on with scale and angle.
+
+    Returns:
+        Points (m, 2) or unit bearings (m, 3); labels (m,) of a column named label, else None.
+
+    Raises:
+        ValueError: As `read_points3d`.
     """
     _check_suffix(path, ARRAYS)
-    values, names = _columns(path)
+    values, names = _columns(path, {name for known in IMAGE_COLUMNS for name in known} | {LABEL})
     if names:
-        points, _, labels = _read_annotation(path, values, names, ("x", "y", "z") if "z" in names else ("x", "y"))
+        coordinates = next((known for known in IMAGE_COLUMNS if set(known) <= set(names)), ("x", "y"))
+        points, _, labels = _read_annotation(path, values, names, coordinates, hint=", or u, v")
         return points, labels
     if values.shape[1] < 2:
         raise ValueError(f"expected points with 2 or 3 columns in {path}, got shape {values.shape}")
@@ -35,28 +51,41 @@ def read_points2d(path: Path) -> tuple[Array, Labels | None]:
 def read_points3d(
     path: Path, *, surface: int | None = None, seed: int = 0
 ) -> tuple[Array, Array | None, Labels | None]:
-    """Points (n, 3) of a file, and their outward normals (n, 3) and labels (n,) where it has them.
+    """Read scene points.
 
-    path: .npy; .csv, .txt, .xyz with numbers in columns, separated by commas, semicolons, tabs or spaces; the first
-    line may name them, else they are x, y, z, then nx, ny, nz or label or both; # starts a comment. Also .ply and
-    meshes (.obj, .off, .stl, .glb): their different vertices, or `surface` points drawn from their triangles; and a
-    COLMAP model, its folder or its points3D. Raises ValueError that names the file and what is wrong in it.
+    Args:
+        path: .npy; .csv, .txt, .xyz with numbers in columns, separated by commas, semicolons, tabs or spaces; beside
+            semicolons and tabs a comma is a decimal mark. The first line may name the columns, else they are x, y, z,
+            then nx, ny, nz or label or both; # starts a comment. Also .ply and meshes (.obj, .off, .stl, .glb): their
+            different vertices, or `surface` points drawn from their triangles; a COLMAP model, its folder or its
+            points3D; `-` or a pipe with the content of a .npy or of a text.
+        surface: Number of points to draw from a mesh.
+        seed: Of these.
+
+    Returns:
+        Points (n, 3); their outward normals (n, 3) and labels (n,), None where the file has none. The normals of a
+        .ply without faces count, but not if all of them are zero.
+
+    Raises:
+        ValueError: The file cannot be read. The message names it and what is wrong in it.
     """
     if path.is_dir() or path.stem == COLMAP_POINTS:
         from bpnp.datamodules.colmap.model_files import read_records
 
         return read_records(path if path.is_dir() else path.parent).points3d, None, None
-    if path.suffix.lower() not in ARRAYS:
+    if path.suffix.lower() not in ARRAYS and not _is_stream(path):
         from bpnp.datamodules.shapes import SUFFIXES, read_mesh, read_vertices, sample_surface
 
         _check_suffix(path, (*ARRAYS, *SUFFIXES))
-        if surface is None:
-            return read_vertices(path), None, None
-        return sample_surface(read_mesh(path), surface, np.random.default_rng(seed)), None, None
+        if surface is not None:
+            return sample_surface(read_mesh(path), surface, np.random.default_rng(seed)), None, None
+        points, columns = read_vertices(path)
+        normals, labels = _normals_and_labels(path, columns.__getitem__, [*columns])
+        return points, None if normals is None or not normals.any() else normals, labels
     _check_suffix(path, ARRAYS)
     if surface is not None:
         raise ValueError(f"expected a mesh to draw {surface} points from, got {path}; try without --surface")
-    return _read_annotation(path, *_columns(path), ("x", "y", "z"))
+    return _read_annotation(path, *_columns(path, {*"xyz", *NORMAL, LABEL}), ("x", "y", "z"))
 
 
 def read_camera(text: str, image: str | None = None) -> Any:
@@ -72,7 +101,7 @@ def read_camera(text: str, image: str | None = None) -> Any:
         return _camera_of(path, image)
     if image is not None:
         raise ValueError(f"expected --image with a COLMAP model as --camera, got it with {text!r}")
-    if path.is_file():
+    if path.is_file() or _is_stream(path):
         return _columns(path)[0]
     model, *words = text.replace(",", " ").split() or [""]
     numbers = [_number(word) for word in words]
@@ -93,7 +122,7 @@ def read_prior(path: Path, degrees: float, distance: float | None) -> Any:
     anything else, a checkpoint. Raises ValueError for JSON without a pose."""
     from bpnp.search.starts import PosePrior
 
-    if path.suffix.lower() != ".json":
+    if path.suffix.lower() != ".json" and not _is_stream(path):
         return path
     rotation, translation = read_pose(path)
     return PosePrior(rotation, translation, degrees, np.inf if distance is None else distance)
@@ -102,10 +131,11 @@ def read_prior(path: Path, degrees: float, distance: float | None) -> Any:
 def read_pose(path: Path) -> tuple[Array, Array]:
     """Rotation and translation in a JSON file with both, such as that of a solution. Raises ValueError without them."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(_content(path))
         return np.array(content["rotation"], np.float64), np.array(content["translation"], np.float64)
     except (OSError, ValueError, KeyError, TypeError) as error:
-        reason = f"no {error}" if isinstance(error, KeyError) else "no file" if not path.is_file() else error
+        missing = "no file" if isinstance(error, FileNotFoundError) else error
+        reason = f"no {error}" if isinstance(error, KeyError) else missing
         raise ValueError(f"expected JSON with `rotation` and `translation` in {path}, got {reason}") from error
 
 
@@ -118,7 +148,19 @@ def read_pairs(path: Path) -> Array:
     return values
 
 
+def _is_stream(path: Path) -> bool:
+    """Return True for standard input and for pipes, which have no suffix: `-`, /dev/stdin, a process substitution."""
+    return path == STANDARD_INPUT or (not path.suffix and path.exists() and not path.is_dir())
+
+
+def _content(path: Path) -> bytes:
+    """Return the bytes of a file, of a pipe, or of standard input."""
+    return sys.stdin.buffer.read() if path == STANDARD_INPUT else path.read_bytes()
+
+
 def _check_suffix(path: Path, known: tuple[str, ...]) -> None:
+    if _is_stream(path):
+        return
     if not path.is_file():
         raise ValueError(f"expected a file of points, got no file {path}")
     if path.suffix.lower() not in known:
@@ -126,23 +168,32 @@ def _check_suffix(path: Path, known: tuple[str, ...]) -> None:
 
 
 def _read_annotation(
-    path: Path, values: Array, names: list[str], coordinates: tuple[str, ...]
+    path: Path, values: Array, names: list[str], coordinates: tuple[str, ...], *, hint: str = ""
 ) -> tuple[Array, Array | None, Labels | None]:
-    hint = " (are the two files swapped?)" if values.shape[1] == 2 else ""
+    """Take points, normals and labels from columns; `hint` follows the coordinates in the message that misses them."""
+    swapped = " (are the two files swapped?)" if values.shape[1] == 2 else ""
     if not names and values.shape[1] not in COLUMNS:
         known = "3 to 4 or 6 to 7 columns (x, y, z, normal, label)"
-        raise ValueError(f"expected {known} in {path}, got shape {values.shape}{hint}")
-    place = {name: column for column, name in enumerate(names or (*coordinates, *COLUMNS[values.shape[1]]))}
-    if not set(coordinates) <= set(place):
-        raise ValueError(f"expected columns {', '.join(coordinates)} in {path}, got {', '.join(names)}{hint}")
+        raise ValueError(f"expected {known} in {path}, got shape {values.shape}{swapped}")
+    names = names or [*coordinates, *COLUMNS[values.shape[1]]]
+    if not set(coordinates) <= set(names):
+        raise ValueError(f"expected columns {', '.join(coordinates)}{hint} in {path}, got {', '.join(names)}{swapped}")
+    place = {name: column for column, name in enumerate(names)}
     points = values[:, [place[name] for name in coordinates]]
-    normals = values[:, [place[name] for name in NORMAL]] if set(NORMAL) <= set(place) else None
-    if LABEL not in place:
-        return points, normals, None
-    labels = values[:, place[LABEL]]
+    return points, *_normals_and_labels(path, lambda name: values[:, place[name]], names)
+
+
+def _normals_and_labels(
+    path: Path, column: Callable[[str], Array], names: Collection[str]
+) -> tuple[Array | None, Labels | None]:
+    """Return normals (n, 3) and labels (n,) of a file with columns of these names, None without them."""
+    normals = np.stack([column(name) for name in NORMAL], -1) if set(NORMAL) <= set(names) else None
+    if LABEL not in names:
+        return normals, None
+    labels = column(LABEL)
     if len(fractions := labels[labels != np.round(labels)]):
         raise ValueError(f"expected integers in the column label of {path}, got {fractions[0]:g}")
-    return points, normals, labels.astype(np.int64)
+    return normals, labels.astype(np.int64)
 
 
 def _camera_of(path: Path, image: str | None) -> tuple[Any, ...]:
@@ -160,44 +211,69 @@ def _camera_of(path: Path, image: str | None) -> tuple[Any, ...]:
     return camera.model, *camera.size, camera.params
 
 
-def _columns(path: Path) -> tuple[Array, list[str]]:
-    """The numbers (k, c) of a .npy or a text, and the names of its columns if its first line has one for each."""
+def _columns(path: Path, wanted: Collection[str] = ()) -> tuple[Array, list[str]]:
+    """Read columns of numbers from a .npy or a text.
+
+    Args:
+        path: File, pipe or standard input.
+        wanted: Names of the columns that have to be numbers, where the first line names them; all by default. A column
+            of another name is NaN. Rows may have one more word than the first line, before the others, as R writes
+            their names.
+
+    Returns:
+        Numbers (k, c), and the names of the c columns; no name if the first line has none.
+    """
     try:
-        if path.suffix.lower() == ".npy":
-            array = np.load(path, allow_pickle=False)
+        content = _content(path)
+        if path.suffix.lower() == ".npy" or content.startswith(NUMPY):
+            array = np.load(io.BytesIO(content), allow_pickle=False)
             array = array[:, 0] if array.ndim == 3 and array.shape[1] == 1 else array  # OpenCV's points are (k, 1, 2)
             if array.dtype.kind not in "fiu" or array.ndim != 2:
                 raise ValueError(f"{array.dtype} of shape {array.shape}")
             return array.astype(np.float64), []
-        text = path.read_text(encoding="utf-8-sig")
+        text = content.decode("utf-8-sig")
     except (ValueError, OSError, EOFError) as error:
         raise ValueError(f"expected rows of numbers in {path}, got {error}") from error
-    lines = [content for line in text.splitlines() if (content := line.partition("#")[0].strip())]
+    lines = [line for commented in text.splitlines() if (line := commented.partition("#")[0].strip())]
     names = _words(lines[0]) if lines else []
     names = [] if any(_number(name) is not None for name in names) else names
     rows = lines[1:] if names else lines
     if not rows:
         raise ValueError(f"expected lines of numbers in {path}, got none")
+    mark, count = _separator(rows[0]), len(_words(rows[0]))
+    if names and count == len(names) + 1:
+        names = ["", *names]
+    names = names if len(names) == count else []
+    others = [i for i, name in enumerate(names) if wanted and name not in wanted]
+    decimals = rows if mark == "," else [row.replace(",", ".") for row in rows]
+    converters: Any = {i: lambda _: np.nan for i in others}
     try:
-        values = np.loadtxt(rows, np.float64, delimiter=_separator(rows[0]), ndmin=2)
+        values = np.loadtxt(decimals, np.float64, delimiter=mark, quotechar='"', converters=converters, ndmin=2)
     except ValueError as error:
-        count = len(_words(rows[0]))
-        wrong = (row for row in rows if len(_words(row)) != count or None in map(_number, _words(row)))
+        needed = sorted({*range(count)} - {*others})
+        wrong = (
+            row for row in rows if len(words := _words(row)) != count or None in [_number(words[i]) for i in needed]
+        )
         raise ValueError(f"expected rows of {count} numbers in {path}, got {next(wrong, rows[0])[:60]!r}") from error
-    return values, names if len(names) == values.shape[1] else []
+    return values, names
 
 
 def _separator(line: str) -> str | None:
-    """What separates the words of a line; None for spaces and tabs."""
-    return next((mark for mark in ",;" if mark in line), None)
+    """Return what separates the words of a line, None for spaces and tabs, beside which a comma is a decimal mark."""
+    if ";" in line:
+        return ";"
+    decimal_commas = "\t" in line and not re.search(r",(?!\d)", line)
+    return "," if "," in line and not decimal_commas else None
 
 
 def _words(line: str) -> list[str]:
-    return [word.strip().lower() for word in line.split(_separator(line))]
+    mark = _separator(line)
+    quoted = re.findall(r'"[^"]*"|\S+', line) if mark is None else next(csv.reader([line], delimiter=mark))
+    return [word.strip(' "').lower() for word in quoted]
 
 
 def _number(word: str) -> float | None:
     try:
-        return float(word)
+        return float(word.replace(",", "."))
     except ValueError:
         return None

@@ -82,22 +82,35 @@ def _open_mesh(path: Path) -> Iterator[tuple[bytes, str]]:
         raise MeshError(f"{path}: {error}") from error
 
 
-def read_vertices(path: Path) -> NDArray[np.float64]:
-    """The points (v, 3) of a cloud in the order of the file, or the different vertices of a mesh.
+def read_vertices(path: Path) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
+    """Read the points of a cloud, or the different vertices of a mesh.
 
-    Reads the files of `read_mesh`. Raises MeshError that names the file: truncated, foreign or empty.
+    Args:
+        path: A file of `read_mesh`.
+
+    Returns:
+        Points (v, 3), those of a cloud in the order of the file; and the other numbers that a .ply without faces has
+        for each of them, (v,) by the name of the property, such as nx.
+
+    Raises:
+        MeshError: The file is truncated, foreign or empty. The message names it.
     """
     with _open_mesh(path) as (content, suffix):
         mesh = _parse_off(content) if suffix == ".off" else _load(content, suffix)
         vertices = np.asarray(mesh.vertices, np.float64)
-        vertices = vertices[np.sort(np.unique(vertices, axis=0, return_index=True)[1])]
-        if not len(vertices):  # as a mesh, a cloud of points is empty
-            vertices = np.asarray(getattr(_load(content, suffix, force=None), "vertices", ()), np.float64)
-            vertices, declared = vertices.reshape(-1, 3), re.search(rb"^element vertex (\d+)", content, re.MULTILINE)
-            expected = 1 if declared is None else int(declared[1])
-            if len(vertices) < expected:  # trimesh takes a text file that ends early for one with fewer points
-                raise MeshError(f"expected {expected} points, got {len(vertices)}")
-        return vertices
+        if len(vertices):
+            return vertices[np.sort(np.unique(vertices, axis=0, return_index=True)[1])], {}
+        cloud = _load(content, suffix, force=None)  # as a mesh, a cloud of points is empty
+        vertices = np.asarray(getattr(cloud, "vertices", ()), np.float64).reshape(-1, 3)
+        declared = re.search(rb"^element vertex (\d+)", content, re.MULTILINE)
+        expected = 1 if declared is None else int(declared[1])
+        if len(vertices) < expected:  # trimesh takes a text file that ends early for one with fewer points
+            raise MeshError(f"expected {expected} points, got {len(vertices)}")
+        raw = getattr(cloud, "metadata", {}).get("_ply_raw", {}).get("vertex")
+        if raw is None:
+            return vertices, {}
+        names = [name for name, kind in raw["properties"].items() if isinstance(kind, str)]  # a list has a tuple
+        return vertices, {name: np.asarray(raw["data"][name], np.float64).reshape(len(vertices)) for name in names}
 
 
 def _parse_off(content: bytes) -> Mesh:

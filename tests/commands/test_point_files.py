@@ -1,12 +1,15 @@
 """Files of points and cameras, against what was written into them."""
 
+import io
+import os
+import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
-from bpnp.commands.point_files import read_camera, read_points2d, read_points3d
+from bpnp.commands.point_files import read_camera, read_points2d, read_points3d, read_pose
 
 POINTS = np.random.default_rng(0).normal(size=(20, 3))
 
@@ -78,6 +81,8 @@ def test_a_mesh_gives_its_corners_or_its_surface(suffix: str, tmp_path: Path) ->
         ("a.csv", b"x,y,z\n", "lines of numbers"),
         ("a.csv", b"1,2\n3,4\n", r"3 to 4 or .*got shape \(2, 2\) \(are the two files swapped\?\)"),
         ("a.csv", b"1,2,3,4,5\n", r"3 to 4 or 6 to 7 columns .*got shape \(1, 5\)$"),
+        ("a.csv", b"x,y,z\nLED,2,3\n", "rows of 3 numbers in .*a.csv, got 'LED,2,3'"),
+        ("a.csv", b"x;y;z\n1.000,5;2;3\n", "rows of 3 numbers in .*a.csv, got '1.000,5;2;3'"),
         ("a.csv", b"a,b,label\n1,2,3\n", "expected columns x, y, z in .*a.csv, got a, b, label"),
         ("a.csv", b"x,y,z,label\n1,2,3,0.5\n", "expected integers in the column label"),
         ("a.txt", b"\xff\xfe\x00", "rows of numbers in .*a.txt"),
@@ -169,8 +174,81 @@ def test_columns_of_normals_and_labels_by_name_and_by_place(tmp_path: Path) -> N
 
 def test_a_header_without_x_and_y_is_no_point(tmp_path: Path) -> None:
     """Its first two columns would be solved as if they were pixels."""
-    (tmp_path / "a.csv").write_text("id,u,v\n1,10,20\n2,30,40\n")
-    with pytest.raises(ValueError, match=r"expected columns x, y in .*a\.csv, got id, u, v"):
+    (tmp_path / "a.csv").write_text("id,row,column\n1,10,20\n2,30,40\n")
+    with pytest.raises(ValueError, match=r"expected columns x, y, or u, v in .*a\.csv, got id, row, column"):
         read_points2d(tmp_path / "a.csv")
     (tmp_path / "a.csv").write_text("id,y,x,scale\n1,10,20,3\n2,30,40,5\n")
     np.testing.assert_array_equal(read_points2d(tmp_path / "a.csv")[0], [[20, 10], [40, 30]])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '"x","y","label"\n1.5,2.5,7\n3.5,-4.5,8\n',
+        '"","x","y","label"\n"1",1.5,2.5,7\n"2",3.5,-4.5,8\n',  # R's write.csv
+        '"x" "y" "label"\n"1" 1.5 2.5 7\n"2" 3.5 -4.5 8\n',  # R's write.table, whose first line has a word less
+        '"";"x";"y";"label"\n"a b";1,5;2,5;7\n"c";3,5;-4,5;8\n',  # R's write.csv2
+        "u;v;label\n1,5;2,5;7\n3,5;-4,5;8\n",
+        "u\tv\tlabel\n1,5\t2,5\t7\n3,5\t-4,5\t8\n",
+        ",x,y,label\n0,1.5,2.5,7\n1,3.5,-4.5,8\n",  # pandas
+        "Name,U,V,label,note\nLED 1,1.5,2.5,7,\nLED 2,3.5,-4.5,8,weak\n",
+    ],
+)
+def test_tables_of_other_programs(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text(text)
+    points, labels = read_points2d(path)
+    np.testing.assert_array_equal(points, [[1.5, 2.5], [3.5, -4.5]])
+    np.testing.assert_array_equal(labels, [7, 8])
+
+
+def test_decimal_commas_without_names(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("1,5;2,5;-1e-3\n3;4,25;0\n")
+    np.testing.assert_array_equal(points_of(tmp_path / "a.csv"), [[1.5, 2.5, -1e-3], [3, 4.25, 0]])
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
+def test_a_ply_cloud_has_normals_and_labels(encoding: str, tmp_path: Path) -> None:
+    kinds = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [("red", "u1"), ("label", "<i4")]
+    rows = np.array([(1, 2, 3, 0, 0, 1, 9, 7), (1, 2, 3, 1, 0, 0, 9, -1), (4, 5, 6, 0, -1, 0, 9, 8)], kinds)
+    names = {"<f4": "float", "u1": "uchar", "<i4": "int"}
+    header = "".join(f"property {names[kind]} {name}\n" for name, kind in kinds)
+    text = "\n".join(" ".join(f"{value:g}" for value in row.tolist()) for row in rows)
+    path = tmp_path / "a.ply"
+    head = f"ply\nformat {encoding} 1.0\nelement vertex 3\n{header}end_header\n".encode()
+    path.write_bytes(head + (f"{text}\n".encode() if encoding == "ascii" else rows.tobytes()))
+    points, normals, labels = read_points3d(path)
+    np.testing.assert_array_equal(points, [[1, 2, 3], [1, 2, 3], [4, 5, 6]])
+    np.testing.assert_array_equal(normals, [[0, 0, 1], [1, 0, 0], [0, -1, 0]])
+    np.testing.assert_array_equal(labels, [7, -1, 8])
+
+
+def test_normals_that_are_all_zero_are_none(tmp_path: Path) -> None:
+    header = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
+    text = f"ply\nformat ascii 1.0\nelement vertex 2\n{header}end_header\n1 2 3 0 0 0\n4 5 6 0 0 0\n"
+    (tmp_path / "a.ply").write_text(text)
+    assert read_points3d(tmp_path / "a.ply")[1] is None
+
+
+def test_a_pipe_is_read(tmp_path: Path) -> None:
+    """As the shell's `<(...)`: a path that is no file and has no suffix, and can be read once."""
+    array = io.BytesIO()
+    np.save(array, POINTS)
+    for content in (("x,y,z\n" + rows(POINTS, ",")).encode(), array.getvalue()):
+        pipe = tmp_path / "pipe"
+        os.mkfifo(pipe)
+        writer = threading.Thread(target=pipe.write_bytes, args=(content,))
+        writer.start()
+        np.testing.assert_array_equal(points_of(pipe), POINTS)
+        writer.join()
+        pipe.unlink()
+
+
+def test_standard_input_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    for content, read in (
+        (b"u,v\n1,2\n3,4\n", lambda: read_points2d(Path("-"))[0].tolist()),
+        (b"1 2\n3 4\n", lambda: read_camera("-").tolist()),
+        (b'{"rotation": [1, 2], "translation": [3, 4]}', lambda: [side.tolist() for side in read_pose(Path("-"))]),
+    ):
+        monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(content)))
+        assert read() == [[1, 2], [3, 4]]
