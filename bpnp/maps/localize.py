@@ -15,11 +15,11 @@ from bpnp.geometry import MIN_POINTS
 from bpnp.loops.parallel import one_blas_thread
 from bpnp.maps.views import Cones, View
 from bpnp.search.annealing import finish, polished
-from bpnp.search.candidates import Candidates, in_user_frame
 from bpnp.search.evidence import reasons
 from bpnp.search.evidence.alternatives import Alternative, fits_as_well
 from bpnp.search.evidence.rivals import against_rivals, other_camera
 from bpnp.search.evidence.settings import Evidence
+from bpnp.search.hypotheses import Hypotheses, to_user_frame
 from bpnp.search.point_sets import UnknownFocal, faces
 from bpnp.search.raster_search import search_beside
 from bpnp.search.scene import Scene
@@ -202,15 +202,15 @@ def on_all_points(solution: Solution, photo: Photo, lens: Camera | UnknownCamera
     scene, sure = Scene(problem.sets, photo.seed, DEFAULT), solution.verdict == "confident"
     # A coarse optimum may have a finer one beside it.
     looks = int(ends.scale[0] > scale) if sure else looks_for_certainty(rule)
-    start = Candidates.unscored(*scene.enter(rotation[None], shift[None]))
+    start = Hypotheses.from_poses(*scene.enter(rotation[None], shift[None]))
     others = [] if sure else [one for one in solution.candidates[1:] if one.log10_false_alarms < 0][:COMPETITORS]
     if others:
         turns = np.stack([one.rotation for one in others])
         shifts = np.stack([one.translation + one.rotation @ problem.origin for one in others])
-        ends = Candidates.concatenated([ends, polished(scene, turns, shifts, max(scale, problem.sets.image.scales[0]))])
+        ends = Hypotheses.concatenate([ends, polished(scene, turns, shifts, max(scale, problem.sets.image.scales[0]))])
     for _ in range(looks):
         beside = finish(scene, search_beside(scene, start, DEFAULT.beside), DEFAULT.finished)
-        ends = Candidates.concatenated([ends, in_user_frame(beside, scene)])
+        ends = Hypotheses.concatenate([ends, to_user_frame(beside, scene)])
     alone = judged(ends, problem.sets, batches=1, exhaustive=True, rule=rule)
     result = against_rivals(alone, problem.sets, lambda: scene, rule, exhaustive=True)
     rotations, shifts = np.stack([rotation, result.best[0]]), np.stack([shift, result.best[1]])

@@ -17,9 +17,9 @@ from bpnp.loops.parallel import one_blas_thread
 from bpnp.maps.localize import Photo, Region, in_picture, problem_near
 from bpnp.maps.views import Array
 from bpnp.search.annealing import finish, polished
-from bpnp.search.candidates import Candidates, in_user_frame
 from bpnp.search.evidence.reasons import number
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
+from bpnp.search.hypotheses import Hypotheses, to_user_frame
 from bpnp.search.kernels.raster import Raster
 from bpnp.search.raster_search import search_beside, search_near
 from bpnp.search.scene import Scene
@@ -91,12 +91,12 @@ def best_rival(photo: Photo, solution: Solution, met: Sequence[Solution]) -> tup
     return float(behind[k]), _candidate(problem, solution, ends, k, float(behind[k]))
 
 
-def _candidate(problem: Problem, solution: Solution, ends: Candidates, k: int, behind: float) -> Candidate:
+def _candidate(problem: Problem, solution: Solution, ends: Hypotheses, k: int, behind: float) -> Candidate:
     rotation, translation = ends.rotation[k], ends.translation[k]
     seen = problem.view(rotation, translation)
     inliers = count_one_to_one(problem.image, seen, solution.inlier_threshold)
     alarms = solution.log10_false_alarms + behind
-    return Candidate(rotation, translation - rotation @ problem.origin, float(ends.score[k]), inliers, alarms)
+    return Candidate(rotation, translation - rotation @ problem.origin, float(ends.log_likelihood[k]), inliers, alarms)
 
 
 def _looks(photo: Photo, solution: Solution, problem: Problem) -> Iterator[tuple[Array, Array]]:
@@ -120,15 +120,15 @@ def _looks(photo: Photo, solution: Solution, problem: Problem) -> Iterator[tuple
         assert isinstance(known, PosePrior)
         found = _likeliest(finish(scene, search_near(scene, known, TWINS.look)), scene, near)
         if len(found) and found.log10_false_alarms[0] < 0:
-            start = Candidates.unscored(*scene.enter(found.rotation, found.translation))
+            start = Hypotheses.from_poses(*scene.enter(found.rotation, found.translation))
             beside = _likeliest(finish(scene, search_beside(scene, start, DEFAULT.beside)), scene, near)
             for one in (found, beside):
                 yield one.rotation[0], one.translation[0] + one.rotation[0] @ (problem.origin - near.origin)
 
 
-def _likeliest(poses: Candidates, scene: Scene, problem: Problem) -> Candidates:
+def _likeliest(poses: Hypotheses, scene: Scene, problem: Problem) -> Hypotheses:
     """(1,) of the poses that with the fewest false alarms, in the user's frame."""
-    return weighed(in_user_frame(poses, scene), problem.sets)[:1]
+    return weighed(to_user_frame(poses, scene), problem.sets)[:1]
 
 
 def without_twins(

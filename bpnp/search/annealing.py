@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bpnp.loops.parallel import in_time
-from bpnp.search.candidates import Candidates, best_distinct, in_user_frame
+from bpnp.search.hypotheses import Hypotheses, select_distinct, to_user_frame
 from bpnp.search.kernels.dense import dense_scratch, descend
 from bpnp.search.kernels.sparse import descend_sparse, sparse_scratch
 from bpnp.search.scene import Scene, Sides
@@ -17,23 +17,23 @@ from bpnp.search.settings import Stages
 from bpnp.search.starts import Array, Prior, draw_poses
 
 
-def multistart(scene: Scene, number: int, prior: Prior | None) -> Candidates:
+def multistart(scene: Scene, number: int, prior: Prior | None) -> Hypotheses:
     """Distinct poses of one batch of starts over all rotations, or those that a prior allows. number: of the batch,
     counted from 0."""
     settings = scene.settings
     recipe = settings.recipes[number % len(settings.recipes)]
     drawn = draw_poses(scene.spread, scene.bulk3d, settings.batch(number), recipe, prior, scene.rng)
-    return run_batch(scene, Candidates.unscored(*drawn, hits=1))
+    return run_batch(scene, Hypotheses.from_poses(*drawn, basin_count=1))
 
 
-def run_batch(scene: Scene, starts: Candidates) -> Candidates:
+def run_batch(scene: Scene, starts: Hypotheses) -> Hypotheses:
     """One batch of starts, from clusters to all points."""
     stages = *scene.settings.coarse, *scene.settings.middle
     poses = anneal_on_clusters(scene, starts, stages, len(starts))
     return anneal_on_points(scene, poses, stages[-1].last_scale * scene.spread)
 
 
-def anneal_on_clusters(scene: Scene, poses: Candidates, stages: Stages, starts: int) -> Candidates:
+def anneal_on_clusters(scene: Scene, poses: Hypotheses, stages: Stages, starts: int) -> Hypotheses:
     """Poses of a batch of so many starts after stages on clusters, best first, of different rotations."""
     outlier = scene.outlier_density(scene.settings.outliers)
     for stage, clusters in zip(stages, scene.clusters([stage.clusters for stage in stages]), strict=True):
@@ -41,27 +41,27 @@ def anneal_on_clusters(scene: Scene, poses: Candidates, stages: Stages, starts: 
         scales = (scene.spread * np.geomspace(stage.first_scale, stage.last_scale, stage.iterations)).astype(np.float32)
         for k, part in enumerate(np.split(scales, stage.halvings)):
             if k:  # best first, since only the first ones go on after the deadline
-                poses = poses[np.argsort(-poses.score, kind="stable")[: max(len(poses) // 2, 2 * kept)]]
+                poses = poses[np.argsort(-poses.log_likelihood, kind="stable")[: max(len(poses) // 2, 2 * kept)]]
             poses = _annealed(scene, poses, clusters, part, outlier)
-        poses = best_distinct(poses, scene, kept, stage.apart_deg)
+        poses = select_distinct(poses, scene, kept, stage.apart_deg)
     return poses
 
 
-def _annealed(scene: Scene, starts: Candidates, sides: Sides, scales: Array, outlier: np.float32) -> Candidates:
+def _annealed(scene: Scene, starts: Hypotheses, sides: Sides, scales: Array, outlier: np.float32) -> Hypotheses:
     """The poses for which there was time, after a step at each of the scales (k,), radians."""
-    rotation, translation, score = starts.rotation.copy(), starts.translation.copy(), starts.score.copy()
+    rotation, translation, score = starts.rotation.copy(), starts.translation.copy(), starts.log_likelihood.copy()
 
     def anneal(i: int, j: int) -> None:
         scratch = dense_scratch(*(len(side.label) for side in sides))
         descend(*sides, rotation[i:j], translation[i:j], scales, outlier, score[i:j], scratch)
 
     done = in_time(anneal, len(starts), scene.deadline, scene.settings.starts_a_check)
-    return replace(starts, rotation=rotation, translation=translation, score=score)[:done]
+    return replace(starts, rotation=rotation, translation=translation, log_likelihood=score)[:done]
 
 
 def anneal_on_points(
-    scene: Scene, starts: Candidates, first_scale: float, *, outliers: float | None = None, every: bool = False
-) -> Candidates:
+    scene: Scene, starts: Hypotheses, first_scale: float, *, outliers: float | None = None, every: bool = False
+) -> Hypotheses:
     """Distinct poses that `starts` reach on all 3D points and as many bearings as the fine stage uses, or `every` one.
 
     first_scale: radians. outliers: share to expect, None for that of the settings.
@@ -86,16 +86,19 @@ def anneal_on_points(
     done = in_time(anneal, len(starts), scene.deadline, torch.get_num_threads())
     score = result[:, 0] + np.float32(math.log(1 - outliers))  # the mixture's factor, for shares to be compared
     ends = replace(
-        starts, rotation=rotation, translation=translation, score=score, matched=result[:, 1], scale=result[:, 2],
-        log10_false_alarms=np.full(len(starts), math.nan),
-        log10_rough=np.full(len(starts), math.nan),
-    )  # fmt: skip
-    return best_distinct(ends[:done], scene, done)
+        starts.unweighed(),
+        rotation=rotation,
+        translation=translation,
+        log_likelihood=score,
+        match_count=result[:, 1].astype(np.float64) * min(len(scene.offsets), len(scene.points3d)),
+        scale=result[:, 2],
+    )
+    return select_distinct(ends[:done], scene, done)
 
 
 def turned_about_middle(
-    scene: Scene, rotation: Array, translation: Array, vectors: Array, shifts: Array, *, hits: int = 0
-) -> Candidates:
+    scene: Scene, rotation: Array, translation: Array, vectors: Array, shifts: Array, *, basin_count: int = 0
+) -> Hypotheses:
     """Copies of poses (k, 3, 3), (k, 3), s in all, turned by rotation vectors (s, 3) about the middle of the points and
     shifted by (s, 3).
 
@@ -106,10 +109,10 @@ def turned_about_middle(
     turned = (turns.reshape(len(rotation), 3 * copies, 3) @ rotation).reshape(-1, 3)
     seen = np.repeat(rotation @ middle + translation, copies, 0)
     shifted = seen + shifts - (turned @ middle).reshape(-1, 3)
-    return Candidates.unscored(turned.reshape(-1, 3, 3), shifted.astype(np.float32), hits=hits)
+    return Hypotheses.from_poses(turned.reshape(-1, 3, 3), shifted.astype(np.float32), basin_count=basin_count)
 
 
-def finish(scene: Scene, poses: Candidates, annealed: int | None = None) -> Candidates:
+def finish(scene: Scene, poses: Hypotheses, annealed: int | None = None) -> Hypotheses:
     """The poses, of which the first `annealed` (None for all) are annealed once more on every bearing.
 
     The best two of these with each of `settings.end_outliers` too.
@@ -117,22 +120,22 @@ def finish(scene: Scene, poses: Candidates, annealed: int | None = None) -> Cand
     settings, count = scene.settings, len(poses) if annealed is None else min(annealed, len(poses))
     runs = [(i, settings.outliers) for i in range(count)]
     runs += [(i, share) for i in range(min(2, count)) for share in settings.end_outliers]
-    ends: list[Candidates] = []
+    ends: list[Hypotheses] = []
     for i, share in runs:
         if scene.deadline.passed():
             break
         first_scale = settings.end_scale * float(poses.scale[i])
         end = anneal_on_points(scene, poses[i : i + 1], first_scale, outliers=share, every=True)
-        ends.append(end if len(ends) < count else end.without_hits())
-    return best_distinct(Candidates.concatenated([*ends, poses[min(len(ends), count) :]]), scene, settings.kept)
+        ends.append(end if len(ends) < count else end.as_dependent())
+    return select_distinct(Hypotheses.concatenate([*ends, poses[min(len(ends), count) :]]), scene, settings.kept)
 
 
 def polished(
     scene: Scene, rotations: NDArray[np.float64], translations: NDArray[np.float64], scale: float
-) -> Candidates:
+) -> Hypotheses:
     """Poses (c, 3, 3), (c, 3) of the user with residuals of `scale`, radians, annealed to the end on all points, in the
     user's frame; as they were after the deadline."""
-    starts = Candidates.unscored(*scene.enter(rotations, translations))
+    starts = Hypotheses.from_poses(*scene.enter(rotations, translations))
     starts = replace(starts, scale=np.full(len(starts), scale, np.float32))
     ends = finish(scene, starts)  # none after the deadline
-    return in_user_frame(ends if len(ends) else starts, scene)
+    return to_user_frame(ends if len(ends) else starts, scene)

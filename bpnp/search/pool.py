@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from bpnp.geometry import same_pose
 from bpnp.search.annealing import finish
-from bpnp.search.candidates import Candidates, in_scene_frame, in_user_frame, merged
 from bpnp.search.evidence.false_alarms import log10_tests
 from bpnp.search.evidence.rivals import against_rivals
+from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_scene_frame, to_user_frame
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene
 from bpnp.search.verdict import SearchResult, judged, missed, weighed, with_false_alarms
@@ -30,73 +30,73 @@ class Pool:
         self._tests = log10_tests(sets)
         self.forget()
         if len(enumerated.candidates):
-            self.candidates = in_scene_frame(enumerated.candidates, scene)
+            self.candidates = to_scene_frame(enumerated.candidates, scene)
 
     def forget(self) -> None:
         """Drop all poses."""
-        self.candidates = self.surrounded = Candidates.none()
-        self.searched: list[Candidates] = []
-        self._around: Candidates | None = None
+        self.candidates = self.surrounded = Hypotheses.empty()
+        self.searched: list[Hypotheses] = []
+        self._around: Hypotheses | None = None
         self.missed = 0.0
 
-    def merge(self, found: Candidates) -> None:
+    def merge(self, found: Hypotheses) -> None:
         """Take up the poses of a turn.
 
         They are weighed first: a pose that exceeds chance may lie beside one that does not and is likelier.
         """
         rule, before = self.scene.settings.evidence, self.alarms
-        self.candidates = self._weighed(merged([self.candidates, self._weighed(found)], self.scene), 1)
+        self.candidates = self._weighed(merge_hypotheses([self.candidates, self._weighed(found)], self.scene), 1)
         if self._around is not None and self.alarms > before - rule.lead and not self.scene.deadline.passed():
-            self.surrounded = Candidates.concatenated([self.surrounded, self._around])
+            self.surrounded = Hypotheses.concatenate([self.surrounded, self._around])
         self._around = None
         self.missed = self._missed()
         if self.missed > rule.missed:  # else the others are weighed for the verdict
             self.candidates = self._weighed(self.candidates)
-            self.candidates = self.candidates[np.argsort(-self.candidates.preference, kind="stable")]
+            self.candidates = self.candidates[np.argsort(-self.candidates.sort_key, kind="stable")]
             self.missed = self._missed()
 
-    def look_around(self, pose: Candidates) -> None:
+    def look_around(self, pose: Hypotheses) -> None:
         """The next turn searches the surroundings of a pose (1,): in vain, if none is much less likely by chance."""
         self._around = pose
 
-    def _weighed(self, candidates: Candidates, count: int | None = None) -> Candidates:
+    def _weighed(self, candidates: Hypotheses, count: int | None = None) -> Hypotheses:
         """The candidates, of which the first `count`, by default as many as a verdict needs, have false alarms."""
         if count is None:
             count = self.scene.settings.finished if self.sets.prior is None else self.scene.settings.kept
         places = np.flatnonzero(self._promising(candidates[:count]))
-        first = with_false_alarms(in_user_frame(candidates[places], self.scene), self.sets)
+        first = with_false_alarms(to_user_frame(candidates[places], self.scene), self.sets)
         alarms, rough = candidates.log10_false_alarms.copy(), candidates.log10_rough.copy()
         alarms[places], rough[places] = first.log10_false_alarms, first.log10_rough
         return replace(candidates, log10_false_alarms=alarms, log10_rough=rough)
 
-    def _promising(self, candidates: Candidates) -> NDArray[np.bool_]:
+    def _promising(self, candidates: Hypotheses) -> NDArray[np.bool_]:
         """Which poses may exceed chance: those that explain the bearings better than scene points would that are spread
         evenly over the view, or worse by less than three times the number of tests, in decades."""
-        nats = candidates.score - math.log(2 * math.pi / self.scene.solid_angle)
+        nats = candidates.log_likelihood - math.log(2 * math.pi / self.scene.solid_angle)
         return np.asarray(nats * len(self.sets.bearings) > -3 * math.log(10) * self._tests)
 
-    def leaders(self) -> Candidates:
+    def leaders(self) -> Hypotheses:
         """The candidates that have their false alarms, as a verdict needs them."""
         known = self.candidates[~np.isnan(self.candidates.log10_false_alarms)]
-        return weighed(in_user_frame(known, self.scene), self.sets, self.scene.settings.evidence)
+        return weighed(to_user_frame(known, self.scene), self.sets, self.scene.settings.evidence)
 
     @property
     def alarms(self) -> float:
         """log10 of the fewest false alarms of a pose."""
         return float(np.nanmin(self.candidates.log10_false_alarms, initial=np.inf))
 
-    def looks(self, leaders: Candidates) -> int:
+    def looks(self, leaders: Hypotheses) -> int:
         """How often the surroundings of the first one, in the user's frame, were searched in vain."""
         if not len(leaders) or not len(self.surrounded):
             return 0
-        rule, looked = self.scene.settings.evidence, in_user_frame(self.surrounded, self.scene)
+        rule, looked = self.scene.settings.evidence, to_user_frame(self.surrounded, self.scene)
         rotation = np.concatenate([leaders.rotation[:1], looked.rotation])
         translation = np.concatenate([leaders.translation[:1], looked.translation])
         return int(self.sets.same_pose(rotation, translation, rule.other_deg, rule.other_shift).sum()) - 1
 
-    def is_searched(self, pose: Candidates) -> bool:
+    def is_searched(self, pose: Hypotheses) -> bool:
         """Whether the surroundings of a pose (1,), or of one much like it, were searched before one exceeded chance."""
-        together, settings = Candidates.concatenated([pose, *self.searched]), self.scene.settings
+        together, settings = Hypotheses.concatenate([pose, *self.searched]), self.scene.settings
         poses = together.rotation, together.translation * self.scene.shift_weight
         return bool(same_pose(*poses, 0, settings.same_deg, settings.same_shift)[1:].any())
 
@@ -111,8 +111,8 @@ class Pool:
         ends = finish(scene, self.candidates, annealed) if len(self.candidates) else self.candidates
         if len(ends) and sets.prior is not None:  # of a pose before and after, that which chance explains less
             ends = self._weighed(ends)
-            ends = merged([ends, self.candidates.without_hits()], scene)
-        leaders = weighed(in_user_frame(ends, scene), sets, rule)
+            ends = merge_hypotheses([ends, self.candidates.as_dependent()], scene)
+        leaders = weighed(to_user_frame(ends, scene), sets, rule)
         looks = self.looks(leaders)
         result = judged(leaders, sets, batches=self.turns, looks=looks, rule=rule)
         if self.enumerated.log10_false_alarms < result.log10_false_alarms:

@@ -26,7 +26,7 @@ from scipy.ndimage import gaussian_filter
 
 from bpnp.loops.parallel import in_time
 from bpnp.search.annealing import anneal_on_points, turned_about_middle
-from bpnp.search.candidates import Candidates
+from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.kernels.raster import Raster, add_up
 from bpnp.search.scene import Scene
 from bpnp.search.settings import RasterSearch, RasterShape
@@ -37,17 +37,17 @@ WIDEST = 2 * math.tan(math.radians(60))  # half a raster's side: 120 degrees off
 NARROW = 4.0  # cells of the raster, of the standard deviation of a smoothing that is added up cell by cell
 
 
-def search_near(scene: Scene, prior: PosePrior, rule: RasterSearch | None = None) -> Candidates:
+def search_near(scene: Scene, prior: PosePrior, rule: RasterSearch | None = None) -> Hypotheses:
     """Poses from starts drawn from a prior with a translation: the likeliest of them by a raster, annealed.
 
     rule: None for those of the settings, one after the other.
     """
     rules = scene.settings.near if rule is None else (rule,)
     starts = (drawn_around(scene, prior, starts_of(scene, prior, one)) for one in rules)
-    return Candidates.concatenated([raster_search(scene, *each) for each in zip(starts, rules, strict=True)])
+    return Hypotheses.concatenate([raster_search(scene, *each) for each in zip(starts, rules, strict=True)])
 
 
-def raster_search(scene: Scene, poses: Candidates, rule: RasterSearch) -> Candidates:
+def raster_search(scene: Scene, poses: Hypotheses, rule: RasterSearch) -> Hypotheses:
     """Distinct poses from those starts under which most points fall on bearings by a raster, annealed."""
     for points, kept in zip(rule.screens.points, rule.screens.kept, strict=True):
         poses, _ = looked_up(scene, poses, rule.raster, rule.narrowing.first_scale, points, kept)
@@ -62,12 +62,12 @@ def raster_search(scene: Scene, poses: Candidates, rule: RasterSearch) -> Candid
         origin = origin[chosen // steps.copies]
     poses, origin = poses[: rule.annealed], origin[: rule.annealed]
     once = np.isin(np.arange(len(poses)), np.unique(origin, return_index=True)[1])
-    poses = replace(poses, hits=np.where(once, poses.hits, 0))
+    poses = replace(poses, basin_count=np.where(once, poses.basin_count, 0))
     outliers = max(scene.settings.outliers, rule.raster.outliers)
     return anneal_on_points(scene, poses, scale * scene.spread, outliers=outliers)
 
 
-def search_everywhere(scene: Scene, number: int, prior: Prior | None) -> Candidates:
+def search_everywhere(scene: Scene, number: int, prior: Prior | None) -> Hypotheses:
     """Distinct poses from as many starts as for a wide prior, but over all rotations, aimed at one place of the view.
 
     number: of the search, counted from 0, on which the place depends. Near one place the right pose competes with fewer
@@ -76,14 +76,14 @@ def search_everywhere(scene: Scene, number: int, prior: Prior | None) -> Candida
     settings = scene.settings
     rule, aim = settings.everywhere, aim_of(number)
     drawn = draw_poses(scene.spread, scene.bulk3d, rule.draws.starts, settings.recipes[0], prior, scene.rng, aim)
-    return raster_search(scene, Candidates.unscored(*drawn, hits=1), rule)
+    return raster_search(scene, Hypotheses.from_poses(*drawn, basin_count=1), rule)
 
 
-def search_beside(scene: Scene, pose: Candidates, rule: RasterSearch) -> Candidates:
-    """Distinct poses around one, as far as the rule's widest prior reaches; they have no hits."""
+def search_beside(scene: Scene, pose: Hypotheses, rule: RasterSearch) -> Hypotheses:
+    """Distinct poses around one, as far as the rule's widest prior reaches; their basin counts are 0."""
     prior = PosePrior(pose.rotation[0], pose.translation[0], rule.draws.wide_deg)
     sigma = rule.draws.wide_shift * distance_of(scene, prior)
-    return search_near(scene, prior._replace(translation_sigma=sigma), rule).without_hits()
+    return search_near(scene, prior._replace(translation_sigma=sigma), rule).as_dependent()
 
 
 def is_near(scene: Scene, prior: PosePrior) -> bool:
@@ -105,16 +105,16 @@ def _volume(scene: Scene, prior: PosePrior, rule: RasterSearch) -> float:
     return (math.radians(prior.rotation_sigma_deg) / wide[0]) ** 3 * (prior.translation_sigma / wide[1]) ** 3
 
 
-def drawn_around(scene: Scene, prior: PosePrior, count: int) -> Candidates:
+def drawn_around(scene: Scene, prior: PosePrior, count: int) -> Hypotheses:
     """Poses drawn from the prior, the first one its mean."""
     mean = np.asarray(prior.rotation, np.float32)[None], np.asarray(prior.translation, np.float32)[None]
     vectors = math.radians(prior.rotation_sigma_deg) * scene.rng.standard_normal((count, 3), np.float32)
     shifts = np.float32(prior.translation_sigma) * scene.rng.standard_normal((count, 3), np.float32)
     vectors[0], shifts[0] = 0, 0
-    return turned_about_middle(scene, *mean, vectors, shifts, hits=1)
+    return turned_about_middle(scene, *mean, vectors, shifts, basin_count=1)
 
 
-def admitted(scene: Scene, poses: Candidates, prior: Prior | None) -> Candidates:
+def admitted(scene: Scene, poses: Hypotheses, prior: Prior | None) -> Hypotheses:
     """The poses that a `PosePrior` of the user admits, within `settings.admitted` standard deviations; all without."""
     if not isinstance(prior, PosePrior):
         return poses
@@ -129,24 +129,24 @@ def admitted(scene: Scene, poses: Candidates, prior: Prior | None) -> Candidates
     return poses[off <= scene.settings.admitted**2]
 
 
-def moved(scene: Scene, poses: Candidates, scale: float, copies: int) -> Candidates:
+def moved(scene: Scene, poses: Hypotheses, scale: float, copies: int) -> Hypotheses:
     """Each pose and copies of it whose points fall about `scale`, in spreads of the bearings, beside its own."""
     vectors, shifts = np.float32(scale) * scene.rng.standard_normal((2, copies * len(poses), 3), np.float32)
     depth = np.linalg.norm(poses.rotation @ scene.bulk3d.mean(0) + poses.translation, axis=-1)
     shifts *= np.repeat(depth, copies)[:, None] * np.array([scene.spread, scene.spread, 1], np.float32)
     vectors[::copies], shifts[::copies] = 0, 0
     copied = turned_about_middle(scene, poses.rotation, poses.translation, vectors, shifts)
-    return replace(copied, hits=poses.hits.repeat(copies))
+    return replace(copied, basin_count=poses.basin_count.repeat(copies))
 
 
-def around_each(scene: Scene, poses: Candidates) -> Candidates:
-    """Copies of poses that come from elsewhere; those that end alike are no evidence, hence no hits."""
-    return moved(scene, poses, scene.settings.copied_scale, scene.settings.copies).without_hits()
+def around_each(scene: Scene, poses: Hypotheses) -> Hypotheses:
+    """Copies of poses that come from elsewhere; basin counts 0, since that copies end alike is no evidence."""
+    return moved(scene, poses, scene.settings.copied_scale, scene.settings.copies).as_dependent()
 
 
 def looked_up(
-    scene: Scene, poses: Candidates, shape: RasterShape, scale: float, points: int, kept: int
-) -> tuple[Candidates, NDArray[np.int64]]:
+    scene: Scene, poses: Hypotheses, shape: RasterShape, scale: float, points: int, kept: int
+) -> tuple[Hypotheses, NDArray[np.int64]]:
     """The `kept` poses under which so many points fall best on the bearings, of all companions too, best first, and
     their places."""
     score = np.zeros(len(poses), np.float32)

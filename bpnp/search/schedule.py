@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.search.annealing import multistart
-from bpnp.search.candidates import Candidates, best_distinct, in_scene_frame
 from bpnp.search.evidence.alternatives import far_missed, near_missed
+from bpnp.search.hypotheses import Hypotheses, select_distinct, to_scene_frame
 from bpnp.search.pool import Pool
 from bpnp.search.raster_search import (
     admitted,
@@ -35,13 +35,13 @@ from bpnp.search.verdict import is_symmetric, starts_met
 Proposals = Callable[[], tuple[NDArray[np.float64], NDArray[np.float64]]]  # rotations (s, 3, 3), translations (s, 3)
 
 
-def turns(pool: Pool, around: Prior | None, proposals: Proposals | None) -> Iterator[Candidates]:
+def turns(pool: Pool, around: Prior | None, proposals: Proposals | None) -> Iterator[Hypotheses]:
     """The poses of one turn after the other; the pool has merged those of a turn before the next one begins."""
     scene, settings = pool.scene, pool.scene.settings
     guess, known = (None if prior is None else scene.enter_prior(prior) for prior in (around, pool.sets.prior))
     if guess is not None:
         for number in range(settings.schedule.around):
-            yield multistart(scene, number, guess).without_hits()
+            yield multistart(scene, number, guess).as_dependent()
     if isinstance(known, PosePrior) and is_near(scene, known):
         near = _near(pool, known, proposals)
         yield from islice(near, settings.schedule.near)
@@ -53,7 +53,7 @@ def turns(pool: Pool, around: Prior | None, proposals: Proposals | None) -> Iter
     yield from _anywhere(pool, known, proposals)
 
 
-def _near(pool: Pool, known: PosePrior, proposals: Proposals | None) -> Iterator[Candidates]:
+def _near(pool: Pool, known: PosePrior, proposals: Proposals | None) -> Iterator[Hypotheses]:
     scene = pool.scene
     for number in count():
         yield search_near(scene, known)
@@ -62,7 +62,7 @@ def _near(pool: Pool, known: PosePrior, proposals: Proposals | None) -> Iterator
             yield proposed(pool, proposals)
 
 
-def _anywhere(pool: Pool, known: Prior | None, proposals: Proposals | None) -> Iterator[Candidates]:
+def _anywhere(pool: Pool, known: Prior | None, proposals: Proposals | None) -> Iterator[Hypotheses]:
     drawn = _drawn(pool, known)
     yield next(drawn)
     for number in count():
@@ -75,27 +75,27 @@ def _anywhere(pool: Pool, known: Prior | None, proposals: Proposals | None) -> I
             proposals = None
 
 
-def _sure(pool: Pool, drawn: Iterator[Candidates]) -> Iterator[Candidates]:
+def _sure(pool: Pool, drawn: Iterator[Hypotheses]) -> Iterator[Hypotheses]:
     """What excludes the likelier case: a raster search around the best pose, or more starts from anywhere."""
     leaders, settings = pool.leaders(), pool.scene.settings
     looks, rule = pool.looks(leaders), settings.evidence
     symmetric = bool(pool.sets.registered) and is_symmetric(leaders, pool.sets, rule)
-    hits = starts_met(leaders, pool.sets, rule, symmetric=symmetric)
-    far = far_missed(hits, rule, symmetric=symmetric)
-    if looks < settings.schedule.looks and near_missed(hits, looks, rule) > far:
+    basin_count = starts_met(leaders, pool.sets, rule, symmetric=symmetric)
+    far = far_missed(basin_count, rule, symmetric=symmetric)
+    if looks < settings.schedule.looks and near_missed(basin_count, looks, rule) > far:
         yield _look(pool)
     else:
         yield next(drawn)
 
 
-def _look(pool: Pool) -> Candidates:
+def _look(pool: Pool) -> Hypotheses:
     """A raster search around the best pose."""
-    leader = in_scene_frame(pool.leaders()[:1], pool.scene)
+    leader = to_scene_frame(pool.leaders()[:1], pool.scene)
     pool.look_around(leader)
     return search_beside(pool.scene, leader, pool.scene.settings.beside)
 
 
-def _drawn(pool: Pool, known: Prior | None) -> Iterator[Candidates]:
+def _drawn(pool: Pool, known: Prior | None) -> Iterator[Hypotheses]:
     """Poses from anywhere: of batches of starts, and of raster searches of all rotations in about as much time; every
     third batch does not know the prior, which may be wrong."""
     scene, searches = pool.scene, count()
@@ -105,32 +105,32 @@ def _drawn(pool: Pool, known: Prior | None) -> Iterator[Candidates]:
             yield search_everywhere(scene, next(searches), known)
 
 
-def _with_surroundings(pool: Pool, found: Candidates) -> Iterator[Candidates]:
+def _with_surroundings(pool: Pool, found: Hypotheses) -> Iterator[Hypotheses]:
     """Poses, and raster searches around each of the best of different rotations, none twice, until several are in vain
     or a pose exceeds chance."""
     yield found
     settings, since = pool.scene.settings, 0
-    poses = best_distinct(found, pool.scene, settings.schedule.around_each, settings.schedule.apart_deg)
+    poses = select_distinct(found, pool.scene, settings.schedule.around_each, settings.schedule.apart_deg)
     for k in range(len(poses)):
         if since == settings.schedule.in_vain or pool.alarms < 0:
             break
         if not pool.is_searched(poses[k : k + 1]):
-            best = pool.candidates.preference.max(initial=-np.inf)
+            best = pool.candidates.sort_key.max(initial=-np.inf)
             pool.searched.append(poses[k : k + 1])
             yield search_beside(pool.scene, poses[k : k + 1], settings.beside)
-            since = 0 if pool.candidates.preference.max(initial=-np.inf) > best else since + 1
+            since = 0 if pool.candidates.sort_key.max(initial=-np.inf) > best else since + 1
 
 
-def proposed(pool: Pool, proposals: Proposals) -> Candidates:
+def proposed(pool: Pool, proposals: Proposals) -> Hypotheses:
     """Distinct poses from those proposed, in the user's coordinates, that a prior of the user admits.
 
-    They have no hits, since proposals depend on each other.
+    Their basin counts are 0, since proposals depend on each other.
     """
-    poses = admitted(pool.scene, Candidates.unscored(*pool.scene.enter(*proposals())), pool.sets.prior)
+    poses = admitted(pool.scene, Hypotheses.from_poses(*pool.scene.enter(*proposals())), pool.sets.prior)
     return raster_search(pool.scene, poses, pool.scene.settings.proposed)
 
 
-def only_proposed(pool: Pool, proposals: Proposals) -> Iterator[Candidates]:
+def only_proposed(pool: Pool, proposals: Proposals) -> Iterator[Hypotheses]:
     """Proposed poses and nothing else, but what is around them."""
     yield from _with_surroundings(pool, proposed(pool, proposals))
     while pool.alarms < 0 and pool.looks(pool.leaders()) < pool.scene.settings.schedule.looks:

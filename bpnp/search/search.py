@@ -12,9 +12,9 @@ from scipy.spatial import cKDTree
 
 from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
 from bpnp.search.annealing import anneal_on_clusters, anneal_on_points, finish, run_batch
-from bpnp.search.candidates import Candidates, in_user_frame, merged
 from bpnp.search.enumeration.search import exceeds_enumeration, is_enumerable, search_by_enumeration
 from bpnp.search.evidence.rivals import against_rivals
+from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_user_frame
 from bpnp.search.infinity.kernels import Image
 from bpnp.search.infinity.search import search_rotation
 from bpnp.search.kernels.sides import FORWARD
@@ -129,7 +129,7 @@ def lacks_partners(scene: Scene) -> bool:
 
 
 def _until_certain(
-    pool: Pool, turns: Iterator[Candidates], tell: Callable[[int], None] = lambda turns: None
+    pool: Pool, turns: Iterator[Hypotheses], tell: Callable[[int], None] = lambda turns: None
 ) -> SearchResult:
     """Turn after turn until the verdict is settled or the budget is spent."""
     settings, finished = pool.scene.settings, 0.0
@@ -190,15 +190,15 @@ def refine_poses(sets: PointSets, rotation: NDArray[np.float64], translation: ND
     crowd = len(starts)
     if crowd > settings.refined_directly:
         starts = anneal_on_clusters(scene, starts, (*settings.coarse, *settings.middle), settings.starts)
-    around = Candidates.concatenated([starts, around_each(scene, starts[: settings.copied])])
+    around = Hypotheses.concatenate([starts, around_each(scene, starts[: settings.copied])])
     first_scale = settings.middle[-1].last_scale * scene.spread
     clustered = anneal_on_clusters(scene, around, settings.middle, settings.starts)
     clustered = anneal_on_points(scene, clustered, first_scale)
     # A start that is right already needs no clusters, which would only shake it.
     direct = anneal_on_points(scene, starts, first_scale)
-    poses = finish(scene, merged([clustered, direct], scene))
+    poses = finish(scene, merge_hypotheses([clustered, direct], scene))
     annealed = crowd + len(around) - len(starts)
-    return judged(in_user_frame(poses, scene), sets, batches=annealed, rule=settings.evidence)
+    return judged(to_user_frame(poses, scene), sets, batches=annealed, rule=settings.evidence)
 
 
 @one_blas_thread
@@ -207,8 +207,8 @@ def score_poses(
 ) -> SearchResult:
     """Poses (c, 3, 3), (c, 3) annealed a little and scored as those of a search; NaN for a missing one.
 
-    Their residuals are taken to be the median distance of a point to the nearest bearing. They have no hits, since no
-    other starts were tried: only overwhelming evidence makes the best of them certain.
+    Their residuals are taken to be the median distance of a point to the nearest bearing. Their basin counts are 0,
+    since no other starts were tried: only overwhelming evidence makes the best of them certain.
     """
     scene = Scene(sets, 0, DEFAULT, deadline)
     starts = _entered(scene, rotation, translation)
@@ -219,13 +219,13 @@ def score_poses(
     distance, _ = cKDTree(scene.offsets + FORWARD).query(camera / length)
     scale = np.asarray(np.maximum(np.median(distance, -1), scene.smallest_scale), np.float32)
     poses = finish(scene, replace(starts, scale=scale))
-    return judged(in_user_frame(poses, scene), sets, batches=len(starts))
+    return judged(to_user_frame(poses, scene), sets, batches=len(starts))
 
 
-def _entered(scene: Scene, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Candidates:
+def _entered(scene: Scene, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Hypotheses:
     """Those of the user's poses in the frame of a scene that are not missing."""
     known = np.isfinite(rotation).all((-2, -1)) & np.isfinite(translation).all(-1)
-    return Candidates.unscored(*scene.enter(rotation[known], translation[known]))
+    return Hypotheses.from_poses(*scene.enter(rotation[known], translation[known]))
 
 
 @one_blas_thread
@@ -242,7 +242,7 @@ def warm_up() -> None:
     self_motions(points, 0.1)
     search_rotation(Image(rays, np.full(WARMING, 1e-3)), rays)
     scene = Scene(sets, 0, DEFAULT)
-    start = Candidates.unscored(*scene.enter(np.eye(3)[None], np.array([[0, 0, 6.0]])))
+    start = Hypotheses.from_poses(*scene.enter(np.eye(3)[None], np.array([[0, 0, 6.0]])))
     run_batch(scene, start)
     looks = DEFAULT.beside.raster, DEFAULT.beside.narrowing.first_scale
     looked_up(scene, start, *looks, WARMING, 1)

@@ -14,13 +14,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.candidates import Candidates
 from bpnp.search.evidence import reasons
 from bpnp.search.evidence.alternatives import Seen, contesting, log10_missed, misfit, other_pose, rougher
 from bpnp.search.evidence.false_alarms import alarms_of
 from bpnp.search.evidence.repetitions import registered
 from bpnp.search.evidence.settings import Evidence
 from bpnp.search.evidence.uncertainty import focal_bound, is_redundant, linearised, rotation_bound
+from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.point_sets import PointSets
 from bpnp.search.propose.symmetries import Motions
 from bpnp.search.settings import DEFAULT
@@ -39,7 +39,7 @@ class SearchResult:
     it: that a better optimum exists is excluded, whatever its matches say of each other.
     """
 
-    candidates: Candidates
+    candidates: Hypotheses
     verdict: Verdict
     reason: str
     batches: int
@@ -63,7 +63,7 @@ class SearchResult:
         return float(self.candidates.log10_false_alarms[0]) if len(self.candidates) else math.inf
 
 
-def with_false_alarms(candidates: Candidates, sets: PointSets) -> Candidates:
+def with_false_alarms(candidates: Hypotheses, sets: PointSets) -> Hypotheses:
     """The candidates, in the user's coordinates, with their false alarms; those that have them already keep them."""
     alarms, rough = candidates.log10_false_alarms.copy(), candidates.log10_rough.copy()
     new = np.isnan(alarms)
@@ -74,7 +74,7 @@ def with_false_alarms(candidates: Candidates, sets: PointSets) -> Candidates:
     return replace(candidates, log10_false_alarms=alarms, log10_rough=rough)
 
 
-def weighed(candidates: Candidates, sets: PointSets, rule: Evidence = DEFAULT.evidence) -> Candidates:
+def weighed(candidates: Hypotheses, sets: PointSets, rule: Evidence = DEFAULT.evidence) -> Hypotheses:
     """The candidates, in the user's coordinates, with their false alarms; the best first, the others as they were.
 
     Best is the first one whose false alarms exceed the fewest by less than the lead that a verdict asks for: among
@@ -89,13 +89,13 @@ def weighed(candidates: Candidates, sets: PointSets, rule: Evidence = DEFAULT.ev
     return candidates[order]
 
 
-def match_count(candidates: Candidates, sets: PointSets) -> float:
+def match_count(candidates: Hypotheses, sets: PointSets) -> float:
     """Expected number of matches of the best pose."""
-    return float(candidates.matched[0]) * min(len(sets.bearings), len(sets.points3d))
+    return float(candidates.match_count[0])
 
 
 def missed(
-    candidates: Candidates, sets: PointSets, looks: float | int, rule: Evidence, *, independent: bool = True
+    candidates: Hypotheses, sets: PointSets, looks: float | int, rule: Evidence, *, independent: bool = True
 ) -> float:
     """Return log10 of the probability that weighed candidates lack a better optimum.
 
@@ -118,13 +118,13 @@ def missed(
     value = log10_missed(starts_met(candidates, sets, rule), decades, looks, rule)
     if value > rule.missed or not is_symmetric(candidates, sets, rule):
         return value
-    hits, share = starts_met(candidates, sets, rule, symmetric=True), 0.0
+    basin_count, share = starts_met(candidates, sets, rule, symmetric=True), 0.0
     if sets.prior is not None:  # a better pose elsewhere is as unlikely as the prior makes it
         share = sets.log10_share(candidates.rotation[0], candidates.translation[0])
-    return min(log10_missed(hits, 0.0, looks, rule, symmetric=True) + share, 0.0)
+    return min(log10_missed(basin_count, 0.0, looks, rule, symmetric=True) + share, 0.0)
 
 
-def motions_of(candidates: Candidates, sets: PointSets, rule: Evidence) -> Motions:
+def motions_of(candidates: Hypotheses, sets: PointSets, rule: Evidence) -> Motions:
     """Return the motions that map the matched points of the first candidate onto other scene points.
 
     They are computed once for a pose and those that are no different pose.
@@ -140,13 +140,13 @@ def motions_of(candidates: Candidates, sets: PointSets, rule: Evidence) -> Motio
     return motions
 
 
-def is_symmetric(candidates: Candidates, sets: PointSets, rule: Evidence) -> bool:
+def is_symmetric(candidates: Hypotheses, sets: PointSets, rule: Evidence) -> bool:
     """Return whether a motion maps so many of the matched points of the first candidate onto other scene points that
     it could by itself explain a better pose."""
     return float(motions_of(candidates, sets, rule).fraction.max(initial=0)) >= rule.repetitions.symmetric
 
 
-def starts_met(candidates: Candidates, sets: PointSets, rule: Evidence, *, symmetric: bool = False) -> int:
+def starts_met(candidates: Hypotheses, sets: PointSets, rule: Evidence, *, symmetric: bool = False) -> int:
     """Return the basin count of the first candidate and of others that are no different pose.
 
     Args:
@@ -164,11 +164,11 @@ def starts_met(candidates: Candidates, sets: PointSets, rule: Evidence, *, symme
     for rotation, translation in zip(*first, strict=True):
         poses = np.concatenate([rotation[None], candidates.rotation]), np.vstack([translation, candidates.translation])
         counted |= sets.same_pose(*poses, rule.other_deg, rule.other_shift)[1:]
-    return int(candidates.hits[counted].sum())
+    return int(candidates.basin_count[counted].sum())
 
 
 def judged(
-    candidates: Candidates,
+    candidates: Hypotheses,
     sets: PointSets,
     *,
     batches: int,
@@ -224,7 +224,7 @@ def judged(
     return SearchResult(candidates, "ambiguous", reason, batches, settled)
 
 
-def is_certain(candidates: Candidates, sets: PointSets, rule: Evidence = DEFAULT.evidence) -> bool:
+def is_certain(candidates: Hypotheses, sets: PointSets, rule: Evidence = DEFAULT.evidence) -> bool:
     """Whether weighed candidates of an enumeration leave no doubt about the first one, as far as is cheaply told."""
     if not len(candidates) or float(candidates.log10_false_alarms[0]) > rule.false_alarms:
         return False
@@ -236,4 +236,4 @@ def is_certain(candidates: Candidates, sets: PointSets, rule: Evidence = DEFAULT
 
 def no_pose(reason: str, batches: int = 0, *, settled: bool = False) -> SearchResult:
     """Of points that fix no pose, or for which none was found."""
-    return SearchResult(Candidates.unscored(np.empty((0, 3, 3)), np.empty((0, 3))), "failed", reason, batches, settled)
+    return SearchResult(Hypotheses.empty(), "failed", reason, batches, settled)

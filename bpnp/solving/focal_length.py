@@ -25,10 +25,10 @@ from bpnp.cameras import (
 from bpnp.geometry import same_pose, turned_by
 from bpnp.loops.parallel import Clock, one_blas_thread
 from bpnp.search.annealing import polished
-from bpnp.search.candidates import Candidates
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.evidence.reasons import number
 from bpnp.search.evidence.settings import OtherFocal
+from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.point_sets import UnknownFocal
 from bpnp.search.propose.lens import fit_lens
 from bpnp.search.scene import Scene
@@ -296,7 +296,7 @@ class FittedCamera(NamedTuple):
 
     camera: Camera
     problem: Problem
-    poses: Candidates
+    poses: Hypotheses
 
     @property
     def log10_false_alarms(self) -> float:
@@ -383,6 +383,6 @@ def _fit_track(
     return FittedCamera(camera, problem, end)
 
 
-def _anneal_pose(problem: Problem, rotation: Array, translation: Array, scale: float, seed: int) -> Candidates:
+def _anneal_pose(problem: Problem, rotation: Array, translation: Array, scale: float, seed: int) -> Hypotheses:
     scene = Scene(problem.sets, seed, SEARCH)
     return weighed(polished(scene, rotation[None], translation[None], scale), problem.sets)[:1]

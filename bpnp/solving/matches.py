@@ -44,12 +44,12 @@ def finished(problem: Problem, result: SearchResult, seconds: float, inlier_thre
     candidates = [
         Candidate(rotation, translation - rotation @ problem.origin, score, count, alarms)
         for (rotation, translation), score, count, alarms in zip(
-            poses, found.score.tolist(), counts, found.log10_false_alarms.tolist(), strict=True
+            poses, found.log_likelihood.tolist(), counts, found.log10_false_alarms.tolist(), strict=True
         )
     ]
     i, j = matches.T
     camera = problem.sets.points3d[j] @ poses[0][0].T + poses[0][1]
-    matched = float(found.matched[0]) * min(len(problem.image), len(problem.points3d))
+    matched = float(found.match_count[0])
     linear = None if result.verdict == "failed" else linearised(problem.sets, *poses[0], result.residual)
     solution = with_pose(
         replace(without_pose(problem, result.reason, None), verdict=result.verdict),

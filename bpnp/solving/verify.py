@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.cameras import camera_from
 from bpnp.loops.parallel import Deadline
-from bpnp.search.candidates import Candidates
 from bpnp.search.evidence.claimed import judge_claim
 from bpnp.search.evidence.uncertainty import linearised, pose_covariance
+from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.verdict import match_count
 from bpnp.solving.arguments import Array, Labels, checked_pose, numbers, positive
 from bpnp.solving.matches import finished, without_pose
@@ -148,7 +148,7 @@ def _of_matches(problem: Problem, matches: Labels) -> Problem:
     )
 
 
-def _of_unrefined(problem: Problem, optimum: Candidates, rotation: Array, translation: Array) -> Array:
+def _of_unrefined(problem: Problem, optimum: Hypotheses, rotation: Array, translation: Array) -> Array:
     """Covariance (6, 6) of a pose of which an optimum beside it is known: that of the optimum, and the way to it."""
     best, shift, scale = optimum.rotation[0], optimum.translation[0], float(optimum.scale[0])
     linear = linearised(problem.sets, best, shift, scale)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.loops.parallel import Clock
 from bpnp.robust.minimal_solvers import p3p
-from bpnp.search.enumeration.search import EnumeratedPoses, enumerate_poses
+from bpnp.search.enumeration.search import Enumerated, enumerate_poses
 from bpnp.search.enumeration.settings import DEFAULT
 from bpnp.search.point_sets import PointSets
 
@@ -35,7 +35,7 @@ def planted(
     return directions(np.concatenate([rays, lights]))[order], points, rotation, translation, match
 
 
-def solved(rays: Array, points: Array, *, is_safe: Any = None) -> EnumeratedPoses:
+def solved(rays: Array, points: Array, *, is_safe: Any = None) -> Enumerated:
     return enumerate_poses(PointSets(rays, points), radius=RADIUS, is_safe=is_safe, deadline=math.inf)
 
 
@@ -46,13 +46,13 @@ def test_planted_poses_are_found(seen: int, hidden: int, background: int) -> Non
         rays, points, rotation, translation, match = planted(
             np.random.default_rng(seed), seen, hidden=hidden, background=background
         )
-        poses = solved(rays, points)
+        poses = solved(rays, points).poses
         errors = [degrees_between(r, rotation) for r in poses.rotation]
         assert min(errors) < 3
         found += errors[0] < 3
         if errors[0] < 3 and seen > 5:
             assert np.linalg.norm(poses.translation[0] - translation) < 0.3
-            assert (poses.match[0] == match).mean() > 0.85
+            assert (poses.matches[0] == match).mean() > 0.85
     assert found >= (10 if seen > 5 else 4)  # four points and noise leave other poses as good
 
 
@@ -72,33 +72,33 @@ def test_small_problems_are_exhausted(seed: int) -> None:
     """On exact points with one stray, the enumeration matches as many as trying everything does."""
     rng = np.random.default_rng(seed)
     rays, points, rotation, _, _ = planted(rng, 5, background=1, noise=0.0)
-    poses = solved(rays, points, is_safe=lambda _: False)
-    assert poses.ended == "exhausted"
+    poses, ended = solved(rays, points, is_safe=lambda _: False)
+    assert ended == "exhausted"
     matches = (poses.residual <= 1e-6).sum(-1)
     assert matches.max() == brute_force(rays, points, 1e-6) == 5
     assert degrees_between(poses.rotation[matches.argmax()], rotation) < 1e-3
     assert enumerate_poses(PointSets(rays, points), radius=RADIUS, deadline=Clock.now()).ended == "interrupted"
 
 
-@pytest.mark.parametrize("hits", [1, 3])
-def test_a_better_pose_is_missed_as_rarely_as_basin_counts_claim(hits: int) -> None:
+@pytest.mark.parametrize("basin_count", [1, 3])
+def test_a_better_pose_is_missed_as_rarely_as_basin_counts_claim(basin_count: int) -> None:
     """Counted on objects of equal parts and a few unique points, without competitors: of partial enumerations that end
-    when the best pose has h hits, at most 2^-h end at a turned pose."""
+    when the best pose has the basin count h, at most 2^-h end at a turned pose."""
     wrong = 0
     for k in range(40):
-        rng = np.random.default_rng([k, hits])
+        rng = np.random.default_rng([k, basin_count])
         part = rng.uniform(-1, 1, (7, 3))
         turns = Rotation.from_rotvec([[0, 0, 2 * np.pi * i / 3] for i in range(3)]).as_matrix()
         points = np.concatenate([*(part @ turn.T for turn in turns), rng.uniform(-1, 1, (3, 3))])
         rotation = Rotation.random(random_state=rng).as_matrix()
         camera = points @ rotation.T + [0, 0, 5]
         rays = rng.permutation(camera / np.linalg.norm(camera, axis=1, keepdims=True))
-        poses = enumerate_poses(
+        poses, ended = enumerate_poses(
             PointSets(rays, points),
-            is_safe=lambda poses: bool(poses.hits[0] >= hits),
+            is_safe=lambda poses: bool(poses.basin_count[0] >= basin_count),
             settings=replace(DEFAULT, safe=-1e9, patience=10**9),
         )
-        assert poses.hits[0] >= hits
-        assert poses.ended == "safe"
+        assert poses.basin_count[0] >= basin_count
+        assert ended == "safe"
         wrong += degrees_between(poses.rotation[0], rotation) > 3
-    assert wrong <= 40 * 0.5**hits
+    assert wrong <= 40 * 0.5**basin_count

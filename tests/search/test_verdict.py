@@ -1,6 +1,5 @@
 """What a verdict asks for beside few false alarms: residuals that carry the evidence, a lead, a pose that is fixed."""
 
-import math
 import re
 from dataclasses import replace
 
@@ -11,8 +10,8 @@ from planted import directions
 from scipy.spatial.transform import Rotation
 
 from bpnp.loops.parallel import NEVER, Deadline
-from bpnp.search.candidates import Candidates
 from bpnp.search.evidence.rivals import AtZoom, likeliest_zoom, other_camera
+from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT
@@ -24,14 +23,14 @@ SHIFT = np.array([0.0, 0.0, 6.0])
 
 def verdict_on(sets: PointSets, rotations: Array, translations: Array, scale: float, matched: float) -> SearchResult:
     c = len(rotations)
-    nan = np.full(c, math.nan)
-    return judged(
-        Candidates(
-            rotations, translations, -np.arange(float(c)), np.full(c, matched), np.full(c, scale),
-            np.zeros(c, np.int64), nan, nan,
-        ),
-        sets, batches=0, exhaustive=True,
-    )  # fmt: skip
+    poses = Hypotheses.from_poses(
+        rotations,
+        translations,
+        log_likelihood=-np.arange(float(c)),
+        match_count=np.full(c, matched * min(len(sets.bearings), len(sets.points3d))),
+        scale=np.full(c, scale),
+    )
+    return judged(poses, sets, batches=0, exhaustive=True)
 
 
 def test_a_few_exact_matches_do_not_make_a_rough_alignment_precise() -> None:
@@ -64,17 +63,17 @@ def test_precision_is_no_ambiguity() -> None:
 
 
 @pytest.mark.parametrize(
-    ("hits", "looks", "verdict"), [(0, 0, "ambiguous"), (10, 0, "ambiguous"), (10, 1, "confident"), (6, 2, "confident")]
+    ("basin_count", "looks", "verdict"),
+    [(0, 0, "ambiguous"), (10, 0, "ambiguous"), (10, 1, "confident"), (6, 2, "confident")],
 )
-def test_matches_that_say_little_ask_for_starts_that_end_alike(hits: int, looks: int, verdict: str) -> None:
+def test_matches_that_say_little_ask_for_starts_that_end_alike(basin_count: int, looks: int, verdict: str) -> None:
     """400 points with residuals of their spacing: a match is worth a hundredth of a decade. Ten starts that might as
     well have ended at a far better optimum exclude one, and a look around the pose one beside it."""
     rng = np.random.default_rng(1)
     points = rng.uniform(-1, 1, (400, 3))
     rays = directions(directions(points + SHIFT) + 5e-3 * rng.standard_normal((400, 3)))
-    pose = replace(
-        Candidates.unscored(np.eye(3)[None], SHIFT[None], hits=hits), matched=np.array([0.8]), scale=np.array([5e-3])
-    )
+    columns = {"match_count": np.array([320.0]), "scale": np.array([5e-3])}
+    pose = Hypotheses.from_poses(np.eye(3)[None], SHIFT[None], basin_count=basin_count, **columns)
     found = judged(pose, PointSets(rays, points), batches=1, looks=looks)
     assert -10 > found.log10_false_alarms > -60
     assert found.verdict == verdict
@@ -88,8 +87,9 @@ def test_starts_that_end_beside_a_pose_met_it(degrees: float, verdict: str) -> N
     points = rng.uniform(-1, 1, (400, 3))
     rays = directions(directions(points + SHIFT) + 5e-3 * rng.standard_normal((400, 3)))
     rotations = Rotation.from_rotvec([[0, 0, 0], [0, 0, np.radians(degrees)]]).as_matrix()
-    poses = Candidates.unscored(rotations, np.stack([SHIFT, SHIFT]), hits=0)
-    poses = replace(poses, matched=np.array([0.8, 0.5]), scale=np.array([5e-3, 5e-3]), hits=np.array([0, 10]))
+    columns = {"match_count": np.array([320.0, 200.0]), "scale": np.array([5e-3, 5e-3])}
+    poses = Hypotheses.from_poses(rotations, np.stack([SHIFT, SHIFT]), **columns)
+    poses = replace(poses, basin_count=np.array([0, 10]))
     found = judged(poses, PointSets(rays, points), batches=1, looks=1)
     assert found.verdict == verdict
     assert ("miss probability" in found.reason) == (verdict == "ambiguous")

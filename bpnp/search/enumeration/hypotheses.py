@@ -76,7 +76,7 @@ def sweep(row: int, first: int, budget: int, stop: float, block: Any, problem: A
                 continue
             known = kept.point[best[0]]
             own = known[i] == a and known[j] == b and known[k] == c
-            if own and kept.counts[best[0]] >= RULES.skipped and kept.hits[best[0]] >= RULES.counted:
+            if own and kept.counts[best[0]] >= RULES.skipped and kept.basin_count[best[0]] >= RULES.counted:
                 continue
             solved += 1
             if block.size == 2:
@@ -140,9 +140,9 @@ class Kept(NamedTuple):
     """Distinct poses (c, 4, 3), their evidence (c,), numbers of matches (c,), matches (c, m) and squared distances
     (c, m).
 
-    best: (1,) the index of the best. most: (1,) matches that any hypothesis of the stage had. hits: (c,) basin counts,
-    the number of image sets of which a hypothesis ended at the pose. last: (c,) the image set that was counted last,
-    at: (1,) the one that is tried, -1 for a pose that does not come from one."""
+    best: (1,) the index of the best. most: (1,) matches that any hypothesis of the stage had. basin_count: (c,) the
+    number of image sets of which a hypothesis ended at the pose. last: (c,) the image set that was counted last, at:
+    (1,) the one that is tried, -1 for a pose that does not come from one."""
 
     poses: Array
     evidence: Array
@@ -151,7 +151,7 @@ class Kept(NamedTuple):
     distance2: Array
     best: Places
     most: Array
-    hits: Places
+    basin_count: Places
     last: Places
     at: Places
 
@@ -237,12 +237,12 @@ def keep(pose: Any, value: float, count: int, matches: Any, kept: Any) -> None:
     for c in range(len(values)):
         if values[c] > -math.inf and _same(pose, kept.poses[c]):
             if kept.at[0] >= 0 and kept.last[c] != kept.at[0]:
-                kept.hits[c], kept.last[c] = kept.hits[c] + 1, kept.at[0]
+                kept.basin_count[c], kept.last[c] = kept.basin_count[c] + 1, kept.at[0]
             if values[c] >= value:
                 return
             if place >= 0:
                 values[c] = -math.inf  # both are this pose
-                kept.hits[place] = max(kept.hits[place], kept.hits[c])
+                kept.basin_count[place] = max(kept.basin_count[place], kept.basin_count[c])
             else:
                 place = c
     if place < 0:
@@ -254,7 +254,7 @@ def keep(pose: Any, value: float, count: int, matches: Any, kept: Any) -> None:
         return
     values[place], kept.counts[place] = value, count
     if is_new:
-        kept.hits[place], kept.last[place] = kept.at[0] >= 0, kept.at[0]
+        kept.basin_count[place], kept.last[place] = kept.at[0] >= 0, kept.at[0]
     copy_pose(pose, pose[3], kept.poses[place], kept.poses[place, 3])
     copy(matches.point, kept.point[place])
     copy(matches.distance2, kept.distance2[place])

@@ -13,13 +13,11 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from bpnp.loops.parallel import Clock, Deadline
-from bpnp.search.candidates import Candidates
 from bpnp.search.enumeration.hypotheses import Block, Kept, Work, explore
 from bpnp.search.enumeration.matching import Matches, Problem
 from bpnp.search.enumeration.points import (
     Array,
     ImageSide,
-    Places,
     SceneSide,
     pairs,
     predicted_pose,
@@ -30,6 +28,7 @@ from bpnp.search.enumeration.points import (
 from bpnp.search.enumeration.settings import DEFAULT, RULES, EnumerationSettings, Stage
 from bpnp.search.evidence.partners import explained
 from bpnp.search.evidence.repetitions import competing_poses, registered
+from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import SearchSettings
 from bpnp.search.starts import GravityPrior, PosePrior
@@ -46,35 +45,22 @@ SHORTEST = 5e-5  # seconds, in which no hypothesis is begun
 Ended = Literal["exhausted", "safe", "interrupted", "most"]
 
 
-class EnumeratedPoses(NamedTuple):
-    """Distinct poses camera = R p + t, likeliest first.
+class Enumerated(NamedTuple):
+    """Result of an enumeration.
 
-    rotation: (c, 3, 3). translation: (c, 3). evidence: (c,) nats beyond chance, before the number of tests counts.
-    match: (c, m) the scene point that each image point is, -1 for none. residual: (c, m) its angle, radians, infinite
-    where there is none. hits: (c,) basin counts: image sets of which a hypothesis ended at the pose. fixing, tests: of
-    `Enumeration`. ended: why; "exhausted" where every hypothesis was tried, "safe" where `is_safe` returned True,
-    "interrupted" by the deadline, "most" after as many as are allowed.
+    Attributes:
+        poses: Distinct hypotheses, likeliest first, with matches and residuals; `evidence` in nats beyond chance, less
+            the logarithm of the number of tests; `basin_count` is the number of image sets of which a minimal problem
+            ended at the pose.
+        ended: "exhausted" where every minimal problem was tried, "safe" where `is_safe` returned True, "interrupted" by
+            the deadline, "most" after as many as are allowed.
     """
 
-    rotation: Array
-    translation: Array
-    evidence: Array
-    match: Places
-    residual: Array
-    hits: Places
-    fixing: int
-    tests: float
+    poses: Hypotheses
     ended: Ended
 
-    @property
-    def scale(self) -> Array:
-        """(c,) standard deviations of the residuals, radians."""
-        matched = np.isfinite(self.residual)
-        free = np.maximum(2 * matched.sum(-1) - 2 * self.fixing, 1)  # numbers that were measured, less those fitted
-        return np.asarray(np.sqrt((np.where(matched, self.residual, 0.0) ** 2).sum(-1) / free))
 
-
-Competitors = Callable[[EnumeratedPoses], tuple[Array, Array]]
+Competitors = Callable[[Hypotheses], tuple[Array, Array]]
 
 
 class Enumeration:
@@ -183,67 +169,71 @@ def enumerate_poses(
     *,
     radius: float | None = None,
     deadline: float = math.inf,
-    is_safe: Callable[[EnumeratedPoses], bool] | None = None,
+    is_safe: Callable[[Hypotheses], bool] | None = None,
     competitors: Competitors | None = None,
     settings: EnumerationSettings = DEFAULT,
-) -> EnumeratedPoses:
-    """Poses under which image points see scene points, one-to-one within `radius`.
+) -> Enumerated:
+    """Enumerate poses under which image points see scene points, one-to-one within a radius.
 
-        poses = enumerate_poses(
-            sets, deadline=deadline.at, is_safe=is_safe, competitors=competitors, settings=rule
-        )
-    is_safe: asked whether to stop, once the best pose exceeds chance and every other pose; None for always. Where
-    gravity is known, or the rotation to a few degrees, two matches fix a pose; where a whole pose is known, it is tried
-    first.
+    Where gravity is known, or the rotation to a few degrees, two matches fix a pose; where a whole pose is known, it is
+    tried first.
+
+    Args:
+        sets: Points of the problem.
+        radius: Largest residual of a match, radians; None for that of the points.
+        deadline: When to stop (`Clock.now`).
+        is_safe: Called once the best pose exceeds chance and every other pose; True stops. None stops always.
+        competitors: Returns poses to try beside the best one.
+        settings: Constants.
 
     >>> import numpy as np
     >>> rng = np.random.default_rng(0)
     >>> points = rng.uniform(-1, 1, (8, 3))
     >>> seen = points[:6] + [0, 0, 5]
     >>> sets = PointSets(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
-    >>> found = enumerate_poses(sets, radius=2e-3)
-    >>> np.allclose(found.rotation[0], np.eye(3)), found.match[0].tolist()
+    >>> found = enumerate_poses(sets, radius=2e-3).poses
+    >>> np.allclose(found.rotation[0], np.eye(3)), found.matches[0].tolist()
     (True, [0, 1, 2, 3, 4, 5])
     """
     run = Enumeration(sets, sets.match_radius if radius is None else radius, settings)
 
-    def enough(safe: float = settings.safe) -> EnumeratedPoses | None:
+    def enough(safe: float = settings.safe) -> Enumerated | None:
         if run.best < run.tests:
             return None
-        poses = _poses(run, "safe")
+        poses = _poses(run)
         if competitors is not None:
             poses = _with_competitors(run, poses, competitors)
         if margin(poses, settings) >= safe * (1 - run.solved / settings.patience) and (
             is_safe is None or is_safe(poses)
         ):
-            return poses
-        return poses._replace(ended="most") if run.solved >= 2 * settings.patience else None
+            return Enumerated(poses, "safe")
+        return Enumerated(poses, "most") if run.solved >= 2 * settings.patience else None
 
     complete = False
     if (predicted := predicted_pose(sets.prior)) is not None:
         run.propose(*predicted, run.reach)
-        if (poses := enough(0.0)) is not None:
-            return poses
+        if (found := enough(0.0)) is not None:
+            return found
     for stage in settings.stages:
         if stage.matches < run.fixing:
             continue
         if run.seconds_to_begin(stage) > deadline - Clock.now():
-            return _poses(run, "interrupted")
+            return Enumerated(_poses(run), "interrupted")
         run.begin(stage)
         while not run.ended:
             run.sweep(settings.look if run.best >= run.tests else settings.chunk, deadline)
-            if (poses := enough()) is not None:
-                return poses
+            if (found := enough()) is not None:
+                return found
             late = deadline - Clock.now() < SHORTEST
             if late or run.solved > settings.most:
-                return _poses(run, "interrupted" if late else "most")
+                return Enumerated(_poses(run), "interrupted" if late else "most")
         complete = stage.near2d >= len(sets.bearings) - 1 and stage.near3d >= len(sets.points3d) - 1
         if complete and stage.matches == 3 and stage.reach == settings.stages[-1].reach:
             break
-    return _poses(run, "exhausted" if complete else "most")
+    return Enumerated(_poses(run), "exhausted" if complete else "most")
 
 
-def _with_competitors(run: Enumeration, poses: EnumeratedPoses, competitors: Competitors) -> EnumeratedPoses:
+def _with_competitors(run: Enumeration, poses: Hypotheses, competitors: Competitors) -> Hypotheses:
     """Propose the competitors of the best pose, and of the better pose that one of them leads to; each pose once."""
     while True:
         best = poses.rotation[0]
@@ -252,7 +242,7 @@ def _with_competitors(run: Enumeration, poses: EnumeratedPoses, competitors: Com
         run.contested.append(best)
         for pose in zip(*competitors(poses), strict=True):
             run.propose(*pose, run.reach)
-        poses = _poses(run, poses.ended)
+        poses = _poses(run)
 
 
 def _reach(sets: PointSets, scene: SceneSide, radius: float, settings: EnumerationSettings) -> float:
@@ -266,8 +256,8 @@ def _reach(sets: PointSets, scene: SceneSide, radius: float, settings: Enumerati
     return needed
 
 
-def _poses(run: Enumeration, ended: Ended) -> EnumeratedPoses:
-    """The kept poses, likeliest first, after the best one was refined again on wider matches."""
+def _poses(run: Enumeration) -> Hypotheses:
+    """Return the kept poses, likeliest first, after the best one was refined again on wider matches."""
     kept = run.kept
     for reach in (0.5 * run.reach, run.reach) if math.isfinite(run.best) else ():
         run.refine(kept.poses[int(kept.evidence.argmax())], reach)
@@ -275,22 +265,30 @@ def _poses(run: Enumeration, ended: Ended) -> EnumeratedPoses:
     order = order[np.isfinite(kept.evidence[order])]
     rotation = run.image.turn.T @ kept.poses[order, :3]
     translation = run.scene.size * kept.poses[order, 3] @ run.image.turn - rotation @ run.scene.centre
-    match, radii = kept.point[order], np.sqrt(kept.distance2[order])
-    residual = np.where(match >= 0, radii / run.image.arrays.per_radian, math.inf)
-    evidence = kept.evidence[order]
-    return EnumeratedPoses(
-        rotation, translation, evidence, match, residual, kept.hits[order], run.fixing, run.tests, ended
+    matches, radii = kept.point[order], np.sqrt(kept.distance2[order])
+    matched, angle = matches >= 0, radii / run.image.arrays.per_radian
+    count = matched.sum(-1)
+    free = np.maximum(2 * count - 2 * run.fixing, 1)  # numbers that were measured, less those fitted
+    return Hypotheses.from_poses(
+        rotation,
+        translation,
+        match_count=count,
+        scale=np.sqrt((np.where(matched, angle, 0.0) ** 2).sum(-1) / free),
+        basin_count=kept.basin_count[order],
+        evidence=kept.evidence[order] - run.tests,
+        matches=matches,
+        residual=np.where(matched, angle, math.inf),
     )
 
 
-def margin(poses: EnumeratedPoses, settings: EnumerationSettings = DEFAULT) -> float:
-    """Nats by which the best pose exceeds both chance after all tests, and every different pose."""
-    if not len(poses.evidence):
+def margin(poses: Hypotheses, settings: EnumerationSettings = DEFAULT) -> float:
+    """Return the nats by which the best pose exceeds both chance after all tests, and every different pose."""
+    if poses.evidence is None or not len(poses):
         return -math.inf
     traces = np.einsum("cij,ij->c", poses.rotation, poses.rotation[0])
     other = poses.evidence[traces < 1 + 2 * math.cos(math.radians(settings.other_deg))]
     lead = float(poses.evidence[0] - other.max()) if len(other) else math.inf
-    return min(float(poses.evidence[0]) - poses.tests, lead)
+    return min(float(poses.evidence[0]), lead)
 
 
 def _log_choose(n: int, k: int) -> float:
@@ -308,7 +306,7 @@ def exceeds_enumeration(sets: PointSets) -> bool:
     return not is_enumerable(replace(sets, prior=None))
 
 
-def search_by_enumeration(sets: PointSets, deadline: Deadline, settings: SearchSettings) -> tuple[Candidates, bool]:
+def search_by_enumeration(sets: PointSets, deadline: Deadline, settings: SearchSettings) -> tuple[Hypotheses, bool]:
     """The poses of few points in the user's coordinates, best first; and whether every hypothesis was tried.
 
     Where the whole pose is known closely, as when a device is tracked, it is tried, and if it does not hold the search
@@ -316,51 +314,49 @@ def search_by_enumeration(sets: PointSets, deadline: Deadline, settings: SearchS
     no pose with the given gravity is significant, the search goes on without it: a hypothesis of two matches has the
     error of the prior.
     """
-    certain: Candidates | None = None
+    certain: Hypotheses | None = None
     annotated = sets
     if sets.cosines3d is not None:
         sets = replace(sets, normals3d=None, cosines3d=None)
 
-    def is_safe(poses: EnumeratedPoses) -> bool:
+    def is_safe(poses: Hypotheses) -> bool:
         nonlocal certain
         candidates = weighed(_candidates(poses, annotated, settings), sets, settings.evidence)
         certain = candidates if is_certain(candidates, sets, settings.evidence) else None
         return certain is not None
 
-    def competitors(poses: EnumeratedPoses) -> tuple[Array, Array]:
+    def competitors(poses: Hypotheses) -> tuple[Array, Array]:
         pose = poses.rotation[0], poses.translation[0]
         scale = max(float(poses.scale[0]), sets.floor or 1e-5)
         motions = registered(annotated, *pose, scale, settings.evidence)
         return competing_poses(annotated, *pose, motions, settings.evidence)
 
-    def enumerated(sets: PointSets, rule: EnumerationSettings) -> tuple[EnumeratedPoses, Candidates]:
-        poses = enumerate_poses(sets, deadline=deadline.at, is_safe=is_safe, competitors=competitors, settings=rule)
-        return poses, _candidates(poses, annotated, settings) if certain is None else certain
+    def enumerated(sets: PointSets, rule: EnumerationSettings) -> tuple[Enumerated, Hypotheses]:
+        found = enumerate_poses(sets, deadline=deadline.at, is_safe=is_safe, competitors=competitors, settings=rule)
+        return found, _candidates(found.poses, annotated, settings) if certain is None else certain
 
     tracked = predicted_pose(sets.prior) is not None
     near = tracked and sets.pairs_that_fix == 2
-    poses, candidates = enumerated(sets, replace(DEFAULT, stages=()) if near else DEFAULT)
+    found, candidates = enumerated(sets, replace(DEFAULT, stages=()) if near else DEFAULT)
     if certain is None and isinstance(sets.prior, GravityPrior):
         candidates = with_false_alarms(candidates, sets)
         if candidates.log10_false_alarms.min(initial=math.inf) > settings.evidence.false_alarms:
-            poses, others = enumerated(replace(sets, prior=None), DEFAULT)
-            candidates = with_false_alarms(Candidates.concatenated([candidates, others]), sets)
+            found, others = enumerated(replace(sets, prior=None), DEFAULT)
+            candidates = with_false_alarms(Hypotheses.concatenate([candidates, others]), sets)
             candidates = candidates[np.argsort(candidates.log10_false_alarms, kind="stable")[: settings.kept]]
-    elif certain is None and tracked and (near or margin(poses) < 0):
-        poses, others = enumerated(replace(sets, prior=None), DEFAULT)
-        candidates = Candidates.concatenated([candidates, others])
-        candidates = candidates[np.argsort(-candidates.score, kind="stable")[: settings.kept]]
-    return candidates, poses.ended == "exhausted"
+    elif certain is None and tracked and (near or margin(found.poses) < 0):
+        found, others = enumerated(replace(sets, prior=None), DEFAULT)
+        candidates = Hypotheses.concatenate([candidates, others])
+        candidates = candidates[np.argsort(-candidates.log_likelihood, kind="stable")[: settings.kept]]
+    return candidates, found.ended == "exhausted"
 
 
-def _candidates(poses: EnumeratedPoses, sets: PointSets, settings: SearchSettings) -> Candidates:
-    """The poses that are not far less likely than the best one; scale and likelihood as the annealing defines them."""
-    rivals = poses.evidence >= (poses.evidence.max() if len(poses.evidence) else 0.0) - DEFAULT.near_nats
-    rivals &= np.arange(len(rivals)) < settings.kept
-    rotation, translation = poses.rotation[rivals], poses.translation[rivals]
-    count = np.isfinite(poses.residual[rivals]).sum(-1)
-    scale = np.maximum(poses.scale[rivals], sets.floor or 1e-5)
-    score = np.array([explained(sets, *each)[0] for each in zip(rotation, translation, scale, strict=True)])
-    share = count / min(len(sets.bearings), len(sets.points3d))
-    unscored = Candidates.unscored(rotation, translation)
-    return replace(unscored, score=score, matched=share, scale=scale, hits=poses.hits[rivals])
+def _candidates(poses: Hypotheses, sets: PointSets, settings: SearchSettings) -> Hypotheses:
+    """Return the poses that are not far less likely than the best one, with scale and likelihood as the annealing
+    defines them."""
+    if poses.evidence is None or not len(poses):
+        return poses
+    poses = poses[poses.evidence >= poses.evidence.max() - DEFAULT.near_nats][: settings.kept]
+    scale = np.maximum(poses.scale, sets.floor or 1e-5)
+    each = zip(poses.rotation, poses.translation, scale, strict=True)
+    return replace(poses, scale=scale, log_likelihood=np.array([explained(sets, *one)[0] for one in each]))

@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bpnp.geometry import turned_by
-from bpnp.search.candidates import Candidates
 from bpnp.search.evidence import reasons
 from bpnp.search.evidence.false_alarms import directions_of, own_evidence
 from bpnp.search.evidence.settings import Evidence
 from bpnp.search.evidence.uncertainty import Linearised, Misfit, systematic_misfit
+from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.point_sets import PointSets, label_groups
 
 SAME_ZOOM = 0.005  # change of the focal length that is not worth a word
 Array = NDArray[np.float64]
-Seen = Sequence[tuple[Candidates, PointSets]]
+Seen = Sequence[tuple[Hypotheses, PointSets]]
 
 
 class Alternative(NamedTuple):
@@ -39,7 +39,7 @@ class Alternative(NamedTuple):
     what: str
 
 
-def other_pose(candidates: Candidates, sets: PointSets, rule: Evidence) -> Alternative | None:
+def other_pose(candidates: Hypotheses, sets: PointSets, rule: Evidence) -> Alternative | None:
     """The different pose with the fewest false alarms; None if there is none.
 
     Different: turned by more than `other_deg`, or the middle of the scene moved by more than `other_shift` of its
@@ -60,7 +60,7 @@ def fits_as_well(rotation: Array, other: Array, decades: float) -> Alternative:
     return Alternative(decades, reasons.competing(off, decades))
 
 
-def rougher(candidates: Candidates) -> Alternative | None:
+def rougher(candidates: Hypotheses) -> Alternative | None:
     """The best pose at scales far beyond that of its residuals, where the points agree with it better there: what its
     matches say of it beyond a rough alignment is then no more than chance. None otherwise."""
     decades = float(candidates.log10_rough[0] - candidates.log10_false_alarms[0])
@@ -183,7 +183,7 @@ def _partners(near: float, sets: PointSets, rotation: Array, translation: Array,
 
 
 def log10_missed(
-    hits: int, decades_a_match: float, looks: float | int, rule: Evidence, *, symmetric: bool = False
+    basin_count: int, decades_a_match: float, looks: float | int, rule: Evidence, *, symmetric: bool = False
 ) -> float:
     """log10 of the probability that a better optimum than the best pose exists and was not met.
 
@@ -207,25 +207,25 @@ def log10_missed(
     Source: C. G. E. Boender, A. H. G. Rinnooy Kan, Bayesian stopping rules for multistart global optimization methods,
     Math. Programming 1987.
 
-    hits: independent starts that ended at the best pose, or at a neighbour that is no different pose. decades_a_match:
-    of its evidence, 0 where its matches are no evidence of each other, as in repeated structures. looks: how often its
-    surroundings were searched in vain.
+    basin_count: independent starts that ended at the best pose, or at a neighbour that is no different pose.
+    decades_a_match: of its evidence, 0 where its matches are no evidence of each other, as in repeated structures.
+    looks: how often its surroundings were searched in vain.
 
     >>> rule = Evidence()
     >>> [round(log10_missed(*seen, rule), 2) for seen in ((0, 0.0, 0), (7, 0.0, 0), (7, 0.0, 1), (1, 1.0, 0))]
     [0.0, -2.0, -3.24, -3.3]
     """
-    unseen = near_missed(hits, looks, rule) + far_missed(hits, rule, symmetric=symmetric)
+    unseen = near_missed(basin_count, looks, rule) + far_missed(basin_count, rule, symmetric=symmetric)
     return min(math.log10(unseen) - rule.independent * max(decades_a_match, 0.0), 0.0)
 
 
-def near_missed(hits: int, looks: float | int, rule: Evidence) -> float:
+def near_missed(basin_count: int, looks: float | int, rule: Evidence) -> float:
     """Probability that a better optimum beside the best pose was not met."""
     overlooked = rule.look_fails * rule.again_fails ** (looks - 1) if looks else 1.0
-    return max(0.5**hits, rule.another) * overlooked
+    return max(0.5**basin_count, rule.another) * overlooked
 
 
-def far_missed(hits: int, rule: Evidence, *, symmetric: bool = False) -> float:
+def far_missed(basin_count: int, rule: Evidence, *, symmetric: bool = False) -> float:
     """Return the probability that a better optimum far from the best pose was not met: without the prior probability
     that there is one where the scene is symmetric."""
-    return (rule.uncompared if symmetric else rule.another) * 0.5**hits
+    return (rule.uncompared if symmetric else rule.another) * 0.5**basin_count

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from bpnp.geometry import turned_by
 from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
 from bpnp.search.annealing import anneal_on_points, finish, polished
-from bpnp.search.candidates import Candidates, in_scene_frame, in_user_frame, merged
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.evidence import reasons
 from bpnp.search.evidence.false_alarms import likeliest_scale, log10_tests
@@ -25,6 +24,7 @@ from bpnp.search.evidence.repetitions import competing_poses, registered
 from bpnp.search.evidence.rivals import against_rivals
 from bpnp.search.evidence.settings import Evidence
 from bpnp.search.evidence.uncertainty import linearised, local_covariance
+from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_scene_frame, to_user_frame
 from bpnp.search.point_sets import SIGMAS, PointSets
 from bpnp.search.raster_search import around_each
 from bpnp.search.scene import Scene
@@ -46,7 +46,7 @@ def judge_claim(
     refine: bool = True,
     seed: int = 0,
     deadline: Deadline = NEVER,
-) -> tuple[SearchResult, Candidates]:
+) -> tuple[SearchResult, Hypotheses]:
     """Judge a given pose, or the optimum near it.
 
     Args:
@@ -71,7 +71,7 @@ def judge_claim(
         motions = registered(one, rotation, translation, float(claim.scale[0]), rule)
         copies = competing_poses(one, rotation, translation, motions, rule)
         if len(copies[0]):
-            others = Candidates.concatenated([others, polished(scene, *copies, float(claim.scale[0]))])
+            others = Hypotheses.concatenate([others, polished(scene, *copies, float(claim.scale[0]))])
     others = _weighed_anew(others, one)
     others = others[np.argsort(others.log10_false_alarms, kind="stable")]
     same = np.array([_is_same(one, claim, others[k : k + 1], rule) for k in range(len(others))], np.bool_)
@@ -85,7 +85,7 @@ def judge_claim(
         one = replace(sets, log10_tried=max(log10_tests(sets) + near, 0.0))
         claim = optimum
     competing = others[~same & (others.log10_false_alarms <= 0)]  # chance explains the rest
-    candidates = _weighed_anew(Candidates.concatenated([claim, competing]), one)
+    candidates = _weighed_anew(Hypotheses.concatenate([claim, competing]), one)
     result = judged(candidates, one, batches=0, exhaustive=True, rule=rule)
     result = against_rivals(result, one, lambda: scene, rule, exhaustive=True, contested=few)
     result = _of_claim(result, candidates[:1])
@@ -101,23 +101,23 @@ def judge_claim(
     return replace(result, batches=int(refined)), optimum  # no last fit to the matches
 
 
-def _proposed(claim: Candidates, scene: Scene) -> Candidates:
+def _proposed(claim: Hypotheses, scene: Scene) -> Hypotheses:
     """Return the distinct poses that annealing reaches from a pose (1,), from copies of it near it, and from
     its mirror image before a flat scene."""
-    start = in_scene_frame(claim, scene)
+    start = to_scene_frame(claim, scene)
     wide = scene.settings.middle[-1].last_scale * scene.spread
-    around = Candidates.concatenated([start, around_each(scene, start), _mirrored(scene, start)])
+    around = Hypotheses.concatenate([start, around_each(scene, start), _mirrored(scene, start)])
     parts = [anneal_on_points(scene, start, wide), anneal_on_points(scene, around, wide), finish(scene, start)]
-    poses = finish(scene, merged(parts, scene), scene.settings.finished)
-    return in_user_frame(poses, scene)
+    poses = finish(scene, merge_hypotheses(parts, scene), scene.settings.finished)
+    return to_user_frame(poses, scene)
 
 
-def _weighed_anew(candidates: Candidates, sets: PointSets) -> Candidates:
+def _weighed_anew(candidates: Hypotheses, sets: PointSets) -> Hypotheses:
     """With the false alarms of as many tests as these sets have."""
-    return with_false_alarms(replace(candidates, log10_false_alarms=np.full(len(candidates), math.nan)), sets)
+    return with_false_alarms(candidates.unweighed(), sets)
 
 
-def _mirrored(scene: Scene, pose: Candidates) -> Candidates:
+def _mirrored(scene: Scene, pose: Hypotheses) -> Hypotheses:
     """The pose (1,) that sees a flat scene nearly the same, its normal on the other side of the line of sight (the
     ambiguity of a plane seen from afar, Oberkampf, DeMenthon, Davis, CVIU 1996)."""
     middle = scene.bulk3d.mean(0)
@@ -126,19 +126,24 @@ def _mirrored(scene: Scene, pose: Candidates) -> Candidates:
     sight = seen / np.linalg.norm(seen)
     across, flipped = (np.eye(3) - 2 * np.outer(axis, axis) for axis in (sight, normal))
     rotation = (across @ pose.rotation[0] @ flipped).astype(np.float32)
-    return Candidates.unscored(rotation[None], (seen - rotation @ middle)[None].astype(np.float32))
+    return Hypotheses.from_poses(rotation[None], (seen - rotation @ middle)[None].astype(np.float32))
 
 
-def _unrefined(sets: PointSets, rotation: Array, translation: Array) -> Candidates:
+def _unrefined(sets: PointSets, rotation: Array, translation: Array) -> Hypotheses:
     """Return a pose (1,) without refinement, at the scale of residuals with the fewest false alarms."""
     scale = likeliest_scale(sets, rotation, translation)
-    score, matched = explained(sets, rotation, translation, scale)
-    pose = Candidates.unscored(rotation[None], translation[None])
-    pose = replace(pose, score=np.array([score]), matched=np.array([matched]), scale=np.array([scale]))
+    score, count = explained(sets, rotation, translation, scale)
+    pose = Hypotheses.from_poses(
+        rotation[None],
+        translation[None],
+        log_likelihood=np.array([score]),
+        match_count=np.array([count]),
+        scale=np.array([scale]),
+    )
     return with_false_alarms(pose, sets)
 
 
-def _is_same(sets: PointSets, claim: Candidates, pose: Candidates, rule: Evidence) -> bool:
+def _is_same(sets: PointSets, claim: Hypotheses, pose: Hypotheses, rule: Evidence) -> bool:
     """Return whether a pose (1,) is the given one, or within what its points leave open of it."""
     rotations = np.concatenate([claim.rotation, pose.rotation])
     translations = np.concatenate([claim.translation, pose.translation])
@@ -157,7 +162,7 @@ def _is_same(sets: PointSets, claim: Candidates, pose: Candidates, rule: Evidenc
     return bool(step @ np.linalg.solve(covariance, step) < WITHIN)
 
 
-def _of_claim(result: SearchResult, claim: Candidates) -> SearchResult:
+def _of_claim(result: SearchResult, claim: Hypotheses) -> SearchResult:
     """Turn a verdict on several poses into one on the given pose (1,), which becomes the first."""
     candidates = result.candidates
     place = int(np.flatnonzero((candidates.translation == claim.translation[0]).all(-1))[0])

@@ -69,7 +69,7 @@ def partners(
 
 def explained(sets: PointSets, rotation: Array, translation: Array, scale: float) -> tuple[float, float]:
     """Mean log-likelihood of the bearings under a pose with residuals of `scale`, radians, in nats as the annealing has
-    it: in units in which a kernel is 1 / s^2 where it is largest; and the share of min(m, n) points with a partner."""
+    it: in units in which a kernel is 1 / s^2 where it is largest; and the expected number of matches."""
     camera, chosen = sets.points3d @ rotation.T + translation, sets.image.chosen
     places = facing(sets, camera, rotation)
     if not len(places):
@@ -77,4 +77,4 @@ def explained(sets: PointSets, rotation: Array, translation: Array, scale: float
     seen = camera[places] / np.linalg.norm(camera[places], axis=-1, keepdims=True)
     i, _, density, every = partners(sets, seen, places, chosen, scale)
     matched = float((density / every[i]).sum()) * len(sets.bearings) / len(chosen)
-    return float(np.log(2 * math.pi * every).mean()), min(matched / min(len(sets.bearings), len(sets.points3d)), 1.0)
+    return float(np.log(2 * math.pi * every).mean()), min(matched, float(min(len(sets.bearings), len(sets.points3d))))

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.search.annealing import polished
-from bpnp.search.candidates import Candidates, in_user_frame
 from bpnp.search.evidence import reasons
 from bpnp.search.evidence.alternatives import Alternative, of_misfit
 from bpnp.search.evidence.false_alarms import alarms_of
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
 from bpnp.search.evidence.settings import Evidence, OtherFocal
 from bpnp.search.evidence.uncertainty import bends_significantly, linearised, misfit_of
+from bpnp.search.hypotheses import Hypotheses, to_user_frame
 from bpnp.search.point_sets import PointSets, UnknownFocal
 from bpnp.search.propose.lens import LensFit, fit_lens, undistort
 from bpnp.search.raster_search import search_beside
@@ -119,11 +119,11 @@ def beside(found: AtZoom, zoom: float, scene: Scene) -> AtZoom:
     sets = at_focal_length(found.sets, zoom)
     there = Scene(sets, 0, scene.settings, scene.deadline)
     shift = found.middle * (1, 1, zoom) - found.rotation @ sets.middle
-    start = Candidates.unscored(*there.enter(found.rotation[None], shift[None]))
-    poses = in_user_frame(search_beside(there, start, scene.settings.zoomed)[:1], there)
+    start = Hypotheses.from_poses(*there.enter(found.rotation[None], shift[None]))
+    poses = to_user_frame(search_beside(there, start, scene.settings.zoomed)[:1], there)
     if not len(poses):
         return found
-    rotation, likelihood = poses.rotation[0], float(poses.score[0]) + math.log(sets.image.solid_angle)
+    rotation, likelihood = poses.rotation[0], float(poses.log_likelihood[0]) + math.log(sets.image.solid_angle)
     middle = rotation @ sets.middle + poses.translation[0]
     return AtZoom(zoom * found.zoom, sets, rotation, middle, float(poses.scale[0]), likelihood)
 
@@ -173,7 +173,7 @@ def _against_repetitions(
     poses, limits = (repeated.rotation, repeated.translation), rule.repetitions
     if contested:
         scales, alarms = np.full(len(poses[0]), scale), repeated.log10_false_alarms
-        rivals = replace(Candidates.unscored(*poses), scale=scales, log10_false_alarms=alarms, log10_rough=alarms)
+        rivals = replace(Hypotheses.from_poses(*poses), scale=scales, log10_false_alarms=alarms, log10_rough=alarms)
         limits = replace(limits, most_missing=1e-12)
     else:
         rivals = with_false_alarms(polished(entered(), *poses, scale), sets)
@@ -183,7 +183,7 @@ def _against_repetitions(
     if contested and (behind >= rule.lead).all():
         return result
     alarms = np.minimum(rivals.log10_false_alarms, result.log10_false_alarms + behind)
-    candidates = Candidates.concatenated([result.candidates, replace(rivals, log10_false_alarms=alarms)])
+    candidates = Hypotheses.concatenate([result.candidates, replace(rivals, log10_false_alarms=alarms)])
     beside = judged(candidates, sets, batches=result.batches, looks=looks, exhaustive=exhaustive, rule=rule)
     if np.array_equal(beside.best[1], best[1]):
         return beside

@@ -6,15 +6,14 @@ may have any size: a search that looks for matches within a radius would lose it
 """
 
 import math
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bpnp.robust.minimal_solvers import p3p_poses
-from bpnp.search.candidates import Candidates
 from bpnp.search.evidence.partners import across, explained
+from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.point_sets import PointSets
 
 Array = NDArray[np.float64]
@@ -50,7 +49,7 @@ def known_matches(sets: PointSets) -> tuple[Labels, Labels] | None:
     return (i, j) if FIXING < len(values) == counts[0] == counts[1] else None
 
 
-def poses_of_matches(sets: PointSets, i: Labels, j: Labels, seed: int = 0) -> Candidates:
+def poses_of_matches(sets: PointSets, i: Labels, j: Labels, seed: int = 0) -> Hypotheses:
     """Return distinct poses that matches fit best, in the user's coordinates.
 
     Args:
@@ -72,7 +71,7 @@ def poses_of_matches(sets: PointSets, i: Labels, j: Labels, seed: int = 0) -> Ca
     poses = p3p_poses(rays[triples], points[triples]).reshape(-1, 4, 3)
     poses = poses[np.isfinite(poses).all((1, 2))]
     if not len(poses):
-        return Candidates.unscored(np.empty((0, 3, 3)), np.empty((0, 3)))
+        return Hypotheses.empty()
     some = np.arange(len(i)) if len(i) <= SCORED else rng.choice(len(i), SCORED, replace=False)
     squared = _squared(rays[some], points[some], poses)
     scales = _scales(sets)
@@ -185,7 +184,7 @@ def _distinct(poses: Array) -> Array:
     return poses[kept]
 
 
-def _scored(sets: PointSets, i: Labels, j: Labels, rotation: Array, translation: Array, scales: Array) -> Candidates:
+def _scored(sets: PointSets, i: Labels, j: Labels, rotation: Array, translation: Array, scales: Array) -> Hypotheses:
     """Return poses (h, 3, 3), (h, 3) with the scale of their residuals, and score and matches at it."""
     poses = np.concatenate([rotation, translation[:, None]], 1)
     squared, density = _squared(sets.bearings[i], sets.points3d[j], poses), 1 / sets.image.solid_angle
@@ -194,5 +193,5 @@ def _scored(sets: PointSets, i: Labels, j: Labels, rotation: Array, translation:
     free = np.maximum(2 * weight.sum(1) - 2 * FIXING, 1.0)
     scale = np.clip(np.sqrt((weight * squared).sum(1) / free), scales[0], scales[-1])
     found = [explained(sets, *each) for each in zip(rotation, translation, scale, strict=True)]
-    score, matched = (np.array([one[k] for one in found]) for k in (0, 1))
-    return replace(Candidates.unscored(rotation, translation), score=score, matched=matched, scale=scale)
+    score, count = (np.array([one[k] for one in found]) for k in (0, 1))
+    return Hypotheses.from_poses(rotation, translation, log_likelihood=score, match_count=count, scale=scale)

@@ -35,7 +35,7 @@ def mirrored_alarms(sets: PointSets, deadline: Deadline) -> float:
         return np.inf
     normals = None if sets.normals3d is None or sets.cosines3d is not None else sets.normals3d * MIRROR
     mirrored = replace(sets, points3d=sets.points3d * MIRROR, normals3d=normals, cosines3d=None)
-    found = enumerate_poses(mirrored, deadline=deadline.at, settings=replace(DEFAULT, most=HYPOTHESES))
-    if not len(found.rotation):
+    found = enumerate_poses(mirrored, deadline=deadline.at, settings=replace(DEFAULT, most=HYPOTHESES)).poses
+    if not len(found):
         return np.inf
     return float(alarms_of(mirrored, found.rotation[:1], found.translation[:1]).own[0])

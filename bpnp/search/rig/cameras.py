@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.search.candidates import Candidates
 from bpnp.search.evidence.false_alarms import directions_of, log10_tests, log_evidence_of
 from bpnp.search.evidence.uncertainty import Linearised, linearised, local_covariance
+from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene
 
@@ -63,11 +63,10 @@ class Rig:
             (turn, shift), (others, moved) = self.mounts[k], self.mounts[other]
             scenes[k].join(scenes[other], others @ turn.T, moved - others @ turn.T @ shift)
 
-    def seen(self, k: int, poses: Candidates) -> Candidates:
+    def seen(self, k: int, poses: Hypotheses) -> Hypotheses:
         """Poses of the rig as those of camera k, whose alternatives that need a derivative are asked of one camera."""
         turns, shifts = self.pose_of(k, poses.rotation, poses.translation)
-        share = poses.matched / min(len(self.sets[k].bearings), len(self.sets[k].points3d))
-        return replace(poses, rotation=turns, translation=shifts, matched=share)
+        return replace(poses, rotation=turns, translation=shifts)
 
     def linearised(self, rotation: Array, translation: Array, scale: float) -> list[tuple[Array, Linearised]]:
         """Each camera that sees a point near an image point, and the matrix (6, unknowns) that makes a step of the rig
@@ -136,18 +135,22 @@ class Rig:
         is_fixed = np.linalg.matrix_rank(information) == self.unknowns
         return np.asarray(np.linalg.inv(information), np.float64) if is_fixed else None
 
-    def candidates(self, rotations: Array, translations: Array) -> Candidates:
-        """Poses refined on all cameras to the scale at which their false alarms are fewest; `matched` is an expected
-        number of matches."""
+    def candidates(self, rotations: Array, translations: Array) -> Hypotheses:
+        """Return poses refined on all cameras, at the scale at which their false alarms are fewest."""
         ends = []
         for rotation, translation in zip(rotations, translations, strict=True):
             last = list(self.refined(rotation, translation))[AGAIN - 1 :: AGAIN][-WEIGHED:]
             if last:
                 ends.append(min(((*self.alarms(*end[:3]), *end) for end in last), key=lambda weighed: weighed[0]))
         if not ends:
-            return Candidates.unscored(rotations[:0], translations[:0])
+            return Hypotheses.from_poses(rotations[:0], translations[:0])
         own, rough, rotations, translations, scales, counts = map(np.array, zip(*ends, strict=True))
-        return replace(
-            Candidates.unscored(rotations, translations),
-            matched=counts, scale=scales, score=-own, log10_false_alarms=own, log10_rough=rough,
-        )  # fmt: skip
+        return Hypotheses.from_poses(
+            rotations,
+            translations,
+            match_count=counts,
+            scale=scales,
+            log_likelihood=-own,
+            log10_false_alarms=own,
+            log10_rough=rough,
+        )

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from bpnp.geometry import distinct
 from bpnp.loops.parallel import NEVER, Clock, Deadline, one_blas_thread
-from bpnp.search.candidates import Candidates, in_scene_frame, in_user_frame
 from bpnp.search.enumeration.search import enumerate_poses, is_enumerable
 from bpnp.search.enumeration.settings import DEFAULT as ENUMERATION
 from bpnp.search.evidence.repetitions import repeated_poses
 from bpnp.search.evidence.uncertainty import share_bound
+from bpnp.search.hypotheses import Hypotheses, to_scene_frame, to_user_frame
 from bpnp.search.pool import Pool
 from bpnp.search.raster_search import search_beside
 from bpnp.search.rig.cameras import WIDE, Array, Pose, Rig
@@ -43,12 +43,12 @@ LEAST_APART = 0.01  # of two cameras, in distances of the scene: a scale with wh
 def search_rig(rig: Rig, *, clutter: float | None = None, seed: int = 0, deadline: Deadline = NEVER) -> SearchResult:
     """Distinct poses of the rig, best first, and the verdict on the first one; arguments as for `search_poses`."""
     settings = DEFAULT if clutter is None else DEFAULT.expecting(clutter)
-    together, searches, few = Together(rig), dict[int, Iterator[Candidates]](), dict[int, Candidates]()
+    together, searches, few = Together(rig), dict[int, Iterator[Hypotheses]](), dict[int, Hypotheses]()
     for k, sets in enumerate(rig.sets):
         if is_enumerable(sets):
             until = (Clock.now() * (len(rig.sets) - k - 1) + deadline.at) / (len(rig.sets) - k)
             found = enumerate_poses(sets, deadline=until, is_safe=lambda _: False, settings=PROPOSING)
-            few[k] = Candidates.unscored(found.rotation, found.translation)
+            few[k] = Hypotheses.from_poses(found.poses.rotation, found.poses.translation)
             together.exhaustive &= found.ended == "exhausted"
             continue
         together.exhaustive = False
@@ -79,15 +79,14 @@ class Together:
     """What the cameras of a rig have proposed, and the best of it refined on all.
 
     met: of each camera all poses, in the user's coordinates. pools: of those that search. starts: poses of the rig that
-    were refined, with their evidence. looked: those around which was searched. best: distinct poses, best first, their
-    `matched` an expected number of matches. exhaustive: whether every pose was looked at.
+    were refined, with their evidence. looked: those around which was searched. best: distinct poses, best first.
+    exhaustive: whether every pose was looked at.
     """
 
     def __init__(self, rig: Rig) -> None:
         self.rig, self.rule, self.exhaustive = rig, DEFAULT.evidence, True
-        empty = np.empty((0, 3, 3))
-        self.met = [Candidates.unscored(empty, np.empty((0, 3))) for _ in rig.sets]
-        self.starts = Candidates.unscored(empty, np.empty((0, 4)))
+        self.met = [Hypotheses.empty() for _ in rig.sets]
+        self.starts = Hypotheses.empty(4)
         self.best, self.looked, self.pools = self.starts, self.starts, dict[int, Pool]()
 
     @property
@@ -95,19 +94,19 @@ class Together:
         """Of all cameras."""
         return sum(pool.turns for pool in self.pools.values())
 
-    def take(self, new: Mapping[int, Candidates], most: int) -> None:
+    def take(self, new: Mapping[int, Hypotheses], most: int) -> None:
         """Refine at most so many of the poses that cameras propose, in the frames of their scenes if they have one,
         those that all agree with best."""
-        new = {k: in_user_frame(p, self.pools[k].scene) if k in self.pools else p for k, p in new.items()}
+        new = {k: to_user_frame(p, self.pools[k].scene) if k in self.pools else p for k, p in new.items()}
         rotation, translation = _proposals(self.rig, new, self.met)
         for k, poses in new.items():
-            self.met[k] = Candidates.concatenated([self.met[k], poses])
+            self.met[k] = Hypotheses.concatenate([self.met[k], poses])
         if len(rotation) > COMPARED:
             best = np.argsort(-_agreement(self.rig, rotation, translation), kind="stable")[:COMPARED]
             rotation, translation = rotation[best], translation[best]
         score = np.array([self.rig.evidence(*pose).sum() for pose in zip(rotation, translation, strict=True)])
-        poses, known = replace(Candidates.unscored(rotation, translation), score=score), len(self.starts)
-        every = Candidates.concatenated([self.starts, poses])
+        poses, known = Hypotheses.from_poses(rotation, translation, log_likelihood=score), len(self.starts)
+        every = Hypotheses.concatenate([self.starts, poses])
         order = self._distinct(every, np.r_[np.full(known, BEFORE), score], known + most)[known:]
         self.starts = every[np.r_[:known, order]]
         self._add(self.rig.candidates(every.rotation[order], every.translation[order]))
@@ -116,27 +115,29 @@ class Together:
         """Search around the pose with most evidence, if none exceeds chance, around none twice."""
         if not self.pools or not len(self.starts) or self.best.log10_false_alarms[:1].min(initial=math.inf) < 0:
             return
-        poses = Candidates.concatenated([self.looked, self.starts])
-        score = np.r_[np.full(len(self.looked), BEFORE), self.starts.score]
+        poses = Hypotheses.concatenate([self.looked, self.starts])
+        score = np.r_[np.full(len(self.looked), BEFORE), self.starts.log_likelihood]
         apart = DEFAULT.schedule.apart_deg
         order = distinct(poses.rotation, poses.translation, score, len(self.looked) + 1, apart, math.inf)
         new = poses[order[len(self.looked) :]]
-        self.looked = Candidates.concatenated([self.looked, new])
+        self.looked = Hypotheses.concatenate([self.looked, new])
         k = max(self.pools, key=lambda k: len(self.rig.sets[k].bearings))
         turn, shift = self.rig.pose_of(k, new.rotation, new.translation)
         if len(new):
             scene = self.pools[k].scene
-            pose = in_scene_frame(Candidates.unscored(turn, shift), scene)
+            pose = to_scene_frame(Hypotheses.from_poses(turn, shift), scene)
             self.take({k: search_beside(scene, pose, scene.settings.beside)}, A_TURN)
 
-    def _add(self, refined: Candidates) -> None:
-        """Take up refined poses; the best one has the hits of all starts of any camera that ended there."""
-        every = Candidates.concatenated([self.best, refined])
+    def _add(self, refined: Hypotheses) -> None:
+        """Take up refined poses; the best one has the basin counts of all cameras."""
+        every = Hypotheses.concatenate([self.best, refined])
         self.best = every[self._distinct(every, -every.log10_false_alarms, REFINED)]
         if len(self.best):
-            self.best.hits[0] = sum(int(poses.hits[self._as_best(k, poses)].sum()) for k, poses in enumerate(self.met))
+            self.best.basin_count[0] = sum(
+                int(poses.basin_count[self._as_best(k, poses)].sum()) for k, poses in enumerate(self.met)
+            )
 
-    def _distinct(self, poses: Candidates, score: Array, count: int) -> NDArray[np.int64]:
+    def _distinct(self, poses: Hypotheses, score: Array, count: int) -> NDArray[np.int64]:
         """The places of the best poses, of which no two show the middle of the scene to all cameras alike."""
         places = []
         for k, sets in enumerate(self.rig.sets):
@@ -149,10 +150,10 @@ class Together:
     def _looks(self) -> int:
         """How often its surroundings were searched in vain."""
         return sum(
-            int(self._as_best(k, in_user_frame(pool.surrounded, pool.scene)).sum()) for k, pool in self.pools.items()
+            int(self._as_best(k, to_user_frame(pool.surrounded, pool.scene)).sum()) for k, pool in self.pools.items()
         )
 
-    def _as_best(self, k: int, poses: Candidates) -> NDArray[np.bool_]:
+    def _as_best(self, k: int, poses: Hypotheses) -> NDArray[np.bool_]:
         """Which poses of a camera are the best one."""
         turn, shift = self.rig.pose_of(k, self.best.rotation[:1], self.best.translation[:1])
         both = np.concatenate([turn, poses.rotation]), np.concatenate([shift, poses.translation])
@@ -165,7 +166,7 @@ class Together:
         strongest, seen = self._strongest()
         return missed(seen, self.rig.sets[strongest], self._looks(), self.rule) <= self.rule.missed
 
-    def _strongest(self) -> tuple[int, Candidates]:
+    def _strongest(self) -> tuple[int, Hypotheses]:
         """The camera in which the best pose has most evidence, and the poses as its own."""
         k = int(self.rig.evidence(self.best.rotation[0], self.best.translation[0], float(self.best.scale[0])).argmax())
         return k, self.rig.seen(k, self.best)
@@ -184,7 +185,7 @@ class Together:
             result = self._judged()
         if result.verdict == "confident" and self.rig.unknowns == 7:
             best = self.best.rotation[0], self.best.translation[0], float(self.best.scale[0])
-            covariance, free = self.rig.covariance(*best), 2 * float(self.best.matched[0]) - 7
+            covariance, free = self.rig.covariance(*best), 2 * float(self.best.match_count[0]) - 7
             if covariance is None or share_bound(covariance[6:, 6:], free) > self.rule.scale:
                 off = f"it may be more than {100 * self.rule.scale:.0f} % off"
                 reason = f"the scale of the scene cannot be told: {off}"
@@ -205,7 +206,7 @@ class Together:
         )
 
 
-def _proposals(rig: Rig, new: Mapping[int, Candidates], met: Sequence[Candidates]) -> Pose:
+def _proposals(rig: Rig, new: Mapping[int, Hypotheses], met: Sequence[Hypotheses]) -> Pose:
     """Poses of the rig: those of each camera; or, of an unknown scale, those in which two cameras that are apart agree,
     one of them with what it had `met` before, the middle of the scene where it is with least squares."""
     if rig.unknowns == 6:
@@ -216,14 +217,14 @@ def _proposals(rig: Rig, new: Mapping[int, Candidates], met: Sequence[Candidates
         for k, other, poses in pairs:
             others = [met[other], *([new[other]] if other in new and other > k else [])]
             if (min(k, other), max(k, other)) in rig.apart:
-                parts.append(_told_by(rig, (k, other), poses, Candidates.concatenated(others)))
+                parts.append(_told_by(rig, (k, other), poses, Hypotheses.concatenate(others)))
     if not parts:
         return np.empty((0, 3, 3)), np.empty((0, 4))
     rotation, translation = map(np.concatenate, zip(*parts, strict=True))
     return rotation, translation
 
 
-def _told_by(rig: Rig, pair: tuple[int, int], first: Candidates, second: Candidates) -> Pose:
+def _told_by(rig: Rig, pair: tuple[int, int], first: Hypotheses, second: Hypotheses) -> Pose:
     """Poses of the rig in which two cameras agree."""
     (turn, shift), (other, moved) = (rig.mounts[k] for k in pair)
     middle = rig.sets[0].middle

@@ -1,0 +1,153 @@
+"""Pose hypotheses of one problem: the one record of them, in columns, and how equal ones are merged."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bpnp.geometry import distinct, same_pose
+from bpnp.search.scene import Scene
+
+SIGNIFICANT = 1e3  # nats a bearing, more than any log-likelihood
+
+
+@dataclass(frozen=True, eq=False)
+class Hypotheses:
+    """Poses of one problem, camera = R p + t, one a row, and how well they explain its points.
+
+    A stage fills the columns that it computes; the others hold what `from_poses` gives them.
+
+    Attributes:
+        rotation: (c, 3, 3). Float32 in the frame of a `Scene`, float64 in that of the user.
+        translation: (c, 3), in the same frame; (c, 4) homogeneous for a rig.
+        log_likelihood: (c,) mean over the bearings, nats; -inf for a pose that was not scored.
+        match_count: (c,) expected number of matches.
+        scale: (c,) standard deviation of the residuals per axis, radians, to which the columns before refer.
+        basin_count: (c,) number of independent starts that ended at this pose.
+        log10_false_alarms: (c,) at the scales of the residuals (`bpnp.search.evidence.false_alarms`); NaN before it is
+            computed.
+        log10_rough: (c,) the same at scales far beyond those of the residuals.
+        evidence: (c,) of a proposer, nats by which the matches exceed chance; None where it computes none.
+        matches: (c, m) index of the scene point of each image point, -1 for none; None where no matches are fixed.
+        residual: (c, m) angle of each match, radians, infinite where there is none; None likewise.
+    """
+
+    rotation: NDArray[Any]
+    translation: NDArray[Any]
+    log_likelihood: NDArray[Any]
+    match_count: NDArray[Any]
+    scale: NDArray[Any]
+    basin_count: NDArray[np.int64]
+    log10_false_alarms: NDArray[np.float64]
+    log10_rough: NDArray[np.float64]
+    evidence: NDArray[np.float64] | None = None
+    matches: NDArray[np.int64] | None = None
+    residual: NDArray[np.float64] | None = None
+
+    @classmethod
+    def from_poses(
+        cls, rotation: NDArray[Any], translation: NDArray[Any], *, basin_count: int | NDArray[Any] = 0, **columns: Any
+    ) -> "Hypotheses":
+        """Return hypotheses with these poses.
+
+        Args:
+            rotation: (c, 3, 3).
+            translation: (c, 3).
+            basin_count: One for all, or (c,).
+            columns: Other columns (c, ...) by name.
+        """
+        c = len(rotation)
+        none, zero, unknown = np.full(c, -math.inf, np.float32), np.zeros(c, np.float32), np.full(c, math.nan)
+        poses = cls(rotation, translation, none, zero, zero, np.full(c, basin_count, np.int64), unknown, unknown)
+        return replace(poses, **columns) if columns else poses
+
+    @classmethod
+    def empty(cls, numbers: int = 3) -> "Hypotheses":
+        """Return no hypotheses, whose translations have this many numbers."""
+        return cls.from_poses(np.empty((0, 3, 3), np.float32), np.empty((0, numbers), np.float32))
+
+    @property
+    def sort_key(self) -> NDArray[np.float64]:
+        """(c,) largest for the best: the number of false alarms of significant poses, else the log-likelihood."""
+        is_significant = self.log10_false_alarms < 0  # not NaN
+        return np.where(is_significant, SIGNIFICANT - self.log10_false_alarms, self.log_likelihood)
+
+    def as_dependent(self) -> "Hypotheses":
+        """Return a copy with all basin counts set to 0, for starts that were not independent."""
+        return replace(self, basin_count=np.zeros_like(self.basin_count))
+
+    def unweighed(self) -> "Hypotheses":
+        """Return a copy whose false alarms are to be computed again."""
+        unknown = np.full(len(self), math.nan)
+        return replace(self, log10_false_alarms=unknown, log10_rough=unknown)
+
+    def __len__(self) -> int:
+        return len(self.rotation)
+
+    def __getitem__(self, chosen: slice | NDArray[Any]) -> "Hypotheses":
+        rows: dict[str, Any] = {}
+        for name, column in self._columns().items():
+            rows[name] = None if column is None else column[chosen]
+        return replace(self, **rows)
+
+    @classmethod
+    def concatenate(cls, parts: "Sequence[Hypotheses]") -> "Hypotheses":
+        """Return all hypotheses of the parts, one part after the other; columns that one of them lacks are None."""
+        columns: dict[str, Any] = {}
+        for name in parts[0]._columns():
+            column = [getattr(part, name) for part in parts]
+            columns[name] = None if any(each is None for each in column) else np.concatenate(column)
+        return replace(parts[0], **columns)
+
+    def _columns(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+def select_distinct(poses: Hypotheses, scene: Scene, count: int, apart_deg: float | None = None) -> Hypotheses:
+    """Return the best hypotheses of a scene of which no two are the same pose, best first.
+
+    Args:
+        poses: In the frame of the scene.
+        scene: Whose settings say which poses are the same.
+        count: Number of hypotheses, at most.
+        apart_deg: Least angle between their rotations, instead.
+
+    Returns:
+        Hypotheses with the basin counts of all those that are the same pose.
+    """
+    settings = scene.settings
+    limits = (settings.same_deg, settings.same_shift) if apart_deg is None else (apart_deg, math.inf)
+    compared = poses.rotation, poses.translation * scene.shift_weight
+    kept = distinct(*compared, poses.sort_key, count, *limits)
+    if not len(kept):
+        return poses[kept]
+    same = same_pose(*compared, kept, *limits)
+    first = same & (np.cumsum(same, 0) == 1)  # a pose near two counts for the better one
+    return replace(poses[kept], basin_count=first @ poses.basin_count)
+
+
+def merge_hypotheses(parts: Sequence[Hypotheses], scene: Scene) -> Hypotheses:
+    """Return the best distinct hypotheses of several batches, with the basin counts of all batches."""
+    return select_distinct(Hypotheses.concatenate(parts), scene, scene.settings.kept)
+
+
+def to_user_frame(poses: Hypotheses, scene: Scene) -> Hypotheses:
+    """Return hypotheses of a scene in the coordinates and unit of the user, in float64."""
+    rotation, translation = scene.leave(poses.rotation, poses.translation)
+    return replace(
+        poses,
+        rotation=rotation,
+        translation=translation,
+        log_likelihood=poses.log_likelihood.astype(np.float64),
+        match_count=poses.match_count.astype(np.float64),
+        scale=poses.scale.astype(np.float64),
+    )
+
+
+def to_scene_frame(poses: Hypotheses, scene: Scene) -> Hypotheses:
+    """Return hypotheses of the user in the frame of a scene."""
+    rotation, translation = scene.enter(poses.rotation, poses.translation)
+    return replace(poses, rotation=rotation, translation=translation)
