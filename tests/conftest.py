@@ -7,23 +7,6 @@ import lightning  # noqa: F401, its log handler keeps the stderr of its first im
 import pytest
 import torch
 
-# Left out of `make check`: processes, trainings, browsers, notebooks, searches of seconds.
-SLOW = {
-    "test_benchmarks", "test_cli", "test_compilation", "test_configs", "test_docs_commands", "test_docstrings",
-    "test_examples", "test_import", "test_interruptions", "test_laws",
-    "test_lightning_command", "test_checkpoint_networks", "test_localize_again",
-    "test_localize_photos", "test_metric_states", "test_notebooks", "test_on_cluster", "test_page_browser",
-    "test_precision", "test_prepare", "test_pretrained", "test_processes", "test_readme", "test_reconstruction",
-    "test_search_poses", "test_store", "test_synthetic_maps", "test_table_command", "test_task",
-    "test_training_command", "test_tutorials", "test_twins", "test_wheel",
-}  # fmt: skip
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    for item in items:
-        if item.path.stem in SLOW:
-            item.add_marker(pytest.mark.slow)
-
 
 @pytest.fixture(autouse=True)
 def _seed() -> None:

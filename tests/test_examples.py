@@ -6,6 +6,8 @@ import pytest
 import bpnp
 from bpnp.examples import Kind, load
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("kind", ["mesh", "photo", "leds", "stars"])
 def test_a_true_pose_projects_points_onto_their_image(kind: Kind) -> None:

@@ -10,6 +10,8 @@ import pytest
 import bpnp
 from bpnp.examples import load
 
+pytestmark = pytest.mark.slow
+
 COSTLY = ("lightning", "wandb", "trimesh", "pandas", "matplotlib", "plotly", "torchmetrics")
 OTHERS = ("roma", "torch._dynamo", "bpnp.models", "sympy", "scipy.optimize", "numba", "pycolmap", "jsonargparse")
 

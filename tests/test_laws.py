@@ -17,6 +17,8 @@ from bpnp.geometry import bearings, retract
 from bpnp.layers import ransac_pnp, sinkhorn, weighted_pnp
 from bpnp.models import Search
 
+pytestmark = pytest.mark.slow
+
 
 def true_matches(batch: Batch) -> torch.Tensor:
     index = torch.arange(batch.points2d.shape[1]).unsqueeze(-1)

@@ -16,6 +16,8 @@ from bpnp.metrics import (
     pose_recalls,
 )
 
+pytestmark = pytest.mark.slow
+
 
 def random_errors(seed: int, size: int, first_index: int = 0) -> PoseErrors:
     values = torch.from_numpy(np.random.default_rng(seed).gamma(1.0, 10.0, (4, size)))

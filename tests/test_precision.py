@@ -12,6 +12,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from bpnp.layers import sinkhorn, weighted_pnp
 from bpnp.models.bpnpnet import pairwise_distance
 
+pytestmark = pytest.mark.slow
+
 PRODUCTS = {torch.ops.aten.mm, torch.ops.aten.bmm, torch.ops.aten.addmm, torch.ops.aten.baddbmm}
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 CONFIGS = {str(file.relative_to(ROOT)): file.read_bytes() for file in (ROOT / "configs").rglob("*.yaml")}
 BUILD = "import sys; from setuptools import build_meta; getattr(build_meta, sys.argv[1])('../built')"

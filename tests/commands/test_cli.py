@@ -14,6 +14,8 @@ from small_data import MESHES, SMALL_NET, write_mesh_tree
 from bpnp.cli import COMMANDS, main
 from bpnp.files import lock_folder
 
+pytestmark = pytest.mark.slow
+
 
 def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     main(["--help"])

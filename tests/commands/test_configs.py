@@ -9,6 +9,8 @@ import bpnp
 from bpnp import BPnPNet
 from bpnp.cli import main
 
+pytestmark = pytest.mark.slow
+
 CONFIGS = Path(bpnp.__file__).parents[1] / "configs"
 RECIPES = sorted(
     path.relative_to(CONFIGS).with_suffix("").as_posix()

@@ -15,6 +15,8 @@ from bpnp.report import read_results
 from bpnp.report.points import read_points
 from bpnp.training.checkpoints import SafeCheckpointIO
 
+pytestmark = pytest.mark.slow
+
 
 class Stop(Callback):
     """Ctrl-C after the second batch."""

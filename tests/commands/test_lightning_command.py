@@ -29,6 +29,8 @@ from bpnp.geometry import quaternion_rotation
 from bpnp.report import read_results
 from bpnp.training import BlindPnPTask
 
+pytestmark = pytest.mark.slow
+
 OTHERS = [
     "--model.solver.features2d.centre=true",
     "--model.solver.features2d.scale=4",

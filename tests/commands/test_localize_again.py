@@ -16,6 +16,8 @@ from bpnp import SceneMap, Solution
 from bpnp.cli import main
 from bpnp.maps.many_photos import PhotoTask, SolutionFolder, attempt, photo_task
 
+pytestmark = pytest.mark.slow
+
 
 @dataclass
 class Place:

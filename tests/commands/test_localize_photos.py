@@ -23,6 +23,8 @@ from bpnp.cli import main
 from bpnp.examples import load
 from bpnp.maps.photos import photo_files
 
+pytestmark = pytest.mark.slow
+
 CAMERA = "PINHOLE,1379.7,1382.1,760.3,503.4"
 
 

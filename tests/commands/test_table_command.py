@@ -20,6 +20,8 @@ from bpnp.training.comparison import parse_methods
 from bpnp.training.task import BlindPnPTask
 from bpnp.types import Batch, Prediction
 
+pytestmark = pytest.mark.slow
+
 RECIPE = """
 data:
   class_path: bpnp.datamodules.MeshDataModule

@@ -21,6 +21,8 @@ from bpnp.models.weights import TrainedNet
 from bpnp.solving.arguments import checked_prior, source_from
 from bpnp.training import PoseLossWarmup
 
+pytestmark = pytest.mark.slow
+
 SHORT = ["--trainer.max_epochs=1", "--trainer.limit_train_batches=2", "--trainer.limit_val_batches=1"]
 seen: list[Any] = []
 

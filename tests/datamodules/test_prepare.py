@@ -24,6 +24,8 @@ from bpnp.datamodules.meshes import POINTS, SURFACES, surfaces_recipe
 from bpnp.datamodules.shapes import normalise, read_mesh, sample_surface
 from bpnp.datamodules.store import Made, Recipe, Store, StoreError, is_store, open_store, prepare
 
+pytestmark = pytest.mark.slow
+
 BAD = {
     "train/cut": "OFF\n3 1 0\n0 0 0\n1 0 0\n",
     "train/empty": "",

@@ -14,6 +14,8 @@ from bpnp.cameras import camera_models, colmap_camera
 from bpnp.datamodules.colmap.model_files import ModelRecords, read_records
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
 
+pytestmark = pytest.mark.slow
+
 FISHEYE = ("OPENCV_FISHEYE", [300.0, 310.0, 400.0, 300.0, 0.05, -0.02, 0.01, 0.001])
 EXACT = ("name", "points2d", "seen", "clutter2d", "observed", "translation")
 PARAMETERS = {

@@ -12,6 +12,8 @@ import pytest
 from bpnp.datamodules.store import Store, StoreError, is_store, new_store, open_store
 from bpnp.files import fingerprint
 
+pytestmark = pytest.mark.slow
+
 WIDTHS = {"flat": 2, "deep": 3}
 
 

@@ -10,6 +10,8 @@ from scipy.spatial.transform import Rotation
 from bpnp.datamodules import Outliers, Problem, SyntheticMapDataModule
 from bpnp.datamodules.synthetic_maps.maps import KINDS, MOST_ERROR_PX, MapOptions, draw_map_problem
 
+pytestmark = pytest.mark.slow
+
 
 def problems(count: int, **options: object) -> list[Problem]:
     rngs = (np.random.default_rng([0, 0, 0, i]) for i in range(count))

@@ -10,6 +10,8 @@ import pytest
 
 import bpnp.loops.compilation
 
+pytestmark = pytest.mark.slow
+
 FACTOR = """
 from bpnp.loops.compilation import compiler
 

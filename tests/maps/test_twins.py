@@ -13,6 +13,8 @@ from bpnp.maps.localize import Photo
 from bpnp.maps.twins import best_rival
 from bpnp.maps.views import View
 
+pytestmark = pytest.mark.slow
+
 FOCAL, ALIKE, DIFFERENT = 800.0, 150, 40  # pixels; points of a face
 CAMERA = np.diag([FOCAL, FOCAL, 1.0])
 Array = np.ndarray

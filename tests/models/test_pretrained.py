@@ -15,6 +15,8 @@ from bpnp.datamodules import MeshDataModule, Outliers, SyntheticMapDataModule
 from bpnp.metrics import rotation_error
 from bpnp.models.weights import LEARNED, checkpoint_path, describe_module
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 
 

@@ -15,6 +15,8 @@ from report_data import HOSTILE, drawn_problem, write_run
 from bpnp.report import Results, write_page
 from bpnp.report.terminal import DARK, LIGHT
 
+pytestmark = pytest.mark.slow
+
 REQUIRED = bool(os.environ.get("BPNP_REQUIRE_BROWSER"))
 if not REQUIRED:
     pytest.importorskip("selenium", reason="needs selenium; try: pip install bpnp[browser]")

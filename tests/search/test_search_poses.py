@@ -16,6 +16,8 @@ from bpnp.search.search import search_poses
 from bpnp.search.settings import DEFAULT, Schedule, SearchSettings
 from bpnp.search.starts import PosePrior
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def problem():

@@ -17,6 +17,8 @@ from bpnp.examples import load
 from bpnp.loops.parallel import in_processes
 from bpnp.solving import sources
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = [load("photo", seed=seed) for seed in range(6)]
 SETS = [e.points2d for e in EXAMPLES], [e.points3d for e in EXAMPLES], [e.camera for e in EXAMPLES]
 

@@ -18,6 +18,8 @@ from bpnp.models.nets import ImageFeatures, SceneFeatures
 from bpnp.models.weights import checkpoint_path, pretrained_names, read_checkpoint
 from bpnp.training import BlindPnPTask, PoseLossWarmup
 
+pytestmark = pytest.mark.slow
+
 RELEASED = Path(__file__).parents[1] / "released"
 # What the version that wrote each file gave for `asked()`.
 ASSIGNMENTS = json.loads((RELEASED / "assignments.json").read_text())

@@ -22,6 +22,8 @@ from bpnp.training.callbacks import PoseLossWarmup, ResultsWriter
 from bpnp.training.losses import correspondence_loss
 from bpnp.training.task import BlindPnPTask, TrainingDivergedError, number_globally
 
+pytestmark = pytest.mark.slow
+
 
 class CountingSolver(nn.Module):
     """BPnPNet that notes for each call whether poses were wanted, and can be told to give an assignment of NaN."""

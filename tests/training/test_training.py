@@ -16,6 +16,8 @@ from small_data import MESHES, SMALL_NET
 from bpnp.cli import main
 from bpnp.report import read_results
 
+pytestmark = pytest.mark.slow
+
 ARGUMENTS = [
     *MESHES,
     *SMALL_NET,
