@@ -29,6 +29,7 @@ FISHEYE = {  # models with the radius t (1 + k1 t^2 + ...) at the angle t from t
 EDGES, STEPS = 1024, 5  # of a fisheye's angles, between which Newton's steps find one to the last digit
 CENTRE = 0.5  # of the first pixel in COLMAP's coordinates; OpenCV and hloc count from 0
 SLIGHTLY, FEW_OUTSIDE = 0.01, 0.02  # larger sides outside an image; fraction of points that may be farther outside
+WIDEST = 10.0  # normalised image coordinates, 84 degrees off the axis
 MOST_PIXELS = 2**31  # of a side of an image; more is a file that is none
 
 
@@ -177,6 +178,21 @@ def image_size(camera: Camera) -> tuple[int, int] | None:
 def same_aspect_ratio(size: tuple[int, int], other: tuple[int, int]) -> bool:
     """Whether images of two sizes are one scaled, to a pixel of rounding on a side."""
     return abs(size[0] * other[1] - size[1] * other[0]) <= max(*size, *other)
+
+
+def check_normalised(points2d: Any, remedy: str) -> None:
+    """Raise ValueError for image points that are pixels: half of them are more than 84 degrees off the axis.
+
+    Args:
+        points2d: (m, 2) array or tensor, finite.
+        remedy: what the message proposes.
+    """
+    points = np.asarray(points2d)
+    if np.median(np.linalg.norm(points, axis=-1)) > WIDEST:
+        raise ValueError(
+            f"expected normalised image coordinates in `points2d`, got values up to {np.abs(points).max():g}, which "
+            f"look like pixels; try {remedy}"
+        )
 
 
 def outside_image(pixels: Array, sides: Any) -> npt.NDArray[np.bool_]:

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-WIDEST = 10.0  # normalised image coordinates, 84 degrees off the axis
 Arrays = Any  # one array, or a sequence of arrays of different sizes; numpy or torch
 _F = TypeVar("_F", bound=Callable[..., Any])
 
@@ -154,21 +153,6 @@ def check_points(name: str, i: int | str, points: Tensor, dim: int) -> Tensor:
         bad = int((~points.isfinite().all(-1)).nonzero()[0, 0])
         raise ValueError(f"expected finite `{name}`, got {points[bad].tolist()} at point {bad} of problem {i}")
     return points
-
-
-def check_normalised(points2d: Any, remedy: str) -> None:
-    """Raise ValueError for image points that are pixels: half of them are more than 84 degrees off the axis.
-
-    Args:
-        points2d: (m, 2) array or tensor, finite.
-        remedy: what the message proposes.
-    """
-    points = np.asarray(points2d)
-    if np.median(np.linalg.norm(points, axis=-1)) > WIDEST:
-        raise ValueError(
-            f"expected normalised image coordinates in `points2d`, got values up to {np.abs(points).max():g}, which "
-            f"look like pixels; try {remedy}"
-        )
 
 
 def check_match3d(i: int | str, match: Tensor, m: int, n: int) -> Tensor:

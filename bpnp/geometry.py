@@ -1,18 +1,9 @@
-"""Bearings, rigid motion, projection, angles and rotations, any leading axes; camera = R p + t. And picking the best of
-many poses of which no two are nearly the same."""
-
-import math
-from typing import Any
+"""Bearings, rigid motion, projection, angles and rotations of tensors, any leading axes; camera = R p + t."""
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from numpy.typing import NDArray
 from torch import Tensor
-
-AT_ONCE = 16  # poses that are compared with all others in one product
-MIN_POINTS = 4  # that fix a pose: three matches fit up to four poses exactly
-Array = NDArray[np.floating[Any]]
 
 
 def bearings(points2d: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 3"]:
@@ -120,41 +111,3 @@ def rotation_angle(a: Float[Tensor, "*b 3 3"], b: Float[Tensor, "*b 3 3"]) -> Fl
     sine = torch.linalg.vector_norm(torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1), dim=-1)
     cosine = relative.diagonal(dim1=-2, dim2=-1).sum(-1) - 1
     return torch.atan2(sine, cosine)
-
-
-def turned_by(one: Array, other: Array) -> float:
-    """Angle between two rotations (3, 3), radians, in [0, pi]."""
-    cosine = (float((one * other).sum()) - 1) / 2
-    return math.acos(min(max(cosine, -1.0), 1.0))
-
-
-def same_pose(
-    rotation: Array, translation: Array, i: int | NDArray[np.int64], degrees: float, shift: float
-) -> NDArray[np.bool_]:
-    """Which poses (c, 3, 3), (c, 3) are within `degrees` and `shift` of pose i, itself among them; NaN is not.
-
-    Of several poses i (k,): (k, c).
-    """
-    flat = rotation.reshape(-1, 9)
-    alike = flat[i] @ flat.T >= 1 + 2 * math.cos(math.radians(degrees))
-    if shift == math.inf:
-        return np.asarray(alike)
-    return alike & (np.linalg.norm(translation - translation[i][..., None, :], axis=-1) <= shift)
-
-
-def distinct(
-    rotation: Array, translation: Array, score: Array, count: int, degrees: float, shift: float
-) -> NDArray[np.int64]:
-    """The best `count` poses of which no two are closer than both limits, best first; NaN and -inf are left out."""
-    kept: list[int] = []
-    free = np.isfinite(score)
-    order = np.argsort(-np.where(free, score, -np.inf), kind="stable")
-    for first in range(0, len(order), AT_ONCE):
-        several = order[first : first + AT_ONCE]
-        for i, same in zip(several.tolist(), same_pose(rotation, translation, several, degrees, shift), strict=True):
-            if len(kept) == count:
-                return np.array(kept, dtype=np.int64)
-            if free[i]:
-                kept.append(i)
-                free &= ~same
-    return np.array(kept, dtype=np.int64)

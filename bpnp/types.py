@@ -14,7 +14,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from bpnp.checks import Arrays, as_tensor_list, check_match3d, check_normalised, check_points, stack_values
+from bpnp.cameras import check_normalised
+from bpnp.checks import Arrays, as_tensor_list, check_match3d, check_points, stack_values
 from bpnp.geometry import is_finite
 
 _T = TypeVar("_T")

@@ -15,7 +15,7 @@ from torch.nn.functional import pad
 from bpnp.checks import check_within
 from bpnp.datamodules.keyed_random import Generators, Key, Purpose, generators, permutations, rotations, uniform
 from bpnp.datamodules.problem import Counts
-from bpnp.geometry import MIN_POINTS
+from bpnp.poses import MIN_POINTS
 from bpnp.types import Batch
 
 Side = Literal["both", "2d", "3d"]

@@ -19,7 +19,7 @@ from bpnp.datamodules.problem import Problem
 from bpnp.datamodules.store import Made, Recipe, Row, Store, is_store, open_or_prepare, open_store
 from bpnp.datamodules.stored import PROBLEMS, WIDTHS, StoredDataModule, problem_row, scene_rows
 from bpnp.files import file_states, fingerprint
-from bpnp.geometry import MIN_POINTS
+from bpnp.poses import MIN_POINTS
 
 PREPROCESSED = ("p2d", "p3d", "R_gt", "t_gt", "W_gt", "num_points_2d", "num_points_3d")
 MATCHES = ("matches", "R", "t")

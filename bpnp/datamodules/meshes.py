@@ -31,7 +31,8 @@ from bpnp.datamodules.loader import STAGES, ProblemDataModule, hold_out
 from bpnp.datamodules.problem import Counts
 from bpnp.datamodules.shapes import MeshError, Normalisation, Sampler, Shapes, normalise, procedural_shapes
 from bpnp.datamodules.store import Made, Recipe, Row, Store, StoreError, is_store, open_or_prepare, open_store
-from bpnp.geometry import MIN_POINTS, project, transform
+from bpnp.geometry import project, transform
+from bpnp.poses import MIN_POINTS
 from bpnp.types import Batch
 
 POINTS = "points"  # the bulk column of a store of surface samples

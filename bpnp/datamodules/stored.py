@@ -17,7 +17,7 @@ from bpnp.datamodules.augment import Augmentation, Side
 from bpnp.datamodules.loader import STAGES, ProblemDataModule
 from bpnp.datamodules.problem import Counts, Problem, ProblemSource, stack_problems
 from bpnp.datamodules.store import Row, Store, StoreError, new_store, open_store
-from bpnp.geometry import MIN_POINTS
+from bpnp.poses import MIN_POINTS
 from bpnp.types import Batch
 
 PROBLEMS = "problems"  # the kind of such a store

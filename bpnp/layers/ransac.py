@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from bpnp.checks import check_positive, check_shapes
-from bpnp.geometry import MIN_POINTS
+from bpnp.poses import MIN_POINTS
 from bpnp.precision import full_precision
 from bpnp.robust.matches import Matches, in_scene, normalised, residuals
 from bpnp.robust.minimal_solvers import take

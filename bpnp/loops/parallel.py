@@ -1,35 +1,43 @@
-"""Work on the CPU: how it is shared among threads or processes, and ended when its time is over."""
+"""Work on the CPU: how it is shared among threads, and ended when its time is over."""
 
 import math
 import os
-import signal
+import sys
 import threading
 import time
-import warnings
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ContextDecorator
 from dataclasses import dataclass
 from functools import lru_cache
-from multiprocessing.context import ForkContext, ForkProcess
-from typing import Any, TypeVar
+from typing import Any
 
-import torch
-from threadpoolctl import ThreadpoolController, threadpool_limits
+from threadpoolctl import ThreadpoolController
 
-Result = TypeVar("Result")
-_work: dict[str, Callable[[int], Any]] = {}  # of a worker process
+
+def thread_count() -> int:
+    """Return how many threads the compiled loops use.
+
+    torch's own number where torch is loaded (`torch.set_num_threads`); else OMP_NUM_THREADS, else the CPUs that this
+    process may use. Results do not depend on it.
+    """
+    of_torch = getattr(sys.modules.get("torch"), "get_num_threads", None)
+    if of_torch is not None:
+        return int(of_torch())
+    wanted = os.environ.get("OMP_NUM_THREADS", "").split(",")[0].strip()
+    if wanted.isdecimal() and int(wanted):
+        return int(wanted)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def in_threads(work: Callable[[int, int], object], count: int) -> None:
     """Call work(first, last) on consecutive shares of range(count), one a thread, and wait for all of them.
 
-    As many threads as torch has (`torch.set_num_threads`, OMP_NUM_THREADS), and no empty share. Only
-    work that gives the GIL back gains, as numba's `nogil` functions do; it writes to its own share of an array.
-    Python's threads and not a pool of numba's: that one does not survive the fork of a loader's workers.
+    Uses `thread_count` threads, and no empty share. Only work that releases the GIL gains, as numba's `nogil` functions
+    do; it writes to its own share of an array. Python's threads and not a pool of numba's: that one does not survive
+    the fork of a data loader's workers.
     """
-    shares = max(1, min(torch.get_num_threads(), count))
+    shares = max(1, min(thread_count(), count))
     if shares == 1:
         work(0, count)
         return
@@ -44,58 +52,6 @@ def in_threads(work: Callable[[int, int], object], count: int) -> None:
 def _pool(process: int) -> ThreadPoolExecutor:
     """The threads of a process; a fork inherits none of its parent's, so each has its own."""
     return ThreadPoolExecutor(os.cpu_count(), f"bpnp-{process}")
-
-
-def in_processes(work: Callable[[int], Result], items: Sequence[int], count: int) -> Iterator[tuple[int, Result]]:
-    """Give items and work(item) from `count` forks of this process, each with one thread, in the order they end.
-
-    For work that is mostly Python, which threads would run one after the other. The forks, and no other children of
-    the process, end with the iteration.
-
-    Raises:
-        Exception: what a worker raises.
-        RuntimeError: a worker was killed.
-    """
-    context = _Recording()
-    pool = ProcessPoolExecutor(min(count, len(items)), context, initializer=_begin, initargs=(work,))
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # other threads: none has a lock that workers take
-            running = {pool.submit(_run, item): item for item in items}
-        for done in as_completed(running):
-            yield running[done], done.result()
-    except BrokenProcessPool as error:
-        raise RuntimeError(
-            "a process that solved problems was killed, possibly out of memory; try fewer threads "
-            "(torch.set_num_threads, OMP_NUM_THREADS)"
-        ) from error
-    finally:
-        for worker in context.started:
-            worker.kill()  # what they work on is not waited for
-        pool.shutdown(cancel_futures=True)
-
-
-class _Recording(ForkContext):
-    """A context that records the processes it starts."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.started: list[ForkProcess] = []
-
-    def Process(self, *arguments: Any, **options: Any) -> ForkProcess:  # type: ignore[override]
-        self.started.append(ForkProcess(*arguments, **options))
-        return self.started[-1]
-
-
-def _begin(work: Callable[[int], Any]) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
-    torch.set_num_threads(1)
-    threadpool_limits(1)  # numpy's BLAS has threads of its own, which would wait for each other's cores
-    _work["work"] = work
-
-
-def _run(item: int) -> Any:
-    return _work["work"](item)
 
 
 class _OneBlasThread(ContextDecorator):

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.cameras import Camera, camera_from
-from bpnp.geometry import MIN_POINTS
 from bpnp.loops.parallel import one_blas_thread
 from bpnp.maps.views import Cones, View
+from bpnp.poses import MIN_POINTS
 from bpnp.search.annealing import finish, polished
 from bpnp.search.evidence import reasons
 from bpnp.search.evidence.alternatives import Alternative, fits_as_well

@@ -5,17 +5,15 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import nn
 
 from bpnp.cameras import CENTRE, Camera, camera_from, is_opencv, resize_camera, same_aspect_ratio
 from bpnp.cameras import image_size as image_size_of
 from bpnp.datamodules.colmap.model_files import ColmapError
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
-from bpnp.geometry import MIN_POINTS
 from bpnp.loops.parallel import Clock, Deadline
 from bpnp.maps import index
 from bpnp.maps.localize import (
@@ -46,12 +44,16 @@ from bpnp.maps.views import (
     scores_of_views,
     viewing_cones,
 )
+from bpnp.poses import MIN_POINTS
 from bpnp.search.settings import SearchSettings
 from bpnp.search.starts import PosePrior
 from bpnp.solving.arguments import check_inside, pixels_from, positive, source_from
 from bpnp.solving.focal_length import UnknownCamera, unknown_camera
 from bpnp.solving.solution import Solution
 from bpnp.solving.sources import Options
+
+if TYPE_CHECKING:
+    import torch
 
 LEAST_TRACK = 2  # views that fix a point; with one left it would not be in the map
 UNKNOWN = "unknown"  # focal length
@@ -219,7 +221,7 @@ class SceneMap:
         views: Iterable[str] | None = None,
         scores: Any = None,
         prior: PosePrior | None = None,
-        solver: str | Path | nn.Module = "auto",
+        solver: "str | Path | torch.nn.Module" = "auto",
         seed: int = 0,
         time_limit: float | int | None = None,
     ) -> Solution:

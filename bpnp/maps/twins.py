@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.geometry import same_pose, turned_by
 from bpnp.loops.parallel import one_blas_thread
 from bpnp.maps.localize import Photo, Region, in_picture, problem_near
 from bpnp.maps.views import Array
+from bpnp.poses import same_pose, turned_by
 from bpnp.search.annealing import finish, polished
 from bpnp.search.evidence.reasons import number
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses

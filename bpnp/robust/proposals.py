@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bpnp.geometry import bearings, distinct
+from bpnp.geometry import bearings
+from bpnp.poses import distinct
 from bpnp.precision import full_precision
 from bpnp.robust.matches import Matches, in_scene, normalised, truncated_scores, weighted_draws
 from bpnp.robust.minimal_solvers import poses_of_triples, take

@@ -16,7 +16,8 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bpnp.geometry import MIN_POINTS, bearings, retract
+from bpnp.geometry import bearings, retract
+from bpnp.poses import MIN_POINTS
 from bpnp.robust.matches import Matches, distinct_triples, residuals, truncated_scores
 from bpnp.robust.minimal_solvers import poses_of_triples, take
 

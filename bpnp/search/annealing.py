@@ -4,11 +4,10 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.loops.parallel import in_time
+from bpnp.loops.parallel import in_time, thread_count
 from bpnp.search.hypotheses import Hypotheses, select_distinct, to_user_frame
 from bpnp.search.kernels.dense import dense_scratch, descend
 from bpnp.search.kernels.sparse import descend_sparse, sparse_scratch
@@ -83,7 +82,7 @@ def anneal_on_points(
             i += descend_sparse(tiles, points, *poses, scales, outlier, fine.patience, result[i:j], scratch)
             pairs = 2 * len(scratch.near.point)  # where more points lie together than there was place for
 
-    done = in_time(anneal, len(starts), scene.deadline, torch.get_num_threads())
+    done = in_time(anneal, len(starts), scene.deadline, thread_count())
     score = result[:, 0] + np.float32(math.log(1 - outliers))  # the mixture's factor, for shares to be compared
     ends = replace(
         starts.unweighed(),

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.geometry import distinct, same_pose
+from bpnp.poses import distinct, same_pose
 from bpnp.search.scene import Scene
 
 SIGNIFICANT = 1e3  # nats a bearing, more than any log-likelihood

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.geometry import same_pose, turned_by
+from bpnp.poses import same_pose, turned_by
 from bpnp.search.evidence.settings import ImagePoints
 from bpnp.search.kernels.neighbours import sums_near
 from bpnp.search.propose.symmetries import Motions

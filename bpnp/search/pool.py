@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.geometry import same_pose
+from bpnp.poses import same_pose
 from bpnp.search.annealing import finish
 from bpnp.search.evidence.false_alarms import log10_tests
 from bpnp.search.evidence.rivals import against_rivals

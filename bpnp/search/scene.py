@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.geometry import MIN_POINTS
 from bpnp.loops.parallel import NEVER, Deadline
+from bpnp.poses import MIN_POINTS
 from bpnp.search.kernels.raster import Raster
 from bpnp.search.kernels.sides import (
     FORWARD,

@@ -21,6 +21,7 @@ from bpnp.search.kernels.sides import FORWARD
 from bpnp.search.point_sets import PointSets
 from bpnp.search.pool import Pool
 from bpnp.search.propose.known_matches import known_matches, poses_of_matches
+from bpnp.search.propose.minimal_solvers import p3p_poses
 from bpnp.search.propose.symmetries import self_motions
 from bpnp.search.raster_search import around_each, looked_up
 from bpnp.search.scene import Scene, degenerate
@@ -239,6 +240,7 @@ def warm_up() -> None:
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     sets = PointSets(rays, points)
     search_by_enumeration(sets, NEVER, DEFAULT)
+    p3p_poses(rays[None, :3], points[None, :3])
     self_motions(points, 0.1)
     search_rotation(Image(rays, np.full(WARMING, 1e-3)), rays)
     scene = Scene(sets, 0, DEFAULT)

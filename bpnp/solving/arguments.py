@@ -1,24 +1,25 @@
 """The arguments of `solve`, `solve_many` and `verify`, checked: ValueError for what is not usable."""
 
 import math
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeGuard, Union
 
 import numpy as np
 import numpy.typing as npt
-import torch
 from scipy.spatial.transform import Rotation
-from torch import nn
 
-from bpnp.cameras import CENTRE, Camera, is_opencv, outside_image
-from bpnp.checks import check_normalised
+from bpnp.cameras import CENTRE, Camera, check_normalised, is_opencv, outside_image
 from bpnp.search.starts import GravityPrior, PosePrior
+
+if TYPE_CHECKING:
+    import torch
 
 Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]
-Prior = PosePrior | GravityPrior | nn.Module  # a TrainedNet
+Prior = Union[PosePrior, GravityPrior, "torch.nn.Module"]  # a TrainedNet
 ROUNDING = 1e-12  # of R R^T: a rotation in float64; others are made orthonormal
 UNIT = 1e-3  # largest error of a length, of a rotation, and of a sum of probabilities
 SURE = 0.97  # probability of a class from which a search matches a point to none of another one
@@ -37,9 +38,15 @@ def about(problem: str | None) -> Iterator[None]:
         raise ValueError(f"{problem}: {error}") from error
 
 
-def source_from(solver: str | Path | nn.Module) -> nn.Module | None:
+def is_network(value: object) -> "TypeGuard[torch.nn.Module]":
+    """Return True for a torch module. Without torch loaded there is none, so it is not imported."""
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(value, torch.nn.Module)
+
+
+def source_from(solver: "str | Path | torch.nn.Module") -> "torch.nn.Module | None":
     """The module that solves, None for the search, alone or not."""
-    if isinstance(solver, nn.Module):
+    if is_network(solver):
         return solver
     if isinstance(solver, str) and solver in ("auto", "search"):
         return None
@@ -54,10 +61,12 @@ def source_from(solver: str | Path | nn.Module) -> nn.Module | None:
     return TrainedNet.from_checkpoint(solver)
 
 
-def device_from(wanted: str | torch.device | None) -> torch.device | None:
+def device_from(wanted: "str | torch.device | None") -> "torch.device | None":
     """The device that a user names, if it can be used."""
     if wanted is None:
         return None
+    import torch  # seconds, so only where a device is named
+
     try:
         device = torch.device(wanted)
         torch.empty(0, device=device)
@@ -143,8 +152,7 @@ def checked_pose(prefix: str, rotation: Any, translation: Any) -> tuple[Array, A
 
 def numbers(name: str, values: Any) -> Array:
     """The values in float64."""
-    if isinstance(values, torch.Tensor):
-        values = values.detach().cpu().double().numpy() if not values.is_complex() else values.numpy()
+    values = _on_host(values)
     try:
         array = np.asarray(values)
         if array.dtype.kind not in "fiu":
@@ -152,6 +160,14 @@ def numbers(name: str, values: Any) -> Array:
         return array.astype(np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(f"expected `{name}` as an array of numbers, got {values!r:.80}") from error
+
+
+def _on_host(values: Any) -> Any:
+    """Return a torch tensor as a NumPy array, and anything else as it is."""
+    if not hasattr(values, "detach"):
+        return values
+    tensor = values.detach().cpu()
+    return (tensor.double() if tensor.is_floating_point() else tensor).numpy()  # NumPy has no bfloat16
 
 
 def _finite(name: str, values: Any, shape: tuple[int, ...]) -> Array:
@@ -336,8 +352,7 @@ def _classes(name: str, values: Any, count: int) -> Array:
 
 
 def _integers(name: str, values: Any, count: int) -> Labels:
-    values = values.detach().cpu() if isinstance(values, torch.Tensor) else values
-    labels = _one_each(name, np.asarray(values), (count,))
+    labels = _one_each(name, np.asarray(_on_host(values)), (count,))
     if labels.dtype.kind not in "iu":
         raise ValueError(f"expected integers in `{name}`, got {labels.dtype}; try .astype(int)")
     if labels.min(initial=0) < -1:

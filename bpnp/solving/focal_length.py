@@ -22,8 +22,8 @@ from bpnp.cameras import (
     scale_focal_length,
     with_radial_distortion,
 )
-from bpnp.geometry import same_pose, turned_by
 from bpnp.loops.parallel import Clock, one_blas_thread
+from bpnp.poses import same_pose, turned_by
 from bpnp.search.annealing import polished
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.evidence.reasons import number

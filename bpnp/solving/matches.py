@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import maximum_bipartite_matching, min_weight_full_bip
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from bpnp.geometry import MIN_POINTS
+from bpnp.poses import MIN_POINTS
 from bpnp.search.evidence.uncertainty import linearised, pose_covariance
 from bpnp.search.verdict import SearchResult
 from bpnp.solving.arguments import Array, Labels

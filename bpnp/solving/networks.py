@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 
 from bpnp.loops.parallel import Deadline
-from bpnp.search.schedule import Proposals
 from bpnp.search.search import score_poses
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import SearchResult
@@ -20,8 +19,6 @@ from bpnp.types import Batch
 if TYPE_CHECKING:
     from bpnp.models.matcher import Matcher
 
-VIEW_MATCHER, SCENE_MATCHER = "matcher-maps", "matcher-sfm"  # packaged weights of the frames "view" and "any"
-MOST_CELLS = 2**22  # of an assignment, 2D points x 3D points, with which a matcher's time and memory grow: seconds
 ESTIMATES = ("refined", "ransac", "pnp")  # of a prediction, the one to trust most first
 DRAWN = 80_000  # triples of an assignment; one match in fifty is right, one triple in 10^5, but some nearly are
 NET_SIGMA_DEG, NET_SIGMA_SHIFT = 10.0, 0.1  # of a net's pose; the latter of its distance from the scene
@@ -71,16 +68,6 @@ def predicted(net: nn.Module, members: list[Problem], deadline: Deadline) -> lis
     ]
 
 
-def proposals_for(problem: Problem, seed: int) -> Proposals | None:
-    """Whom a search in doubt asks for poses: the packaged matcher for views around a known pose, and without a prior
-    that for scenes in any axes, unless the points are too many for it."""
-    weights = VIEW_MATCHER if isinstance(problem.prior, PosePrior) else SCENE_MATCHER
-    too_many = len(problem.image) * len(problem.points3d) > MOST_CELLS
-    if weights == SCENE_MATCHER and (too_many or problem.prior is not None):
-        return None
-    return lambda: proposed(_packaged(weights), problem, seed)
-
-
 def proposed(net: "Matcher", problem: Problem, seed: int) -> tuple[Array, Array]:
     """Poses (s, 3, 3), (s, 3) of triples of matches drawn in proportion to the root of a matcher's assignment.
 
@@ -101,7 +88,8 @@ def proposed(net: "Matcher", problem: Problem, seed: int) -> tuple[Array, Array]
 
 
 @cache
-def _packaged(weights: str) -> "Matcher":
+def packaged_matcher(weights: str) -> "Matcher":
+    """Return the matcher of packaged weights."""
     from bpnp.models.matcher import Matcher
 
     return Matcher.from_pretrained(weights)

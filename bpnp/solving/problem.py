@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bpnp.cameras import Camera, in_front
-from bpnp.geometry import MIN_POINTS
+from bpnp.poses import MIN_POINTS
 from bpnp.search.point_sets import PointSets, UnknownFocal, faces
 from bpnp.search.starts import GravityPrior, PosePrior
 from bpnp.solving.arguments import (

@@ -2,11 +2,9 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from torch import nn
 
 from bpnp.cameras import Camera, camera_from
 from bpnp.loops.parallel import Clock, Deadline
@@ -33,6 +31,9 @@ from bpnp.solving.rig import solve_rig
 from bpnp.solving.solution import Solution
 from bpnp.solving.sources import Options, Progress, solutions_of
 
+if TYPE_CHECKING:
+    import torch
+
 SECONDS, SECONDS_OF_MANY = 10.0, 5.0  # that a problem may take, of `solve` and of `solve_many`
 
 
@@ -49,7 +50,7 @@ def solve(
     labels3d: Any = None,
     scores2d: Any = None,
     scores3d: Any = None,
-    solver: str | Path | nn.Module = "auto",
+    solver: "str | Path | torch.nn.Module" = "auto",
     prior: Prior | str | Path | None = None,
     inlier_threshold: float | int | None = None,
     clutter: float | int | None = None,
@@ -58,7 +59,7 @@ def solve(
     scale: bool = False,
     seed: int = 0,
     time_limit: float | int | None = None,
-    device: str | torch.device | None = None,
+    device: "str | torch.device | None" = None,
     progress: Progress | None = None,
 ) -> Solution:
     """Camera pose from 2D and 3D points that nobody has matched.
@@ -186,13 +187,13 @@ def solve_many(
     labels3d: Any = None,
     scores2d: Any = None,
     scores3d: Any = None,
-    solver: str | Path | nn.Module = "auto",
+    solver: "str | Path | torch.nn.Module" = "auto",
     prior: Any = None,
     inlier_threshold: float | int | None = None,
     clutter: float | int | None = None,
     seed: int = 0,
     time_limit: float | int | None = None,
-    device: str | torch.device | None = None,
+    device: "str | torch.device | None" = None,
     progress: Progress | None = None,
 ) -> list[Solution]:
     """`solve` for many problems; a solution depends on nothing but its own, unless few-point ones share an image.

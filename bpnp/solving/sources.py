@@ -1,29 +1,31 @@
 """From problems to their solutions: by the search, by a trained module, or by one after the other."""
 
-import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import torch
-from torch import nn
-
-from bpnp.loops.parallel import Clock, Deadline, in_processes
+from bpnp.loops.parallel import Clock, Deadline
 from bpnp.search.enumeration.search import exceeds_enumeration
 from bpnp.search.evidence import reasons
 from bpnp.search.propose.mirror import mirrored_alarms
+from bpnp.search.schedule import Proposals
 from bpnp.search.search import search_poses, search_proposed
 from bpnp.search.settings import DEFAULT, SearchSettings
+from bpnp.search.starts import PosePrior
+from bpnp.solving.arguments import Array, is_network
 from bpnp.solving.matches import finished, without_pose
-from bpnp.solving.networks import device_of, evaluation_copy, pose_prior, predicted, proposals_for, proposed, view_for
 from bpnp.solving.problem import Problem
 from bpnp.solving.solution import Solution
 
+if TYPE_CHECKING:
+    import torch
+
 Progress = Callable[[int, int, float], None]  # problem, batches of starts so far, seconds
 TOGETHER = 2**26  # cells of the assignments, 2D points x 3D points, that a module solves together on a GPU
-WORTH_FORKING = 0.3  # seconds of work; starting processes takes some tens of milliseconds
+VIEW_MATCHER, SCENE_MATCHER = "matcher-maps", "matcher-sfm"  # packaged weights of the frames "view" and "any"
+MOST_CELLS = 2**22  # of an assignment, 2D points x 3D points, with which a matcher's time and memory grow: seconds
 # Seconds, and seconds a 2D or 3D point, that the verdict and matching take after the search; of a limit at most half.
 ENDING, ENDING_A_POINT = 4e-3, 8e-6
 
@@ -31,18 +33,18 @@ ENDING, ENDING_A_POINT = 4e-3, 8e-6
 class Options(NamedTuple):
     """What applies to all problems; see `bpnp.solve`.
 
-    solver: None for the search. asks: whether a search in doubt asks packaged matchers for poses (`proposals_for`).
+    solver: None for the search. asks: whether a search in doubt asks packaged matchers for poses.
     time_limit: seconds a problem, None for none. until: when all of it has to end. device: None for that of each
     module. settings: of the search.
     """
 
-    solver: nn.Module | None = None
+    solver: "torch.nn.Module | None" = None
     asks: bool = True
     inlier_threshold: float | None = None
     clutter: float | None = None
     seed: int = 0
     time_limit: float | None = None
-    device: torch.device | None = None
+    device: "torch.device | None" = None
     progress: Progress | None = None
     settings: SearchSettings = DEFAULT
     until: Deadline = Deadline()
@@ -59,40 +61,25 @@ def solutions_of(problems: Mapping[int, Problem], options: Options) -> dict[int,
     """The solution of each problem, which has its number."""
     solutions: dict[int, Solution] = {}
     solvable: dict[int, Problem] = {}
-    copies: dict[int, nn.Module] = {}
+    copies: dict[int, torch.nn.Module] = {}
     for i, problem in problems.items():
         if problem.degenerate is not None:
             solutions[i] = without_pose(problem, problem.degenerate, options.inlier_threshold)
             continue
-        net = problem.prior if isinstance(problem.prior, nn.Module) else None
-        for module in (options.solver, net):
-            if module is not None:
-                view_for(module, problem)  # raises before anything is solved
-        if net is not None:
-            copies[id(net)] = copies.get(id(net)) or evaluation_copy(net, options.device)
-            problem = replace(problem, prior=copies[id(net)])
+        net = problem.prior if is_network(problem.prior) else None
+        if net is not None or options.solver is not None:
+            from bpnp.solving.networks import evaluation_copy, view_for
+
+            for module in (options.solver, net):
+                if module is not None:
+                    view_for(module, problem)  # raises before anything is solved
+            if net is not None:
+                copies[id(net)] = copies.get(id(net)) or evaluation_copy(net, options.device)
+                problem = replace(problem, prior=copies[id(net)])
         solvable[i] = problem
-    if options.solver is not None:
+    if options.solver is not None and solvable:
         return solutions | dict(_by_module(evaluation_copy(options.solver, options.device), solvable, options))
-    if copies:  # a process would copy the networks
-        return solutions | {i: _by_search(i, problem, options) for i, problem in solvable.items()}
-    return solutions | (dict(_by_searches(solvable, options)) if solvable else {})
-
-
-def _by_searches(problems: Mapping[int, Problem], options: Options) -> Iterator[tuple[int, Solution]]:
-    """In as many processes as torch has threads, where that pays and nobody asks for the progress.
-
-    The first one is solved here: it compiles what all need, and tells how long one takes.
-    """
-    first, *waiting = problems
-    solution = _by_search(first, problems[first], options)
-    yield first, solution
-    workers = 1 if multiprocessing.current_process().daemon else torch.get_num_threads()  # which may have no children
-    pays = len(waiting) > 1 and solution.seconds * len(waiting) > WORTH_FORKING
-    if workers > 1 and pays and options.progress is None:
-        yield from in_processes(lambda i: _by_search(i, problems[i], options), waiting, workers)
-    else:
-        yield from ((i, _by_search(i, problems[i], options)) for i in waiting)
+    return solutions | {i: _by_search(i, problem, options) for i, problem in solvable.items()}
 
 
 def _by_search(i: int, problem: Problem, options: Options) -> Solution:
@@ -100,9 +87,9 @@ def _by_search(i: int, problem: Problem, options: Options) -> Solution:
     radius = None if options.inlier_threshold is None else options.inlier_threshold / problem.per_radian
     result = search_poses(
         replace(problem.sets, radius=radius),
-        around=pose_prior(problem.prior, problem, deadline) if isinstance(problem.prior, nn.Module) else None,
+        around=_pose_of_network(problem.prior, problem, deadline) if is_network(problem.prior) else None,
         clutter=options.clutter,
-        proposals=proposals_for(problem, options.seed) if options.asks else None,
+        proposals=_proposals_of_matcher(problem, options.seed) if options.asks else None,
         seed=options.seed,
         deadline=deadline,
         settings=options.settings,
@@ -119,10 +106,38 @@ def _by_search(i: int, problem: Problem, options: Options) -> Solution:
     return finished(problem, result, seconds, options.inlier_threshold)
 
 
-def _by_module(net: nn.Module, problems: Mapping[int, Problem], options: Options) -> Iterator[tuple[int, Solution]]:
+def _pose_of_network(net: "torch.nn.Module", problem: Problem, deadline: Deadline) -> PosePrior | None:
+    from bpnp.solving.networks import pose_prior
+
+    return pose_prior(net, problem, deadline)
+
+
+def _proposals_of_matcher(problem: Problem, seed: int) -> Proposals | None:
+    """Return a function that proposes poses of the packaged matcher for a problem, None where no matcher applies.
+
+    The matcher for views around a known pose applies with a `PosePrior`, that for scenes in any axes without a prior
+    and for few enough points. Networks are imported when the function is called: the search is undecided only then.
+    """
+    weights = VIEW_MATCHER if isinstance(problem.prior, PosePrior) else SCENE_MATCHER
+    too_many = len(problem.image) * len(problem.points3d) > MOST_CELLS
+    if weights == SCENE_MATCHER and (too_many or problem.prior is not None):
+        return None
+
+    def propose() -> tuple[Array, Array]:
+        from bpnp.solving.networks import packaged_matcher, proposed
+
+        return proposed(packaged_matcher(weights), problem, seed)
+
+    return propose
+
+
+def _by_module(
+    net: "torch.nn.Module", problems: Mapping[int, Problem], options: Options
+) -> Iterator[tuple[int, Solution]]:
     """A matcher's assignment of many points proposes poses, from which the search goes on. Of other modules the poses
     count; on a GPU they get problems of similar size together."""
-    from bpnp.models.matcher import Matcher  # the networks, where one is given
+    from bpnp.models.matcher import Matcher
+    from bpnp.solving.networks import device_of, predicted, proposed
 
     groups: list[list[int]] = []
     cells = {i: len(problem.image) * len(problem.points3d) for i, problem in problems.items()}

@@ -113,7 +113,7 @@ def test_a_search_in_doubt_asks_and_a_sure_one_does_not(
         asked.append((seed, weights))
         return np.empty((0, 3, 3)), np.empty((0, 3))
 
-    monkeypatch.setattr(networks, "_packaged", str)
+    monkeypatch.setattr(networks, "packaged_matcher", str)
     monkeypatch.setattr(networks, "proposed", propose)
     if name is not None:
         image, points, *_ = scene()

@@ -27,7 +27,7 @@ from bpnp.datamodules.synthetic_maps.scene import (
     look,
     nearby_camera,
 )
-from bpnp.geometry import MIN_POINTS
+from bpnp.poses import MIN_POINTS
 from bpnp.types import Batch
 
 Frame = Literal["upright", "view"]

@@ -2,9 +2,10 @@
 
 import math
 
-from bpnp.geometry import MIN_POINTS, bearings
+from bpnp.geometry import bearings
 from bpnp.loops.parallel import Deadline
 from bpnp.models.baselines.single_problem import Answer, SingleProblem, SingleSolver, agreement
+from bpnp.poses import MIN_POINTS
 from bpnp.robust.matches import distinct_triples
 from bpnp.robust.minimal_solvers import p3p
 

@@ -8,8 +8,9 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from bpnp.checks import check_positive
-from bpnp.geometry import MIN_POINTS, project, transform
+from bpnp.geometry import project, transform
 from bpnp.loops.parallel import Deadline
+from bpnp.poses import MIN_POINTS
 from bpnp.types import Batch, Pose, Prediction, SolveStats
 
 CHUNK = 2**22  # distances computed at a time, in float32

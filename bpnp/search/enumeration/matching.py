@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bpnp.loops.vectors import rotated, turn
-from bpnp.robust.minimal_solvers import part
 from bpnp.search.enumeration.points import Array, Heading, ImagePoints, Places, PriorArrays, ScenePoints
 from bpnp.search.enumeration.settings import RULES
 from bpnp.search.kernels.dense import solve_normal_equations
+from bpnp.search.propose.minimal_solvers import part
 
 
 class Problem(NamedTuple):

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.robust.minimal_solvers import Triangles, triangles_of
 from bpnp.search.enumeration.settings import RULES, EnumerationSettings
 from bpnp.search.point_sets import PointSets
+from bpnp.search.propose.minimal_solvers import Triangles, triangles_of
 from bpnp.search.starts import GravityPrior, PosePrior, Prior, turned_to
 
 Array = NDArray[np.float64]

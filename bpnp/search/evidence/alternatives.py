@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.geometry import turned_by
+from bpnp.poses import turned_by
 from bpnp.search.evidence import reasons
 from bpnp.search.evidence.false_alarms import directions_of, own_evidence
 from bpnp.search.evidence.settings import Evidence

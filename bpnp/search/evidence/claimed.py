@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.geometry import turned_by
 from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
+from bpnp.poses import turned_by
 from bpnp.search.annealing import anneal_on_points, finish, polished
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.evidence import reasons

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.special import fdtrc, fdtri, stdtrit
 
-from bpnp.geometry import turned_by
+from bpnp.poses import turned_by
 from bpnp.search.evidence.partners import across, facing, partners
 from bpnp.search.evidence.settings import Evidence
 from bpnp.search.point_sets import PointSets

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.robust.minimal_solvers import p3p_poses
 from bpnp.search.evidence.partners import across, explained
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.point_sets import PointSets
+from bpnp.search.propose.minimal_solvers import p3p_poses
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]

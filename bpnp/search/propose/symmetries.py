@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.geometry import distinct
 from bpnp.loops.vectors import compiled, part
+from bpnp.poses import distinct
 from bpnp.search.kernels.neighbours import HashedPoints, hashed, lies_on
 
 Array = NDArray[np.float64]

@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.geometry import distinct
 from bpnp.loops.parallel import NEVER, Clock, Deadline, one_blas_thread
+from bpnp.poses import distinct
 from bpnp.search.enumeration.search import enumerate_poses, is_enumerable
 from bpnp.search.enumeration.settings import DEFAULT as ENUMERATION
 from bpnp.search.evidence.repetitions import repeated_poses
