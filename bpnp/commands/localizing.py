@@ -1,25 +1,31 @@
 """`bpnp localize`: where photos were taken, in a map of the place."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
+from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rich import box
+from rich.console import Console
+from rich.table import Table
 from rich.text import Text
 
 from bpnp.files import lock_folder
-from bpnp.report.terminal import console, progress, say
+from bpnp.report.terminal import console, count_items, say
 
 if TYPE_CHECKING:
     from bpnp.maps.many_photos import Outcome, SolutionFolder
     from bpnp.maps.scene_map import SceneMap
 
 CAPTION = (
-    "error px: mean distance between the keypoints of the matches and their points. log10 false: how many poses would "
-    "fit as well by chance, as a power of ten; smaller is surer."
+    "error px: mean distance between the keypoints of the matches and their points. log10 false: logarithm of the "
+    "number of poses that would fit as well by chance; smaller is better."
 )
-COLUMNS = ("verdict", "view", "matches", "error\npx", "log10\nfalse", "sec")
+FOCAL = "focal px: the focal length that was found."
+OFF = "off: from the map's own pose of the photo, degrees and scene units."
+LEAST = 8  # columns of a name
 
 
 def localize(
@@ -35,6 +41,8 @@ def localize(
     cluster: str | None = None,
     output: Path = Path("runs/localize"),
     no_pictures: bool = False,
+    json: bool = False,
+    quiet: bool = False,
     solver: str = "auto",
     time_limit: float | None = None,
     seed: int = 0,
@@ -60,6 +68,8 @@ def localize(
         cluster: address of a Dask scheduler whose workers localize the photos, or a number of processes here.
         output: folder of the results.
         no_pictures: write no pictures.
+        json: print JSON instead of a table: what results.json has of these photos.
+        quiet: print nothing but errors, and JSON if asked for.
         solver: auto, which asks the packaged matcher about a known view when the search is in doubt; search; or a
             checkpoint of a network.
         time_limit: seconds a photo.
@@ -84,15 +94,15 @@ def localize(
     files, scene = photo_files(photos, besides=output), SceneMap.from_colmap(map)
     attempts, lens = _attempts(cluster), None if camera is None else _camera(camera, map, scene)
     tried = None if views is None else read_views(views)
-    with lock_folder(output), progress() as shown:
-        folder, bar = SolutionFolder(output, content_of_map(map)), shown.add_task("localizing", total=len(files))
+    with lock_folder(output), count_items("localizing", len(files), quiet=quiet) as done:
+        folder = SolutionFolder(output, content_of_map(map))
         outcome = localize_photos(
             scene,
             files,
             folder,
             attempts=attempts,
             pictures=not no_pictures,
-            done=lambda name: shown.update(bar, description=f"localized {name}", advance=1),
+            done=done,
             camera=lens,
             focal_error=focal_error,
             distortion=distortion or None,
@@ -103,20 +113,31 @@ def localize(
             seed=seed,
             time_limit=time_limit,
         )
-    _report(files, folder, outcome, pictures=not no_pictures)
+    out = console(json=json, quiet=quiet)
+    records = {name: folder.records[name] for name in files if name in folder.records and name not in outcome.errors}
+    if json:
+        say(dumps({"map": folder.map_content, "photos": records}, indent=1))
+    elif records:
+        out.print(_table(records, out.width), Text(_caption(records), "dim italic"))
+    _report(files, records, folder, outcome, out, pictures=not no_pictures)
     if outcome.errors:
         (name, reason), *others = outcome.errors.items()
         for other, why in others:
-            say(f"{other}: {why}")
+            say(f"{other}: {why}", to=out)
         raise ValueError(f"{len(others) + 1} of {len(files)} photos could not be tried, such as {name}: {reason}")
 
 
-def _report(files: Mapping[str, Path], folder: "SolutionFolder", outcome: "Outcome", *, pictures: bool) -> None:
-    """Say what was found, kept and written."""
-    out = console()
-    records = {name: folder.records[name] for name in files if name in folder.records and name not in outcome.errors}
+def _report(
+    files: Mapping[str, Path],
+    records: Mapping[str, Any],
+    folder: "SolutionFolder",
+    outcome: "Outcome",
+    out: Console,
+    *,
+    pictures: bool,
+) -> None:
+    """Print where the cameras are from, what was kept and what was written."""
     if records:
-        out.print(_table(records))
         cameras = Counter(record["made_with"]["camera_from"] for record in records.values())
         say(f"camera: {', '.join(f'{source} ({count})' for source, count in cameras.items())}", to=out)
     if outcome.kept:
@@ -158,14 +179,54 @@ def _attempts(cluster: str | None) -> Callable[..., Any]:
     return partial(attempts_on_cluster, cluster=cluster)
 
 
-def _table(records: Mapping[str, Mapping[str, Any]]) -> Any:
-    """A row for each photo."""
-    from bpnp.report.terminal import VERDICTS, SplitTable, number
+def _table(records: Mapping[str, Mapping[str, Any]], width: int) -> Table:
+    """Return a table of so many characters with a row for each photo; long names of photos and views are cut."""
+    from bpnp.maps.many_photos import ERROR
+    from bpnp.report.terminal import VERDICTS, number, shorten
 
-    rows = []
-    for name, record in records.items():
-        known = {key: float("nan") if value is None else value for key, value in record.items()}
-        figures = number(known["reprojection_error"]), f"{known['log10_false_alarms']:.0f}", number(known["seconds"])
-        cells = str(record["view"]), str(record["inlier_count"]), *figures
-        rows.append((Text(name), [Text(record["verdict"], VERDICTS[record["verdict"]]), *map(Text, cells)]))
-    return SplitTable("", COLUMNS, [rows], CAPTION)
+    rows = list(records.values())
+    found = [row["verdict"] != "failed" for row in rows]
+
+    def cells(values: Iterable[float | None], form: Callable[[float], str] = number) -> list[str]:
+        return [form(value) if value is not None and good else "-" for value, good in zip(values, found, strict=True)]
+
+    numbers = {"matches": cells((row["inlier_count"] for row in rows), str)}
+    if any(_focal_was_found(row) for row in rows):
+        numbers["focal\npx"] = cells((row["focal_length"] for row in rows), "{:.0f}".format)
+    numbers["error\npx"] = cells(row["reprojection_error"] for row in rows)
+    if any(row[ERROR] for row in rows):
+        numbers["off\ndeg"] = cells((row[ERROR] or {}).get("rotation_deg") for row in rows)
+        numbers["off\nunits"] = cells((row[ERROR] or {}).get("centre") for row in rows)
+    alarms = [row["log10_false_alarms"] for row in rows]
+    numbers["log10\nfalse"] = ["-" if value is None else f"{value:.0f}" for value in alarms]
+    numbers["sec"] = [number(row["seconds"]) for row in rows]
+
+    names, views, verdicts = [*records], [str(row["view"]) for row in rows], [row["verdict"] for row in rows]
+    taken = sum(1 + max(map(len, [*head.split("\n"), *column])) for head, column in numbers.items())
+    left = max(width - taken - 1 - max(map(len, verdicts)) - 1, 2 * LEAST)
+    longest = [max(map(len, ["photo", *names])), max(map(len, ["view", *views]))]
+    if sum(longest) > left:
+        longest[1] = min(longest[1], max(left - longest[0], left // 2))
+        longest[0] = left - longest[1]
+    table = Table(box=box.SIMPLE_HEAD, padding=0, pad_edge=False, show_edge=False)
+    table.add_column("photo", no_wrap=True)
+    table.add_column("verdict", no_wrap=True)
+    table.add_column("view", no_wrap=True)
+    for head in numbers:
+        table.add_column(head, justify="right", no_wrap=True)
+    shown = zip(shorten(names, longest[0]), verdicts, shorten(views, longest[1]), *numbers.values(), strict=True)
+    for name, verdict, *row in shown:
+        table.add_row(Text(name), Text(verdict, VERDICTS[verdict]), *map(Text, row))
+    return table
+
+
+def _caption(records: Mapping[str, Mapping[str, Any]]) -> str:
+    from bpnp.maps.many_photos import ERROR
+
+    focal = any(_focal_was_found(record) for record in records.values())
+    compared = any(record[ERROR] for record in records.values())
+    return " ".join([CAPTION, *([FOCAL] if focal else []), *([OFF] if compared else [])])
+
+
+def _focal_was_found(record: Mapping[str, Any]) -> bool:
+    return bool(record["focal_length_std"])

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from bpnp.cameras import camera_from
 from bpnp.report.figures import size_in_camera
-from bpnp.report.terminal import LIGHT, QUIET, VERDICTS
+from bpnp.report.terminal import LIGHT, QUIET, VERDICTS, number
 from bpnp.search.evidence.uncertainty import centre_covariance
 from bpnp.solving.solution import Solution, solution_points
 
@@ -21,6 +21,7 @@ Array = npt.NDArray[Any]
 FADED = 0.55  # of the photo's contrast is taken, so that points stand out
 BOUND = 3.72  # standard deviations that hold 99.9 % of a plane's normal distribution
 SHOWN = 98.0  # % of the map's points that its drawing holds
+FARTHEST = 4.0  # extents of the points, around them, in which cameras are drawn where they are
 MOST_POINTS = 20_000  # of the map that are drawn
 WIDTHS = (9.0, 6.0)  # inches, of photo and map
 
@@ -28,8 +29,18 @@ WIDTHS = (9.0, 6.0)  # inches, of photo and map
 def localized_picture(
     scene: "SceneMap", solution: Solution, *, photo: Array | None = None, title: str | None = None
 ) -> "Figure":
-    """Left the photo (h, w, 3) uint8 with its matches, coloured by their residuals, and the other keypoints faint;
-    right the map from above with its views, and the camera with the ellipse that holds its centre at 99.9 %."""
+    """Draw a photo in a map.
+
+    Left the photo with its matches, coloured by their residuals, and the other keypoints faint; right the map from
+    above with its views, and the camera with the ellipse that holds its centre at 99.9 %. Of an ambiguous solution the
+    next candidate is drawn too. Of a failed one neither matches nor camera are drawn: its pose is a guess.
+
+    Args:
+        scene: The map.
+        solution: Pose of the photo.
+        photo: (h, w, 3) uint8, to draw under the matches.
+        title: First line, such as the name of the photo.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(sum(WIDTHS), 6.5), layout="constrained")
@@ -38,19 +49,24 @@ def localized_picture(
     if marks is not None:
         figure.colorbar(marks, ax=image, location="bottom", shrink=0.5, aspect=40, label=f"residual, {solution.unit}")
     draw_from_above(above, scene, solution)
-    text = solution_points(solution, title=title).id.replace("$", r"\$")
+    near = "" if solution.view is None or solution.verdict == "failed" else f", found near view {solution.view}"
+    text = solution_points(solution, title=None if title is None else title + near).id.replace("$", r"\$")
     figure.suptitle(text, fontsize=10, color=VERDICTS[solution.verdict])
     return figure
 
 
 def draw_matches(axes: "Axes", solution: Solution, *, photo: Array | None = None) -> Any:
-    """Keypoints faint, matches coloured by the distance to where their scene points are reprojected, a line to it.
-    Returns what was coloured, None without a match."""
+    """Draw keypoints faint, and matches coloured by the distance to where their scene points are reprojected.
+
+    Returns:
+        What was coloured; None without a match, or for a failed solution, of which matches are not drawn.
+    """
     from matplotlib.collections import LineCollection
 
     camera = camera_from(solution.camera)
     seen = camera.project(np.column_stack([solution.points2d, np.ones(len(solution.points2d))]))
-    image, scene = solution.match_places.T
+    places = solution.match_places if solution.verdict != "failed" else solution.match_places[:0]
+    image, scene = places.T
     reprojected = camera.project(solution.points3d[scene] @ solution.rotation.T + solution.translation)
     residuals = np.linalg.norm(seen[image] - reprojected, axis=-1)
     if photo is not None:
@@ -63,7 +79,8 @@ def draw_matches(axes: "Axes", solution: Solution, *, photo: Array | None = None
     rest = np.delete(seen, image, 0)
     axes.plot(*rest.T, ".", color=QUIET, ms=1.5, alpha=0.35, zorder=1)
     axes.set(aspect="equal", xticks=[], yticks=[])
-    axes.set_title(f"{len(image)} matches of {len(seen)} keypoints", fontsize=9)
+    matched = "" if solution.verdict == "failed" else f", {len(image)} matched"
+    axes.set_title(f"{len(seen)} keypoints{matched}", fontsize=9)
     if not len(image):
         return None
     axes.add_collection(LineCollection(list(np.stack([seen[image], reprojected], 1)), colors="black", linewidths=0.8))
@@ -72,12 +89,15 @@ def draw_matches(axes: "Axes", solution: Solution, *, photo: Array | None = None
 
 
 def draw_from_above(axes: "Axes", scene: "SceneMap", solution: Solution) -> None:
-    """Points and views of the map, and the camera, which looks upwards in the drawing, as far as there is a pose."""
-    from matplotlib.patches import Ellipse
+    """Draw points and views of the map from above, and the camera, which looks upwards in the drawing.
 
+    An ambiguous solution has its next candidate drawn as a hollow star; a failed one has no camera. A camera that is
+    far outside of the map stands at the edge of the drawing, and the legend says so.
+    """
+    found = solution.verdict != "failed"
     down = np.mean([view.rotation[1] for view in scene.views], axis=0)  # of upright photos
     down /= np.linalg.norm(down)
-    forward = solution.rotation[2] if solution.found else scene.views[0].rotation[2]
+    forward = solution.rotation[2] if found else scene.views[0].rotation[2]
     ahead = forward - down * (forward @ down)
     ahead /= np.linalg.norm(ahead)
     plane = np.stack([np.cross(down, ahead), ahead])  # to the right, ahead
@@ -85,29 +105,45 @@ def draw_from_above(axes: "Axes", scene: "SceneMap", solution: Solution) -> None
     points, centres = scene.points3d[::step] @ plane.T, np.array([view.centre for view in scene.views]) @ plane.T
     axes.plot(*points.T, ".", color=QUIET, ms=1, alpha=0.35, zorder=1)
     looks = np.array([view.rotation[2] for view in scene.views]) @ plane.T
+    drawn = [("the photo", solution.centre, solution.rotation)] if found else []
+    if solution.verdict == "ambiguous" and len(solution.candidates) > 1:
+        drawn.append(("or here", solution.candidates[1].centre, solution.candidates[1].rotation))
+    stars = np.array([centre for _, centre, _ in drawn]).reshape(-1, 3) @ plane.T
     low, high = np.percentile(points, [(100 - SHOWN) / 2, (100 + SHOWN) / 2], axis=0)
-    placed = np.concatenate([centres, (plane @ solution.centre)[None]]) if solution.found else centres
-    placed = np.clip(placed, 2 * low - high, 2 * high - low)  # a pose that failed may be anywhere
+    farthest = FARTHEST * (high - low)
+    placed = np.clip(np.concatenate([centres, stars]), low - farthest, high + farthest)
     low, high = np.minimum(low, placed.min(0)), np.maximum(high, placed.max(0))
     middle, reach = (low + high) / 2, 0.5 * 1.15 * float((high - low).max())
     axes.quiver(*centres.T, *looks.T, color=LIGHT[0], width=0.004, scale=25, zorder=2)
     axes.plot(*centres.T, ".", color=LIGHT[0], ms=4, label=f"{len(centres)} views", zorder=2)
-    if solution.found:
-        colour, centre = VERDICTS[solution.verdict], plane @ solution.centre
-        half = np.tan(np.nanmax(np.abs(np.arctan(solution.points2d[:, 0]))))
+    colour, half = VERDICTS[solution.verdict], np.tan(np.nanmax(np.abs(np.arctan(solution.points2d[:, 0]))))
+    for (label, _, rotation), star, inside in zip(drawn, stars, placed[len(centres) :], strict=True):
+        first = label == drawn[0][0]
         for side in (-half, half):
-            edge = plane @ (solution.rotation.T @ np.array([side, 0, 1]))
-            axes.plot(*np.stack([centre, centre + 0.5 * reach * edge / np.linalg.norm(edge)], 1), color=colour, lw=1)
-        axes.plot(*centre, "*", color=colour, ms=14, mec="white", label="the photo", zorder=4)
-        to_plane = plane @ solution.rotation.T
-        spread = to_plane @ centre_covariance(solution.covariance, solution.translation) @ to_plane.T
-        if np.isfinite(spread).all():
-            lengths, axes_of = np.linalg.eigh(spread)
-            angle = float(np.degrees(np.arctan2(*axes_of[::-1, 1])))
-            size = 2 * BOUND * np.sqrt(np.maximum(lengths[::-1], 0))
-            axes.add_patch(Ellipse(tuple(centre), *size, angle=angle, fill=False, ec=colour, zorder=5))
+            edge = plane @ (rotation.T @ np.array([side, 0, 1]))
+            ends = np.stack([inside, inside + 0.5 * reach * edge / np.linalg.norm(edge)], 1)
+            axes.plot(*ends, color=colour, lw=1, ls="-" if first else ":")
+        shown = label if np.allclose(star, inside) else f"{label}, outside of the drawing"
+        face, edge_colour = (colour, "white") if first else ("white", colour)
+        axes.plot(*inside, "*", color=face, ms=14, mec=edge_colour, label=shown, zorder=4)
+    if found:
+        draw_ellipse(axes, solution, plane, colour)
     axes.set(xlim=middle[0] + np.array([-reach, reach]), ylim=middle[1] + np.array([-reach, reach]))
     axes.set(aspect="equal", xticks=[], yticks=[])
-    known = f"; the centre is known to {solution.centre_std:.2g} scene units" if solution.found else ""
-    axes.set_title(f"the map from above{known}", fontsize=9)
+    known = f"; centre known to {number(solution.centre_std)} scene units" if np.isfinite(solution.centre_std) else ""
+    axes.set_title(f"the map from above{known if found else '; no pose'}", fontsize=9)
     axes.legend(loc="lower right", fontsize=8)
+
+
+def draw_ellipse(axes: "Axes", solution: Solution, plane: Array, colour: str) -> None:
+    """Draw the ellipse that holds the camera's centre at 99.9 %, in a plane (2, 3) of the scene, if it is known."""
+    from matplotlib.patches import Ellipse
+
+    to_plane = plane @ solution.rotation.T
+    spread = to_plane @ centre_covariance(solution.covariance, solution.translation) @ to_plane.T
+    if not np.isfinite(spread).all():
+        return
+    lengths, directions = np.linalg.eigh(spread)
+    angle = float(np.degrees(np.arctan2(*directions[::-1, 1])))
+    size = 2 * BOUND * np.sqrt(np.maximum(lengths[::-1], 0))
+    axes.add_patch(Ellipse(tuple(plane @ solution.centre), *size, angle=angle, fill=False, ec=colour, zorder=5))

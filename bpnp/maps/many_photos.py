@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bpnp.cameras import camera_from, camera_to_json
@@ -26,7 +27,9 @@ from bpnp.solving.solution import Solution
 CHANGES = {"photo": "another photo", "map": "another map", "views": "other views", "keypoints": "other keypoints"}
 MADE_WITH = "made_with"  # beside the fields of a solution in its file
 REPORTED: tuple[str, ...] = ("verdict", "reason", "view", "inlier_count", "reprojection_error", "inlier_threshold")
-REPORTED += ("log10_false_alarms", "seconds", "rotation", "translation", "camera", MADE_WITH)
+REPORTED += ("log10_false_alarms", "seconds", "rotation", "translation", "camera", "focal_length", "focal_length_std")
+REPORTED += (MADE_WITH,)
+ERROR = "error_to_map"  # of a photo that was left out of the map
 POSES_HEADER = "# NAME, QW, QX, QY, QZ, TX, TY, TZ (COLMAP's cam_from_world)\n"
 Record = dict[str, Any]  # what results.json has of a photo
 
@@ -68,6 +71,7 @@ def photo_task(
     if camera is None or isinstance(camera, SceneMap):
         camera, source = (camera or scene).camera_for(photo, exif=camera is None)
     lens = UNKNOWN if camera is None or isinstance(camera, str) else camera_to_json(camera_from(camera))
+    source = "unknown focal length" if lens == UNKNOWN else source
     shown = None if views is None else list(views.get(name, ()))
     if shown is not None and not shown:
         raise ValueError(f"expected views for {name} in the file of views, got none; try without --views")
@@ -125,7 +129,7 @@ def localize_photos(
 ) -> Outcome:
     """Localize photos, by name, into a folder; those that were solved there with the same content and options are kept.
 
-    attempts: what localises them, here or on a cluster. done: called with the name of each photo. options: as for
+    attempts: what localises them, here or on a cluster. done: called with a few words on each photo. options: as for
     `photo_task`. Each task is made when its turn comes: a photo may be replaced in the meantime.
     """
     outcome = Outcome()
@@ -133,7 +137,7 @@ def localize_photos(
     def failed(name: str, photo: Path, error: Exception) -> None:
         outcome.errors[name] = str(error)
         folder.forget_replaced(name, photo)
-        done(name)
+        done(f"{name}: could not be tried")
 
     def tasks() -> Iterator[PhotoTask]:
         for name, photo in files.items():
@@ -145,7 +149,7 @@ def localize_photos(
             changes = folder.changes(task)
             if changes == []:
                 outcome.kept.append(name)
-                done(name)
+                done(f"{name}: kept, {folder.records[name]['verdict']}")
                 continue
             if changes:
                 outcome.again[name] = ", ".join(dict.fromkeys(CHANGES.get(key, "other options") for key in changes))
@@ -156,10 +160,11 @@ def localize_photos(
             try:
                 with delay_interrupts():
                     folder.keep(task, solution, draw_in=scene if pictures else None)
-                done(task.name)
+                done(f"{task.name}: {folder.records[task.name]['verdict']}")
             except (ValueError, OSError) as error:
                 failed(task.name, task.photo, error)
     finally:
+        folder.compare(scene)
         folder.write()
     return outcome
 
@@ -226,8 +231,8 @@ class SolutionFolder:
             raise ValueError(solution)
         self.picture(task.name).unlink(missing_ok=True)
         if draw_in is not None:
-            title, photo = f"{task.name}: {solution.view}", read_photo(task.photo)
-            save_figure(localized_picture(draw_in, solution, photo=photo, title=title), self.picture(task.name))
+            photo = read_photo(task.photo)
+            save_figure(localized_picture(draw_in, solution, photo=photo, title=task.name), self.picture(task.name))
         text = f'{solution.to_json()[:-1]}, "{MADE_WITH}": {json.dumps(task.made_with)}}}'
         write_text(self._file("solutions", task.name, "json"), text + "\n")
         self._record(task.name, text)
@@ -244,8 +249,18 @@ class SolutionFolder:
             self.picture(name).unlink(missing_ok=True)
 
     def picture(self, name: str) -> Path:
-        """Where the picture of a photo is."""
-        return self._file("pictures", name, "png")
+        """Return the file of a photo's picture, which has the photo's name and is a PNG."""
+        return self._file("pictures", name.removesuffix(".png"), "png")
+
+    def compare(self, scene: SceneMap) -> None:
+        """Add to each photo that was left out of this map how far its pose is from that of the map."""
+        for name, record in self.records.items():
+            known = record["rotation"] is not None and name in scene.view_numbers
+            if known and record[MADE_WITH]["leave_one_out"] and record[MADE_WITH]["map"] == self.map_content:
+                (view,), rotation = scene.named([name]), np.array(record["rotation"])
+                degrees = np.degrees(Rotation.from_matrix(rotation @ view.rotation.T).magnitude())
+                shift = np.linalg.norm(rotation.T @ record["translation"] + view.centre)
+                record[ERROR] = {"rotation_deg": float(degrees), "centre": float(shift)}
 
     def of_other_maps(self) -> list[str]:
         """Photos whose solutions are of another map, so that their poses have another frame."""
@@ -265,7 +280,7 @@ class SolutionFolder:
 
     def _record(self, name: str, text: str) -> None:
         content = json.loads(text)
-        self.records[name] = {key: content[key] for key in REPORTED}
+        self.records[name] = {key: content[key] for key in REPORTED} | {ERROR: None}
 
     def _file(self, folder: str, name: str, suffix: str) -> Path:
         return self.path / folder / f"{name}.{suffix}"

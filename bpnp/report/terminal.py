@@ -3,7 +3,8 @@ number whole in 80 columns.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal
 
@@ -40,10 +41,10 @@ def say(line: object, *, to: Console | None = None) -> None:
     (to or Console()).print(str(line), markup=False, highlight=False, soft_wrap=True)
 
 
-def progress(*, items: bool = True) -> Progress:
+def progress(*, items: bool = True, quiet: bool = False) -> Progress:
     """What is going on and since when, and of several items how many are done; gone when the block ends."""
     columns = (BarColumn(), MofNCompleteColumn()) if items else ()
-    console = Console(stderr=True)
+    console = Console(stderr=True, quiet=quiet)
     return Progress(
         SpinnerColumn(),
         TextColumn("{task.description}", markup=False),
@@ -51,13 +52,36 @@ def progress(*, items: bool = True) -> Progress:
         TimeElapsedColumn(),
         console=console,
         transient=True,
-        disable=not console.is_interactive,
+        disable=quiet or not console.is_interactive,
     )
 
 
-def console() -> Console:
-    """Standard output, at least `WIDTH` columns wide."""
-    terminal = Console()
+@contextmanager
+def count_items(what: str, total: int, *, quiet: bool = False) -> Iterator[Callable[[str], None]]:
+    """Show how many items are done, on stderr: a bar on a terminal, elsewhere, such as in a pipe, a line each.
+
+    Args:
+        what: What is being done.
+        total: Number of items.
+        quiet: Show nothing.
+
+    Yields:
+        The function to call with a few words on each item that is done.
+    """
+    with progress(quiet=quiet) as shown:
+        bar = shown.add_task(what, total=total)
+
+        def finish(words: str) -> None:
+            shown.update(bar, description=words, advance=1)
+            if shown.disable:
+                say(f"{shown.tasks[bar].completed:.0f}/{total} {words}", to=shown.console)
+
+        yield finish
+
+
+def console(*, json: bool = False, quiet: bool = False) -> Console:
+    """Return the console for results, `WIDTH` columns at least: standard output, stderr beside JSON, none if quiet."""
+    terminal = Console(stderr=json, quiet=quiet)
     terminal.width = max(terminal.width, WIDTH)
     return terminal
 
@@ -99,6 +123,32 @@ class SplitTable:
             yield table
         if self.caption:
             yield Text(self.caption, "dim italic")
+
+
+def shorten(names: Sequence[str], width: int) -> list[str]:
+    """Cut names to a width: their heads, an ellipsis, and their tails, so that as many as possible stay different.
+
+    >>> shorten(["cam0/000001.jpg", "cam1/000001.jpg", "a.jpg"], 9)
+    ['cam0….jpg', 'cam1….jpg', 'a.jpg']
+    """
+
+    def cut(name: str, head: int) -> str:
+        return name if len(name) <= width else f"{name[:head]}…{name[len(name) - (width - 1 - head) :]}"
+
+    heads = sorted(range(width), key=lambda head: abs(head - (width - 1) // 2))
+    best = max(heads, key=lambda head: len({cut(name, head) for name in names}))
+    return [cut(name, best) for name in names]
+
+
+def fixed(values: Sequence[float]) -> list[str]:
+    """Write numbers of one kind, such as coordinates, without exponents: three decimals, more if all are small.
+
+    >>> fixed([500000.25, 5123456.789, 0]), fixed([0.02, -1.5, 0])
+    (['500000.250', '5123456.789', '0.000'], ['0.02000', '-1.50000', '0.00000'])
+    """
+    largest = max([abs(value) for value in values if math.isfinite(value)], default=0.0)
+    before = math.floor(math.log10(largest)) + 1 if largest else 1
+    return [f"{value:.{max(6 - before, 3)}f}" for value in values]
 
 
 def number(value: float | None) -> str:

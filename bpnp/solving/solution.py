@@ -278,9 +278,12 @@ def with_pose(
 
 
 def solution_points(solution: Solution, *, title: str | None = None) -> "ProblemPoints":
-    """The points of a solution, ready to draw; its id is the title, the verdict with its figures, and the reason.
+    """Return the points of a solution, ready to draw.
 
-    Raises ValueError if a match has no point.
+    Its id is the title, the verdict with its figures, none of a failed one, and the reason.
+
+    Raises:
+        ValueError: A match has no point.
     """
     from bpnp.report.points import ProblemPoints
 
@@ -296,7 +299,10 @@ def solution_points(solution: Solution, *, title: str | None = None) -> "Problem
             sizes = f"{len(points2d)} 2D and {len(points3d)} 3D points"
             raise ValueError(f"expected `matches` of {sizes}, got indices up to {most.tolist()}")
         assigned[matches[:, 1]] = matches[:, 0]
-    lines = [*([] if title is None else [title]), f"{solution.verdict}: {shown}", textwrap.fill(solution.reason, LINE)]
+    verdict = [f"{solution.verdict}: {shown}", solution.reason]
+    if solution.verdict == "failed":
+        verdict = [f"failed: {solution.reason}"]
+    lines = [*([] if title is None else [title]), *(textwrap.fill(line, LINE) for line in verdict)]
     return ProblemPoints(
         0, "\n".join(lines), points2d, points3d, np.full_like(assigned, -1), assigned,
         estimates={"solution": (solution.rotation, solution.translation / solution.scale)}, camera=solution.camera,

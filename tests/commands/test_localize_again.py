@@ -73,7 +73,7 @@ def test_the_same_photo_is_kept_and_the_output_says_so(place: Place, capsys: pyt
     assert "kept 2" not in shown
     # What the columns mean is said, once.
     assert shown.count("error px: mean distance between the keypoints of the matches and their points") == 1
-    assert shown.count("log10 false: how many poses would fit as well by chance, as a power of ten") == 1
+    assert shown.count("log10 false: logarithm of the number of poses that would fit as well by chance") == 1
     place.run("a.png", "b.png")
     assert "kept 2 of 2 photos, solved before with the same content and options" in capsys.readouterr().out
     assert file.stat().st_mtime_ns == before
@@ -183,7 +183,7 @@ def test_a_folder_and_an_underscore_are_different_photos(place: Place) -> None:
     assert place.is_right("cam_1.png", 1)
     pictures = (place.folder / "out/pictures").rglob("*.png")
     names = [path.relative_to(place.folder / "out/pictures").as_posix() for path in pictures]
-    assert sorted(names) == ["cam/1.png.png", "cam_1.png.png"]
+    assert sorted(names) == ["cam/1.png", "cam_1.png"]
 
 
 def test_the_camera_of_views_of_the_same_size_is_taken_and_named(
@@ -213,3 +213,21 @@ def test_a_focal_length_is_found_with_the_pose(place: Place, capsys: pytest.Capt
     np.testing.assert_allclose(place.poses()["a.png"], before, atol=2e-3)
     solution = Solution.from_json(place.folder / "out/solutions/a.png.json")
     assert abs(solution.focal_length - 520) < 4 * solution.focal_length_std < 50
+
+
+def test_json_is_all_that_is_printed_and_a_pipe_gets_a_line_for_each_photo(
+    place: Place, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place.run("a.png", "b.png", more=("--json",))
+    printed = capsys.readouterr()
+    content = json.loads(printed.out)
+    assert list(content["photos"]) == ["a.png", "b.png"]
+    assert content["photos"]["a.png"]["verdict"] == "confident"
+    lines = printed.err.splitlines()
+    assert [line for line in lines if line[:3] in ("1/2", "2/2")] == ["1/2 a.png: confident", "2/2 b.png: confident"]
+    place.run("a.png", "b.png", more=("--quiet",))
+    assert capsys.readouterr() == ("", "")
+    place.run("a.png", more=("--quiet", "--json"))
+    printed = capsys.readouterr()
+    assert list(json.loads(printed.out)["photos"]) == ["a.png"]
+    assert printed.err == ""

@@ -14,6 +14,7 @@ from matplotlib.transforms import BboxBase
 from PIL import Image
 from planted import degrees_between
 from planted_model import HEIGHT, WIDTH, plant_model
+from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 import bpnp
@@ -64,6 +65,10 @@ def test_photos_left_out_of_their_map_are_found_and_a_broken_one_is_named(
         assert solution.view in ("0003.jpg", "0005.jpg", "0007.jpg")
         assert set(solution.matches[:, 1].tolist()) <= set(scene.point_ids.tolist())
         assert (output / "pictures" / f"{name}.png").stat().st_size > 20000
+        error = json.loads((output / "results.json").read_text())["photos"][name]["error_to_map"]
+        angle = (rotation * Rotation.from_matrix(view.rotation).inv()).magnitude()
+        assert error["rotation_deg"] == pytest.approx(np.degrees(angle), rel=1e-3)
+        assert error["centre"] == pytest.approx(np.linalg.norm(centre - view.centre), rel=1e-3)
 
     before = (output / "solutions/0004.jpg.json").stat().st_mtime_ns
     fails(*command, "--leave-one-out")
@@ -149,7 +154,7 @@ def test_ctrl_c_while_a_picture_is_drawn_ends_the_run_and_keeps_the_photo(
     assert stop.value.code == 130
     assert capsys.readouterr().err.splitlines()[-1] == "bpnp: interrupted; run it again to go on"
     kept = (path.relative_to(tmp_path / "out") for path in (tmp_path / "out").rglob("*.*"))
-    assert sorted(map(str, kept)) == ["pictures/a.png.png", "poses.txt", "results.json", "solutions/a.png.json"]
+    assert sorted(map(str, kept)) == ["pictures/a.png", "poses.txt", "results.json", "solutions/a.png.json"]
     assert "a.png" in (tmp_path / "out/poses.txt").read_text()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
@@ -175,3 +180,31 @@ def test_a_rough_focal_length_and_distortion_are_found(tmp_path: Path, fails: Ca
         assert degrees_between(solution.rotation, truth.rotations[0]) < 0.1
     assert "`focal_error` is 2.0; it is a fraction of the focal length" in fails(*command, "--focal_error", "2")
     assert "`distortion=True` needs" in fails(*command, "--distortion")
+
+
+HASHES = {k: f"{k}b5d5c3712955042212316173ccf37{k}.jpg" for k in range(3)}
+
+
+def test_each_photo_has_one_row_of_80_characters() -> None:
+    """With the focal length that was found and the error against the map, and names of 36 characters."""
+    from bpnp.commands.localizing import _table
+
+    record = {
+        "verdict": "confident", "view": HASHES[0], "inlier_count": 1170, "focal_length": 1381.6,
+        "focal_length_std": 2.5, "reprojection_error": 0.325, "log10_false_alarms": -1981.0,
+        "seconds": 13.8,
+        "error_to_map": {"rotation_deg": 0.0213, "centre": 1234.5},
+    }  # fmt: skip
+    failed = record | {"verdict": "failed", "reprojection_error": None, "log10_false_alarms": None}
+    console = Console(width=80, record=True)
+    console.print(_table({HASHES[1]: record, HASHES[2]: failed, "a.jpg": record | {"view": "b.jpg"}}, 80))
+    text = console.export_text()
+    lines = text.splitlines()
+    assert len(lines) == 2 + 1 + 3, text
+    assert max(map(len, lines)) <= 80
+    first, second, third = (line.split() for line in lines[-3:])
+    assert (first[0][:4], first[0][-4:], first[2][:4], first[2][-4:]) == ("1b5d", ".jpg", "0b5d", ".jpg")
+    assert first[1] == "confident"
+    assert first[3:] == ["1170", "1382", "0.325", "0.0213", "1234", "-1981", "13.8"]
+    assert second[3:] == ["-", "-", "-", "-", "-", "-", "13.8"]  # the pose is a guess
+    assert third[:3] == ["a.jpg", "confident", "b.jpg"]

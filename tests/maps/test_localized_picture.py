@@ -1,13 +1,14 @@
 """What the picture of a photo in a map shows, read back from the figure."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from planted_model import PINHOLE, plant_model
 
-from bpnp import SceneMap
-from bpnp.maps.localized_picture import BOUND, draw_from_above, draw_matches
+from bpnp import SceneMap, Solution
+from bpnp.maps.localized_picture import BOUND, draw_from_above, draw_matches, localized_picture
 
 
 def test_matches_have_the_colour_of_their_residual_and_the_camera_stands_where_it_was_planted(tmp_path: Path) -> None:
@@ -38,3 +39,34 @@ def test_matches_have_the_colour_of_their_residual_and_the_camera_stands_where_i
     down = np.mean([view.rotation[1] for view in scene.views], axis=0)
     down /= np.linalg.norm(down)
     assert spaced == pytest.approx(np.linalg.norm(centres - down * (centres @ down)))
+
+
+def planted(folder: Path) -> tuple[SceneMap, Solution, np.ndarray]:
+    truth = plant_model(folder, camera=PINHOLE, images=3, points=140, seen=90, clutter=15)
+    scene, keypoints = SceneMap.from_colmap(folder), 520 * truth.points2d[1] + [400, 300]
+    return scene, scene.localize(keypoints, PINHOLE, views=["photo 1.jpg"]), keypoints
+
+
+def test_a_failed_photo_shows_its_keypoints_alone(tmp_path: Path) -> None:
+    scene, solution, keypoints = planted(tmp_path)
+    unknown = np.full((6, 6), np.nan)
+    failed = replace(solution, verdict="failed", reason="No pose fits.", covariance=unknown)
+    figure = localized_picture(scene, failed, title="a.jpg")
+    image, above = figure.axes  # and no colour bar
+    assert not image.collections
+    assert {len(line.get_xdata()) for line in image.lines} == {len(keypoints)}
+    assert [line.get_label() for line in above.lines if not line.get_label().startswith("_")] == ["3 views"]
+    shown = [figure.get_suptitle(), *(axes.get_title() for axes in figure.axes)]
+    assert shown == ["a.jpg\nfailed: No pose fits.", f"{len(keypoints)} keypoints", "the map from above; no pose"]
+
+
+def test_an_ambiguous_photo_stands_at_both_places(tmp_path: Path) -> None:
+    scene, solution, _ = planted(tmp_path)
+    far = replace(solution.candidates[0], translation=solution.translation - 1e6 * solution.rotation[:, 0])
+    ambiguous = replace(solution, verdict="ambiguous", candidates=(solution.candidates[0], far))
+    above = localized_picture(scene, ambiguous, title="a.jpg").axes[1]
+    stars = {line.get_label(): line.get_xydata()[0] for line in above.lines if line.get_marker() == "*"}
+    assert list(stars) == ["the photo", "or here, outside of the drawing"]
+    for x, y in stars.values():
+        assert above.get_xlim()[0] < x < above.get_xlim()[1]
+        assert above.get_ylim()[0] < y < above.get_ylim()[1]
