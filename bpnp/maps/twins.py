@@ -64,7 +64,7 @@ def best_rival(photo: Photo, solution: Solution, met: Sequence[Solution]) -> tup
     problem, rule = photo.problem, DEFAULT.evidence
     sets, scale = problem.sets, max(solution.stats.residual, problem.sets.image.scales[0])
     best = solution.rotation, solution.translation + solution.rotation @ problem.origin
-    repeated = repeated_poses(sets, *best, scale, rule)
+    repeated, _ = repeated_poses(sets, *best, scale, rule)
     met_poses = [one for other in met for one in other.candidates if one.log10_false_alarms < 0]
     poses = [(one.rotation, one.translation + one.rotation @ problem.origin) for one in met_poses]
     poses += [*zip(repeated.rotation, repeated.translation, strict=True), *_looks(photo, solution, problem)]

@@ -33,6 +33,7 @@ class Hypotheses:
         evidence: (c,) of a proposer, nats by which the matches exceed chance; None where it computes none.
         matches: (c, m) index of the scene point of each image point, -1 for none; None where no matches are fixed.
         residual: (c, m) angle of each match, radians, infinite where there is none; None likewise.
+        point_evidence: (c, m) nats by which a pose explains each image point better than chance does; None likewise.
     """
 
     rotation: NDArray[Any]
@@ -46,6 +47,7 @@ class Hypotheses:
     evidence: NDArray[np.float64] | None = None
     matches: NDArray[np.int64] | None = None
     residual: NDArray[np.float64] | None = None
+    point_evidence: NDArray[np.float64] | None = None
 
     @classmethod
     def from_poses(
@@ -65,9 +67,9 @@ class Hypotheses:
         return replace(poses, **columns) if columns else poses
 
     @classmethod
-    def empty(cls, numbers: int = 3) -> "Hypotheses":
+    def empty(cls, numbers: int = 3, dtype: type[np.floating[Any]] = np.float64) -> "Hypotheses":
         """Return no hypotheses, whose translations have this many numbers."""
-        return cls.from_poses(np.empty((0, 3, 3), np.float32), np.empty((0, numbers), np.float32))
+        return cls.from_poses(np.empty((0, 3, 3), dtype), np.empty((0, numbers), dtype))
 
     @property
     def sort_key(self) -> NDArray[np.float64]:

@@ -34,7 +34,7 @@ class Pool:
 
     def forget(self) -> None:
         """Drop all poses."""
-        self.candidates = self.surrounded = Hypotheses.empty()
+        self.candidates = self.surrounded = Hypotheses.empty(dtype=np.float32)
         self.searched: list[Hypotheses] = []
         self._around: Hypotheses | None = None
         self.missed = 0.0

@@ -144,16 +144,17 @@ def _seen_by(
         reason=result.reason,
         unit=unit_of(image, lens),
         inlier_threshold=math.nan if inlier_threshold is None else inlier_threshold,
-        stats=SolutionStats(result.turns, dropped2d=len(image) - len(usable)),
+        stats=SolutionStats(result.batches, dropped2d=len(image) - len(usable)),
         points2d=plane,
         points3d=scene,
         camera=lens,
     )
-    if not result.found:
+    found = result.candidates
+    if found.matches is None:
         return solution
-    best, seen = result.found[0], [scene @ one.rotation.T for one in result.found]
-    hit = np.flatnonzero(best.match >= 0)
-    residual = noise_of(seen[0][best.match[hit]], bearings[hit], pixel[hit])
+    seen = [scene @ rotation.T for rotation in found.rotation]
+    hit = np.flatnonzero(found.matches[0] >= 0)
+    residual = noise_of(seen[0][found.matches[0, hit]], bearings[hit], pixel[hit])
     threshold = inlier_threshold or SCALES * residual * middle * per_radian
     radius = threshold / per_radian
     i, j = one_to_one(bearings, seen[0], radius).T
@@ -166,10 +167,15 @@ def _seen_by(
     return with_pose(
         solution,
         [
-            Candidate(
-                one.rotation, np.zeros(3), float(one.decades.mean()) * math.log(10), count, one.log10_false_alarms
+            Candidate(*each)
+            for each in zip(
+                found.rotation,
+                found.translation,
+                found.log_likelihood.tolist(),
+                counts,
+                found.log10_false_alarms.tolist(),
+                strict=True,
             )
-            for one, count in zip(result.found, counts, strict=True)
         ],
         np.stack([usable[i], j], -1),
         angles * per_radian,

@@ -2,7 +2,7 @@
 
 import math
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from bpnp.search.evidence.false_alarms import SHARES, alarms_of, directions_of, point_evidence
 from bpnp.search.evidence.settings import Evidence, Repetitions
+from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.point_sets import PointSets
 from bpnp.search.propose.symmetries import Motions, matching_tolerance, mirror_pose, self_motions
 
@@ -99,28 +100,10 @@ def competing_poses(sets: PointSets, rotation: Array, translation: Array, motion
     return rotations[other], translations[other]
 
 
-class RepeatedPoses(NamedTuple):
-    """Poses that the scene's own motions confuse with one.
-
-    Attributes:
-        rotation: (c, 3, 3).
-        translation: (c, 3).
-        log10_false_alarms: (c,) of these poses as they are, not refined.
-        fraction: smallest fraction of the matched points that one of the motions maps; 1 without a motion.
-        complete: whether there are so few motions that these poses stand for all.
-    """
-
-    rotation: Array
-    translation: Array
-    log10_false_alarms: Array
-    fraction: float
-    complete: bool
-
-
 def repeated_poses(
     sets: PointSets, rotation: Array, translation: Array, scale: float, rule: Evidence, *, least: float = 0.0
-) -> RepeatedPoses:
-    """Return the poses that the scene's own motions confuse with one.
+) -> tuple[Hypotheses, Motions]:
+    """Return the poses that the scene's own motions confuse with one, and these motions.
 
     Args:
         sets: the points of a problem.
@@ -131,7 +114,7 @@ def repeated_poses(
 
     Returns:
         Those poses that a verdict takes for different from the given one (`Evidence.other_deg`), at most
-        `Repetitions.kept`, with the fewest false alarms; of a flat scene also its mirror image.
+        `Repetitions.kept`, as they are, with the fewest false alarms first; of a flat scene also its mirror image.
 
     Examples:
         >>> import numpy as np
@@ -139,17 +122,18 @@ def repeated_poses(
         >>> scene = np.concatenate([motif + [2 * k, 0, 6] for k in range(3)])
         >>> image = motif + [0, 0, 6]  # the first of three equal things
         >>> sets = PointSets(image / np.linalg.norm(image, axis=1, keepdims=True), scene)
-        >>> repeated = repeated_poses(sets, np.eye(3), np.zeros(3), 1e-3, Evidence())
-        >>> best = repeated.log10_false_alarms.argsort()[:2]
-        >>> sorted(repeated.translation[best, 0].round(6).tolist())
+        >>> repeated, _ = repeated_poses(sets, np.eye(3), np.zeros(3), 1e-3, Evidence())
+        >>> sorted(repeated.translation[:2, 0].round(6).tolist())
         [-4.0, -2.0]
     """
     motions = registered(sets, rotation, translation, scale, rule).mapping(least)
     rotations, translations = competing_poses(sets, rotation, translation, motions, rule)
-    alarms = alarms_of(sets, rotations, translations, np.full(len(rotations), scale)).own
-    best = np.argsort(alarms, kind="stable")[: rule.repetitions.kept]
-    fraction = float(motions.fraction.min(initial=1.0))
-    return RepeatedPoses(rotations[best], translations[best], alarms[best], fraction, motions.complete)
+    scales = np.full(len(rotations), scale)
+    alarms = alarms_of(sets, rotations, translations, scales).own
+    poses = Hypotheses.from_poses(
+        rotations, translations, scale=scales, log10_false_alarms=alarms, log10_rough=alarms.copy()
+    )
+    return poses[np.argsort(alarms, kind="stable")[: rule.repetitions.kept]], motions
 
 
 def decades_behind(

@@ -167,19 +167,18 @@ def _against_repetitions(
         return result
     best, scale = result.best, max(result.residual, sets.image.scales[0])
     least = rule.repetitions.symmetric if contested else 0.0
-    repeated = repeated_poses(sets, *best, scale, rule, least=least)
-    if not len(repeated.rotation):
+    repeated, motions = repeated_poses(sets, *best, scale, rule, least=least)
+    if not len(repeated):
         return result
     poses, limits = (repeated.rotation, repeated.translation), rule.repetitions
     if contested:
-        scales, alarms = np.full(len(poses[0]), scale), repeated.log10_false_alarms
-        rivals = replace(Hypotheses.from_poses(*poses), scale=scales, log10_false_alarms=alarms, log10_rough=alarms)
+        rivals = repeated
         limits = replace(limits, most_missing=1e-12)
     else:
         rivals = with_false_alarms(polished(entered(), *poses, scale), sets)
     others = rivals.rotation, rivals.translation
-    behind = decades_behind(sets, best, poses, others, scale, limits, fraction=repeated.fraction)
-    behind = np.maximum(behind, 0) if repeated.complete else np.zeros(len(rivals))
+    behind = decades_behind(sets, best, poses, others, scale, limits, fraction=float(motions.fraction.min(initial=1.0)))
+    behind = np.maximum(behind, 0) if motions.complete else np.zeros(len(rivals))
     if contested and (behind >= rule.lead).all():
         return result
     alarms = np.minimum(rivals.log10_false_alarms, result.log10_false_alarms + behind)

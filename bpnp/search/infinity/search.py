@@ -14,11 +14,13 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import betaln
 
 from bpnp.loops.parallel import NEVER, Deadline
 from bpnp.search.evidence import reasons
+from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.infinity.evidence import (
     FIXING,
     Array,
@@ -45,7 +47,7 @@ from bpnp.search.infinity.kernels import (
 )
 from bpnp.search.kernels.neighbours import hashed
 from bpnp.search.settings import DEFAULT as SEARCH
-from bpnp.search.verdict import Verdict
+from bpnp.search.verdict import SearchResult, no_pose
 
 BINS = (6, 7)  # log2 of the fewest and most bins of azimuths
 
@@ -103,37 +105,6 @@ class InfinitySettings:
 DEFAULT = InfinitySettings()
 
 
-@dataclass(frozen=True, eq=False)
-class Rotated:
-    """A rotation (3, 3), camera = R d, and how it explains m image points: place of each one's direction, -1 for none,
-    squared distance in squared pixels, decades of evidence; the nats by which its matches are likelier than by chance,
-    as `fit` counts them; log10 of its false alarms."""
-
-    rotation: Array
-    match: Labels
-    squared: Array
-    decades: Array
-    nats: float
-    log10_false_alarms: float
-
-
-@dataclass(frozen=True, eq=False)
-class RotationResult:
-    """The rotations that were met, the best first, and what is to be said of that one; see `bpnp.search.verdict`.
-
-    turns: image points that were tried.
-    """
-
-    found: list[Rotated]
-    verdict: Verdict
-    reason: str
-    turns: int = 0
-
-    @property
-    def log10_false_alarms(self) -> float:
-        return self.found[0].log10_false_alarms if self.found else math.inf
-
-
 class Sight(NamedTuple):
     """One problem at one noise: what is looked for where."""
 
@@ -177,15 +148,25 @@ def search_rotation(
     seed: int = 0,
     deadline: Deadline = NEVER,
     settings: InfinitySettings = DEFAULT,
-) -> RotationResult:
-    """The rotation under which image points (m) see unit directions (n, 3).
+) -> SearchResult:
+    """Search the rotation under which image points see directions.
 
-    scores (m,): points with the largest ones are tried first. noise: standard deviation of the image points,
-    pixels, if it is known. zooms: of a focal length that is one of several, the log of the largest over the smallest.
+    Args:
+        image: Image points (m).
+        directions: (n, 3) unit vectors.
+        scores: (m,) points with the largest ones are tried first.
+        noise: Standard deviation of the image points, pixels; None if it is unknown.
+        zooms: Logarithm of the largest over the smallest focal length, of one that is one of several.
+        seed: Of the order in which points are tried.
+        deadline: When to stop.
+        settings: Constants.
+
+    Returns:
+        The verdict and the rotations, with translations of 0; `batches` is the number of image points that were tried.
     """
     catalogue, sample = catalogue_of(directions), np.random.default_rng(seed).permutation(len(image.bearings))
     density = float(np.median(catalogue.density))
-    result, turns = RotationResult([], "failed", "no rotation was found"), 0
+    result, turns = no_pose("no rotation was found"), 0
     for scale in settings.noise if noise is None else (noise,):
         if turns and deadline.passed():
             break
@@ -204,24 +185,25 @@ def search_rotation(
             settings,
         )
         new = _search(sight, scores, seed, deadline)
-        turns += new.turns
+        turns += new.batches
         if new.log10_false_alarms <= result.log10_false_alarms:
             result = new
-        if result.verdict != "failed" and noise_of(*_matches(sight, result.found[0])) < settings.rougher * scale:
+        if result.verdict != "failed" and noise_of(*_matches(sight, result.candidates)) < settings.rougher * scale:
             break
-    return replace(result, turns=turns)
+    return replace(result, batches=turns)
 
 
-def _matches(sight: Sight, one: Rotated) -> tuple[Array, Array, Array]:
-    """Of a rotation: directions in the camera (k, 3), bearings (k, 3) and angles of a pixel (k,)."""
-    hit = np.flatnonzero(one.match >= 0)
-    seen = sight.catalogue.directions[one.match[hit]] @ one.rotation.T
-    return seen, sight.image.bearings[hit], sight.image.pixel[hit]
+def _matches(sight: Sight, found: Hypotheses) -> tuple[Array, Array, Array]:
+    """Return the matches of the best rotation: directions in the camera (k, 3), bearings (k, 3) and angles of a pixel
+    (k,)."""
+    assert found.matches is not None
+    matched = np.flatnonzero(found.matches[0] >= 0)
+    seen = sight.catalogue.directions[found.matches[0, matched]] @ found.rotation[0].T
+    return seen, sight.image.bearings[matched], sight.image.pixel[matched]
 
 
-def _search(sight: Sight, scores: Array | None, seed: int, deadline: Deadline) -> RotationResult:
-    settings, count = sight.settings, len(sight.image.bearings)
-    found: list[Rotated] = []
+def _search(sight: Sight, scores: Array | None, seed: int, deadline: Deadline) -> SearchResult:
+    settings, count, found = sight.settings, len(sight.image.bearings), Hypotheses.empty()
     order, tried = np.random.default_rng(seed).permutation(count), 0
     tree = cKDTree(sight.image.bearings, balanced_tree=False)
     if scores is not None:
@@ -236,7 +218,7 @@ def _search(sight: Sight, scores: Array | None, seed: int, deadline: Deadline) -
         some = np.union1d(near, sight.sample)
         for rotation, farthest in _agreeing(sight, i, around, rays, bins):
             one = _fitted(sight, rotation, near, farthest, some, found)
-            found = found if one is None else _merged(found, one, sight)
+            found = found if one is None else _merge(found, one, sight)
         result = _judged(found, sight, tried)
         least = max(math.ceil(settings.least_share * count), FIXING + 1)
         hopeless = log10_missed(tried, count, least, settings.power) <= SEARCH.evidence.missed
@@ -299,12 +281,14 @@ def _agreeing(sight: Sight, i: int, around: Labels, rays: Rays, bins: int) -> It
 
 
 def _fitted(
-    sight: Sight, rotation: Array, near: Labels, farthest: int, some: Labels, found: list[Rotated]
-) -> Rotated | None:
-    """A rotation fitted to the points near a first one, then to some others, and to all of them; None where it does not
-    contest the best one that was found, or is one of those.
+    sight: Sight, rotation: Array, near: Labels, farthest: int, some: Labels, found: Hypotheses
+) -> Hypotheses | None:
+    """Fit a rotation to the points near a first one, then to some others, and to all of them.
 
     It is known as well as two points fix it, the first and the farthest that agrees.
+
+    Returns:
+        The rotation (1,); None where it does not compete with the best one that was found, or is one of those.
     """
     image, settings, m = sight.image, sight.settings, len(sight.image.bearings)
     two, weight = image.bearings[[near[0], farthest]], image.pixel[[near[0], farthest]] ** -2.0
@@ -312,8 +296,8 @@ def _fitted(
     state, scratch = Fit(rotation, known, np.full(m, -1), np.full(m, np.inf)), np.empty((4, 3))
     fit(image, near, sight.sky, sight.reach, settings.rounds, state, scratch)
     nats = fit(image, some, sight.sky, sight.reach, settings.last_rounds, state, scratch)
-    best = max(settings.contests * found[0].nats * len(some) / m, 0.0) if found else 0.0
-    if nats <= best or any(_is_same(sight, one.rotation, state.rotation, some) for one in found):
+    best = 0.0 if found.evidence is None else max(settings.contests * float(found.evidence[0]) * len(some) / m, 0.0)
+    if nats <= best or _is_same(sight, found.rotation, state.rotation, some).any():
         return None
     nats = fit(image, np.arange(m), sight.sky, sight.reach, settings.last_rounds, state, scratch)
     if (state.match >= 0).sum() <= FIXING:
@@ -321,52 +305,60 @@ def _fitted(
     left, _, right = np.linalg.svd(state.rotation)
     squared = np.where(state.match >= 0, state.squared, np.inf)
     alarms, decades = log10_false_alarms(squared, sight.catalogue.density[state.match], sight.known)
-    return Rotated(left @ right, state.match, squared, decades, nats, alarms)
+    return Hypotheses.from_poses(
+        (left @ right)[None],
+        np.zeros((1, 3)),
+        log_likelihood=math.log(10) * decades.mean(keepdims=True),
+        match_count=(state.match >= 0).sum(keepdims=True),
+        log10_false_alarms=np.array([alarms]),
+        evidence=np.array([nats]),
+        matches=state.match[None],
+        residual=(np.sqrt(squared) * image.pixel)[None],
+        point_evidence=math.log(10) * decades[None],
+    )
 
 
-def _is_same(sight: Sight, one: Array, other: Array, places: Labels) -> bool:
-    """Whether two rotations see some points alike, to within the reach."""
-    limit = sight.reach * float(np.median(sight.image.pixel[places]))
-    return bool((np.linalg.norm(sight.image.bearings[places] @ (one - other), axis=-1) < limit).all())
+def _is_same(sight: Sight, rotations: Array, other: Array, indices: Labels) -> NDArray[np.bool_]:
+    """Return which of rotations (c, 3, 3) see some points where another one does, to within the reach."""
+    limit = sight.reach * float(np.median(sight.image.pixel[indices]))
+    return np.asarray((np.linalg.norm(sight.image.bearings[indices] @ (rotations - other), axis=-1) < limit).all(-1))
 
 
-def _merged(found: list[Rotated], new: Rotated, sight: Sight) -> list[Rotated]:
-    """With a rotation more, the best first; of those that are the same the best, and of those that chance explains none
-    but a first one."""
-    every = np.arange(len(sight.image.bearings))
-    alike = [one for one in found if _is_same(sight, one.rotation, new.rotation, every)]
-    if any(one.log10_false_alarms <= new.log10_false_alarms for one in alike):
+def _merge(found: Hypotheses, new: Hypotheses, sight: Sight) -> Hypotheses:
+    """Return the rotations with another one (1,), the best first; of those that are the same the best, and of those
+    that are not significant none but a first one."""
+    alike = _is_same(sight, found.rotation, new.rotation[0], np.arange(len(sight.image.bearings)))
+    if (found.log10_false_alarms[alike] <= new.log10_false_alarms).any():
         return found
-    rest = [one for one in found if not any(one is other for other in alike)]
-    first, *others = sorted([*rest, new], key=lambda one: one.log10_false_alarms)
-    return [first, *(one for one in others if one.log10_false_alarms <= 0)][: SEARCH.kept]
+    every = Hypotheses.concatenate([found[~alike], new]) if len(found) else new
+    every = every[np.argsort(every.log10_false_alarms, kind="stable")]
+    return every[(every.log10_false_alarms <= 0) | (np.arange(len(every)) == 0)][: SEARCH.kept]
 
 
-def _judged(found: list[Rotated], sight: Sight, turns: int) -> RotationResult:
-    """The verdict on rotations, best first, by the rules of `bpnp.search.verdict`."""
+def _judged(found: Hypotheses, sight: Sight, turns: int) -> SearchResult:
+    """Judge rotations, best first, by the rules of `bpnp.search.verdict`."""
     rule = SEARCH.evidence
-    if not found:
-        return RotationResult(found, "failed", "no rotation was found", turns)
-    best = found[0]
-    alarms = best.log10_false_alarms
+    if found.matches is None or found.point_evidence is None:
+        return no_pose("no rotation was found", turns)
+    alarms = float(found.log10_false_alarms[0])
     if alarms > 0:
-        return RotationResult(found, "failed", reasons.against("no rotation fits better than chance", alarms), turns)
-    hit = np.flatnonzero(best.match >= 0)
-    worth = best.decades[hit]
+        return SearchResult(found, "failed", reasons.against("no rotation fits better than chance", alarms), turns)
+    hit = np.flatnonzero(found.matches[0] >= 0)
+    worth = found.point_evidence[0, hit] / math.log(10)
     most = float(worth.mean() + 2 * worth.std() / math.sqrt(len(hit)))  # that a match of an alternative may be worth
     least = max(math.ceil((float(worth.sum()) - rule.lead) / most), FIXING + 1)
     count = len(sight.image.bearings)
     missed = log10_missed(turns, count, min(least, count), sight.settings.power)
-    lead = found[1].log10_false_alarms - alarms if len(found) > 1 else math.inf
+    lead = float(found.log10_false_alarms[1]) - alarms if len(found) > 1 else math.inf
     doubt = known = None
     if alarms > rule.false_alarms:
-        return RotationResult(found, "ambiguous", reasons.insignificant(alarms, rule.false_alarms), turns)
+        return SearchResult(found, "ambiguous", reasons.insignificant(alarms, rule.false_alarms), turns)
     if lead < rule.lead:
         doubt = f"another rotation fits about as well (margin {lead:.1f} decades)"
     elif missed > rule.missed:
         doubt = f"a better rotation may exist (miss probability up to {reasons.number(missed)})"
     else:  # what costs more is asked only where the verdict depends on it
-        seen, bearings, pixel = _matches(sight, best)
+        seen, bearings, pixel = _matches(sight, found)
         some = np.linspace(0, len(hit) - 1, min(len(hit), sight.settings.strained)).astype(np.int64)
         known = how_well_known(seen, bearings, pixel)
         strain = strain_of(seen[some], bearings[some], pixel[some], sight.image.bearings)
@@ -375,6 +367,6 @@ def _judged(found: list[Rotated], sight: Sight, turns: int) -> RotationResult:
         elif not math.isfinite(known.bound):
             doubt = f"its {len(hit)} matches do not fix it"
     if doubt is not None or known is None:
-        return RotationResult(found, "ambiguous", reasons.against(doubt or "", alarms), turns)
+        return SearchResult(found, "ambiguous", reasons.against(doubt or "", alarms), turns)
     reason = reasons.confident(alarms, rule.lead, math.degrees(known.bound))
-    return RotationResult(found, "confident", reason, turns)
+    return SearchResult(found, "confident", reason, turns)

@@ -179,7 +179,7 @@ class Together:
         if result.verdict == "confident":
             strongest, seen = self._strongest()
             known = seen.rotation[0], seen.translation[0], float(seen.scale[0])
-            repeated = repeated_poses(self.rig.sets[strongest], *known, self.rule)
+            repeated, _ = repeated_poses(self.rig.sets[strongest], *known, self.rule)
             turns, shifts = repeated.rotation, repeated.translation
             self._add(self.rig.candidates(*self.rig.rig_of(strongest, turns, shifts, self.best.translation[0, 3])))
             result = self._judged()
