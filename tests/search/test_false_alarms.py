@@ -7,10 +7,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from planted import directions
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from bpnp.search import point_sets
-from bpnp.search.evidence.false_alarms import alarms_of, log10_cells, point_evidence
+from bpnp.search.evidence.false_alarms import (
+    alarms_of,
+    camera_terms,
+    directions_of,
+    log10_cells,
+    log10_nfa,
+    point_evidence,
+)
+from bpnp.search.infinity.evidence import background_of, log10_false_alarms
 from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import GravityPrior, PosePrior
 
@@ -138,3 +147,34 @@ def test_an_image_point_whose_label_no_scene_point_has_is_an_outlier(
             logs = point_evidence(sets, directions(points), np.array([1e-3]), np.array([0.75]), even=even)
         assert logs[0, 0, 0] == pytest.approx(math.log(0.25))
         assert (logs[1:] > 0).all()
+
+
+def test_the_bound_of_markov_holds_for_rotations() -> None:
+    """Image points and directions that have nothing to do with each other: without the number of tests, the evidence of
+    a rotation exceeds b with a probability of at most 1 / b."""
+    rng, exceeded, count = np.random.default_rng(0), 0, 400
+    pixel = np.full(12, 1e-3)
+    for _ in range(count):
+        rays, sky = scattered(rng, 12, 0.2), directions(rng.standard_normal((3000, 3)))
+        known = background_of(rays, pixel, len(sky), 8.0)
+        chord, nearest = cKDTree(sky).query(rays)
+        density = np.full(len(rays), len(sky) / (4 * np.pi))
+        nfa, of_points = log10_false_alarms((chord / pixel) ** 2, density, known)
+        assert of_points.shape == (12,)
+        exceeded += float(known.log_tests.max()) / np.log(10) - nfa > 1
+    assert exceeded <= 0.1 * count + 3 * np.sqrt(0.09 * count)
+
+
+def test_the_false_alarms_of_independent_cameras_multiply() -> None:
+    """Two cameras that see the same: the evidence is that of one squared, with the matches that fix the pose left out
+    in one of them; each match that is left out costs evidence."""
+    rays, points, rotation = planted(np.random.default_rng(3), 30)
+    sets = PointSets(rays, points, floor=2e-4)
+    terms = camera_terms(sets, directions_of(sets, rotation, SHIFT), 4e-4)
+    assert terms is not None
+    whole, without = (terms.evidence(count)[0] / math.log(10) for count in (0, 3))
+    assert without < whole - 1
+    assert log10_nfa([terms], 5.0, [[3]])[0] == pytest.approx(5 - without)
+    assert log10_nfa([terms, terms], 5.0, [[3, 0], [0, 3]])[0] == pytest.approx(5 - whole - without)
+    assert log10_nfa([terms, None], 5.0, [[3, 0], [0, 3]])[0] == pytest.approx(5 - without)
+    assert log10_nfa([None], 5.0, [[3]]) == (5.0, 5.0)

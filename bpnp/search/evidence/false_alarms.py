@@ -36,7 +36,7 @@ the evidence of dense points, whose neighbours lie as close as their residuals.
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,13 +47,76 @@ from bpnp.search.point_sets import ImageStatistics, PointSets, faces, label_grou
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
 
-FIXING = 3  # matches that fix a pose; one more fixes a focal length too
+FIXING = 3  # matches that fix a pose; one more fixes a focal length or the scale of a rig's scene too
+FIXING_ROTATION = 2  # matches that fix a rotation
 SHARES = np.array([0.15, 0.4, 0.75])  # w
 LEAST_SHARE, MOST_SHARE = 0.02, 0.98  # of w where clutter or scores are given
 OUTLINE = 0.5  # width of the smoothing of l, in spreads of the bearings: the outline is no evidence beyond it
 MOST_SMOOTHED = 256  # projected points from which l is estimated
 FARTHEST = math.sqrt(18.0)  # distance over s beyond which a pair adds nothing to g
 OWN, ROUGH = 2.0, 4.0  # factors of the scale of a pose's residuals within which s is its own, and beyond which rougher
+
+
+class Terms(NamedTuple):
+    """Evidence of the k image points of one camera for a pose, at S scales and W fractions.
+
+    Attributes:
+        logs: (k, S, W) log x_i / c_i, clumps weighted.
+        together: (k, S) c_i.
+        own: (S,) True at the scales of the residuals of the pose.
+        rough: (S,) True at scales far beyond them.
+        pairs: Number of pairs (s, w) over which the mean is taken, those of finer scales that are left out among them.
+        fewer: (S,) log of the number of tests at each scale, over the number of all.
+    """
+
+    logs: Array
+    together: NDArray[Any]
+    own: NDArray[np.bool_]
+    rough: NDArray[np.bool_]
+    pairs: int
+    fewer: Array
+
+    def by_scale(self, left_out: int) -> Array:
+        """Return log of sum_w prod_i x_i^(1 / c_i) / pairs at each scale (S,), without the largest x_i."""
+        evidence = self.logs.sum(0) - sum_of_largest(self.logs * self.together[:, :, None], left_out)
+        return np.asarray(np.logaddexp.reduce(evidence, 1) - math.log(self.pairs) - self.fewer)
+
+    def of_points(self) -> Array:
+        """Return the logs (k,) at the own scale and the fraction with the largest sum."""
+        own = self.logs[:, self.own].reshape(len(self.logs), -1)
+        return np.asarray(own[:, own.sum(0).argmax()])
+
+    def evidence(self, left_out: int) -> Array:
+        """Return the log of the evidence at the own scales and at the rough ones (2,), without the largest x_i."""
+        each = self.by_scale(left_out)
+        return np.array([np.logaddexp.reduce(each[some], initial=-math.inf) for some in (self.own, self.rough)])
+
+
+def log10_nfa(
+    cameras: Sequence[Terms | None], log10_tests: float, fixing: Sequence[Sequence[int]]
+) -> tuple[float, float]:
+    """Compute the logarithm of the number of false alarms of a pose.
+
+        NFA = T / prod_cameras mean_{s, w} prod_i x_i^(1 / c_i)
+
+    It is the same for a rotation, a pose, a pose with a focal length and a rig; these differ in the number T of tests
+    and in how many matches fix them, which are no evidence.
+
+    Args:
+        cameras: Evidence of each camera, which are independent; None for a camera without any.
+        log10_tests: Logarithm of the number of tests.
+        fixing: Ways to choose the matches that fix the pose, each as their number in each camera. The way that leaves
+            least evidence counts.
+
+    Returns:
+        Logarithms at the scales of the residuals, and at rougher ones.
+    """
+    counts = {count for way in fixing for count in way}
+    none = np.zeros(2)
+    each = [{count: none if one is None else one.evidence(count) for count in counts} for one in cameras]
+    ways = [sum((known[count] for known, count in zip(each, way, strict=True)), none) for way in fixing]
+    own, rough = log10_tests - np.min(ways, 0) / math.log(10)
+    return float(own), float(rough)
 
 
 class Alarms(NamedTuple):
@@ -87,9 +150,8 @@ def alarms_of(sets: PointSets, rotations: Array, translations: Array, scales: Ar
         # Fewer tests at a scale are as much more evidence, but a pose has no less chance than all of them.
         fewer = math.log(10) * (np.maximum(cells + share[k], 0.0) - none[k])
         scale = None if scales is None else float(scales[k])
-        own, rough = log_evidence_of(sets, seen, scale, [_fixing(sets)], fewer)[0]
-        result.own[k] -= own / math.log(10)
-        result.rough[k] -= rough / math.log(10)
+        terms = camera_terms(sets, seen, scale, fewer=fewer)
+        result.own[k], result.rough[k] = log10_nfa([terms], float(none[k]), [[_fixing(sets)]])
     return Alarms(result.own + sets.log10_views, result.rough + sets.log10_views)
 
 
@@ -143,6 +205,14 @@ def log10_cells(image: ImageStatistics) -> Array:
     return np.asarray(np.log10(np.maximum(cells, 1.0)))
 
 
+def log10_rotations(spread: float, scales: Array) -> Array:
+    """Return log10 (S,) of the number of rotations that differ at each scale s of an image: 8 pi^2 h / s^3.
+
+    4 pi / s^2 directions of the axis, and 2 pi h / s rotations about it, which move points h off it by s.
+    """
+    return np.asarray(np.log10(np.maximum(8 * math.pi**2 * spread / scales**3, 1.0)))
+
+
 def directions_of(sets: PointSets, rotation: Array, translation: Array) -> Array:
     """Unit directions (n, 3) in the camera's frame; NaN for a point in the camera or facing away."""
     camera = sets.points3d @ rotation.T + translation
@@ -153,37 +223,41 @@ def directions_of(sets: PointSets, rotation: Array, translation: Array) -> Array
     return seen
 
 
-def log_evidence_of(
-    sets: PointSets, seen: Array, scale: float | None, fixing: Sequence[int], tests: Array | float = 0.0
-) -> Array:
-    """(f, 2) log of the evidence of one camera for points seen in directions (n, 3), without each of these numbers of
-    largest terms: at the scales of the residuals, or all of them if that is None, and at rougher ones; less the `tests`
-    (S,) of each scale."""
-    if min(len(sets.bearings), int(np.isfinite(seen[:, 0]).sum())) <= max(FIXING, *fixing):
-        return np.zeros((len(fixing), 2))
+def camera_terms(
+    sets: PointSets, seen: Array, scale: float | None = None, *, fewer: Array | float = 0.0
+) -> Terms | None:
+    """Return the evidence of one camera for points seen in directions.
+
+    Args:
+        sets: Points of the problem.
+        seen: (n, 3) unit directions, NaN for points that are not seen.
+        scale: Scale of the residuals, radians; None counts all scales as their own.
+        fewer: (S,) log of the number of tests at each scale of the image, over the number of all.
+
+    Returns:
+        The terms from the finest own scale on; None where no more points are seen than fix the pose.
+    """
+    if min(len(sets.bearings), int(np.isfinite(seen[:, 0]).sum())) <= _fixing(sets):
+        return None
     ratio = np.ones(len(sets.image.scales)) if scale is None else _ratio(sets.image, scale)
     own, rough = _is_own(ratio), ratio >= ROUGH
     finest = int(own.argmax())
-    terms = _terms(sets, seen, finest)
-    every = (_log_evidence(sets, terms, finest, count) - tests for count in fixing)
-    return np.array([[np.logaddexp.reduce(one[some], initial=-math.inf) for some in (own, rough)] for one in every])
+    logs, less = _terms(sets, seen, finest), np.broadcast_to(fewer, own.shape)[finest:]
+    pairs = len(own) * logs.shape[2]
+    return Terms(logs, sets.image.together[:, finest:], own[finest:], rough[finest:], pairs, less)
 
 
 def own_evidence(sets: PointSets, rotation: Array, translation: Array, scale: float) -> Array:
-    """log x_i / c_i (k,) of each chosen image point under a pose, clumps weighted, at the share and the s within a
-    factor of two of the scale of its residuals, radians, at which their sum is largest."""
-    own = np.flatnonzero(_is_own(_ratio(sets.image, scale)))
-    terms = _terms(sets, directions_of(sets, rotation, translation), int(own[0]))[:, : len(own)]
-    terms = terms.reshape(len(terms), -1)
-    return np.asarray(terms[:, terms.sum(0).argmax()])
+    """Return log x_i / c_i (k,) of each chosen image point under a pose, clumps weighted, at the fraction and the s
+    within a factor of two of the scale of its residuals, radians, at which their sum is largest."""
+    terms = camera_terms(sets, directions_of(sets, rotation, translation), scale)
+    return np.zeros(len(sets.image.chosen)) if terms is None else terms.of_points()
 
 
 def likeliest_scale(sets: PointSets, rotation: Array, translation: Array) -> float:
-    """Scale of the residuals, radians, at which a pose has the fewest false alarms; the largest if it sees nothing."""
-    seen = directions_of(sets, rotation, translation)
-    if int(np.isfinite(seen[:, 0]).sum()) <= FIXING or len(sets.bearings) <= FIXING:
-        return float(sets.image.scales[-1])
-    return float(sets.image.scales[_log_evidence(sets, _terms(sets, seen, 0), 0).argmax()])
+    """Return the scale of the residuals, radians, with the most evidence; the largest if a pose sees nothing."""
+    terms = camera_terms(sets, directions_of(sets, rotation, translation))
+    return float(sets.image.scales[-1 if terms is None else terms.by_scale(_fixing(sets)).argmax()])
 
 
 def _ratio(image: ImageStatistics, scale: float) -> Array:
@@ -213,15 +287,6 @@ def _terms(sets: PointSets, seen: Array, finest: int) -> Array:
     return np.asarray(
         image.weights[:, finest:, finest:] @ point_evidence(sets, seen, image.scales[finest:], _shares(sets))
     )
-
-
-def _log_evidence(sets: PointSets, terms: Array, finest: int, left_out: int | None = None) -> Array:
-    """log of sum_w prod_i x_i^(1 / c_i) / (S W), clumps weighted and the largest x_i left out, at each of S scales, of
-    `_terms` (k, S', W); -inf at the scales before the finest one, which are not looked at."""
-    image, count = sets.image, _fixing(sets) if left_out is None else left_out
-    evidence = terms.sum(0) - sum_of_largest(terms * image.together[:, finest:, None], count)
-    total = np.logaddexp.reduce(evidence, 1) - math.log(len(image.scales) * evidence.shape[1])
-    return np.r_[np.full(finest, -math.inf), total]
 
 
 def sum_of_largest(values: Array, count: int) -> Array:

@@ -1,8 +1,8 @@
 """How likely a rotation fits by chance, how well it is known, and whether the camera is to blame.
 
-The number of false alarms is that of `bpnp.search.evidence.false_alarms` for three unknowns: an unrelated image point
-f_i falls with the density l_i of the directions around it; a rotation that explains a share w of the points with
-residuals of s predicts
+The number of false alarms is that of `bpnp.search.evidence.false_alarms` (`log10_nfa`) for three unknowns: an unrelated
+image point f_i falls with the density l_i of the directions around it; a rotation that explains a fraction w of the
+points with residuals of s predicts
 
     x_i = 1 - w + w exp(-r_i^2 / 2 s^2) / (2 pi s^2 l_i),
 
@@ -26,14 +26,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc, stdtrit
 
-from bpnp.search.evidence.false_alarms import sum_of_largest
+from bpnp.search.evidence.false_alarms import FIXING_ROTATION, SHARES, Terms, log10_nfa, log10_rotations
 from bpnp.search.evidence.uncertainty import EXCEEDED, ONE_SIGMA, STRAINS, exceeded_once
 from bpnp.search.kernels.neighbours import sums_near
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
-FIXING = 2  # matches that fix a rotation
-SHARES = np.array([0.15, 0.4, 0.75])  # w
 STEPS = 5  # scales s, each half of the one before, from the largest noise that is searched for
 
 
@@ -52,28 +50,32 @@ def background_of(bearings: Array, pixel: Array, count: int, noise: float, zooms
     of the largest over the smallest one."""
     m, scales = len(bearings), np.asarray(noise * 0.5 ** np.arange(STEPS), np.float64)
     spread = float(np.sqrt(((bearings - bearings.mean(0)) ** 2).sum(-1).mean()))
-    cells = 8 * math.pi**2 * spread / (scales * np.median(pixel)) ** 3
-    focal_lengths = np.maximum(zooms * spread / (scales * np.median(pixel)), 1.0)  # that can be told apart
-    cells = cells * focal_lengths
-    tests = np.log(np.maximum(np.minimum(cells, m * (m - 1) / 2 * count * (count - 1)), 1.0))
+    radians = scales * np.median(pixel)
+    cells = math.log(10) * log10_rotations(spread, radians)
+    focal_lengths = np.log(np.maximum(zooms * spread / radians, 1.0))  # that differ
+    tests = np.minimum(cells + focal_lengths, math.log(max(m * (m - 1) / 2 * count * (count - 1), 1.0)))
     axes = np.linalg.svd(bearings - bearings.mean(0), full_matrices=False)[2][:2].T
     together = sums_near(bearings, bearings, axes, 2 * scales[::-1] * np.median(pixel), np.zeros(STEPS))
     return Background(scales, tests, together[:, ::-1], pixel)
 
 
 def log10_false_alarms(squared: Array, density: Array, known: Background) -> tuple[float, Array]:
-    """log10 NFA of a rotation, and the decades (m,) of each image point at the scale and share where it is largest.
+    """Compute the logarithm of the number of false alarms of a rotation.
 
-    squared (m,): squared distances in squared pixels to the nearest directions, inf beyond reach; density (m,): of
-    these, a steradian.
+    Args:
+        squared: (m,) squared distances to the nearest directions, in squared pixels; infinite beyond reach.
+        density: (m,) of these, a steradian.
+        known: What chance gives.
+
+    Returns:
+        log10 NFA, and the log x_i / c_i (m,) of each image point at the scale and fraction with the largest sum.
     """
     width = known.scales * known.pixel[:, None]
     ratio = np.exp(-0.5 * squared[:, None] / known.scales**2) / (2 * math.pi * width**2 * density[:, None])
-    terms = np.log(1 - SHARES + SHARES * ratio[:, :, None]) / known.together[:, :, None]
-    evidence = terms.sum(0) - sum_of_largest(terms, FIXING) - known.log_tests[:, None]
-    best = np.unravel_index(evidence.argmax(), evidence.shape)
-    mean = np.logaddexp.reduce(evidence, None) - math.log(evidence.size)
-    return -float(mean) / math.log(10), terms[:, best[0], best[1]] / math.log(10)
+    logs = np.log(1 - SHARES + SHARES * ratio[:, :, None]) / known.together[:, :, None]
+    every, most = np.ones(len(known.scales), np.bool_), float(known.log_tests.max())
+    terms = Terms(logs, known.together, every, ~every, len(every) * len(SHARES), known.log_tests - most)
+    return log10_nfa([terms], most / math.log(10), [[FIXING_ROTATION]])[0], terms.of_points()
 
 
 class Known(NamedTuple):

@@ -20,9 +20,9 @@ from scipy.special import betaln
 
 from bpnp.loops.parallel import NEVER, Deadline
 from bpnp.search.evidence import reasons
+from bpnp.search.evidence.false_alarms import FIXING_ROTATION
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.infinity.evidence import (
-    FIXING,
     Array,
     Background,
     Labels,
@@ -211,7 +211,7 @@ def _search(sight: Sight, scores: Array | None, seed: int, deadline: Deadline) -
     result = _judged(found, sight, tried)
     for i in order.tolist():
         around, rays, bins = _rays(sight, i, tree)
-        if len(around) < FIXING:
+        if len(around) < FIXING_ROTATION:
             continue
         tried += 1
         near = np.r_[i, around]
@@ -220,7 +220,7 @@ def _search(sight: Sight, scores: Array | None, seed: int, deadline: Deadline) -
             one = _fitted(sight, rotation, near, farthest, some, found)
             found = found if one is None else _merge(found, one, sight)
         result = _judged(found, sight, tried)
-        least = max(math.ceil(settings.least_share * count), FIXING + 1)
+        least = max(math.ceil(settings.least_share * count), FIXING_ROTATION + 1)
         hopeless = log10_missed(tried, count, least, settings.power) <= SEARCH.evidence.missed
         if result.verdict == "confident" or (result.verdict == "failed" and hopeless):
             break
@@ -273,7 +273,7 @@ def _agreeing(sight: Sight, i: int, around: Labels, rays: Rays, bins: int) -> It
     for a, c in zip(places.tolist(), bin_of.tolist(), strict=True):
         chord, turned = neighbours.chord[a], ((neighbours.azimuth[a] - azimuth) & (TURN - 1)) >> shift
         agrees = (chord >= low) & (chord <= high) & ((c - turned) & (bins - 1) < 2)
-        if agrees.any(1).sum() >= FIXING:
+        if agrees.any(1).sum() >= FIXING_ROTATION:
             k, e = np.nonzero(agrees)
             seen, directions = np.r_[i, around[k]], np.r_[a, neighbours.place[a, e]]
             left, _, right = np.linalg.svd(sight.image.bearings[seen].T @ sight.catalogue.directions[directions])
@@ -300,21 +300,21 @@ def _fitted(
     if nats <= best or _is_same(sight, found.rotation, state.rotation, some).any():
         return None
     nats = fit(image, np.arange(m), sight.sky, sight.reach, settings.last_rounds, state, scratch)
-    if (state.match >= 0).sum() <= FIXING:
+    if (state.match >= 0).sum() <= FIXING_ROTATION:
         return None
     left, _, right = np.linalg.svd(state.rotation)
     squared = np.where(state.match >= 0, state.squared, np.inf)
-    alarms, decades = log10_false_alarms(squared, sight.catalogue.density[state.match], sight.known)
+    alarms, nats_of_points = log10_false_alarms(squared, sight.catalogue.density[state.match], sight.known)
     return Hypotheses.from_poses(
         (left @ right)[None],
         np.zeros((1, 3)),
-        log_likelihood=math.log(10) * decades.mean(keepdims=True),
+        log_likelihood=nats_of_points.mean(keepdims=True),
         match_count=(state.match >= 0).sum(keepdims=True),
         log10_false_alarms=np.array([alarms]),
         evidence=np.array([nats]),
         matches=state.match[None],
         residual=(np.sqrt(squared) * image.pixel)[None],
-        point_evidence=math.log(10) * decades[None],
+        point_evidence=nats_of_points[None],
     )
 
 
@@ -346,7 +346,7 @@ def _judged(found: Hypotheses, sight: Sight, turns: int) -> SearchResult:
     hit = np.flatnonzero(found.matches[0] >= 0)
     worth = found.point_evidence[0, hit] / math.log(10)
     most = float(worth.mean() + 2 * worth.std() / math.sqrt(len(hit)))  # that a match of an alternative may be worth
-    least = max(math.ceil((float(worth.sum()) - rule.lead) / most), FIXING + 1)
+    least = max(math.ceil((float(worth.sum()) - rule.lead) / most), FIXING_ROTATION + 1)
     count = len(sight.image.bearings)
     missed = log10_missed(turns, count, min(least, count), sight.settings.power)
     lead = float(found.log10_false_alarms[1]) - alarms if len(found) > 1 else math.inf

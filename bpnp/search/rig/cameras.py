@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.search.evidence.false_alarms import directions_of, log10_tests, log_evidence_of
+from bpnp.search.evidence.false_alarms import FIXING, Terms, camera_terms, directions_of, log10_nfa, log10_tests
 from bpnp.search.evidence.uncertainty import Linearised, linearised, local_covariance
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.point_sets import PointSets
@@ -101,28 +101,27 @@ class Rig:
             yield rotation, translation, float(scale), count
 
     def alarms(self, rotation: Array, translation: Array, scale: float) -> tuple[float, float]:
-        """log10 of the number of false alarms at the scale of the residuals, and at rougher ones."""
+        """Return log10 of the number of false alarms at the scale of the residuals, and at rougher ones.
+
+        Three matches of a camera fix the pose; of an unknown scale, one more of a camera that is apart from it.
+        """
         tests = math.log10(sum(10 ** log10_tests(each) for each in self.sets))
         if self.unknowns == 7:
             tests += math.log10(sum(len(each.bearings) * len(each.points3d) for each in self.sets))
-        terms = []
-        for k, sets in enumerate(self.sets):
-            seen = directions_of(sets, *self.pose_of(k, rotation, translation))
-            terms.append(log_evidence_of(sets, seen, scale, (0, 3, 1)[: self.unknowns - 4]))
-        every, *without = np.array(terms).transpose(1, 2, 0)  # (own and rough, cameras) each
-        three, *one = (np.where(np.isfinite(every), every, 0) - np.where(np.isfinite(x), x, 0) for x in without)
-        fixing = three.max(1)
-        if self.unknowns == 7:  # three matches in one camera, one in another that is apart from it
-            either = [*self.apart, *(pair[::-1] for pair in self.apart)]
-            fixing = np.max([three[:, k] + one[0][:, other] for k, other in either], 0)
-        own, rough = tests - (every.sum(1) - fixing) / math.log(10)
-        return float(own), float(rough)
+        cameras, one = self._terms(rotation, translation, scale), np.eye(len(self.sets), dtype=np.int64)
+        either = [*self.apart, *(pair[::-1] for pair in self.apart)]
+        fixing = FIXING * one if self.unknowns == 6 else np.array([FIXING * one[k] + one[other] for k, other in either])
+        return log10_nfa(cameras, tests, fixing.tolist())
+
+    def _terms(self, rotation: Array, translation: Array, scale: float | None) -> list[Terms | None]:
+        seen = (directions_of(sets, *self.pose_of(k, rotation, translation)) for k, sets in enumerate(self.sets))
+        return [camera_terms(*each, scale) for each in zip(self.sets, seen, strict=True)]
 
     def evidence(self, rotation: Array, translation: Array, scale: float | None = None) -> Array:
         """log (cameras,) of how much likelier the bearings of each are under a pose than by chance, at the scale of the
         residuals, or of each camera at any."""
-        seen = [directions_of(sets, *self.pose_of(k, rotation, translation)) for k, sets in enumerate(self.sets)]
-        return np.array([log_evidence_of(*each, scale, (0,))[0, 0] for each in zip(self.sets, seen, strict=True)])
+        terms = self._terms(rotation, translation, scale)
+        return np.array([0.0 if one is None else one.evidence(0)[0] for one in terms])
 
     def covariance(self, rotation: Array, translation: Array, scale: float) -> Array | None:
         """Covariance of the turn, of the shift of the middle of the scene, in the axes of the rig, and of the logarithm
