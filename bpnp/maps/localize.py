@@ -130,7 +130,7 @@ def in_picture(problem: Problem, pose: Solution | Candidate) -> NDArray[np.bool_
     return np.asarray(inside.all(-1))
 
 
-def points_in_view(place: Region, camera: Any, pose: Solution, keypoints: Array) -> NDArray[np.int64]:
+def points_in_view(place: Region, camera: Any, pose: Solution | View, keypoints: Array) -> NDArray[np.int64]:
     """Return the indices of the points of a place that a pose sees between the keypoints (m, 2), pixels."""
     in_camera = place.points3d @ pose.rotation.T + pose.translation
     ahead = (in_camera[:, 2] > 0) & faces(place.cones.axes, place.cones.cosines, in_camera, pose.rotation)

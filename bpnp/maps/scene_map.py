@@ -32,6 +32,7 @@ from bpnp.maps.localize import (
 )
 from bpnp.maps.photos import focal_from_exif, photo_keypoints, photo_size
 from bpnp.maps.twins import without_twins
+from bpnp.maps.verify_view import verify_pose
 from bpnp.maps.views import (
     RUNG,
     STEP,
@@ -320,6 +321,35 @@ class SceneMap:
             raise ValueError("expected a map with views that see 4 or more points, got none")
         solution = best[0][1] if strongest is None else among_all(best[0][1], strongest, pixels)
         return replace(solution, seconds=Clock.now() - start)
+
+    def verify_view(
+        self, name: str, keypoints: Any, *, seed: int = 0, time_limit: float | int | None = 10.0
+    ) -> Solution:
+        """Verify the pose of a view without its own observations.
+
+        The view is taken out of the map, with the points that fewer than two other views see: these have no position
+        without it. Its pose is judged on the other points that it can see, whatever points the reconstruction matched
+        its keypoints to, and compared with poses elsewhere in the map. The pose is "ambiguous" if another one is about
+        as likely, and "failed" if it fits no better than chance or another one is likelier by three decades.
+
+        Args:
+            name: Of the view.
+            keypoints: (m, 2) pixels, all that were detected in its image, COLMAP's: (0.5, 0.5) is the centre of the
+                first one.
+            seed: Of the copies of the pose from which its optimum is refined.
+            time_limit: Seconds until its competitors in view are no longer tested; None for no limit.
+
+        Returns:
+            The solution, as of `bpnp.verify`; `matches` have the ids of points.
+
+        Raises:
+            ValueError: For a name that the map does not have, and if fewer than 4 points are left that it can see.
+        """
+        view, rest = self.named([name])[0], self.without([name])
+        pixels = np.asarray(pixels_from(keypoints, view.camera), np.float64)
+        place = replace(rest._region(rest.views[0], np.arange(len(rest.points3d))), view=view)
+        photo = Photo(pixels, view.camera, place, partial(rest._regions, None, view.camera), seed)
+        return verify_pose(photo, view, time_limit=positive("time_limit", time_limit))
 
     def _lens(
         self, camera: Any, image_size: Any, focal_error: float | int | None, distortion: bool

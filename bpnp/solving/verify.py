@@ -78,9 +78,7 @@ def verify(
     >>> bpnp.verify(image, scene, np.eye(3), [0, 1, 6]).verdict
     'failed'
     """
-    begun = time.perf_counter()
     limit = positive("time_limit", SECONDS if time_limit is None else time_limit)
-    deadline = Deadline.after(limit)
     threshold = positive("inlier_threshold", inlier_threshold, finite=True)
     rotation, translation = checked_pose("", rotation, translation)
     problem = problem_from(
@@ -95,17 +93,9 @@ def verify(
     )
     given = None if matches is None else _checked_matches(matches, problem)
     judged = problem if given is None else _of_matches(problem, given)
-    if judged.degenerate is not None:
-        return without_pose(judged, judged.degenerate, threshold)
-    moved = translation + rotation @ judged.origin
-    result, optimum = judge_claim(judged.sets, rotation, moved, refine=refine, seed=seed, deadline=deadline)
-    if result.verdict == "confident" and deadline.passed():
-        reason = f"not decided in {limit:.3g} s: its competitors were not tested"
-        result = replace(result, verdict="ambiguous", reason=reason)
-    solution = finished(judged, result, time.perf_counter() - begun, threshold)
-    if not refine and solution.verdict != "failed" and len(optimum):
-        solution = replace(solution, covariance=_of_unrefined(judged, optimum, rotation, moved))
-    if given is None:
+    limits: dict[str, Any] = {"inlier_threshold": threshold, "seed": seed, "time_limit": limit}
+    solution = verify_problem(judged, rotation, translation, refine=refine, **limits)
+    if given is None or judged.degenerate is not None:
         return solution
     return replace(
         solution,
@@ -114,6 +104,39 @@ def verify(
         points2d=problem.points2d,
         points3d=problem.points3d,
     )
+
+
+def verify_problem(
+    problem: Problem,
+    rotation: Array,
+    translation: Array,
+    *,
+    refine: bool = True,
+    inlier_threshold: float | None = None,
+    seed: int = 0,
+    time_limit: float | None = SECONDS,
+) -> Solution:
+    """Verify a pose of a problem whose points have been checked; arguments and result are those of `verify`.
+
+    Args:
+        problem: Points, and what is known of them.
+        rotation: (3, 3) of the pose.
+        translation: (3,) of the pose, scene units.
+        refine, inlier_threshold, seed: As for `verify`.
+        time_limit: Seconds; None for no limit.
+    """
+    begun, deadline = time.perf_counter(), Deadline.after(time_limit)
+    if problem.degenerate is not None:
+        return without_pose(problem, problem.degenerate, inlier_threshold)
+    moved = translation + rotation @ problem.origin
+    result, optimum = judge_claim(problem.sets, rotation, moved, refine=refine, seed=seed, deadline=deadline)
+    if result.verdict == "confident" and deadline.passed():
+        reason = f"not decided in {time_limit:.3g} s: its competitors were not tested"
+        result = replace(result, verdict="ambiguous", reason=reason)
+    solution = finished(problem, result, time.perf_counter() - begun, inlier_threshold)
+    if not refine and solution.verdict != "failed" and len(optimum):
+        solution = replace(solution, covariance=_of_unrefined(problem, optimum, rotation, moved))
+    return solution
 
 
 def _checked_matches(values: Any, problem: Problem) -> Labels:
