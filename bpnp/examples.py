@@ -21,6 +21,7 @@ NOISE_PX = 0.5
 LEDS, LIGHTS = 17, 3
 CATALOGUE, STARS, FALSE_STARS = 500, 42, 18
 PHOTO_CAMERA = ("PINHOLE", 640, 480, (560.0, 560.0, 320.0, 240.0))  # COLMAP's, pixels
+HOUSES_APART, WRONG_IMAGE = 40.0, "07.jpg"  # of `draw_map`, metres
 TEXELS = 80.0  # of a texture, a metre: about as many as the photos have pixels
 LIGHT = (0.95, 0.6, 0.8, 0.7, 1.0, 0.4)  # on the faces of a box towards -y, y, -x, x, z, -z
 COLOURS = {
@@ -147,6 +148,63 @@ def draw_photos(folder: Path | str, *, count: int = 14, seed: int = 0) -> dict[s
         name = f"{number:02d}.png"
         poses[name] = rotation, -rotation @ centre
         _seen(faces, *poses[name]).save(Path(folder) / name)
+    return poses
+
+
+def draw_map(folder: Path | str, *, seed: int = 0) -> dict[str, tuple[Array, Array]]:
+    """Draw a COLMAP model of two equal houses in which one image has a wrong pose.
+
+    Eleven images were taken before a house and its copy `HOUSES_APART` metres to the right. `WRONG_IMAGE` was taken
+    before the second house and has the pose, and the points, of the first one: what structure from motion makes of
+    buildings that repeat. What is beside the houses is different.
+
+    Args:
+        folder: Where cameras, images and points3D are written, .bin.
+        seed: Of the points and the poses.
+
+    Returns:
+        The true pose of each image by its name: rotation (3, 3) and translation (3,), camera = R p + t, metres.
+
+    Raises:
+        ValueError: If the folder exists and is not empty.
+    """
+    import pycolmap
+
+    path = Path(folder)
+    if path.exists() and any(path.iterdir()):
+        raise ValueError(f"{path} is not empty; name a new folder for the map")
+    rng = np.random.default_rng(seed)
+    house = rng.uniform((-5, -6, -1), (5, 1, 1), (90, 3))  # x to the right, y down, z away, metres
+    beside = [rng.uniform((-9, -2, -3), (9, 1, 3), (60, 3)) for _ in range(2)]
+    apart = np.array([HOUSES_APART, 0.0, 0.0])
+    points = np.concatenate([house, house + apart, beside[0], beside[1] + apart])
+    poses, parts = dict[str, tuple[Array, Array]](), np.split(np.arange(len(points)), (90, 180, 240))
+    model, (name, width, height, parameters) = pycolmap.Reconstruction(), PHOTO_CAMERA
+    lens = pycolmap.Camera(camera_id=1, model=name, width=width, height=height, params=parameters)
+    model.add_camera_with_trivial_rig(lens)
+    tracks = [pycolmap.Track() for _ in points]
+    for number in range(11):
+        second = number % 2
+        name, turn = f"{number:02d}.jpg", Rotation.from_euler("yx", rng.normal(0, 6, 2), degrees=True).as_matrix()
+        centre = np.array([rng.uniform(-5, 5), rng.uniform(-1, 0.5), rng.uniform(-16, -12)]) + second * apart
+        seen = np.concatenate([parts[second], parts[2 + second]])
+        seen = np.sort(rng.choice(seen, round(0.8 * len(seen)), replace=False))
+        pixels = np.asarray(lens.img_from_cam((points[seen] - centre) @ turn.T)) + rng.normal(0, 0.4, (len(seen), 2))
+        poses[name] = turn, -turn @ centre
+        if name == WRONG_IMAGE:  # its points are those of the first house, the others have none
+            centre, seen = centre - apart, np.where(seen < 180, seen - 90, -1)
+        others = rng.uniform((0, 0), (width, height), (80, 2))  # keypoints without a point
+        model.add_image_with_trivial_frame(
+            pycolmap.Image(name, np.concatenate([pixels, others]), 1, number + 1),
+            pycolmap.Rigid3d(pycolmap.Rotation3d(turn), -turn @ centre),
+        )
+        for element, point in enumerate(seen):
+            if point >= 0:
+                tracks[point].add_element(number + 1, element)
+    for point, track in zip(points, tracks, strict=True):
+        model.add_point3D(point, track)
+    path.mkdir(parents=True, exist_ok=True)
+    model.write_binary(path)
     return poses
 
 

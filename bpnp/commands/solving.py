@@ -152,7 +152,7 @@ def solve(
 
 def verify(
     points2d: Path,
-    points3d: Path,
+    points3d: Path | None = None,
     pose: Path | None = None,
     *,
     rotation: tuple[float, float, float, float, float, float, float, float, float] | None = None,
@@ -162,6 +162,7 @@ def verify(
     matches: Path | None = None,
     as_it_is: bool = False,
     output: Path | None = None,
+    page: Path | None = None,
     json: bool = False,
     surface: int | None = None,
     inlier_threshold: float | None = None,
@@ -173,8 +174,12 @@ def verify(
     confident; ambiguous (something else may fit as well); or failed: it fits no better than chance, or another pose
     fits better. Files: as for `bpnp solve`.
 
+    `bpnp verify MAP`, with the folder of a COLMAP model alone, verifies the pose of each of its images without the
+    image's own observations, and prints the most doubtful first. Its options are --output, --page, --json,
+    --time_limit (an image) and --seed.
+
     Args:
-        points2d: as for bpnp solve.
+        points2d: as for bpnp solve; or the folder of a COLMAP model, without other arguments.
         points3d: as for bpnp solve.
         pose: JSON with `rotation` and `translation`, such as that of a solution.
         rotation: the nine numbers of R, row by row, in place of the file; camera = R p + t.
@@ -183,7 +188,8 @@ def verify(
         image: as for bpnp solve.
         matches: .npy, .csv or .txt with two columns, places of a 2D and of a 3D point, counted from 0.
         as_it_is: do not refine the pose.
-        output: write the solution as JSON.
+        output: write the solution as JSON; of a model a file that ends in .json or .csv.
+        page: of a model, write the table and a drawing of the map as one .html file.
         json: print JSON instead of a table.
         surface: points to draw from a mesh; its vertices by default.
         inlier_threshold: largest error of a match, pixels with a camera, else of x/z, y/z; three
@@ -191,6 +197,20 @@ def verify(
         time_limit: seconds, 10 by default; inf for no limit.
         seed: of the search around the pose.
     """
+    if points3d is None:
+        from bpnp.commands.verifying_maps import verify_images
+
+        of_points: dict[str, Any] = {"rotation": rotation, "translation": translation, "camera": camera, "image": image}
+        of_points |= {"matches": matches, "as_it_is": as_it_is or None, "surface": surface}
+        of_points |= {"inlier_threshold": inlier_threshold}
+        if wrong := [name for name, value in of_points.items() if value is not None]:
+            raise ValueError(
+                f"--{wrong[0]} has no effect on the images of a COLMAP model; name points3d, or leave it out"
+            )
+        verify_images(points2d, output=output, page=page, json=json, time_limit=time_limit, seed=seed)
+        return
+    if page is not None:
+        raise ValueError("--page needs the folder of a COLMAP model alone: bpnp verify MAP --page FILE.html")
     from bpnp.commands.point_files import read_camera, read_pairs, read_pose
     from bpnp.solving.verify import verify as judge_pose
 

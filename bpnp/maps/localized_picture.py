@@ -1,5 +1,6 @@
 """A photo that was found in a map, drawn: its matches over the photo, and the map from above with the camera."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from bpnp.maps.scene_map import SceneMap
+    from bpnp.maps.views import View
 
 Array = npt.NDArray[Any]
 FADED = 0.55  # of the photo's contrast is taken, so that points stand out
@@ -88,6 +90,18 @@ def draw_matches(axes: "Axes", solution: Solution, *, photo: Array | None = None
     return axes.scatter(x, y, c=residuals, cmap="plasma", s=14, edgecolors="white", linewidths=0.3, zorder=3)
 
 
+def plane_from_above(views: "Sequence[View]", forward: Array) -> Array:
+    """Return the axes (2, 3) of a drawing of a map from above: to the right, and ahead along `forward` (3,).
+
+    The photos are taken for upright: down is the mean of their y axes.
+    """
+    down = np.mean([view.rotation[1] for view in views], axis=0)
+    down /= np.linalg.norm(down)
+    ahead = forward - down * (forward @ down)
+    ahead /= np.linalg.norm(ahead)
+    return np.stack([np.cross(down, ahead), ahead])
+
+
 def draw_from_above(axes: "Axes", scene: "SceneMap", solution: Solution) -> None:
     """Draw points and views of the map from above, and the camera, which looks upwards in the drawing.
 
@@ -95,12 +109,7 @@ def draw_from_above(axes: "Axes", scene: "SceneMap", solution: Solution) -> None
     far outside of the map stands at the edge of the drawing, and the legend says so.
     """
     found = solution.verdict != "failed"
-    down = np.mean([view.rotation[1] for view in scene.views], axis=0)  # of upright photos
-    down /= np.linalg.norm(down)
-    forward = solution.rotation[2] if found else scene.views[0].rotation[2]
-    ahead = forward - down * (forward @ down)
-    ahead /= np.linalg.norm(ahead)
-    plane = np.stack([np.cross(down, ahead), ahead])  # to the right, ahead
+    plane = plane_from_above(scene.views, solution.rotation[2] if found else scene.views[0].rotation[2])
     step = -(-len(scene.points3d) // MOST_POINTS)
     points, centres = scene.points3d[::step] @ plane.T, np.array([view.centre for view in scene.views]) @ plane.T
     axes.plot(*points.T, ".", color=QUIET, ms=1, alpha=0.35, zorder=1)

@@ -26,8 +26,10 @@ def verify_pose(photo: Photo, view: View, *, time_limit: float | None) -> Soluti
         time_limit: Seconds for the first part; None for no limit.
 
     Raises:
-        ValueError: If the pose sees fewer than 4 points of the map.
+        ValueError: If there are fewer than 4 keypoints, or the pose sees fewer than 4 points of the map.
     """
+    if len(photo.keypoints) < MIN_POINTS:
+        raise ValueError(f"{view.name} has {len(photo.keypoints)} keypoints; at least {MIN_POINTS} are needed")
     place, lead = photo.place, DEFAULT.evidence.lead
     seen = points_in_view(place, photo.camera, view, photo.keypoints)
     if len(seen) < MIN_POINTS:

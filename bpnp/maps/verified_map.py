@@ -1,0 +1,196 @@
+"""Verify all images of a COLMAP model: which poses are doubtful, as records and as a page."""
+
+import csv
+import io
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment
+from markupsafe import Markup
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from bpnp.datamodules.colmap.model_files import read_records
+from bpnp.maps.localized_picture import plane_from_above
+from bpnp.maps.scene_map import SceneMap
+from bpnp.report.terminal import INKS, VERDICTS, number
+
+SECONDS = 10.0  # an image
+UNTESTED = "untested"
+WORST_FIRST = ("failed", "ambiguous", UNTESTED, "confident")
+DRAWN = 3000  # points of the map on the page
+SIDE = 1000.0  # of the drawing
+
+
+@dataclass(frozen=True)
+class VerifiedView:
+    """The verdict on the pose of an image of a model.
+
+    Attributes:
+        name: Of the image.
+        verdict: As of `bpnp.verify`, or "untested" if the other images see too few of its points.
+        reason: One sentence.
+        points: Number of points in view that two other images see.
+        matches: Number of keypoints that one of these points explains.
+        reprojection_error: Mean over the matches, pixels; NaN without a match.
+        log10_false_alarms: Log10 NFA; infinite if untested.
+        rotation_change_deg: Angle from the pose to the optimum of these points, degrees; NaN if untested.
+        centre_change: Distance from its camera centre to that of the optimum, scene units; NaN if untested.
+        other_centre: Camera centre of the best competing pose; None without one.
+    """
+
+    name: str
+    verdict: str
+    reason: str
+    points: int = 0
+    matches: int = 0
+    reprojection_error: float = math.nan
+    log10_false_alarms: float = math.inf
+    rotation_change_deg: float = math.nan
+    centre_change: float = math.nan
+    other_centre: tuple[float, float, float] | None = None
+
+    @property
+    def doubtful(self) -> bool:
+        return self.verdict != "confident"
+
+
+def verify_map(
+    folder: Path,
+    scene: SceneMap,
+    *,
+    seed: int = 0,
+    time_limit: float | None = SECONDS,
+    done: Callable[[], None] = lambda: None,
+) -> list[VerifiedView]:
+    """Verify the pose of each image of a COLMAP model without the image's own observations.
+
+    Args:
+        folder: Of the model; the keypoints of its images are read.
+        scene: The map of the same model.
+        seed: As for `SceneMap.verify_view`.
+        time_limit: Seconds an image, as for `SceneMap.verify_view`.
+        done: Called after each image.
+
+    Returns:
+        A record for each view of the map: failed, ambiguous, untested, confident; the largest NFA first.
+
+    Raises:
+        ColmapError: A ValueError, if the model cannot be read.
+    """
+    keypoints = {image.name: image.keypoints for image in read_records(folder).images}
+    verified = []
+    for view in scene.views:
+        pixels = np.unique(keypoints[view.name], axis=0)
+        verified.append(_verified(scene, view.name, pixels[np.isfinite(pixels).all(-1)], seed, time_limit))
+        done()
+    return sorted(verified, key=lambda one: (WORST_FIRST.index(one.verdict), -one.log10_false_alarms, one.name))
+
+
+def _verified(
+    scene: SceneMap, name: str, keypoints: NDArray[np.float64], seed: int, time_limit: float | None
+) -> VerifiedView:
+    view = scene.named([name])[0]
+    try:
+        solution = scene.verify_view(name, keypoints, seed=seed, time_limit=time_limit)
+    except ValueError as error:
+        return VerifiedView(name, UNTESTED, str(error))
+    turn = Rotation.from_matrix(solution.rotation @ view.rotation.T).magnitude() if solution.found else math.nan
+    others = [tuple(one.centre.tolist()) for one in solution.candidates[1:2]] if solution.verdict != "confident" else []
+    return VerifiedView(
+        name,
+        solution.verdict,
+        solution.reason,
+        len(solution.points3d),
+        len(solution.matches),
+        solution.reprojection_error,
+        solution.log10_false_alarms,
+        math.degrees(turn),
+        float(np.linalg.norm(solution.centre - view.centre)),
+        others[0] if others else None,  # type: ignore[arg-type]
+    )
+
+
+def summary(verified: Sequence[VerifiedView]) -> str:
+    """Return the number of doubtful images as a sentence."""
+    count = sum(one.doubtful for one in verified)
+    return f"{count} of {len(verified)} images {'is' if count == 1 else 'are'} doubtful."
+
+
+def as_json(verified: Sequence[VerifiedView], folder: Path) -> str:
+    """Return the records as JSON; a number that is not finite is null."""
+    images = [
+        {
+            key: None if isinstance(value, float) and not math.isfinite(value) else value
+            for key, value in asdict(one).items()
+        }
+        for one in verified
+    ]
+    return json.dumps({"map": str(folder), "images": images}, indent=1)
+
+
+def as_csv(verified: Sequence[VerifiedView]) -> str:
+    """Return the records as comma-separated values with a head; a number that is not finite is empty."""
+    text, columns = io.StringIO(), [key for key in asdict(verified[0]) if key != "other_centre"]
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*columns, "other_x", "other_y", "other_z"])
+    for one in verified:
+        cells = [getattr(one, key) for key in columns]
+        cells = ["" if isinstance(cell, float) and not math.isfinite(cell) else cell for cell in cells]
+        writer.writerow([*cells, *(one.other_centre or ("", "", ""))])
+    return text.getvalue()
+
+
+def page_html(verified: Sequence[VerifiedView], scene: SceneMap, folder: Path) -> str:
+    """Return a page of one file: the map from above with its views by their verdicts, and the table."""
+    assets = files("bpnp.report") / "assets"
+    page = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    return page.from_string((assets / "verified_map.html").read_text(encoding="utf-8")).render(
+        style=Markup((assets / "page.css").read_text(encoding="utf-8")),
+        inks=INKS,
+        colours=VERDICTS,
+        title=folder,
+        summary=summary(verified),
+        rows=[(one, *cells(one)) for one in verified],
+        drawing=_drawing(verified, scene),
+        side=SIDE,
+    )
+
+
+def cells(one: VerifiedView) -> tuple[str, str, str, str, str]:
+    """Return the numbers of a record as texts: points, matches, error, log10 NFA, rotation change."""
+    if one.verdict == UNTESTED:
+        return ("-",) * 5
+    error, change = (None if math.isnan(x) else x for x in (one.reprojection_error, one.rotation_change_deg))
+    return str(one.points), str(one.matches), number(error), f"{one.log10_false_alarms:.0f}", number(change)
+
+
+def _drawing(verified: Sequence[VerifiedView], scene: SceneMap) -> dict[str, Any]:
+    """Return where the page draws the points, the views and the competing poses, in a square of `SIDE`."""
+    plane = plane_from_above(scene.views, scene.views[0].rotation[2]) * np.array([[1.0], [-1.0]])  # y is down
+    views = scene.named([one.name for one in verified])
+    centres = np.array([view.centre for view in views]) @ plane.T
+    points = scene.points3d[:: -(-len(scene.points3d) // DRAWN)] @ plane.T
+    low, high = np.percentile(np.concatenate([points, centres]), [1, 99], axis=0)
+    low, high = np.minimum(low, centres.min(0)), np.maximum(high, centres.max(0))
+    scale = 0.92 * SIDE / max(float((high - low).max()), 1e-9)
+    size = (high - low) * scale + 0.08 * SIDE
+
+    def placed(values: Any) -> Any:
+        return np.round((np.asarray(values) - low) * scale + 0.04 * SIDE, 1).tolist()
+
+    inside = ((points >= low) & (points <= high)).all(-1)
+    looks = np.array([view.rotation[2] for view in views]) @ plane.T
+    looks /= np.maximum(np.linalg.norm(looks, axis=-1, keepdims=True), 1e-9)
+    others = [
+        placed(np.clip(plane @ np.array(one.other_centre), low, high)) if one.other_centre is not None else None
+        for one in verified
+    ]
+    drawn = zip(verified, placed(centres), np.round(24 * looks, 1).tolist(), others, strict=True)
+    return {"size": size.round().tolist(), "points": placed(points[inside]), "views": list(drawn)[::-1]}

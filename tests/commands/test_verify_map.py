@@ -1,0 +1,126 @@
+"""`bpnp verify MAP`: of a planted map the one image whose pose is wrong is doubtful, and no other."""
+
+import csv
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from planted_model import PINHOLE, plant_model
+from scipy.spatial.transform import Rotation
+
+from bpnp import SceneMap
+from bpnp.cli import main
+from bpnp.examples import HOUSES_APART, WRONG_IMAGE, draw_map
+from bpnp.maps.verified_map import verify_map
+
+
+@pytest.fixture(scope="module")
+def houses(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, tuple[np.ndarray, np.ndarray]]]:
+    folder = tmp_path_factory.mktemp("maps") / "houses"
+    return folder, draw_map(folder)
+
+
+def test_the_image_at_the_copy_of_its_building_is_the_only_doubtful_one(
+    houses: tuple[Path, dict[str, tuple[np.ndarray, np.ndarray]]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The truth is where the images were drawn from, not what the model says."""
+    folder, poses = houses
+    model = SceneMap.from_colmap(folder)
+    wrong = [
+        view.name
+        for view in model.views
+        if np.linalg.norm(view.centre + poses[view.name][0].T @ poses[view.name][1]) > 1
+    ]
+    assert wrong == [WRONG_IMAGE]
+    page, table = tmp_path / "page.html", tmp_path / "table.csv"
+    main(["verify", str(folder), "--page", str(page), "--output", str(table), "--time_limit", "1000"])
+    printed = capsys.readouterr().out
+    assert "1 of 11 images is doubtful." in printed
+    rows = list(csv.DictReader(table.read_text().splitlines()))
+    assert [row["verdict"] == "confident" for row in rows] == [False, *[True] * 10]
+    assert rows[0]["name"] == WRONG_IMAGE
+    assert rows[0]["verdict"] == "failed"
+    centre = [float(rows[0][f"other_{axis}"]) for axis in "xyz"]
+    rotation, translation = poses[WRONG_IMAGE]
+    np.testing.assert_allclose(centre, -rotation.T @ translation, atol=0.2)  # where it was taken
+    assert f"{WRONG_IMAGE}: A pose {HOUSES_APART:.0f} scene units away" in printed
+    first, *others = re.findall(
+        r'<th scope="row">(\S+)</th><td class="verdict"><span [^>]*></span>(\w+)', page.read_text()
+    )
+    assert first == (WRONG_IMAGE, "failed")
+    assert dict(others) == dict.fromkeys(set(poses) - {WRONG_IMAGE}, "confident")
+
+
+def test_json_has_a_record_for_each_image(
+    houses: tuple[Path, dict[str, tuple[np.ndarray, np.ndarray]]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(["verify", str(houses[0]), "--json", "--seed", "1", "--time_limit", "1000"])
+    images = json.loads(capsys.readouterr().out)["images"]
+    assert sorted(image["name"] for image in images) == sorted(houses[1])
+    assert images[0]["name"] == WRONG_IMAGE
+    assert images[0]["log10_false_alarms"] < -50  # it fits far better than chance, and yet it is wrong
+    assert all(image["points"] > image["matches"] > 50 for image in images)
+
+
+def test_an_image_is_judged_without_the_points_that_it_made(tmp_path: Path) -> None:
+    """A turned view whose own points fit it exactly; no other view sees them."""
+    truth = plant_model(tmp_path / "map", camera=PINHOLE, images=5, points=120, seen=80, clutter=10)
+    model = pycolmap.Reconstruction(tmp_path / "map")
+    rng, turn = np.random.default_rng(9), Rotation.from_euler("y", 8, degrees=True).as_matrix()
+    rotation, shift = turn @ truth.rotations[0], truth.translations[0]
+    own = rng.uniform(-0.5, 0.5, (60, 3))
+    seen = own @ rotation.T + shift
+    pixels = 520 * seen[:, :2] / seen[:, 2:] + [400, 300]
+    model.add_image_with_trivial_frame(
+        pycolmap.Image("turned.jpg", pixels, 1, 6), pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), shift)
+    )
+    for k, point in enumerate(own):
+        model.add_point3D(point, pycolmap.Track([pycolmap.TrackElement(6, k)]))
+    model.write_binary(tmp_path / "map")
+    scene = SceneMap.from_colmap(tmp_path / "map")
+    verified = verify_map(tmp_path / "map", scene, time_limit=None)
+    assert verified[0].name == "turned.jpg"
+    assert (verified[0].verdict, [one.verdict for one in verified[1:]]) == ("failed", ["confident"] * 5)
+    assert len(scene.points3d) == 180
+
+
+def test_images_whose_points_hardly_another_one_sees_are_untested(tmp_path: Path) -> None:
+    """Of two images no point is left that two others see."""
+    plant_model(tmp_path / "map", camera=PINHOLE, images=2)
+    verified = verify_map(tmp_path / "map", SceneMap.from_colmap(tmp_path / "map"))
+    assert [one.verdict for one in verified] == ["untested"] * 2
+    assert "points that 2 or more views see" in verified[0].reason
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere"], "nowhere does not exist; name points2d, points3d and a pose, or the folder of a COLMAP model"),
+        (["file.csv"], "file.csv is a file; name points2d, points3d and a pose, or the folder of a COLMAP model"),
+        (["empty"], "expected a COLMAP model (cameras, images and points3D, all .bin or all .txt) in empty"),
+        (["scene"], "scene has no COLMAP model, but scene/0 has; try bpnp verify scene/0"),
+        (["scene/0", "--output", "out.txt"], "--output is out.txt; name a file that ends in .json or .csv"),
+        (["scene/0", "--page", "scene"], "--page is scene; name a file that ends in .html"),
+        (["scene/0", "--as_it_is"], "--as_it_is has no effect on the images of a COLMAP model"),
+        (["scene/0", "--camera", "PINHOLE,1,1,1,1"], "--camera has no effect on the images of a COLMAP model"),
+        (["scene/0", "--time_limit", "0"], "expected a positive `time_limit`, got 0"),
+        (["file.csv", "file.csv", "--page", "a.html"], "--page needs the folder of a COLMAP model alone"),
+    ],
+)
+def test_a_mistake_is_one_line(
+    arguments: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fails: Callable[..., str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("file.csv").write_text("1,2\n")
+    Path("empty").mkdir()
+    plant_model(Path("scene/0"), camera=PINHOLE)
+    assert message in fails("verify", *arguments)
+
+
+def test_the_drawn_map_never_replaces_a_folder(houses: tuple[Path, dict[str, tuple[np.ndarray, np.ndarray]]]) -> None:
+    with pytest.raises(ValueError, match=r"houses is not empty; name a new folder"):
+        draw_map(houses[0])
