@@ -179,8 +179,8 @@ def draw_map(folder: Path | str, *, seed: int = 0) -> dict[str, tuple[Array, Arr
     apart = np.array([HOUSES_APART, 0.0, 0.0])
     points = np.concatenate([house, house + apart, beside[0], beside[1] + apart])
     poses, parts = dict[str, tuple[Array, Array]](), np.split(np.arange(len(points)), (90, 180, 240))
-    model, (name, width, height, parameters) = pycolmap.Reconstruction(), PHOTO_CAMERA
-    lens = pycolmap.Camera(camera_id=1, model=name, width=width, height=height, params=parameters)
+    model, (kind, width, height, parameters) = pycolmap.Reconstruction(), PHOTO_CAMERA
+    lens = pycolmap.Camera(camera_id=1, model=kind, width=width, height=height, params=parameters)
     model.add_camera_with_trivial_rig(lens)
     tracks = [pycolmap.Track() for _ in points]
     for number in range(11):

@@ -46,7 +46,7 @@ def shows(printed: str, expected: str, *, numbers: bool) -> None:
             assert values == pytest.approx(shown, rel=0.5, abs=0.02)
 
 
-@pytest.mark.parametrize("name", ["photo", "leds", "train"])
+@pytest.mark.parametrize("name", ["photo", "leds", "targets", "verify", "train"])
 def test_a_tutorial_runs_and_prints_what_it_shows(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -113,7 +113,7 @@ def _verified(
         solution.log10_false_alarms,
         math.degrees(turn),
         float(np.linalg.norm(solution.centre - view.centre)),
-        others[0] if others else None,  # type: ignore[arg-type]
+        others[0] if others else None,
     )
 
 
