@@ -156,7 +156,7 @@ def draw_map(folder: Path | str, *, seed: int = 0) -> dict[str, tuple[Array, Arr
 
     Eleven images were taken before a house and its copy `HOUSES_APART` metres to the right. `WRONG_IMAGE` was taken
     before the second house and has the pose, and the points, of the first one: what structure from motion makes of
-    buildings that repeat. What is beside the houses is different.
+    buildings that repeat. The surroundings of the houses differ.
 
     Args:
         folder: Where cameras, images and points3D are written, .bin.

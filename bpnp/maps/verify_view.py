@@ -1,13 +1,13 @@
-"""Verify the pose of a view of a map: by the points that other views see, and beside the rest of the map."""
+"""Verify the pose of a view of a map: by the points that other views see, against the rest of the map."""
 
 from dataclasses import replace
 
 import numpy as np
 
-from bpnp.geometry import MIN_POINTS
 from bpnp.maps.localize import Photo, points_in_view, problem_near, with_ids
 from bpnp.maps.twins import best_rival
 from bpnp.maps.views import Cones, View
+from bpnp.poses import MIN_POINTS
 from bpnp.search.evidence import reasons
 from bpnp.search.settings import DEFAULT
 from bpnp.solving.solution import Solution

@@ -17,6 +17,8 @@ from bpnp.cli import main
 from bpnp.examples import HOUSES_APART, WRONG_IMAGE, draw_map
 from bpnp.maps.verified_map import verify_map
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def houses(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, tuple[np.ndarray, np.ndarray]]]:
