@@ -1,12 +1,13 @@
-"""Cameras: from pixels to normalised image coordinates and back, distortion included.
+"""Camera models: pixels to normalised image coordinates and back, distortion included.
 
-The only file that imports pycolmap, and only when a camera needs it: it takes half a second.
+This is the only module that imports pycolmap. It does so when a camera first needs it, because the import takes half a
+second.
 """
 
 import signal
 import threading
 
-# zlib has to be loaded before pycolmap (4.2): in the other order zlib.compress and np.savez_compressed abort Python.
+# Import zlib before pycolmap 4.2: in the other order zlib.compress and np.savez_compressed abort Python.
 import zlib  # noqa: F401
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,72 +19,83 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
-ROUND_TRIP = 0.01  # pixels
-FISHEYE = {  # models with the radius t (1 + k1 t^2 + ...) at the angle t from the axis: focal lengths, coefficients
+ROUND_TRIP = 0.01  # largest error of a pixel that is undistorted and distorted again, pixels
+# Models whose image radius at the angle t from the axis is t (1 + k1 t^2 + ...): number of focal lengths and of k.
+FISHEYE = {
     "SIMPLE_FISHEYE": (1, 0),
     "FISHEYE": (2, 0),
     "SIMPLE_RADIAL_FISHEYE": (1, 1),
     "RADIAL_FISHEYE": (1, 2),
     "OPENCV_FISHEYE": (2, 4),
 }
-EDGES, STEPS = 1024, 5  # of a fisheye's angles, between which Newton's steps find one to the last digit
-CENTRE = 0.5  # of the first pixel in COLMAP's coordinates; OpenCV and hloc count from 0
-SLIGHTLY, FEW_OUTSIDE = 0.01, 0.02  # larger sides outside an image; fraction of points that may be farther outside
-WIDEST = 10.0  # normalised image coordinates, 84 degrees off the axis
-MOST_PIXELS = 2**31  # of a side of an image; more is a file that is none
+EDGES, STEPS = 1024, 5  # table of fisheye angles, and Newton steps from a table entry to full precision
+CENTRE = 0.5  # centre of the first pixel in COLMAP's coordinates; it is 0 in OpenCV's and hloc's
+SLACK, FEW_OUTSIDE = 0.01, 0.02  # margin around an image in larger sides; fraction of points allowed beyond it
+WIDEST = 10.0  # normalised image coordinates; 84 degrees off the axis
+MOST_PIXELS = 2**31  # largest side of an image, pixels; a larger one means a corrupt file
 
 
 @dataclass(frozen=True, eq=False)
 class Pinhole:
-    """A camera without distortion, pixels ~ K (x, y, 1)."""
+    """Camera without distortion, pixels ~ K (x, y, 1).
+
+    Attributes:
+        matrix: K (3, 3), pixels.
+    """
 
     matrix: Array
 
     @property
     def focal(self) -> float:
-        """Pixels per unit of normalised coordinates."""
+        """Focal length in pixels: the geometric mean of both axes."""
         return float(np.sqrt(abs(np.linalg.det(self.matrix[:2, :2]))))
 
     def normalise(self, pixels: Array) -> Array:
-        """Normalised coordinates (k, 2) of pixels (k, 2)."""
+        """Convert pixels (k, 2) to normalised image coordinates (k, 2)."""
         return np.asarray((pixels - self.matrix[:2, 2]) @ np.linalg.inv(self.matrix[:2, :2]).T, np.float64)
 
     def bearings(self, pixels: Array) -> Array:
-        """Unit vectors (k, 3) towards pixels (k, 2)."""
+        """Return the unit viewing rays (k, 3) of pixels (k, 2)."""
         return _of_length_one(np.column_stack([self.normalise(pixels), np.ones(len(pixels))]))
 
     def project(self, points: Array) -> Array:
-        """Pixels (k, 2) of points (k, 3) in camera coordinates; NaN at and behind the plane of the camera."""
+        """Project points (k, 3) in camera coordinates to pixels (k, 2); NaN unless z > 0."""
         return in_front(points) @ self.matrix[:2].T
 
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """A camera of any COLMAP model, with its distortion; `camera` is pycolmap's."""
+    """Camera of any COLMAP model, with its distortion.
+
+    Attributes:
+        camera: A `pycolmap.Camera`.
+    """
 
     camera: Any
 
     @property
     def focal(self) -> float:
-        """Pixels per unit of normalised coordinates: the mean focal length; of a model that has none (equirectangular),
-        the scale at the principal ray."""
+        """Mean focal length in pixels.
+
+        For a model without focal length (equirectangular) it is the scale at the principal ray.
+        """
         step = 1e-4
-        ahead, aside = self.camera.img_from_cam(np.array([[0.0, 0.0, 1.0], [step, 0.0, 1.0]]))
-        return float(self.camera.mean_focal_length() or np.linalg.norm(aside - ahead) / step)
+        axis, off_axis = self.camera.img_from_cam(np.array([[0.0, 0.0, 1.0], [step, 0.0, 1.0]]))
+        return float(self.camera.mean_focal_length() or np.linalg.norm(off_axis - axis) / step)
 
     @property
     def matrix(self) -> Array:
-        """(3, 3) focal lengths and principal point in pixels: the pinhole camera of the undistorted image."""
+        """K (3, 3) of the undistorted image, pixels."""
         if self.camera.mean_focal_length():
             return np.asarray(self.camera.calibration_matrix(), np.float64)
         ((x, y),) = self.camera.img_from_cam(np.array([[0.0, 0.0, 1.0]]))
         return np.array([[self.focal, 0, x], [0, self.focal, y], [0, 0, 1]])
 
     def normalise(self, pixels: Array) -> Array:
-        """Normalised, undistorted coordinates (k, 2) of pixels (k, 2), NaN where there are none.
+        """Convert pixels (k, 2) to normalised, undistorted image coordinates (k, 2); NaN where there are none.
 
-        pycolmap marks some failures with NaN and returns a wrong finite point for others (a fisheye beyond 90 degrees),
-        so the result has to project back to the pixel.
+        pycolmap marks some failures with NaN, and returns a wrong finite point for others (a fisheye beyond 90
+        degrees). Therefore the result is projected back and has to meet the pixel.
         """
         points = np.asarray(self.camera.cam_from_img(np.ascontiguousarray(pixels)), dtype=np.float64)
         back = np.asarray(self.camera.img_from_cam(np.column_stack([points, np.ones(len(points))])), dtype=np.float64)
@@ -92,35 +104,37 @@ class Lens:
         return np.where(good[:, None], points, np.nan)
 
     def bearings(self, pixels: Array) -> Array:
-        """Unit vectors (k, 3) towards pixels (k, 2), of a fisheye up to 180 degrees off its axis; NaN where there is
-        none."""
+        """Return the unit viewing rays (k, 3) of pixels (k, 2), NaN where there are none.
+
+        Rays of a fisheye reach up to 180 degrees off its axis.
+        """
         name, params = self.camera.model.name, np.asarray(self.camera.params, np.float64)
         if name not in FISHEYE:
             return _of_length_one(np.column_stack([self.normalise(pixels), np.ones(len(pixels))]))
         focals, count = FISHEYE[name]
-        seen = (pixels - params[focals : focals + 2]) / params[:focals]
-        radius = np.linalg.norm(seen, axis=-1)
-        # t (1 + k1 t^2 + ...) rises up to the first root of its derivative, or to the angle of a full turn.
+        distorted = (pixels - params[focals : focals + 2]) / params[:focals]
+        radius = np.linalg.norm(distorted, axis=-1)
+        # t (1 + k1 t^2 + ...) rises up to the first root of its derivative, at most to 180 degrees.
         radial = np.zeros(2 * count + 2)
         radial[1::2] = np.r_[1.0, params[focals + 2 : focals + 2 + count]]
         distance = np.polynomial.Polynomial(radial).trim()
         slope = distance.deriv()
         roots = slope.roots()
-        turns = roots.real[(abs(roots.imag) < 1e-9) & (roots.real > 0)]
-        widest = min([np.pi, *turns.tolist()])
+        maxima = roots.real[(abs(roots.imag) < 1e-9) & (roots.real > 0)]
+        widest = min([np.pi, *maxima.tolist()])
         edges = np.linspace(0, widest, EDGES)
         rising = distance(edges)
         k = np.clip(np.searchsorted(rising, radius) - 1, 0, EDGES - 2)
         angle = edges[k]
-        for _ in range(STEPS):  # Newton's, between two edges
+        for _ in range(STEPS):  # Newton steps, kept between two table entries
             angle += (radius - distance(angle)) / np.maximum(slope(angle), np.finfo(float).tiny)
             angle = np.clip(angle, edges[k], edges[k + 1])
         angle = np.where(radius <= rising[-1], angle, np.nan)
-        aside = seen * (np.sin(angle) / np.maximum(radius, np.finfo(float).tiny))[:, None]
-        return np.column_stack([aside, np.cos(angle)])
+        transverse = distorted * (np.sin(angle) / np.maximum(radius, np.finfo(float).tiny))[:, None]
+        return np.column_stack([transverse, np.cos(angle)])
 
     def project(self, points: Array) -> Array:
-        """Pixels (k, 2) of points (k, 3) in camera coordinates; NaN at and behind the plane of the camera."""
+        """Project points (k, 3) in camera coordinates to pixels (k, 2); NaN unless z > 0."""
         return np.asarray(self.camera.img_from_cam(np.ascontiguousarray(in_front(points))), dtype=np.float64)
 
 
@@ -132,19 +146,26 @@ def _of_length_one(rays: Array) -> Array:
 
 
 def in_front(points: Array) -> Array:
-    """(x/z, y/z, 1) of points (k, 3) with z > 0, NaN for the others."""
+    """Return (x/z, y/z, 1) of points (k, 3) with z > 0, and NaN for the others."""
     depth = np.where(points[:, 2:] > 0, points[:, 2:], np.nan)
     with np.errstate(over="ignore"):
         return points / depth
 
 
 def camera_from(camera: Any) -> Camera:
-    """The camera of a 3x3 matrix K, of OpenCV's (K, distortion), of (COLMAP model name, parameters) or (name, width,
-    height, parameters), of a mapping with `model` and `params` (and `width`, `height`), or of a pycolmap.Camera; a
-    `Camera` as it is.
+    """Convert a description of a camera to a `Camera`.
 
-    Raises ValueError for a singular or broken K, an unknown model, a wrong number of parameters, or no positive focal
-    length.
+    Args:
+        camera: One of: a 3x3 matrix K; OpenCV's (K, distortion); (COLMAP model name, parameters); (name, width, height,
+            parameters); a mapping with `model` and `params`, and optionally `width` and `height`; a `pycolmap.Camera`;
+            a `Camera`, which is returned unchanged.
+
+    Raises:
+        ValueError: K is singular or not finite, the model is unknown, the number of parameters is wrong, or the focal
+            length is not positive.
+
+    >>> camera_from([[800, 0, 320], [0, 800, 240], [0, 0, 1]]).focal
+    800.0
     """
     if isinstance(camera, (Pinhole, Lens)):
         return camera
@@ -152,7 +173,7 @@ def camera_from(camera: Any) -> Camera:
         return _checked(Lens(camera), f"{camera.params}")
     if isinstance(camera, Mapping):
         if not {"model", "params"} <= set(camera):
-            raise ValueError(f"expected `camera` with `model` and `params`, got a mapping with {', '.join(camera)}")
+            raise ValueError(f"`camera` needs the keys `model` and `params`; it has {', '.join(camera) or 'no keys'}")
         return colmap_camera(str(camera["model"]), camera["params"], (camera.get("width", 0), camera.get("height", 0)))
     if isinstance(camera, (tuple, list)) and len(camera) and isinstance(camera[0], str):
         if len(camera) not in (2, 4):
@@ -165,27 +186,32 @@ def camera_from(camera: Any) -> Camera:
 
 
 def is_opencv(camera: Any) -> bool:
-    """Whether a camera is OpenCV's (K, distortion), whose pixels count from (0, 0), the centre of the first one."""
+    """Return True for OpenCV's (K, distortion), whose pixel (0, 0) is the centre of the first pixel."""
     return isinstance(camera, tuple) and len(camera) == 2 and np.shape(camera[0]) == (3, 3)
 
 
 def image_size(camera: Camera) -> tuple[int, int] | None:
-    """Width and height of a camera's images in pixels, None where they are not known."""
+    """Return the width and height of a camera's images in pixels, or None if they are unknown."""
     size = (camera.camera.width, camera.camera.height) if isinstance(camera, Lens) else (0, 0)
     return size if all(size) else None
 
 
 def same_aspect_ratio(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether images of two sizes are one scaled, to a pixel of rounding on a side."""
+    """Return True if two image sizes have the same aspect ratio, up to a pixel of rounding a side.
+
+    Args:
+        size: Width and height, pixels.
+        other: Width and height, pixels.
+    """
     return abs(size[0] * other[1] - size[1] * other[0]) <= max(*size, *other)
 
 
 def check_normalised(points2d: Any, remedy: str) -> None:
-    """Raise ValueError for image points that are pixels: half of them are more than 84 degrees off the axis.
+    """Raise ValueError if the image points are pixels: half of them lie more than 84 degrees off the axis.
 
     Args:
-        points2d: (m, 2) array or tensor, finite.
-        remedy: what the message proposes.
+        points2d: Image points (m, 2), array or tensor, finite.
+        remedy: What the message proposes.
     """
     points = np.asarray(points2d)
     if np.median(np.linalg.norm(points, axis=-1)) > WIDEST:
@@ -196,37 +222,41 @@ def check_normalised(points2d: Any, remedy: str) -> None:
 
 
 def outside_image(pixels: Array, sides: Any) -> npt.NDArray[np.bool_]:
-    """Return which pixels tell that an image has another size.
+    """Return which pixels show that an image has another size.
 
-    Detectors put some keypoints slightly outside: by a hundredth of the larger side, or a pixel, all may be, and by
-    more one in 50.
+    Detectors place some keypoints slightly outside of an image. Allowed are all points within a hundredth of the larger
+    side (at least one pixel) of the image, and up to 2 % of the points farther away.
 
     Args:
-        pixels: (m, 2); NaN is inside.
+        pixels: Image points (m, 2), pixels. NaN counts as inside.
         sides: Width and height, pixels.
 
     Returns:
-        (m,) those that lie farther outside; none of them where they are few.
+        Mask (m,) of the points farther outside; all False if they are no more than 2 %.
 
     >>> outside_image(np.array([[101.8, 20.0], [50, 50], [10, 20]]), (100, 100)).tolist()
     [True, False, False]
     """
     sides = np.asarray(sides, np.float64)
-    slack = max(SLIGHTLY * float(sides.max()), 1.0)
+    slack = max(SLACK * float(sides.max()), 1.0)
     outside = ((pixels < -slack) | (pixels > sides + slack)).any(-1)
     return np.asarray(outside & (outside.mean() > FEW_OUTSIDE))
 
 
 def resize_camera(camera: Camera, size: tuple[int, int]) -> Camera:
-    """The camera of images that were scaled to `size`, width and height in pixels; itself where they have that size.
+    """Return the camera of resized images.
+
+    Args:
+        camera: Camera with a known image size.
+        size: Width and height of the resized images, pixels, with the same aspect ratio.
 
     >>> resize_camera(camera_from(("PINHOLE", 1000, 800, [900, 880, 500, 400])), (500, 400)).matrix.tolist()
     [[450.0, 0.0, 250.0], [0.0, 440.0, 200.0], [0.0, 0.0, 1.0]]
     """
-    known = image_size(camera)
-    if known is None or not same_aspect_ratio(known, size):
-        raise ValueError(f"expected a camera with images of the shape {size[0]} x {size[1]}, got {known}")
-    if known == size:
+    full_size = image_size(camera)
+    if full_size is None or not same_aspect_ratio(full_size, size):
+        raise ValueError(f"expected a camera with images of the shape {size[0]} x {size[1]}, got {full_size}")
+    if full_size == size:
         return camera
     scaled = camera_from(camera_to_json(camera))
     assert isinstance(scaled, Lens)
@@ -235,7 +265,11 @@ def resize_camera(camera: Camera, size: tuple[int, int]) -> Camera:
 
 
 def scale_focal_length(camera: Camera, zoom: float) -> Camera:
-    """The camera with so many times the focal length.
+    """Return the camera with its focal length multiplied by a factor.
+
+    Args:
+        camera: Any camera.
+        zoom: Factor.
 
     >>> scale_focal_length(camera_from(("SIMPLE_RADIAL", 1000, 800, [900, 500, 400, 0.1])), 2.0).focal
     1800.0
@@ -251,14 +285,21 @@ def scale_focal_length(camera: Camera, zoom: float) -> Camera:
 
 
 def is_pinhole(camera: Camera) -> bool:
-    """Whether a camera is a pinhole camera without skew, to which `with_radial_distortion` can add distortion."""
+    """Return True for a pinhole camera without skew, to which `with_radial_distortion` can add distortion."""
     if isinstance(camera, Pinhole):
         return bool(camera.matrix[0, 1] == camera.matrix[1, 0] == 0)
     return camera.camera.model.name in ("SIMPLE_PINHOLE", "PINHOLE")
 
 
 def with_radial_distortion(camera: Camera, radial: float) -> Lens:
-    """Return a pinhole camera with a radial coefficient: SIMPLE_RADIAL, or OPENCV with two focal lengths.
+    """Add a radial distortion coefficient to a pinhole camera.
+
+    Args:
+        camera: Pinhole camera without skew.
+        radial: Coefficient k1 of the squared radius.
+
+    Returns:
+        A SIMPLE_RADIAL camera, or an OPENCV camera for two different focal lengths.
 
     >>> with_radial_distortion(camera_from(("SIMPLE_PINHOLE", 1000, 800, [900, 500, 400])), 0.1).camera.params.tolist()
     [900.0, 500.0, 400.0, 0.1]
@@ -271,7 +312,7 @@ def with_radial_distortion(camera: Camera, radial: float) -> Lens:
 
 
 def camera_to_json(camera: Camera) -> list[list[float]] | dict[str, Any]:
-    """A camera as JSON can hold it, which `camera_from` reads again."""
+    """Return a camera in a form that JSON can hold and `camera_from` reads."""
     if isinstance(camera, Pinhole):
         return camera.matrix.tolist()
     lens = camera.camera
@@ -279,11 +320,19 @@ def camera_to_json(camera: Camera) -> list[list[float]] | dict[str, Any]:
 
 
 def colmap_camera(model: str, params: Any, size: Any = (0, 0)) -> Lens:
-    """The camera of a COLMAP model's name and parameters, in COLMAP's order; size: width and height of its images,
-    pixels, 0 if unknown. Raises ValueError as `camera_from`."""
+    """Return the camera of a COLMAP model.
+
+    Args:
+        model: COLMAP's name of the model, such as "PINHOLE".
+        params: Parameters in COLMAP's order.
+        size: Width and height of the images, pixels; 0 if unknown.
+
+    Raises:
+        ValueError: As in `camera_from`.
+    """
     counts = dict(camera_models().values())
     if model not in counts:
-        raise ValueError(f"expected a COLMAP camera model among {', '.join(counts)}, got {model!r}")
+        raise ValueError(f"{model!r} is no COLMAP camera model; the models are {', '.join(counts)}")
     try:
         values = np.asarray(params, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -303,7 +352,17 @@ def colmap_camera(model: str, params: Any, size: Any = (0, 0)) -> Lens:
 
 
 def read_text_model(folder: Path) -> Any:
-    """The pycolmap.Reconstruction of a COLMAP model in text files. Raises ValueError with pycolmap's reason."""
+    """Read a COLMAP model in text files.
+
+    Args:
+        folder: Folder with cameras.txt, images.txt and points3D.txt.
+
+    Returns:
+        A `pycolmap.Reconstruction`.
+
+    Raises:
+        ValueError: pycolmap cannot read the files; the message has its reason.
+    """
     model = _pycolmap().Reconstruction()
     try:
         model.read_text(str(folder))
@@ -314,7 +373,7 @@ def read_text_model(folder: Path) -> Any:
 
 @cache
 def camera_models() -> Mapping[int, tuple[str, int]]:
-    """Name and number of parameters of each COLMAP camera model, by its id."""
+    """Return the name and the number of parameters of each COLMAP camera model, by its id."""
     pycolmap = _pycolmap()
     return {
         int(model): (name, len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params))
@@ -337,12 +396,12 @@ def _pycolmap() -> Any:
 def _checked(lens: Lens, shown: str) -> Lens:
     focal = lens.focal
     if not focal > 0:
-        raise ValueError(f"expected a camera with a positive focal length, got {focal} of the parameters {shown}")
+        raise ValueError(f"the focal length of a camera has to be positive; the parameters {shown} give {focal}")
     return lens
 
 
 def _opencv(matrix: Any, distortion: Any) -> Camera:
-    """OpenCV's matrix and its coefficients k1, k2, p1, p2, k3, k4, k5, k6, of which the last two or four may lack."""
+    """Return the camera of OpenCV's matrix and coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]]."""
     pinhole = _pinhole(matrix)
     values = np.asarray([] if distortion is None else distortion, np.float64).ravel()
     if len(values) not in (0, 4, 5, 8) and (len(values) not in (12, 14) or values[8:].any()):
@@ -350,7 +409,7 @@ def _opencv(matrix: Any, distortion: Any) -> Camera:
     if not values.any():
         return pinhole
     if pinhole.matrix[0, 1]:
-        raise ValueError(f"expected a `camera` matrix without skew beside a distortion, got {pinhole.matrix.tolist()}")
+        raise ValueError(f"a `camera` with distortion cannot have skew; its matrix is {pinhole.matrix.tolist()}")
     (fx, _, cx), (_, fy, cy), _ = pinhole.matrix.tolist()
     coefficients = np.zeros(8)
     coefficients[: len(values[:8])] = values[:8]

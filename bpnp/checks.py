@@ -1,4 +1,4 @@
-"""Arguments that callers without a type checker can get wrong: one clear ValueError each."""
+"""Checks of arguments, with one clear ValueError for each mistake."""
 
 import functools
 import inspect
@@ -15,12 +15,15 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 
 
 def check_shapes(function: _F) -> _F:
-    """Raise ValueError if a tensor argument has not the shape or the kind of numbers that its annotation names, and
-    within a transform of `torch.func`.
+    """Decorate a function so that it checks the shape and dtype of its tensor arguments.
 
-    An annotation such as `Float[Tensor, "b m 2"]` asks for three axes, none of them empty, the last of size 2, and
-    floating-point numbers; an axis name stands for one size in all arguments. Annotations of other types, arguments
-    that are None where the annotation allows it, and annotations with a variable number of axes are not looked at.
+    An annotation such as `Float[Tensor, "b m 2"]` requires three non-empty axes, the last of size 2, and floating-point
+    numbers. An axis name stands for one size in all arguments. Not checked are other annotations, those with a variable
+    number of axes, and arguments that are None by default.
+
+    Raises:
+        ValueError: From the decorated function, for an argument that does not fit, or within a transform of
+            `torch.func`.
 
     >>> import torch
     >>> from jaxtyping import Float
@@ -49,7 +52,7 @@ def check_shapes(function: _F) -> _F:
 
 
 class _Probe(torch.autograd.Function):
-    """A function without `setup_context`, which torch refuses within its transforms."""
+    """A function without `setup_context`, which torch rejects within its transforms."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor) -> Tensor:
@@ -57,7 +60,11 @@ class _Probe(torch.autograd.Function):
 
 
 def refuse_transforms(name: str) -> None:
-    """Raise ValueError within a transform of `torch.func`, or within `torch.vmap`."""
+    """Raise ValueError within a transform of `torch.func`, such as `torch.vmap`.
+
+    Args:
+        name: Name of the calling function, for the message.
+    """
     if torch.compiler.is_compiling():
         return
     try:
@@ -70,14 +77,23 @@ def refuse_transforms(name: str) -> None:
 
 
 def check_positive(**options: int | float) -> None:
-    """Raise ValueError that names the first option that is not above zero, NaN included."""
+    """Raise ValueError for the first option that is not above zero (NaN included).
+
+    Args:
+        **options: Values by the name of the option.
+    """
     for name, value in options.items():
         if not value > 0:
             raise ValueError(f"expected `{name}` > 0, got {value}")
 
 
 def check_within(least: float | int, most: float | int, **options: Any) -> None:
-    """Raise ValueError that names the first option that is not a finite number from `least` to `most`, or two of them.
+    """Raise ValueError for the first option that is not finite or not within limits.
+
+    Args:
+        least: Lower limit, included.
+        most: Upper limit, included.
+        **options: A number, or a pair (low, high) with low <= high, by the name of the option.
 
     >>> check_within(0, 1, share=(0.2, 0.5))
     >>> check_within(0, 1, share=(0.5, 0.2))
@@ -93,7 +109,7 @@ def check_within(least: float | int, most: float | int, **options: Any) -> None:
 
 
 def _tensor_type(hint: Any) -> Any:
-    """The jaxtyping annotation in `hint` or in `hint | None`; None if there is none of a fixed number of axes."""
+    """Return the jaxtyping annotation in `hint` or in `hint | None`; None unless it has a fixed number of axes."""
     for part in (hint, *typing.get_args(hint)):
         if hasattr(part, "dim_str") and not set(part.dim_str) & set("*.#"):
             return part
@@ -101,38 +117,55 @@ def _tensor_type(hint: Any) -> Any:
 
 
 def _check(name: str, value: Any, kind: Any, sizes: dict[str, tuple[int, str]]) -> None:
-    """Check one argument; `sizes` holds the size of each axis name met so far and the argument that set it."""
+    """Check one argument against its annotation.
+
+    Args:
+        name: Name of the argument.
+        value: Its value.
+        kind: Its jaxtyping annotation.
+        sizes: Size of each axis name found so far, and the argument that set it; extended.
+    """
     axes = kind.dim_str.split()
     shape = f"({', '.join(axes)}{',' * (len(axes) == 1)})"
     if not isinstance(value, Tensor):
         raise ValueError(f"expected `{name}` as a tensor of shape {shape}, got {type(value).__name__}")
-    got = tuple(value.shape)
-    if len(got) != len(axes):
-        hint = "; try .unsqueeze(0) for a batch of one" if len(got) == len(axes) - 1 else ""
-        raise ValueError(f"expected `{name}` of shape {shape}, got {got}{hint}")
-    if 0 in got:
-        raise ValueError(f"expected `{name}` of shape {shape} with no empty axis, got {got}")
-    for axis, size in zip(axes, got, strict=True):
-        wanted, source = (int(axis), "") if axis.isdigit() else sizes.setdefault(axis, (size, name))
-        if size != wanted:
-            reason = f" with {axis} = {wanted} as in `{source}`" if source else ""
-            raise ValueError(f"expected `{name}` of shape {shape}{reason}, got {got}")
+    actual = tuple(value.shape)
+    if len(actual) != len(axes):
+        hint = "; try .unsqueeze(0) for a batch of one" if len(actual) == len(axes) - 1 else ""
+        raise ValueError(f"expected `{name}` of shape {shape}, got {actual}{hint}")
+    if 0 in actual:
+        raise ValueError(f"expected `{name}` of shape {shape} with no empty axis, got {actual}")
+    for axis, size in zip(axes, actual, strict=True):
+        required, source = (int(axis), "") if axis.isdigit() else sizes.setdefault(axis, (size, name))
+        if size != required:
+            reason = f" with {axis} = {required} as in `{source}`" if source else ""
+            raise ValueError(f"expected `{name}` of shape {shape}{reason}, got {actual}")
     if str(value.dtype).removeprefix("torch.") not in kind.dtypes:
         numbers = kind.__name__.split("[")[0].lower()
         raise ValueError(f"expected `{name}` of type {numbers}, got {value.dtype}; try .{numbers}()")
 
 
 def as_tensor_list(name: str, values: Arrays, ndim: int) -> list[Tensor]:
-    """One array of `ndim` axes, a stack of them, or a sequence of them, as a list of CPU tensors."""
+    """Convert one array, a stack of arrays, or a sequence of arrays to a list of CPU tensors.
+
+    Args:
+        name: Name of the argument, for messages.
+        values: Array or arrays.
+        ndim: Number of axes of one array.
+
+    Returns:
+        One tensor for each problem.
+    """
     if isinstance(values, (list, tuple)) and values and np.ndim(values[0]) == ndim:
         return [as_tensor(name, v) for v in values]
     array = as_tensor(name, values)
     if array.numel() == 0 and array.ndim != ndim:
-        raise ValueError(f"expected at least one problem, got an empty `{name}`")
+        raise ValueError(f"`{name}` is empty; at least one problem is needed")
     return list(array) if array.ndim == ndim + 1 else [array]
 
 
 def as_tensor(name: str, values: Arrays) -> Tensor:
+    """Convert an array to a CPU tensor, in this machine's byte order."""
     if isinstance(values, Tensor):
         return values.cpu()
     try:
@@ -143,12 +176,22 @@ def as_tensor(name: str, values: Arrays) -> Tensor:
 
 
 def check_points(name: str, i: int | str, points: Tensor, dim: int) -> Tensor:
-    """The points of problem i, (k, dim). Raises ValueError for another shape, none of them, NaN or infinity."""
+    """Check the points of one problem and return them.
+
+    Args:
+        name: Name of the argument, for messages.
+        i: Index or name of the problem, for messages.
+        points: Points (k, dim).
+        dim: Number of coordinates.
+
+    Raises:
+        ValueError: Another shape, no points, NaN or infinity.
+    """
     if points.ndim != 2 or points.shape[1] != dim:
         hint = " (are points2d and points3d swapped?)" if points.ndim == 2 and points.shape[1] in (2, 3) else ""
         raise ValueError(f"expected `{name}` of shape (k, {dim}), got {tuple(points.shape)} in problem {i}{hint}")
     if len(points) == 0:
-        raise ValueError(f"expected at least one point in `{name}`, got none in problem {i}")
+        raise ValueError(f"`{name}` has no points in problem {i}; at least one is needed")
     if not points.isfinite().all():
         bad = int((~points.isfinite().all(-1)).nonzero()[0, 0])
         raise ValueError(f"expected finite `{name}`, got {points[bad].tolist()} at point {bad} of problem {i}")
@@ -156,7 +199,17 @@ def check_points(name: str, i: int | str, points: Tensor, dim: int) -> Tensor:
 
 
 def check_match3d(i: int | str, match: Tensor, m: int, n: int) -> Tensor:
-    """The match3d of problem i, (n,). Raises ValueError for another shape, no integers, or what is no 2D point."""
+    """Check the `match3d` of one problem and return it as int64.
+
+    Args:
+        i: Index or name of the problem, for messages.
+        match: Index of the 2D point of each 3D point (n,), -1 for none.
+        m: Number of 2D points.
+        n: Number of 3D points.
+
+    Raises:
+        ValueError: Another shape, no integers, or an index that is no 2D point.
+    """
     if match.shape != (n,):
         raise ValueError(f"expected `match3d` of shape ({n},), one a 3D point, got {tuple(match.shape)} in problem {i}")
     if match.is_floating_point() or match.is_complex() or match.dtype == torch.bool:
@@ -170,7 +223,17 @@ def check_match3d(i: int | str, match: Tensor, m: int, n: int) -> Tensor:
 
 
 def stack_values(name: str, values: list[Tensor], shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-    """One tensor of the values of all problems. Raises ValueError for another shape, NaN or infinity."""
+    """Stack the values of all problems.
+
+    Args:
+        name: Name of the argument, for messages.
+        values: One tensor for each problem.
+        shape: Required shape of each.
+        dtype: Dtype of the result.
+
+    Raises:
+        ValueError: Another shape, NaN or infinity.
+    """
     for i, value in enumerate(values):
         if value.shape != shape:
             raise ValueError(f"expected `{name}` of shape {shape}, got {tuple(value.shape)} in problem {i}")

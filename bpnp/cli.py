@@ -1,4 +1,4 @@
-"""The command line: `bpnp fit|validate|test|predict` are Lightning's own, the others are typed functions."""
+"""Command line. `bpnp fit|validate|test|predict` are Lightning's commands, the others are typed functions."""
 
 import ctypes
 import difflib
@@ -17,10 +17,10 @@ from bpnp.commands import COMMANDS
 from bpnp.commands.parser import LIGHTNING, first_line, parse_arguments, plain, short_help
 from bpnp.files import config_names, packaged_config
 
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h: bytes from which memory is given back to the system
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # options of mallopt, from glibc's malloc.h
 AFTER_CTRL_C = {
-    "localize": "; run it again to go on",
-    "table": "; run it again to go on",
+    "localize": "; run it again to continue",
+    "table": "; run it again to continue",
     "prepare": "; nothing was written, run it again",
 }
 LIBRARIES = sys.stdlib_module_names | {
@@ -30,13 +30,19 @@ LIBRARIES = sys.stdlib_module_names | {
 LIGHTNING_MISTAKES = {
     "MisconfigurationException",
     "TrainingDivergedError",
-}  # named, since Lightning is imported for its own commands only
+}  # names instead of classes, since importing Lightning takes seconds
 OTHER_SCRIPT = "lightning-sdk is installed, which has a script named `lightning` too"
 WIDTH = 80  # columns of the help
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Run a command. A mistake of the user's ends in one line on stderr and exit status 2, not in a traceback."""
+    """Run a command.
+
+    A user's mistake ends in one line on stderr and exit status 2, without a traceback.
+
+    Args:
+        args: Arguments. Default: those of the process.
+    """
     arguments = list(sys.argv[1:] if args is None else args)
     _quieten()
     try:
@@ -44,7 +50,7 @@ def main(args: Sequence[str] | None = None) -> None:
             keep_freed_memory()
             let_threads_sleep()
         if not {"", os.getcwd()} & set(sys.path):
-            sys.path.append(os.getcwd())  # class paths of a user's own; last, so that they hide no module
+            sys.path.append(os.getcwd())  # for the user's own classes; last, so that they hide no module
         _run(arguments)
         sys.stdout.flush()
     except BrokenPipeError:  # the reader of a pipe, such as head, closed it
@@ -53,7 +59,7 @@ def main(args: Sequence[str] | None = None) -> None:
     except Exception as error:
         if os.environ.get("BPNP_TRACEBACK") or not _is_mistake(error):
             raise
-        # Names of files that are not UTF-8 reach us as surrogates, which a terminal cannot show.
+        # File names that are not UTF-8 contain surrogates, which a terminal cannot show.
         print(f"bpnp: error: {plain(str(error))}".encode("utf-8", "replace").decode(), file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt:
@@ -62,9 +68,9 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 def _is_mistake(error: Exception) -> bool:
-    """Return True for an exception that is a message to the user, raised by this package or a library that it uses.
+    """Return True for an error that is a message to the user, raised by this package or a library that it uses.
 
-    The exceptions of a user's own class, such as a callback or a data module, keep their traceback.
+    Errors of a user's own class, such as a callback or a data module, keep their traceback.
     """
     if not isinstance(error, (ValueError, OSError)) and type(error).__name__ not in LIGHTNING_MISTAKES:
         return False
@@ -90,23 +96,23 @@ def _run(arguments: list[str]) -> None:
         run_training(_with_packaged_configs(arguments))
     else:
         name, *rest = arguments
-        command = COMMANDS[_known(name, [*LIGHTNING, *COMMANDS], "a command")]
+        command = COMMANDS[_check_name(name, [*LIGHTNING, *COMMANDS], "a command")]
         if isinstance(command, Mapping):
             if not rest or rest[0] in ("-h", "--help"):
                 lines = (_row(f"  {word:<14}", first_line(function)) for word, function in command.items())
                 print("\n".join([f"usage: bpnp {name} WHAT [options]", "", *lines]))
                 return
             word, *rest = rest
-            name, command = f"{name} {word}", command[_known(word, list(command), f"one of bpnp {name}")]
+            name, command = f"{name} {word}", command[_check_name(word, list(command), f"one of bpnp {name}")]
         command(**parse_arguments(name, command, rest))
 
 
 def keep_freed_memory() -> None:
-    """Until this process ends, freed memory stays with it, and torch, imported afterwards, asks for large pages.
+    """Keep freed memory in this process, and let torch, imported afterwards, request large pages.
 
-    A step of training makes and frees hundreds of results of 8 to 64 MB, and the page faults of new memory cost more
-    than their arithmetic: 1.35 instead of 1.7 s for a step of 16 problems of 1,000 points. Large pages are not asked
-    for where THP_MEM_ALLOC_ENABLE is set otherwise; a C library other than glibc has no `mallopt` and does as it does.
+    A training step makes and frees hundreds of results of 8 to 64 MB, and the page faults of new memory cost more than
+    their arithmetic: a step of 16 problems of 1,000 points takes 1.35 instead of 1.7 s. A value of THP_MEM_ALLOC_ENABLE
+    that is already set stays. Nothing changes with a C library other than glibc, which has no `mallopt`.
     """
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
@@ -118,13 +124,14 @@ def keep_freed_memory() -> None:
 def let_threads_sleep() -> None:
     """Let threads of torch, imported afterwards, sleep while they wait for work, unless OMP_WAIT_POLICY is set.
 
-    By default they spin. Beside two other processes on two cores a step of the quickstart takes 3.7 s with threads that
+    By default they spin. With two other processes on two cores, a step of the quickstart takes 3.7 s with threads that
     spin and 0.6 s with threads that sleep.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
-def _known(name: str, names: Sequence[str], what: str) -> str:
+def _check_name(name: str, names: Sequence[str], what: str) -> str:
+    """Return `name` if it is among `names`; raise ValueError otherwise."""
     if name in names:
         return name
     close = difflib.get_close_matches(name, names, n=1)
@@ -133,9 +140,9 @@ def _known(name: str, names: Sequence[str], what: str) -> str:
 
 
 def help_text() -> str:
-    """Return the text of `bpnp --help`: every command in a line."""
+    """Return the text of `bpnp --help`, one line for each command."""
     commands = {
-        name: "Pack a data set, once: " + ", ".join(command) if isinstance(command, Mapping) else first_line(command)
+        name: "Pack a data set: " + ", ".join(command) if isinstance(command, Mapping) else first_line(command)
         for name, command in COMMANDS.items()
     }
     lines = [_row(f"  {name:<17}", text) for name, text in (commands | LIGHTNING).items()]
@@ -158,21 +165,25 @@ def _row(head: str, text: str) -> str:
 
 
 def _with_packaged_configs(arguments: Sequence[str]) -> list[str]:
-    """The arguments with the file in place of the name of a packaged configuration. ValueError if there is none."""
+    """Replace names of packaged configurations by their files.
+
+    Raises:
+        ValueError: There is no such file or configuration.
+    """
     words = [part for text in arguments for part in (text.split("=", 1) if text.startswith("--config=") else [text])]
     for i, before in enumerate(words[:-1], 1):
         if before in ("-c", "--config"):
             file = packaged_config(words[i])
             if not os.path.isfile(file):
-                _known(file, config_names(), "a configuration file or the name of a packaged one")
+                _check_name(file, config_names(), "a configuration file or the name of a packaged one")
             if file != words[i] not in config_names():
-                print(f"bpnp: there is no {words[i]} in this folder, so the packaged {file} is used", file=sys.stderr)
+                print(f"bpnp: {words[i]} is not in this folder; using the packaged {file}", file=sys.stderr)
             words[i] = file
     return words
 
 
 def _quieten() -> None:
-    """Third-party advice that does not apply here."""
+    """Silence third-party advice that does not apply here."""
     advice = logging.getLogger("lightning.pytorch.utilities.rank_zero")
     advice.addFilter(lambda record: not re.search("Tip:|weights_only", record.getMessage()))
     for part in (

@@ -1,6 +1,6 @@
-"""Problems to try, with the true pose.
+"""Example problems with their true pose.
 
-Nothing is downloaded: the points come from the generators that the package trains on, photos are drawn.
+Nothing is downloaded: the points come from the generators of the training data, and photos are drawn.
 """
 
 from collections.abc import Sequence
@@ -16,14 +16,14 @@ from bpnp.datamodules.shapes import procedural_shape, sample_surface
 from bpnp.datamodules.synthetic_maps.maps import LONG_SIDE, MapOptions, draw_map_problem
 
 Kind = Literal["mesh", "photo", "leds", "stars"]
-CAMERA = np.array([[800.0, 0.0, 640.0], [0.0, 800.0, 480.0], [0.0, 0.0, 1.0]])  # of 1280 x 960 pixels
+CAMERA = np.array([[800.0, 0.0, 640.0], [0.0, 800.0, 480.0], [0.0, 0.0, 1.0]])  # images of 1280 x 960 pixels
 NOISE_PX = 0.5
 LEDS, LIGHTS = 17, 3
 CATALOGUE, STARS, FALSE_STARS = 500, 42, 18
-PHOTO_CAMERA = ("PINHOLE", 640, 480, (560.0, 560.0, 320.0, 240.0))  # COLMAP's, pixels
-HOUSES_APART, WRONG_IMAGE = 40.0, "07.jpg"  # of `draw_map`, metres
-TEXELS = 80.0  # of a texture, a metre: about as many as the photos have pixels
-LIGHT = (0.95, 0.6, 0.8, 0.7, 1.0, 0.4)  # on the faces of a box towards -y, y, -x, x, z, -z
+PHOTO_CAMERA = ("PINHOLE", 640, 480, (560.0, 560.0, 320.0, 240.0))  # COLMAP's model, size and parameters in pixels
+HOUSES_APART, WRONG_IMAGE = 40.0, "07.jpg"  # distance of the houses of `draw_map`, metres; image with a wrong pose
+TEXELS = 80.0  # texels per metre of a texture, about the resolution of the photos
+LIGHT = (0.95, 0.6, 0.8, 0.7, 1.0, 0.4)  # brightness of the faces of a box towards -y, y, -x, x, z, -z
 COLOURS = {
     "brick": np.array([(150, 70, 60), (180, 90, 70), (190, 170, 150), (90, 50, 40), (190, 200, 200)]),
     "ground": np.array([(70, 110, 60), (110, 120, 80), (150, 150, 140), (100, 90, 90), (60, 80, 50)]),
@@ -36,9 +36,15 @@ Face = tuple[Array, Array, Array, Image.Image]  # corner, edges a and b (metres,
 
 @dataclass(frozen=True)
 class Example:
-    """points2d: (m, 2) pixels. points3d: (n, 3). camera: (3, 3). rotation, translation: camera = R p + t.
+    """Problem with its true pose.
 
-    normals3d: (n, 3) outward normals, None where points have none.
+    Attributes:
+        points2d: Image points (m, 2), pixels.
+        points3d: Scene points (n, 3), or unit directions (n, 3).
+        camera: K (3, 3), pixels.
+        rotation: True R (3, 3), camera = R p + t.
+        translation: True t (3,), scene units.
+        normals3d: Outward normals (n, 3), None for points without normals.
     """
 
     points2d: Array
@@ -49,7 +55,13 @@ class Example:
     normals3d: Array | None = None
 
     def rotation_error_deg(self, rotation: Any) -> float:
-        """Angle between a rotation and the true one, degrees; NaN for one that is not finite, of a failed solution.
+        """Return the angle between a rotation and the true one, degrees.
+
+        Args:
+            rotation: Estimated R (3, 3).
+
+        Returns:
+            The angle in [0, 180], or NaN for a rotation that is not finite, such as that of a failed solution.
 
         >>> load("mesh").rotation_error_deg(np.full((3, 3), np.nan))
         nan
@@ -60,21 +72,26 @@ class Example:
 
 
 def load(kind: Kind | str, *, seed: int = 0) -> Example:
-    """A problem of one kind; the same for the same seed.
+    """Return an example problem.
 
-    - "mesh": 200 points on a shape, all of them seen, from any side;
-    - "photo": keypoints of a photo and points of a map, of which a third have no partner;
-    - "leds": 17 LEDs on a ring with their normals, those that face the camera, and 3 background lights;
-    - "stars": 60 lights of which 42 are among 500 directions; `points3d` are unit vectors, for `at_infinity=True`.
+    - "mesh": 200 points on a shape, all of them visible, seen from any side.
+    - "photo": keypoints of a photo and points of a map; a third of them have no correspondence.
+    - "leds": the LEDs that face the camera of 17 LEDs on a ring, with their normals, and 3 background lights.
+    - "stars": 42 of 500 catalogue directions and 18 false stars. `points3d` are unit vectors, for `at_infinity=True`.
 
-    Raises ValueError for another kind.
+    Args:
+        kind: Kind of problem.
+        seed: Random seed; the same seed gives the same problem.
+
+    Raises:
+        ValueError: The kind is unknown.
 
     >>> from bpnp.examples import load
     >>> load("mesh").points2d.shape
     (200, 2)
     """
     if kind not in get_args(Kind):
-        raise ValueError(f"expected an example among {', '.join(get_args(Kind))}, got {kind!r}")
+        raise ValueError(f"there is no example {kind!r}; the examples are {', '.join(get_args(Kind))}")
     rng = np.random.default_rng(seed)
     return {"mesh": _mesh, "photo": _photo, "leds": _leds, "stars": _stars}[kind](rng)
 
@@ -131,11 +148,18 @@ def _pixels(points: Any, rotation: Any, translation: Any) -> Any:
 def draw_photos(folder: Path | str, *, count: int = 14, seed: int = 0) -> dict[str, tuple[Array, Array]]:
     """Draw photos of a house and some boxes, taken on an arc around them, for COLMAP to build a map from.
 
-    Writes 00.png, 01.png, ... into the folder, seen by `PHOTO_CAMERA`. Returns the true pose of each by its name:
-    rotation (3, 3) and translation (3,), camera = R p + t, metres.
+    The photos are 00.png, 01.png, ..., taken by `PHOTO_CAMERA`.
+
+    Args:
+        folder: Folder for the photos, created if needed.
+        count: Number of photos.
+        seed: Random seed.
+
+    Returns:
+        True pose of each photo by its file name: R (3, 3) and t (3,), camera = R p + t, metres.
     """
     rng = np.random.default_rng(seed)
-    faces, poses = _place(rng), {}
+    faces, poses = _build_scene(rng), {}
     Path(folder).mkdir(parents=True, exist_ok=True)
     for number, angle in enumerate(np.radians(np.linspace(-75, 15, count))):
         distance, height = rng.uniform(8, 10), rng.uniform(1.5, 3.4)
@@ -147,26 +171,26 @@ def draw_photos(folder: Path | str, *, count: int = 14, seed: int = 0) -> dict[s
         rotation = Rotation.from_euler("z", rng.normal(0, 3), degrees=True).as_matrix() @ upright
         name = f"{number:02d}.png"
         poses[name] = rotation, -rotation @ centre
-        _seen(faces, *poses[name]).save(Path(folder) / name)
+        _render(faces, *poses[name]).save(Path(folder) / name)
     return poses
 
 
 def draw_map(folder: Path | str, *, seed: int = 0) -> dict[str, tuple[Array, Array]]:
     """Draw a COLMAP model of two equal houses in which one image has a wrong pose.
 
-    Eleven images were taken before a house and its copy `HOUSES_APART` metres to the right. `WRONG_IMAGE` was taken
-    before the second house and has the pose, and the points, of the first one: what structure from motion makes of
-    buildings that repeat. The surroundings of the houses differ.
+    Eleven images show a house and its copy `HOUSES_APART` metres to the right. `WRONG_IMAGE` shows the second house but
+    has the pose and the points of the first one, as structure from motion may assign where buildings repeat. The
+    surroundings of the houses differ.
 
     Args:
-        folder: Where cameras, images and points3D are written, .bin.
-        seed: Of the points and the poses.
+        folder: New folder for cameras, images and points3D, .bin.
+        seed: Random seed.
 
     Returns:
-        The true pose of each image by its name: rotation (3, 3) and translation (3,), camera = R p + t, metres.
+        True pose of each image by its name: R (3, 3) and t (3,), camera = R p + t, metres.
 
     Raises:
-        ValueError: If the folder exists and is not empty.
+        ValueError: The folder exists and is not empty.
     """
     import pycolmap
 
@@ -208,8 +232,8 @@ def draw_map(folder: Path | str, *, seed: int = 0) -> dict[str, tuple[Array, Arr
     return poses
 
 
-def _place(rng: np.random.Generator) -> list[Face]:
-    """Ground, a house with a flat roof, and boxes around its corner."""
+def _build_scene(rng: np.random.Generator) -> list[Face]:
+    """Return the faces of the ground, a house with a flat roof, and boxes around its corner."""
     edges = np.diag([15.0, 14.0, 0.0])
     faces = [(np.array([-7.0, -8.0, 0.0]), edges[0], edges[1], _texture(15, 14, "ground", rng))]
     for corner, size, colours in (
@@ -228,9 +252,15 @@ def _place(rng: np.random.Generator) -> list[Face]:
 
 
 def _texture(width: Any, height: Any, colours: str, rng: np.random.Generator) -> Image.Image:
-    """Rectangles of all sizes over each other (metres): detail at every scale, as in images of nature.
+    """Draw overlapping rectangles of all sizes: detail at every scale, as in natural images.
 
     Source: Lee, Mumford, Huang, Occlusion models for natural images (dead leaves), IJCV 2001.
+
+    Args:
+        width: Width, metres.
+        height: Height, metres.
+        colours: Key of `COLOURS`.
+        rng: Random generator.
     """
     w, h = round(TEXELS * width), round(TEXELS * height)
     picture = Image.new("RGB", (w, h), tuple(COLOURS[colours].mean(0).astype(int)))
@@ -244,8 +274,8 @@ def _texture(width: Any, height: Any, colours: str, rng: np.random.Generator) ->
     return picture
 
 
-def _seen(faces: Sequence[Face], rotation: Array, translation: Array) -> Image.Image:
-    """The photo of faces by `PHOTO_CAMERA`: each pixel the mean of four of the nearest face."""
+def _render(faces: Sequence[Face], rotation: Array, translation: Array) -> Image.Image:
+    """Render faces as a photo by `PHOTO_CAMERA`; each pixel is the mean of four samples of the nearest face."""
     _, width, height, (fx, fy, cx, cy) = PHOTO_CAMERA
     camera = np.array([[2 * fx, 0, 2 * cx], [0, 2 * fy, 2 * cy], [0, 0, 1]])
     y, x = np.indices((2 * height, 2 * width), np.float32) + np.float32(0.5)

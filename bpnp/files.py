@@ -1,4 +1,4 @@
-"""Files and folders written whole or not at all, locks, the packaged configurations, the user's cache."""
+"""Atomic writes, folder locks, fingerprints, the packaged configurations and the user's cache."""
 
 import hashlib
 import json
@@ -14,14 +14,17 @@ from typing import Any
 from filelock import FileLock, Timeout
 from platformdirs import user_cache_path
 
-CONFIGS = Path(__file__).parent / "configs"  # in a checkout a link to the folder `configs` at its top
+CONFIGS = Path(__file__).parent / "configs"  # in a checkout, a link to the folder `configs` at the top
 
 
 @contextmanager
 def write_atomically(path: Path) -> Iterator[Path]:
-    """A temporary name beside `path` for a file or a folder; renamed to `path` on success, deleted on error.
+    """Yield a temporary path next to `path`, renamed to `path` on success and deleted on error.
 
-    Makes the folders above it. An error of the disk names `path`.
+    Parent folders are created. An OSError without a file name gets `path`.
+
+    Args:
+        path: File or folder to write.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
@@ -29,7 +32,7 @@ def write_atomically(path: Path) -> Iterator[Path]:
         yield temporary
         os.replace(temporary, path)
     except OSError as error:
-        if error.filename is None and error.errno is not None:  # a write to a full disk does not say to which file
+        if error.filename is None and error.errno is not None:  # such as a write to a full disk
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
     finally:
@@ -40,7 +43,12 @@ def write_atomically(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> Path:
-    """Write a text whole or not at all, with line ends as they are."""
+    """Write a text file atomically, with its line ends unchanged, and return its path.
+
+    Args:
+        path: File.
+        text: Content, written as UTF-8.
+    """
     with write_atomically(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="")
     return path
@@ -48,10 +56,16 @@ def write_text(path: Path, text: str) -> Path:
 
 @contextmanager
 def lock_folder(folder: Path, *, wait: bool = False) -> Iterator[None]:
-    """Hold a folder for this process; it is made if it is not there.
+    """Lock a folder for this process until the block ends; create it if it does not exist.
 
-    Raises ValueError if it is a file, or if another process holds it, unless told to wait. The lock ends with the
-    process, however it ends.
+    The operating system releases the lock when the process ends, however it ends.
+
+    Args:
+        folder: Folder to lock.
+        wait: Wait for another process that holds the lock, instead of raising.
+
+    Raises:
+        ValueError: `folder` is or lies in a file, or another process holds the lock.
     """
     lock = FileLock(folder / ".lock", timeout=-1 if wait else 0)
     while not lock.is_locked:
@@ -61,9 +75,9 @@ def lock_folder(folder: Path, *, wait: bool = False) -> Iterator[None]:
         except FileNotFoundError:
             continue  # another process has just removed the folder
         except (FileExistsError, NotADirectoryError) as error:
-            raise ValueError(f"expected a folder to write to, got {folder}, which is or lies in a file") from error
+            raise ValueError(f"cannot write to {folder}: it is a file, or lies in one") from error
         except Timeout:
-            message = f"expected a folder that no other process writes to, got {folder}; try another, or later"
+            message = f"another process writes to {folder}; try another folder, or try again later"
             raise ValueError(message) from None
     try:
         yield
@@ -74,7 +88,10 @@ def lock_folder(folder: Path, *, wait: bool = False) -> Iterator[None]:
 
 @contextmanager
 def delay_interrupts() -> Iterator[None]:
-    """Hold Ctrl-C back until the block ends; a thread other than the main one never gets it."""
+    """Delay Ctrl-C until the block ends.
+
+    Only the main thread receives Ctrl-C; in another thread nothing is done.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -89,22 +106,30 @@ def delay_interrupts() -> Iterator[None]:
 
 
 def fingerprint(content: Any) -> str:
-    """A name for JSON content, 32 hexadecimal digits: different content has a different one."""
+    """Return a hash of JSON content, 32 hexadecimal digits."""
     return hashlib.blake2b(json.dumps(content, sort_keys=True).encode(), digest_size=16).hexdigest()
 
 
 def file_states(files: Iterable[Path]) -> list[tuple[str, int, int]]:
-    """Names, sizes and times of files, for a `fingerprint` that changes when one of them does."""
+    """Return the name, size and modification time of each file, for a `fingerprint` that changes with any of them.
+
+    Args:
+        files: Existing files.
+    """
     return [(file.name, (stat := file.stat()).st_size, stat.st_mtime_ns) for file in files]
 
 
 def cache_folder() -> Path:
-    """Where data that can be made again is kept: BPNP_CACHE, else the user's cache, ``~/.cache/bpnp``."""
+    """Return the folder for data that can be made again: `BPNP_CACHE`, else the user's cache, ``~/.cache/bpnp``."""
     return Path(os.environ.get("BPNP_CACHE") or user_cache_path("bpnp"))
 
 
 def packaged_config(name: str) -> str:
-    """The file of a configuration: a path that is a file as it is, or of a name such as `quickstart` the packaged one.
+    """Return the file of a configuration.
+
+    Args:
+        name: Path of a file, which is returned unchanged, or the name of a packaged configuration, such as
+            `quickstart`.
 
     >>> Path(packaged_config("quickstart")).name
     'quickstart.yaml'
@@ -115,18 +140,25 @@ def packaged_config(name: str) -> str:
 
 
 def config_names() -> list[str]:
-    """The names that `packaged_config` takes."""
+    """Return the names of the packaged configurations, sorted."""
     return sorted(str(path.relative_to(CONFIGS).with_suffix("")) for path in CONFIGS.rglob("*.yaml"))
 
 
 def config_content(file: Path) -> dict[str, Any]:
-    """The content of a configuration file. Raises ValueError that names a file without options."""
+    """Read the options of a configuration file.
+
+    Args:
+        file: YAML file.
+
+    Raises:
+        ValueError: The file is not YAML, or holds no options.
+    """
     import yaml
 
     try:
         content = yaml.safe_load(file.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"expected YAML in {file}, got {' '.join(str(error).split())}") from error
+        raise ValueError(f"{file} is not YAML: {' '.join(str(error).split())}") from error
     if not isinstance(content, dict):
-        raise ValueError(f"expected options such as `model:` and `data:` in {file}, got {content!r:.60}")
+        raise ValueError(f"{file} has no options such as `model:` and `data:`; its content is {content!r:.60}")
     return content

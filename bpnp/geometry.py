@@ -1,4 +1,7 @@
-"""Bearings, rigid motion, projection, angles and rotations of tensors, any leading axes; camera = R p + t."""
+"""Geometry of poses and bearings: rigid motion, projection, rotations and angles of tensors.
+
+A pose is world to camera: camera = R p + t. Functions take any number of leading axes unless they say otherwise.
+"""
 
 import numpy as np
 import torch
@@ -7,7 +10,17 @@ from torch import Tensor
 
 
 def bearings(points2d: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 3"]:
-    """Unit viewing rays f = (x, y, 1) / |(x, y, 1)| of normalised image points."""
+    """Return the unit viewing rays f = (x, y, 1) / |(x, y, 1)| of image points.
+
+    Args:
+        points2d: Normalised image coordinates (..., 2).
+
+    Returns:
+        Unit vectors (..., 3) in camera coordinates.
+
+    >>> bearings(torch.tensor([[0.75, 0.0]]))
+    tensor([[0.6000, 0.0000, 0.8000]])
+    """
     homogeneous = torch.cat([points2d, torch.ones_like(points2d[..., :1])], -1)
     return torch.nn.functional.normalize(homogeneous, dim=-1)
 
@@ -15,27 +28,70 @@ def bearings(points2d: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 3"]:
 def transform(
     rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"], points3d: Float[Tensor, "*b n 3"]
 ) -> Float[Tensor, "*b n 3"]:
-    """Camera coordinates R p + t."""
+    """Transform scene points to camera coordinates, R p + t.
+
+    Args:
+        rotation: R (..., 3, 3).
+        translation: t (..., 3), scene units.
+        points3d: p (..., n, 3), scene units.
+
+    Returns:
+        Camera coordinates (..., n, 3), scene units.
+    """
     return points3d @ rotation.mT + translation.unsqueeze(-2)
 
 
 def project(points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 2"]:
-    """Normalised image coordinates (x/z, y/z) of points in camera coordinates; infinite at z = 0."""
+    """Project points in camera coordinates to the normalised image plane.
+
+    Args:
+        points: Camera coordinates (..., 3).
+
+    Returns:
+        (x/z, y/z), (..., 2); infinite at z = 0.
+
+    >>> project(torch.tensor([1.0, 2.0, 4.0]))
+    tensor([0.2500, 0.5000])
+    """
     return points[..., :2] / points[..., 2:]
 
 
 def camera_centre(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-    """Centre of the camera in scene coordinates, -R^T t."""
+    """Return the camera centre in scene coordinates, -R^T t.
+
+    Args:
+        rotation: R (..., 3, 3).
+        translation: t (..., 3), scene units.
+
+    Returns:
+        Centre (..., 3), scene units.
+    """
     return -(rotation.mT @ translation.unsqueeze(-1)).squeeze(-1)
 
 
 def choose(chosen: Bool[Tensor, " b"], first: Tensor, second: Tensor) -> Tensor:
-    """The first tensor (b, ...) for the chosen samples, the second for the others."""
+    """Choose between two tensors sample by sample.
+
+    Args:
+        chosen: Mask (b,).
+        first: Values (b, ...) where the mask is True.
+        second: Values (b, ...) where the mask is False.
+
+    Returns:
+        Values (b, ...).
+    """
     return torch.where(chosen.view(-1, *(1 for _ in first.shape[1:])), first, second)
 
 
 def hat(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Skew matrix [v]x with [v]x w = v x w."""
+    """Return the skew-symmetric matrix [v]x with [v]x w = v x w.
+
+    Args:
+        vector: v (..., 3).
+
+    Returns:
+        Matrices (..., 3, 3).
+    """
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
@@ -44,21 +100,38 @@ def hat(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 def retract(
     step: Float[Tensor, "*b 6"], rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]
 ) -> tuple[Float[Tensor, "*b 3 3"], Float[Tensor, "*b 3"]]:
-    """Pose (exp([w]x) R, t + s) after the step (w, s): w in radians, s in the units of t.
+    """Move a pose by a step: (R, t) becomes (exp([w]x) R, t + s).
 
     The exponential acts on the left, so that camera coordinates y = R p + t change by w x (R p) + s to first order.
+
+    Args:
+        step: (w, s), (..., 6); w in radians, s in the units of t.
+        rotation: R (..., 3, 3).
+        translation: t (..., 3).
+
+    Returns:
+        The new rotation (..., 3, 3) and translation (..., 3).
 
     >>> _, translation = retract(torch.tensor([0.0, 0, 0, 1, 2, 3]), torch.eye(3), torch.zeros(3))
     >>> translation
     tensor([1., 2., 3.])
     """
-    import roma  # at its first use: it imports all of torch's compiler
+    import roma  # here, not at the top: it imports all of torch's compiler
 
     return roma.rotvec_to_rotmat(step[..., :3]) @ rotation, translation + step[..., 3:]
 
 
 def quaternion_rotation(quaternion: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3 3"]:
-    """Rotation of a quaternion (x, y, z, w) of any length; one of normal numbers gives a uniform rotation."""
+    """Convert quaternions of any length to rotation matrices.
+
+    A quaternion of four normal numbers gives a uniformly random rotation.
+
+    Args:
+        quaternion: (x, y, z, w), (..., 4), not zero.
+
+    Returns:
+        Rotations (..., 3, 3).
+    """
     import roma  # as in `retract`
 
     return roma.unitquat_to_rotmat(torch.nn.functional.normalize(quaternion, dim=-1))
@@ -67,9 +140,14 @@ def quaternion_rotation(quaternion: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 
 def random_rotations(
     count: int, generator: torch.Generator | np.random.Generator | None = None
 ) -> Float[Tensor, "count 3 3"]:
-    """Rotations (count, 3, 3) drawn uniformly over SO(3), float64, on the CPU.
+    """Draw rotations uniformly over SO(3).
 
-    generator: draws 4 normal numbers a rotation; torch's global generator if None.
+    Args:
+        count: Number of rotations.
+        generator: Source of 4 normal numbers a rotation. Default: torch's global generator.
+
+    Returns:
+        Rotations (count, 3, 3), float64, on the CPU.
     """
     if isinstance(generator, np.random.Generator):
         return quaternion_rotation(torch.from_numpy(generator.standard_normal((count, 4))))
@@ -77,13 +155,33 @@ def random_rotations(
 
 
 def angle_between(a: Float[Tensor, "*#b 3"], b: Float[Tensor, "*#b 3"]) -> Float[Tensor, "*#b"]:
-    """Angle in radians, atan2(|a x b|, a.b): exact near 0 and pi, where arccos loses half the digits."""
+    """Return the angle between vectors, atan2(|a x b|, a.b).
+
+    This form is exact near 0 and pi, where arccos loses half of the digits.
+
+    Args:
+        a: Vectors (..., 3) of any length.
+        b: Vectors (..., 3); their leading axes broadcast with those of `a`.
+
+    Returns:
+        Angles (...) in [0, pi], radians.
+    """
     a, b = torch.broadcast_tensors(a, b)
     return torch.atan2(torch.linalg.vector_norm(torch.linalg.cross(a, b), dim=-1), (a * b).sum(-1))
 
 
 def is_finite(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
-    """Poses that are there: what was not found is NaN or infinite."""
+    """Return which poses are finite.
+
+    A pose that was not found holds NaN or infinity.
+
+    Args:
+        rotation: R (..., 3, 3).
+        translation: t (..., 3).
+
+    Returns:
+        Mask (...).
+    """
     return rotation.isfinite().all((-2, -1)) & translation.isfinite().all(-1)
 
 
@@ -93,18 +191,34 @@ def chords(
     rotation: Float[Tensor, "b 3 3"],
     translation: Float[Tensor, "b 3"],
 ) -> Float[Tensor, "b m n"]:
-    """|f_i - u_j|, u_j the direction of R p_j + t: 2 sin(angle / 2).
+    """Return the distance between each bearing and each point's direction, |f_i - u_j| = 2 sin(angle / 2).
 
-    Keeps its digits at small angles and needs no cross products.
+    u_j is the unit direction of R p_j + t. The chord keeps its digits at small angles and needs no cross products.
+
+    Args:
+        bearings: Unit vectors f_i (b, m, 3).
+        points3d: Scene points p_j (b, n, 3), scene units.
+        rotation: R (b, 3, 3).
+        translation: t (b, 3), scene units.
+
+    Returns:
+        Chords (b, m, n) in [0, 2].
     """
     directions = torch.nn.functional.normalize(transform(rotation, translation, points3d), dim=-1)
     return torch.cdist(bearings, directions, compute_mode="donot_use_mm_for_euclid_dist")
 
 
 def rotation_angle(a: Float[Tensor, "*b 3 3"], b: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
-    """Angle of a^T b in radians, in [0, pi] (paper Eq. 13), by atan2 of twice its sine and twice its cosine.
+    """Return the angle of the relative rotation a^T b (paper Eq. 13).
 
-    The gradient is undefined at 0 and pi; zero is returned there.
+    It is atan2 of twice the sine and twice the cosine. The gradient is undefined at 0 and pi; zero is returned there.
+
+    Args:
+        a: Rotations (..., 3, 3).
+        b: Rotations (..., 3, 3).
+
+    Returns:
+        Angles (...) in [0, pi], radians.
     """
     relative = a.mT @ b
     skew = relative - relative.mT

@@ -1,9 +1,10 @@
-"""Errors of poses, and their quartiles and recalls over many problems, as functions and as torchmetrics' metrics.
+"""Pose errors, and their quartiles and recall over many problems, as functions and as torchmetrics metrics.
 
 Conventions: camera = R p + t. Angles are in degrees, lengths in scene units; everything is computed in float64.
-A problem without a pose (NaN or infinity in the estimate) has errors of 180 deg and infinity: it counts as the worst
-pose and is right at no threshold, it is never left out. A problem with a pose but without a true match has no
-reprojection error (NaN): it is left out of what is said of that error, and counted as "without_matches".
+
+A problem without a pose (NaN or infinity in the estimate) has errors of 180 degrees and infinity. It counts as the
+worst pose and is never left out. A problem with a pose but without a true match has no reprojection error (NaN). The
+statistics of that error leave it out; it is counted as "without_matches".
 """
 
 import math
@@ -24,7 +25,15 @@ from bpnp.types import Batch, Pose, Prediction
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """Errors of one estimate for b problems, float64; see the functions below. `index` is their `Batch.index`."""
+    """Errors of one estimate for b problems, float64.
+
+    Attributes:
+        rotation_deg: `rotation_error` (b,), degrees.
+        translation: `translation_error` (b,), scene units.
+        centre: `centre_error` (b,), scene units.
+        reprojection_deg: `reprojection_error` (b,), degrees.
+        index: `Batch.index` of the problems (b,), None if they have none.
+    """
 
     rotation_deg: Float[Tensor, " b"]
     translation: Float[Tensor, " b"]
@@ -34,7 +43,14 @@ class PoseErrors:
 
 
 def rotation_error(rotation: Float[Tensor, "b 3 3"], rotation_gt: Float[Tensor, "b 3 3"]) -> Float[Tensor, " b"]:
-    """Angle of R^T R_gt in degrees, in [0, 180] (paper Eq. 13), by atan2; 180 where R is not finite.
+    """Return the angle of R^T R_gt (paper Eq. 13).
+
+    Args:
+        rotation: Estimated R (b, 3, 3).
+        rotation_gt: True R (b, 3, 3).
+
+    Returns:
+        Angles (b,) in [0, 180], degrees, float64; 180 where R is not finite.
 
     >>> quarter_turn = torch.tensor([[[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]])
     >>> float(rotation_error(quarter_turn, torch.eye(3)[None]))
@@ -45,7 +61,14 @@ def rotation_error(rotation: Float[Tensor, "b 3 3"], rotation_gt: Float[Tensor, 
 
 
 def translation_error(translation: Float[Tensor, "b 3"], translation_gt: Float[Tensor, "b 3"]) -> Float[Tensor, " b"]:
-    """|t - t_gt| in scene units (paper Eq. 14); infinite where t is not finite.
+    """Return the distance |t - t_gt| (paper Eq. 14).
+
+    Args:
+        translation: Estimated t (b, 3), scene units.
+        translation_gt: True t (b, 3), scene units.
+
+    Returns:
+        Distances (b,), scene units, float64; infinity where t is not finite.
 
     >>> float(translation_error(torch.tensor([[3.0, 4.0, 1.0]]), torch.tensor([[0.0, 0.0, 1.0]])))
     5.0
@@ -60,9 +83,18 @@ def centre_error(
     rotation_gt: Float[Tensor, "b 3 3"],
     translation_gt: Float[Tensor, "b 3"],
 ) -> Float[Tensor, " b"]:
-    """Distance |R^T t - R_gt^T t_gt| of the camera centres in scene units; infinite where the pose is not finite.
+    """Return the distance of the camera centres, |R^T t - R_gt^T t_gt|.
 
-    Unlike |t - t_gt| it does not depend on where the scene's origin is.
+    Unlike |t - t_gt|, it does not depend on the origin of the scene.
+
+    Args:
+        rotation: Estimated R (b, 3, 3).
+        translation: Estimated t (b, 3), scene units.
+        rotation_gt: True R (b, 3, 3).
+        translation_gt: True t (b, 3), scene units.
+
+    Returns:
+        Distances (b,), scene units, float64; infinity where the pose is not finite.
     """
     centre = camera_centre(rotation.double(), translation.double())
     error = torch.linalg.vector_norm(centre - camera_centre(rotation_gt.double(), translation_gt.double()), dim=-1)
@@ -76,30 +108,47 @@ def reprojection_error(
     points3d: Float[Tensor, "b n 3"],
     match3d: Int[Tensor, "b n"],
 ) -> Float[Tensor, " b"]:
-    """Mean angle in degrees between f_i and R p_j + t over the true matches i = match3d[j] >= 0.
+    """Return the mean angle between the bearings and the projected points of the true matches.
 
-    Paper Eq. 2 divides the sum over the true matches by m n; here it is divided by their number, so that it is an angle
-    and does not depend on the sizes of the sets. A point at the camera centre counts as 180. A sample without a pose
-    is 180; else a sample without a true match is NaN.
+    Paper Eq. 2 divides the sum over the true matches by m n. Here it is divided by their number, so that the result is
+    an angle and does not depend on the sizes of the sets. A point at the camera centre counts as 180 degrees.
+
+    Args:
+        rotation: Estimated R (b, 3, 3).
+        translation: Estimated t (b, 3), scene units.
+        points2d: Normalised image coordinates (b, m, 2).
+        points3d: Scene points (b, n, 3), scene units.
+        match3d: Index of the true 2D point of each 3D point (b, n), -1 for none.
+
+    Returns:
+        Angles (b,), degrees, float64; 180 for a sample without a pose, else NaN for one without a true match.
     """
     true = match3d >= 0
-    seen = points2d.double().gather(1, match3d.clamp(min=0).unsqueeze(-1).expand(-1, -1, 2))
+    observed = points2d.double().gather(1, match3d.clamp(min=0).unsqueeze(-1).expand(-1, -1, 2))
     points = transform(rotation.double(), translation.double(), points3d.double())
-    angle = angle_between(bearings(seen), points).where((points != 0).any(-1), math.pi)
+    angle = angle_between(bearings(observed), points).where((points != 0).any(-1), math.pi)
     mean = torch.rad2deg(angle.where(true, 0.0).sum(-1) / true.sum(-1))
     return mean.where(is_finite(rotation, translation), 180.0)
 
 
 def pose_errors(pose: Pose, batch: Batch) -> PoseErrors:
-    """All four errors against the batch's true pose. `reprojection_deg` is NaN if the batch has no `match3d`.
+    """Return all four errors of a pose against the true pose of the batch.
 
-    Raises ValueError if the true pose is absent or not finite.
+    Args:
+        pose: Estimated poses.
+        batch: Problems with their true pose.
+
+    Returns:
+        The errors. `reprojection_deg` is NaN if the batch has no `match3d`.
+
+    Raises:
+        ValueError: The batch has no true pose, or one that is not finite.
     """
     if batch.rotation is None or batch.translation is None:
-        raise ValueError("expected a batch with its true `rotation` and `translation`, got None; try Batch.from_arrays")
-    known = is_finite(batch.rotation, batch.translation)
-    if not bool(known.all()):
-        raise ValueError(f"expected a finite true pose, got NaN or infinity in {batch.ids[int(known.int().argmin())]}")
+        raise ValueError("the batch has no true `rotation` and `translation`, which pose errors need")
+    finite = is_finite(batch.rotation, batch.translation)
+    if not bool(finite.all()):
+        raise ValueError(f"the true pose of {batch.ids[int(finite.int().argmin())]} holds NaN or infinity")
     rotation = pose.rotation.where(pose.found[:, None, None], math.nan)
     translation = pose.translation.where(pose.found[:, None], math.nan)
     reprojection = torch.full_like(translation[:, 0], math.nan, dtype=torch.float64)
@@ -115,17 +164,28 @@ def pose_errors(pose: Pose, batch: Batch) -> PoseErrors:
 
 
 def prediction_errors(prediction: Prediction, batch: Batch) -> dict[str, PoseErrors]:
-    """Return the `pose_errors` of each estimate of a prediction."""
+    """Return the `pose_errors` of each estimate of a prediction, by its name."""
     return {name: pose_errors(pose, batch) for name, pose in prediction.poses.items()}
 
 
 Limits = Sequence[float | int]
-NO_PROBLEM = "expected at least one problem, got none; try update() before compute()"
+NO_PROBLEM = "there are no problems to compute a metric of; call update() before compute()"
 
 
 @dataclass(frozen=True)
 class RecallThresholds:
-    """Errors up to which a pose counts as right; `joint` holds limits (rotation in deg, translation)."""
+    """Largest errors of a pose that counts as correct.
+
+    Args:
+        rotation_deg: Rotation errors, degrees.
+        translation: Translation errors, scene units.
+        centre: Errors of the camera centre, scene units.
+        reprojection_deg: Reprojection errors, degrees.
+        joint: Pairs (rotation error in degrees, translation error in scene units); both have to hold.
+
+    Raises:
+        ValueError: A threshold is negative or not finite.
+    """
 
     rotation_deg: Limits = (1.0, 2.0, 5.0, 10.0, 15.0, 20.0)
     translation: Limits = (0.05, 0.1, 0.2, 0.5, 1.0)
@@ -134,19 +194,28 @@ class RecallThresholds:
     joint: Sequence[tuple[float | int, float | int]] = ((15.0, 0.5), (10.0, 1.0))
 
     def __post_init__(self) -> None:
-        given = (self.rotation_deg, self.translation, self.centre, self.reprojection_deg, *self.joint)
-        if not all(0 <= limit < math.inf for limits in given for limit in limits):
+        thresholds = (self.rotation_deg, self.translation, self.centre, self.reprojection_deg, *self.joint)
+        if not all(0 <= limit < math.inf for limits in thresholds for limit in limits):
             raise ValueError(f"expected finite thresholds >= 0, got {self}")
 
 
 def pose_quartiles(errors: PoseErrors) -> dict[str, Tensor]:
-    """First, second (median) and third quartile of each error, as float64 scalars.
+    """Return the three quartiles of each error.
 
-    Keys: "rotation_q1_deg", "translation_q2", "centre_q3", "reprojection_q1_deg" and so on; "found", the share of
-    problems with a pose; "without_matches", the number of those without a reprojection error. Linear
-    interpolation between order statistics (numpy's default); a quartile that leans on an infinite neighbour is
-    infinite. The reprojection quartiles are absent if no problem has that error. Raises ValueError if there is no
-    problem.
+    Quartiles interpolate linearly between order statistics (numpy's default). A quartile next to an infinite error is
+    infinite.
+
+    Args:
+        errors: Errors of at least one problem.
+
+    Returns:
+        Float64 scalars by name: "rotation_q1_deg", "translation_q2", "centre_q3", "reprojection_q1_deg" and so on (q2
+            is
+        the median); "found", the fraction of problems with a pose; "without_matches", the number of problems without a
+        reprojection error. The reprojection quartiles are absent if no problem has that error.
+
+    Raises:
+        ValueError: There are no problems.
     """
     values: dict[str, Tensor] = {}
     for name, unit, error in known_errors(errors):
@@ -154,7 +223,7 @@ def pose_quartiles(errors: PoseErrors) -> dict[str, Tensor]:
         for number in (1, 2, 3):
             position = number / 4 * (len(ordered) - 1)
             below, above = ordered[math.floor(position)], ordered[math.ceil(position)]
-            # Between two infinities the interpolation is NaN.
+            # Interpolation between two infinities would give NaN.
             value = torch.lerp(below, above, position % 1).where(above.isfinite(), above)
             values[f"{name}_q{number}_{unit}".rstrip("_")] = value
     values["found"] = errors.translation.isfinite().double().mean()
@@ -163,10 +232,18 @@ def pose_quartiles(errors: PoseErrors) -> dict[str, Tensor]:
 
 
 def pose_recalls(errors: PoseErrors, thresholds: RecallThresholds | None = None) -> dict[str, Tensor]:
-    """Share of problems in [0, 1] with error <= threshold, for every threshold, as float64 scalars.
+    """Return the fraction of problems with an error up to each threshold.
 
-    Keys: "recall_rotation_5deg", "recall_translation_0.5", "recall_centre_0.5", "recall_reprojection_1deg", and
-    "recall_joint_15deg_0.5" for rotation and translation both. Raises ValueError if there is no problem.
+    Args:
+        errors: Errors of at least one problem.
+        thresholds: Thresholds. Default: `RecallThresholds()`.
+
+    Returns:
+        Float64 scalars in [0, 1] by name: "recall_rotation_5deg", "recall_translation_0.5", "recall_centre_0.5",
+        "recall_reprojection_1deg" and so on, and "recall_joint_15deg_0.5" for rotation and translation together.
+
+    Raises:
+        ValueError: There are no problems.
     """
     thresholds = thresholds or RecallThresholds()
     values: dict[str, Tensor] = {}
@@ -180,7 +257,14 @@ def pose_recalls(errors: PoseErrors, thresholds: RecallThresholds | None = None)
 
 
 def recall_curve(error: Float[Tensor, " b"], limits: Limits) -> Float[Tensor, " k"]:
-    """Share of errors up to each limit, float64.
+    """Return the fraction of errors up to each limit.
+
+    Args:
+        error: Errors (b,).
+        limits: Limits (k,), in the unit of the errors.
+
+    Returns:
+        Fractions (k,), float64.
 
     >>> recall_curve(torch.tensor([1.0, 3.0, 3.0, 9.0]), [1, 3, 4]).tolist()
     [0.25, 0.75, 0.75]
@@ -191,25 +275,37 @@ def recall_curve(error: Float[Tensor, " b"], limits: Limits) -> Float[Tensor, " 
 
 
 def joint_error(errors: PoseErrors, translation: float | int) -> Float[Tensor, " b"]:
-    """Rotation errors in degrees, infinite for a pose with more than this translation error."""
+    """Return the rotation errors in degrees, infinite where the translation error exceeds a limit.
+
+    Args:
+        errors: Errors of b problems.
+        translation: Largest translation error, scene units.
+    """
     return errors.rotation_deg.where(errors.translation <= translation, math.inf)
 
 
 def known_errors(errors: PoseErrors) -> Iterator[tuple[str, str, Tensor]]:
-    """Name, unit and values of each error that at least one problem has."""
+    """Yield the name, the unit and the finite or infinite values of each error that at least one problem has.
+
+    Raises:
+        ValueError: There are no problems, or an error other than the reprojection error is NaN.
+    """
     if len(errors.rotation_deg) == 0:
         raise ValueError(NO_PROBLEM)
     for name, unit in (("rotation", "deg"), ("translation", ""), ("centre", ""), ("reprojection", "deg")):
         error: Tensor = getattr(errors, f"{name}_{unit}".rstrip("_"))
         known = error[~error.isnan()].double()
         if len(known) < len(error) and name != "reprojection":
-            raise ValueError(f"expected a {name} error for each problem, got NaN; one without a pose is 180 deg or inf")
+            raise ValueError(f"a {name} error is NaN; a problem without a pose has 180 deg or infinity")
         if len(known):
             yield name, unit, known
 
 
 class ProblemMetric(Metric):
-    """Numbers of every problem, `width` of them, over batches and processes; each problem once, by its index."""
+    """Base of metrics that keep `width` numbers of every problem, over batches and processes.
+
+    A problem is counted once, by its index.
+    """
 
     full_state_update = False
     is_differentiable = False
@@ -221,35 +317,37 @@ class ProblemMetric(Metric):
         self.add_state("records", default=[], dist_reduce_fx="cat")
 
     def sync(self, *args: Any, **kwargs: Any) -> None:
-        """A process without a batch joins the exchange with no rows, in the type and width of the others' rows."""
+        """Exchange the records; a process without a batch joins with no rows of the right type and width."""
         if len(self.records) == 0:
             self.records.append(torch.empty(0, self.width + 1, dtype=torch.float64, device=self.device))
         super().sync(*args, **kwargs)
 
     def _append(self, *columns: Tensor, index: Tensor | None) -> None:
-        """Add rows; those without an index are all counted."""
+        """Add rows; rows without an index are all counted."""
         index = torch.full_like(columns[0], math.nan) if index is None else index
         self.records.append(torch.stack([column.detach().double() for column in (*columns, index)], -1))
 
     def _columns(self) -> tuple[Tensor, ...]:
-        """The columns so far, with the first occurrence of each problem."""
+        """Return the columns so far, with the first row of each problem."""
         records = dim_zero_cat(self.records)
         if len(records) == 0:
             raise ValueError(NO_PROBLEM)
         values, index = records[:, :-1], records[:, -1]
         order = torch.argsort(index, stable=True)
-        again = index[order].diff() == 0  # never true of NaN, the index of problems that have none
-        first, repeat = order[:-1][again], order[1:][again]
+        repeated = index[order].diff() == 0  # never True for NaN, which stands for no index
+        first, repeat = order[:-1][repeated], order[1:][repeated]
         if not torch.isclose(values[first], values[repeat], rtol=1e-3, atol=1e-3, equal_nan=True).all():
-            message = "expected one problem per `Batch.index`, got one index with several values; the first is counted"
-            warnings.warn(f"{message}; try a metric per data set, and an index for each of its problems", stacklevel=2)
+            message = "problems with the same `Batch.index` have different values; only the first one is counted"
+            warnings.warn(f"{message}. Use one metric per data set, and one index per problem", stacklevel=2)
         keep = torch.ones_like(index, dtype=torch.bool)
         keep[repeat] = False
         return values[keep].unbind(-1)
 
 
 class MeanOverProblems(ProblemMetric):
-    """Mean of one value per problem over batches and processes, each problem counted once by its `Batch.index`.
+    """Mean of one value per problem, over batches and processes.
+
+    A problem is counted once, by its `Batch.index`.
 
     >>> mean = MeanOverProblems()
     >>> mean.update(torch.tensor([1.0, 2.0, 6.0]), torch.tensor([0, 1, 2]))
@@ -262,30 +360,36 @@ class MeanOverProblems(ProblemMetric):
     width = 1
 
     def update(self, values: Float[Tensor, " b"], index: Int[Tensor, " b"]) -> None:
+        """Add the values (b,) of the problems with these indices (b,)."""
         self._append(values, index=index)
 
     def compute(self) -> Float[Tensor, ""]:
+        """Return the mean."""
         return self._columns()[0].mean()
 
 
 class PoseMetric(ProblemMetric):
-    """The four errors of every problem's pose."""
+    """Base of metrics of the four errors of every problem's pose."""
 
     width = 4
 
     def update(self, errors: PoseErrors) -> None:
-        """Add the errors of a batch; all of them are counted if their index is None."""
+        """Add the errors of a batch.
+
+        Args:
+            errors: Errors; all of them are counted if their `index` is None.
+        """
         self._append(
             errors.rotation_deg, errors.translation, errors.centre, errors.reprojection_deg, index=errors.index
         )
 
     def errors(self) -> PoseErrors:
-        """The errors so far, each problem once."""
+        """Return the errors so far, each problem once."""
         return PoseErrors(*self._columns())
 
 
 class PoseQuartiles(PoseMetric):
-    """`pose_quartiles` over all problems.
+    """`pose_quartiles` over all problems, as a metric.
 
     >>> metric = PoseQuartiles()
     >>> metric.update(PoseErrors(*torch.tensor([[1.0, 3.0, 5.0], [0.1, 0.2, 0.3], [0.1, 0.2, 0.3], [0.2, 0.2, 0.4]])))
@@ -296,11 +400,16 @@ class PoseQuartiles(PoseMetric):
     higher_is_better = False
 
     def compute(self) -> dict[str, Tensor]:
+        """Return the quartiles by name, as `pose_quartiles` does."""
         return pose_quartiles(self.errors())
 
 
 class PoseRecall(PoseMetric):
-    """`pose_recalls` over all problems.
+    """`pose_recalls` over all problems, as a metric.
+
+    Args:
+        thresholds: Largest errors of a correct pose. Default: `RecallThresholds()`.
+        **kwargs: Options of `torchmetrics.Metric`.
 
     >>> metric = PoseRecall(RecallThresholds(rotation_deg=(4,)))
     >>> metric.update(PoseErrors(*torch.tensor([[1.0, 3.0, 5.0], [0.1, 0.2, 0.3], [0.1, 0.2, 0.3], [0.2, 0.2, 0.4]])))
@@ -315,4 +424,5 @@ class PoseRecall(PoseMetric):
         self.thresholds = thresholds
 
     def compute(self) -> dict[str, Tensor]:
+        """Return the recalls by name, as `pose_recalls` does."""
         return pose_recalls(self.errors(), self.thresholds)

@@ -1,7 +1,7 @@
-"""Full precision for functions whose results need every digit of float32, whatever the user chose for the networks.
+"""Full float32 precision for functions that need every digit, whatever precision the user chose for the networks.
 
-Autocast would run their products in 16 bits, and `torch.set_float32_matmul_precision("high")` with the 11 significant
-bits of TF32: a distance near zero is then wrong by 0.03, and the transport kernel exp(-distance / mu) by 30 %.
+Autocast would compute their products in 16 bits. `torch.set_float32_matmul_precision("high")` would use TF32, with 11
+significant bits: a distance near zero is then wrong by 0.03, and the transport kernel exp(-distance / mu) by 30 %.
 """
 
 import functools
@@ -16,13 +16,13 @@ from torch import Tensor
 _F = TypeVar("_F", bound=Callable[..., Any])
 HALF = (torch.float16, torch.bfloat16)
 _LOCK = threading.Lock()
-_RESTORE: list[Callable[[], None]] = []  # one an open block; the first has the user's setting
+_RESTORE: list[Callable[[], None]] = []  # one for each open block; the first restores the user's setting
 
 
 def full_precision(function: _F) -> _F:
-    """Decorator: run a function of tensors as in `exact_products`, with half-precision arguments cast to float32.
+    """Decorate a function of tensors to run within `exact_products`, with half-precision arguments cast to float32.
 
-    The first argument is a tensor; its device is the one whose autocast is switched off.
+    The first argument has to be a tensor. Autocast is switched off for its device.
     """
 
     def widened(value: Any) -> Any:
@@ -38,10 +38,13 @@ def full_precision(function: _F) -> _F:
 
 @contextmanager
 def exact_products(device: torch.device) -> Iterator[None]:
-    """Autocast off in this thread, float32 matrix products in full precision in this process, until the block ends.
+    """Switch autocast off, and compute float32 matrix products exactly, until the block ends.
 
-    The precision of products is a setting of the process: products that other threads start meanwhile are as exact.
-    The user's setting returns when the last of nested or concurrent blocks ends.
+    Autocast is a setting of the thread. The precision of products is one of the process, so other threads compute exact
+    products meanwhile. The user's setting returns when the last of nested or concurrent blocks ends.
+
+    Args:
+        device: Device whose autocast is switched off.
     """
     with _LOCK:
         _RESTORE.append(_raise_precision())
@@ -56,10 +59,10 @@ def exact_products(device: torch.device) -> Iterator[None]:
 
 
 def _raise_precision() -> Callable[[], None]:
-    """Make float32 products exact; return what undoes it."""
+    """Make float32 products exact, and return a function that restores the setting."""
     try:
         before = torch.get_float32_matmul_precision()
-    except RuntimeError:  # the user has set the switch of one backend, which this function cannot tell
+    except RuntimeError:  # the user has set a single backend, for which torch has no common value
         switches: list[Any] = [getattr(torch.backends, name).matmul for name in ("cuda", "mkldnn")]
         values = [switch.fp32_precision for switch in switches]
         _set_switches(switches, ["ieee"] * len(switches))

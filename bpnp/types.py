@@ -1,6 +1,6 @@
-"""What flows through bpnp: a `Batch` goes into a solver, a `Prediction` comes out.
+"""Data types of a solver: a `Batch` of problems is the input, a `Prediction` the output.
 
-Axes: b batch, m 2D points, n 3D points (m and n padded to the largest set of the batch).
+Axes: b batch, m 2D points, n 3D points (m and n are padded to the largest set of the batch).
 Conventions: camera = R p + t (world to camera, COLMAP's `cam_from_world`); `points2d` are normalised image coordinates
 x/z, y/z (intrinsics applied, distortion removed); 3D points and translations are in scene units.
 """
@@ -22,22 +22,34 @@ _T = TypeVar("_T")
 
 
 def has_no_padding(mask: Bool[Tensor, "b k"]) -> bool:
-    """Whether every point is known to be real, so that masks need not be applied.
+    """Return True if every point is known to be real, so that the mask need not be applied.
 
-    False for a mask on a GPU, whose values the host would have to wait for, and in a graph that is to serve any mask.
+    The result is False for a mask on a GPU, where reading the values would make the host wait, and while a graph is
+    compiled, which has to serve any mask.
+
+    Args:
+        mask: True at real points (b, k).
     """
     return mask.is_cpu and not torch.compiler.is_compiling() and bool(mask.all())
 
 
 class Tensors:
-    """A dataclass of tensors, of dicts of them, and of such dataclasses."""
+    """Base of dataclasses whose fields are tensors, dicts of tensors, or such dataclasses."""
 
     def to(self: _T, *args: Any, **kwargs: Any) -> _T:
-        """Move every tensor; a dtype applies to the floating-point ones. Same arguments as `Tensor.to`."""
+        """Move every tensor to a device or a dtype.
+
+        Args:
+            *args: As for `Tensor.to`. A dtype applies to floating-point tensors only.
+            **kwargs: As for `Tensor.to`.
+
+        Returns:
+            A copy.
+        """
 
         def move(x: Tensor) -> Tensor:
             moved = x.to(*args, **kwargs)
-            # A dtype is for numbers: half precision has no index 257.
+            # Integers keep their dtype: half precision cannot hold the index 2049.
             return moved if x.is_floating_point() or moved.dtype == x.dtype else x.to(moved.device)
 
         return map_tensors(self, move)
@@ -45,7 +57,13 @@ class Tensors:
 
 @dataclass(frozen=True)
 class SolveStats(Tensors):
-    """How an iterative solver ended, per sample."""
+    """Convergence of an iterative solver, per sample.
+
+    Attributes:
+        iterations: Iterations used (b,).
+        residual: What the solver compares with its tolerance (b,).
+        converged: True where the tolerance was met (b,).
+    """
 
     iterations: Int[Tensor, " b"]
     residual: Float[Tensor, " b"]
@@ -53,18 +71,31 @@ class SolveStats(Tensors):
 
     @classmethod
     def of(cls, converged: Bool[Tensor, " b"], *, residual: Float[Tensor, " b"] | None = None) -> "SolveStats":
-        """Of a solver without iterations: one each. Its residual, if it has none, is 0 where it converged, else inf.
+        """Return the stats of a solver without iterations: one iteration each.
+
+        Args:
+            converged: True where the solver succeeded (b,).
+            residual: Residuals (b,). Default: 0 where it converged, infinity elsewhere.
 
         >>> SolveStats.of(torch.tensor([True, False])).residual.tolist()
         [0.0, inf]
         """
-        known = torch.where(converged, 0.0, torch.inf) if residual is None else residual
-        return cls(torch.ones_like(converged, dtype=torch.long), known, converged)
+        if residual is None:
+            residual = torch.where(converged, 0.0, torch.inf)
+        return cls(torch.ones_like(converged, dtype=torch.long), residual, converged)
 
 
 @dataclass(frozen=True)
 class Pose(Tensors):
-    """World-to-camera poses. A sample without a pose holds NaN and `stats.converged` False."""
+    """World-to-camera poses, camera = R p + t.
+
+    A sample without a pose holds NaN, and its `stats.converged` is False.
+
+    Attributes:
+        rotation: R (b, 3, 3).
+        translation: t (b, 3), scene units.
+        stats: Convergence of the solver.
+    """
 
     rotation: Float[Tensor, "b 3 3"]
     translation: Float[Tensor, "b 3"]
@@ -72,19 +103,24 @@ class Pose(Tensors):
 
     @property
     def found(self) -> Bool[Tensor, " b"]:
-        """Samples that have a finite pose."""
+        """True for samples with a finite pose (b,)."""
         return is_finite(self.rotation, self.translation)
 
 
 @dataclass(frozen=True)
 class Prediction(Tensors):
-    """A solver's answer: the joint probability of every match, and each pose estimate by name.
+    """Output of a solver: the joint probability of every match, and poses by the name of the estimate.
 
-    assignment: what the solver's own transport gave. rematched: that of the last round, of a solver that matches again
-        under its pose in evaluation.
-    unmatched2d, unmatched3d: the probability that a point has no partner, of an assignment with bins for them.
-    seconds: by the name of a pose, the time from the start of the batch until it was found; empty if not measured.
-    ids, index: those of the batch, of a prediction by `Trainer.predict`.
+    Attributes:
+        assignment: P (b, m, n) of the solver's own transport; None for a solver without one.
+        assignment_stats: Convergence of the transport.
+        poses: Poses by name, such as "ransac" and "pnp".
+        unmatched2d: Probability that a 2D point has no correspondence (b, m); None without dustbins.
+        unmatched3d: Probability that a 3D point has no correspondence (b, n); None without dustbins.
+        rematched: P (b, m, n) of the last round, if the solver matches the points again under its pose in evaluation.
+        seconds: Time from the start of the batch until each pose was found, by its name; empty if not measured.
+        ids: `Batch.ids`, set by `Trainer.predict`.
+        index: `Batch.index`, set by `Trainer.predict`.
     """
 
     assignment: Float[Tensor, "b m n"] | None = None
@@ -98,20 +134,24 @@ class Prediction(Tensors):
     index: Int[Tensor, " b"] | None = None
 
 
-@dataclass  # not frozen: Lightning's precision plugins cast inputs by assigning to the fields of a copy
+@dataclass  # not frozen: Lightning's precision plugins assign the cast inputs to the fields of a copy
 class Batch(Tensors):
-    """Problems, padded and masked: sets of image points and of scene points, and what is known of them.
+    """Problems, padded and masked: image points, scene points and their annotations.
 
-    points2d: (b, m, 2) normalised image coordinates.
-    points3d: (b, n, 3) scene units.
-    mask2d, mask3d: True at real points.
-    rotation, translation: true pose, if known.
-    match3d: (b, n) index of the 2D point that 3D point j was seen as, -1 for none; if known.
-    focal: (b,) pixels per unit of normalised coordinates, to report errors in pixels.
-    index: (b,) position of each problem in its data set; a problem that appears twice (a padded distributed epoch) is
-        counted once.
-    ids: a name for each problem.
-    origin: (b, 3) what was subtracted from the scene's coordinates; written poses have it undone.
+    Attributes:
+        points2d: Normalised image coordinates (b, m, 2).
+        points3d: Scene points (b, n, 3), scene units.
+        mask2d: True at real image points (b, m).
+        mask3d: True at real scene points (b, n).
+        focal: Pixels per unit of normalised coordinates (b,), to report errors in pixels.
+        index: Position of each problem in its data set (b,). Metrics count an index once, although a padded distributed
+            epoch repeats some problems.
+        ids: Name of each problem.
+        rotation: True rotation (b, 3, 3), None if unknown.
+        translation: True translation (b, 3), scene units, None if unknown.
+        match3d: Index of the 2D point that corresponds to 3D point j (b, n), -1 for none; None if unknown.
+        origin: Vector that was subtracted from the scene's coordinates (b, 3). Written poses are in the coordinates
+            before.
     """
 
     points2d: Float[Tensor, "b m 2"]
@@ -131,13 +171,16 @@ class Batch(Tensors):
 
     @property
     def count2d(self) -> Int[Tensor, " b"]:
+        """Number of real 2D points (b,)."""
         return self.mask2d.sum(-1)
 
     @property
     def count3d(self) -> Int[Tensor, " b"]:
+        """Number of real 3D points (b,)."""
         return self.mask3d.sum(-1)
 
     def pin_memory(self) -> "Batch":
+        """Return a copy in pinned memory; called by torch's data loader."""
         return map_tensors(self, lambda x: x.pin_memory())
 
     @classmethod
@@ -155,12 +198,22 @@ class Batch(Tensors):
     ) -> "Batch":
         """Pad and mask one problem, or lists of problems of different sizes.
 
-        points2d (m, 2) and points3d (n, 3) for one problem, or sequences of such arrays; rotation (3, 3), translation
-        (3,), match3d (n,) and focal () likewise, or one focal for all. Padding is zero. The dtype is float64 if a 2D
-        array is, else float32; the batch is on the CPU.
+        Every argument is one array (numpy or torch) for one problem, or a sequence of arrays for several. The batch is
+        on the CPU, in float64 if a 2D array is, else in float32. Padding is zero.
 
-        Raises ValueError that names the argument: wrong shape, NaN or infinity, pixels, no points, lists of different
-        length, or a match3d that holds no integers or an index that is no 2D point.
+        Args:
+            points2d: Normalised image coordinates (m, 2).
+            points3d: Scene points (n, 3).
+            rotation: True rotation (3, 3).
+            translation: True translation (3,), scene units.
+            match3d: Index of the 2D point of each 3D point (n,), -1 for none.
+            focal: Focal length in pixels (), one for each problem or one for all. Default: 1.
+            index: Position of each problem in its data set. Default: 0, 1, 2, ...
+            ids: Name of each problem. Default: "0", "1", ...
+
+        Raises:
+            ValueError: An array has a wrong shape, holds NaN or infinity, or has no points; the points are pixels; the
+                lists differ in length; `match3d` holds no integers or no index of a 2D point.
 
         >>> batch = Batch.from_arrays([torch.rand(5, 2), torch.rand(7, 2)], [torch.rand(9, 3), torch.rand(6, 3)])
         >>> tuple(batch.points2d.shape), batch.count2d.tolist(), batch.count3d.tolist()
@@ -188,7 +241,7 @@ class Batch(Tensors):
             ("ids", ids),
         ):
             if values is not None and len(values) != size:
-                raise ValueError(f"expected `{name}` for {size} problems as in `points2d`, got {len(values)}")
+                raise ValueError(f"`{name}` has {len(values)} problems, but `points2d` has {size}")
         m, n = max(map(len, sets2d)), max(map(len, sets3d))
         if matches is not None:
             matches = [check_match3d(i, x, len(sets2d[i]), len(sets3d[i])) for i, x in enumerate(matches)]
@@ -207,7 +260,15 @@ class Batch(Tensors):
 
 
 def map_tensors(value: _T, function: Callable[[Tensor], Tensor]) -> _T:
-    """The value with a function applied to every tensor in dataclasses and dicts of them; the rest stays."""
+    """Apply a function to every tensor of a dataclass or dict, recursively.
+
+    Args:
+        value: Tensor, dict or dataclass; any other value is returned unchanged.
+        function: Function of one tensor.
+
+    Returns:
+        A copy with the results.
+    """
     if isinstance(value, Tensor):
         return cast(_T, function(value))
     if isinstance(value, dict):

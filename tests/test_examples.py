@@ -49,5 +49,5 @@ def test_the_error_of_a_failed_solution_is_not_a_number() -> None:
 
 
 def test_other_names_are_refused() -> None:
-    with pytest.raises(ValueError, match="expected an example among mesh, photo, leds, stars, got 'video'"):
+    with pytest.raises(ValueError, match="there is no example 'video'; the examples are mesh, photo, leds, stars"):
         load("video")

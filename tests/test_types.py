@@ -71,40 +71,40 @@ def test_one_focal_serves_all() -> None:
 
 NAN = np.array([[0.0, 0.0], [np.nan, 1.0]])
 WRONG = {
-    r"`points2d` of shape \(k, 2\), got \(7, 3\) in problem 0 \(are points2d and points3d swapped\?\)": {
+    r"expected `points2d` of shape \(k, 2\), got \(7, 3\) in problem 0 \(are points2d and points3d swapped\?\)": {
         "points2d": np.zeros((7, 3)),
         "points3d": np.zeros((7, 2)),
     },
-    r"`points3d` of shape \(k, 3\), got \(5, 4\)": {"points3d": np.zeros((5, 4))},
-    r"finite `points2d`, got \[nan, 1.0\] at point 1 of problem 0": {"points2d": NAN, "match3d": None},
-    r"finite `points3d`": {"points3d": np.full((7, 3), np.inf)},
-    r"finite `rotation`": {"rotation": np.full((3, 3), np.nan)},
-    r"finite `translation`": {"translation": np.full(3, np.inf)},
-    r"at least one point in `points2d`, got none in problem 0": {"points2d": np.zeros((0, 2))},
-    r"at least one point in `points3d`, got none": {"points3d": np.zeros((0, 3))},
-    r"at least one problem, got an empty `points2d`": {"points2d": np.zeros((0, 5, 2))},
-    r"`points3d` for 1 problems as in `points2d`, got 2": {"points3d": [np.zeros((7, 3))] * 2},
-    r"`rotation` for 1 problems as in `points2d`, got 2": {"rotation": np.zeros((2, 3, 3))},
-    r"`focal` for 1 problems": {"focal": [1.0, 2.0]},
-    r"`ids` for 1 problems": {"ids": ["a", "b"]},
-    r"`index` for 1 problems": {"index": [1, 2]},
-    r"`rotation` of shape \(3, 3\), got \(3, 4\)": {"rotation": np.zeros((3, 4))},
-    r"`translation` of shape \(3,\), got \(4,\)": {"translation": np.zeros(4)},
-    r"`match3d` of shape \(7,\), one a 3D point, got \(5,\)": {"match3d": np.zeros(5, int)},
-    r"`match3d` between -1 and 4, got 0 to 5": {"match3d": np.array([0, 1, 2, 3, 4, 5, 0])},
-    r"`match3d` between -1 and 4, got -2": {"match3d": np.array([0, 1, 2, 3, 4, -2, 0])},
-    r"`points2d` .* in problem 1": {
+    r"expected `points3d` of shape \(k, 3\), got \(5, 4\)": {"points3d": np.zeros((5, 4))},
+    r"expected finite `points2d`, got \[nan, 1.0\] at point 1 of problem 0": {"points2d": NAN, "match3d": None},
+    r"expected finite `points3d`": {"points3d": np.full((7, 3), np.inf)},
+    r"expected finite `rotation`": {"rotation": np.full((3, 3), np.nan)},
+    r"expected finite `translation`": {"translation": np.full(3, np.inf)},
+    r"`points2d` has no points in problem 0; at least one is needed": {"points2d": np.zeros((0, 2))},
+    r"`points3d` has no points in problem 0": {"points3d": np.zeros((0, 3))},
+    r"`points2d` is empty; at least one problem is needed": {"points2d": np.zeros((0, 5, 2))},
+    r"`points3d` has 2 problems, but `points2d` has 1": {"points3d": [np.zeros((7, 3))] * 2},
+    r"`rotation` has 2 problems, but `points2d` has 1": {"rotation": np.zeros((2, 3, 3))},
+    r"`focal` has 2 problems, but `points2d` has 1": {"focal": [1.0, 2.0]},
+    r"`ids` has 2 problems, but `points2d` has 1": {"ids": ["a", "b"]},
+    r"`index` has 2 problems, but `points2d` has 1": {"index": [1, 2]},
+    r"expected `rotation` of shape \(3, 3\), got \(3, 4\)": {"rotation": np.zeros((3, 4))},
+    r"expected `translation` of shape \(3,\), got \(4,\)": {"translation": np.zeros(4)},
+    r"expected `match3d` of shape \(7,\), one a 3D point, got \(5,\)": {"match3d": np.zeros(5, int)},
+    r"expected `match3d` between -1 and 4, got 0 to 5": {"match3d": np.array([0, 1, 2, 3, 4, 5, 0])},
+    r"expected `match3d` between -1 and 4, got -2": {"match3d": np.array([0, 1, 2, 3, 4, -2, 0])},
+    r"expected `points2d` .* in problem 1": {
         "points2d": [np.zeros((5, 2)), np.zeros((5, 1))],
         "points3d": [np.zeros((7, 3))] * 2,
     },
-    r"`points2d` as an array of numbers or a list of them, got None": {"points2d": None},
-    r"`points3d` as an array of numbers or a list of them, got 'scene.ply'": {"points3d": "scene.ply"},
+    r"expected `points2d` as an array of numbers or a list of them, got None": {"points2d": None},
+    r"expected `points3d` as an array of numbers or a list of them, got 'scene.ply'": {"points3d": "scene.ply"},
 }
 
 
 @pytest.mark.parametrize("message", WRONG)
 def test_says_what_is_wrong(message: str) -> None:
-    with pytest.raises(ValueError, match="expected " + message):
+    with pytest.raises(ValueError, match=message):
         Batch.from_arrays(**{**pair(5, 7), **WRONG[message]})
 
 

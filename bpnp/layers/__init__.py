@@ -1,4 +1,7 @@
-"""Differentiable layers: pure tensors in, tensors and per-sample stats out; and the RANSAC that starts the last one."""
+"""Differentiable Sinkhorn and weighted PnP layers, and RANSAC for the initial pose.
+
+Each is a function of tensors and a module around it. All return their results and per-sample `SolveStats`.
+"""
 
 from bpnp.layers.assignment import Sinkhorn, sinkhorn
 from bpnp.layers.implicit import BackwardStats

@@ -1,6 +1,6 @@
-"""Entropic optimal transport from a cost matrix to a joint probability (paper Eqs. 9 and 10), to convergence.
+"""Entropic optimal transport from a cost matrix to a joint probability, run to convergence (paper Eqs. 9 and 10).
 
-`layers.transport` finds the optimum, `layers.laplacian` its gradient, by the theorem in `layers.implicit`.
+`layers.transport` finds the optimum and `layers.laplacian` its gradient, by the theorem in `layers.implicit`.
 """
 
 import math
@@ -32,24 +32,33 @@ def sinkhorn(
     max_iterations: int = 1000,
     backward_stats: BackwardStats | None = None,
 ) -> tuple[Float[Tensor, "b m n"], SolveStats]:
-    """Joint probability P of every match: argmin <P, M> + mu sum P (log P - 1) with P 1 = r, P^T 1 = c (paper Eq. 9).
+    """Solve the entropic transport problem (paper Eq. 9): the joint probability P of every match.
 
-    cost: M, infinite for a match that cannot be.
-    mu: entropy weight > 0, a number or a scalar tensor (which receives a gradient).
-    row_marginal, col_marginal: r and c, each summing to one over real points (default uniform); they receive gradients.
-    mask2d, mask3d: True at real points; a padded row or column gets no mass.
-    dustbin: cost of leaving a point unmatched, a number or a scalar tensor (which receives a gradient); None for a full
-        assignment. With it each side gets one more point, the bin (`dustbin_marginals`), which is left out of the
-        result, so that P sums to less than one.
-    tolerance: largest L1 error of the row and of the column sums at which a sample stops.
-    max_iterations: scalings of rows and of columns for each sample.
-    backward_stats: counts the samples of backward passes, and those that did not converge. Without it the latter cause
-        a RuntimeWarning.
+    P minimises <P, M> + mu sum P (log P - 1) subject to P 1 = r and P^T 1 = c. Samples stop independently of each
+    other. The gradient is that of the optimum (`bpnp.layers.implicit`) and takes O(m n) memory. There is no second
+    derivative.
 
-    Returns P and stats (residual: that L1 error). Samples stop independently of each other. The gradient is that of the
-    optimum (`bpnp.layers.implicit`); it needs O(m n) memory. There is no second derivative.
-    Raises ValueError for mu <= 0, a sample without a real point on either side, shapes that do not fit, an empty axis
-    or integers.
+    Args:
+        cost: Cost M (b, m, n); infinite for an impossible match.
+        mu: Entropy weight > 0, a number or a scalar tensor, which receives a gradient.
+        row_marginal: r (b, m), summing to one over the real points; receives a gradient. Default: uniform.
+        col_marginal: c (b, n), as `row_marginal`.
+        mask2d: True at real image points (b, m). A padded row gets no mass. Default: all are real.
+        mask3d: True at real scene points (b, n). A padded column gets no mass. Default: all are real.
+        dustbin: Cost of leaving a point unmatched, a number or a scalar tensor, which receives a gradient. Each side
+            gets one more point, the dustbin (`dustbin_marginals`), which is left out of the result, so that P sums to
+            less than one. Default: None, every point is matched.
+        tolerance: Largest L1 error of the row sums, and of the column sums, at which a sample stops.
+        max_iterations: Largest number of row and column scalings of a sample.
+        backward_stats: Counts the samples of backward passes and those that did not converge. Default: None, a
+            RuntimeWarning reports the latter.
+
+    Returns:
+        P (b, m, n), and stats whose `residual` is the L1 error of the marginals.
+
+    Raises:
+        ValueError: mu is not positive, a sample has no real point on one side, or an argument has a wrong shape or
+            dtype.
 
     >>> assignment, stats = sinkhorn(torch.tensor([[[0.0, 1.0], [1.0, 0.2]]]), mu=0.5)
     >>> assignment
@@ -64,7 +73,7 @@ def sinkhorn(
     check_mu(mu)
     for name, mask in (("mask2d", mask2d), ("mask3d", mask3d)):
         if mask is not None and not bool(mask.any(-1).all()):
-            raise ValueError(f"expected at least one real point on each side of every sample, got an empty `{name}`")
+            raise ValueError(f"a sample has no real point in `{name}`; every sample needs one on each side")
     b, m, n = cost.shape
     real2d = cost.new_ones(b, m, dtype=torch.bool) if mask2d is None else mask2d
     real3d = cost.new_ones(b, n, dtype=torch.bool) if mask3d is None else mask3d
@@ -83,41 +92,58 @@ def sinkhorn(
 
 
 def uniform_marginal(real: Bool[Tensor, "b k"], dtype: torch.dtype) -> Float[Tensor, "b k"]:
-    """The same share of one for each real point."""
+    """Return a uniform distribution over the real points.
+
+    Args:
+        real: True at real points (b, k).
+        dtype: Dtype of the result.
+
+    Returns:
+        Probabilities (b, k), zero at padded points.
+    """
     return real.to(dtype) / real.sum(-1, keepdim=True)
 
 
 def dustbin_marginals(
     rows: Float[Tensor, "b m"], cols: Float[Tensor, "b n"], real2d: Bool[Tensor, "b m"], real3d: Bool[Tensor, "b n"]
 ) -> tuple[Float[Tensor, "b rows"], Float[Tensor, "b cols"]]:
-    """Marginals (b, m + 1), (b, n + 1) of both sides with a bin at the end that has room for the other side's points.
+    """Append a dustbin to each side, with room for all points of the other side.
 
-    With m and n real points, those of the image have m / (m + n) of the mass and their bin n / (m + n); in the scene
-    it is the other way round. Uniform marginals thus give each point of either side 1 / (m + n).
+    With m and n real points, the image points have m / (m + n) of the mass and their dustbin n / (m + n); the scene has
+    it the other way round. With uniform marginals each point of either side thus has the mass 1 / (m + n).
+
+    Args:
+        rows: Marginal of the image points (b, m), summing to one.
+        cols: Marginal of the scene points (b, n), summing to one.
+        real2d: True at real image points (b, m).
+        real3d: True at real scene points (b, n).
+
+    Returns:
+        Marginals (b, m + 1) and (b, n + 1), the dustbin last.
     """
     m, n = (real.sum(-1, keepdim=True).to(rows.dtype) for real in (real2d, real3d))
-    share2d, share3d = m / (m + n), n / (m + n)
-    return torch.cat([rows * share2d, share3d], -1), torch.cat([cols * share3d, share2d], -1)
+    mass2d, mass3d = m / (m + n), n / (m + n)
+    return torch.cat([rows * mass2d, mass3d], -1), torch.cat([cols * mass3d, mass2d], -1)
 
 
 def check_mu(mu: float | Tensor) -> None:
-    """Raise ValueError for an entropy weight that is not above zero, NaN included."""
+    """Raise ValueError unless the entropy weight is positive."""
     if not mu > 0:
         raise ValueError(f"expected `mu` > 0, got {float(mu)}; try 0.1")
 
 
 class Sinkhorn(nn.Module):
-    """`sinkhorn` with its options as a module; `mu` may be learned.
+    """Entropic optimal transport as a module; see `sinkhorn`.
 
-    Its `backward_stats` count the backward passes of the module and those that did not converge: log
+    `backward_stats` counts the backward passes of the module and those that did not converge. Log
     `backward_stats.unconverged` at the end of an epoch, then call `backward_stats.reset()`.
 
     Args:
-        mu: entropy weight of the transport.
-        learn_mu: whether mu is learned.
-        dustbin: cost of leaving a point unmatched; null for a full assignment.
-        tolerance: L1 error of the marginals at which the transport stops.
-        max_iterations: scalings of rows and of columns, at most.
+        mu: Entropy weight.
+        learn_mu: Learn the entropy weight, starting from `mu`.
+        dustbin: Cost of leaving a point unmatched. Default: null, every point is matched.
+        tolerance: L1 error of the marginals at which a sample stops.
+        max_iterations: Largest number of row and column scalings.
 
     >>> layer = Sinkhorn(mu=0.1, learn_mu=True)
     >>> assignment, stats = layer(torch.rand(2, 5, 6))
@@ -144,6 +170,13 @@ class Sinkhorn(nn.Module):
     def forward(
         self, cost: Tensor, mask2d: Tensor | None = None, mask3d: Tensor | None = None
     ) -> tuple[Float[Tensor, "b m n"], SolveStats]:
+        """Return the assignment P (b, m, n) and its stats; see `sinkhorn`.
+
+        Args:
+            cost: Cost M (b, m, n).
+            mask2d: True at real image points (b, m). Default: all are real.
+            mask3d: True at real scene points (b, n). Default: all are real.
+        """
         return sinkhorn(
             cost,
             mu=self.entropy,
@@ -157,5 +190,5 @@ class Sinkhorn(nn.Module):
 
     @property
     def entropy(self) -> float | Tensor:
-        """mu, as it is now."""
+        """Current entropy weight mu."""
         return self.mu if self.log_mu is None else self.log_mu.exp()

@@ -1,7 +1,7 @@
 """Conjugate gradients on the Laplacian of a transport plan, compiled for the CPU.
 
-Four rows of the plan at a time are used for both products of an iteration while they are in the cache, so that it reads
-the plan once where torch reads it twice. Samples are divided among torch's threads; each stops by itself.
+Both products of an iteration use four rows of the plan while these are in the cache, so the plan is read once where
+torch reads it twice. Samples are divided among torch's threads, and each stops by itself.
 """
 
 from typing import Any
@@ -16,12 +16,12 @@ from bpnp.loops.compilation import FAST, compiler
 from bpnp.loops.parallel import in_threads
 
 compiled = compiler(fastmath=FAST, _nrt=False)
-part = compiler(fastmath=FAST, _nrt=False, no_cpython_wrapper=True)  # called by compiled functions alone
-SHORT_COLUMN = 256  # rows that are added up in the precision of the data
+part = compiler(fastmath=FAST, _nrt=False, no_cpython_wrapper=True)  # for functions called by compiled code only
+SHORT_COLUMN = 256  # rows summed in the precision of the data before the sum is added in float64
 
 
 def applies_to(tensor: Tensor) -> bool:
-    """Whether the compiled loops can read this tensor."""
+    """Return True if the compiled loops can read this tensor."""
     return tensor.is_cpu
 
 
@@ -34,7 +34,10 @@ def conjugate_gradients(
     tolerance: Float[Tensor, " b"],
     limit: int,
 ) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b m"], Bool[Tensor, " b"]]:
-    """`bpnp.layers.laplacian.conjugate_gradients`, same arguments and results; the inputs may have any strides."""
+    """Solve for x as `bpnp.layers.laplacian.conjugate_gradients` does; same arguments and results.
+
+    The inputs may have any strides.
+    """
     inputs = plan.kernel, plan.alpha, plan.beta, rows, cols, degree, rhs, tolerance
     x, mean = rhs.new_zeros(rhs.shape), rhs.new_zeros(rows.shape)
     solved = torch.zeros(len(rhs), dtype=torch.bool)
@@ -51,11 +54,20 @@ def conjugate_gradients(
 
 @part
 def _products(kernel: Any, x: Any, before: Any, after: Any, y: Any, short: Any, total: Any, four: Any) -> None:
-    """y = before . (K x) and total = K^T (after . y).
+    """Compute y = before . (K x) and total = K^T (after . y).
 
-    kernel (m, n), x (n,), before, after (m,) -> y (m,), total (n,) in float64; short (n,) and four (4,) are scratch
-    memory. Sums of thousands of terms in float32 lose the digits in which the Laplacian's terms differ: short sums are
-    made in the data's precision and added up in float64.
+    Sums of thousands of float32 terms lose the digits in which the terms of the Laplacian differ. Short sums are
+    therefore made in the precision of the data and added up in float64.
+
+    Args:
+        kernel: K (m, n).
+        x: Vector (n,).
+        before: Factors (m,).
+        after: Factors (m,).
+        y: Result (m,).
+        short: Scratch memory (n,).
+        total: Result (n,), float64.
+        four: Scratch memory (4,).
     """
     total[:] = 0
     short[:] = 0
@@ -77,8 +89,10 @@ def _products(kernel: Any, x: Any, before: Any, after: Any, y: Any, short: Any, 
 
 @part
 def _dots(a: Any, b: Any, c: Any, d: Any, x: Any) -> tuple[float, float, float, float]:
-    """Products of four rows with x, all (n,). The loop is over slices: an index that might be negative is not made a
-    vector instruction."""
+    """Return the products of four rows (n,) with x (n,).
+
+    The loop runs over slices, because numba does not vectorise a loop whose index might be negative.
+    """
     sums = 0.0, 0.0, 0.0, 0.0
     for start in range(0, len(x), SHORT_SUM):
         stop = start + SHORT_SUM
@@ -103,7 +117,7 @@ def _flush(short: Any, total: Any) -> None:
 
 @part
 def _invert(values: Any, result: Any) -> None:
-    """1 / values into `result`, both (n,); zero where a value is not positive."""
+    """Write 1 / values to `result`, both (n,); zero where a value is not positive."""
     for j in range(len(values)):
         result[j] = 1 / values[j] if values[j] > 0 else 0
 
@@ -126,9 +140,27 @@ def _solve(
     solved: Any,
     scratch: Any,
 ) -> None:
-    """Samples start to stop: kernel (b, m, n), alpha, rows (b, m), beta, cols, degree, rhs (b, n), tolerance (b,)
-    -> x (b, n), mean (b, m), solved (b,); x and mean are zero at the start. limit: of the iterations.
-    scratch: overwritten. In loops, for numpy's expressions of several arrays take seconds to compile."""
+    """Solve samples `start` to `stop`, writing x (b, n), mean (b, m) and solved (b,); x and mean are zero at first.
+
+    It is written in loops, because numpy expressions of several arrays take seconds to compile.
+
+    Args:
+        start: First sample.
+        stop: Sample after the last.
+        limit: Largest number of iterations.
+        kernel: K (b, m, n).
+        alpha: Row scalings (b, m).
+        beta: Column scalings (b, n).
+        rows: Row sums (b, m).
+        cols: Column sums (b, n).
+        degree: Preconditioner (b, n).
+        rhs: Right-hand side (b, n).
+        tolerance: Relative tolerance (b,).
+        x: Result (b, n).
+        mean: Result (b, m).
+        solved: Result (b,).
+        scratch: Overwritten.
+    """
     before, y, inverse, unit, r, p, sp, weighed, short, total, four = scratch
     for s in range(start, stop):
         _invert(degree[s], inverse)

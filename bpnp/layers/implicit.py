@@ -1,9 +1,8 @@
-"""The derivative of an optimum with respect to its problem (paper Lemmas 1 and 2), whatever solver found it.
+"""Derivative of an optimum with respect to its problem, whatever solver found it (paper Lemmas 1 and 2).
 
 If F(y, x) = 0 defines y(x), then dL/dx = -(dF/dx)^T w with (dF/dy)^T w = dL/dy: one linear solve and one
-vector-Jacobian product; the iterations need not be kept. For a pose that is the derivative of one more Newton step
-(`bpnp.layers.pnp`), for the transport plan a closed form (`bpnp.layers.laplacian.entropic_plan`). `BackwardStats` count
-how often the solver of the linear system did not converge.
+vector-Jacobian product. The iterations need not be stored. For a pose this is the derivative of one more Newton step
+(`bpnp.layers.pnp`), for the transport plan a closed form (`bpnp.layers.laplacian.entropic_plan`).
 """
 
 import functools
@@ -21,9 +20,13 @@ from bpnp.precision import exact_products
 
 @dataclass
 class BackwardStats:
-    """Number of samples whose gradient was solved for, and of those whose solver did not converge.
+    """Number of samples in backward passes, and of those whose linear system did not converge.
 
-    A sample that did not converge still has a gradient, the last iterate; it is not finite where the sample was not.
+    A sample that did not converge has the gradient of the last iterate.
+
+    Attributes:
+        samples: Samples so far.
+        unconverged: Samples whose solver did not converge.
 
     >>> from bpnp.layers import Sinkhorn
     >>> layer = Sinkhorn(mu=0.1)
@@ -37,11 +40,18 @@ class BackwardStats:
     unconverged: int = 0
 
     def reset(self) -> None:
+        """Set both counts to zero."""
         self.samples = self.unconverged = 0
 
 
 def record(stats: BackwardStats | None, layer: str, converged: Bool[Tensor, " b"]) -> None:
-    """Count a backward pass in `stats`; without an object to count in, warn of samples that did not converge."""
+    """Count a backward pass, or warn of samples that did not converge if there is nothing to count in.
+
+    Args:
+        stats: Counts, or None.
+        layer: Name of the layer, for the warning.
+        converged: True where the linear solver converged (b,).
+    """
     unconverged = int((~converged).sum())
     if stats is not None:
         stats.samples += len(converged)
@@ -56,7 +66,7 @@ def record(stats: BackwardStats | None, layer: str, converged: Bool[Tensor, " b"
 
 
 def first_derivative(backward: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorator of the `backward` of a Function that has no second derivative; products are exact in it."""
+    """Decorate the `backward` of a Function without a second derivative; its matrix products are exact."""
 
     @functools.wraps(backward)
     def run(ctx: Any, gradient: Tensor) -> Any:
@@ -68,9 +78,8 @@ def first_derivative(backward: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def refuse_second_derivative(gradient: Tensor) -> None:
-    """In a backward pass, raise ValueError under `create_graph=True`: the gradient would have no graph."""
+    """Raise ValueError in a backward pass under `create_graph=True`, because the gradient would have no graph."""
     if torch.is_grad_enabled():
         raise ValueError(
-            "expected a first derivative, got create_graph=True: the layers have no second derivative; "
-            "try create_graph=False"
+            "create_graph=True asks for a second derivative, which the layers do not have; use create_graph=False"
         )

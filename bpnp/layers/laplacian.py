@@ -1,8 +1,8 @@
-"""The linear system of the entropic transport plan, which its gradient and its Newton step have in common.
+"""Linear system of the entropic transport plan, shared by its gradient and its Newton step.
 
 [diag(P1) P; P^T diag(P^T 1)] [a; b] = [x; y] is singular along (1, -1) and consistent when sum x = sum y. Eliminating a
 leaves S b = y - P^T (x / P1) with S = diag(P^T 1) - P^T diag(1 / P1) P, the Laplacian of a graph between columns.
-`solve_multipliers` are those of the gradient, which `entropic_plan` has.
+`solve_multipliers` solves the system of the gradient, for `entropic_plan`.
 """
 
 from typing import Any
@@ -15,17 +15,17 @@ import bpnp.layers.compiled as compiled
 from bpnp.layers.implicit import BackwardStats, first_derivative, record
 from bpnp.layers.plan import Plan, cached_parts, divide, times, transpose_times
 
-ITERATIONS = 150  # of conjugate gradients; slower systems are factorised
-BETWEEN_TESTS = 8  # iterations in torch between two tests for the end: a test makes the host wait for a GPU
-RIDGE = 1e-13  # of the factorisation, relative to the diagonal's scale
+ITERATIONS = 150  # limit of conjugate gradients; slower systems are factorised
+BETWEEN_TESTS = 8  # torch iterations between two tests for convergence, each of which makes the host wait for a GPU
+RIDGE = 1e-13  # added to the diagonal before the factorisation, relative to its scale
 FACTORISED = 1e-6  # largest relative residual of a factorised system that counts as solved
-TOLERANCE = {torch.float32: 5e-6, torch.float64: 1e-13}  # of conjugate gradients, relative
-TOLERANCE_PROMOTED = 1e-8  # in float64 for float32 data
-ROUNDING = 1e-12  # of sums in float64, relative
-SHARP = 16.0  # mass per sum of the degrees, beyond which float32 loses the gradient's fifth digit
+TOLERANCE = {torch.float32: 5e-6, torch.float64: 1e-13}  # relative, for conjugate gradients
+TOLERANCE_PROMOTED = 1e-8  # relative, for float32 data solved in float64
+ROUNDING = 1e-12  # relative rounding error of sums in float64
+SHARP = 16.0  # mass per sum of the degrees above which float32 loses the fifth digit of the gradient
 
 
-# b with S b = rhs, weighted mean zero; P b / rows; and which samples met their tolerance
+# b with S b = rhs and weighted mean zero; P b / rows; True for samples that met their tolerance
 Solution = tuple[Float[Tensor, "b n"], Float[Tensor, "b m"], Bool[Tensor, " b"]]
 
 
@@ -37,11 +37,21 @@ def solve_laplacian(
     rhs: Float[Tensor, "b n"],
     tolerance: Float[Tensor, " b"],
 ) -> Solution:
-    """Conjugate gradients, preconditioned by `degree`; in float64, what stalls is factorised.
+    """Solve S b = rhs by preconditioned conjugate gradients; in float64, factorise the samples that stall.
 
-    rows, cols: sums of P, zero at padded points. degree: the diagonal of S or near it. tolerance: of the residual per
-    unit of mass, sqrt(sum r_j^2 / cols_j), relative to that of the right-hand side: in the preconditioner's own norm
-    columns with weak links would outweigh all others.
+    The tolerance limits the residual per unit of mass, sqrt(sum r_j^2 / cols_j), relative to that of the right-hand
+    side. In the norm of the preconditioner, columns with weak links would outweigh all others.
+
+    Args:
+        plan: P (b, m, n).
+        rows: Row sums of P (b, m), zero at padded points.
+        cols: Column sums of P (b, n), zero at padded points.
+        degree: Preconditioner (b, n), the diagonal of S or an approximation.
+        rhs: Right-hand side (b, n).
+        tolerance: Relative tolerance (b,).
+
+    Returns:
+        b (b, n) with a weighted mean of zero, P b / rows (b, m), and which samples met the tolerance (b,).
     """
     solve = compiled.conjugate_gradients if compiled.applies_to(rhs) else conjugate_gradients
     x, mean, solved = solve(plan, rows, cols, degree, rhs, tolerance, ITERATIONS)
@@ -58,7 +68,20 @@ def solve_laplacian(
 def conjugate_gradients(
     plan: Plan, rows: Tensor, cols: Tensor, degree: Tensor, rhs: Tensor, tolerance: Float[Tensor, " b"], limit: int
 ) -> Solution:
-    """x with S x = rhs, P x / rows, and which samples met the tolerance; each keeps the x at which it did."""
+    """Solve S x = rhs by preconditioned conjugate gradients.
+
+    Args:
+        plan: P (b, m, n).
+        rows: Row sums of P (b, m).
+        cols: Column sums of P (b, n).
+        degree: Preconditioner (b, n).
+        rhs: Right-hand side (b, n).
+        tolerance: Relative tolerance (b,), as in `solve_laplacian`.
+        limit: Largest number of iterations.
+
+    Returns:
+        x (b, n), P x / rows (b, m), and which samples met the tolerance (b,). A sample keeps the x that met it.
+    """
     inverse, unit, per_row = (divide(torch.ones_like(x), x) for x in (degree, cols, rows))
     x, mean, r = torch.zeros_like(rhs), torch.zeros_like(rows), rhs
     p = inverse * r
@@ -84,17 +107,17 @@ def conjugate_gradients(
 
 
 def _solve_by_cholesky(plan: Float[Tensor, "b m n"], rows: Tensor, cols: Tensor, rhs: Tensor) -> Solution:
-    """The solution by a Cholesky factorisation of S and one refinement, in float64.
+    """Solve S b = rhs by a Cholesky factorisation and one refinement, in float64.
 
-    The diagonal is the sum of the other entries of its row: as a difference from `cols` it would be noise when P is
-    almost a permutation.
+    A diagonal entry is computed as the sum of the other entries of its row: as a difference from `cols` it would be
+    noise when P is almost a permutation.
     """
     per_row, unit = (divide(torch.ones_like(x), x) for x in (rows, cols))
     system = plan.mT @ (plan * -per_row.unsqueeze(-1))
     diagonal = system.diagonal(dim1=-2, dim2=-1)
     diagonal.zero_()
-    # Between groups of columns that hardly share a row, the right-hand side is rounding and S nearly singular. The
-    # ridge, relative to the marginals, keeps the difference of their b small where it hardly matters.
+    # Between groups of columns that hardly share a row, the right-hand side is rounding error and S nearly singular.
+    # The ridge, relative to the marginals, keeps the difference of their b small where it hardly matters.
     ridge = RIDGE * cols
     diagonal.copy_(torch.where(cols > 0, ridge - system.sum(-1), 1))
     factor, _ = torch.linalg.cholesky_ex(system)
@@ -108,7 +131,7 @@ def _solve_by_cholesky(plan: Float[Tensor, "b m n"], rows: Tensor, cols: Tensor,
 
 
 def _mean(b: Float[Tensor, "b n"], cols: Float[Tensor, "b n"]) -> Float[Tensor, "b 1"]:
-    """Component along the null vector: the mean weighted by `cols`."""
+    """Return the component along the null vector: the mean of b weighted by `cols`."""
     return (cols * b).sum(-1, keepdim=True) / cols.sum(-1, keepdim=True)
 
 
@@ -120,14 +143,21 @@ def entropic_plan(
     col_marginal: Float[Tensor, "b n"],
     backward_stats: BackwardStats | None,
 ) -> Float[Tensor, "b m n"]:
-    """Return `plan`, the minimiser of <P, cost> + mu P (log P - 1) with the given marginals, with its gradients.
+    """Return `plan` with the gradients of the transport problem that it solves.
 
-    With V = dL/dP and multipliers a, b from [diag(P1) P; P^T diag(P^T 1)] [a; b] = [(P.V)1; (P.V)^T 1]:
-    dL/dcost = -P.(V - a1^T - 1b^T)/mu, dL/dmu = <dL/dcost, log P>, dL/drow = a, dL/dcol = b
-    (up to one constant added to a and taken from b, chosen so that the mean of b, weighted by c, is zero).
-    The actual sums of P enter, so that a plan short of convergence has the gradient of the problem that it does solve.
+    `plan` minimises <P, cost> + mu P (log P - 1) with the given marginals. With V = dL/dP and multipliers a, b from
+    [diag(P1) P; P^T diag(P^T 1)] [a; b] = [(P.V)1; (P.V)^T 1], the gradients are
+    dL/dcost = -P.(V - a1^T - 1b^T)/mu, dL/dmu = <dL/dcost, log P>, dL/drow = a, dL/dcol = b,
+    up to one constant added to a and subtracted from b, chosen so that the mean of b, weighted by c, is zero. The
+    actual sums of P are used, so that a plan short of convergence has the gradient of the problem that it does solve.
 
-    backward_stats: as for `bpnp.layers.sinkhorn`.
+    Args:
+        plan: P (b, m, n).
+        cost: Cost M (b, m, n).
+        mu: Entropy weight, scalar.
+        row_marginal: r (b, m).
+        col_marginal: c (b, n).
+        backward_stats: As for `bpnp.layers.sinkhorn`.
     """
     return _EntropicPlan.apply(plan, cost, mu, row_marginal, col_marginal, backward_stats)
 
@@ -155,7 +185,7 @@ class _EntropicPlan(torch.autograd.Function):
 def _project_gradient(
     plan: Tensor, gradient: Tensor, a: Tensor, b: Tensor, factor: float | Tensor = 1.0
 ) -> Float[Tensor, "b m n"]:
-    """factor P.(V - a1^T - 1b^T)."""
+    """Return factor P.(V - a1^T - 1b^T), (b, m, n)."""
     result = torch.empty_like(plan)
     for out, p, v, x, y in cached_parts(result, plan, gradient, a, b):
         torch.sub(v, x.unsqueeze(-1), out=out).sub_(y.unsqueeze(-2)).mul_(p).mul_(factor)
@@ -165,10 +195,17 @@ def _project_gradient(
 def solve_multipliers(
     plan: Float[Tensor, "b m n"], gradient: Float[Tensor, "b m n"]
 ) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b n"], Bool[Tensor, " b"]]:
-    """Multipliers (a, b) of the projection of `gradient` onto plans with the marginals of `plan`; sum(P^T 1 . b) = 0.
+    """Compute the multipliers (a, b) that project `gradient` onto plans with the marginals of `plan`.
 
-    The last value tells which samples converged. Samples whose plan is sharp, where differences of nearly equal numbers
-    decide, and samples that stall are solved in float64, by a Cholesky factorisation at last.
+    Two kinds of samples are solved in float64, and by a Cholesky factorisation at last: those whose plan is sharp,
+    where differences of nearly equal numbers decide, and those that stall.
+
+    Args:
+        plan: P (b, m, n).
+        gradient: V = dL/dP (b, m, n).
+
+    Returns:
+        a (b, m), b (b, n) with sum(P^T 1 . b) = 0, and which samples converged (b,).
     """
     a, b, solved, trusted = _solve_parts(plan, gradient, TOLERANCE[plan.dtype])
     if plan.dtype != torch.float64 and not bool(trusted.all()):
@@ -181,21 +218,30 @@ def solve_multipliers(
 
 
 def _solve_parts(plan: Tensor, gradient: Tensor, tolerance: float) -> tuple[Tensor, ...]:
-    """`_solve` of a few samples at a time."""
+    """Run `_solve` for a few samples at a time."""
     parts = [_solve(p, v, tolerance) for p, v in cached_parts(plan, gradient)]
     return tuple(map(torch.cat, zip(*parts, strict=True)))
 
 
 def _solve(plan: Tensor, gradient: Tensor, tolerance: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """(a, b) in the precision of the plan, which samples are solved, and for which of these the precision is enough."""
+    """Solve for the multipliers in the precision of the plan.
+
+    Args:
+        plan: P (b, m, n).
+        gradient: V = dL/dP (b, m, n).
+        tolerance: Relative tolerance.
+
+    Returns:
+        a, b, which samples are solved (b,), and which of these have enough precision (b,).
+    """
     weighted, rows, cols, kernel = plan * gradient, plan.sum(-1), plan.sum(-2), Plan.of(plan)
     row_mean, degree = divide(weighted.sum(-1), rows), kernel.degree(rows, cols)
     rhs = weighted.sum(-2) - transpose_times(plan, row_mean)
     b, mean, solved = solve_laplacian(kernel, rows, cols, degree, rhs, torch.full_like(rhs[:, 0], tolerance))
     a = row_mean - mean
     if plan.dtype == torch.float64 and not bool(solved.all()):
-        # Links between groups of columns may be so weak that the whole right-hand side is rounding, which nothing
-        # solves to a relative precision: it is enough that the projected gradient's column sums are rounding too.
+        # Weak links between groups of columns may leave only rounding error on the right-hand side, which no solver
+        # can meet to a relative tolerance. It is enough that the column sums of the projected gradient are rounding.
         sums, size = _project_gradient(plan, gradient, a, b).sum(-2), (plan * gradient.square()).sum((-2, -1))
         solved = solved | ((divide(sums.square(), cols).sum(-1) <= ROUNDING**2 * size) & size.isfinite())
     return a, b, solved, solved & (cols.sum(-1) <= SHARP * degree.sum(-1))

@@ -1,4 +1,4 @@
-"""L-BFGS with a strong Wolfe line search for the weighted PnP layer: the solver of the paper (section 3.3)."""
+"""L-BFGS with a strong Wolfe line search for the weighted PnP layer, the solver of the paper (section 3.3)."""
 
 import torch
 from jaxtyping import Float, Int
@@ -6,8 +6,8 @@ from torch import Tensor
 
 from bpnp.geometry import retract
 
-HISTORY = 10  # pairs of steps and gradients from which the curvature is estimated
-EVALUATIONS = 25  # of the objective per iteration, at most
+HISTORY = 10  # pairs of steps and gradients that estimate the curvature
+EVALUATIONS = 25  # largest number of objective evaluations per iteration
 
 
 def lbfgs(
@@ -19,22 +19,22 @@ def lbfgs(
     tolerance: float,
     max_iterations: int,
 ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], Int[Tensor, " b"]]:
-    """Minimise the aggregated PnP objective with `torch.optim.LBFGS`, each sample by itself.
+    """Minimise the aggregated PnP objective with `torch.optim.LBFGS`, sample by sample.
 
-    The unknowns are an angle-axis vector, relative to the start, and the translation.
+    The unknowns are an angle-axis vector, relative to the initial pose, and the translation.
 
     Args:
-        q: weighted bearings, the weights of a sample summing to one.
-        points: scene points of unit size.
-        rotation: of the start.
-        translation: of the start.
-        tolerance: gradient norm at which a sample stops. Rounding of the objective ends the line search at some 1e-10.
-        max_iterations: of each sample.
+        q: Weighted bearings (b, 3, n), the weights of a sample summing to one.
+        points: Scene points of unit size (b, 3, n).
+        rotation: Initial R (b, 3, 3).
+        translation: Initial t (b, 3).
+        tolerance: Gradient norm at which a sample stops. Rounding of the objective ends the line search at about 1e-10.
+        max_iterations: Largest number of iterations of a sample.
 
     Returns:
-        Rotation, translation and the iterations of each sample.
+        Rotation (b, 3, 3), translation (b, 3) and the iterations of each sample (b,).
     """
-    # A trainer's inference mode would forbid the optimiser's gradients, of its tensors too.
+    # The optimiser needs gradients, which a trainer's inference mode forbids, also for tensors made within it.
     with torch.inference_mode(False):
         problem = q.clone(), points.clone(), rotation.clone(), translation.clone()
         steps = torch.zeros(len(q), 6, dtype=q.dtype, device=q.device)
@@ -54,7 +54,11 @@ def _minimise(
     tolerance: float,
     max_iterations: int,
 ) -> tuple[Float[Tensor, "6"], int]:
-    """Return the step (w, s) from the start to the minimum of one sample, and the iterations."""
+    """Minimise the objective of one sample.
+
+    Returns:
+        The step (w, s) from the initial pose to the minimum (6,), and the number of iterations.
+    """
     step = torch.zeros(6, dtype=q.dtype, device=q.device, requires_grad=True)
     optimiser = torch.optim.LBFGS(
         [step],
@@ -72,7 +76,7 @@ def _minimise(
         with torch.enable_grad():
             r, t = retract(step, rotation, translation)
             y = r @ points + t[:, None]
-            # sum |q| is constant; with it the sum has digits left where the residuals are small
+            # Adding the constant sum |q| keeps the digits of the value where the residuals are small.
             value = (weights - (q * torch.nn.functional.normalize(y, dim=0)).sum(0)).sum()
             value.backward()
         return value.detach()

@@ -1,9 +1,10 @@
-"""The weighted blind PnP layer (paper Eq. 8): from a start to the pose that best explains a soft assignment.
+"""Weighted blind PnP layer (paper Eq. 8): from an initial pose to the pose that best explains a soft assignment.
 
-f(R, t) = sum_ij P_ij (1 - f_i . g(R p_j + t)),  g(y) = y / |y|.
-It is linear in the bearings: with q_j = sum_i P_ij f_i, f = sum P - sum_j q_j . g(R p_j + t). After one product the
-cost of an evaluation is O(n), not O(m n). A step (w, s) acts on the left: y = exp([w]x) R p + t + s.
-The q_j and p_j are the columns of (b, 3, n) tensors: torch adds up three rows of n numbers faster than n rows of three.
+The objective is f(R, t) = sum_ij P_ij (1 - f_i . g(R p_j + t)) with g(y) = y / |y|. It is linear in the bearings: with
+q_j = sum_i P_ij f_i, f = sum P - sum_j q_j . g(R p_j + t). After one product, an evaluation costs O(n), not O(m n).
+
+A step (w, s) acts on the left: y = exp([w]x) R p + t + s. The q_j and p_j are columns of (b, 3, n) tensors, because
+torch sums three rows of n numbers faster than n rows of three.
 """
 
 import math
@@ -26,7 +27,7 @@ Rotations = Float[Tensor, "b 3 3"]
 Translations = Float[Tensor, "b 3"]
 NEAR = 1e-12  # scene radii; smaller distances are set to this: a point at the camera centre has no direction
 FARTHEST = 1e4  # scene radii; beyond this distance all bearings coincide: the solver has diverged
-WELL_POSED = 1e-9  # smallest Hessian eigenvalue, as a part of the trace, at which the pose has a derivative
+WELL_POSED = 1e-9  # smallest Hessian eigenvalue, as a fraction of the trace, for which the pose has a derivative
 
 
 Solver = Literal["newton", "lbfgs"]
@@ -37,20 +38,25 @@ class ClippedColumns:
     """Number of columns of the pose's derivative in backward passes, and of those that were clipped.
 
     Column ij is the derivative of the pose (angle-axis, translation) with respect to P_ij.
+
+    Attributes:
+        columns: Columns so far.
+        clipped: Columns whose norm was reduced.
     """
 
     columns: int = 0
     clipped: int = 0
 
     def reset(self) -> None:
+        """Set both counts to zero."""
         self.columns = self.clipped = 0
 
 
 class _Aggregate(torch.autograd.Function):
-    """F^T P (b, 3, n): q_j = sum_i P_ij f_i, the mean bearing of each 3D point, its length the point's weight.
+    """F^T P (b, 3, n): q_j = sum_i P_ij f_i, the mean bearing of each 3D point times the point's weight.
 
-    Its gradients are exact products too. grams: with `limit`, (b, n, 3, 3) such that f_i^T grams_j f_i is the squared
-    norm of column ij; the gradient of P_ij is that of the column scaled down to norm `limit`.
+    Its gradients are exact products too. With `grams` (b, n, 3, 3) and `limit`, f_i^T grams_j f_i is the squared norm
+    of column ij, and the gradient of P_ij is that of the column scaled down to the norm `limit`.
     """
 
     @staticmethod
@@ -85,7 +91,7 @@ class _Aggregate(torch.autograd.Function):
 
 
 class Derivatives(NamedTuple):
-    """Value, gradient and Hessian of -sum_j q_j . g(R p_j + t) in the step (w, s) at zero."""
+    """Value, gradient and Hessian of -sum_j q_j . g(R p_j + t) in the step (w, s), at zero."""
 
     value: Float[Tensor, " b"]
     gradient: Float[Tensor, "b 6"]
@@ -93,12 +99,18 @@ class Derivatives(NamedTuple):
 
 
 def derivatives(q: Columns, points: Columns, rotation: Rotations, translation: Translations) -> Derivatives:
-    """Value, gradient and Hessian together.
+    """Compute the value, gradient and Hessian of the objective together.
 
     With x = R p, y = x + t, d = |y|, u = y/d, the derivative of a term in y is h = ((q.u) u - q)/d, and its second
     derivative G = [(q.u)(I - 3 u u^T) + q u^T + u q^T]/d^2. Since dy = D (w, s) with D = [-[x]x, I], the Hessian is
     sum D^T G D, plus sym(x h^T) - (x.h) I in its rotation block, the second derivative of exp([w]x) x.
     G is written as (q.u)/d^2 I + v k^T + k v^T with v = u/d, k = (q - 1.5 (q.u) u)/d.
+
+    Args:
+        q: Weighted bearings (b, 3, n).
+        points: Scene points (b, 3, n).
+        rotation: R (b, 3, 3).
+        translation: t (b, 3).
     """
     x = rotation @ points
     y = x + translation.unsqueeze(-1)
@@ -125,19 +137,19 @@ def derivatives(q: Columns, points: Columns, rotation: Rotations, translation: T
 
 
 def _point_gradient(q: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """u = y/d (b, 3, n), 1/d (b, 1, n) with d = |y|, and h = ((q.u) u - q)/d (b, 3, n)."""
+    """Return u = y/d (b, 3, n), 1/d (b, 1, n) with d = |y|, and h = ((q.u) u - q)/d (b, 3, n)."""
     inverse = y.square().sum(-2, keepdim=True).clamp_min(NEAR**2).rsqrt()
     u = inverse * y
     return u, inverse, ((q * u).sum(-2, keepdim=True) * u - q) * inverse
 
 
 def _gradient(outer: Tensor, h: Tensor) -> Float[Tensor, "b 6"]:
-    """(sum x cross h, sum h) of columns x, h with outer = sum x h^T."""
+    """Return (sum x cross h, sum h) of columns x, h, given outer = sum x h^T."""
     twist = outer - outer.mT
     return torch.stack([twist[:, 1, 2], twist[:, 2, 0], twist[:, 0, 1], *h.sum(-1).unbind(-1)], -1)
 
 
-EQUAL = 1e-13  # values of the objective (weights sum to one) that agree to this differ by rounding only
+EQUAL = 1e-13  # a smaller difference of two objective values (weights sum to one) is rounding error
 
 
 def newton(
@@ -149,11 +161,20 @@ def newton(
     tolerance: float,
     max_iterations: int,
 ) -> tuple[Rotations, Translations, Int[Tensor, " b"]]:
-    """Newton's method with Levenberg's damping on the aggregated objective, for all samples of a batch at once.
+    """Minimise the aggregated objective by Newton's method with Levenberg damping, for the whole batch at once.
 
-    Returns the pose near the start at which the gradient's norm is at most `tolerance`, and the iterations per sample.
-    q, points: weighted bearings and points of unit size, the weights of a sample summing to one. Each sample has its
-    own damping, zero until a step fails, and its own stop.
+    Each sample has its own damping, zero until a step fails, and stops by itself.
+
+    Args:
+        q: Weighted bearings (b, 3, n), the weights of a sample summing to one.
+        points: Scene points of unit size (b, 3, n).
+        rotation: Initial R (b, 3, 3).
+        translation: Initial t (b, 3).
+        tolerance: Largest gradient norm at the result.
+        max_iterations: Largest number of iterations of a sample.
+
+    Returns:
+        Rotation (b, 3, 3), translation (b, 3) and the iterations of each sample (b,).
     """
     current = derivatives(q, points, rotation, translation)
     damping = torch.zeros_like(current.value)
@@ -199,36 +220,36 @@ def weighted_pnp(
     clip_columns: float | None = None,
     clipped: ClippedColumns | None = None,
 ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], SolveStats]:
-    """Minimise sum_ij P_ij (1 - f_i . g(R p_j + t)), g(y) = y / |y|, over (R, t) near a start (paper Eq. 8).
+    """Minimise sum_ij P_ij (1 - f_i . g(R p_j + t)), g(y) = y / |y|, over (R, t) near an initial pose (paper Eq. 8).
 
     Gradients flow to assignment, bearings and points3d by the implicit function theorem with the true Hessian (paper
     Lemma 1). There is no second derivative. The solver runs in float64.
 
     Args:
-        assignment: P, zero at padded points; its total does not matter.
-        bearings: unit vectors f_i (`bpnp.geometry.bearings` of image points).
-        points3d: p_j in scene units.
-        rotation: of the start, camera = R p + t; no gradient flows to it. A sample whose start is NaN has no pose.
-        translation: of the start, scene units.
+        assignment: P (b, m, n), zero at padded points; its total does not matter.
+        bearings: Unit vectors f_i (b, m, 3), `bpnp.geometry.bearings` of image points.
+        points3d: p_j (b, n, 3), scene units.
+        rotation: Initial R (b, 3, 3), camera = R p + t, without a gradient. A sample whose initial pose is NaN has no
+            pose.
+        translation: Initial t (b, 3), scene units.
         solver: "newton" (damped Newton steps for the whole batch) or "lbfgs" (L-BFGS with a strong Wolfe line search,
             as in the paper; sample by sample). Both find the same optimum.
-        tolerance: largest norm of the objective's gradient per unit of weight, in radians and scene radii. L-BFGS does
-            not get below some 1e-10.
-        max_iterations: of the solver, O(n) each, for each sample.
-        clip_columns: largest norm of a column of the pose's derivative, d(r, t) / dP_ij with the angle-axis vector r
-            in radians and t in scene units, for P that sums to one; longer columns are scaled down. The paper has 100.
-            None for the exact derivative. It applies to the gradient of the assignment alone.
-        clipped: counts the columns of backward passes, and those that were clipped.
+        tolerance: Largest gradient norm of the objective per unit of weight, in radians and scene radii. L-BFGS does
+            not get below about 1e-10.
+        max_iterations: Largest number of iterations of a sample, O(n) each.
+        clip_columns: Largest norm of a column of the pose's derivative, d(r, t) / dP_ij with the angle-axis vector r in
+            radians and t in scene units, for P that sums to one. Longer columns are scaled down; the paper uses 100. It
+            applies only to the gradient of the assignment. Default: None, the exact derivative.
+        clipped: Counts the columns of backward passes, and those that were clipped.
 
     Returns:
-        Rotation (b, 3, 3) and translation (b, 3) in the dtype of the assignment, and stats per sample. `residual` is
-        the norm that is compared with the tolerance. `converged` is False, and the gradient zero, where the start is
-        missing, the tolerance was not met, the camera is farther than 10^4 scene radii or the Hessian is not positive
+        Rotation (b, 3, 3) and translation (b, 3) in the dtype of the assignment, and stats. `residual` is the gradient
+        norm that is compared with the tolerance. `converged` is False, and the gradient zero, where the initial pose is
+        NaN, the tolerance was not met, the camera is farther than 10^4 scene radii, or the Hessian is not positive
         definite: leave such samples out of a loss.
 
     Raises:
-        ValueError: Shapes do not fit, an axis is empty, values are integers, the solver is unknown or `clip_columns`
-            is not positive.
+        ValueError: An argument has a wrong shape or dtype, the solver is unknown, or `clip_columns` is not positive.
 
     >>> points3d = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]])
     >>> bearings = torch.nn.functional.normalize(points3d + torch.tensor([0.0, 0, 4]), dim=-1)
@@ -253,7 +274,7 @@ def weighted_pnp(
     points, centre, scale = _normalise(points3d.double().mT.contiguous(), weight)
     with torch.no_grad():
         found = is_finite(rotation, translation)
-        # The rotation nearest to a rounded one; any pose for samples that have none.
+        # Project a rounded rotation onto SO(3); samples without a pose get an arbitrary one.
         r = torch.where(found[:, None, None], rotation.double(), torch.eye(3).to(q))
         r = roma.special_procrustes(r)
         t = (torch.where(found[:, None], translation.double(), 1) + _rotate(r, centre)) / scale
@@ -263,7 +284,7 @@ def weighted_pnp(
         grams = None
         if clip_columns is not None:
             to_scene = _scene_step(r, centre, scale)
-            # P as the paper has it sums to one; the weights here do.
+            # The columns are those for a P that sums to one, as in the paper.
             unit = (assignment.sum((-2, -1)).double() / total[:, 0, 0])[:, None, None]
             grams = _column_grams(points, r, t, factor, unit * to_scene)
 
@@ -286,7 +307,7 @@ def weighted_pnp(
 
 
 def _scene_step(rotation: Rotations, centre: Translations, scale: Float[Tensor, "b 1"]) -> Float[Tensor, "b 6 6"]:
-    """Return the matrix from a step (w, s) in the solver's frame to that of (angle-axis r, t in scene units).
+    """Return the matrix from a step (w, s) in the solver's frame to one of (angle-axis r, t in scene units).
 
     t = scale t' - R c, so dt = scale s + (R c) x w; dr = J^-1 w with the left Jacobian J of exp at r.
     """
@@ -311,10 +332,10 @@ def _column_grams(
     factor: Float[Tensor, "b 6 6"],
     to_scene: Float[Tensor, "b 6 6"],
 ) -> Float[Tensor, "b n 3 3"]:
-    """Return A_j^T A_j for the columns dy / dP_ij = A_j f_i of the pose's derivative.
+    """Return A_j^T A_j (b, n, 3, 3) for the columns dy / dP_ij = A_j f_i of the pose's derivative.
 
-    With u = g(y_j) and D = [-[x]x, I], the optimality condition has d/dP_ij = -D^T (I - u u^T) f_i / d, and dy is minus
-    the inverse Hessian, whose Cholesky factor is given, times it.
+    With u = g(y_j) and D = [-[x]x, I], the optimality condition has d/dP_ij = -D^T (I - u u^T) f_i / d; dy is minus the
+    inverse Hessian times it. `factor` is the Cholesky factor of the Hessian.
     """
     x = rotation @ points
     u, inverse, _ = _point_gradient(torch.zeros_like(x), x + translation.unsqueeze(-1))
@@ -336,7 +357,7 @@ def _rotate(rotation: Rotations, vector: Translations) -> Translations:
 
 
 def _normalise(points: Columns, weight: Float[Tensor, "b 1 n"]) -> tuple[Columns, Translations, Float[Tensor, "b 1"]]:
-    """Points p' with weighted mean zero and mean square one, centre and scale in p = scale p' + centre.
+    """Return p' with weighted mean zero and mean square one, and centre and scale in p = scale p' + centre.
 
     The Hessian is well scaled in these coordinates.
     """
@@ -348,8 +369,10 @@ def _normalise(points: Columns, weight: Float[Tensor, "b 1 n"]) -> tuple[Columns
 
 
 def _judge(end: Derivatives) -> tuple[Float[Tensor, " b"], Bool[Tensor, " b"], Float[Tensor, "b 6 6"]]:
-    """Norm of the gradient, which samples are well-posed minima, and the Cholesky factor of their Hessians (the
-    identity for the others)."""
+    """Return the gradient norm, which samples are well-posed minima, and the Cholesky factors of their Hessians.
+
+    The factor is the identity for the other samples.
+    """
     eye = torch.eye(6).to(end.hessian)
     trace = end.hessian.diagonal(dim1=-2, dim2=-1).sum(-1)
     # A Cholesky factor of H - c I exists if and only if every eigenvalue of H exceeds c.
@@ -361,17 +384,17 @@ def _judge(end: Derivatives) -> tuple[Float[Tensor, " b"], Bool[Tensor, " b"], F
 
 
 class WeightedPnP(nn.Module):
-    """`weighted_pnp` with its options as a module.
+    """Weighted PnP as a module; see `weighted_pnp`.
 
-    Its `clipped` counts the columns of the derivative in backward passes, and those that `clip_columns` shortened; call
+    `clipped` counts the columns of the derivative in backward passes, and those that `clip_columns` shortened; call
     `clipped.reset()` after reading it.
 
     Args:
         solver: newton, or lbfgs for the paper's L-BFGS with a strong Wolfe line search.
-        tolerance: norm of the gradient per unit of weight at which a sample stops, radians and scene radii.
-        max_iterations: of the solver, at most.
-        clip_columns: largest norm of a column of the derivative with respect to the assignment; the paper has 100,
-            null is for no limit.
+        tolerance: Gradient norm per unit of weight at which a sample stops, radians and scene radii.
+        max_iterations: Largest number of iterations.
+        clip_columns: Largest norm of a column of the derivative with respect to the assignment; the paper uses 100.
+            Default: null, no limit.
 
     >>> layer = WeightedPnP(max_iterations=20)
     >>> points3d = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]])
@@ -397,6 +420,15 @@ class WeightedPnP(nn.Module):
     def forward(
         self, assignment: Tensor, bearings: Tensor, points3d: Tensor, rotation: Tensor, translation: Tensor
     ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], SolveStats]:
+        """Return rotation (b, 3, 3), translation (b, 3) and stats; see `weighted_pnp`.
+
+        Args:
+            assignment: P (b, m, n).
+            bearings: f_i (b, m, 3).
+            points3d: p_j (b, n, 3), scene units.
+            rotation: Initial R (b, 3, 3).
+            translation: Initial t (b, 3), scene units.
+        """
         return weighted_pnp(
             assignment,
             bearings,

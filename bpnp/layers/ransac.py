@@ -1,4 +1,4 @@
-"""RANSAC on the most probable matches: a robust first pose from a soft assignment (paper section 3.3)."""
+"""RANSAC on the most probable matches: a robust initial pose from a soft assignment (paper section 3.3)."""
 
 from typing import Literal
 
@@ -23,8 +23,18 @@ def top_matches(
     mask3d: Bool[Tensor, "b n"] | None,
     matches_factor: float,
 ) -> tuple[Int[Tensor, "b k"], Int[Tensor, "b k"], Bool[Tensor, "b k"]]:
-    """The k = matches_factor * min(m, n) matches of highest probability, most probable first: indices of their 2D and
-    3D points, and which of them there are; m and n count a sample's real points."""
+    """Select the k = matches_factor * min(m, n) most probable matches of each sample, m and n its real points.
+
+    Args:
+        assignment: P (b, m, n).
+        mask2d: True at real image points (b, m). None: all are real.
+        mask3d: True at real scene points (b, n). None: all are real.
+        matches_factor: Matches per point of the smaller side.
+
+    Returns:
+        Indices of the 2D points (b, k) and of the 3D points (b, k), most probable match first, and which of them are
+        matches of the sample rather than padding (b, k).
+    """
     b, m, n = assignment.shape
     real2d = assignment.new_ones(b, m, dtype=torch.bool) if mask2d is None else mask2d
     real3d = assignment.new_ones(b, n, dtype=torch.bool) if mask3d is None else mask3d
@@ -52,19 +62,32 @@ def ransac_pnp(
     max_iterations: int = 1000,
     seed: int = 0,
 ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], SolveStats]:
-    """Pose from the k = matches_factor * min(m, n) most probable matches by RANSAC with a P3P solver.
+    """Estimate a pose from the k = matches_factor * min(m, n) most probable matches by RANSAC with a P3P solver.
 
-    assignment: P; only the order of its entries matters. points2d: normalised image coordinates. points3d: scene units.
-    backend: "poselib", LO-RANSAC that samples in the order of P (PROSAC); "opencv", P3P-RANSAC with 1000 iterations,
-        then EPnP on its inliers, the paper's, or SQPnP where EPnP loses inliers, as it may on points of one plane;
-        "torch", a whole batch at once on its device, in the order of P too; "auto", torch on cuda, else poselib.
-    threshold: largest reprojection error of an inlier, normalised units (0.01 is 8 px at a focal length of 800).
-    seed: of the sampling, the same for each sample, so that a pose does not depend on the other samples.
+    The pose has no gradient: it is the initial pose of a layer that has one.
 
-    Returns rotation, translation and stats (residual: mean reprojection error of the inliers; iterations: hypotheses,
-    or the bound on them where the backend does not tell). A sample for which no pose has 4 inliers holds NaN and
-    `converged` False. No gradient: the pose is the initial pose of a solver that has one.
-    Raises ValueError for arguments of wrong shape or type, an unknown backend and options that are not positive.
+    Args:
+        assignment: P (b, m, n); only the order of its entries matters.
+        points2d: Normalised image coordinates (b, m, 2).
+        points3d: Scene points (b, n, 3), scene units.
+        mask2d: True at real image points (b, m). Default: all are real.
+        mask3d: True at real scene points (b, n). Default: all are real.
+        backend: "poselib" is LO-RANSAC that samples in the order of P (PROSAC). "opencv" is the paper's P3P-RANSAC
+            followed by EPnP on its inliers, or by SQPnP where EPnP loses inliers, as it may for coplanar points.
+            "torch" samples in the order of P too and solves the whole batch at once on its device. "auto" is torch on
+            cuda, else poselib.
+        matches_factor: Matches per point of the smaller side.
+        threshold: Largest reprojection error of an inlier, normalised units (0.01 is 8 px at a focal length of 800).
+        max_iterations: Largest number of hypotheses; the paper uses 1000.
+        seed: Seed of the sampling, the same for each sample, so that a pose does not depend on the other samples.
+
+    Returns:
+        Rotation (b, 3, 3), translation (b, 3) and stats. `residual` is the mean reprojection error of the inliers;
+        `iterations` is the number of hypotheses, or its limit where the backend does not report it. A sample without a
+        pose of 4 or more inliers holds NaN, and its `converged` is False.
+
+    Raises:
+        ValueError: An argument has a wrong shape or dtype, the backend is unknown, or an option is not positive.
 
     >>> points3d = torch.rand(1, 50, 3, generator=torch.Generator().manual_seed(0))
     >>> camera = points3d + torch.tensor([0.0, 0.0, 4.0])
@@ -74,7 +97,7 @@ def ransac_pnp(
     True
     """
     if backend not in ("auto", *BACKENDS):
-        raise ValueError(f"expected `backend` auto, poselib, opencv or torch, got {backend!r}")
+        raise ValueError(f"`backend` is {backend!r}; it is one of auto, {', '.join(BACKENDS)}")
     check_positive(matches_factor=matches_factor, threshold=threshold, max_iterations=max_iterations)
     if backend == "auto":
         backend = "torch" if assignment.device.type == "cuda" else "poselib"
@@ -95,15 +118,15 @@ def ransac_pnp(
 
 
 class RansacPnP(nn.Module):
-    """`ransac_pnp` with its options as a module.
+    """RANSAC as a module; see `ransac_pnp`.
 
     Args:
         backend: poselib (LO-RANSAC, PROSAC order), opencv (the paper's P3P-RANSAC and EPnP), torch (the whole batch on
             its device), or auto (torch on cuda, else poselib).
-        matches_factor: RANSAC sees the matches_factor * min(m, n) most probable matches.
-        threshold: inlier threshold, normalised image coordinates.
-        max_iterations: most hypotheses; the paper has 1000.
-        seed: of the sampling.
+        matches_factor: Matches per point of the smaller side; RANSAC uses the most probable ones.
+        threshold: Largest reprojection error of an inlier, normalised image coordinates.
+        max_iterations: Largest number of hypotheses; the paper uses 1000.
+        seed: Seed of the sampling.
     """
 
     def __init__(
@@ -127,6 +150,15 @@ class RansacPnP(nn.Module):
         mask2d: Tensor | None = None,
         mask3d: Tensor | None = None,
     ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], SolveStats]:
+        """Return rotation (b, 3, 3), translation (b, 3) and stats; see `ransac_pnp`.
+
+        Args:
+            assignment: P (b, m, n).
+            points2d: Normalised image coordinates (b, m, 2).
+            points3d: Scene points (b, n, 3), scene units.
+            mask2d: True at real image points (b, m). Default: all are real.
+            mask3d: True at real scene points (b, n). Default: all are real.
+        """
         return ransac_pnp(
             assignment,
             points2d,

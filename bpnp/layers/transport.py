@@ -1,10 +1,12 @@
 """Forward solver of the entropic transport problem: Sinkhorn sweeps, Newton steps, and annealing for small mu.
 
-The plan is P = diag(alpha) K diag(beta), K = exp((u + v - M) / mu) from potentials near the optimum. K is made once,
-and again only if the scalings grow so far that entries which underflowed might matter; in between all work is products
-of K with vectors. Rescaling rows and columns in turn (a sweep) converges linearly, and slowly once points share their
-probability with neighbours or P is nearly a permutation. Newton's method on the multipliers (the system of
-`bpnp.layers.laplacian`, by conjugate gradients to no more digits than the step has) is quadratic there.
+The plan is P = diag(alpha) K diag(beta) with K = exp((u + v - M) / mu) from potentials near the optimum. K is computed
+once, and again only if the scalings grow so far that entries which underflowed might matter. All other work is products
+of K with vectors.
+
+Rescaling rows and columns in turn (a sweep) converges linearly, and slowly once points share their probability with
+neighbours or P is nearly a permutation. There Newton's method on the multipliers converges quadratically. It solves the
+system of `bpnp.layers.laplacian` by conjugate gradients, to no more digits than the step has.
 """
 
 import math
@@ -20,12 +22,12 @@ from bpnp.types import SolveStats
 
 SWEEPS = 4  # before the first Newton step
 SWEEPS_PER_TEMPERATURE = 5
-ITERATIONS_IN_FLOAT32 = 28  # a sample that is not done by then lacks digits, not iterations
-NEWTON_RADIUS = 2.0  # largest first change of a log scaling
-LOOSEST, SAFETY = 0.3, 0.8  # of a Newton step: largest relative error, and the error to end at per tolerance
-COARSEST = 0.05  # annealing starts at this part of the range of the costs
-COOLING = 4.0  # ratio of two temperatures
-LARGEST_LOG_SCALING = 20.0  # twice this is far from where entries of K underflow in float32
+ITERATIONS_IN_FLOAT32 = 28  # a sample that has not converged by then needs more digits, not more iterations
+NEWTON_RADIUS = 2.0  # largest change of a log scaling in the first Newton step
+LOOSEST, SAFETY = 0.3, 0.8  # Newton step: largest relative error of its system, and target error per tolerance
+COARSEST = 0.05  # first temperature of the annealing, as a fraction of the range of the costs
+COOLING = 4.0  # ratio of successive temperatures
+LARGEST_LOG_SCALING = 20.0  # even twice this is far from underflow of K in float32
 
 
 def solve_plan(
@@ -37,19 +39,29 @@ def solve_plan(
     tolerance: float,
     max_iterations: int,
 ) -> tuple[Float[Tensor, "b m n"], SolveStats]:
-    """Plan with column sums `cols` and row sums `rows` to an L1 error of `tolerance`, sample by sample.
+    """Compute the plan whose row and column sums meet the marginals.
 
-    A point with zero marginal takes no part. Iterations count sweeps; a late one follows a Newton step. Samples for
-    which float32 has too few digits are solved again in float64.
+    A point with zero marginal gets no mass. Samples for which float32 has too few digits are solved again in float64.
+
+    Args:
+        cost: Cost M (b, m, n).
+        rows: Required row sums (b, m).
+        cols: Required column sums (b, n).
+        mu: Entropy weight, float64 scalar.
+        tolerance: Largest L1 error of the sums of a sample.
+        max_iterations: Largest number of sweeps.
+
+    Returns:
+        The plan (b, m, n), and stats whose `iterations` count sweeps; a late sweep follows a Newton step.
     """
     limit = torch.full((len(cost),), max_iterations, device=cost.device)
     plan, iterations, residual = _solve_parts(cost, rows, cols, limit, mu, tolerance)
-    left = limit - iterations
-    hard = (residual > tolerance) & (left > 0)
+    remaining = limit - iterations
+    hard = (residual > tolerance) & (remaining > 0)
     if cost.dtype != torch.float64 and bool(hard.any()):
         some = hard.nonzero().squeeze(-1)
         problem = cost[some].double(), rows[some].double(), cols[some].double()
-        exact_plan, more, exact_residual = _solve_parts(*problem, left[some], mu, tolerance)
+        exact_plan, more, exact_residual = _solve_parts(*problem, remaining[some], mu, tolerance)
         plan[some], residual[some] = exact_plan.to(plan.dtype), exact_residual.to(residual.dtype)
         iterations[some] += more
     return plan, SolveStats(iterations, residual, residual <= tolerance)
@@ -58,7 +70,7 @@ def solve_plan(
 def _solve_parts(
     cost: Tensor, rows: Tensor, cols: Tensor, limit: Int[Tensor, " b"], mu: Tensor, tolerance: float
 ) -> tuple[Tensor, ...]:
-    """Plan, iterations and residuals; a few samples at a time."""
+    """Solve a few samples at a time; return the plan, the iterations and the residuals."""
     plan = cost.new_empty(cost.shape)
     parts = cached_parts(plan, cost, rows, cols, limit)
     ends = [_solve(k, m, r, c, most, mu, tolerance) for k, m, r, c, most in parts]
@@ -68,9 +80,9 @@ def _solve_parts(
 def _solve(
     kernel: Tensor, cost: Tensor, rows: Tensor, cols: Tensor, limit: Int[Tensor, " b"], mu: Tensor, tolerance: float
 ) -> tuple[Int[Tensor, " b"], Float[Tensor, " b"]]:
-    """Iterations and residuals, in the precision of the cost; the plan is written to `kernel`.
+    """Write the plans to `kernel`; return iterations and residuals, in the precision of the cost.
 
-    Samples that are active have all taken the same steps: which others share the batch does not matter to any.
+    All active samples have taken the same steps, so a result does not depend on the other samples of the batch.
     """
     temperature = mu.to(cost.dtype).expand(len(cost))
     u, v, plan = _anneal(kernel, cost, rows, cols, temperature)
@@ -100,9 +112,19 @@ def _solve(
 def sweep(
     plan: Plan, sums: Float[Tensor, "b m"], rows: Tensor, cols: Tensor, count: Int[Tensor, " b"], tolerance: float
 ) -> tuple[Plan, Float[Tensor, "b m"], Float[Tensor, " b"], Int[Tensor, " b"]]:
-    """Rescale the rows, then the columns, `count` times; a sample stops at the tolerance. sums: P 1.
+    """Rescale the rows, then the columns, `count` times; a sample stops at the tolerance.
 
-    Returns the plan, its row sums, their L1 error (infinite for a sample without sweeps) and the sweeps taken.
+    Args:
+        plan: Plan (b, m, n).
+        sums: Its row sums (b, m).
+        rows: Required row sums (b, m).
+        cols: Required column sums (b, n).
+        count: Number of sweeps (b,).
+        tolerance: L1 error of the row sums at which a sample stops.
+
+    Returns:
+        The plan, its row sums (b, m), their L1 error (b,), infinite for a sample without sweeps, and the sweeps taken
+        (b,).
     """
     residual = torch.full_like(sums[:, 0], torch.inf)
     taken = torch.zeros_like(count)
@@ -118,23 +140,26 @@ def sweep(
 
 
 def _rescale(scaling: Tensor, factor: Tensor, active: Bool[Tensor, " b"]) -> Tensor:
-    """Padded points, whose factor is 0/0, keep their scaling, and so do samples that have stopped."""
+    """Scale by a factor; padded points, whose factor is 0/0, and samples that have stopped keep their scaling."""
     return torch.where(active.unsqueeze(-1) & (factor > 0) & (factor < math.inf), scaling * factor, scaling)
 
 
 def _newton(
     plan: Plan, sums: Tensor, rows: Tensor, cols: Tensor, radius: Float[Tensor, " b"], tolerance: float
 ) -> tuple[Plan, Float[Tensor, "b m"], Float[Tensor, " b"], Bool[Tensor, " b"]]:
-    """One Newton step inside a trust radius, taken if it does not lower the (concave) dual objective.
+    """Take one Newton step inside a trust region, unless it lowers the (concave) dual objective.
 
-    Returns the plan, its row sums, the new radius, and which samples go on: those whose direction the precision can
-    tell. The change (x, y) of the log scalings gives diag(e^x) P diag(e^y) the marginals, to first order; the columns
-    have theirs already.
+    The change (x, y) of the log scalings gives diag(e^x) P diag(e^y) the marginals to first order. The columns meet
+    theirs before the step.
+
+    Returns:
+        The plan, its row sums (b, m), the new radius (b,), and which samples continue (b,): those whose direction was
+        computed to enough digits.
     """
     error = (sums - rows).abs().sum(-1)
     precision = torch.maximum(SAFETY * tolerance / error, error.sqrt().clamp_max(LOOSEST))
     row_error = divide(rows - sums, sums)
-    # For the few digits of a step in float32 the marginals precondition as well, and need no pass over the plan.
+    # In float32 a step has few digits; the marginals precondition well enough and need no pass over the plan.
     degree = plan.degree(sums, cols) if cols.dtype == torch.float64 else cols
     y, mean, solved = solve_laplacian(plan, sums, cols, degree, -plan.transpose_times(row_error), precision)
     x = row_error - mean
@@ -149,17 +174,17 @@ def _newton(
         torch.where(accept.unsqueeze(-1), changed, kept)
         for changed, kept in ((new.alpha, plan.alpha), (new.beta, plan.beta), (new_sums, sums))
     )
-    goes_on = solved | (rows.dtype == torch.float64)
-    return Plan(plan.kernel, alpha, beta), sums, torch.where(accept, 2 * radius, radius / 4), goes_on
+    continues = solved | (rows.dtype == torch.float64)
+    return Plan(plan.kernel, alpha, beta), sums, torch.where(accept, 2 * radius, radius / 4), continues
 
 
 def _anneal(
     kernel: Tensor, cost: Tensor, rows: Tensor, cols: Tensor, mu: Float[Tensor, " b"]
 ) -> tuple[Tensor, Tensor, Plan]:
-    """Potentials u, v from which the plan at `mu` neither over- nor underflows, and that plan, in `kernel`.
+    """Compute potentials u, v from which the plan at `mu` neither over- nor underflows, and that plan, in `kernel`.
 
-    Sweeps at falling temperatures, each sample from its own range of costs down to mu. Each temperature starts with the
-    largest entry of every row at one. A point without mass has the potential -inf.
+    Sweeps at falling temperatures, each sample from its own range of costs down to mu. At each temperature the largest
+    entry of every row is one at first. A point without mass has the potential -inf.
     """
     warm = torch.maximum(COARSEST * _range(cost, rows, cols), mu)
     v = torch.where(cols > 0, 0.0, -math.inf).to(cost.dtype)
@@ -175,7 +200,10 @@ def _anneal(
 def _from_row_minima(
     cost: Tensor, rows: Tensor, v: Tensor, mu: Float[Tensor, " b"], kernel: Tensor
 ) -> tuple[Float[Tensor, "b m"], Plan]:
-    """u for which the largest entry of each row of K is one (-inf in rows without mass), and K, written to `kernel`."""
+    """Return u for which the largest entry of each row of K is one, and K, written to `kernel`.
+
+    u is -inf in rows without mass.
+    """
     u = torch.sub(cost, v.unsqueeze(-2), out=kernel).amin(-1)
     u = torch.where(rows > 0, u, -math.inf)
     return u, Plan.of(kernel.sub_(u.unsqueeze(-1)).div_(-mu[:, None, None]).exp_())
@@ -184,9 +212,9 @@ def _from_row_minima(
 def _absorb(
     u: Tensor, v: Tensor, plan: Plan, sums: Tensor, cost: Tensor, mu: Tensor, active: Bool[Tensor, " b"]
 ) -> tuple[Tensor, Tensor, Plan, Tensor]:
-    """Move large scalings of active samples into the potentials and make their K again, in place.
+    """Move large scalings of active samples into the potentials, and recompute their K in place.
 
-    One sample at a time: K may be nearly all the memory there is.
+    Works sample by sample, because K may take most of the memory.
     """
     log_alpha, log_beta = plan.alpha.log(), plan.beta.log()
     large = active & (torch.maximum(log_alpha.abs().amax(-1), log_beta.abs().amax(-1)) > LARGEST_LOG_SCALING)
@@ -197,13 +225,13 @@ def _absorb(
     for i in large.nonzero().flatten().tolist():
         kernel = torch.sub(u[i].unsqueeze(-1), cost[i], out=plan.kernel[i])
         kernel.add_(v[i]).div_(mu[i]).exp_()
-    moved = large.unsqueeze(-1)
-    plan = Plan(plan.kernel, torch.where(moved, 1, plan.alpha), torch.where(moved, 1, plan.beta))
-    return u, v, plan, torch.where(moved, plan.row_sums(), sums)
+    absorbed = large.unsqueeze(-1)
+    plan = Plan(plan.kernel, torch.where(absorbed, 1, plan.alpha), torch.where(absorbed, 1, plan.beta))
+    return u, v, plan, torch.where(absorbed, plan.row_sums(), sums)
 
 
 def _range(cost: Tensor, rows: Tensor, cols: Tensor) -> Float[Tensor, " b"]:
-    """Difference of the largest and the smallest finite cost between points with mass."""
+    """Return the difference of the largest and the smallest finite cost between points with mass (b,)."""
     highest, lowest = cost.amax(-1), cost.amin(-1)
     if not bool((cols > 0).all() & highest.isfinite().all()):
         real = (cols > 0).unsqueeze(-2) & cost.isfinite()

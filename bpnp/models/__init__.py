@@ -1,4 +1,4 @@
-"""Solvers: modules from a `Batch` to a `Prediction`."""
+"""Solvers: modules that map a `Batch` to a `Prediction`."""
 
 from bpnp.models.bpnpnet import BPnPNet
 from bpnp.models.evaluation import Refinement, Search

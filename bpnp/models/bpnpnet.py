@@ -1,7 +1,7 @@
-"""BPnPNet: blind PnP end to end, and the weights of its authors (``*.pth.tar``), read into our network.
+"""BPnPNet, blind PnP end to end, and the weights of its authors (``*.pth.tar``).
 
-Source: Campbell, Liu, Gould, "Solving the Blind Perspective-n-Point Problem End-to-End with Robust Differentiable
-Geometric Optimization", ECCV 2020; the names and shapes of the 185 tensors are those of its public code.
+Source: Campbell, Liu, Gould, "Solving the Blind Perspective-n-Point Problem End-To-End With Robust Differentiable
+Geometric Optimization", ECCV 2020. The names and shapes of the 185 tensors are those of its public code.
 """
 
 import re
@@ -25,7 +25,7 @@ from bpnp.precision import full_precision
 from bpnp.types import Batch, Prediction
 
 SQUARED_FLOOR = 1e-7  # rounding of the product of two float32 unit vectors
-# A checkpoint may hold its best error as a numpy scalar. The function that makes one has two names, by numpy's version.
+# A checkpoint may hold its best error as a numpy scalar. Its constructor has one name per numpy version.
 _NUMPY_SCALAR = np.float64(0).__reduce__()[0]
 _NUMPY_GLOBALS: list[Any] = [
     (_NUMPY_SCALAR, "numpy.core.multiarray.scalar"),
@@ -33,7 +33,7 @@ _NUMPY_GLOBALS: list[Any] = [
     np.dtype,
     *(type(np.dtype(kind)) for kind in ("f2", "f4", "f8", "i4", "i8", "?")),
 ]
-# Our module names, as patterns, and theirs.
+# Names of our modules, as patterns, and the authors' names.
 _THEIRS = {
     r"features(\d)d\.enter": r"FeatureExtractor\1d.conv_in.0",
     r"features(\d)d\.blocks\.(\d+)\.linear_a": r"FeatureExtractor\1d.conv_\2.preconv.0",
@@ -48,22 +48,25 @@ _THEIRS = {
 
 
 class BPnPNet(TrainedNet):
-    """Features of both point sets, transport between them, RANSAC on the best matches, weighted PnP on all of them.
+    """Network of the paper: features of both point sets, transport, RANSAC, and weighted PnP.
 
-    Every part is a module with its own options and may be replaced by another of the same arguments and results. A
-    part that is None is the paper's with its default options.
+    The transport turns distances of features into an assignment. RANSAC estimates an initial pose from the most
+    probable matches, and weighted PnP refines it on all of them. Every part is a module with its own options, and may
+    be replaced by another with the same arguments and results. A part that is None is the paper's with its default
+    options.
 
     Args:
-        features2d: image points (b, m, 2) and their mask to unit features (b, m, c).
-        features3d: scene points (b, n, 3) and their mask to unit features (b, n, c).
-        transport: cost (b, m, n) and both masks to the assignment (b, m, n) and its `SolveStats`.
-        ransac: assignment, points2d, points3d and both masks to the rotation, translation and `SolveStats` of a first
-            pose.
-        pnp: assignment, bearings, points3d and the first pose to a pose that is differentiable in the assignment.
-        refinement: in evaluation, the third pose "refined".
-        rounds: in evaluation, how often the points are matched again under the last pose, of which RANSAC's is the
-            first (`bpnp.models.evaluation.match_again`); the residuals of the last round are as wide as the `threshold`
-            of `ransac`.
+        features2d: Maps image points (b, m, 2) and their mask to unit features (b, m, c).
+        features3d: Maps scene points (b, n, 3) and their mask to unit features (b, n, c).
+        transport: Maps a cost (b, m, n) and both masks to the assignment (b, m, n) and its `SolveStats`.
+        ransac: Maps assignment, points2d, points3d and both masks to rotation, translation and `SolveStats` of an
+            initial pose.
+        pnp: Maps assignment, bearings, points3d and the initial pose to a pose that is differentiable in the
+            assignment.
+        refinement: Computes the third pose "refined" in evaluation.
+        rounds: Number of times that the points are matched again under the last pose in evaluation, starting from
+            RANSAC's (`bpnp.models.evaluation.match_again`). The residuals of the last round have the width of RANSAC's
+            `threshold`.
 
     >>> net = BPnPNet(transport=Sinkhorn(mu=0.05)).eval()
     >>> prediction = net(Batch.from_arrays(torch.rand(20, 2), torch.rand(30, 3)))
@@ -93,7 +96,10 @@ class BPnPNet(TrainedNet):
         self.widths = round_widths(rounds, self.ransac)
 
     def forward(self, batch: Batch) -> Prediction:
-        """Return the assignment, "ransac" and "pnp"; in evaluation, "pnp" after the rounds, and "refined"."""
+        """Return the assignment and the poses "ransac" and "pnp".
+
+        In evaluation "pnp" is the pose after the rounds, and "refined" is added.
+        """
         clock = Clock()
         cost = self.cost(batch)
         assignment, stats = self.transport(cost, batch.mask2d, batch.mask3d)
@@ -108,27 +114,34 @@ class BPnPNet(TrainedNet):
         return clock.timed(self.refinement(again, batch))
 
     def match(self, batch: Batch) -> Prediction:
-        """The assignment alone: what a training without the pose loss needs."""
+        """Return the assignment without poses, which is all that training without the pose loss needs."""
         return Prediction(*self.transport(self.cost(batch), batch.mask2d, batch.mask3d))
 
     def cost(self, batch: Batch) -> Float[Tensor, "b m n"]:
-        """M_ij = ||z_i - z_j||_2 between the unit features of both sides, in [0, 2], in the network's dtype."""
+        """Return the feature distances M_ij = ||z_i - z_j||_2 (b, m, n), in [0, 2], in the network's dtype."""
         return pairwise_distance(*self.features(batch))
 
     def features(self, batch: Batch) -> tuple[Float[Tensor, "b m c"], Float[Tensor, "b n c"]]:
-        """Unit features of both sides, in the network's dtype."""
+        """Return the unit features of both sides, (b, m, c) and (b, n, c), in the network's dtype."""
         batch = batch.to(next((p.dtype for p in self.parameters()), batch.points2d.dtype))
         return self.features2d(batch.points2d, batch.mask2d), self.features3d(batch.points3d, batch.mask3d)
 
 
 @full_precision
 def pairwise_distance(a: Float[Tensor, "b m c"], b: Float[Tensor, "b n c"]) -> Float[Tensor, "b m n"]:
-    """||a_i - b_j||_2 of unit vectors from one matrix product. The gradient at distance zero is taken as zero."""
+    """Return ||a_i - b_j||_2 (b, m, n) of unit vectors, from one matrix product.
+
+    The gradient at distance zero is zero.
+
+    Args:
+        a: Unit vectors (b, m, c).
+        b: Unit vectors (b, n, c).
+    """
     return _PairwiseDistance.apply(a, b)
 
 
 class _PairwiseDistance(torch.autograd.Function):
-    """One matrix is kept for the gradient, the distances: dL/da = -(G / D) b. Its products are exact too."""
+    """Distances D with the gradient dL/da = -(G / D) b, for which only D is stored; its products are exact."""
 
     @staticmethod
     def forward(ctx: Any, a: Tensor, b: Tensor) -> Tensor:
@@ -146,29 +159,35 @@ class _PairwiseDistance(torch.autograd.Function):
 
 
 def tensor_maps() -> dict[str, tuple[tuple[int, ...], str]]:
-    """Shape there, and name in BPnPNet, of the 185 tensors (1,992,841 parameters and the batch norms' buffers) by the
-    authors' names.
+    """Return the shape and our name of each tensor of the authors' network, by the authors' name.
 
-    Their 1x1 convolutions (out, in, 1) are our linear maps (out, in). Both apply the input transform from the right,
-    points @ T.
+    There are 185 tensors: 1,992,841 parameters and the buffers of the batch norms. The authors' 1x1 convolutions
+    (out, in, 1) are our linear maps (out, in). Both apply the input transform from the right, points @ T.
     """
     with torch.device("meta"):
         weights = BPnPNet().state_dict()
     maps = {}
     for ours, value in weights.items():
         module, _, kind = ours.rpartition(".")
-        theirs = next(re.sub(old, new, module) for old, new in _THEIRS.items() if re.fullmatch(old, module))
-        convolution = "conv" in theirs and kind == "weight"
-        maps[f"{theirs}.{kind}"] = ((*value.shape, 1) if convolution else tuple(value.shape), ours)
+        authors = next(re.sub(old, new, module) for old, new in _THEIRS.items() if re.fullmatch(old, module))
+        convolution = "conv" in authors and kind == "weight"
+        maps[f"{authors}.{kind}"] = ((*value.shape, 1) if convolution else tuple(value.shape), ours)
     return maps
 
 
 def load_authors_weights(path: str | Path, *, backend: Backend = "auto") -> BPnPNet:
-    """The network of a ``*.pth.tar`` file in evaluation mode: the same assignment as the authors' for every problem.
+    """Load a ``*.pth.tar`` file of the authors, in evaluation mode.
 
-    backend: of `bpnp.layers.RansacPnP`, which has no weights.
-    Only tensors, plain containers and numbers are unpickled. Raises FileNotFoundError, or ValueError that names the
-    file and, where one tensor is wrong (missing, unexpected, of another shape, not finite), its key.
+    The network computes the same assignment as the authors' network for every problem. Only tensors, plain containers
+    and numbers are unpickled.
+
+    Args:
+        path: File.
+        backend: Backend of `bpnp.layers.RansacPnP`, which has no weights.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is no checkpoint, or a tensor is missing, unexpected, not finite or of another shape.
     """
     file = Path(path)
     state = _read_state(file)
@@ -196,9 +215,9 @@ def load_authors_weights(path: str | Path, *, backend: Backend = "auto") -> BPnP
 
 
 def _read_state(file: Path) -> Mapping[str, Any]:
-    """The `state_dict` of a checkpoint of either of torch's file formats."""
+    """Read the `state_dict` of a checkpoint, in either of torch's file formats."""
     if not file.is_file():
-        raise FileNotFoundError(f"expected the authors' weights, got no file at {file}; try its path")
+        raise FileNotFoundError(f"there is no file of the authors' weights at {file}")
     try:
         with torch.serialization.safe_globals(_NUMPY_GLOBALS):
             content = torch.load(file, map_location="cpu", weights_only=True)
@@ -213,5 +232,5 @@ def _read_state(file: Path) -> Mapping[str, Any]:
     if not isinstance(state, Mapping):
         found = ", ".join(map(repr, list(content)[:6])) if isinstance(content, dict) else type(content).__name__
         raise ValueError(f"expected a dict with `state_dict` in {file}, got {found or 'an empty one'}")
-    # DataParallel puts this before every name
+    # DataParallel prefixes every name
     return {str(key).removeprefix("module."): value for key, value in state.items()}

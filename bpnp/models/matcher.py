@@ -1,4 +1,4 @@
-"""A matcher for clutter: attention within and between the two sets, and a bin for every point without a partner."""
+"""Matcher for clutter: attention within and between both point sets, and dustbins for unmatched points."""
 
 import math
 from dataclasses import replace
@@ -18,30 +18,32 @@ from bpnp.models.nets import ExchangeBlock, Neighbourhood, subtract_mean
 from bpnp.models.weights import AnyModule, TrainedNet, module_or_default
 from bpnp.types import Batch, Prediction, SolveStats
 
-WIDEST = 4.0  # distance from the middle of a view's image over the focal length, 76 degrees
-FREQUENCIES = 8  # of the encoding of a coordinate, from a half turn per robust radius, times sqrt(2) each
+WIDEST = 4.0  # largest distance from the centre of a view's image in focal lengths; 76 degrees
+FREQUENCIES = 8  # frequencies that encode a coordinate, from half a period per robust radius upwards by sqrt(2)
 
 
 class Matcher(TrainedNet):
-    """Pose from unmatched points of which many have no partner.
+    """Network for point sets of which many points have no correspondence.
 
-    Points are encoded from their coordinates in a robust frame of their set and from their nearest neighbours; blocks
-    of self and cross attention let both sets know of each other, which BPnPNet's features do not; an inlier head gives
-    each point its own cost of staying without a partner; entropic transport with these bins is the assignment, and
-    RANSAC, the weighted PnP layer and the refinement make poses of it as in `BPnPNet`.
+    Points are encoded from their coordinates in a robust frame of their set and from their nearest neighbours. Blocks
+    of self and cross attention exchange information between both sets, which BPnPNet's features do not. A head predicts
+    the cost of leaving each point unmatched. Entropic transport with dustbins of these costs gives the assignment;
+    RANSAC, weighted PnP and the refinement turn it into poses as in `BPnPNet`.
 
     Args:
-        channels: width, a multiple of heads.
-        depth: attention blocks.
-        heads: of each attention.
-        neighbours: nearest neighbours that a point is described by; 0 for none.
-        frame: coordinates in which the 3D points are expected: "any", or "view", those of a camera nearby, such as that
-            of a map's view of the same place, which looks along the third axis. There a 3D point is also described by
-            its place in that camera's image, as a 2D point is. `bpnp.solve` and `SceneMap.localize` move the points
-            so, and the pose back.
-        mu: entropy weight of the transport at the start of a training; it is learned.
+        channels: Width, a multiple of heads.
+        depth: Number of attention blocks.
+        heads: Heads of each attention.
+        neighbours: Number of nearest neighbours that describe a point; 0 for none.
+        frame: Frame in which the 3D points are expected: "any", or "view", that of a camera nearby which looks along
+            the third axis, such as a map's view of the same scene. In "view" a 3D point is also described by its image
+            in that camera, as a 2D point is. `bpnp.solve` and `SceneMap.localize` transform the points, and the pose
+            back.
+        mu: Entropy weight of the transport at the start of training; it is learned.
         tolerance: L1 error of the marginals at which the transport stops.
-        ransac, pnp, refinement: as in `BPnPNet`.
+        ransac: As in `BPnPNet`.
+        pnp: As in `BPnPNet`.
+        refinement: As in `BPnPNet`.
 
     >>> net = Matcher(channels=32, depth=2).eval()
     >>> prediction = net.match(Batch.from_arrays(torch.rand(20, 2), torch.rand(30, 3)))
@@ -77,7 +79,7 @@ class Matcher(TrainedNet):
         self.around2d = Neighbourhood(2, channels, neighbours=neighbours) if neighbours else None
         self.around3d = Neighbourhood(3, channels, neighbours=neighbours) if neighbours else None
         self.seen = None
-        if frame == "view":  # nothing of it at first, so that weights for any axes can go on so
+        if frame == "view":  # zero at first, so that training can continue from weights for the frame "any"
             self.seen = nn.Linear(channels, channels, bias=False)
             nn.init.zeros_(self.seen.weight)
         self.blocks = nn.ModuleList(ExchangeBlock(channels, heads) for _ in range(depth))
@@ -91,7 +93,7 @@ class Matcher(TrainedNet):
         self.refinement = Refinement() if refinement is None else refinement
 
     def forward(self, batch: Batch) -> Prediction:
-        """Return the assignment, its bins and the poses "ransac" and "pnp"; in evaluation "refined" too."""
+        """Return the assignment, unmatched probabilities, and poses "ransac", "pnp" and, in evaluation, "refined"."""
         clock = Clock()
         prediction = self.match(batch)
         assert prediction.assignment is not None
@@ -103,15 +105,18 @@ class Matcher(TrainedNet):
         return prediction if self.training else clock.timed(self.refinement(prediction, batch))
 
     def match(self, batch: Batch) -> Prediction:
-        """The assignment and its bins, without poses."""
+        """Return the assignment and the unmatched probabilities, without poses."""
         plan, stats = self.transport(batch)
         return Prediction(plan[:, :-1, :-1], stats, unmatched2d=plan[:, :-1, -1], unmatched3d=plan[:, -1, :-1])
 
     def transport(self, batch: Batch) -> tuple[Float[Tensor, "b rows cols"], SolveStats]:
-        """Plan over the points and one bin on each side (last row, last column).
+        """Compute the plan over the points and one dustbin on each side.
 
-        Every real point has the mass 1 / (m + n), each bin that of the other side's points. A match costs the distance
-        of the unit features, a point its own cost to leave.
+        Every real point has the mass 1 / (m + n), each dustbin that of all points of the other side. A match costs the
+        distance of the unit features, an unmatched point its own predicted cost.
+
+        Returns:
+            The plan (b, m + 1, n + 1), dustbins last, and the stats of the transport.
         """
         batch = batch.to(self.bin_cost.dtype)
         z2d, z3d = self.features(batch)
@@ -131,7 +136,7 @@ class Matcher(TrainedNet):
         )
 
     def features(self, batch: Batch) -> tuple[Float[Tensor, "b m c"], Float[Tensor, "b n c"]]:
-        """Features of both sides after the last block, normalised by layer, not to unit length."""
+        """Return the features of both sides after the last block, layer-normalised, not of unit length."""
         centre3d, radius3d = robust_frame(batch.points3d, batch.mask3d)
         local3d = (batch.points3d - centre3d) / radius3d
         x2d, x3d = self._image_features(batch.points2d, batch.mask2d), self.enter3d(encode(local3d))
@@ -144,7 +149,7 @@ class Matcher(TrainedNet):
         return self.norm(x2d), self.norm(x3d)
 
     def _image_features(self, points2d: Float[Tensor, "b k 2"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
-        """Of points of an image: by their place in a robust frame, the frame itself, and what lies around them."""
+        """Encode image points: position in a robust frame, the frame itself, and the neighbourhood."""
         centre, radius = robust_frame(points2d, mask)
         local = (points2d - centre) / radius
         frame = torch.cat([centre, radius.log()], -1).expand(-1, local.shape[1], -1)
@@ -152,16 +157,26 @@ class Matcher(TrainedNet):
         return x if self.around2d is None else x + self.around2d(local, mask)
 
     def _unit(self, z: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
-        """Projected, centred over the set, of unit length: a set's features cannot all be the same."""
+        """Project features, subtract their mean over the set, and scale them to unit length.
+
+        Without the mean, the features of a set cannot all be the same.
+        """
         return nn.functional.normalize(subtract_mean(self.project(z), mask), dim=-1)
 
 
 def robust_frame(
     points: Float[Tensor, "b k d"], mask: Bool[Tensor, "b k"]
 ) -> tuple[Float[Tensor, "b 1 d"], Float[Tensor, "b 1 1"]]:
-    """Median of each coordinate and median distance from it: half of the points may be clutter. Padding is not seen.
+    """Return the median of each coordinate and the median distance from it.
 
-    A set whose points coincide has radius one.
+    Up to half of the points may be clutter. Padding is ignored.
+
+    Args:
+        points: Points (b, k, d).
+        mask: True at real points (b, k).
+
+    Returns:
+        Centre (b, 1, d) and radius (b, 1, 1); the radius of coinciding points is one.
     """
     hidden = points.masked_fill(~mask.unsqueeze(-1), torch.nan)
     centre = hidden.nanmedian(1, keepdim=True).values
@@ -170,14 +185,18 @@ def robust_frame(
 
 
 def image_of(points3d: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 2"]:
-    """x/z, y/z of points in the coordinates of a camera; of those beside or behind it, at the edge of a wide image."""
+    """Return x/z, y/z of points in camera coordinates, limited to a wide image for points far off the axis or behind.
+
+    Args:
+        points3d: Camera coordinates (b, n, 3).
+    """
     plane = points3d[..., :2]
     depth = torch.maximum(points3d[..., 2:], plane.norm(dim=-1, keepdim=True) / WIDEST)
     return plane / depth.clamp_min(torch.finfo(depth.dtype).tiny)
 
 
 def encode(points: Float[Tensor, "b k d"]) -> Float[Tensor, "b k e"]:
-    """Coordinates, and their sines and cosines at rising frequencies."""
-    turns = math.pi / 2 * math.sqrt(2) ** torch.arange(FREQUENCIES, dtype=points.dtype, device=points.device)
-    phase = (points.unsqueeze(-1) * turns).flatten(-2)
+    """Return coordinates, and their sines and cosines at increasing frequencies."""
+    frequencies = math.pi / 2 * math.sqrt(2) ** torch.arange(FREQUENCIES, dtype=points.dtype, device=points.device)
+    phase = (points.unsqueeze(-1) * frequencies).flatten(-2)
     return torch.cat([points, phase.sin(), phase.cos()], -1)

@@ -1,7 +1,7 @@
-"""The neural networks that give points their features; no result depends on a padded point.
+"""Feature networks of point sets; no result depends on a padded point.
 
-Norms of padded sets, the context norm (Yi et al. 2018) and batch norm; point features with PointNet's input transform
-(paper section 3.4); attention within and between two sets.
+Norms of padded sets: the context norm (Yi et al. 2018) and batch norm. Point features with PointNet's input transform
+(paper section 3.4). Attention within and between two sets.
 """
 
 from itertools import pairwise
@@ -17,11 +17,16 @@ from torch.nn import functional
 
 from bpnp.types import has_no_padding
 
-CONTEXT_EPS = 1e-3  # as in the authors' code
+CONTEXT_EPS = 1e-3  # added to the variance, as in the authors' code
 
 
 def subtract_mean(x: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
-    """x - mean over the real points of each set, per channel."""
+    """Subtract the mean over the real points of each set, per channel.
+
+    Args:
+        x: Features (b, k, c).
+        mask: True at real points (b, k).
+    """
     weight = mask.unsqueeze(-1).to(x.dtype)
     return x - (x * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True)
 
@@ -33,11 +38,21 @@ def linear_context_norm(
     mask: Bool[Tensor, "b k"] | None,
     skip: Float[Tensor, "b k d"] | None = None,
 ) -> Float[Tensor, "b k d"]:
-    """y = CN(x W^T + b) with CN(z) = (z - mean) / sqrt(var + 1e-3) over the points of each set, per channel.
+    """Apply a linear map and the context norm: y = CN(x W^T + b), CN(z) = (z - mean) / sqrt(var + 1e-3).
 
-    With `skip` the result is skip + relu(y). The context norm is the only exchange between the points of a set; its
-    variance is unbiased, and zero for a set of one point. Padded points have y = 0; mask None: there are none. The
-    statistics of half-precision values are made in float32. The bias has no effect and its gradient is zero.
+    The statistics are over the points of each set, per channel; the variance is unbiased, and zero for a set of one
+    point. The context norm is the only exchange between the points of a set. Statistics of half-precision values are
+    computed in float32. The bias has no effect and its gradient is zero.
+
+    Args:
+        x: Features (b, k, c).
+        weight: W (d, c).
+        bias: b (d,).
+        mask: True at real points (b, k), None without padding. Padded points have y = 0.
+        skip: If given, the result is skip + relu(y).
+
+    Returns:
+        Features (b, k, d).
     """
     device = x.device.type
     if torch.is_autocast_enabled(device):
@@ -48,9 +63,10 @@ def linear_context_norm(
 
 
 class _LinearContextNorm(torch.autograd.Function):
-    """Keeps x and y for the gradient, and works in place: results in new memory cost more than their arithmetic.
+    """Linear map and context norm in place; results in new memory would cost more than their arithmetic.
 
-    dL/dz = (g - mean(g) - y sum(g y) / (count - 1)) / std for the gradient g of y.
+    x and y are stored for the gradient: dL/dz = (g - mean(g) - y sum(g y) / (count - 1)) / std with the gradient g of
+    y.
     """
 
     @staticmethod
@@ -84,7 +100,7 @@ class _LinearContextNorm(torch.autograd.Function):
 
 
 def _zero_padding(x: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"] | None) -> Float[Tensor, "b k c"]:
-    """Zero at padded points."""
+    """Return x with zeros at padded points."""
     return x if mask is None else x.masked_fill(~mask.unsqueeze(-1), 0)
 
 
@@ -92,7 +108,7 @@ class MaskedBatchNorm(nn.BatchNorm1d):
     """Batch norm over the real points of (b, k, c), or over the samples of (b, c).
 
     In training the statistics cover the batches of all processes, so that splitting a batch over processes changes
-    nothing; a batch with a single value per channel has no variance and uses the running statistics. With `momentum`
+    nothing. A batch with a single value per channel has no variance and uses the running statistics. With `momentum`
     None these are the mean over all batches, as in `torch.nn.BatchNorm1d`.
     """
 
@@ -109,9 +125,9 @@ class MaskedBatchNorm(nn.BatchNorm1d):
         return torch.addcmul(self.bias - mean * scale, x, scale)
 
     def _statistics(self, x: Tensor, mask: Bool[Tensor, "b k"] | None) -> tuple[Tensor, Tensor]:
-        """Mean and variance of the values of all processes, which the running statistics follow."""
+        """Return mean and variance over all processes, and update the running statistics."""
         real = torch.ones_like(x[..., :1]) if mask is None else mask.unsqueeze(-1)
-        weight, axes = real.to(self.running_mean), tuple(range(x.ndim - 1))  # half precision has too few digits here
+        weight, axes = real.to(self.running_mean), tuple(range(x.ndim - 1))  # in the dtype of the statistics, not half
         count, total = weight.sum().reshape(1), (x * weight).sum(axes)
         if dist.is_initialized():
             count, total = collectives.all_reduce(count), collectives.all_reduce(total)
@@ -130,9 +146,12 @@ class MaskedBatchNorm(nn.BatchNorm1d):
 
 
 class ResidualBlock(nn.Module):
-    """x + relu(CN(linear_c(CN(linear_b(linear_a(x)))))), CN the context norm.
+    """Residual block x + relu(CN(linear_c(CN(linear_b(linear_a(x)))))) with the context norm CN.
 
-    Nothing stands between linear_a and linear_b: they are applied as one map, made of their product.
+    There is nothing between linear_a and linear_b, so their product is applied as one map.
+
+    Args:
+        channels: Width.
     """
 
     def __init__(self, channels: int) -> None:
@@ -142,22 +161,27 @@ class ResidualBlock(nn.Module):
         self.linear_c = nn.Linear(channels, channels)
 
     def forward(self, x: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"] | None) -> Float[Tensor, "b k c"]:
-        """mask: None where nothing is padded."""
+        """Return the features (b, k, c).
+
+        Args:
+            x: Features (b, k, c).
+            mask: True at real points (b, k), None without padding.
+        """
         a, b, c = self.linear_a, self.linear_b, self.linear_c
-        with torch.autocast(x.device.type, enabled=False):  # the product keeps its digits
+        with torch.autocast(x.device.type, enabled=False):  # full precision for the product of the weights
             weight, bias = b.weight @ a.weight, torch.addmv(b.bias, b.weight, a.bias)
         return linear_context_norm(linear_context_norm(x, weight, bias, mask), c.weight, c.bias, mask, skip=x)
 
 
 class PointFeatures(nn.Module):
-    """A vector of unit length for each point, from its coordinates and the statistics of its set.
+    """Unit feature vector of each point, from its coordinates and the statistics of its set.
 
     Args:
-        coordinates: 2 or 3.
-        channels: width of the residual net.
-        depth: its residual blocks.
-        centre: subtract the mean feature of the set before the normalisation to unit length, which sharpens the
-            assignment (ours; off in the paper).
+        coordinates: Number of coordinates, 2 or 3.
+        channels: Width of the residual network.
+        depth: Number of residual blocks.
+        centre: Subtract the mean feature of the set before scaling to unit length, which sharpens the assignment (an
+            addition to the paper).
     """
 
     def __init__(self, coordinates: int, *, channels: int = 128, depth: int = 12, centre: bool = False) -> None:
@@ -167,9 +191,15 @@ class PointFeatures(nn.Module):
         self.blocks = nn.ModuleList(ResidualBlock(channels) for _ in range(depth))
 
     def forward(self, points: Float[Tensor, "b k d"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
-        z, seen = self.enter(points), None if has_no_padding(mask) else mask
+        """Return unit features (b, k, c).
+
+        Args:
+            points: Coordinates (b, k, d).
+            mask: True at real points (b, k).
+        """
+        z, padding_mask = self.enter(points), None if has_no_padding(mask) else mask
         for block in self.blocks:
-            z = block(z, seen)
+            z = block(z, padding_mask)
         return functional.normalize(subtract_mean(z, mask) if self.centre else z, dim=-1)
 
 
@@ -177,8 +207,10 @@ class ImageFeatures(PointFeatures):
     """Features of normalised image points.
 
     Args:
-        channels, depth, centre: as in `PointFeatures`.
-        scale: factor on the coordinates; 4 brings the image of a 50 degree camera to the size of a unit scene.
+        channels: Width of the residual network.
+        depth: Number of residual blocks.
+        centre: As in `PointFeatures`.
+        scale: Factor of the coordinates; 4 brings the image of a 50 degree camera to the size of a unit scene.
     """
 
     def __init__(self, *, channels: int = 128, depth: int = 12, centre: bool = False, scale: float = 1.0) -> None:
@@ -190,12 +222,14 @@ class ImageFeatures(PointFeatures):
 
 
 class SceneFeatures(PointFeatures):
-    """Features of scene points after PointNet's learned transform of the set.
+    """Features of scene points, after PointNet's learned transform of the set.
 
     Args:
-        channels, depth, centre: as in `PointFeatures`.
-        normalise: centre the points and scale them to unit size first, so that the features depend neither on the
-            scene's unit nor on its origin.
+        channels: Width of the residual network.
+        depth: Number of residual blocks.
+        centre: As in `PointFeatures`.
+        normalise: Centre the points and scale them to unit size first, so that the features depend neither on the unit
+            nor on the origin of the scene.
     """
 
     def __init__(self, *, channels: int = 128, depth: int = 12, centre: bool = False, normalise: bool = False) -> None:
@@ -209,7 +243,7 @@ class SceneFeatures(PointFeatures):
 
 
 class InputTransform(nn.Module):
-    """PointNet's learned 3 x 3 transform T of a 3D set: points @ T, T = I + output of a small set network."""
+    """PointNet's learned 3 x 3 transform of a 3D set: points @ T, T = I + output of a small set network."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -219,10 +253,10 @@ class InputTransform(nn.Module):
         self.out = nn.Linear(256, 9)
 
     def forward(self, points: Float[Tensor, "b n 3"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b n 3"]:
-        z, seen = points, None if has_no_padding(mask) else mask
+        z, padding_mask = points, None if has_no_padding(mask) else mask
         for linear, norm in zip(self.linears[:3], self.norms[:3], strict=True):
-            z = torch.relu(norm(linear(z), seen))
-        z = (z if seen is None else z.masked_fill(~seen.unsqueeze(-1), 0)).amax(1)
+            z = torch.relu(norm(linear(z), padding_mask))
+        z = (z if padding_mask is None else z.masked_fill(~padding_mask.unsqueeze(-1), 0)).amax(1)
         for linear, norm in zip(self.linears[3:], self.norms[3:], strict=True):
             z = torch.relu(norm(linear(z)))
         transform = torch.eye(3, dtype=z.dtype, device=z.device) + self.out(z).unflatten(-1, (3, 3))
@@ -230,7 +264,15 @@ class InputTransform(nn.Module):
 
 
 def normalise_points3d(points3d: Float[Tensor, "b n 3"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b n 3"]:
-    """Centred at the mean, root mean square distance one: features that do not depend on the scene's units."""
+    """Centre the points of each set at their mean and scale them to a root mean square distance of one.
+
+    Args:
+        points3d: Points (b, n, 3).
+        mask: True at real points (b, n).
+
+    Returns:
+        Points (b, n, 3); padded points are zero.
+    """
     weight = mask.unsqueeze(-1).to(points3d.dtype)
     around = subtract_mean(points3d, mask) * weight
     radius = ((around**2).sum((1, 2), keepdim=True) / weight.sum(1, keepdim=True)).sqrt()
@@ -238,9 +280,11 @@ def normalise_points3d(points3d: Float[Tensor, "b n 3"], mask: Bool[Tensor, "b n
 
 
 class Attention(nn.Module):
-    """x + out(softmax(q k^T / sqrt(d)) v), with q of the points x and k, v of the points it looks at, both normalised.
+    """Residual attention x + out(softmax(q k^T / sqrt(d)) v), with layer norm of both inputs.
 
-    channels: width, a multiple of heads.
+    Args:
+        channels: Width, a multiple of heads.
+        heads: Number of heads.
     """
 
     def __init__(self, channels: int, heads: int) -> None:
@@ -254,11 +298,17 @@ class Attention(nn.Module):
         self.out = nn.Linear(channels, channels)
 
     def forward(
-        self, x: Float[Tensor, "b k c"], seen: Float[Tensor, "b l c"], mask: Bool[Tensor, "b l"]
+        self, x: Float[Tensor, "b k c"], source: Float[Tensor, "b l c"], mask: Bool[Tensor, "b l"]
     ) -> Float[Tensor, "b k c"]:
-        """mask: True at the real points of `seen`."""
+        """Return the features (b, k, c).
+
+        Args:
+            x: Features that give the queries (b, k, c).
+            source: Features that give keys and values (b, l, c).
+            mask: True at the real points of `source` (b, l).
+        """
         q = self._split(self.query(self.norm(x)))
-        k, v = (self._split(part) for part in self.key_value(self.norm(seen)).chunk(2, -1))
+        k, v = (self._split(part) for part in self.key_value(self.norm(source)).chunk(2, -1))
         z = functional.scaled_dot_product_attention(q, k, v, attn_mask=mask[:, None, None, :])
         return x + self.out(z.transpose(1, 2).flatten(2))
 
@@ -267,7 +317,7 @@ class Attention(nn.Module):
 
 
 class FeedForward(nn.Module):
-    """x + linear(gelu(linear(norm(x)))), each point for itself."""
+    """Residual network x + linear(gelu(linear(norm(x)))) of each point."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -280,7 +330,12 @@ class FeedForward(nn.Module):
 
 
 class ExchangeBlock(nn.Module):
-    """Each set looks at itself, then at the other; the weights of the two directions are the same."""
+    """Self attention of each set, then cross attention between both; the two directions share their weights.
+
+    Args:
+        channels: Width.
+        heads: Number of heads.
+    """
 
     def __init__(self, channels: int, heads: int) -> None:
         super().__init__()
@@ -301,10 +356,15 @@ class ExchangeBlock(nn.Module):
 
 
 class Neighbourhood(nn.Module):
-    """What lies around each point: the largest response, by channel, to the offsets of its nearest neighbours.
+    """Features of the neighbourhood of each point: the channel-wise maximum over responses to its nearest neighbours.
 
-    The offsets are in units of the set's mean distance to the neighbours, so that a denser sample of the same shape
-    looks alike. A point without a neighbour gets zeros.
+    Offsets are in units of the set's mean distance to the neighbours, so that a denser sample of the same shape has
+    similar features. A point without a neighbour gets zeros.
+
+    Args:
+        coordinates: Number of coordinates, 2 or 3.
+        channels: Width.
+        neighbours: Number of neighbours.
     """
 
     def __init__(self, coordinates: int, channels: int, *, neighbours: int) -> None:

@@ -1,7 +1,7 @@
-"""Checkpoints of earlier versions, in the form of this one.
+"""Conversion of checkpoints of earlier versions.
 
-Version 0.1 had all options in the network's constructor; now they are in its parts. Some options have other names
-since, or are gone.
+In version 0.1 the network's constructor had all options; now its parts have them. Some options have been renamed or
+removed since.
 """
 
 from collections.abc import Iterator, Mapping
@@ -37,21 +37,21 @@ CLASSES = {
 }
 WEIGHTS = {"solver.align.": "solver.features3d.align.", "solver.sinkhorn.": "solver.transport."}
 RENAMED = {"pairs_factor": "matches_factor"}  # settings of parts
-# Settings of parts that had no other value in use.
+# Removed settings of parts, with the only value that was in use.
 REMOVED = {"batch_norm": False, "principal": False, "method": "newton"}
 
 
 def upgrade(content: dict[str, Any]) -> dict[str, Any]:
-    """Bring the content of a checkpoint into the form of this version.
+    """Convert the content of a checkpoint to this version.
 
     An option that the older network did not have gets its default when the network is built. The order of the
-    parameters, which the state of an optimizer depends on, is the same.
+    parameters, which the state of an optimiser depends on, is unchanged.
 
     Args:
-        content: of a checkpoint of any version; that of another program is returned unchanged.
+        content: Content of a checkpoint of any version. That of another program is returned unchanged.
 
     Returns:
-        The content with today's settings under "solver" and today's names under "state_dict".
+        The content with current settings under "solver" and current names under "state_dict".
     """
     solver = content.get("solver")
     if not isinstance(solver, Mapping) or not isinstance(solver.get("settings"), Mapping):
@@ -69,13 +69,16 @@ def upgrade(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def _has_one_constructor(solver: Mapping[str, Any]) -> bool:
-    """All options of BPnPNet but `rounds` are in its parts since; Matcher had `blocks`."""
+    """Return True for a description of version 0.1, in which the network has the settings of its parts."""
     names = solver["settings"].keys()
     return "blocks" in names and solver.get("class") in ("BPnPNet", "Matcher")
 
 
 def _places(name: str, settings: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Where each option of version 0.1 is now, and its value. The constructor refuses an option that never was."""
+    """Yield the current path and the value of each option of version 0.1.
+
+    An option that never existed is left for the constructor to reject.
+    """
     for option, value in settings.items():
         if name == "BPnPNet" and option in BOTH_SIDES:
             yield f"features2d.{BOTH_SIDES[option]}", value
@@ -87,7 +90,7 @@ def _places(name: str, settings: Mapping[str, Any]) -> Iterator[tuple[str, Any]]
 
 
 def _upgrade_part(value: Any) -> Any:
-    """A description with the names of this version, and without the options that are gone."""
+    """Rename the settings of a description, and remove those that no longer exist."""
     if not isinstance(value, Mapping) or not isinstance(value.get("settings"), Mapping):
         return value
     settings = {

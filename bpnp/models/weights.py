@@ -1,9 +1,9 @@
-"""Checkpoint files, read as data and never as code; the weights of this package; and the networks of both.
+"""Checkpoint files, read as data and never as code; packaged weights; and the networks of both.
 
-A description of a module has the name of its class and its constructor's arguments, each kept by the module as an
-attribute of the same name; an argument that is a module is described likewise. A description holds dicts, lists,
-tuples, strings and numbers only. Building one imports nothing: the classes are looked up by name among those that the
-caller names. A checkpoint describes its network under "solver", and nothing else decides which network it belongs to.
+A module is described by the name of its class and the arguments of its constructor. The module keeps each argument as
+an attribute of the same name; an argument that is a module is described likewise. A description holds only dicts,
+lists, tuples, strings and numbers. Building a module imports nothing: classes are looked up by name among those that
+the caller passes. A checkpoint describes its network under "solver", which alone decides which network it belongs to.
 """
 
 import inspect
@@ -25,17 +25,17 @@ from bpnp.models.older_checkpoints import upgrade
 
 PARTS = (ImageFeatures, SceneFeatures, PointFeatures, Sinkhorn, RansacPnP, WeightedPnP, Refinement)
 WEIGHTS = resources.files("bpnp") / "weights"
-LEARNED = "procedural-so3"  # what `solve(prior="learned")` asks
+LEARNED = "procedural-so3"  # weights of `solve(prior="learned")`
 PLAIN = (bool, int, float, str, type(None))
-PREFIX = "solver."  # of the weights of BlindPnPTask's solver
-# Settings that do not change the assignment: a run may have other ones than its checkpoint.
+PREFIX = "solver."  # prefix of the weights of BlindPnPTask's solver
+# Settings that do not change the assignment, so that a run may override those of its checkpoint.
 ADJUSTABLE = {"ransac", "pnp", "refinement", "rounds", "tolerance", "max_iterations"}
 
 Net = TypeVar("Net", bound="TrainedNet")
 
 
 class TrainedNet(nn.Module):
-    """A network that comes back from its checkpoint, in evaluation mode.
+    """Base of networks that can be restored from a checkpoint, in evaluation mode.
 
     >>> from bpnp import BPnPNet
     >>> BPnPNet.from_pretrained("procedural-so3").training
@@ -46,36 +46,46 @@ class TrainedNet(nn.Module):
 
     @classmethod
     def from_checkpoint(cls: type[Net], path: str | Path, *, parts: Iterable[type[nn.Module]] = ()) -> Net:
-        """The network of a checkpoint that `bpnp fit` wrote; by `TrainedNet` whichever it is.
+        """Load the network of a checkpoint that `bpnp fit` wrote.
 
-        path: a file, or the name of packaged weights.
-        parts: classes outside this package that the network is made of; a checkpoint names them, and only those given
-            here are used.
-        Raises FileNotFoundError, or ValueError naming the file if it holds another network or none.
+        `TrainedNet.from_checkpoint` loads a network of any class.
+
+        Args:
+            path: File, or the name of packaged weights.
+            parts: Classes outside this package that the network is made of. A checkpoint names its classes, and only
+                those passed here are used.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: The file holds another network, or none.
         """
         content = read_checkpoint(path)
         saved = content.get("solver")
-        found = saved.get("class") if isinstance(saved, Mapping) else None
-        known = {class_name(net): net for net in networks()}
-        if not issubclass(known.get(str(found), object), cls):
-            wanted = " or ".join(known) if cls is TrainedNet else class_name(cls)
-            raise ValueError(f"expected a checkpoint of {wanted}, got {found or 'another file'} in {path}")
+        name = saved.get("class") if isinstance(saved, Mapping) else None
+        classes = {class_name(net): net for net in networks()}
+        if not issubclass(classes.get(str(name), object), cls):
+            wanted = " or ".join(classes) if cls is TrainedNet else class_name(cls)
+            raise ValueError(f"expected a checkpoint of {wanted}, got {name or 'another file'} in {path}")
         try:
             net = build_solver(content, parts)
             net.load_state_dict(fitting_state(content, net)[0])
         except ValueError as error:
-            raise ValueError(f"expected a checkpoint of {found}, got {path}: {error}") from error
+            raise ValueError(f"cannot load {name} from {path}: {error}") from error
         assert isinstance(net, cls)
         return net.eval()
 
     @classmethod
     def from_pretrained(cls: type[Net], name: str) -> Net:
-        """A network with weights of this package; `docs/model-card.md` has the names and what each can do.
+        """Load a network with weights of this package; nothing is downloaded.
 
-        Raises ValueError that lists the names for any other. Nothing is downloaded.
+        Args:
+            name: Name of the weights; `docs/model-card.md` lists them.
+
+        Raises:
+            ValueError: There are no such weights.
         """
         if name not in (names := pretrained_names()):
-            raise ValueError(f"expected the name of packaged weights, got {name!r}; try {', '.join(names)}")
+            raise ValueError(f"there are no packaged weights {name!r}; the names are {', '.join(names)}")
         return cls.from_checkpoint(name)
 
     @property
@@ -85,54 +95,74 @@ class TrainedNet(nn.Module):
 
 
 def pretrained_names() -> list[str]:
-    """Names that `from_pretrained` takes."""
+    """Return the names that `from_pretrained` accepts."""
     return sorted(file.name.removesuffix(".ckpt") for file in WEIGHTS.iterdir() if file.name.endswith(".ckpt"))
 
 
 def checkpoint_path(name: str | Path) -> Path:
-    """Return the file of a checkpoint: a path to a file, or the file of packaged weights by their name.
+    """Return the file of a checkpoint.
 
-    Raises FileNotFoundError for anything else.
+    Args:
+        name: Path of a file, or the name of packaged weights.
+
+    Raises:
+        FileNotFoundError: There is no such file.
     """
     if Path(name).is_file():
         return Path(name)
     if str(name) in pretrained_names():
         return Path(str(WEIGHTS / f"{name}.ckpt"))
     raise FileNotFoundError(
-        f"expected a checkpoint, got no file at {name}; try runs/<name>/checkpoints/last.ckpt, or packaged weights: "
+        f"there is no checkpoint {name}; give a file such as runs/<name>/checkpoints/last.ckpt, or packaged weights: "
         f"{', '.join(pretrained_names())}"
     )
 
 
 def read_checkpoint(path: str | Path, *, map_location: Any = "cpu") -> dict[str, Any]:
-    """Content of a checkpoint that `bpnp fit` wrote, restricted to tensors, numbers and plain containers.
+    """Read a checkpoint that `bpnp fit` wrote, restricted to tensors, numbers and plain containers.
 
-    path: a file, or the name of packaged weights.
-    Raises FileNotFoundError if there is no such file, ValueError naming it if it is truncated, foreign or holds code.
+    Args:
+        path: File, or the name of packaged weights.
+        map_location: As in `torch.load`.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is truncated, of another program, or holds code.
     """
     content = read_data(path, map_location=map_location)
     if "state_dict" not in content:
-        raise ValueError(f"expected a checkpoint of `bpnp fit`, got a file without a `state_dict`: {path}")
+        raise ValueError(f"{path} is no checkpoint of `bpnp fit`: it has no `state_dict`")
     return upgrade(content)
 
 
 def read_data(path: str | Path, *, map_location: Any = "cpu") -> dict[str, Any]:
-    """Read a dict of tensors, numbers and plain containers that torch saved; errors as in `read_checkpoint`."""
+    """Read a dict of tensors, numbers and plain containers that torch saved.
+
+    Args:
+        path: As in `read_checkpoint`.
+        map_location: As in `torch.load`.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file cannot be read.
+    """
     file = checkpoint_path(path)
     try:
         content = torch.load(file, map_location=map_location, weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, LookupError, OSError) as error:
         reason = (str(error) or type(error).__name__).splitlines()[0].split(". ")[0]
-        raise ValueError(
-            f"expected a checkpoint of `bpnp fit`, got a file that cannot be read: {file} ({reason})"
-        ) from error
+        raise ValueError(f"{file} is no checkpoint of `bpnp fit`: it cannot be read ({reason})") from error
     if not isinstance(content, dict):
-        raise ValueError(f"expected a checkpoint of `bpnp fit`, got a file without a `state_dict`: {file}")
+        raise ValueError(f"{file} is no checkpoint of `bpnp fit`: it has no `state_dict`")
     return content
 
 
 def solver_state(content: Mapping[str, Any]) -> dict[str, Tensor]:
-    """The weights of the solver in the checkpoint of a `BlindPnPTask`, by their names in the solver."""
+    """Return the weights of the solver in a checkpoint of a `BlindPnPTask`, by their names in the solver.
+
+    Args:
+        content: Content of a checkpoint.
+    """
     state = content["state_dict"]
     return {key.removeprefix(PREFIX): value for key, value in state.items() if key.startswith(PREFIX)}
 
@@ -141,17 +171,17 @@ def build_solver(content: Mapping[str, Any], parts: Iterable[type[nn.Module]] = 
     """Build the network that a checkpoint describes, without its weights.
 
     Args:
-        content: of `read_checkpoint`.
-        parts: classes outside this package that the network may be made of.
+        content: Content from `read_checkpoint`.
+        parts: Classes outside this package that the network may be made of.
 
     Raises:
-        ValueError: the checkpoint describes no network, or a class that is neither of this package nor in `parts`.
+        ValueError: The checkpoint describes no network, or a class that is neither of this package nor in `parts`.
     """
     return build_module(content.get("solver"), (*networks(), *PARTS, *parts))
 
 
 def networks(base: type[nn.Module] = TrainedNet) -> Iterator[type[nn.Module]]:
-    """Every class of networks that is defined, also those that derive from one of this package."""
+    """Yield every class derived from `base`, directly or not."""
     for cls in base.__subclasses__():
         yield cls
         yield from networks(cls)
@@ -160,18 +190,18 @@ def networks(base: type[nn.Module] = TrainedNet) -> Iterator[type[nn.Module]]:
 def fitting_state(
     content: Mapping[str, Any], solver: nn.Module, *, grown: bool = False
 ) -> tuple[dict[str, Tensor], list[str]]:
-    """Check that a checkpoint is of a solver.
+    """Check that the weights and settings of a checkpoint fit a solver.
 
     Args:
-        content: of `read_checkpoint`.
-        solver: what the weights are for.
-        grown: allow weights that the checkpoint lacks if they are zero: parts that add nothing before training.
+        content: Content from `read_checkpoint`.
+        solver: Solver that the weights are for.
+        grown: Allow the checkpoint to lack weights that are zero, of parts that add nothing before training.
 
     Returns:
-        The weights of the solver, and the `ADJUSTABLE` settings that it has different, as `rounds=0 (saved: 8)`.
+        The weights of the solver, and the `ADJUSTABLE` settings that differ, such as `rounds=0 (saved: 8)`.
 
     Raises:
-        ValueError: the class, another setting or the shape of a weight differs.
+        ValueError: The class, another setting, or the shape of a weight differs.
     """
     saved, wanted = content.get("solver", {}), describe_module(solver)
     state, weights = solver_state(content), solver.state_dict()
@@ -194,12 +224,12 @@ def fitting_state(
             "the saved ones"
         )
     if misfits:
-        raise ValueError(f"the checkpoint has no fitting {sorted(misfits)[0]} for this {wanted['class']}")
+        raise ValueError(f"the checkpoint has no {sorted(misfits)[0]} of the shape that this {wanted['class']} needs")
     return state | added, [*adjusted, *wrong]
 
 
 def _with_defaults(description: Mapping[str, Any], solver: nn.Module) -> Mapping[str, Any]:
-    """The description with the settings that it leaves out, which an older version wrote."""
+    """Add the settings that a description of an older version lacks, with their defaults."""
     try:
         with torch.device("meta"):
             return describe_module(
@@ -219,24 +249,33 @@ def _setting_text(setting: Any) -> Any:
 
 @runtime_checkable
 class AnyModule(Protocol):
-    """The type of an option that takes any `nn.Module`: the help of `nn.Module` itself would list all of torch's."""
+    """Type of an option that takes any `nn.Module`; the help of `nn.Module` itself would list all classes of torch."""
 
     def __call__(self, *arguments: Any, **options: Any) -> Any: ...
 
 
 def module_or_default(module: AnyModule | None, default: type[nn.Module]) -> nn.Module:
-    """The module that was given, or the default class with its default options."""
+    """Return the module, or a default module if it is None.
+
+    Args:
+        module: Module or None.
+        default: Class of the default module, built with its default options.
+
+    Raises:
+        ValueError: `module` is no module.
+    """
     if module is None:
         return default()
     if not isinstance(module, nn.Module):
-        raise ValueError(f"expected a module, got {module!r:.80}; try a subclass of torch.nn.Module")
+        raise ValueError(f"{module!r:.80} is no torch.nn.Module")
     return module
 
 
 def describe_module(module: nn.Module) -> dict[str, Any]:
-    """``{"class": name, "settings": {argument: value}}`` of a module.
+    """Describe a module as ``{"class": name, "settings": {argument: value}}``.
 
-    The settings are None where the module does not keep its arguments: such a module has weights, and cannot be built.
+    The settings are None where the module does not keep its arguments; such a module can have weights but cannot be
+    built.
     """
     settings: dict[str, Any] = {}
     for name, parameter in inspect.signature(type(module)).parameters.items():
@@ -252,13 +291,21 @@ def describe_module(module: nn.Module) -> dict[str, Any]:
 
 
 def build_module(description: Any, classes: Iterable[type[nn.Module]]) -> nn.Module:
-    """Build the module of a description. Raises ValueError for a class not among `classes`, or unusable settings."""
+    """Build the module of a description.
+
+    Args:
+        description: Result of `describe_module`.
+        classes: Classes that it may name.
+
+    Raises:
+        ValueError: A class is not among `classes`, or its settings are unusable.
+    """
     if not is_description(description):
         raise ValueError(f"expected the class and the settings of a module, got {description!r:.80}")
-    known = {class_name(cls): cls for cls in classes}
+    by_name = {class_name(cls): cls for cls in classes}
     name, settings = description["class"], description["settings"]
-    if name not in known:
-        raise ValueError(f"expected a class among {', '.join(sorted(known))}, got {name!r}; try it in `parts`")
+    if name not in by_name:
+        raise ValueError(f"the class {name!r} is not among {', '.join(sorted(by_name))}; pass it in `parts`")
     if settings is None:
         raise ValueError(
             f"The checkpoint has no settings of {name}. Write a class that keeps each constructor argument as an "
@@ -268,28 +315,28 @@ def build_module(description: Any, classes: Iterable[type[nn.Module]]) -> nn.Mod
         key: build_module(value, classes) if is_description(value) else value for key, value in settings.items()
     }
     try:
-        return known[name](**arguments)
+        return by_name[name](**arguments)
     except TypeError as error:
-        raise ValueError(f"expected settings of {name}, got {error}") from error
+        raise ValueError(f"the settings do not fit {name}: {error}") from error
 
 
 def differences(first: Any, second: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Settings that two descriptions have different: the place, such as `features2d.channels`, and both values.
+    """Yield the settings in which two descriptions differ: the path, such as `features2d.channels`, and both values.
 
-    A setting that the second leaves out is no difference.
+    A setting that the second description lacks is no difference.
     """
     if not (is_description(first) and is_description(second)) or first["class"] != second["class"]:
         if first != second:
             yield name, first, second
         return
-    theirs = second["settings"] or {}
+    other = second["settings"] or {}
     for key, value in (first["settings"] or {}).items():
-        if key in theirs:
-            yield from differences(value, theirs[key], f"{name}.{key}" if name else key)
+        if key in other:
+            yield from differences(value, other[key], f"{name}.{key}" if name else key)
 
 
 def class_name(cls: type) -> str:
-    """Its own name for a class of this package, whose files may move; with its module for any other."""
+    """Return the name of a class, with its module unless it is of this package, whose files may move."""
     return cls.__name__ if cls.__module__.startswith("bpnp.") else f"{cls.__module__}.{cls.__qualname__}"
 
 

@@ -152,7 +152,7 @@ def test_ctrl_c_while_a_picture_is_drawn_ends_the_run_and_keeps_the_photo(
     with pytest.raises(SystemExit) as stop:
         main(["localize", *files, "--camera", "SIMPLE_PINHOLE,80,32,24", "--output", str(tmp_path / "out")])
     assert stop.value.code == 130
-    assert capsys.readouterr().err.splitlines()[-1] == "bpnp: interrupted; run it again to go on"
+    assert capsys.readouterr().err.splitlines()[-1] == "bpnp: interrupted; run it again to continue"
     kept = (path.relative_to(tmp_path / "out") for path in (tmp_path / "out").rglob("*.*"))
     assert sorted(map(str, kept)) == ["pictures/a.png", "poses.txt", "results.json", "solutions/a.png.json"]
     assert "a.png" in (tmp_path / "out/poses.txt").read_text()

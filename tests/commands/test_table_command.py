@@ -96,7 +96,7 @@ def test_finished_methods_are_skipped_and_longer_tables_run_again(
     main([*recipes, "--limit=1"])
     assert read_results(tmp_path / "out" / "blind").rows == longer
     with lock_folder(tmp_path / "out" / "blind"):
-        assert "expected a folder that no other process writes to" in fails(*recipes, "--limit=1")
+        assert "another process writes to" in fails(*recipes, "--limit=1")
     rows = list(csv.DictReader((tmp_path / "out" / "table.csv").open()))
     assert {row["problems"] for row in rows if row["source"] == "here"} == {"1"}
 
@@ -193,7 +193,7 @@ def test_a_table_of_several_seeds_has_their_mean_and_spread(recipes: list[str], 
         (["--methods", "a-b=ransac", "a/b=search"], "expected a label for each method"),
         (["--methods", "..=ransac"], "the label '..' of '..=ransac' cannot name a folder of results"),
         (["--methods", "=ransac"], "the label '' of '=ransac' cannot name a folder of results"),
-        (["--methods", "bpnpnet@nothing.ckpt"], "got no file at nothing.ckpt"),
+        (["--methods", "bpnpnet@nothing.ckpt"], "there is no checkpoint nothing.ckpt"),
         (["--methods", "bpnp.models.baselines.Nothing"], "bpnp.models.baselines.Nothing"),
         (["--data.nonsense=3"], "nonsense"),
         (["--seed=3"], "nrecognized arguments: --seed=3"),

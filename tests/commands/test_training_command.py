@@ -159,7 +159,7 @@ def test_a_packaged_configuration_in_the_place_of_a_file_is_named(
     for given, told in (("configs/quickstart.yaml", True), ("quickstart", False), ("presets/debug", False)):
         with pytest.raises(SystemExit):
             main(["fit", "--config=quickstart", f"--config={given}", "--print_config"])
-        line = f"there is no {given} in this folder, so the packaged {CONFIGS}"
+        line = f"{given} is not in this folder; using the packaged {CONFIGS}"
         assert (line in capsys.readouterr().err) == told
 
 
@@ -168,7 +168,7 @@ def test_ctrl_c_tells_how_to_go_on(monkeypatch: pytest.MonkeyPatch, capsys: pyte
         raise KeyboardInterrupt
 
     monkeypatch.setattr(cli, "parse_arguments", interrupted)
-    for command, told in (("localize", "interrupted; run it again to go on"), ("solve", "interrupted")):
+    for command, told in (("localize", "interrupted; run it again to continue"), ("solve", "interrupted")):
         with pytest.raises(SystemExit) as ended:
             main([command])
         assert ended.value.code == 130

@@ -99,16 +99,16 @@ def test_softposit_starts_near_the_truth_as_far_as_it_says() -> None:
     away = translation_error(pose.translation, batch.translation)
     assert 8 < degrees.max() <= 10.001
     assert 0.4 < away.max() <= 0.501
-    with pytest.raises(ValueError, match="expected a batch with its true poses"):
+    with pytest.raises(ValueError, match="`start` near_truth needs the true poses"):
         SoftPOSIT(start="near_truth")(Batch.from_arrays(problem.points2d, problem.points3d))
 
 
 @pytest.mark.parametrize(
     ("solver", "options", "message"),
     [
-        (RandomRansac, {"time_limit": None}, "expected `time_limit` or `max_hypotheses`, got neither"),
+        (RandomRansac, {"time_limit": None}, "`time_limit` and `max_hypotheses` are both null"),
         (RandomRansac, {"confidence": 0.0}, r"expected `threshold` > 0, `confidence` in \(0, 1\], got 0.01 and 0.0"),
-        (Hungarian, {"checkpoint": "x.ckpt", "net": BPnPNet()}, "expected `checkpoint` or `net`, got both"),
+        (Hungarian, {"checkpoint": "x.ckpt", "net": BPnPNet()}, "`checkpoint` and `net` are both given"),
     ],
 )
 def test_options_that_mean_nothing_are_named(solver: type, options: dict[str, object], message: str) -> None:

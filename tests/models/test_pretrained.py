@@ -35,7 +35,7 @@ def unseen(tmp_path_factory: pytest.TempPathFactory) -> Batch:
 
 
 def test_an_unknown_name_is_refused_with_those_there_are() -> None:
-    with pytest.raises(ValueError, match="expected the name of packaged weights, got '../x'; try .*procedural-so3"):
+    with pytest.raises(ValueError, match="there are no packaged weights '../x'; the names are .*procedural-so3"):
         BPnPNet.from_pretrained("../x")
 
 

@@ -1,4 +1,4 @@
-"""The methods that BPnPNet is compared with: each maps a `Batch` to a `Prediction`."""
+"""Baselines that BPnPNet is compared with; each maps a `Batch` to a `Prediction`."""
 
 from bpnp.models.baselines.blind_p3p import RandomRansac
 from bpnp.models.baselines.branch_and_bound import GOPAC

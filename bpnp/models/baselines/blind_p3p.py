@@ -1,4 +1,4 @@
-"""P3P without any matching, on random triples until the time is up: the paper's RANSAC."""
+"""P3P on random triples of 2D and 3D points until a time limit: the RANSAC baseline of the paper."""
 
 import math
 
@@ -9,25 +9,25 @@ from bpnp.poses import MIN_POINTS
 from bpnp.robust.matches import distinct_triples
 from bpnp.robust.minimal_solvers import p3p
 
-TRIPLES = 256  # random ones, solved at a time
-PREVIEW = 32  # 2D points on which every hypothesis of random triples is scored
-HYPOTHESES = 8  # of these triples that are then scored on all points
+TRIPLES = 256  # random triples solved at a time
+PREVIEW = 32  # 2D points that give the first score of a hypothesis
+HYPOTHESES = 8  # best hypotheses of these triples, which are then scored on all points
 
 
 class RandomRansac(SingleSolver):
-    """Random triples of 2D and 3D points without any matching, P3P, and the pose under which most points have a
-    partner.
+    """RANSAC without matches: P3P on random triples of 2D and 3D points, keeping the pose with the most inliers.
 
-    `residual` of the pose is the share of points of both sides without a partner. It converges when an all-true triple
-    would have been drawn with probability `confidence`, were the matches of the best pose the true ones; with m = n =
-    1000 that takes some 10^9 triples. The random numbers depend on the seed and on the problem's index alone.
+    `residual` of the pose is the fraction of points of both sides without a point of the other side within `threshold`.
+    It converges when a triple of true matches would have been drawn with probability `confidence`, if the matches of
+    the best pose were the true ones. With m = n = 1000 that takes about 10^9 triples. The random numbers depend only on
+    the seed and on the index of the problem.
 
     Args:
-        threshold: distance of partners in the normalised image.
-        confidence: probability at which to stop; 1 for never.
-        max_hypotheses: most triples; null for as many as the time allows.
-        seed: of the triples.
-        time_limit: seconds a problem; null for none, which needs `max_hypotheses`.
+        threshold: Largest distance of matching points in the normalised image.
+        confidence: Probability at which to stop; 1 for never.
+        max_hypotheses: Largest number of triples; null for as many as the time allows.
+        seed: Seed of the triples.
+        time_limit: Seconds for each problem; null for no limit, which needs `max_hypotheses`.
     """
 
     estimates = ("random_ransac",)
@@ -43,7 +43,7 @@ class RandomRansac(SingleSolver):
     ) -> None:
         super().__init__(time_limit)
         if time_limit is None and max_hypotheses is None:
-            raise ValueError("expected `time_limit` or `max_hypotheses`, got neither; try time_limit 30")
+            raise ValueError("`time_limit` and `max_hypotheses` are both null; set one of them, such as time_limit 30")
         if not 0 < confidence <= 1 or not threshold > 0:
             raise ValueError(f"expected `threshold` > 0, `confidence` in (0, 1], got {threshold} and {confidence}")
         self.threshold, self.confidence, self.seed = threshold, confidence, seed
@@ -61,7 +61,7 @@ class RandomRansac(SingleSolver):
             rotation, translation = found.rotation[found.valid], found.translation[found.valid]
             tried += count
             if len(rotation) > HYPOTHESES:
-                # A stride takes points from all of the image, should they be in an order.
+                # A stride takes points from the whole image even if they are ordered.
                 some = sides[0][:: max(1, m // PREVIEW)]
                 few = agreement(some, sides[1], rotation, translation, threshold=self.threshold)
                 chosen = (few[0] * n + few[1] * len(some)).topk(HYPOTHESES).indices
@@ -76,7 +76,7 @@ class RandomRansac(SingleSolver):
         return Answer(best, tried, 1 - most / (m + n), self._enough(matches, m, n, tried))
 
     def _enough(self, matches: int, m: int, n: int, tried: int) -> bool:
-        """Whether one of the triples is all true with the probability wanted, if there are so many true matches."""
+        """Return True if a triple of true matches has been drawn with the required probability."""
         true = probability_of_true_triple(matches, m, n)
         if self.confidence == 1 or true == 0:
             return False
@@ -84,5 +84,11 @@ class RandomRansac(SingleSolver):
 
 
 def probability_of_true_triple(matches: int, m: int, n: int) -> float:
-    """Probability that three random image points and three random scene points are three of the one-to-one matches."""
+    """Return the probability that three random image points and three random scene points are three one-to-one matches.
+
+    Args:
+        matches: Number of true matches.
+        m: Number of image points.
+        n: Number of scene points.
+    """
     return math.prod(max(0, matches - i) / ((m - i) * (n - i)) for i in range(3))

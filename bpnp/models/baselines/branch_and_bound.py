@@ -1,7 +1,8 @@
-"""Branch and bound over camera poses: camera = R (p - c), R in a cube of rotation vectors, c in a cuboid; GOPAC.
+"""Branch and bound over camera poses, and GOPAC.
 
-Uncertainty angles bound how far a direction turns in a box (Campbell et al., Globally-optimal inlier set maximisation,
-ICCV 2017).
+A pose is camera = R (p - c) with R in a cube of rotation vectors and the camera centre c in a cuboid. Uncertainty
+angles bound how far a direction rotates within a box (Campbell et al., Globally-optimal inlier set maximisation, ICCV
+2017).
 """
 
 import itertools
@@ -23,13 +24,20 @@ from bpnp.models.baselines.single_problem import Answer, SingleProblem, SingleSo
 
 DOMAIN = 1.5  # half side of the cube of camera centres, weak-perspective distances
 CHUNK = 2**22  # angles computed at a time
-ROUNDING = 1e-9  # of a cosine
+ROUNDING = 1e-9  # rounding error of a cosine
 SMALLEST_TURN = 1e-3  # half side of the smallest cubes of rotation vectors, radians
 SMALLEST_PLACE = 1e-3  # half side of the smallest boxes of camera centres, in root mean square radii of the scene
 
 
 class Boxes(NamedTuple):
-    """Centres and half sides. The cubes of rotation vectors cover the ball of radius pi."""
+    """Boxes of poses: centres and half sides. The cubes of rotation vectors cover the ball of radius pi.
+
+    Attributes:
+        turn: Centres of the rotation vectors (b, 3), radians.
+        turn_half: Half sides of their cubes (b,), radians.
+        place: Centres of the camera centres (b, 3).
+        place_half: Half sides of their cuboids (b, 3).
+    """
 
     turn: Float[Tensor, "b 3"]
     turn_half: Float[Tensor, " b"]
@@ -38,15 +46,25 @@ class Boxes(NamedTuple):
 
     @property
     def rotation(self) -> Float[Tensor, "b 3 3"]:
+        """Rotations at the centres of the boxes (b, 3, 3)."""
         return roma.rotvec_to_rotmat(self.turn)
 
     def pick(self, index: Tensor) -> "Boxes":
+        """Return the boxes at the given indices."""
         return Boxes(*(values[index] for values in self))
 
 
 class Found(NamedTuple):
-    """The best pose, camera = R (p - c), and its value; `certified`: no pose of the domain is better than `bound`, and
-    this one is as good, or within the gap that is asked for."""
+    """Best pose of a search, camera = R (p - c).
+
+    Attributes:
+        rotation: R (3, 3), None if there is no pose.
+        place: c (3,).
+        value: Value of the pose, smaller is better.
+        bound: Lower bound of the value over all poses of the domain.
+        boxes: Number of boxes searched.
+        certified: True if no pose of the domain is better, by more than the allowed gap.
+    """
 
     rotation: Float[Tensor, "3 3"] | None
     place: Float[Tensor, "3"]
@@ -57,7 +75,12 @@ class Found(NamedTuple):
 
 
 class BranchAndBound(SingleSolver):
-    """Searches the camera centre in a cube around the scene's centre and the rotation everywhere."""
+    """Base of searches over all rotations and over camera centres in a cube around the scene's centre.
+
+    Args:
+        max_boxes: Largest number of boxes, None for no limit.
+        time_limit: Seconds for each problem, None for no limit.
+    """
 
     def __init__(self, max_boxes: int | None, time_limit: float | None) -> None:
         super().__init__(time_limit)
@@ -79,15 +102,20 @@ class BranchAndBound(SingleSolver):
     def search(
         self, rays: Float[Tensor, "m 3"], points: Float[Tensor, "n 3"], domain: Boxes, away: float, deadline: Deadline
     ) -> Found:
-        """The best pose for a scene of root mean square radius 1 at the origin; its value is the pose's residual.
+        """Return the best pose, whose value is its residual, for a scene of root mean square radius 1 at the origin.
 
-        away: weak-perspective distance of the camera.
+        Args:
+            rays: Bearings (m, 3).
+            points: Scene points (n, 3).
+            domain: One box that holds all poses to search.
+            away: Weak-perspective distance of the camera.
+            deadline: Time limit.
         """
         raise NotImplementedError
 
 
 def root_mean_square(distances: Float[Tensor, " k"]) -> float:
-    """Root mean square; 1 where it is zero."""
+    """Return the root mean square of distances, or 1 where it is zero."""
     value = float(distances.square().mean().sqrt())
     return value if value > 0 and math.isfinite(value) else 1.0
 
@@ -101,16 +129,23 @@ def best_first(
     until: Callable[[int], bool],
     small: Callable[[Boxes], Bool[Tensor, " b"]] | None = None,
 ) -> tuple[float, int]:
-    """Expand the `at_once` boxes of highest bound together until no box can hold anything better than was found.
+    """Expand the boxes of highest bound first, until no box can hold a better value than was found.
 
-    bounds: no pose of a box is better. expand: boxes to their children, the bounds of these, and the value that a bound
-    must exceed for its box to be kept. until: whether to stop after so many children. small: which boxes are kept for
-    their bound but not expanded.
-    Returns the highest bound of the boxes that are left, -inf if none is, and the number of children.
+    Args:
+        boxes: Boxes to search.
+        bounds: Upper bound of the value in each box (b,).
+        expand: Maps boxes to their children, the bounds of these, and the value that a bound must exceed for its box to
+            be kept.
+        at_once: Number of boxes expanded together.
+        until: Returns True to stop after a number of children.
+        small: Returns which boxes are kept for their bound but not expanded. Default: none.
+
+    Returns:
+        The highest bound of the remaining boxes, -inf if there are none, and the number of children.
     """
-    done, aside = 0, bounds.new_tensor([-math.inf])
+    done, final_bounds = 0, bounds.new_tensor([-math.inf])
     while len(bounds) and not until(done):
-        # One at a time: of equal bounds the oldest.
+        # One at a time, the oldest of equal bounds is expanded.
         chosen = bounds.topk(min(at_once, len(bounds))).indices if at_once > 1 else bounds.argmax().unsqueeze(0)
         rest = torch.ones_like(bounds, dtype=torch.bool)
         rest[chosen] = False
@@ -122,21 +157,21 @@ def best_first(
         boxes, bounds = boxes.pick(promising), bounds[promising]
         if small is not None:
             final = small(boxes)
-            aside = torch.cat([aside, bounds[final]])
+            final_bounds = torch.cat([final_bounds, bounds[final]])
             boxes, bounds = boxes.pick(~final), bounds[~final]
-    return float(torch.cat([aside, bounds]).max()), done
+    return float(torch.cat([final_bounds, bounds]).max()), done
 
 
 def rotation_uncertainty(boxes: Boxes) -> Float[Tensor, " b"]:
-    """psi_r >= angle(R x, R_0 x) for all R in the cube around R_0 and all x: sqrt(3) times its half side."""
+    """Return psi_r >= angle(R x, R_0 x) for all R in the cube around R_0 and all x: sqrt(3) times its half side."""
     return (math.sqrt(3) * boxes.turn_half).clamp_max(math.pi)
 
 
 def translation_uncertainty(boxes: Boxes, points: Float[Tensor, "a 3"]) -> Float[Tensor, "b a"]:
-    """psi_t(p) >= angle(p - c, p - c_0) for all c in the cuboid around c_0.
+    """Return psi_t(p) >= angle(p - c, p - c_0), (b, a), for all c in the cuboid around c_0.
 
-    The directions to the points of a convex set lie in the cone that its corners span, so that their angle to an axis
-    is largest at a corner, as long as that is below pi/2; else pi.
+    Directions to the points of a convex set lie in the cone that its corners span. Their angle to an axis is therefore
+    largest at a corner, as long as that is below pi/2; otherwise the bound is pi.
     """
     towards = points - boxes.place.unsqueeze(1)
     cosine = torch.ones_like(towards[..., 0])
@@ -145,20 +180,22 @@ def translation_uncertainty(boxes: Boxes, points: Float[Tensor, "a 3"]) -> Float
         lengths = torch.linalg.vector_norm(corner, dim=-1) * torch.linalg.vector_norm(towards, dim=-1)
         cosine = torch.minimum(cosine, (corner * towards).sum(-1) / lengths.clamp_min(1e-300))
     inside = (towards.abs() <= boxes.place_half.unsqueeze(1)).all(-1)
-    # The rounding of a cosine near 1 is worth 1e-8 in its angle.
+    # Rounding of a cosine near 1 changes its angle by 1e-8.
     return torch.where(inside | (cosine <= 0), math.pi, torch.acos(cosine.clamp(max=1)) + 1e-7)
 
 
 def distance_range(boxes: Boxes, points: Float[Tensor, "a 3"]) -> tuple[Float[Tensor, "b a"], Float[Tensor, "b a"]]:
-    """Least and largest distance between a point and the camera centres of a box."""
+    """Return the least and the largest distance between each point and the camera centres of each box, (b, a)."""
     offset = (points - boxes.place.unsqueeze(1)).abs()
     half = boxes.place_half.unsqueeze(1)
     return (offset - half).clamp_min(0).norm(dim=-1), (offset + half).norm(dim=-1)
 
 
 def split(boxes: Boxes, turning: Bool[Tensor, " b"]) -> Boxes:
-    """The eight children of each box, in rotation where `turning`, else in translation; cubes without a rotation
-    vector of length pi or less are left out."""
+    """Split each box into eight children, in rotation where `turning`, else in translation.
+
+    Cubes without a rotation vector of length pi or less are left out.
+    """
     signs = boxes.turn.new_tensor(list(itertools.product((-0.5, 0.5), repeat=3)))
     chosen = turning[:, None, None]
     turn_shift = torch.where(chosen, boxes.turn_half[:, None, None] * signs, 0)
@@ -174,15 +211,15 @@ def split(boxes: Boxes, turning: Bool[Tensor, " b"]) -> Boxes:
 
 
 class GOPAC(BranchAndBound):
-    """Branch and bound on the number of inlying image points; exact, feasible for small problems only.
+    """Branch and bound on the number of inlier image points; exact, feasible for small problems only.
 
-    `residual` of the pose is the share of image points without a partner; `converged` is the certificate that no pose
-    has more inliers.
+    `residual` of the pose is the fraction of image points that are no inliers. `converged` certifies that no pose has
+    more inliers.
 
     Args:
-        angle: largest angle between an inlier's ray and its scene point, radians.
-        max_boxes: most boxes, inner ones included; null for as many as the time allows.
-        time_limit: seconds a problem, after which the best pose so far is returned unconverged; null for none.
+        angle: Largest angle between an inlier's ray and its scene point, radians.
+        max_boxes: Largest number of boxes, including those of inner searches; null for as many as the time allows.
+        time_limit: Seconds for each problem; then the best pose so far is returned, not converged. Null for no limit.
     """
 
     estimates = ("gopac",)
@@ -193,13 +230,12 @@ class GOPAC(BranchAndBound):
         self.angle = angle
 
     def search(self, rays: Tensor, points: Tensor, domain: Boxes, away: float, deadline: Deadline) -> Found:
-        """The camera that sees most rays within `angle` of a point: max nu(R, c) = sum_i max_j [angle(f_i, R (p_j - c))
-        <= angle]; value and bound are shares of the rays without one.
+        """Maximise nu(R, c) = sum_i max_j [angle(f_i, R (p_j - c)) <= angle], the number of inlier rays.
 
-        The outer search is over the camera centre c in the one box of the domain; for each box two inner searches over
-        R: at its centre, for a better pose, which is refined, and with every angle widened by the uncertainty
-        psi_t(p_j), for whether the box can hold one. Boxes under SMALLEST_PLACE are not split: their bound may stay
-        above the count.
+        The value and the bound are the fractions of rays that are no inliers. The outer search is over the camera
+        centre c. For each box there are two inner searches over R. The first, at the centre of the box, looks for a
+        better pose, which is refined. The second, with every angle widened by the uncertainty psi_t(p_j), decides
+        whether the box can hold one. Boxes under SMALLEST_PLACE are not split, so their bound may stay above the count.
         """
         del away
         best: tuple[Tensor | None, Tensor, int] = (None, domain.place[0], 0)
@@ -233,7 +269,7 @@ class GOPAC(BranchAndBound):
 
 
 def _refined(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, angle: float) -> tuple[Tensor, Tensor, int]:
-    """The pose and its number of inliers; refined by the weighted PnP layer unless that loses inliers."""
+    """Refine a pose by weighted PnP unless that loses inliers; return the pose and its number of inliers."""
     near = within(rays, points, rotation, place, angle)
     count = int(near.any(-1).sum())
     inputs = near.to(rays), rays, points, rotation, -rotation @ place
@@ -256,10 +292,20 @@ def best_rotation(
     first: bool = False,
     deadline: Deadline,
 ) -> Found:
-    """Most rays f_i with some angle(f_i, R (p_j - c)) <= reach_j, over the rotations of a domain, at one centre c.
+    """Maximise the number of rays f_i with some angle(f_i, R (p_j - c)) <= reach_j over rotations, at one centre c.
 
-    Boxes that cannot have more than `floor` rays are dropped. first: stop at the first rotation that has. Boxes under
-    SMALLEST_TURN are not split; they, and those left at the deadline, keep the bound above the count.
+    Boxes that cannot have more than `floor` such rays are dropped. Boxes under SMALLEST_TURN are not split; they, and
+    those left at the deadline, keep the bound above the count.
+
+    Args:
+        rays: Bearings (m, 3).
+        points: Scene points (n, 3).
+        place: c (3,).
+        reach: Largest angle for each scene point (n,), radians.
+        domain: Box whose rotations are searched.
+        floor: Number of rays to exceed.
+        first: Stop at the first rotation that exceeds `floor`.
+        deadline: Time limit.
     """
     directions = normalize(points - place, dim=-1)
     count, rotation = floor, None
@@ -288,5 +334,5 @@ def best_rotation(
 
 
 def within(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, angle: float) -> Bool[Tensor, "m n"]:
-    """Whether angle(f_i, R (p_j - c)) <= `angle`."""
+    """Return which pairs have angle(f_i, R (p_j - c)) <= `angle`, (m, n)."""
     return (rays @ rotation) @ normalize(points - place, dim=-1).mT >= math.cos(angle) - ROUNDING

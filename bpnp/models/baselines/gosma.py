@@ -1,8 +1,8 @@
 """GOSMA: globally optimal alignment of two mixtures on the sphere, by branch and bound (Campbell et al., CVPR 2019).
 
-From the camera centre c a Gaussian (mu, s^2) is seen as a von Mises-Fisher density of direction mu - c and of
+From the camera centre c, a Gaussian (mu, s^2) appears as a von Mises-Fisher density of direction mu - c and
 concentration |mu - c|^2/s^2 + 1. The product of two densities has the integral E = Z(|k m + k' m'|) / (Z(k) Z(k')),
-Z(k) = 4 pi sinh(k)/k, so that the L2 distance of the scene's mixture, seen from a camera, to the image's is closed:
+Z(k) = 4 pi sinh(k)/k. The L2 distance between the scene's mixture, seen from a camera, and the image's is therefore
 d(R, c) = sum_ab w_a w_b E_ab(c) - 2 sum_ac w_a w_c E_ac(R, c) + sum_cc' w_c w_c' E_cc'.
 """
 
@@ -30,18 +30,18 @@ from bpnp.models.baselines.branch_and_bound import (
     translation_uncertainty,
 )
 
-CLOSEST = 0.5  # distance of a camera centre from the scene's, weak-perspective distances
-GAP = 0.1  # share of the image mixture's squared norm by which the answer may miss the optimum
+CLOSEST = 0.5  # least distance of a camera centre from the scene's centre, weak-perspective distances
+GAP = 0.1  # distance from the optimum that is allowed, as a fraction of the image mixture's squared norm
 POLISH_STEPS = 50
 DESCENTS = 32  # best box centres of an iteration, from which Adam descends
 DESCENT_STEPS = 30
-ITERATIONS = 300  # of Lloyd's
+ITERATIONS = 300  # largest number of Lloyd iterations
 BISECTIONS = 16
-ROUNDING = 1e-9  # relative; of a bound's terms
+ROUNDING = 1e-9  # relative rounding error of the terms of a bound
 
 
 class RayMixture(NamedTuple):
-    """von Mises-Fisher components on the unit sphere."""
+    """Mixture of von Mises-Fisher components on the unit sphere."""
 
     weights: Float[Tensor, " c"]
     directions: Float[Tensor, "c 3"]
@@ -49,31 +49,34 @@ class RayMixture(NamedTuple):
 
 
 class SceneMixture(NamedTuple):
-    """Isotropic Gaussian components."""
+    """Mixture of isotropic Gaussian components."""
 
     weights: Float[Tensor, " a"]
     means: Float[Tensor, "a 3"]
     variances: Float[Tensor, " a"]
 
     def seen(self, place: Float[Tensor, "b 3"]) -> tuple[Float[Tensor, "b a 3"], Float[Tensor, "b a"]]:
-        """Directions and concentrations of the components from camera centres."""
+        """Return directions (b, a, 3) and concentrations (b, a) of the components, seen from camera centres (b, 3)."""
         towards = self.means - place.unsqueeze(1)
         return normalize(towards, dim=-1), towards.square().sum(-1) / self.variances + 1
 
 
 class GOSMA(BranchAndBound):
-    """Branch and bound on the distance between the mixtures of both point sets; no matching, no initial pose.
+    """Branch and bound on the distance between the mixtures of both point sets, without matches or an initial pose.
 
-    Camera centres are no closer to the scene's centre than CLOSEST. `residual` of the pose is its distance as a share
-    of the image mixture's squared norm (0 for mixtures that coincide); `converged` is the certificate that no pose of
-    the domain is better by more than GAP. It certifies the mixtures' alignment, which need not be that of the points.
+    Camera centres are no closer to the scene's centre than CLOSEST. `residual` of the pose is its distance as a
+    fraction of the image mixture's squared norm (0 for mixtures that coincide). `converged` certifies that no pose of
+    the domain is better by more than GAP. This is a certificate of the mixtures' alignment, which need not be that of
+    the points.
 
     Args:
-        cluster2d: largest angle from an image cluster's mean, in root mean square angles of all rays to theirs.
-        cluster3d: largest distance from a scene cluster's mean, in root mean square distances of all points to theirs.
-        batch: boxes split together.
-        max_boxes: most boxes; null for as many as the time allows.
-        time_limit: seconds a problem, after which the best pose so far is returned unconverged; null for none.
+        cluster2d: Largest angle from the mean of an image cluster, in root mean square angles of all rays to their
+            mean.
+        cluster3d: Largest distance from the mean of a scene cluster, in root mean square distances of all points to
+            their mean.
+        batch: Number of boxes split together.
+        max_boxes: Largest number of boxes; null for as many as the time allows.
+        time_limit: Seconds for each problem; then the best pose so far is returned, not converged. Null for no limit.
     """
 
     estimates = ("gosma",)
@@ -106,11 +109,11 @@ class GOSMA(BranchAndBound):
         closest: float = 0.0,
         deadline: Deadline = NEVER,
     ) -> Found:
-        """Smallest d(R, c) over a domain with |c| >= `closest`, to within `gap` of the image mixture's squared norm.
+        """Minimise d(R, c) over a domain with |c| >= `closest`, to within `gap` of the image mixture's squared norm.
 
-        The `batch` boxes of lowest bound are split together, in rotation or in translation, whichever is the less
-        certain; Adam descends from their best centres, and L-BFGS polishes a better pose. Value and bound are shares of
-        the image mixture's squared norm.
+        The `batch` boxes of lowest bound are split together, in rotation or in translation, whichever is less certain.
+        Adam descends from their best centres, and L-BFGS refines a better pose. Value and bound are fractions of the
+        image mixture's squared norm.
         """
         norm = float(squared_norm(rays))
         best = (math.inf, domain.rotation[0], domain.place[0])
@@ -157,9 +160,16 @@ class GOSMA(BranchAndBound):
 def descend(
     scene: SceneMixture, rays: RayMixture, rotation: Tensor, place: Tensor, *, finely: bool = False
 ) -> tuple[Tensor, Tensor]:
-    """Adam's steps from poses (b, 3, 3), (b, 3), from a tenth of a unit down to a thousandth; or L-BFGS.
+    """Descend from poses (b, 3, 3), (b, 3), by Adam with steps from a tenth of a unit to a thousandth, or by L-BFGS.
 
-    A unit is a radian, and the mean distance to the scene's clusters.
+    A unit is a radian for rotations, and the mean distance to the scene's clusters for translations.
+
+    Args:
+        scene: Mixture of the scene.
+        rays: Mixture of the image.
+        rotation: Initial R (b, 3, 3).
+        place: Initial c (b, 3).
+        finely: Use L-BFGS.
     """
     away = torch.linalg.vector_norm(scene.means - place.unsqueeze(1), dim=-1).mean(-1, keepdim=True)
     unit = torch.cat([torch.ones_like(place), away.expand_as(place)], -1)
@@ -181,8 +191,11 @@ def descend(
 
 
 def ray_mixture(rays: Float[Tensor, "m 3"], angle: float) -> RayMixture:
-    """DP-vMF-means: clusters within `angle` (radians) of their mean direction, and the vMF of each, no narrower than a
-    tenth of the angle. Its concentration is r (3 - r^2)/(1 - r^2) of the mean resultant length r."""
+    """Fit a mixture to rays by DP-vMF-means: clusters within `angle` (radians) of their mean direction.
+
+    A cluster with the mean resultant length r gets the concentration r (3 - r^2)/(1 - r^2), and is no narrower than a
+    tenth of the angle.
+    """
     weights, sums = _totals(rays, _means(rays, angle, spherical=True))
     length = torch.linalg.vector_norm(sums, dim=-1) / weights
     concentration = length * (3 - length.square()) / (1 - length.square()).clamp_min(1e-12)
@@ -190,8 +203,10 @@ def ray_mixture(rays: Float[Tensor, "m 3"], angle: float) -> RayMixture:
 
 
 def scene_mixture(points: Float[Tensor, "n 3"], radius: float) -> SceneMixture:
-    """DP-means: clusters within `radius` of their mean, and the isotropic Gaussian of each, no narrower than a tenth
-    of the radius."""
+    """Fit a mixture to points by DP-means: clusters within `radius` of their mean.
+
+    A cluster is no narrower than a tenth of the radius.
+    """
     labels = _means(points, radius, spherical=False)
     weights, sums = _totals(points, labels)
     means = sums / weights.unsqueeze(-1)
@@ -201,8 +216,11 @@ def scene_mixture(points: Float[Tensor, "n 3"], radius: float) -> SceneMixture:
 
 
 def _means(points: Tensor, limit: float, *, spherical: bool) -> Int[Tensor, " k"]:
-    """DP-means: Lloyd's iterations; when they have converged, a new cluster at the point farthest from all centres, if
-    that is beyond `limit`. The result does not depend on the order of the points."""
+    """Cluster points by DP-means and return their labels.
+
+    When Lloyd's iterations have converged, a new cluster is added at the point farthest from all centres, if that is
+    beyond `limit`. The result does not depend on the order of the points.
+    """
     labels = torch.zeros(len(points), dtype=torch.long, device=points.device)
     for _ in range(ITERATIONS):
         weights, sums = _totals(points, labels)
@@ -219,31 +237,31 @@ def _means(points: Tensor, limit: float, *, spherical: bool) -> Int[Tensor, " k"
 
 
 def _totals(values: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
-    """Number and sum of the values of each label."""
+    """Return the number and the sum of the values of each label."""
     members = one_hot(labels).to(values.dtype)
     return members.sum(0), members.mT @ values
 
 
 def log_z(k: Tensor) -> Tensor:
-    """log of 4 pi sinh(k)/k, k >= 0."""
+    """Return log(4 pi sinh(k)/k), k >= 0."""
     k = k.clamp_min(1e-9)
     return k + torch.log(-torch.expm1(-2 * k)) - torch.log(2 * k) + math.log(4 * math.pi)
 
 
 def overlap(k: Tensor, other: Tensor, cosine: Tensor) -> Tensor:
-    """E of two von Mises-Fisher densities whose directions enclose an angle of this cosine."""
+    """Return E of two von Mises-Fisher densities whose directions enclose an angle of this cosine."""
     together = (k.square() + other.square() + 2 * k * other * cosine).clamp_min(0).sqrt()
     return torch.exp(log_z(together) - log_z(k) - log_z(other))
 
 
 def squared_norm(rays: RayMixture) -> Float[Tensor, ""]:
-    """Integral of the squared density of the image's mixture."""
+    """Return the integral of the squared density of the image's mixture."""
     terms = overlap(rays.concentrations.unsqueeze(-1), rays.concentrations, rays.directions @ rays.directions.mT)
     return rays.weights @ terms @ rays.weights
 
 
 def distance(scene: SceneMixture, rays: RayMixture, rotation: Tensor, place: Tensor) -> Float[Tensor, " b"]:
-    """d(R, c) of rotations (b, 3, 3) and centres (b, 3) without the constant `squared_norm(rays)`."""
+    """Return d(R, c) of rotations (b, 3, 3) and centres (b, 3), without the constant `squared_norm(rays)`."""
     directions, k = scene.seen(place)
     self_terms = overlap(k.unsqueeze(-1), k.unsqueeze(-2), directions @ directions.mT)
     cross_terms = overlap(k.unsqueeze(-1), rays.concentrations, directions @ rotation.mT @ rays.directions.mT)
@@ -251,10 +269,10 @@ def distance(scene: SceneMixture, rays: RayMixture, rotation: Tensor, place: Ten
 
 
 def lower_bound(scene: SceneMixture, rays: RayMixture, boxes: Boxes) -> Float[Tensor, " b"]:
-    """A number that d(R, c) does not fall below for any pose of a box: every term takes its best value on its own.
+    """Return a lower bound of d(R, c) over all poses of each box: every term takes its best value independently.
 
     Angles are within the box's uncertainty of those at its centre, concentrations between those at the least and the
-    largest distance. The angle that two means subtend at the camera centre has a gradient of the length
+    largest distance. The angle between two means, seen from the camera centre, has a gradient of the length
     |mu - mu'| / (d d'), d and d' their distances, which bounds its change too.
     """
     directions, _ = scene.seen(boxes.place)
@@ -279,31 +297,34 @@ def _combine(scene: SceneMixture, rays: RayMixture, self_terms: Tensor, cross_te
 
 
 def _least_overlap(least: Tensor, largest: Tensor, cosine: Tensor) -> Tensor:
-    """Smallest E over both concentrations: E has one maximum in each of them, so its minimum is at an end."""
+    """Return the smallest E over both concentrations.
+
+    E has one maximum in each of them, so its minimum is at an end.
+    """
     ends = [overlap(a.unsqueeze(-1), b.unsqueeze(-2), cosine) for a in (least, largest) for b in (least, largest)]
-    # A component with itself: one concentration, not two.
+    # A component paired with itself has one concentration, not two.
     itself = overlap(least, least, torch.ones_like(least))
     same = torch.eye(least.shape[-1], dtype=torch.bool, device=least.device)
     return torch.where(same, itself.unsqueeze(-1), torch.stack(ends).amin(0))
 
 
 def _largest_overlap(least: Tensor, largest: Tensor, fixed: Tensor, cosine: Tensor) -> Tensor:
-    """Largest E over the first concentration, where its only maximum is found by bisection of the slope's sign."""
+    """Return the largest E over the first concentration; bisection of the sign of the slope finds its only maximum."""
     low, high, fixed, cosine = torch.broadcast_tensors(least, largest, fixed, cosine)
     rises_to_end, falls_from_start = _rises(high, fixed, cosine), ~_rises(low, fixed, cosine)
     inside = ~(rises_to_end | falls_from_start)
     best = torch.where(rises_to_end, high, low).clone()
     a, b, k, c = (values[inside] for values in (low, high, fixed, cosine))
     for _ in range(BISECTIONS):
-        middle = (a + b) / 2
-        up = _rises(middle, k, c)
-        a, b = torch.where(up, middle, a), torch.where(up, b, middle)
+        midpoint = (a + b) / 2
+        up = _rises(midpoint, k, c)
+        a, b = torch.where(up, midpoint, a), torch.where(up, b, midpoint)
     best[inside] = (a + b) / 2
     return overlap(best, fixed, cosine)
 
 
 def _rises(k: Tensor, fixed: Tensor, cosine: Tensor) -> Tensor:
-    """Whether E grows with k: A(|k m + k' m'|) cos(m, k m + k' m') > A(k) with A(k) = coth k - 1/k."""
+    """Return True where E grows with k: A(|k m + k' m'|) cos(m, k m + k' m') > A(k) with A(k) = coth k - 1/k."""
     together = (k.square() + fixed.square() + 2 * k * fixed * cosine).clamp_min(1e-18).sqrt()
     return _mean_length(together) * (k + fixed * cosine) > _mean_length(k) * together
 

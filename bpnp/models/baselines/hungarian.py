@@ -1,4 +1,4 @@
-"""BPnPNet's features with a hard assignment: the Hungarian algorithm in the place of the transport, at test time."""
+"""Hard assignment of BPnPNet's features: the Hungarian algorithm in place of the transport, for evaluation."""
 
 import torch
 from jaxtyping import Float
@@ -12,14 +12,15 @@ from bpnp.types import Batch, Prediction
 
 
 class Hungarian(nn.Module):
-    """min(m, n) one-to-one matches of least total feature distance, RANSAC on all of them, the weighted PnP layer.
+    """BPnPNet with the Hungarian algorithm: min(m, n) one-to-one matches of least total feature distance.
 
-    A variant for evaluation: the assignment has no gradient. All its matches weigh the same.
+    RANSAC uses all of these matches, and weighted PnP refines its pose. All matches have the same weight. The
+    assignment has no gradient.
 
     Args:
-        checkpoint: of a BPnPNet, as `bpnp fit` wrote it; null for `net`.
-        net: the network; null for untrained weights with the default settings where there is no checkpoint either.
-        ransac_backend: as in BPnPNet; opencv is the paper's.
+        checkpoint: Checkpoint of a BPnPNet, written by `bpnp fit`; null to use `net`.
+        net: Network; null with a null checkpoint for untrained weights with the default settings.
+        ransac_backend: As in BPnPNet; opencv is the paper's.
     """
 
     estimates = ("ransac", "pnp")
@@ -29,7 +30,7 @@ class Hungarian(nn.Module):
     ) -> None:
         super().__init__()
         if checkpoint is not None and net is not None:
-            raise ValueError("expected `checkpoint` or `net`, got both")
+            raise ValueError("`checkpoint` and `net` are both given; give one of them")
         self.net = BPnPNet.from_checkpoint(checkpoint) if checkpoint is not None else net or BPnPNet()
         self.ransac = RansacPnP(
             backend=ransac_backend,
@@ -39,22 +40,28 @@ class Hungarian(nn.Module):
         )
 
     def forward(self, batch: Batch) -> Prediction:
+        """Return the assignment and the poses "ransac" and "pnp"."""
         assignment = self.match(batch).assignment
         assert assignment is not None
         start = ransac_pose(self.ransac, assignment, batch)
         return Prediction(assignment, None, {"ransac": start, "pnp": pnp_pose(self.net.pnp, assignment, batch, start)})
 
     def match(self, batch: Batch) -> Prediction:
-        """The assignment alone."""
+        """Return the assignment without poses."""
         with torch.no_grad():
             return Prediction(hungarian(self.net.cost(batch), batch))
 
 
 def hungarian(cost: Float[Tensor, "b m n"], batch: Batch) -> Float[Tensor, "b m n"]:
-    """The permutation of least cost between the real points, as a joint probability: equal entries of sum one."""
+    """Return the least-cost one-to-one matches of the real points as equal probabilities that sum to one.
+
+    Args:
+        cost: Cost (b, m, n).
+        batch: Problems.
+    """
     assignment = torch.zeros_like(cost)
     for i, (real2d, real3d) in enumerate(zip(batch.mask2d.cpu(), batch.mask3d.cpu(), strict=True)):
-        places2d, places3d = real2d.nonzero()[:, 0], real3d.nonzero()[:, 0]
+        indices2d, indices3d = real2d.nonzero()[:, 0], real3d.nonzero()[:, 0]
         rows, columns = linear_sum_assignment(cost[i].cpu()[real2d][:, real3d].numpy())
-        assignment[i, places2d[rows], places3d[columns]] = 1 / len(rows)
+        assignment[i, indices2d[rows], indices3d[columns]] = 1 / len(rows)
     return assignment

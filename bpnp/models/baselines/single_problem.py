@@ -1,4 +1,4 @@
-"""What the baselines share: each problem by itself, in float64, within a limit of time; and the count of partners."""
+"""Shared parts of the baselines: one problem at a time, in float64, within a time limit; and inlier counts."""
 
 import math
 from typing import NamedTuple
@@ -17,7 +17,15 @@ CHUNK = 2**22  # distances computed at a time, in float32
 
 
 class SingleProblem(NamedTuple):
-    """The real points of one problem, its `Batch.index`, and its true pose where it is known."""
+    """Real points of one problem, its `Batch.index`, and its true pose if known.
+
+    Attributes:
+        points2d: Normalised image coordinates (m, 2).
+        points3d: Scene points (n, 3).
+        number: `Batch.index` of the problem.
+        rotation: True R (3, 3), None if unknown.
+        translation: True t (3,), None if unknown.
+    """
 
     points2d: Float[Tensor, "m 2"]
     points3d: Float[Tensor, "n 3"]
@@ -26,13 +34,13 @@ class SingleProblem(NamedTuple):
     translation: Float[Tensor, "3"] | None
 
     def seed(self, seed: int) -> int:
-        """Seed of its random numbers, whatever batch it is in."""
+        """Return the seed of the problem's random numbers, which does not depend on its batch."""
         mixed = torch.Generator().manual_seed(seed)
         return int(torch.randint(2**31, (1,), generator=mixed)) * 1_000_003 + self.number
 
 
 class Answer(NamedTuple):
-    """The pose of one problem, None if there is none, and how its solver ended: the fields of `SolveStats`."""
+    """Pose of one problem, None if there is none, and the fields of `SolveStats`."""
 
     pose: tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]] | None = None
     iterations: int = 0
@@ -41,9 +49,13 @@ class Answer(NamedTuple):
 
 
 class SingleSolver(nn.Module):
-    """A solver of one problem after the other: subclasses implement `solve` and name their one estimate.
+    """Base of solvers of one problem at a time. Subclasses implement `solve` and name their one estimate.
 
-    A problem's pose depends neither on the others nor on padding. A side with fewer than 4 points has no pose.
+    The pose of a problem depends neither on other problems nor on padding. A problem with fewer than 4 points on a side
+    has no pose.
+
+    Args:
+        time_limit: Seconds for each problem, None for no limit.
     """
 
     estimates: tuple[str, ...]
@@ -55,7 +67,7 @@ class SingleSolver(nn.Module):
 
     def forward(self, batch: Batch) -> Prediction:
         like, answers = batch.points3d, []
-        # The trainer's inference mode would forbid a local optimiser's gradients.
+        # A local optimiser needs gradients, which the trainer's inference mode forbids.
         with torch.inference_mode(False), torch.no_grad():
             for i, number in enumerate(batch.index.tolist()):
                 sides = batch.points2d[i][batch.mask2d[i]], batch.points3d[i][batch.mask3d[i]]
@@ -73,14 +85,21 @@ class SingleSolver(nn.Module):
             return Prediction(poses={self.estimates[0]: Pose(rotation, translation, stats.to(like))})
 
     def solve(self, problem: SingleProblem, deadline: Deadline) -> Answer:
-        """The pose of one problem, found before the deadline."""
+        """Return the pose of one problem, found before the deadline."""
         raise NotImplementedError
 
 
 def weak_perspective_distance(points2d: Tensor, points3d: Tensor) -> float:
-    """Distance at which the scene looks as large as the image: the ratio of their root mean square radii.
+    """Return the distance at which the scene looks as large as the image: the ratio of their root mean square radii.
 
-    Averaged over rotations, the image shows two of the scene's three axes: the factor sqrt(2/3).
+    Averaged over rotations, the image shows two of the scene's three axes; hence the factor sqrt(2/3).
+
+    Args:
+        points2d: Normalised image coordinates (m, 2).
+        points3d: Scene points (n, 3).
+
+    Returns:
+        Distance, scene units.
     """
     image, scene = ((points - points.mean(0)).square().sum(-1).mean().sqrt() for points in (points2d, points3d))
     return float(math.sqrt(2 / 3) * scene / image.clamp_min(1e-12))
@@ -94,18 +113,28 @@ def agreement(
     *,
     threshold: float,
 ) -> Int[Tensor, "2 h"]:
-    """Points of either side with a point of the other closer than `threshold` (normalised image units), for each pose.
+    """Count the points of each side that have a point of the other side within `threshold`, for each pose.
 
-    The smaller count bounds the number of one-to-one matches. A 3D point behind the camera has no partner, and no point
-    has one under a pose that is NaN.
+    The smaller count bounds the number of one-to-one matches. A 3D point behind the camera has no such point, and no
+    point has one under a pose that is NaN.
+
+    Args:
+        points2d: Normalised image coordinates (m, 2).
+        points3d: Scene points (n, 3).
+        rotation: Rotations (h, 3, 3).
+        translation: Translations (h, 3).
+        threshold: Distance in the normalised image.
+
+    Returns:
+        Counts (2, h), of image points and of scene points.
     """
     part = max(1, CHUNK // (len(points2d) * len(points3d)))
     x, y = points2d.float().unsqueeze(-1).unbind(1)
     counts = []
-    for turned, shift in zip(rotation.split(part), translation.split(part), strict=True):
-        camera = transform(turned, shift, points3d.expand(len(turned), -1, -1))
-        seen = torch.where(camera[..., 2:] > 0, project(camera), torch.inf).nan_to_num(torch.inf).float()
-        squared = (seen[:, None, :, 0] - x).square_()
-        squared += (seen[:, None, :, 1] - y).square_()
+    for some_r, some_t in zip(rotation.split(part), translation.split(part), strict=True):
+        camera = transform(some_r, some_t, points3d.expand(len(some_r), -1, -1))
+        image = torch.where(camera[..., 2:] > 0, project(camera), torch.inf).nan_to_num(torch.inf).float()
+        squared = (image[:, None, :, 0] - x).square_()
+        squared += (image[:, None, :, 1] - y).square_()
         counts.append(torch.stack([(squared.amin(axis) < threshold**2).sum(-1) for axis in (2, 1)]))
     return torch.cat(counts, 1)

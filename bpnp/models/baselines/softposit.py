@@ -19,31 +19,32 @@ from bpnp.models.baselines.single_problem import (
 )
 
 Start = Literal["mean", "near_truth", "random"]
-CHUNK = 2**22  # image points times scene points times initial poses, that are annealed together
-THRESHOLD = 0.01  # distance of partners in the normalised image, to choose between starts
-FOCAL = 800.0  # pixels per unit of the normalised image, in which the other constants are
+CHUNK = 2**22  # largest product of image points, scene points and initial poses annealed together
+THRESHOLD = 0.01  # distance of matching points in the normalised image, to choose between results
+FOCAL = 800.0  # pixels per unit of the normalised image; the other constants are in pixels
 NOISE = 2.0  # standard deviation of the image points, pixels
 ALPHA = 9.21 * NOISE**2 + 1  # squared pixels; 9.21 is the 99 % quantile of chi^2 with two degrees of freedom
 BETA_START, BETA_FINAL, BETA_RATE = 4e-4, 0.5, 1.05  # weight of squared distances, 1/pixel^2; factor of a step
 STEPS = 1 + int(math.log(BETA_FINAL / BETA_START) / math.log(BETA_RATE))
 ENOUGH_STEPS = 20
-SCALINGS, TOLERANCE = 60, 1e-3  # of a soft assignment: most of them, and the error of the row sums, in total
+SCALINGS, TOLERANCE = 60, 1e-3  # soft assignment: largest number of scalings, and total error of the row sums
 WELL_POSED = 1e-10  # smallest eigenvalue of the points' second moments, per trace
 
 
 class SoftPOSIT(SingleSolver):
-    """SoftPOSIT (David et al., IJCV 2004), a local solver: its result depends on its initial pose.
+    """SoftPOSIT (David et al., IJCV 2004), a local solver whose result depends on its initial pose.
 
-    Of several poses that under which most points have a partner is returned, an accepted one before one that is not.
-    `residual` of the pose is the root mean square distance of the matched points in pixels.
+    Of several results, the one with the most inliers is returned, accepted results first. `residual` of the pose is the
+    root mean square distance of the matched points in pixels.
 
     Args:
-        start: mean, a fixed pose (the paper's start for ModelNet40: its mean pose); near_truth, the true pose disturbed
-            (the paper's start for MegaDepth: not comparable with solvers that start blind); random, uniform rotations.
-        starts: number of random starts.
-        max_steps: most annealing steps; null for all.
-        seed: of the random starts and disturbances.
-        time_limit: seconds a problem, after which the best pose so far is returned unconverged; null for none.
+        start: Initial pose. mean: a fixed pose (the paper's for ModelNet40: its mean pose). near_truth: the true pose
+            with a perturbation (the paper's for MegaDepth; not comparable with blind solvers). random: uniform
+            rotations.
+        starts: Number of random initial poses.
+        max_steps: Largest number of annealing steps; null for all.
+        seed: Seed of the initial poses.
+        time_limit: Seconds for each problem; then the best pose so far is returned, not converged. Null for no limit.
     """
 
     estimates = ("softposit",)
@@ -59,7 +60,7 @@ class SoftPOSIT(SingleSolver):
     ) -> None:
         super().__init__(time_limit)
         if start not in ("mean", "near_truth", "random"):
-            raise ValueError(f"expected `start` mean, near_truth or random, got {start!r}")
+            raise ValueError(f"`start` is {start!r}; it is one of mean, near_truth, random")
         self.start, self.starts, self.seed, self.max_steps = start, starts, seed, max_steps
 
     def solve(self, problem: SingleProblem, deadline: Deadline) -> Answer:
@@ -92,8 +93,8 @@ class SoftPOSIT(SingleSolver):
             ray = torch.nn.functional.pad(problem.points2d.mean(0), (0, 1), value=1.0)
             return rotation, weak_perspective_distance(problem.points2d, like) * ray - rotation @ like.mean(0)
         if problem.rotation is None or problem.translation is None:
-            raise ValueError("expected a batch with its true poses to start near them, got none; try start 'random'")
-        # Turned by up to 10 degrees about a random axis and moved by up to 0.5 in a random direction, uniformly.
+            raise ValueError("`start` near_truth needs the true poses, which the batch lacks; use start 'random'")
+        # Rotate by up to 10 degrees about a random axis and move by up to 0.5 in a random direction, uniformly.
         directions = torch.nn.functional.normalize(torch.randn(2, 3, generator=generator, dtype=torch.float64), dim=-1)
         amounts = 2 * torch.rand(2, generator=generator, dtype=torch.float64) - 1
         step = (amounts * torch.tensor([math.radians(10), 0.5])).unsqueeze(-1) * directions
@@ -102,7 +103,16 @@ class SoftPOSIT(SingleSolver):
 
 
 class Annealed(NamedTuple):
-    """A pose for each initial one; `residual` is the root mean square distance of the matched points, in pixels."""
+    """Pose from each initial pose.
+
+    Attributes:
+        rotation: R (s, 3, 3).
+        translation: t (s, 3).
+        residual: Root mean square distance of the matched points (s,), pixels.
+        accepted: True for an acceptable result (s,).
+        steps: Annealing steps.
+        finished: False if the deadline passed.
+    """
 
     rotation: Float[Tensor, "s 3 3"]
     translation: Float[Tensor, "s 3"]
@@ -115,15 +125,23 @@ class Annealed(NamedTuple):
 def softposit(
     points2d: Tensor, points3d: Tensor, rotation: Tensor, translation: Tensor, max_steps: int | None, deadline: Deadline
 ) -> Annealed:
-    """Anneal every initial pose (R, t) (s, 3, 3), (s, 3) of one problem, points2d (m, 2) and points3d (n, 3).
+    """Anneal every initial pose of one problem.
 
     With S_k = (X_k, 1), Q1 = (R1, Tx)/Tz, Q2 = (R2, Ty)/Tz and w_k = 1 + R3 . X_k / Tz, the distance of image point j
     and scene point k is d^2_jk = FOCAL^2 [(Q1 . S_k - w_k x_j)^2 + (Q2 . S_k - w_k y_j)^2]. A step soft-assigns by
     exp(-beta (d^2 - ALPHA)) with slack, fits Q1 and Q2 to the assignment, makes their rows orthonormal, and multiplies
     beta by BETA_RATE.
 
-    An initial pose is accepted if its residual is below sqrt(ALPHA)/2 after 20 steps or more. Where the matched points
-    span no volume it keeps its last pose and is not accepted.
+    A result is accepted if its residual is below sqrt(ALPHA)/2 after 20 steps or more. Where the matched points span no
+    volume, the last pose is returned, not accepted.
+
+    Args:
+        points2d: Normalised image coordinates (m, 2).
+        points3d: Scene points (n, 3).
+        rotation: Initial rotations (s, 3, 3).
+        translation: Initial translations (s, 3).
+        max_steps: Largest number of steps; None for all.
+        deadline: Time limit.
     """
     image = points2d.double()
     centre = points3d.double().mean(0)
@@ -153,11 +171,16 @@ def softposit(
 
 
 def slack_scalings(kernel: Float[Tensor, "s m n"], slack: float) -> tuple[Tensor, Tensor]:
-    """u and v such that u_j K_jk v_k with the slack entries sums to one over every real row and every real column.
+    """Compute u and v such that u_j K_jk v_k, with slack entries, sums to one over every real row and column.
 
-    All slack entries start as `slack` and are scaled with their own row or column alone, unlike the Sinkhorn layer's
-    dustbins. Where K_jk is the largest of its row and of its column and above the slack, both slacks keep their initial
-    ratio to the entry: a good match is not lost to them. Stops when the row sums are off by less than TOLERANCE.
+    All slack entries start as `slack` and are scaled only with their own row or column, unlike the dustbins of the
+    Sinkhorn layer. Where K_jk is the largest of its row and of its column and above the slack, both slacks keep their
+    initial ratio to it, so that a good match is not lost to them. The iteration stops when the row sums are off by less
+    than TOLERANCE.
+
+    Args:
+        kernel: K (s, m, n).
+        slack: Initial slack.
     """
     best3d, best2d = kernel.max(2), kernel.max(1)
     rows = torch.arange(kernel.shape[1], device=kernel.device)
@@ -168,8 +191,8 @@ def slack_scalings(kernel: Float[Tensor, "s m n"], slack: float) -> tuple[Tensor
     total = (kernel @ v.unsqueeze(-1)).squeeze(-1) + slack
     for _ in range(SCALINGS):
         u = 1 / total
-        partner = torch.where(kept3d, u.gather(1, best2d.indices), 1)
-        v = 1 / ((kernel.mT @ u.unsqueeze(-1)).squeeze(-1) + slack * partner)
+        factor = torch.where(kept3d, u.gather(1, best2d.indices), 1)
+        v = 1 / ((kernel.mT @ u.unsqueeze(-1)).squeeze(-1) + slack * factor)
         total = (kernel @ v.unsqueeze(-1)).squeeze(-1) + slack * torch.where(kept2d, v.gather(1, best3d.indices), 1)
         if bool(((u * total - 1).abs().sum(-1) < TOLERANCE).all()):
             break
@@ -177,7 +200,7 @@ def slack_scalings(kernel: Float[Tensor, "s m n"], slack: float) -> tuple[Tensor
 
 
 def _kernel(image: Tensor, rows: Tensor, depth: Tensor, beta: float) -> Tensor:
-    """gamma exp(-beta (d^2 - ALPHA)) (s, m, n) with gamma = 1/(max(m, n) + 1), in float32."""
+    """Return gamma exp(-beta (d^2 - ALPHA)) (s, m, n) with gamma = 1/(max(m, n) + 1), in float32."""
     x, y = (FOCAL * image).float().unsqueeze(-1).unbind(1)
     along_x, along_y = (FOCAL * rows).float().unsqueeze(2).unbind(1)
     w = depth.float().unsqueeze(1)
