@@ -1,11 +1,11 @@
-"""Sources of problems: meshes and random scenes seen by virtual cameras, COLMAP models, the authors' files, a store."""
+"""Data modules: meshes and point clouds, COLMAP models, the authors' files, synthetic maps, and a store of problems."""
 
 from typing import Any
 
 import lazy_loader
 
-_find, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)  # the names are in __init__.pyi
-# What YAML files of earlier versions call them.
+_find, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)  # exports are in __init__.pyi
+# Old names in YAML files of earlier versions.
 RENAMED = {"PreprocessedDataModule": "AuthorsDataModule", "SfmSceneDataModule": "SyntheticMapDataModule"}
 
 

@@ -21,7 +21,7 @@ from bpnp.types import Batch
 Side = Literal["both", "2d", "3d"]
 DrawnSide = Literal["both", "2d", "3d", "random"]
 Drawn = float | tuple[float, float]  # a number, or (low, high) for one drawn uniformly for each problem
-SIDES = ("2d", "both", "3d")  # in this order, a side is numbered
+SIDES = ("2d", "both", "3d")  # the order in which `_on_sides` numbers them
 
 
 @dataclass(frozen=True)
@@ -29,13 +29,13 @@ class Outliers:
     """Synthetic outliers and occlusion of a problem. The defaults change nothing.
 
     Args:
-        ratio: rho, synthetic outliers as a ratio to the matches: int(rho * matches) points, uniform in the
+        ratio: Ratio of synthetic outliers to matches, rho: int(rho * matches) points are added, uniform in the
             axis-aligned bounding box of the matched points of that side; 1 makes half of the points outliers. Two
-            numbers, [low, high], draw it for each problem, uniformly.
-        side: the side that gets them, both, 2d or 3d, or random for one of the three in each problem.
-        occlusion: fraction of the matches that lose one of their two points, so that the other has no correspondence; a
+            numbers, [low, high], draw it uniformly for each problem.
+        side: Side that gets the outliers, both, 2d or 3d, or random for one of the three in each problem.
+        occlusion: Fraction of the matches that lose one of their two points, so that the other has no correspondence; a
             number or [low, high], as ratio. At least 4 matches are left.
-        occluded_side: side of the lost points, 2d, 3d, or both for half of the matches on each side; or random.
+        occluded_side: Side of the lost points, 2d, 3d, both for half of the matches on each side, or random.
     """
 
     ratio: Drawn = 0.0
@@ -50,7 +50,7 @@ class Outliers:
             raise ValueError(f"expected `occlusion` below 1, got {self.occlusion}; 0.1 hides one point in ten")
         for name in ("side", "occluded_side"):
             if getattr(self, name) not in (*SIDES, "random"):
-                raise ValueError(f'expected `{name}` "both", "2d", "3d" or "random", got {getattr(self, name)!r}')
+                raise ValueError(f'`{name}` is {getattr(self, name)!r}; it is one of "both", "2d", "3d", "random"')
 
 
 @dataclass(frozen=True)
@@ -58,15 +58,15 @@ class Augmentation:
     """Options of `augment`.
 
     Args:
-        max_points: largest number of matches, a random subset of more; None for all.
-        clutter: points without a correspondence to keep, as a ratio to the matches kept, or all if there are fewer;
-            inf for all.
-        clutter_side: side that keeps them, "both", "2d" or "3d".
-        rotate: rotate the 3D points about their origin by a uniformly random rotation.
-        outliers: synthetic outliers and occlusion.
+        max_points: Largest number of matches; of more, a random subset is taken. Default: None, all matches.
+        clutter: Number of points without a correspondence to keep, as a ratio to the matches kept, or all if there are
+            fewer; inf for all.
+        clutter_side: Side that keeps them, "both", "2d" or "3d".
+        rotate: Rotate the 3D points about their origin by a uniformly random rotation.
+        outliers: Synthetic outliers and occlusion.
 
     Raises:
-        ValueError: a value is out of range.
+        ValueError: A value is out of range.
     """
 
     max_points: int | None = None
@@ -80,7 +80,7 @@ class Augmentation:
             raise ValueError(f"expected `max_points` of {MIN_POINTS} or more, got {self.max_points}")
         check_clutter(self.clutter)
         if self.clutter_side not in SIDES:
-            raise ValueError(f'expected `clutter_side` "both", "2d" or "3d", got {self.clutter_side!r}')
+            raise ValueError(f'`clutter_side` is {self.clutter_side!r}; it is one of "both", "2d", "3d"')
 
     @property
     def clutter_by_side(self) -> tuple[float, float]:
@@ -88,7 +88,7 @@ class Augmentation:
         return 0.0 if self.clutter_side == "3d" else self.clutter, 0.0 if self.clutter_side == "2d" else self.clutter
 
     def sizes(self, counts: Counts) -> NDArray[np.int64]:
-        """Return an upper bound of the points on the larger side of each augmented problem (k,)."""
+        """Return an upper bound of the number of points on the larger side of each augmented problem (k,)."""
         matched = counts.matched if self.max_points is None else np.minimum(counts.matched, self.max_points)
         extra2d, extra3d = (
             np.minimum(count - counts.matched, np.rint(ratio * np.maximum(matched, 1)))
@@ -102,10 +102,10 @@ class SideCounts(NamedTuple):
     """Numbers of points on one side of each augmented problem, (b, 1) each.
 
     Attributes:
-        matched: points of the chosen matches that are left on this side.
-        hidden: chosen matches whose point on this side is hidden.
-        extra: clutter.
-        outliers: synthetic outliers.
+        matched: Points of the chosen matches that remain on this side.
+        hidden: Chosen matches whose point on this side is hidden.
+        extra: Clutter.
+        outliers: Synthetic outliers.
     """
 
     matched: Tensor
@@ -115,47 +115,47 @@ class SideCounts(NamedTuple):
 
 
 def augment(batch: Batch, how: Augmentation, keys: Sequence[Key]) -> Batch:
-    """Choose the points of each problem, add outliers, and put both sides into random order.
+    """Choose the points of each problem, add outliers, and shuffle both sides.
 
     Rotations and translations keep their dtype.
 
     Args:
-        batch: problems as `stack_problems` makes them, on the CPU.
-        how: what is chosen and added.
-        keys: of each problem, which depends on its key alone, whatever batch it is in and however it is padded.
+        batch: Problems from `stack_problems`, on the CPU.
+        how: Options.
+        keys: Key of each problem. The result depends only on the problem and its key, not on its batch or its padding.
 
     Raises:
-        ValueError: the problems have no `match3d` or no pose.
+        ValueError: The problems have no `match3d` or no pose.
     """
     if batch.match3d is None or batch.rotation is None:
         raise ValueError("the problems have no `match3d` or no pose, which the augmentation needs")
     matched = batch.match3d >= 0
     total = matched.sum(-1, keepdim=True)
     true, side2d, side3d = _amounts(how, total, batch, generators(keys, Purpose.AMOUNTS))
-    # On both sides the matches in one random order, then the points without a correspondence.
+    # Order both sides alike: matches in one random order, then points without a correspondence.
     order3d = _matches_first_order(generators(keys, Purpose.CHOICE), matched, batch.mask3d)
     alike = torch.equal(batch.mask2d, batch.mask3d)
     matched2d = pad(matched, (0, batch.points2d.shape[1] - matched.shape[1]))
     order2d = order3d if alike else _matches_first_order(generators(keys, Purpose.CHOICE), matched2d, batch.mask2d)
     points2d = _choose_points(batch.points2d, order2d, true, total, side2d, generators(keys, Purpose.OUTLIERS2D))
     points3d = _choose_points(batch.points3d, order3d, true, total, side3d, generators(keys, Purpose.OUTLIERS3D))
-    points2d, mask2d, place2d = _shuffle_points(points2d, side2d, generators(keys, Purpose.ORDER2D))
-    points3d, mask3d, place3d = _shuffle_points(points3d, side3d, generators(keys, Purpose.ORDER3D))
-    slots2d = torch.arange(place2d.shape[1], device=place2d.device).expand_as(place2d)
-    seen_as = torch.empty_like(place2d).scatter_(1, place2d, slots2d).gather(1, place3d.clamp(max=len(slots2d[0]) - 1))
+    points2d, mask2d, order2d = _shuffle_points(points2d, side2d, generators(keys, Purpose.ORDER2D))
+    points3d, mask3d, order3d = _shuffle_points(points3d, side3d, generators(keys, Purpose.ORDER3D))
+    slots2d = torch.arange(order2d.shape[1], device=order2d.device).expand_as(order2d)
+    match3d = torch.empty_like(order2d).scatter_(1, order2d, slots2d).gather(1, order3d.clamp(max=len(slots2d[0]) - 1))
     rotation, origin = batch.rotation, batch.origin
-    if how.rotate:  # a scene whose points p are turned: turn p
-        turn = rotations(generators(keys, Purpose.TURN))
-        points3d = (points3d.double() @ turn.mT).to(points3d)
-        rotation = rotation @ turn.mT.to(rotation)
-        origin = None if origin is None else (turn.to(origin) @ origin[..., None]).squeeze(-1)
+    if how.rotate:  # scene points become S p, so the rotation becomes R S^T
+        scene_rotation = rotations(generators(keys, Purpose.TURN))
+        points3d = (points3d.double() @ scene_rotation.mT).to(points3d)
+        rotation = rotation @ scene_rotation.mT.to(rotation)
+        origin = None if origin is None else (scene_rotation.to(origin) @ origin[..., None]).squeeze(-1)
     return replace(
         batch,
         points2d=points2d,
         points3d=points3d,
         mask2d=mask2d,
         mask3d=mask3d,
-        match3d=torch.where(place3d < true, seen_as, -1),
+        match3d=torch.where(order3d < true, match3d, -1),
         rotation=rotation,
         origin=origin,
     )
@@ -176,7 +176,14 @@ def bounds(value: Drawn) -> tuple[float, float]:
 def _amounts(
     how: Augmentation, total: Tensor, batch: Batch, random: Generators
 ) -> tuple[Tensor, SideCounts, SideCounts]:
-    """Return the number of matches that are left of `total`, (b, 1), and the numbers of points of both sides."""
+    """Return the number of matches that remain (b, 1), and the numbers of points of both sides.
+
+    Args:
+        how: Options.
+        total: Number of matches before (b, 1).
+        batch: Problems.
+        random: Random generator of each problem.
+    """
     ratio, side, occlusion, occluded = uniform(random, 4).unsqueeze(-1).unbind(1)
     chosen = total if how.max_points is None else total.clamp(max=how.max_points)
     hidden = (_draw_amount(how.outliers.occlusion, occlusion) * chosen).round().long()
@@ -197,26 +204,26 @@ def _amounts(
     )
 
 
-def _draw_amount(value: Drawn, share: Tensor) -> Tensor:
+def _draw_amount(value: Drawn, uniform: Tensor) -> Tensor:
     low, high = bounds(value)
-    return low + (high - low) * share
+    return low + (high - low) * uniform
 
 
-def _on_sides(side: DrawnSide, share: Tensor) -> tuple[Bool[Tensor, "b 1"], Bool[Tensor, "b 1"]]:
+def _on_sides(side: DrawnSide, uniform: Tensor) -> tuple[Bool[Tensor, "b 1"], Bool[Tensor, "b 1"]]:
     """Return masks of the 2D side and of the 3D side; for "random", 2d, both and 3d are equally likely."""
-    number = (3 * share).long() if side == "random" else torch.full_like(share, SIDES.index(side)).long()
+    number = (3 * uniform).long() if side == "random" else torch.full_like(uniform, SIDES.index(side)).long()
     return number < 2, number > 0
 
 
 def _matches_first_order(random: Generators, matched: Tensor, mask: Tensor) -> Int[Tensor, "b n"]:
-    """Return the indices of the matches in random order, then of the other points in random order, then padding."""
+    """Return indices: matches in random order, then other points in random order, then padding."""
     return permutations(random, mask.shape[1], group=2 - mask.long() - matched.long())
 
 
 def _choose_points(
     points: Float[Tensor, "b n d"], order: Tensor, true: Tensor, total: Tensor, side: SideCounts, random: Generators
 ) -> Float[Tensor, "b k d"]:
-    """Return the points of matches, then those without a correspondence, then outliers, then arbitrary ones."""
+    """Return the points of the matches, then points without a correspondence, then outliers, then arbitrary points."""
     natural = side.matched + side.extra
     slot = torch.arange(int((natural + side.outliers).max()), device=points.device)
     rank = torch.where(slot < side.matched, slot + side.hidden * (slot >= true), total + slot - side.matched)
@@ -226,19 +233,24 @@ def _choose_points(
     is_match = (slot < true)[..., None]
     low = chosen.where(is_match, math.inf).amin(1, keepdim=True)
     high = chosen.where(is_match, -math.inf).amax(1, keepdim=True)
-    share = uniform(random, chosen[0].numel()).view_as(chosen).to(chosen)
-    return torch.where((slot < natural)[..., None], chosen, low + (high - low) * share)
+    fraction = uniform(random, chosen[0].numel()).view_as(chosen).to(chosen)
+    return torch.where((slot < natural)[..., None], chosen, low + (high - low) * fraction)
 
 
 def _shuffle_points(points: Tensor, side: SideCounts, random: Generators) -> tuple[Tensor, Tensor, Tensor]:
     """Return the points in random order with zeros as padding, the mask of real points, and the order."""
     slot = torch.arange(points.shape[1], device=points.device)
     mask = slot < side.matched + side.extra + side.outliers
-    place = permutations(random, len(slot), group=1 - mask.long())
-    return gather_points(points, place) * mask[..., None], mask, place
+    order = permutations(random, len(slot), group=1 - mask.long())
+    return gather_points(points, order) * mask[..., None], mask, order
 
 
 def gather_points(points: Float[Tensor, "b n d"], order: Int[Tensor, "b k"]) -> Float[Tensor, "b k d"]:
-    """Return the points at the indices `order` of each row."""
+    """Return the points at the given indices of each row.
+
+    Args:
+        points: Points (b, n, d).
+        order: Indices (b, k).
+    """
     rows = torch.arange(len(points), device=points.device)[:, None] * points.shape[1]
     return points.flatten(0, 1).index_select(0, (order + rows).flatten()).view(*order.shape, points.shape[2])

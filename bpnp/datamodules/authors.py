@@ -1,8 +1,8 @@
-"""The data sets as the authors of BPnPNet published them, pickles, converted once into a store of problems.
+"""Data sets in the form in which the authors of BPnPNet published them (pickles), converted once into a store.
 
-``<dataset>_{train,test}/preprocessed/{p2d,p3d,R_gt,t_gt,W_gt,num_points_2d,num_points_3d}.pkl``, each a dict or a list
-indexed by sample; or the form before that, ``<dataset>_{train,test}[/<scene>]/{matches,R,t}.pkl``, where a row of
-`matches` (k, 5) is a 2D point and its 3D point. Points are normalised, camera = R p + t.
+The files are ``<dataset>_{train,test}/preprocessed/{p2d,p3d,R_gt,t_gt,W_gt,num_points_2d,num_points_3d}.pkl``, each a
+dict or a list indexed by sample; or the form before that, ``<dataset>_{train,test}[/<scene>]/{matches,R,t}.pkl``, where
+a row of `matches` (k, 5) is a 2D point and its 3D point. Points are normalised, camera = R p + t.
 """
 
 import math
@@ -23,23 +23,23 @@ from bpnp.poses import MIN_POINTS
 
 PREPROCESSED = ("p2d", "p3d", "R_gt", "t_gt", "W_gt", "num_points_2d", "num_points_3d")
 MATCHES = ("matches", "R", "t")
-FOCAL = {"modelnet40": 800.0}  # pixels; for the others nothing is known
-PROBED = 50  # samples that decide which side W_gt is indexed by
-AGREEMENT = 0.1  # median distance of a projected 3D point to its 2D point, normalised
+FOCAL = {"modelnet40": 800.0}  # pixels; unknown for the other data sets
+PROBED = 50  # number of samples that decide which side indexes W_gt
+AGREEMENT = 0.1  # largest median distance of a projected 3D point to its 2D point, normalised
 
 
 class AuthorsDataModule(StoredDataModule):
-    """The problems that Campbell et al. (ECCV 2020) published, with their split; some are held out for validation.
+    """Problems that Campbell et al. (ECCV 2020) published, with their split; some are held out for validation.
 
     Works without a Trainer: `setup()`, then the loaders.
 
     Args:
-        root: folder that `bpnp prepare authors` made, or the authors' folder with <dataset>_{train,test} in it,
-            which is then converted once into cache_dir.
-        dataset: modelnet40, megadepth or data61_2d3d; none for the only one that is there.
-        val_fraction: share of the training problems that is held out for validation, at random.
-        cache_dir: where the authors' files are converted to; none for BPNP_CACHE, else the user's cache folder.
-        options: those of `StoredDataModule`.
+        root: Folder that `bpnp prepare authors` made, or the authors' folder that holds <dataset>_{train,test}, which
+            is converted once into cache_dir.
+        dataset: modelnet40, megadepth or data61_2d3d; none if the folder holds only one data set.
+        val_fraction: Fraction of the training problems held out for validation, at random.
+        cache_dir: Folder for the converted files; none for BPNP_CACHE, else the user's cache folder.
+        options: Options of `StoredDataModule`.
     """
 
     def __init__(
@@ -55,11 +55,11 @@ class AuthorsDataModule(StoredDataModule):
         self.dataset, self.cache_dir, self.held_out = dataset, cache_dir, val_fraction
 
     def prepare_data(self) -> None:
-        """Convert in one process, for `setup` to open in all."""
+        """Convert the files in one process, before `setup` opens them in all."""
         self._open()
 
     def _open(self) -> dict[str, Any]:
-        """The rows of each part. The problems are opened once, and converted now if they are not."""
+        """Return the rows of each part. The problems are opened once, and converted if necessary."""
         if not hasattr(self, "store"):
             if is_store(self.root):
                 self.store = open_store(self.root, PROBLEMS)
@@ -72,9 +72,16 @@ class AuthorsDataModule(StoredDataModule):
 
 
 def authors_recipe(source: Path, dataset: str | None) -> Recipe:
-    """How the store of the authors' files below `source` is made, with the scenes train and test.
+    """Return the recipe of the store of the authors' files, with the scenes train and test.
 
-    Raises ValueError where there is nothing to convert, or several data sets; `prepare` PickleError for a bad file.
+    `prepare` raises PickleError for a bad file.
+
+    Args:
+        source: Folder of the files.
+        dataset: Name of the data set, None for the only one.
+
+    Raises:
+        ValueError: There is nothing to convert, or there are several data sets.
     """
     name, parts = _find_parts(source, dataset)
     files = [file for _, part in parts for file in part]
@@ -90,21 +97,25 @@ def authors_recipe(source: Path, dataset: str | None) -> Recipe:
 
 
 def split_rows(store: Store, split: str) -> NDArray[np.int64]:
-    """The problems of a split's scenes, `train` or `train/...`."""
+    """Return the rows of a split, whose scenes are `train` or `train/...`."""
     rows = [rows for scene, rows in scene_rows(store).items() if scene.split("/")[0] == split]
     return np.sort(np.concatenate([*rows, np.empty(0, np.int64)]))
 
 
 def _find_parts(root: Path, dataset: str | None) -> tuple[str, list[tuple[str, list[Path]]]]:
-    """The name of the data set below `root`, and of each scene its pickles."""
+    """Return the name of the data set below `root`, and the scenes with their pickles."""
     if not root.is_dir():
-        raise ValueError(f"expected a folder with <dataset>_train and <dataset>_test, got {root}, which is no folder")
+        raise ValueError(f"{root} is no folder; give one that holds <dataset>_train and <dataset>_test")
     names = sorted({path.name.rpartition("_")[0] for split in ("train", "test") for path in root.glob(f"*_{split}")})
     if dataset is None and len(names) > 1:
-        raise ValueError(f"expected one data set in {root}, got {', '.join(names)}; try --dataset {names[0]}")
+        raise ValueError(
+            f"{root} holds several data sets: {', '.join(names)}; choose one, such as --dataset {names[0]}"
+        )
     chosen = dataset or (names[0] if names else "")
     if chosen not in names or not chosen:
-        raise ValueError(f"expected {dataset or '<dataset>'}_train and _test in {root}, got {names or 'none'}")
+        raise ValueError(
+            f"{root} has no {dataset or '<dataset>'}_train and _test; its data sets: {', '.join(names) or 'none'}"
+        )
     parts = []
     for split in ("train", "test"):
         top = root / f"{chosen}_{split}"
@@ -115,25 +126,28 @@ def _find_parts(root: Path, dataset: str | None) -> tuple[str, list[tuple[str, l
             scene = "/".join((split, *first.parent.relative_to(top).parts))
             parts.append((scene, [first.with_name(f"{name}.pkl") for name in MATCHES]))
     if not parts:
-        raise ValueError(f"expected preprocessed/*.pkl or matches.pkl in {root / chosen}_train and _test, got neither")
+        raise ValueError(f"{root / chosen}_train and _test have neither preprocessed/*.pkl nor matches.pkl")
     missing = [str(file) for _, files in parts for file in files if not file.is_file()]
     if missing:
-        raise ValueError(f"expected all pickles of {chosen}, got no {', '.join(missing[:4])}; try downloading it again")
+        raise ValueError(f"pickles of {chosen} are missing: {', '.join(missing[:4])}; download the data set again")
     return chosen, parts
 
 
 def _convert(scene: str, files: Sequence[Path], focal: float) -> Made:
-    """Every sample of a scene, or the reason why it cannot be used.
+    """Convert every sample of a scene, or record why it cannot be used.
 
-    Copies that fill small sets up to 1000 points are dropped. W_gt may hold the 2D point of each 3D point or, as for
-    Data61/2D3D, the 3D point of each 2D point: the one that agrees with the poses is taken. -1, or an index one past
-    the end, is no point. Raises PickleError that names the file.
+    Copies that pad small sets to 1000 points are dropped. W_gt may hold the 2D point of each 3D point or, as for
+    Data61/2D3D, the 3D point of each 2D point; the reading that agrees with the poses is taken. -1, or an index one
+    past the end, means no point.
+
+    Raises:
+        PickleError: A file is broken.
     """
     columns = {file.stem: _column(file) for file in files}
     keys = list(next(iter(columns.values())))
     for file in files:
         if columns[file.stem].keys() != set(keys):
-            raise PickleError(f"expected the {len(keys)} samples of {files[0].name} in {file} too, got others")
+            raise PickleError(f"{file} has other samples than {files[0].name}, which has {len(keys)}")
     samples = {f"{scene}/{key:06d}": {name: column[key] for name, column in columns.items()} for key in keys}
     by_2d = "W_gt" in columns and _index_by_2d(files[0].parent, list(samples.values())[:PROBED])
     rows: list[Row] = []
@@ -155,23 +169,23 @@ def _column(file: Path) -> dict[int, Any]:
     else:
         raise PickleError(f"expected a dict or list indexed by sample in {file}, got a {type(content).__name__}")
     if not column:
-        raise PickleError(f"expected at least one sample in {file}, got none")
+        raise PickleError(f"{file} has no samples")
     return column
 
 
 def _index_by_2d(folder: Path, samples: Sequence[Mapping[str, Any]]) -> bool:
-    """Whether W_gt is an m-vector: which reading projects the 3D points nearer to their 2D points."""
+    """Return True if W_gt is indexed by 2D point: the reading that projects the 3D points nearer to their 2D points."""
     direct, inverse = (float(np.median([_error(sample, by_2d) for sample in samples])) for by_2d in (False, True))
     if AGREEMENT < min(direct, inverse) < np.inf:
         raise PickleError(
-            f"expected the poses in {folder} to project 3D points onto their 2D points, got a median distance of "
-            f"{min(direct, inverse):.3g}; try normalised 2D points and poses with camera = R p + t"
+            f"the poses in {folder} do not project 3D points onto their 2D points: the median distance is "
+            f"{min(direct, inverse):.3g}. 2D points have to be normalised, and poses camera = R p + t"
         )
     return inverse < direct
 
 
 def _error(sample: Mapping[str, Any], by_2d: bool) -> float:
-    """Median distance of the projected 3D points to their 2D points."""
+    """Return the median distance of the projected 3D points to their 2D points."""
     try:
         problem = _problem("", sample, by_2d=by_2d, focal=1.0)
     except ValueError:
@@ -183,7 +197,11 @@ def _error(sample: Mapping[str, Any], by_2d: bool) -> float:
 
 
 def _problem(name: str, sample: Mapping[str, Any], *, by_2d: bool, focal: float) -> Problem:
-    """Raises ValueError for a sample that cannot be used."""
+    """Convert one sample.
+
+    Raises:
+        ValueError: The sample cannot be used.
+    """
     if "matches" in sample:
         matches = _numbers(sample["matches"], "matches", 5)
         points2d, points3d, match3d = matches[:, :2], matches[:, 2:], np.arange(len(matches))
@@ -196,8 +214,8 @@ def _problem(name: str, sample: Mapping[str, Any], *, by_2d: bool, focal: float)
     rotation, translation = _numbers(rotation, "R", 3), np.asarray(translation, np.float64).reshape(-1)
     proper = rotation.shape == (3, 3) and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
     if not proper or np.linalg.det(rotation) < 0 or translation.shape != (3,):
-        raise ValueError("expected a rotation and a translation, got another matrix, a reflection or something else")
-    _, first = np.unique(match3d, return_index=True)  # of several 3D points that were seen as one 2D point
+        raise ValueError("the pose is no rotation matrix and translation vector")
+    _, first = np.unique(match3d, return_index=True)  # keep one of several 3D points with the same 2D point
     once = np.full_like(match3d, -1)
     once[first] = match3d[first]
     if (once >= 0).sum() < MIN_POINTS:
@@ -209,14 +227,14 @@ def _numbers(value: Any, name: str, width: int) -> NDArray[np.float64]:
     try:
         array = np.asarray(value, np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"expected numbers in {name}, got something else") from error
+        raise ValueError(f"{name} is no array of numbers") from error
     if array.ndim != 2 or array.shape[1] != width or not len(array) or not np.isfinite(array).all():
         raise ValueError(f"expected finite {name} of shape (k, {width}), got {array.shape} or NaN")
     return array
 
 
 def _match3d(value: Any, m: int, n: int, *, by_2d: bool) -> NDArray[np.int64]:
-    """The 2D point of each 3D point, -1 for none, from W_gt and its tiled copies."""
+    """Return the 2D point of each 3D point, -1 for none, from W_gt and its tiled copies."""
     length, other = (m, n) if by_2d else (n, m)
     index = np.asarray(value).reshape(-1)[:length]
     if len(index) < length or not np.issubdtype(index.dtype, np.number):
@@ -232,13 +250,20 @@ def _match3d(value: Any, m: int, n: int, *, by_2d: bool) -> NDArray[np.int64]:
 
 
 class PickleError(ValueError):
-    """A pickle that is broken or holds more than arrays, plain containers and numbers. The message names the file."""
+    """Pickle that is broken, or holds more than arrays, plain containers and numbers. The message names the file."""
 
 
 def load_pickle(path: Path) -> Any:
-    """The dict, list, tuple or array in a pickle of Python 2 or 3; nothing else in it is ever imported or called.
+    """Read a dict, list, tuple or array from a pickle of Python 2 or 3.
 
-    Raises PickleError; OSError if the file cannot be read.
+    Nothing else in the pickle is imported or called.
+
+    Args:
+        path: File.
+
+    Raises:
+        PickleError: The content is something else.
+        OSError: The file cannot be read.
     """
     with path.open("rb") as file:
         try:
@@ -246,8 +271,10 @@ def load_pickle(path: Path) -> Any:
             if not isinstance(content, (dict, list, tuple, np.ndarray)):
                 raise pickle.UnpicklingError(f"a bare {type(content).__name__} is refused")
         except Exception as error:
-            got = f"{path}: {error!r}; try the authors' file as it was downloaded"
-            raise PickleError(f"expected a pickle of numpy arrays, plain containers and numbers, got {got}") from error
+            raise PickleError(
+                f"{path}: {error!r}; only numpy arrays, plain containers and numbers are unpickled. Use the authors' "
+                "file as it was downloaded"
+            ) from error
     return content
 
 
@@ -256,7 +283,7 @@ class _Unpickler(pickle.Unpickler):
         full = f"{module}.{name}".replace("_core.", "").replace("core.", "").replace("__builtin__", "builtins")
         if full not in ALLOWED:
             raise pickle.UnpicklingError(f"{full} is refused")
-        return ALLOWED[full].__call__  # a bound slot: can be called, not changed
+        return ALLOWED[full].__call__  # a bound slot, which the pickle can call but not change
 
 
 class _Type:
@@ -266,7 +293,7 @@ class _Type:
         self.dtype = np.dtype(text)
 
     def __setstate__(self, state: Any) -> None:
-        self.dtype = self.dtype.newbyteorder(state[1])  # not the fields: they could lay pointers over numbers
+        self.dtype = self.dtype.newbyteorder(state[1])  # only the byte order: fields could alias pointers and numbers
 
 
 class _Array(np.ndarray[Any, Any]):
@@ -279,7 +306,7 @@ class _Array(np.ndarray[Any, Any]):
 
 
 ALLOWED: dict[str, Any] = {
-    "numpy.ndarray": lambda: None,  # what the next one is asked for
+    "numpy.ndarray": lambda: None,  # argument of _reconstruct
     "numpy.multiarray._reconstruct": lambda *_: np.ndarray.__new__(_Array, (0,)),
     "numpy.multiarray.scalar": lambda kind, content: np.frombuffer(content, kind.dtype).item(),
     "numpy.numeric._frombuffer": lambda a, kind, shape, order: np.frombuffer(a, kind.dtype).reshape(shape, order=order),

@@ -1,4 +1,4 @@
-"""Shapes that are published as point clouds: one file a shape, or ModelNet40's HDF5 and `normal_resampled` archives."""
+"""Point clouds: one file for each shape, or ModelNet40's HDF5 and `normal_resampled` archives."""
 
 import zlib
 from collections.abc import Mapping
@@ -73,7 +73,7 @@ def is_cloud(path: Path) -> bool:
 
 
 def draw_points(points: NDArray[np.float64], count: int, name: str) -> NDArray[np.float64]:
-    """Return `count` points of a cloud in a random order that depends on its name only; all if it has fewer."""
+    """Return `count` points of a cloud in a random order that depends only on its name; all points if it has fewer."""
     order = np.random.default_rng(zlib.crc32(name.encode())).permutation(len(points))
     return points[order[:count]]
 
@@ -82,9 +82,9 @@ def open_shapes(source: Path) -> Shapes:
     """Find the shapes of a folder.
 
     Args:
-        source: folder of meshes or point clouds in ModelNet40's layout, <class>/{train,test}/*, or a folder of such
-            folders; or one of the two archives in which ModelNet40's point clouds are spread:
-            `modelnet40_ply_hdf5_2048` (HDF5) and `modelnet40_normal_resampled` (text).
+        source: Folder of meshes or point clouds in ModelNet40's layout, <class>/{train,test}/*, or a folder of such
+            folders; or one of the two archives of ModelNet40's point clouds: `modelnet40_ply_hdf5_2048` (HDF5) and
+            `modelnet40_normal_resampled` (text).
 
     Returns:
         The shapes, named ``<class>/<split>/<stem>``, training shapes first. The name has the suffix of the file where
@@ -129,7 +129,7 @@ def _cloud_samples(name: str, path: Path, count: int) -> NDArray[np.float64]:
 
 
 def _read_shape_list(folder: Path) -> Shapes | None:
-    """The shapes of `modelnet40_normal_resampled`: <class>/<name>.txt and lists of the names in each split."""
+    """Find the shapes of `modelnet40_normal_resampled`: <class>/<name>.txt, and lists of the names in each split."""
     samplers: dict[str, Sampler] = {}
     files: dict[str, Path] = {}
     for split in SPLITS:
@@ -144,13 +144,13 @@ def _read_shape_list(folder: Path) -> Shapes | None:
 
 
 def _hdf5_shapes(folder: Path) -> Shapes | None:
-    """The shapes of `modelnet40_ply_hdf5_2048`: arrays `data` (shapes, 2048, 3) and `label` (shapes, 1) a file."""
+    """Find the shapes of `modelnet40_ply_hdf5_2048`: each file has `data` (shapes, 2048, 3) and `label` (shapes, 1)."""
     files = {split: sorted(folder.glob(f"*{split}*.h5")) for split in SPLITS}
     if not any(files.values()):
         return None
     h5py = _h5py(folder)
-    listed = folder / "shape_names.txt"
-    classes = listed.read_text(encoding="utf-8").split() if listed.is_file() else []
+    class_list = folder / "shape_names.txt"
+    classes = class_list.read_text(encoding="utf-8").split() if class_list.is_file() else []
     samplers: dict[str, Sampler] = {}
     for split, paths in files.items():
         for path in paths:

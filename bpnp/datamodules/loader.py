@@ -1,4 +1,4 @@
-"""Batches of a source of problems: sampling in any number of processes, exact resuming, the base data module."""
+"""Batches of problems: sampling in any number of processes, exact resuming, and the base data module."""
 
 import math
 from abc import abstractmethod
@@ -19,18 +19,18 @@ from bpnp.datamodules.keyed_random import row_keys
 from bpnp.datamodules.problem import ProblemSource
 from bpnp.types import Batch
 
-Key = tuple[int, int]  # (epoch, index): with the seed, all that a problem depends on
-POOL_BATCHES = 50  # training batches are cut from pools of this many, sorted by size
+Key = tuple[int, int]  # (epoch, index); a problem depends on these and the seed only
+POOL_BATCHES = 50  # number of training batches in a pool that is sorted by size
 
 
 class ProblemDataset(Dataset[Batch]):
-    """Map a list of (epoch, index) keys to a batch, so that workers, resuming and order change nothing.
+    """Data set that maps a list of (epoch, index) keys to a batch, whatever the worker or the order.
 
     Args:
-        source: of the problems.
-        augmentation: of the problems; none by default.
-        seed: a problem is a function of (seed, index).
-        fresh: whether it is a function of the epoch too.
+        source: Source of the problems.
+        augmentation: Augmentation of the problems. Default: none.
+        seed: A problem is a function of (seed, index).
+        fresh: Make a problem a function of the epoch too.
     """
 
     def __init__(
@@ -59,19 +59,28 @@ class ProblemDataset(Dataset[Batch]):
 
 
 class BucketSampler(DistributedSampler[list[Key]]):
-    """Give the keys of this process's part of each batch.
+    """Sampler of batches of similar size; yields the keys of this process's part of each batch.
 
-    `batch_size` counts the problems of a step over all processes: any number of processes has the same problems in a
-    step, each a contiguous slice of equal length. Training (`shuffle`) draws new batches for every (seed, epoch);
-    evaluation visits every problem, in the same batches, as epoch 0. Lightning does not replace a `DistributedSampler`,
-    and calls its `set_epoch`.
+    `batch_size` counts the problems of a step over all processes. Any number of processes has the same problems in a
+    step, each process a contiguous slice of equal length. Training (`shuffle`) draws new batches for every (seed,
+    epoch); evaluation visits every problem, in the batches of epoch 0. Lightning does not replace a
+    `DistributedSampler`, and calls its `set_epoch`.
 
-    The problems of a batch have similar sizes. The order of the batches is random, so that the first few, all that a
-    limited run has, are a fair sample. Problems are repeated if the processes do not divide the last batch.
+    The order of the batches is random, so that the first few, all that a limited run has, are a fair sample. Problems
+    are repeated if the processes do not divide the last batch.
+
+    Args:
+        dataset: Problems.
+        batch_size: Problems in a step, over all processes.
+        shuffle: True for training.
+        seed: Random seed.
+        num_replicas: Number of processes.
+        rank: Number of this process.
+        max_cells: Limit of problems x size^2 of a step in evaluation. Default: no limit.
 
     Raises:
-        ValueError: the set is empty, the processes do not divide `batch_size`, or `max_cells` is set in training, where
-            a step keeps its number of problems.
+        ValueError: The data set is empty, the processes do not divide `batch_size`, or `max_cells` is set in training,
+            where a step keeps its number of problems.
     """
 
     def __init__(
@@ -86,18 +95,18 @@ class BucketSampler(DistributedSampler[list[Key]]):
         max_cells: int | None = None,
     ) -> None:
         if len(dataset) == 0:
-            raise ValueError("expected a source of at least one problem, got an empty one")
+            raise ValueError("the data set has no problems")
         if batch_size < 1 or batch_size % num_replicas:
             raise ValueError(
-                f"expected a `batch_size` (problems a step over all processes) that {num_replicas} processes divide, "
-                f"got {batch_size}; try {max(1, round(batch_size / num_replicas)) * num_replicas}"
+                f"`batch_size` {batch_size} (problems in a step over all processes) cannot be divided among "
+                f"{num_replicas} processes; try {max(1, round(batch_size / num_replicas)) * num_replicas}"
             )
         if shuffle and max_cells is not None:
-            raise ValueError("expected `max_cells` with `shuffle=False` only, got both; try a smaller `batch_size`")
+            raise ValueError("`max_cells` cannot be used with `shuffle=True`; use a smaller `batch_size`")
         super().__init__(dataset, num_replicas=num_replicas, rank=rank, shuffle=shuffle, seed=seed)
         self.sizes = dataset.sizes
         self.batch_size = batch_size
-        self.first_batch = 0  # the next pass starts here: an epoch that is resumed
+        self.first_batch = 0  # first batch of the next pass, above 0 for a resumed epoch
         self.max_cells = max_cells
         self._length = max(1, len(self.sizes) // batch_size) if shuffle else len(self.batches(0))
 
@@ -111,7 +120,8 @@ class BucketSampler(DistributedSampler[list[Key]]):
     def _training_batches(self, order: NDArray[np.int64]) -> list[NDArray[np.int64]]:
         """Cut the shuffled set into pools of 50 batches, sort each pool by size and cut it into batches.
 
-        The remainder by `batch_size` is left out of the epoch. A set smaller than one batch is one batch.
+        The remainder of the division by `batch_size` is left out of the epoch. A set smaller than one batch is one
+        batch.
         """
         whole = len(order) - len(order) % self.batch_size
         if whole == 0:
@@ -150,15 +160,15 @@ class BucketSampler(DistributedSampler[list[Key]]):
     def __iter__(self) -> Iterator[list[Key]]:
         epoch = self.epoch if self.shuffle else 0
         for batch in self.batches(epoch)[self.first_batch :]:
-            share = len(batch) // self.num_replicas
-            yield [(epoch, int(i)) for i in batch[self.rank * share : (self.rank + 1) * share]]
+            size = len(batch) // self.num_replicas
+            yield [(epoch, int(i)) for i in batch[self.rank * size : (self.rank + 1) * size]]
 
 
 class ProblemLoader(DataLoader[Batch]):
-    """A DataLoader of whole batches that resumes exactly, also within an epoch.
+    """DataLoader of whole batches that resumes exactly, also within an epoch.
 
-    The workers start at the first `next`, not at `iter`: Lightning calls `set_epoch` between the two when it resumes.
-    The state is (epoch, batches served) and applies to that epoch only.
+    The workers start at the first `next`, not at `iter`, because Lightning calls `set_epoch` between the two when it
+    resumes. The state is (epoch, batches served) and applies to that epoch only.
     """
 
     served = 0
@@ -185,22 +195,22 @@ STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "pre
 
 
 class ProblemDataModule(LightningDataModule):
-    """Stages and loaders over a source of problems; a subclass implements `_source`.
+    """Base data module over a source of problems; a subclass implements `_source`.
 
-    Works without a Trainer: `setup()`, then the loaders. After `setup`, `datasets` has those of the parts train, val,
+    Works without a Trainer: `setup()`, then the loaders. After `setup`, `datasets` holds those of the parts train, val,
     test and predict.
 
     Args:
-        train_outliers: synthetic outliers and occlusion in training and validation; none for none.
-        test_outliers: the same in testing and prediction.
-        batch_size: training problems per step, over all processes.
-        eval_batch_size: problems per step in validation, testing and prediction; none for batch_size.
-        max_cells: limit of problems x 2D points x 3D points of such a step, to bound the memory; none for no limit.
-        num_workers: loader processes.
-        seed: of all random numbers and of the order.
+        train_outliers: Synthetic outliers and occlusion in training and validation. Default: none.
+        test_outliers: Synthetic outliers and occlusion in testing and prediction. Default: none.
+        batch_size: Training problems in a step, over all processes.
+        eval_batch_size: Problems in a step of validation, testing and prediction; none for batch_size.
+        max_cells: Limit of problems x 2D points x 3D points in such a step, to bound the memory; none for no limit.
+        num_workers: Number of loader processes.
+        seed: Seed of all random numbers and of the order.
     """
 
-    fresh = False  # whether each epoch draws new training problems
+    fresh = False  # True if each epoch draws new training problems
 
     def __init__(
         self,
@@ -222,7 +232,7 @@ class ProblemDataModule(LightningDataModule):
         self.batch_size = batch_size
         self.eval_batch_size = batch_size if eval_batch_size is None else eval_batch_size
         self.max_cells, self.num_workers, self.seed = max_cells, num_workers, seed
-        self.augmentations: dict[str, Augmentation] = {}  # of the parts, outliers apart; a child sets its own
+        self.augmentations: dict[str, Augmentation] = {}  # by part, without outliers; set by subclasses
         self.datasets: dict[str, ProblemDataset] = {}
 
     @abstractmethod
@@ -230,13 +240,13 @@ class ProblemDataModule(LightningDataModule):
         """Return the problems of train, val or test; None if there are none and the stage does not need them."""
 
     def setup(self, stage: str | None = None) -> None:
-        """Open the problems of a stage: fit, validate, test, predict; None for all.
+        """Open the problems of a stage: fit, validate, test or predict; None for all.
 
         Raises:
-            ValueError: the data are unusable.
+            ValueError: The data are unusable.
         """
         for part in STAGES[stage]:
-            split = "test" if part == "predict" else part  # prediction has the problems of testing
+            split = "test" if part == "predict" else part  # prediction uses the test problems
             seed = (self.seed, PARTS.index(split))
             if (source := self._source(split, seed)) is not None:
                 fresh = self.fresh and part == "train"
@@ -270,7 +280,7 @@ class ProblemDataModule(LightningDataModule):
             max_cells=None if training else self.max_cells,
         )
         if self.trainer is not None and self.trainer.overfit_batches > 0:  # type: ignore[attr-defined]
-            batches: list[Any] = list(sampler)  # the same in every epoch; Lightning takes them in their order
+            batches: list[Any] = list(sampler)  # the same batches in every epoch, in this order
             return DataLoader(Subset(dataset, batches), batch_size=None, num_workers=self.num_workers)
         return ProblemLoader(
             dataset,
@@ -286,7 +296,13 @@ class ProblemDataModule(LightningDataModule):
 def hold_out(count: int, fraction: float, *, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Split range(count) at random into training rows and validation rows, at least one of each, both sorted.
 
-    Raises ValueError for a fraction outside (0, 1) or fewer than two rows.
+    Args:
+        count: Number of rows, at least two.
+        fraction: Fraction of validation rows, in (0, 1).
+        seed: Random seed.
+
+    Raises:
+        ValueError: `fraction` is out of range, or there are fewer than two rows.
     """
     if not 0 < fraction < 1:
         raise ValueError(f"expected `val_fraction` between 0 and 1, got {fraction}")

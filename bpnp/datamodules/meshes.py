@@ -35,18 +35,28 @@ from bpnp.geometry import project, transform
 from bpnp.poses import MIN_POINTS
 from bpnp.types import Batch
 
-POINTS = "points"  # the bulk column of a store of surface samples
-SURFACES = "surfaces"  # the kind of such a store
-MESHES_A_PART = 64  # sampled by a process at a time
-MIN_DEPTH = 0.1  # scene units; nothing nearer to the camera is seen
+POINTS = "points"  # bulk column of a store of surface samples
+SURFACES = "surfaces"  # kind of such a store
+MESHES_A_PART = 64  # meshes sampled in one job
+MIN_DEPTH = 0.1  # least depth of a visible point, scene units
 
 
 @dataclass(frozen=True)
 class RandomCameras:
-    """How cameras are drawn, see `MeshDataModule`: t = (x, y, distance + z), each of x, y, z in +-translation_range.
+    """Distribution of the cameras of `MeshDataModule`.
 
-    The defaults are those of Campbell et al. (ECCV 2020) for ModelNet40. The paper's image has 640 x 480 pixels, but
-    points beyond its border stay, there and here.
+    The translation is t = (x, y, distance + z), each of x, y, z uniform in +-translation_range.
+
+    The defaults are those of Campbell et al. (ECCV 2020) for ModelNet40. As in the paper, points beyond the border of
+    the 640 x 480 image are kept.
+
+    Args:
+        rotation: euler for R = Rz Ry Rx with angles from euler_range, so3 for uniform rotations.
+        euler_range: Smallest and largest Euler angle, degrees.
+        translation_range: Half width of the uniform distribution of each coordinate, scene units.
+        distance: Added to the translation along the optical axis, scene units.
+        focal: Focal length, pixels.
+        noise_px: Standard deviation of the noise of 2D points, pixels.
     """
 
     rotation: Literal["euler", "so3"] = "euler"
@@ -58,14 +68,14 @@ class RandomCameras:
 
     def __post_init__(self) -> None:
         if self.rotation not in ("euler", "so3"):
-            raise ValueError(f"expected `rotation` euler or so3, got {self.rotation!r}")
+            raise ValueError(f"`rotation` is {self.rotation!r}; it is euler or so3")
         check_within(-math.inf, math.inf, euler_range=self.euler_range)
         lengths = {name: getattr(self, name) for name in ("translation_range", "distance", "noise_px", "focal")}
         check_within(0, math.inf, **lengths)
         check_positive(focal=self.focal)
 
     def poses(self, random: Generators) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"]]:
-        """Draw camera = R p + t from each generator; float64."""
+        """Draw a pose camera = R p + t from each generator, float64."""
         numbers = uniform(random, 6)
         if self.rotation == "so3":
             rotation = rotations(random)
@@ -78,12 +88,24 @@ class RandomCameras:
 
 
 class MeshSource:
-    """A `ProblemSource`: problem i is view i // k of mesh rows[i % k] of a store of surface samples, k meshes in all.
+    """Source of problems: problem i is view i // k of mesh rows[i % k] of a store of surface samples, with k meshes.
 
-    Fewer problems than meshes are a random choice of the meshes. A problem draws its points from the first `pool_size`
-    samples of its mesh; it is a function of (seed, epoch, index).
+    Fewer problems than meshes use a random choice of the meshes. A problem draws its points from the first `pool_size`
+    samples of its mesh. It is a function of (seed, epoch, index). A warning is issued if some points may lie behind a
+    camera.
 
-    Warns if cameras may come too near to some points. Raises ValueError for no problems.
+    Args:
+        store: Store of surface samples.
+        rows: Rows of the meshes.
+        count: Number of problems, None for one per mesh.
+        num_points: Number of 3D points of a problem.
+        pool_size: Number of samples of a mesh to draw from.
+        cameras: Distribution of the cameras.
+        seed: Seeds.
+        label: Name of the split, for messages.
+
+    Raises:
+        ValueError: There are no problems.
     """
 
     def __init__(
@@ -103,26 +125,30 @@ class MeshSource:
         self.sees_all = cameras.distance - cameras.translation_range - radius > MIN_DEPTH
         if not self.sees_all:
             warnings.warn(
-                f"the {label} meshes reach {radius:.3g} from their origin: points that fall behind a camera at "
-                f"`distance` {cameras.distance} get no 2D point; try normalisation unit_sphere or a larger distance",
+                f"the {label} meshes extend {radius:.3g} from their origin; points behind a camera at `distance` "
+                f"{cameras.distance} get no 2D point. Use normalisation unit_sphere or a larger distance",
                 stacklevel=2,
             )
         self.count = len(rows) if count is None else count
-        if self.count < len(rows):  # the first meshes would all be of one class
+        if self.count < len(rows):  # a random choice, because the first meshes are all of one class
             rows = np.sort(np.random.default_rng(seed[0]).choice(rows, self.count, replace=False))
         self.store, self.rows, self.num_points, self.pool_size = store, rows, num_points, pool_size
         self.cameras, self.seed = cameras, tuple(seed)
 
     @property
     def counts(self) -> Counts:
+        """Numbers of points of each problem."""
         points = np.full(self.count, self.num_points)
         return Counts(points, points, points)
 
     def batch(self, index: Int[Tensor, " b"], epoch: int) -> Batch:
-        """A random camera's view of `num_points` samples of each mesh, drawn without replacement.
+        """Return random camera views of `num_points` samples of each mesh, drawn without replacement.
 
-        2D points are x/z and y/z plus noise, computed in float64. A point behind the camera, or less than 0.1 in front
-        of it, has no 2D point and -1 in match3d. Raises ValueError that names a problem of which fewer than 4 are left.
+        2D points are x/z and y/z plus noise, computed in float64. A point with a depth below 0.1 has no 2D point and -1
+        in match3d.
+
+        Raises:
+            ValueError: A problem has fewer than 4 points in front of its camera.
         """
         count, size = self.num_points, len(index)
         keys = row_keys(index, *self.seed, epoch)
@@ -132,31 +158,31 @@ class MeshSource:
         points3d = self._draw_points(rows, generators(keys, Purpose.SUBSET))
         rotation, translation = self.cameras.poses(generators(keys, Purpose.POSE))
         camera = transform(rotation, translation, points3d.double())
-        seen = camera[..., 2] > MIN_DEPTH
-        if not self.sees_all and bool((few := seen.sum(-1) < MIN_POINTS).any()):
+        visible = camera[..., 2] > MIN_DEPTH
+        if not self.sees_all and bool((few := visible.sum(-1) < MIN_POINTS).any()):
             first = int(few.nonzero()[0, 0])
             raise ValueError(
-                f"expected at least {MIN_POINTS} points in front of the camera, got {int(seen[first].sum())} in "
+                f"expected at least {MIN_POINTS} points in front of the camera, got {int(visible[first].sum())} in "
                 f"{ids[first]}; try normalisation unit_sphere or a larger `distance`"
             )
         noise = normal(generators(keys, Purpose.NOISE), 2 * count).view(size, count, 2)
         points2d = project(camera) + noise * (self.cameras.noise_px / self.cameras.focal)
         return Batch(
-            points2d=(points2d.where(seen[..., None], 0.0)).float(),
+            points2d=(points2d.where(visible[..., None], 0.0)).float(),
             points3d=points3d,
-            mask2d=seen,
-            mask3d=torch.ones_like(seen),
+            mask2d=visible,
+            mask3d=torch.ones_like(visible),
             focal=torch.full((size,), self.cameras.focal),
             index=index,
             ids=ids,
             rotation=rotation,
             translation=translation,
-            match3d=torch.arange(count).where(seen, -1),
+            match3d=torch.arange(count).where(visible, -1),
             origin=torch.zeros(size, 3, dtype=torch.float64),
         )
 
     def _draw_points(self, rows: Sequence[int], random: Generators) -> Float[Tensor, "b n 3"]:
-        """Draw `num_points` of the first `pool_size` points of each shape; shapes may have different numbers."""
+        """Draw `num_points` of the first `pool_size` points of each shape, whose numbers of points may differ."""
         pools = [self.store.row(row)[POINTS][: self.pool_size] for row in rows]
         points = torch.empty((len(rows), self.num_points, 3), dtype=torch.float32)
         sizes = np.array([len(pool) for pool in pools])
@@ -175,32 +201,33 @@ class MeshDataModule(ProblemDataModule):
     loaders.
 
     Args:
-        root: folder that `bpnp prepare modelnet40` made, or folder of meshes or point clouds in ModelNet40's layout,
+        root: Folder that `bpnp prepare modelnet40` made, or folder of meshes or point clouds in ModelNet40's layout,
             <class>/{train,test}/*.{glb,obj,off,ply,stl,npy,txt,xyz}, or ModelNet40's HDF5 or `normal_resampled`
             archive, unpacked; none for procedural shapes.
-        train_problems: training problems; problem i shows training mesh i modulo their number.
-        fresh_views: draw new cameras, points and noise every epoch; false for the fixed problems of the paper.
-        val_fraction: share of the training meshes that is held out for validation.
-        val_problems: validation problems, fixed; none for one per held-out mesh.
-        test_problems: test problems, fixed; none for one per test mesh. Fewer are a random choice of meshes, more are
-            further views.
-        num_points: 3D points of a problem.
-        pool_size: surface samples kept of each mesh, at least num_points; every problem draws its own num_points of
-            them (pool_size equal to num_points: all problems of a mesh have the same points, as in the paper). A point
-            cloud with fewer points is used whole.
-        normalisation: of each mesh. unit_sphere: mean of its surface samples at the origin, farthest at distance 1;
+        train_problems: Number of training problems; problem i shows training mesh i modulo the number of meshes.
+        fresh_views: Draw new cameras, points and noise every epoch; false for the fixed problems of the paper.
+        val_fraction: Fraction of the training meshes held out for validation.
+        val_problems: Number of validation problems, fixed; none for one per held-out mesh.
+        test_problems: Number of test problems, fixed; none for one per test mesh. Fewer use a random choice of meshes,
+            more are further views.
+        num_points: Number of 3D points of a problem.
+        pool_size: Number of surface samples kept of each mesh, at least num_points. Every problem draws its own
+            num_points of them. With pool_size equal to num_points all problems of a mesh have the same points, as in
+            the paper. A point cloud with fewer points is used whole.
+        normalisation: Frame of each mesh. unit_sphere: mean of its surface samples at the origin, farthest at distance
+            1;
             unit_cube: bounding box centred, longest side 1; none: units of the file.
         rotation: euler for R = Rz Ry Rx with angles from euler_range, so3 for uniform rotations.
-        euler_range: lowest and highest Euler angle, degrees.
-        translation_range: each coordinate of the translation is uniform within plus and minus this, scene units.
-        distance: added to the translation along the optical axis, scene units.
-        focal: focal length, pixels.
-        noise_px: standard deviation of the noise on 2D points, pixels.
-        train_shapes: procedural training shapes; like val_shapes and test_shapes only used without root.
-        val_shapes: procedural validation shapes; with root val_fraction counts.
-        test_shapes: procedural test shapes.
-        cache_dir: where the surface samples are kept; none for BPNP_CACHE, else the user's cache folder.
-        loading: options of `ProblemDataModule`: batch_size, eval_batch_size, train_outliers, test_outliers, seed, ...
+        euler_range: Smallest and largest Euler angle, degrees.
+        translation_range: Half width of the uniform distribution of each coordinate of the translation, scene units.
+        distance: Added to the translation along the optical axis, scene units.
+        focal: Focal length, pixels.
+        noise_px: Standard deviation of the noise of 2D points, pixels.
+        train_shapes: Number of procedural training shapes; used without root only, as are val_shapes and test_shapes.
+        val_shapes: Number of procedural validation shapes; with root, val_fraction is used.
+        test_shapes: Number of procedural test shapes.
+        cache_dir: Folder for the surface samples; none for BPNP_CACHE, else the user's cache folder.
+        loading: Options of `ProblemDataModule`: batch_size, eval_batch_size, train_outliers, test_outliers, seed, ...
     """
 
     def __init__(
@@ -242,7 +269,7 @@ class MeshDataModule(ProblemDataModule):
         self.fresh, self.val_fraction = fresh_views, val_fraction
 
     def prepare_data(self) -> None:
-        """Build the caches in one process, for `setup` to open in all."""
+        """Build the caches in one process, before `setup` opens them in all."""
         state = None if self.trainer is None else self.trainer.state.fn
         for part in STAGES[state]:
             self._store(part)
@@ -261,17 +288,19 @@ class MeshDataModule(ProblemDataModule):
         )
 
     def _rows(self, store: Store, split: str, root: Path) -> NDArray[np.int64]:
-        """Return the shapes of a split. StoreError if there are none, or one has too few points."""
+        """Return the rows of the shapes of a split.
+
+        Raises:
+            StoreError: There are none, or one has too few points.
+        """
         folder = "test" if split == "test" else "train"
         rows = np.array([row for row in range(len(store)) if store.name(row).split("/")[-2] == folder])
         if not len(rows):
-            raise StoreError(
-                f"expected meshes <class>/{{train,test}}/* in {root}, got none for {folder!r}; try another `root`"
-            )
+            raise StoreError(f"{root} has no meshes <class>/{folder}/*; give another `root`")
         if self.pool_size > (most := int(store.parameters["points"])):
             raise StoreError(
-                f"expected `pool_size` of at most {most}, the samples in {store.folder}, got {self.pool_size}; try "
-                f"that, or preparing again with --points {self.pool_size}"
+                f"`pool_size` is {self.pool_size}, but {store.folder} has {most} samples of each mesh; use that, or "
+                f"prepare it again with --points {self.pool_size}"
             )
         fewest = int(rows[store.counts(POINTS)[rows].argmin()])
         if self.num_points > (count := int(store.counts(POINTS)[fewest])):
@@ -285,7 +314,7 @@ class MeshDataModule(ProblemDataModule):
         return rows[training if split == "train" else held_out]
 
     def _store(self, part: str) -> Store:
-        """The surface samples of a part, opened once, and made now if they are not there."""
+        """Return the surface samples of a part, opened once, and made if they do not exist."""
         split = "all" if self.root is not None else "test" if part == "predict" else part
         if split not in self._stores:
             self._stores[split] = self._open_store(split)
@@ -301,8 +330,8 @@ class MeshDataModule(ProblemDataModule):
             store = open_store(self.root, SURFACES)
             if (stored := store.parameters["normalisation"]) != self.normalisation:
                 raise StoreError(
-                    f"expected meshes of `normalisation` {self.normalisation}, got {stored} in {self.root}; try "
-                    f"{stored}, or preparing again with --normalisation {self.normalisation}"
+                    f"`normalisation` is {self.normalisation}, but {self.root} was made with {stored}; use that, or "
+                    f"prepare it again with --normalisation {self.normalisation}"
                 )
             return store
         recipe = surfaces_recipe(shapes, points=self.pool_size, normalisation=self.normalisation, label=label)
@@ -310,7 +339,14 @@ class MeshDataModule(ProblemDataModule):
 
 
 def surfaces_recipe(shapes: Shapes, *, points: int, normalisation: Normalisation, label: str) -> Recipe:
-    """How the store of `points` surface samples of each shape is made. label: what the shapes are, for messages."""
+    """Return the recipe of a store of surface samples.
+
+    Args:
+        shapes: Shapes.
+        points: Number of samples of each shape.
+        normalisation: Frame of each shape.
+        label: Name of the shapes, for messages.
+    """
     samplers = list(shapes.samplers.items())
     starts = range(0, len(samplers), MESHES_A_PART)
     return Recipe(

@@ -1,4 +1,4 @@
-"""A problem, one set of image points and one of scene points, as a source gives it; and how problems become a batch."""
+"""Problem, one set of image points and one of scene points; sources of problems; and how problems become a batch."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,12 +16,21 @@ from bpnp.types import Batch
 
 @dataclass(frozen=True)
 class Problem:
-    """One image's points and the scene's points; see `bpnp.types` for the conventions.
+    """Image points and scene points of one problem; see `bpnp.types` for the conventions.
 
-    points2d (m, 2) normalised, points3d (n, 3), rotation (3, 3), translation (3,), focal pixels per unit of normalised
-    coordinates. The first `matched` points of both sides are the matches, in the same order; the others have no
-    partner. origin (3,): what was subtracted from the scene's coordinates, for scenes so far from theirs that float32
-    would lose digits; None for nothing.
+    The first `matched` points of both sides are the matches, in the same order. The other points have no
+    correspondence.
+
+    Attributes:
+        name: Name.
+        points2d: Normalised image coordinates (m, 2).
+        points3d: Scene points (n, 3).
+        matched: Number of matches.
+        rotation: R (3, 3).
+        translation: t (3,).
+        focal: Pixels per unit of normalised coordinates.
+        origin: Vector that was subtracted from the scene's coordinates (3,), for coordinates so large that float32
+            would lose digits. Default: none.
     """
 
     name: str
@@ -45,10 +54,21 @@ class Problem:
         focal: float,
         origin: NDArray[np.float64] | None = None,
     ) -> "Problem":
-        """The problem of two sets in any order; match3d (n,) is the 2D point of each 3D point, -1 for none.
+        """Make a problem from two point sets in any order.
 
-        Raises ValueError that names the problem: shapes that do not fit, NaN or infinity, or a match3d that holds no
-        integers, an index that is no 2D point, or one 2D point twice.
+        Args:
+            name: Name.
+            points2d: Normalised image coordinates (m, 2).
+            points3d: Scene points (n, 3).
+            rotation: R (3, 3).
+            translation: t (3,).
+            match3d: Index of the 2D point of each 3D point (n,), -1 for none.
+            focal: Pixels per unit of normalised coordinates.
+            origin: Vector that was subtracted from the scene's coordinates (3,). Default: none.
+
+        Raises:
+            ValueError: Shapes do not fit, a value is NaN or infinite, or `match3d` holds no integers, an index that is
+                no 2D point, or one 2D point twice.
         """
         which = repr(name)
         set2d = check_points("points2d", which, as_tensor("points2d", points2d), 2).numpy()
@@ -56,11 +76,11 @@ class Problem:
         match = check_match3d(which, as_tensor("match3d", match3d), len(set2d), len(set3d)).numpy()
         origins = () if origin is None else (origin,)
         if not all(np.isfinite(values).all() for values in (rotation, translation, focal, *origins)):
-            raise ValueError(f"expected a finite pose, focal and origin, got NaN or infinity in problem {which}")
+            raise ValueError(f"the pose, focal length or origin of problem {which} holds NaN or infinity")
         matched3d = np.flatnonzero(match >= 0)
         matched2d = match[matched3d]
         if len(np.unique(matched2d)) < len(matched2d):
-            raise ValueError(f"expected at most one 3D point for each 2D point, got two in `match3d` of {which}")
+            raise ValueError(f"`match3d` of {which} assigns one 2D point to two 3D points")
         return cls(
             name,
             set2d[np.concatenate([matched2d, np.setdiff1d(np.arange(len(set2d)), matched2d)])].astype(np.float32),
@@ -74,7 +94,13 @@ class Problem:
 
 
 class Counts(NamedTuple):
-    """Matches, 2D points and 3D points of each problem of a source (k,)."""
+    """Numbers of points of the problems of a source.
+
+    Attributes:
+        matched: Matches (k,).
+        points2d: 2D points (k,).
+        points3d: 3D points (k,).
+    """
 
     matched: NDArray[np.int64]
     points2d: NDArray[np.int64]
@@ -83,26 +109,30 @@ class Counts(NamedTuple):
 
 @runtime_checkable
 class ProblemSource(Protocol):
-    """An indexed set of problems, before their augmentation."""
+    """Indexed set of problems, before augmentation."""
 
     @property
     def counts(self) -> Counts:
-        """Points of each problem."""
+        """Numbers of points of each problem."""
 
     def batch(self, index: Int[Tensor, " b"], epoch: int) -> Batch:
-        """Problems as `stack_problems` makes them: each a function of its index, the epoch and the source's seed."""
+        """Return problems from `stack_problems`, each a function of its index, the epoch and the seed of the source."""
 
 
 def stack_problems(problems: Sequence[Problem], index: Int[Tensor, " b"]) -> Batch:
-    """Pad and mask problems: 3D point j of the batch was seen as 2D point j, or (match3d -1) not at all.
+    """Pad and mask problems. 3D point j of the batch corresponds to 2D point j, or to none (match3d -1).
 
     Points are float32, poses float64.
+
+    Args:
+        problems: Problems.
+        index: Their `Batch.index` (b,).
     """
-    places = [np.arange(len(problem.points3d)) for problem in problems]
+    indices = [np.arange(len(problem.points3d)) for problem in problems]
     batch = Batch.from_arrays(
         [problem.points2d for problem in problems],
         [problem.points3d for problem in problems],
-        match3d=[np.where(j < problem.matched, j, -1) for j, problem in zip(places, problems, strict=True)],
+        match3d=[np.where(j < problem.matched, j, -1) for j, problem in zip(indices, problems, strict=True)],
         focal=[problem.focal for problem in problems],
         index=index.tolist(),
         ids=[problem.name for problem in problems],

@@ -1,4 +1,4 @@
-"""Triangle meshes, read from files or drawn; uniform samples of their surface; and collections of shapes to sample."""
+"""Triangle meshes, from files or drawn; uniform samples of their surface; and collections of shapes to sample."""
 
 import io
 import math
@@ -22,33 +22,41 @@ from bpnp.geometry import random_rotations
 
 SUFFIXES = (".glb", ".obj", ".off", ".ply", ".stl")
 Normalisation = Literal["unit_sphere", "unit_cube", "none"]
-VERSION = 1  # of procedural shapes, raised whenever the same seed makes another one
+VERSION = 1  # version of procedural shapes, raised whenever the same seed makes another one
 PARTS = ("train", "val", "test")
 Sampler = Callable[[int], NDArray[np.float64]]
 
 
 class MeshError(ValueError):
-    """A file that is no usable mesh. The message names the file."""
+    """File that is no usable mesh. The message names the file."""
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles: vertices (v, 3) and the vertex indices (f, 3) of the faces. MeshError if they are no surface."""
+    """Triangle mesh.
+
+    Attributes:
+        vertices: Vertices (v, 3).
+        faces: Vertex indices of the triangles (f, 3).
+
+    Raises:
+        MeshError: The triangles are no surface.
+    """
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
 
     def __post_init__(self) -> None:
         if len(self.faces) == 0:
-            raise MeshError("expected a mesh with faces, got none")
+            raise MeshError("the mesh has no faces")
         if not np.isfinite(self.vertices).all():
-            raise MeshError("expected finite vertices, got NaN or infinity")
+            raise MeshError("a vertex is NaN or infinite")
         if self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
             used = f"{self.faces.min()} to {self.faces.max()}"
-            raise MeshError(f"expected faces of the vertices 0 to {len(self.vertices) - 1}, got {used}")
+            raise MeshError(f"the faces use the vertices {used}, but there are only {len(self.vertices)}")
         area = self.areas.sum()
         if not 0 < area < np.inf:
-            raise MeshError(f"expected a surface of positive area, got {area}")
+            raise MeshError(f"the surface needs a positive area; it has {area}")
 
     @property
     def areas(self) -> NDArray[np.float64]:
@@ -58,10 +66,16 @@ class Mesh:
 
 
 def read_mesh(path: Path) -> Mesh:
-    """Read an .off, .ply, .obj, .stl or .glb file; the parts of a scene become one mesh. Polygons become fans.
+    """Read an .off, .ply, .obj, .stl or .glb file.
 
-    Raises MeshError that names the file: truncated, foreign or empty file, no faces, no area, NaN, a face of missing
-    vertices.
+    The parts of a scene become one mesh; polygons become fans of triangles.
+
+    Args:
+        path: File.
+
+    Raises:
+        MeshError: The file is truncated, foreign or empty, or the mesh has no faces, no area, NaN, or a face of missing
+            vertices.
     """
     with _open_mesh(path) as (content, suffix):
         if suffix == ".off":
@@ -75,7 +89,7 @@ def read_mesh(path: Path) -> Mesh:
 
 @contextmanager
 def _open_mesh(path: Path) -> Iterator[tuple[bytes, str]]:
-    """The bytes and the suffix of a file, which a MeshError of the block names."""
+    """Yield the bytes and the suffix of a file; a MeshError of the block gets its name."""
     try:
         yield path.read_bytes(), path.suffix.lower()
     except MeshError as error:
@@ -83,28 +97,27 @@ def _open_mesh(path: Path) -> Iterator[tuple[bytes, str]]:
 
 
 def read_vertices(path: Path) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
-    """Read the points of a cloud, or the different vertices of a mesh.
+    """Read the points of a cloud in the order of the file, or the distinct vertices of a mesh.
 
     Args:
-        path: A file of `read_mesh`.
+        path: File as for `read_mesh`.
 
     Returns:
-        Points (v, 3), those of a cloud in the order of the file; and the other numbers that a .ply without faces has
-        for each of them, (v,) by the name of the property, such as nx.
+        The points (v, 3), and the properties of the points of a .ply cloud (v,) by name, empty for other files.
 
     Raises:
-        MeshError: The file is truncated, foreign or empty. The message names it.
+        MeshError: The file is truncated, foreign or empty.
     """
     with _open_mesh(path) as (content, suffix):
         mesh = _parse_off(content) if suffix == ".off" else _load(content, suffix)
         vertices = np.asarray(mesh.vertices, np.float64)
         if len(vertices):
             return vertices[np.sort(np.unique(vertices, axis=0, return_index=True)[1])], {}
-        cloud = _load(content, suffix, force=None)  # as a mesh, a cloud of points is empty
+        cloud = _load(content, suffix, force=None)  # trimesh reads a point cloud as an empty mesh
         vertices = np.asarray(getattr(cloud, "vertices", ()), np.float64).reshape(-1, 3)
         declared = re.search(rb"^element vertex (\d+)", content, re.MULTILINE)
         expected = 1 if declared is None else int(declared[1])
-        if len(vertices) < expected:  # trimesh takes a text file that ends early for one with fewer points
+        if len(vertices) < expected:  # trimesh reads a truncated text file without an error
             raise MeshError(f"expected {expected} points, got {len(vertices)}")
         raw = getattr(cloud, "metadata", {}).get("_ply_raw", {}).get("vertex")
         if raw is None:
@@ -114,9 +127,9 @@ def read_vertices(path: Path) -> tuple[NDArray[np.float64], dict[str, NDArray[np
 
 
 def _parse_off(content: bytes) -> Mesh:
-    """The counts may stand on the header line (``OFF490 518 0``), as in many files of ModelNet40.
+    """Parse an OFF file. The counts may stand on the header line (``OFF490 518 0``), as in many files of ModelNet40.
 
-    trimesh reads OFF too, but five times slower, and takes a file that ends early for one with fewer faces.
+    trimesh reads OFF too, but takes five times longer and reads a truncated file without an error.
     """
     text = content.decode("utf-8-sig", errors="replace")
     lines = [stripped for line in text.splitlines() if (stripped := line.partition("#")[0].strip())]
@@ -136,42 +149,50 @@ def _parse_off(content: bytes) -> Mesh:
         vertices = np.loadtxt(body[:num_vertices], usecols=(0, 1, 2), ndmin=2) if num_vertices else np.empty((0, 3))
         faces = _triangles(body[num_vertices : num_vertices + num_faces])
     except (ValueError, IndexError) as error:
-        raise MeshError(f"expected vertices and faces as numbers, got something else ({error})") from error
+        raise MeshError(f"vertices and faces are not numbers ({error})") from error
     return Mesh(vertices, faces)
 
 
 def _triangles(rows: Sequence[str]) -> NDArray[np.int64]:
-    """Fans of the polygons in rows ``k i_1 ... i_k [colour]``; points and edges (k < 3) have no surface."""
+    """Split the polygons in rows ``k i_1 ... i_k [colour]`` into fans; points and edges (k < 3) have no surface."""
     corners = np.array([int(row.split(None, 1)[0]) for row in rows])
     fans = [np.empty((0, 3), np.int64)]
     for count in np.unique(corners[corners >= 3]):
         same = [row for row, k in zip(rows, corners, strict=True) if k == count]
         polygons = np.loadtxt(same, usecols=range(1, count + 1), dtype=np.int64, ndmin=2)
-        middle, last = polygons[:, 1:-1], polygons[:, 2:]
-        fans.append(np.stack([np.broadcast_to(polygons[:, :1], middle.shape), middle, last], -1).reshape(-1, 3))
+        second, third = polygons[:, 1:-1], polygons[:, 2:]
+        fans.append(np.stack([np.broadcast_to(polygons[:, :1], second.shape), second, third], -1).reshape(-1, 3))
     return np.concatenate(fans)
 
 
 def _load(content: bytes, suffix: str, *, force: Literal["mesh"] | None = "mesh") -> Any:
-    """trimesh's mesh, or what it makes of the file."""
+    """Return trimesh's mesh, or whatever else trimesh makes of the file."""
     if not content:
-        raise MeshError("expected a mesh, got an empty file")
+        raise MeshError("the file is empty")
     try:
-        # force: one mesh of all parts, each where the scene puts it; process: no search for equal vertices
+        # force: merge all parts, each at its position in the scene; process: do not merge equal vertices
         file = io.BytesIO(content)
         return trimesh.load(file, file_type=suffix[1:], force=force, process=False, skip_materials=True)
     except Exception as error:
-        raise MeshError(f"expected a {suffix} mesh, got a file that trimesh cannot read ({error})") from error
+        raise MeshError(f"trimesh cannot read it as a {suffix} mesh ({error})") from error
 
 
 def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """`count` points (count, 3) drawn uniformly by area from the triangles of a mesh.
+    """Draw points uniformly by area from the triangles of a mesh.
 
     A triangle is drawn with probability proportional to its area, a point in it as a + u (b - a) + v (c - a) with
     (u, v) uniform in the unit square, folded over its diagonal.
+
+    Args:
+        mesh: Mesh.
+        count: Number of points.
+        rng: Random generator.
+
+    Returns:
+        Points (count, 3).
     """
     cumulative = mesh.areas.cumsum()
-    # side="right": a triangle without area is never drawn
+    # side="right" never draws a triangle without area
     face = np.searchsorted(cumulative, rng.random(count) * cumulative[-1], side="right")
     a, b, c = (mesh.vertices[mesh.faces[face, i]] for i in range(3))
     u, v = rng.random((2, count, 1))
@@ -181,10 +202,12 @@ def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> NDArray[
 
 
 def normalise(points: NDArray[np.float64], mode: Normalisation) -> NDArray[np.float64]:
-    """Put the surface samples (k, 3) of a mesh into a frame that does not depend on its units.
+    """Transform the surface samples of a mesh to a frame that does not depend on its units.
 
-    unit_sphere: their mean at the origin, the farthest at distance 1. unit_cube: their bounding box centred, its
-    longest side 1. none: as in the file.
+    Args:
+        points: Samples (k, 3).
+        mode: unit_sphere: mean at the origin, farthest sample at distance 1. unit_cube: bounding box centred, longest
+            side 1. none: unchanged.
     """
     if mode == "none":
         return points
@@ -194,7 +217,7 @@ def normalise(points: NDArray[np.float64], mode: Normalisation) -> NDArray[np.fl
     if mode == "unit_cube":
         low, high = points.min(0), points.max(0)
         return (points - (low + high) / 2) / (high - low).max()
-    raise ValueError(f"expected `normalisation` unit_sphere, unit_cube or none, got {mode!r}")
+    raise ValueError(f"`normalisation` is {mode!r}; it is one of unit_sphere, unit_cube, none")
 
 
 @dataclass(frozen=True)
@@ -202,10 +225,10 @@ class Shapes:
     """Shapes to sample.
 
     Attributes:
-        samplers: by the name of each shape, a function from a number to so many points (k, 3) of its surface; fewer if
-            the shape is a point cloud of fewer points. The points depend on the shape and its name only. It raises
+        samplers: By the name of each shape, a function from a number to that many points (k, 3) of its surface; fewer
+            if the shape is a point cloud of fewer points. The points depend only on the shape and its name. It raises
             MeshError for a file that cannot be used.
-        identity: fingerprint that changes with any shape.
+        identity: Fingerprint that changes with any shape.
     """
 
     samplers: Mapping[str, Sampler]
@@ -213,9 +236,14 @@ class Shapes:
 
 
 def procedural_shapes(split: str, count: int, *, seed: int) -> Shapes:
-    """The shapes of a split: train, val or test. No shape belongs to two splits or two seeds.
+    """Return the shapes of a split.
 
-    Shape i does not depend on their number. Raises ValueError for none.
+    No shape belongs to two splits or two seeds, and shape i does not depend on `count`.
+
+    Args:
+        split: train, val or test.
+        count: Number of shapes, at least 1.
+        seed: Random seed.
     """
     check_within(1, math.inf, **{f"{split}_shapes": count})
     samplers = {
@@ -230,9 +258,9 @@ def _procedural_samples(seed: tuple[int, ...], count: int) -> NDArray[np.float64
 
 
 def procedural_shape(rng: np.random.Generator) -> Mesh:
-    """2 to 6 primitives, each stretched, tapered, turned and centred on the surface of an earlier one.
+    """Draw a shape of 2 to 6 primitives, each stretched, tapered, rotated and centred on the surface of an earlier one.
 
-    Nothing is mirrored or repeated, so that a shape has one pose only, up to chance.
+    Nothing is mirrored or repeated, so that a shape has only one pose, up to chance.
     """
     parts = [_part(rng, 1.0)]
     for _ in range(rng.integers(1, 6)):
@@ -256,7 +284,7 @@ def _part(rng: np.random.Generator, size: float) -> Mesh:
 
 @cache
 def primitives() -> tuple[Mesh, ...]:
-    """Solids of about unit radius: box, wedge, cylinder, cone, capsule, two tori, ball, tube, vase."""
+    """Return solids of about unit radius: box, wedge, cylinder, cone, capsule, two tori, ball, tube, vase."""
     create = trimesh.creation
     profile = np.array([[0.0, -1.0], [0.7, -1.0], [0.3, -0.2], [0.9, 0.5], [0.5, 1.0], [0.0, 1.0]])
     solids = [
@@ -277,7 +305,7 @@ def primitives() -> tuple[Mesh, ...]:
 def shape_files(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> dict[str, Path]:
     """Find <class>/{train,test}/<stem><suffix> in a folder, by ``<class>/<split>/<stem>``, training shapes first.
 
-    Files of one folder and one stem are named with their suffix.
+    Files of one folder with the same stem are named with their suffix.
     """
     named: dict[str, list[Path]] = defaultdict(list)
     for path in sorted(folder.glob("*/[!.]*/[!.]*")):
@@ -290,12 +318,12 @@ def shape_files(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> dict[str, P
 
 
 def training_meshes_first(name: str) -> tuple[bool, str]:
-    """Sort key of the name of a shape."""
+    """Return the sort key of the name of a shape: training shapes first."""
     return "/test/" in name, name
 
 
 def mesh_shapes(files: Mapping[str, Path]) -> dict[str, Sampler]:
-    """Return the sampler of each mesh file, by its name; the samples depend on the mesh and the name only."""
+    """Return the sampler of each mesh file, by its name; the samples depend only on the mesh and the name."""
     return {name: partial(_mesh_samples, name, path) for name, path in files.items()}
 
 

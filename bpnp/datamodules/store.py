@@ -1,8 +1,8 @@
-"""The data store: a folder of memory-mapped .npy columns and a manifest; recipes that make one from a data set.
+"""Data store: a folder of memory-mapped .npy columns and a manifest; and recipes that make one from a data set.
 
 A row is one problem or one mesh. Its points are in the bulk columns, row after row; `<bulk>_start.npy` has the first
-index of each row. Every other column has one entry a row. A store is written whole or not at all, and every file is
-compared with the checksum in the manifest when the store is opened.
+index of each row. Every other column has one entry a row. A store is written atomically, and every file is compared
+with its checksum in the manifest when the store is opened.
 """
 
 import json
@@ -27,33 +27,33 @@ from torch.utils.data import DataLoader, Dataset
 from bpnp.files import cache_folder, delay_interrupts, fingerprint, lock_folder, write_atomically
 
 MANIFEST = "manifest.json"
-FORMAT = 4  # raised whenever a column changes its meaning
+FORMAT = 4  # raised whenever the meaning of a column changes
 BULK = np.dtype("<f4")
-Row = tuple[str, Mapping[str, NDArray[Any]], Mapping[str, Any]]  # name, points by bulk column, entries of the others
-Made = tuple[list[Row], dict[str, str]]  # rows, and by name what was left out and why
+Row = tuple[str, Mapping[str, NDArray[Any]], Mapping[str, Any]]  # name, points by bulk column, other entries by column
+Made = tuple[list[Row], dict[str, str]]  # rows, and the reason for each item left out, by its name
 
 
 class StoreError(ValueError):
-    """Unusable store, or a store that cannot be made; the message names its folder."""
+    """Store that cannot be used or made. The message names its folder."""
 
 
 def is_store(folder: str | Path) -> bool:
-    """Return whether a folder has the manifest of a store."""
+    """Return True if a folder has the manifest of a store."""
     return (Path(folder) / MANIFEST).is_file()
 
 
 @dataclass(frozen=True)
 class Store:
-    """An open store, as `open_store` returns it.
+    """Open store, from `open_store`.
 
-    Args:
-        folder: of the files.
-        kind: of the rows.
-        bulk: columns of points (total, width), float32.
-        starts: first index of each row of a bulk column, and its length, (k + 1,).
-        columns: those with one entry a row.
-        parameters: with which the store was made.
-        skipped: reason for each item that is not in the store.
+    Attributes:
+        folder: Folder of the files.
+        kind: Kind of the rows.
+        bulk: Columns of points (total, width), float32.
+        starts: First index of each row of a bulk column, and its length, (k + 1,).
+        columns: Columns with one entry a row.
+        parameters: Parameters that the store was made with.
+        skipped: Reason for each item that is not in the store.
     """
 
     folder: Path
@@ -68,33 +68,38 @@ class Store:
         return len(self.columns["name"])
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _map_file, (self.folder, self.kind)  # another process maps the files itself
+        return _map_file, (self.folder, self.kind)  # unpickled in another process by mapping the files there
 
     def counts(self, bulk: str) -> NDArray[np.int64]:
         """Return the number of points of each row (k,) in a bulk column."""
         return np.diff(self.starts[bulk])
 
     def name(self, row: int) -> str:
+        """Return the name of a row."""
         return bytes(self.columns["name"][row]).decode()
 
     def row(self, row: int) -> dict[str, NDArray[np.float32]]:
-        """Return the points of a row, views of the mapped files."""
+        """Return the points of a row by bulk column, as views of the mapped files."""
         return {name: self.bulk[name][start[row] : start[row + 1]] for name, start in self.starts.items()}
 
 
 def open_store(folder: str | Path, kind: str) -> Store:
     """Open a store, and read it once to compare it with its checksums.
 
+    Args:
+        folder: Folder of the store.
+        kind: Required kind of its rows.
+
     Raises:
-        StoreError: there is no manifest, the kind or the format is another one, or a file is missing or changed. The
-            message names the folder or the file.
+        StoreError: There is no manifest, the kind or the format differs, or a file is missing or changed. The message
+            names the folder or the file.
     """
     path = Path(folder)
     for name, (size, checksum) in _manifest(path, kind)["files"].items():
         file = path / name
         if not file.is_file() or file.stat().st_size != size:
-            got = f"{file.stat().st_size} bytes" if file.is_file() else "no such file"
-            raise StoreError(f"expected {file} of {size} bytes, got {got}; try copying or preparing again")
+            problem = f"has {file.stat().st_size} bytes instead of {size}" if file.is_file() else "is missing"
+            raise StoreError(f"{file} {problem}; copy or prepare the store again")
         if _checksum(file) != checksum:
             raise StoreError(f"{file} has changed since it was written; copy or prepare it again")
     return _map_file(path, kind)
@@ -112,20 +117,20 @@ def _manifest(folder: Path, kind: str) -> dict[str, Any]:
     """Read the manifest of a store.
 
     Raises:
-        StoreError: it is missing, cut or edited, of another kind or format, or names other files than the columns.
+        StoreError: It is missing, truncated, edited, of another kind or format, or names files other than the columns.
     """
     try:
         manifest = dict(json.loads((folder / MANIFEST).read_text(encoding="utf-8")))
         whole = manifest.pop("checksum") == fingerprint(manifest)
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise StoreError(f"expected a folder made by `bpnp prepare`, got {folder} ({error})") from error
+        raise StoreError(f"{folder} is no store made by `bpnp prepare` ({error})") from error
     if (manifest.get("format"), manifest.get("kind")) != (FORMAT, kind):
         raise StoreError(
-            f"expected {kind} in format {FORMAT}, got {manifest.get('kind')} in format {manifest.get('format')} in "
-            f"{folder}; try the other data module, or preparing again with this version"
+            f"{folder} holds {manifest.get('kind')} in format {manifest.get('format')}, not {kind} in format {FORMAT}; "
+            "use the other data module, or prepare it again with this version"
         )
     if not whole:
-        raise StoreError(f"expected an unchanged {folder / MANIFEST}, got an edited or cut one; try preparing again")
+        raise StoreError(f"{folder / MANIFEST} was edited or truncated; prepare the store again")
     columns = {f"{name}.npy" for name in (*manifest["bulk"], *(f"{name}_start" for name in manifest["bulk"]))}
     columns |= {f"{name}.npy" for name in manifest["columns"]}
     if columns != manifest["files"].keys() or any(Path(name).name != name for name in columns):
@@ -141,11 +146,11 @@ def _checksum(file: Path) -> int:
 
 
 class StoreWriter:
-    """Append rows to the columns of a new store; `new_store` makes one.
+    """Writer that appends rows to the columns of a new store; made by `new_store`.
 
     Attributes:
         parameters: JSON content for the manifest.
-        skipped: reason for each item that is left out.
+        skipped: Reason for each item that is left out.
     """
 
     def __init__(self, files: Mapping[str, BinaryIO], widths: Mapping[str, int]) -> None:
@@ -160,7 +165,13 @@ class StoreWriter:
         return len(self._columns["name"])
 
     def add(self, name: str, points: Mapping[str, NDArray[Any]], columns: Mapping[str, Any]) -> None:
-        """Append one row: its points by bulk column, and its entries of the other columns."""
+        """Append one row.
+
+        Args:
+            name: Name of the row.
+            points: Points by bulk column.
+            columns: Entries of the other columns.
+        """
         for key in self._widths:
             part = np.ascontiguousarray(points[key], BULK)
             self._files[key].write(part.data)
@@ -176,7 +187,7 @@ class StoreWriter:
             file.flush()
         for key, values in self._columns.items():
             column = np.array(values) if values else np.empty(0, "S1")
-            with (folder / f"{key}.npy").open("wb") as file:  # np.save hides the reason why a write fails
+            with (folder / f"{key}.npy").open("wb") as file:  # np.save hides why a write failed
                 _write_header(file, column.dtype, column.shape)
                 file.write(column.data)
         files = {path.name: [path.stat().st_size, _checksum(path)] for path in sorted(folder.glob("*.npy"))}
@@ -189,19 +200,21 @@ class StoreWriter:
 
 @contextmanager
 def new_store(folder: Path, kind: str, widths: Mapping[str, int]) -> Iterator[StoreWriter]:
-    """Give a writer of a new folder, which appears, complete, when the block ends without an error.
+    """Yield a writer of a new folder, which appears, complete, when the block ends without an error.
+
+    Points are written at once; memory holds the other columns.
 
     Args:
-        folder: of the store.
-        kind: of its rows.
-        widths: coordinates of a point in each bulk column. Points are written at once; memory holds the other columns.
+        folder: Folder of the store.
+        kind: Kind of its rows.
+        widths: Number of coordinates of a point in each bulk column.
 
     Raises:
-        StoreError: the folder exists.
-        OSError: the disk is full; the message names the folder.
+        StoreError: The folder exists.
+        OSError: The disk is full; the message names the folder.
     """
     if folder.exists():
-        raise StoreError(f"expected a new folder to write to, got {folder}, which exists; try another or remove it")
+        raise StoreError(f"{folder} exists; remove it, or give a new folder")
     with write_atomically(folder) as temporary:
         temporary.mkdir()
         with ExitStack() as stack:
@@ -218,16 +231,16 @@ def _write_header(file: BinaryIO, dtype: np.dtype[Any], shape: tuple[int, ...]) 
 
 @dataclass(frozen=True)
 class Recipe(Dataset[Made]):
-    """The jobs that make a store; `work(*job)` returns rows.
+    """Jobs that make a store; `work(*job)` returns rows.
 
-    Args:
-        kind: as in `new_store`.
-        widths: as in `new_store`.
-        parameters: saved in the store; other parameters make another store.
-        jobs: arguments of `work`; picklable for several processes.
-        work: picklable for several processes.
-        what: an item, for messages.
-        source: of the items, for messages.
+    Attributes:
+        kind: As in `new_store`.
+        widths: As in `new_store`.
+        parameters: Saved in the store; other parameters make another store.
+        jobs: Arguments of `work`; picklable for several processes.
+        work: Function that does a job; picklable for several processes.
+        what: Name of an item, for messages.
+        source: Source of the items, for messages.
     """
 
     kind: str
@@ -246,24 +259,24 @@ class Recipe(Dataset[Made]):
 
 
 def prepare(recipe: Recipe, output: Path, *, processes: int = 1, wait_for_others: bool = False) -> Store:
-    """Open the store `output`, or make it; a run that is stopped leaves nothing.
+    """Open the store `output`, or make it; an interrupted run leaves no store.
 
     The store is made in the folder `.<output>.unfinished` of the same parent, which only this function writes to. Files
     that a killed process has left there are removed.
 
     Args:
-        recipe: how the store is made.
-        output: folder of the store.
-        processes: that read the source.
-        wait_for_others: whether to wait for another process that is making the store.
+        recipe: Recipe of the store.
+        output: Folder of the store.
+        processes: Number of processes that read the source.
+        wait_for_others: Wait for another process that is making the store, instead of raising.
 
     Raises:
         StoreError: `output` is something else or was made with other parameters, or no job gives a row.
-        ValueError: another process is making the store, and `wait_for_others` is False.
+        ValueError: Another process is making the store, and `wait_for_others` is False.
     """
     if not is_store(output):
         if output.exists() and not is_store(output):  # unless another process has just made it
-            raise StoreError(f"expected a new folder as output, got {output}, which is no store of bpnp; try another")
+            raise StoreError(f"{output} exists and is no store of bpnp; give a new folder")
         work = output.with_name(f".{output.name}.unfinished")
         try:
             with lock_folder(work, wait=wait_for_others):
@@ -271,21 +284,23 @@ def prepare(recipe: Recipe, output: Path, *, processes: int = 1, wait_for_others
                     _make(recipe, work / "store", processes)
                     os.replace(work / "store", output)
         finally:
-            with suppress(OSError):  # another process is using it, or it is not ours
+            with suppress(OSError):  # another process uses the folder, or made it
                 work.rmdir()
     store = open_store(output, recipe.kind)
     if different := sorted(key for key, value in recipe.parameters.items() if store.parameters.get(key) != value):
-        raise StoreError(
-            f"expected a new folder, or one made in the same way, got {output} of another {', '.join(different)}; "
-            "try another --output, or remove it"
-        )
+        raise StoreError(f"{output} was made with another {', '.join(different)}; give another --output, or remove it")
     return store
 
 
 def open_or_prepare(recipe: Recipe, label: str, cache_dir: str | None) -> Store:
     """Return the store of a recipe in the cache folder; make it if it is missing or damaged.
 
-    Warns of items that are left out. Raises as `prepare`.
+    A warning names items that are left out. Errors are those of `prepare`.
+
+    Args:
+        recipe: Recipe of the store.
+        label: Beginning of the folder's name.
+        cache_dir: Folder for stores, None for `cache_folder()`.
     """
     folder = Path(cache_dir) if cache_dir is not None else cache_folder()
     output = folder / f"{label}-{fingerprint([recipe.kind, dict(recipe.parameters)])[:16]}"
@@ -308,8 +323,8 @@ def open_or_prepare(recipe: Recipe, label: str, cache_dir: str | None) -> Store:
 
 
 def _make(recipe: Recipe, output: Path, processes: int) -> None:
-    for left in (output, *output.parent.glob(f".{output.name}.[0-9]*")):  # by a process that was killed
-        shutil.rmtree(left, ignore_errors=True)
+    for remnant in (output, *output.parent.glob(f".{output.name}.[0-9]*")):  # left by a killed process
+        shutil.rmtree(remnant, ignore_errors=True)
     made, console = _make_store(recipe, processes), Console(stderr=True)
     with new_store(output, recipe.kind, recipe.widths) as writer:
         writer.parameters |= recipe.parameters
@@ -320,17 +335,16 @@ def _make(recipe: Recipe, output: Path, processes: int) -> None:
         if not len(writer):
             first = next(iter(writer.skipped.values()), "none found")
             raise StoreError(
-                f"expected at least one usable {recipe.what} in {recipe.source}, got {len(writer.skipped)} "
-                f"that are not; the first: {first}"
+                f"{recipe.source} has no usable {recipe.what}; {len(writer.skipped)} are unusable, the first: {first}"
             )
 
 
 def _make_store(recipe: Recipe, processes: int) -> Iterator[Made]:
-    """Run the jobs and give their results in order. The workers of a loader end with this process, even if killed."""
+    """Run the jobs and yield their results in order; worker processes end with this process, even if it is killed."""
     workers = 0 if processes == 1 else min(processes, len(recipe))
-    generator = torch.Generator()  # else the seeds of the workers are drawn from the global one
+    generator = torch.Generator()  # otherwise the seeds of the workers change the global generator
     loader = DataLoader(recipe, batch_size=None, num_workers=workers, collate_fn=tuple, generator=generator)
-    with delay_interrupts():  # the workers leave Ctrl-C to this process
+    with delay_interrupts():  # worker processes inherit the handler and ignore Ctrl-C
         made = iter(loader)
     try:
         yield from made

@@ -1,4 +1,4 @@
-"""Problems in a data store: 50,000 of them open at once, split by scene."""
+"""Problems in a data store, split by scene; 50,000 of them are open at once."""
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,17 +20,24 @@ from bpnp.datamodules.store import Row, Store, StoreError, new_store, open_store
 from bpnp.poses import MIN_POINTS
 from bpnp.types import Batch
 
-PROBLEMS = "problems"  # the kind of such a store
+PROBLEMS = "problems"  # kind of a store of problems
 WIDTHS = {"points2d": 2, "points3d": 3}
 
 
 def write_problems(
     folder: Path, problems: Iterable[tuple[str, Problem]], *, parameters: Mapping[str, Any] | None = None
 ) -> None:
-    """Write (scene, problem) after (scene, problem) into the new store `folder`, for `StoredDataModule(root=folder)`.
+    """Write problems into a new store, for `StoredDataModule(root=folder)`.
 
-    parameters: kept in the manifest, must be JSON.
-    Raises StoreError if the folder exists; what is not complete is not there at all.
+    An interrupted run leaves no store.
+
+    Args:
+        folder: New folder.
+        problems: Pairs (scene, problem).
+        parameters: JSON content for the manifest.
+
+    Raises:
+        StoreError: The folder exists.
     """
     with new_store(folder, PROBLEMS, WIDTHS) as writer:
         for scene, problem in problems:
@@ -39,14 +46,14 @@ def write_problems(
 
 
 def problem_row(scene: str, problem: Problem) -> Row:
-    """The row of a store that keeps a problem."""
+    """Return the row of a store that holds a problem."""
     columns = {name: getattr(problem, name) for name in ("matched", "focal", "rotation", "translation")}
     origin = np.zeros(3) if problem.origin is None else problem.origin
     return problem.name, {name: getattr(problem, name) for name in WIDTHS}, columns | {"scene": scene, "origin": origin}
 
 
 def stored_problem(store: Store, row: int) -> Problem:
-    """The problem in a row; its points are views of the mapped files."""
+    """Return the problem in a row; its points are views of the mapped files."""
     points, columns = store.row(row), {name: column[row] for name, column in store.columns.items()}
     pose, matched = (columns["rotation"], columns["translation"]), int(columns["matched"])
     focal, origin = float(columns["focal"]), columns["origin"]
@@ -54,13 +61,22 @@ def stored_problem(store: Store, row: int) -> Problem:
 
 
 def scene_rows(store: Store) -> dict[str, NDArray[np.int64]]:
-    """The rows of each scene, scenes in the order of their first row."""
+    """Return the rows of each scene; scenes are in the order of their first row."""
     names, first, scene = np.unique(store.columns["scene"], return_index=True, return_inverse=True)
     return {bytes(names[i]).decode(): np.flatnonzero(scene == i) for i in np.argsort(first)}
 
 
 class StoredProblems:
-    """A `ProblemSource`: rows of a store of problems. Raises ValueError as `has_enough_matches`."""
+    """Source of problems in rows of a store.
+
+    Args:
+        store: Store of problems.
+        rows: Rows to use.
+        min_points: Least number of matches.
+
+    Raises:
+        StoreError: No problem has that many matches.
+    """
 
     def __init__(self, store: Store, rows: NDArray[np.int64], *, min_points: int) -> None:
         self.store = store
@@ -68,35 +84,37 @@ class StoredProblems:
 
     @property
     def counts(self) -> Counts:
+        """Numbers of points of each problem."""
         matched = self.store.columns["matched"][self.rows]
         return Counts(matched, *(self.store.counts(name)[self.rows] for name in WIDTHS))
 
     def batch(self, index: Int[Tensor, " b"], epoch: int) -> Batch:
+        """Return problems; see `ProblemSource.batch`."""
         return stack_problems([stored_problem(self.store, int(self.rows[i])) for i in index.tolist()], index)
 
 
 class StoredDataModule(ProblemDataModule):
-    """Problems that `write_problems` wrote, or `bpnp prepare` of COLMAP models, split by scene.
+    """Problems from `write_problems`, or from `bpnp prepare` of COLMAP models, split by scene.
 
     Scenes are split, not images, so that no landmark is both trained and tested on, as in Campbell et al. (ECCV 2020).
     Works without a Trainer: `setup()`, then the loaders.
 
     Args:
-        root: folder of the store.
-        train_scenes: scenes to train on, or a text file with one a line; none for all that are left by the others.
-        val_scenes: scenes to validate on, or a file; none to draw val_fraction.
-        test_scenes: scenes to test and predict on, or a file; none to draw test_fraction.
-        val_fraction: share of the scenes to validate on, drawn by seed.
-        test_fraction: share of the scenes to test and predict on, drawn by seed; 1 for all.
-        min_points: images that see fewer points are skipped; at least 4.
-        max_points: largest number of matches of a training image, a random subset of more; none for all.
-        fresh_subsets: draw new subsets, clutter and rotations every epoch in training.
-        eval_max_points: the same in validation, testing and prediction, where it is fixed; none for all.
-        clutter: natural clutter, as a ratio to the matches: keypoints without a 3D point, and points of the scene
-            that the image does not see.
-        clutter_side: the side that gets clutter, both, 2d or 3d.
-        rotate: turn the scene of each problem by a random rotation; never in prediction.
-        loading: options of `ProblemDataModule`: batch_size, eval_batch_size, train_outliers, test_outliers, seed, ...
+        root: Folder of the store.
+        train_scenes: Scenes to train on, or a text file with one a line; none for all scenes that the others leave.
+        val_scenes: Scenes to validate on, or a file; none to draw val_fraction.
+        test_scenes: Scenes to test and predict on, or a file; none to draw test_fraction.
+        val_fraction: Fraction of the scenes to validate on, drawn by seed.
+        test_fraction: Fraction of the scenes to test and predict on, drawn by seed; 1 for all.
+        min_points: Images that see fewer points are skipped; at least 4.
+        max_points: Largest number of matches of a training image; of more, a random subset is taken. none for all.
+        fresh_subsets: Draw new subsets, clutter and rotations every epoch in training.
+        eval_max_points: As max_points, in validation, testing and prediction, where the subset is fixed; none for all.
+        clutter: Natural clutter, as a ratio to the matches: keypoints without a 3D point, and points of the scene that
+            the image does not see.
+        clutter_side: Side that gets clutter, both, 2d or 3d.
+        rotate: Rotate the scene of each problem at random; never in prediction.
+        loading: Options of `ProblemDataModule`: batch_size, eval_batch_size, train_outliers, test_outliers, seed, ...
     """
 
     def __init__(
@@ -135,10 +153,11 @@ class StoredDataModule(ProblemDataModule):
         self.splitting |= {part: _scene_list(f"{part}_scenes", scenes) for part, scenes in lists.items()}
 
     def setup(self, stage: str | None = None) -> None:
-        """Open the scenes of a stage (fit, validate, test, predict; none for all).
+        """Open the scenes of a stage: fit, validate, test or predict; None for all.
 
-        Raises ValueError for a store or models that cannot be used, a split that does not fit the scenes, or one that
-        leaves none for the stage; fit does without validation scenes.
+        Raises:
+            ValueError: The store or the models cannot be used, the split does not fit the scenes, or the stage has no
+                scenes (fit does without validation scenes).
         """
         self.scenes = self._open()
         self.split = split_scenes(list(self.scenes), **self.splitting, seed=self.seed)
@@ -146,22 +165,22 @@ class StoredDataModule(ProblemDataModule):
         if stage is not None and STAGES[stage][0] not in self.datasets:
             name = stage.value if isinstance(stage, TrainerFn) else stage
             raise ValueError(
-                f"expected scenes for {name}, got none left of {', '.join(self.scenes)}; try to name them in the "
-                "*_scenes arguments, or other fractions"
+                f"no scene is left for {name} of {', '.join(self.scenes)}; name scenes in the *_scenes arguments, or "
+                "change the fractions"
             )
 
     def _source(self, split: str, seed: tuple[int, int]) -> ProblemSource | None:
-        """The problems of a split's scenes; None if it has no scenes."""
+        """Return the problems of a split's scenes; None if it has no scenes."""
         scenes = [self.scenes[scene] for scene in self.split[split]]
         return self._problems(scenes, seed) if scenes else None
 
     def _open(self) -> dict[str, Any]:
-        """What `_problems` needs of each scene, by its name."""
+        """Return the input of `_problems` for each scene, by its name."""
         self.store = open_store(self.root, PROBLEMS)
         if self.clutter > (stored := self.store.parameters.get("clutter", np.inf)):
             raise StoreError(
-                f"expected `clutter` of at most {stored}, what {self.root} was made with, got {self.clutter}; try "
-                f"that, or preparing again with --clutter {self.clutter}"
+                f"`clutter` is {self.clutter}, but {self.root} was made with {stored}; use at most that, or prepare it "
+                f"again with --clutter {self.clutter}"
             )
         return scene_rows(self.store)
 
@@ -179,42 +198,58 @@ def split_scenes(
     test_fraction: float = 0.2,
     seed: int = 0,
 ) -> dict[str, list[str]]:
-    """Deal `scenes` to "train", "val" and "test" without overlap.
+    """Divide scenes among "train", "val" and "test" without overlap.
 
-    Lists that are given are taken as they are. The scenes in none of them are shuffled by `seed`, and where a list is
-    None it gets its share: test, then val, `fraction` of all scenes, at least one if the fraction is not 0 (val only
-    if one is left to train), then train the rest.
+    Lists that are given are taken unchanged. The remaining scenes are shuffled by `seed`, and where a list is None it
+    gets its fraction of all scenes: first test, then val, at least one unless the fraction is 0 (val only if one is
+    left to train); train gets the rest.
 
-    Raises ValueError for a name that is not in `scenes`, a scene in two lists, or a fraction outside [0, 1].
+    Args:
+        scenes: All scenes.
+        train: Training scenes.
+        val: Validation scenes.
+        test: Test scenes.
+        val_fraction: Fraction of validation scenes.
+        test_fraction: Fraction of test scenes.
+        seed: Random seed.
+
+    Raises:
+        ValueError: A name is not in `scenes`, a scene is in two lists, or a fraction is outside [0, 1].
     """
     split = {part: list(names) for part, names in (("train", train), ("val", val), ("test", test)) if names is not None}
     fractions = {"test": test_fraction, "val": val_fraction}
     named = [name for names in split.values() for name in names]
     if unknown := [name for name in named if name not in scenes]:
-        raise ValueError(f"expected scenes among {', '.join(scenes)}, got {', '.join(unknown)}; try one of those")
+        raise ValueError(f"there are no scenes {', '.join(unknown)}; the scenes are {', '.join(scenes)}")
     if twice := sorted({name for name in named if named.count(name) > 1}):
-        raise ValueError(f"expected each scene once in the lists of scenes, got {', '.join(twice)} more than once")
+        raise ValueError(f"the lists of scenes name {', '.join(twice)} more than once")
     check_within(0, 1, test_fraction=test_fraction, val_fraction=val_fraction)
     rest = sorted(set(scenes) - set(named))
     rest = [rest[i] for i in np.random.default_rng(seed).permutation(len(rest))]
     for part, fraction in fractions.items():
         if part not in split:
-            share = max(round(fraction * len(scenes)), fraction > 0)
-            share = min(share, len(rest) - (part == "val" and train is None)) if rest else 0
-            split[part], rest = sorted(rest[:share]), rest[share:]
+            count = max(round(fraction * len(scenes)), fraction > 0)
+            count = min(count, len(rest) - (part == "val" and train is None)) if rest else 0
+            split[part], rest = sorted(rest[:count]), rest[count:]
     return {"train": sorted(rest), **split}
 
 
 def has_enough_matches(matched: NDArray[np.int64], min_points: int, where: str) -> NDArray[np.int64]:
-    """Which problems have `min_points` matches or more; the others are warned about.
+    """Return the indices of problems with `min_points` matches or more, and warn of the others.
 
-    Raises StoreError if there are none.
+    Args:
+        matched: Number of matches of each problem (k,).
+        min_points: Least number of matches.
+        where: Source of the problems, for messages.
+
+    Raises:
+        StoreError: No problem has that many matches.
     """
     large = np.flatnonzero(matched >= min_points)
     if not len(large):
         raise StoreError(
-            f"expected problems of {min_points} or more matches in {where}, got none of {len(matched)}; try a "
-            "smaller `min_points` or other scenes"
+            f"none of the {len(matched)} problems in {where} has {min_points} or more matches; use a smaller "
+            "`min_points` or other scenes"
         )
     if skipped := len(matched) - len(large):
         message = f"skipped {skipped} of {len(matched)} problems of {where}: fewer than {min_points} matches"
@@ -223,13 +258,13 @@ def has_enough_matches(matched: NDArray[np.int64], min_points: int, where: str) 
 
 
 def _scene_list(name: str, scenes: list[str] | str | None) -> list[str] | None:
-    """The scenes of a list, or of the lines of a text file."""
+    """Return the scenes of a list, or of the lines of a text file."""
     if not isinstance(scenes, str):
         return scenes
     path = Path(scenes)
     if not path.is_file():
-        raise ValueError(f"expected `{name}` as a list of scenes or a text file with one a line, got no file {path}")
+        raise ValueError(f"there is no file {path}; `{name}` is a list of scenes, or a text file with one a line")
     lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
     if not lines:
-        raise ValueError(f"expected `{name}` to name scenes, got {path} without a line; try none for no list")
+        raise ValueError(f"{path} is empty; `{name}` needs a file with one scene a line")
     return lines

@@ -52,27 +52,47 @@ def test_a_text_model_whose_last_line_has_no_break_is_read_if_its_header_has_the
     ("name", "content", "message"),
     [
         ("cameras.bin", b"\x89PNG\r\n\x1a\n" + bytes(range(256)), "cameras.bin"),
-        ("images.bin", np.random.default_rng(0).bytes(5000), "images.bin, got .* truncated or not a COLMAP file"),
-        ("points3D.bin", b"# text\n" * 99, "points3D.bin, got .* truncated or not a COLMAP file"),
-        ("cameras.bin", struct.pack("<QIiQQ4d", 1, 1, 77, 9, 9, 1, 1, 1, 1), "got id 77"),
+        ("images.bin", np.random.default_rng(0).bytes(5000), "images.bin is truncated or not a COLMAP file"),
+        ("points3D.bin", b"# text\n" * 99, "points3D.bin is truncated or not a COLMAP file"),
+        ("cameras.bin", struct.pack("<QIiQQ4d", 1, 1, 77, 9, 9, 1, 1, 1, 1), "a camera of the unknown model 77"),
         (
             "cameras.bin",
             struct.pack("<QIiQQ4d", 1, 1, 1, 9, 9, np.nan, 1, 1, 1),
             "camera 1 of image .*: expected finite",
         ),
-        ("cameras.bin", struct.pack("<QIiQQ4d", 1, 1, 1, 9, 9, -2, -2, 1, 1), "focal length, got -2"),
-        ("cameras.bin", struct.pack("<QIiQQ4d", 1, 7, 1, 9, 9, 1, 1, 1, 1), "got no such camera"),
-        ("cameras.bin", struct.pack("<QIiQQ5d", 1, 1, 1, 9, 9, 1, 1, 1, 1, 1), "to end at byte 64, got 72"),
-        ("images.bin", bytes(8), "got none in .*images.bin"),
-        ("points3D.bin", bytes(8), "got none in .*points3D.bin"),
-        ("points3D.txt", b"1 nan 0 0 0 0 0 0\n", "cameras.txt, images.txt and points3D.txt.*refuses"),
-        ("points3D.txt", b"# Number of points: 0\n", "got none in .*points3D.txt"),
-        ("cameras.txt", b"1 PINHOLE 9 9 1 1 1\n", "cameras.txt, .* refuses: .*VerifyParams"),
-        ("cameras.txt", b"1 PINHALL 9 9 1 1 1 1\n", "cameras.txt, .* refuses: Camera model does not exist"),
-        ("images.txt", b"1 1 0 0 0 zero 0 0 1 a.jpg\n1 1 1\n", "images.txt and .* refuses: .*cam_from_world"),
-        ("images.txt", b"1 1 0 0 0 0 0 0 1 a.jpg\n1 1 1 2\n", "images.txt and .* refuses"),
-        ("points3D.txt", b"\x00\xff\xfe garbage\n", "points3D.txt, got one that pycolmap refuses"),
-        ("points3D.txt", b"99999999999999999999 0 0 0 0 0 0 0\n", "points3D.txt, got one that pycolmap refuses"),
+        (
+            "cameras.bin",
+            struct.pack("<QIiQQ4d", 1, 1, 1, 9, 9, -2, -2, 1, 1),
+            "focal length of a camera has to be positive; .* give -2",
+        ),
+        ("cameras.bin", struct.pack("<QIiQQ4d", 1, 7, 1, 9, 9, 1, 1, 1, 1), "camera 1 of image .* is missing"),
+        (
+            "cameras.bin",
+            struct.pack("<QIiQQ5d", 1, 1, 1, 9, 9, 1, 1, 1, 1, 1),
+            "should end at byte 64, but has 72 bytes",
+        ),
+        ("images.bin", bytes(8), "images.bin has no records"),
+        ("points3D.bin", bytes(8), "points3D.bin has no records"),
+        (
+            "points3D.txt",
+            b"1 nan 0 0 0 0 0 0\n",
+            "pycolmap cannot read the model in .*cameras.txt, images.txt and points3D.txt: ",
+        ),
+        ("points3D.txt", b"# Number of points: 0\n", "points3D.txt has no records"),
+        ("cameras.txt", b"1 PINHOLE 9 9 1 1 1\n", "pycolmap cannot read .*cameras.txt, .*: .*VerifyParams"),
+        (
+            "cameras.txt",
+            b"1 PINHALL 9 9 1 1 1 1\n",
+            "pycolmap cannot read .*cameras.txt, .*: Camera model does not exist",
+        ),
+        (
+            "images.txt",
+            b"1 1 0 0 0 zero 0 0 1 a.jpg\n1 1 1\n",
+            "pycolmap cannot read .*images.txt and .*: .*cam_from_world",
+        ),
+        ("images.txt", b"1 1 0 0 0 0 0 0 1 a.jpg\n1 1 1 2\n", "pycolmap cannot read .*images.txt and "),
+        ("points3D.txt", b"\x00\xff\xfe garbage\n", "pycolmap cannot read .*points3D.txt: "),
+        ("points3D.txt", b"99999999999999999999 0 0 0 0 0 0 0\n", "pycolmap cannot read .*points3D.txt: "),
     ],
 )
 def test_a_foreign_file_is_one_error_that_names_it(name: str, content: bytes, message: str, tmp_path: Path) -> None:
@@ -86,5 +106,5 @@ def test_a_missing_file_or_folder_is_one_error(tmp_path: Path) -> None:
     plant_model(tmp_path / "scene")
     (tmp_path / "scene" / "points3D.bin").unlink()
     for folder in ("scene", "nowhere"):
-        with pytest.raises(ColmapError, match=f"{folder}, got .* try the folder sparse/0"):
+        with pytest.raises(ColmapError, match=f"{folder} is no COLMAP model .* Give a folder such as sparse/0"):
             read_reconstruction(tmp_path / folder)

@@ -89,7 +89,7 @@ def test_images_with_too_few_points_are_skipped_and_counted(tmp_path: Path) -> N
     with pytest.warns(UserWarning, match="skipped 2 of 5 problems of few, many: fewer than 6 matches"):
         problems = ColmapSource(scenes, min_points=6)
     assert len(problems.images) == 3
-    with pytest.raises(StoreError, match="7 or more matches in few, many, got none of 5"):
+    with pytest.raises(StoreError, match="none of the 5 problems in few, many has 7 or more matches"):
         ColmapSource(scenes, min_points=7)
     with pytest.raises(ValueError, match="`clutter` of 0 or more, got -0.1"):
         ColmapSource(scenes, clutter=-0.1)

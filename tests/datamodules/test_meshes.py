@@ -90,7 +90,7 @@ def test_poses_have_the_distributions_of_the_paper(tmp_path: Path) -> None:
 
 
 def test_points_behind_the_camera_have_no_image(tmp_path: Path) -> None:
-    with pytest.warns(UserWarning, match="reach 1 from their origin"):
+    with pytest.warns(UserWarning, match="extend 1 from their origin"):
         inside = source(tmp_path, RandomCameras(distance=0.0, noise_px=0.0), count=5)
     batch = ProblemDataset(inside, Augmentation(outliers=Outliers(ratio=0.2)))[[(0, i) for i in range(5)]]
     natural = drawn(inside, 5)
@@ -102,7 +102,7 @@ def test_points_behind_the_camera_have_no_image(tmp_path: Path) -> None:
     assert torch.equal(batch.count3d, 300 + (0.2 * true.sum(-1)).long())
     check_pairs(batch, 1e-4)
     blind = RandomCameras(distance=0.0, translation_range=0.0, euler_range=(0.0, 0.0))
-    with pytest.warns(UserWarning, match="reach 1"):
+    with pytest.warns(UserWarning, match="extend 1"):
         problems = source(tmp_path, blind, num_points=4, pool_size=4, count=1)
     with pytest.raises(ValueError, match=r"4 points in front of the camera, got \d in c/.*#0"):
         drawn(problems, 1)

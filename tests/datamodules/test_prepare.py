@@ -267,7 +267,7 @@ def test_colmap_pairs_are_those_read_anew(tmp_path: Path, capsys: pytest.Capture
 
 def test_no_usable_model_is_one_error(tmp_path: Path) -> None:
     scenes(tmp_path / "scenes", 1)
-    with pytest.raises(StoreError, match="at least one usable image.*min_points"):
+    with pytest.raises(StoreError, match="no usable image.*min_points"):
         prepare(colmap_recipe(tmp_path / "scenes", min_points=50, clutter=0.0), tmp_path / "store")
     assert not (tmp_path / "store").exists()
 

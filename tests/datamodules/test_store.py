@@ -67,7 +67,7 @@ def test_damage_is_one_clear_error(store: Store, name: str, damage: str) -> None
 
 
 def test_a_broken_or_edited_manifest_and_another_kind_are_noticed(store: Store) -> None:
-    with pytest.raises(StoreError, match=r"expected other in format \d, got toy .*try the other data module"):
+    with pytest.raises(StoreError, match=r"holds toy in format \d, not other in format \d; use the other data module"):
         open_store(store.folder, "other")
     path = store.folder / "manifest.json"
     manifest = json.loads(path.read_text())

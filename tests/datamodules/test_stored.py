@@ -61,9 +61,9 @@ WRONG = [
     ({"match3d": np.array([0.0, 1.5, -1.0, 2.0])}, "`match3d` as integers.*float64 in problem 'a/1'; try .astype"),
     ({"match3d": np.array([0, 1, -1, 4])}, "`match3d` between -1 and 3, got -1 to 4 in problem 'a/1'"),
     ({"match3d": np.arange(3)}, r"`match3d` of shape \(4,\).* in problem 'a/1'"),
-    ({"match3d": np.array([0, 1, 1, 2])}, "at most one 3D point for each 2D point, got two in `match3d` of 'a/1'"),
+    ({"match3d": np.array([0, 1, 1, 2])}, "`match3d` of 'a/1' assigns one 2D point to two 3D points"),
     ({"points2d": np.full((4, 2), np.nan)}, "finite `points2d`.*'a/1'"),
-    ({"translation": np.full(3, np.inf)}, "finite pose, focal and origin.*'a/1'"),
+    ({"translation": np.full(3, np.inf)}, "pose, focal length or origin of problem 'a/1' holds NaN or infinity"),
 ]
 
 

@@ -1,1 +1,1 @@
-"""Photos with known poses, in COLMAP models."""
+"""Photos with known poses, from COLMAP models."""

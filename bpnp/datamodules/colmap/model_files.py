@@ -1,10 +1,10 @@
-"""COLMAP models below a folder, and the three files of one, binary or text, as plain numpy arrays.
+"""COLMAP models in a folder, and the three files of one, binary or text, as plain numpy arrays.
 
-pycolmap rewrites text files as binary ones. It does not read binary ones, because pycolmap 4.2 takes a truncated
-`cameras.bin` for a whole one (the parameters are then whatever was in memory), fills the memory on a truncated
-`points3D.bin` and never returns from a truncated `frames.bin`: here every size is checked against the file before
-anything is read. Poses are those of `images`, which COLMAP writes composed with the rig, so `rigs` and `frames` are not
-needed.
+pycolmap reads text files and rewrites them as binary ones. It does not read binary files here, because pycolmap 4.2
+takes a truncated `cameras.bin` for a complete one (the parameters are then whatever was in memory), fills the memory on
+a truncated `points3D.bin` and never returns from a truncated `frames.bin`. This reader checks every size against the
+file before it reads. Poses are those of `images`, which COLMAP writes composed with the rig, so `rigs` and `frames` are
+not needed.
 
 Source: https://colmap.github.io/format.html
 """
@@ -28,17 +28,17 @@ from bpnp.cameras import camera_models, read_text_model
 
 FILES = {"cameras": 1, "images": 2, "points3D": 1}  # lines of a record in a text file
 TRACK_ELEMENT = 8
-KEYPOINT = np.dtype([("position", "<f8", 2), ("point_id", "<i8")])  # no point: 2^64 - 1 in the file, so -1 here
+KEYPOINT = np.dtype([("position", "<f8", 2), ("point_id", "<i8")])  # no point: 2^64 - 1 in the file, read as -1
 POINT = np.dtype([("point_id", "<i8"), ("position", "<f8", 3)])
-COLOUR_AND_ERROR = 3 + 8  # bytes after these, before the length of a point's track; it follows, 8 bytes an element
-# What lies between the folder of a scene and its models: <scene>/sparse/0, <scene>/sparse/manhattan/0 (MegaDepth),
+COLOUR_AND_ERROR = 3 + 8  # bytes between a POINT and the length of its track, which has 8 bytes an element
+# Folders between a scene and its models: <scene>/sparse/0, <scene>/sparse/manhattan/0 (MegaDepth),
 # <scene>/dense/0/sparse.
 LAYOUT = re.compile(r"sparse|dense\d*")
 INSIDE_LAYOUT = re.compile(r"sparse|dense\d*|manhattan|\d+")
 
 
 class ColmapError(ValueError):
-    """A COLMAP folder or file that cannot be used; the message names it."""
+    """COLMAP folder or file that cannot be used. The message names it."""
 
 
 class CameraRecord(NamedTuple):
@@ -49,7 +49,17 @@ class CameraRecord(NamedTuple):
 
 @dataclass(frozen=True)
 class ImageRecord:
-    """quaternion (w, x, y, z) and translation are cam_from_world; keypoints (k, 2) pixels; point_ids (k,), -1: none."""
+    """Record of an image; the pose is cam_from_world.
+
+    Attributes:
+        name: Name.
+        image_id: Id.
+        camera_id: Id of the camera.
+        quaternion: (w, x, y, z).
+        translation: t (3,).
+        keypoints: Keypoints (k, 2), pixels.
+        point_ids: Id of the 3D point of each keypoint (k,), -1 for none.
+    """
 
     name: str
     image_id: int
@@ -62,7 +72,14 @@ class ImageRecord:
 
 @dataclass(frozen=True)
 class ModelRecords:
-    """What the three files hold. points3d (n, 3) has the ids `point_ids`."""
+    """Content of the three files.
+
+    Attributes:
+        cameras: Cameras by id.
+        images: Images.
+        point_ids: Ids of the points (n,).
+        points3d: Points (n, 3).
+    """
 
     cameras: dict[int, CameraRecord]
     images: list[ImageRecord]
@@ -71,23 +88,27 @@ class ModelRecords:
 
 
 def model_format(folder: Path) -> str | None:
-    """The suffix, "bin" or "txt", of the whole model in a folder, "bin" if there are two; None if there is no model."""
+    """Return the suffix, "bin" or "txt", of the complete model in a folder ("bin" if there are both), or None."""
     whole = (suffix for suffix in ("bin", "txt") if all((folder / f"{name}.{suffix}").is_file() for name in FILES))
     return next(whole, None)
 
 
 def read_records(folder: Path) -> ModelRecords:
-    """Read the model in `folder`.
+    """Read the model in a folder.
 
-    Raises ColmapError, naming the file and the byte or line, if a file is missing, empty, truncated or too long, holds
-    no record, or is not a COLMAP file.
+    Args:
+        folder: Folder.
+
+    Raises:
+        ColmapError: A file is missing, empty, truncated or too long, holds no record, or is not a COLMAP file. The
+            message names the file, and the byte or line.
     """
     suffix = model_format(folder)
     if suffix is None:
         files = ", ".join(sorted(path.name for path in folder.glob("*"))[:8])
         raise ColmapError(
-            f"expected a COLMAP model (cameras, images and points3D, all .bin or all .txt) in {folder}, got "
-            f"{files or 'no file'}; try the folder sparse/0 of a scene"
+            f"{folder} is no COLMAP model (cameras, images and points3D, all .bin or all .txt); it holds "
+            f"{files or 'no files'}. Give a folder such as sparse/0 of a scene"
         )
     paths = [folder / f"{name}.{suffix}" for name in FILES]
     contents = [_content(path) for path in paths]
@@ -99,45 +120,45 @@ def read_records(folder: Path) -> ModelRecords:
         cameras, images, points = dict(_cameras(cursors[0])), list(_images(cursors[1])), _points(cursors[2])
     for path, count in zip(paths, (len(cameras), len(images), len(points)), strict=True):
         if not count:
-            raise ColmapError(f"expected cameras, images and points in a COLMAP model, got none in {path}; try another")
+            raise ColmapError(f"{path} has no records; a COLMAP model needs cameras, images and points")
     return ModelRecords(cameras, images, points["point_id"].copy(), points["position"].copy())
 
 
 def _content(path: Path) -> mmap.mmap:
-    """The bytes of a file, read as they are used: most of images.bin are keypoints without a point."""
+    """Map the bytes of a file, to read only the used ones: most of images.bin are keypoints without a point."""
     try:
         with path.open("rb") as file:
             if path.stat().st_size:
                 return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except OSError as error:
-        raise ColmapError(f"expected a readable COLMAP file, got {error}; try its permissions") from error
-    raise ColmapError(f"expected a COLMAP file, got {path} of 0 bytes; try copying the model again")
+        raise ColmapError(f"cannot read a COLMAP file: {error}") from error
+    raise ColmapError(f"{path} is empty; copy the model again")
 
 
 def _rewrite_text(paths: list[Path], contents: list[bytes], target: str) -> None:
     """Write the model of three text files as binary files into a folder.
 
-    Notices what pycolmap does not: that a file was cut between two records, or in the last number. The count in
-    COLMAP's header, where there is one, and the line break at the end show it. Where the line break lacks, the header
-    has to have the count, and the last track of a point has to agree with the keypoint that it names, and the reverse.
+    Truncations that pycolmap does not notice are found here: between two records, or in the last number. The count in
+    COLMAP's header, where there is one, and the line break at the end show them. Without a line break at the end, the
+    header has to have the count, and the last track of a point and the keypoint that it names have to agree.
     """
-    unended = [path for path, content in zip(paths, contents, strict=True) if not content.endswith(b"\n")]
+    without_break = [path for path, content in zip(paths, contents, strict=True) if not content.endswith(b"\n")]
     for path, content in zip(paths, contents, strict=True):
         header = re.search(rb"^# Number of \w+: (\d+)", content, re.MULTILINE)
         records = sum(not line.startswith(b"#") for line in content.splitlines()) // FILES[path.stem]
-        if path in unended and (not header or int(header[1]) != records):
+        if path in without_break and (not header or int(header[1]) != records):
             raise _truncated(path, content)
         if header and int(header[1]) > records:
             raise ColmapError(
-                f"expected {int(header[1])} records in {path} as its header says, got {records}: it is truncated; try "
-                "copying the model again, or correct the header if records were removed on purpose"
+                f"{path} is truncated: it has {records} of the {int(header[1])} records in its header; copy the model "
+                "again, or correct the header if records were removed on purpose"
             )
     try:
         model = read_text_model(paths[0].parent)
         names = dict(_names(contents[1]))
         for image_id, name in names.items():
             model.image(image_id).name = name
-        for path in unended:
+        for path in without_break:
             content = contents[paths.index(path)]
             if not _last_record_agrees(model, path.stem, list(names), content.splitlines()[-1].split()):
                 raise _truncated(path, content)
@@ -146,7 +167,7 @@ def _rewrite_text(paths: list[Path], contents: list[bytes], target: str) -> None
         if isinstance(error, ColmapError):
             raise
         files = f"{paths[0]}, {paths[1].name} and {paths[2].name}"
-        raise ColmapError(f"expected a COLMAP model in {files}, got one that pycolmap refuses: {error}") from error
+        raise ColmapError(f"pycolmap cannot read the model in {files}: {error}") from error
 
 
 def _truncated(path: Path, content: bytes) -> "ColmapError":
@@ -157,7 +178,7 @@ def _truncated(path: Path, content: bytes) -> "ColmapError":
 
 
 def _names(images: bytes) -> Iterator[tuple[int, str]]:
-    """Yield the id and name of each image of a text file, in its order."""
+    """Yield the id and the name of each image of a text file, in its order."""
     lines = (line for line in images.splitlines() if not line.startswith(b"#"))
     for line in filter(bytes.strip, lines):
         image_id, *_, name = line.split(maxsplit=9)
@@ -166,10 +187,10 @@ def _names(images: bytes) -> Iterator[tuple[int, str]]:
 
 
 def _last_record_agrees(model: Any, file: str, image_ids: list[int], fields: list[bytes]) -> bool:
-    """Return whether the last line of a text file, split into fields, is whole.
+    """Return True if the last line of a text file, split into fields, is complete.
 
-    The keypoints of the last image and the tracks of the points have to name each other. Keypoints without a point that
-    are missing at the end, and digits that are missing in the last parameter of a camera, cannot be noticed.
+    The keypoints of the last image and the tracks of the points have to name each other. Missing keypoints without a
+    point at the end, and missing digits in the last parameter of a camera, cannot be noticed.
     """
     if file == "images":
         if len(fields) % 3 or not re.fullmatch(rb"-1|\d+", fields[-1]):
@@ -186,18 +207,18 @@ def _last_record_agrees(model: Any, file: str, image_ids: list[int], fields: lis
 
 
 class _Cursor:
-    """Walks a binary file; no read goes past its end."""
+    """Reader of a binary file that never reads past its end."""
 
     def __init__(self, path: Path, content: mmap.mmap) -> None:
         self.path, self.content, self.offset = path, content, 0
 
     def skip(self, size: int) -> int:
-        """Where the next `size` bytes begin."""
+        """Skip `size` bytes and return where they begin."""
         start, self.offset = self.offset, self.offset + size
         if self.offset > len(self.content):
             raise ColmapError(
-                f"expected {size} more bytes at byte {start} of {self.path}, got {len(self.content) - start}: it is "
-                "truncated or not a COLMAP file; try copying the model again"
+                f"{self.path} is truncated or not a COLMAP file: {size} bytes are needed at byte {start}, but "
+                f"{len(self.content) - start} are left; copy the model again"
             )
         return start
 
@@ -213,12 +234,12 @@ class _Cursor:
         return self.content[start:end].decode(errors="backslashreplace")
 
     def records(self) -> Iterator[int]:
-        """The number of each record of the file, which has to end after the last."""
+        """Yield the number of each record of the file, which has to end after the last."""
         yield from range(self.take(_COUNT)[0])
         if self.offset != len(self.content):
             raise ColmapError(
-                f"expected {self.path} to end at byte {self.offset}, got {len(self.content)} bytes: it is not a COLMAP "
-                "file or of an unknown version; try `colmap model_converter`"
+                f"{self.path} should end at byte {self.offset}, but has {len(self.content)} bytes: it is not a COLMAP "
+                "file, or of an unknown version; convert it with `colmap model_converter`"
             )
 
 
@@ -233,8 +254,8 @@ def _cameras(cursor: _Cursor) -> Iterator[tuple[int, CameraRecord]]:
         camera_id, model_id, width, height = cursor.take(_CAMERA)
         if model_id not in models:
             raise ColmapError(
-                f"expected a camera model among {', '.join(name for name, _ in models.values())}, got id {model_id} in "
-                f"{cursor.path}: it is not a COLMAP file, or newer than this pycolmap"
+                f"{cursor.path} has a camera of the unknown model {model_id}: it is not a COLMAP file, or newer than "
+                f"this pycolmap, whose models are {', '.join(name for name, _ in models.values())}"
             )
         name, count = models[model_id]
         yield camera_id, CameraRecord(name, cursor.array(np.dtype("<f8"), count), (width, height))
@@ -259,14 +280,21 @@ def _points(cursor: _Cursor) -> NDArray[Any]:
 
 
 def find_scenes(roots: str | Path | Sequence[str | Path]) -> dict[str, dict[str, Path]]:
-    """Every COLMAP model at or below `roots`, as {scene: {name of the model: folder}}, sorted.
+    """Find every COLMAP model at or below some folders.
 
-    A scene is named by its path below the root, without what follows from `sparse` or `dense` on; all models below it
-    (`sparse/0`, `sparse/1`, `sparse/manhattan/0`) belong to it. A scene's only model has the scene's name, others have
-    their path added.
+    A scene is named by its path below the root, up to `sparse` or `dense`. All models below it (`sparse/0`, `sparse/1`,
+    `sparse/manhattan/0`) belong to it. The only model of a scene has the scene's name; of several, each has its path
+    added.
 
-    Raises ColmapError if a root is not a folder, holds no model, or two scenes have one name. A folder that lacks one
-    of the three files is skipped with a warning if there are whole ones.
+    Args:
+        roots: Folder or folders.
+
+    Returns:
+        {scene: {name of the model: folder}}, sorted.
+
+    Raises:
+        ColmapError: A root is not a folder, holds no model, or two scenes have one name. A folder that lacks one of the
+            three files is skipped with a warning if there are complete ones.
     """
     scenes: dict[str, dict[str, Path]] = {}
     homes: dict[str, Path] = {}
@@ -277,8 +305,7 @@ def find_scenes(roots: str | Path | Sequence[str | Path]) -> dict[str, dict[str,
             scene = home.relative_to(top).as_posix() if top in home.parents else home.name
             if homes.setdefault(scene, home) != home:
                 raise ColmapError(
-                    f"expected scenes of different names, got {homes[scene]} and {home} for {scene!r}; try their "
-                    "common parent folder as `root`"
+                    f"{homes[scene]} and {home} are both named {scene!r}; give their common parent folder as `root`"
                 )
             scenes.setdefault(scene, {})["/".join((scene, *folder.relative_to(home).parts))] = folder
     return {
@@ -289,12 +316,12 @@ def find_scenes(roots: str | Path | Sequence[str | Path]) -> dict[str, dict[str,
 
 def _find_models(top: Path) -> list[Path]:
     if not top.is_dir():
-        raise ColmapError(f"expected a folder of COLMAP models, got {top}, which is no folder; try another `root`")
+        raise ColmapError(f"{top} is no folder; give a folder of COLMAP models as `root`")
     whole, incomplete, visited = [], [], set[Path]()
     for name, children, files in os.walk(top, followlinks=True):
         folder = Path(name)
         children.sort()
-        if folder.resolve() in visited:  # a link
+        if folder.resolve() in visited:  # reached again through a link
             children.clear()
             continue
         visited.add(folder.resolve())
@@ -304,24 +331,24 @@ def _find_models(top: Path) -> list[Path]:
             incomplete.append(folder)
     if incomplete:
         message = (
-            f"expected cameras, images and points3D in a COLMAP model, got {len(incomplete)} folders without one of "
-            f"them ({', '.join(map(str, incomplete[:4]))}); try copying them again"
+            f"{len(incomplete)} folders lack cameras, images or points3D of a COLMAP model "
+            f"({', '.join(map(str, incomplete[:4]))}); copy them again"
         )
         if not whole:
             raise ColmapError(message)
         warnings.warn(f"skipped: {message}", stacklevel=4)
     if not whole:
         raise ColmapError(
-            f"expected COLMAP models below {top}, got none; try a folder that holds <scene>/sparse/0/cameras.bin (or "
-            ".txt), images and points3D"
+            f"{top} has no COLMAP models; give a folder that holds <scene>/sparse/0/cameras.bin (or .txt), images and "
+            "points3D"
         )
     return whole
 
 
 def _scene_folder(top: Path, folder: Path) -> Path:
-    """Where the path to a model first meets `sparse` or `dense`; else the model's folder itself.
+    """Return the folder that holds the first `sparse` or `dense` of a path to a model, else the model's folder itself.
 
-    Looked for below the root, or from above it if the root is inside a scene, `castle/sparse` say.
+    The search starts below the root, or above it if the root is inside a scene, such as `castle/sparse`.
     """
     start = len(top.parts)
     if all(INSIDE_LAYOUT.fullmatch(part) for part in folder.relative_to(top).parts):

@@ -1,4 +1,4 @@
-"""Photos with known poses in COLMAP models: MegaDepth, or scenes of your own."""
+"""Data module of photos with known poses in COLMAP models: MegaDepth, or your own scenes."""
 
 import logging
 import warnings
@@ -20,26 +20,26 @@ from bpnp.datamodules.stored import PROBLEMS, WIDTHS, StoredDataModule, has_enou
 from bpnp.files import file_states, fingerprint
 from bpnp.types import Batch
 
-FAR = 100.0  # median distances of the points from their median; further off float32 steps by 1e-5 of that distance
+FAR = 100.0  # distance from the origin, in extents of the points, beyond which float32 resolves only 1e-5 of an extent
 logger = logging.getLogger(__name__)
 
 
 class ColmapDataModule(StoredDataModule):
-    """Photos with known poses in COLMAP models, read as they are, or once by `bpnp prepare megadepth`.
+    """Photos with known poses in COLMAP models, read directly, or converted once by `bpnp prepare megadepth`.
 
-    Of models that are read as they are a setup reads only the scenes of its stage. A model that cannot be read is
-    skipped with a warning if the part (train, val, test) has others.
+    Of models that are read directly, a setup reads only the scenes of its stage. A model that cannot be read is skipped
+    with a warning if the part (train, val, test) has others.
 
     Args:
-        root: folder that `bpnp prepare megadepth` made; or folder of scenes, <scene>/sparse/0 or
+        root: Folder that `bpnp prepare megadepth` made; or a folder of scenes, <scene>/sparse/0 or
             <scene>/sparse/manhattan/0 with cameras, images and points3D (.bin or .txt) in it; or one scene, one model,
             or a list of any of these.
-        options: those of `StoredDataModule`.
+        options: Options of `StoredDataModule`.
     """
 
     def __init__(self, root: str | list[str], **options: Any) -> None:
         super().__init__(root, **options)  # type: ignore[arg-type]
-        self.models: dict[str, Reconstruction] = {}  # that have been read
+        self.models: dict[str, Reconstruction] = {}  # models read so far, by name
 
     def _open(self) -> dict[str, Any]:
         return super()._open() if self._is_store() else find_scenes(self.root)
@@ -71,16 +71,19 @@ class ColmapDataModule(StoredDataModule):
 
 
 class ColmapSource:
-    """A `ProblemSource`: the keypoints of each image with a 3D point, those points, and points without a partner.
+    """Source of problems from the images of COLMAP models.
 
-    reconstructions: the models, see `read_reconstruction`.
-    min_points: an image with fewer matches is skipped, with a warning.
-    clutter: points without a partner, as a ratio to the matches, or as many as there are: keypoints without a 3D
-        point, and points of the scene that the image does not see; drawn uniformly, by (seed, epoch, index).
+    A problem has the keypoints of an image with a 3D point, these points, and clutter without correspondence. Units are
+    the scene's. An image whose points lie more than 100 times their extent from the origin, as in a geo-referenced
+    scene, gets their median as its origin, because float32 has 7 digits; a warning logs the number of such images.
 
-    Units are the scene's. An image whose points lie more than 100 times their extent from the origin (in a geo-
-    referenced scene, say) gets their median as its origin, for float32 has 7 digits; how many did is logged as a
-    warning.
+    Args:
+        reconstructions: Models, from `read_reconstruction`.
+        min_points: An image with fewer matches is skipped, with a warning.
+        clutter: Points without correspondence, as a ratio to the matches, or all if there are fewer: keypoints without
+            a 3D point, and points of the scene that the image does not see. They are drawn uniformly, by (seed, epoch,
+            index).
+        seed: Seeds.
     """
 
     def __init__(
@@ -109,15 +112,22 @@ class ColmapSource:
 
     @property
     def counts(self) -> Counts:
+        """Numbers of points of each problem."""
         matched = np.array([len(image.seen) for _, image in self.images])
         free = np.array([self._free(scene, image) for scene, image in self.images])
         return Counts(matched, matched + free[:, 0], matched + free[:, 1])
 
     def batch(self, index: Int[Tensor, " b"], epoch: int) -> Batch:
+        """Return problems; see `ProblemSource.batch`."""
         return stack_problems([self.problem(i, epoch) for i in index.tolist()], index)
 
     def problem(self, index: int, epoch: int = 0) -> Problem:
-        """The points of image `index`."""
+        """Return the problem of one image.
+
+        Args:
+            index: Index of the image.
+            epoch: Epoch, for the choice of the clutter.
+        """
         scene, image = self.images[index]
         rng = np.random.default_rng([*self.seed, epoch, index])
         free2d, free3d = self._free(scene, image)
@@ -137,24 +147,28 @@ class ColmapSource:
         )
 
     def _free(self, scene: Reconstruction, image: ImagePoints) -> tuple[int, int]:
-        """Points without a partner on the 2D side, and on the 3D side."""
+        """Return the number of points without correspondence on the 2D side and on the 3D side."""
         wanted = self.clutter * len(image.seen)
         free3d = len(scene.points3d) - len(image.observed)
         return round(min(wanted, len(image.clutter2d))), round(min(wanted, free3d))
 
 
 def _origin(points3d: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The median of the points if they are far from the origin, else the origin."""
+    """Return the median of the points if they are far from the origin, else the origin."""
     median = np.median(points3d, axis=0)
     extent = np.median(np.linalg.norm(points3d - median, axis=-1))
     return median if np.linalg.norm(median) > FAR * extent else np.zeros(3)
 
 
 def colmap_recipe(source: Path, *, min_points: int, clutter: float) -> Recipe:
-    """How the store of the problems of every image of every COLMAP model below `source` is made.
+    """Return the recipe of the store of all images of all COLMAP models in a folder.
 
-    Images with fewer than `min_points` matches, and models that cannot be read, are left out and listed. `clutter`:
-    natural clutter to keep on both sides, as a ratio to the matches.
+    Images with fewer than `min_points` matches, and models that cannot be read, are left out and listed in the store.
+
+    Args:
+        source: Folder.
+        min_points: Least number of matches of an image.
+        clutter: Natural clutter to keep on both sides, as a ratio to the matches.
     """
     models = [(scene, *model) for scene, models in find_scenes(source).items() for model in models.items()]
     files = (folder / f"{file}.{suffix}" for _, _, folder in models for file in FILES for suffix in ("bin", "txt"))
@@ -175,9 +189,9 @@ def colmap_recipe(source: Path, *, min_points: int, clutter: float) -> Recipe:
 
 
 def model_rows(scene: str, name: str, folder: Path, min_points: int, clutter: float) -> Made:
-    """The problems of one COLMAP model; none if it cannot be used.
+    """Return the problems of one COLMAP model, none if it cannot be used.
 
-    What was not used of it is listed, not logged: there may be hundreds of models.
+    Unused parts are listed in the result instead of logged, because there may be hundreds of models.
     """
     disabled = logging.root.manager.disable
     logging.disable(logging.WARNING)

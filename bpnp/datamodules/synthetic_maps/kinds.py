@@ -1,5 +1,4 @@
-"""The kinds of scenes, buildings from outside, streets from within and objects seen from around, and the surfaces that
-they are made of, with points where keypoints would be."""
+"""Kinds of scenes: buildings from outside, streets from within, objects from around; and their surfaces."""
 
 import math
 
@@ -14,20 +13,20 @@ from bpnp.datamodules.synthetic_maps.scene import (
     Surface,
     Viewpoint,
     Walls,
-    assembled,
+    assemble,
     directions,
-    joined,
+    join_walls,
     right_of,
 )
 
 WINDOW_POINTS, LEDGES, PATCHES = 14, 5, 8  # of each wall
-OTHER_SIDES = 0.2  # points on an area of a wall that the camera cannot see, of those on as much of another
-RELIEF = 0.8  # metres, of a facade: windows are recessed, balconies stand out
+OTHER_SIDES = 0.2  # density of points on walls that the camera cannot see, relative to the others
+RELIEF = 0.8  # depth of the relief of a facade (recessed windows, balconies), metres
 FACADE_CELL = 3.2  # metres between two windows
 GROUND_PATCHES = 8
-CLUSTERS = 14  # of each ellipsoid's points, some of them almost empty
-SPREAD = (0.15, 1.5)  # of a cluster on the unit sphere, lowest and highest
-PLAIN = (0.2, 0.9)  # share of an ellipsoid's points that are spread evenly, lowest and highest
+CLUSTERS = 14  # clusters of the points of an ellipsoid, some of them almost empty
+SPREAD = (0.15, 1.5)  # smallest and largest standard deviation of a cluster on the unit sphere
+PLAIN = (0.2, 0.9)  # smallest and largest fraction of evenly spread points of an ellipsoid
 
 
 def alike_walls(
@@ -40,15 +39,20 @@ def alike_walls(
     relief: float = RELIEF,
     weight: float = 1.0,
 ) -> Walls:
-    """Walls that differ in place and size only; their outside is on the right of `along`. See `Walls`."""
+    """Return walls that differ only in position and size; the outside is on the right of `along`. See `Walls`."""
     alike = (np.full(len(width), value) for value in (weight, cell, relief))
     return Walls(start, along, right_of(along), width, height, *alike)
 
 
 def box_walls(centre: Array, half: Array, yaw: Array, height: Array, **alike: float) -> Walls:
-    """Four walls of each of b boxes: centre (b, 2), half widths (b, 2), yaw (b,), height (b,); metres, radians.
+    """Return the four walls of each of b boxes.
 
-    alike: options of `alike_walls`.
+    Args:
+        centre: Centres (b, 2), metres.
+        half: Half widths (b, 2), metres.
+        yaw: Angles (b,), radians.
+        height: Heights (b,), metres.
+        alike: Options of `alike_walls`.
     """
     along = directions((yaw[:, None] + np.pi / 2 * np.arange(4)).ravel())  # counter-clockwise
     ahead, right = half[:, [0, 1, 0, 1]].ravel(), half[:, [1, 0, 1, 0]].ravel()
@@ -57,7 +61,10 @@ def box_walls(centre: Array, half: Array, yaw: Array, height: Array, **alike: fl
 
 
 def wall_points(walls: Walls, count: int, rng: np.random.Generator) -> Surface:
-    """Points on walls; each kind of them prefers walls of its own. In some scenes all walls bear the same pattern."""
+    """Draw points on walls.
+
+    Each kind of points prefers its own walls. In some scenes all walls have the same pattern.
+    """
     kinds = (_windows, _ledges, _patches, _plain)
     counts = rng.multinomial(count, rng.dirichlet([3.0, 1.0, 2.0, 3.0]))
     area = walls.width * walls.height * walls.weight
@@ -69,40 +76,40 @@ def wall_points(walls: Walls, count: int, rng: np.random.Generator) -> Surface:
     return Surface(upright(flat, np.abs(local[1])), upright(walls.normal[wall], np.zeros(count)), 0.5)
 
 
-def before(walls: Walls, view: Viewpoint) -> Walls:
-    """The walls with fewer points on those that a camera at the viewpoint sees from behind or not at all."""
-    middle = walls.start + walls.width[:, None] / 2 * walls.along
-    towards = view.centre[:2] - middle
+def thin_hidden_walls(walls: Walls, view: Viewpoint) -> Walls:
+    """Reduce the density of points on walls that the viewpoint sees from behind or not at all."""
+    midpoint = walls.start + walls.width[:, None] / 2 * walls.along
+    towards = view.centre[:2] - midpoint
     ahead = (towards * (view.centre - view.target)[:2]).sum(-1) > 0
-    seen = ahead & ((towards * walls.normal).sum(-1) > 0)
-    return walls._replace(weight=walls.weight * np.where(seen, 1.0, OTHER_SIDES))
+    visible = ahead & ((towards * walls.normal).sum(-1) > 0)
+    return walls._replace(weight=walls.weight * np.where(visible, 1.0, OTHER_SIDES))
 
 
 def upright(flat: Array, up: Array) -> Array:
-    """(n, 3) of (n, 2) and the heights (n,)."""
+    """Return (n, 3) from (n, 2) and the heights (n,)."""
     points = np.empty((len(flat), 3))
     points[:, :2], points[:, 2] = flat, up
     return points
 
 
 def column_points(walls: Walls, count: int, rng: np.random.Generator) -> Surface:
-    """A row of columns before the first wall, or a tower beside it; many points on the rings around them."""
+    """Draw points on a row of columns before the first wall, or on a tower next to it, many of them on rings."""
     columns = int(rng.integers(1, 9))
     tower = columns == 1
     radius = rng.uniform(2, 5) if tower else rng.uniform(0.3, 0.8)
     height = walls.height[0] * (rng.uniform(1, 1.8) if tower else rng.uniform(0.4, 0.9))
     foot = walls.start[0] + walls.normal[0] * rng.uniform(1, 4) - walls.along[0] * (2 * radius if tower else 0)
-    place = (rng.integers(0, columns, count) + 0.5) / columns * (0 if tower else walls.width[0])
+    along = (rng.integers(0, columns, count) + 0.5) / columns * (0 if tower else walls.width[0])
     angle, up = rng.uniform(0, 2 * np.pi, count), rng.random(count)
     rings = rng.random(5)[rng.integers(0, 5, count)]
     up = np.where(rng.random(count) < 0.6, rings + 0.01 * rng.standard_normal(count), up)
     outward = directions(angle)
-    points = foot + place[:, None] * walls.along[0] + radius * outward
+    points = foot + along[:, None] * walls.along[0] + radius * outward
     return Surface(upright(points, height * np.abs(up)), upright(outward, np.zeros(count)), 0.5)
 
 
 def tree_points(low: Array, high: Array, count: int, rng: np.random.Generator) -> Surface:
-    """Up to five fuzzy blobs with their centres between two corners (3,) of a box."""
+    """Draw points of up to five fuzzy blobs with centres between two corners (3,) of a box."""
     trees = int(rng.integers(1, 6))
     centre = rng.uniform(low, high, (trees, 3))
     spread = rng.uniform(0.05, 0.25, (trees, 3)) * (high[2] - low[2] + 1)
@@ -113,7 +120,7 @@ def tree_points(low: Array, high: Array, count: int, rng: np.random.Generator) -
 
 
 def ground_points(low: Array, high: Array, count: int, rng: np.random.Generator) -> Surface:
-    """The ground in patches, between two corners (2,); every point is turned upwards."""
+    """Draw points on the ground in patches, between two corners (2,); their normals point upwards."""
     centre = rng.uniform(low, high, (GROUND_PATCHES, 2))
     spread = rng.uniform(0.03, 0.5, (GROUND_PATCHES, 1)) * np.abs(high - low)
     which = rng.integers(0, GROUND_PATCHES, count)
@@ -124,25 +131,25 @@ def ground_points(low: Array, high: Array, count: int, rng: np.random.Generator)
 
 
 def horizon_points(centre: Array, distance: float, count: int, rng: np.random.Generator) -> Surface:
-    """Hills, clouds and houses in clusters around a centre (3,), from a distance to twenty times as far."""
+    """Draw hills, clouds and houses in clusters around a centre (3,), from `distance` to twenty times as far."""
     clusters = int(rng.integers(4, 12))
     around = rng.uniform(0, 2 * np.pi, clusters)
     far = distance * 20 ** rng.random(clusters)
-    middle = centre + upright(far[:, None] * directions(around), rng.uniform(0, 0.25, clusters) * far)
+    cluster_centre = centre + upright(far[:, None] * directions(around), rng.uniform(0, 0.25, clusters) * far)
     which = rng.integers(0, clusters, count)
-    points = middle[which] + (0.2 * far)[which, None] * rng.standard_normal((count, 3)) * [1.0, 1.0, 0.4]
+    points = cluster_centre[which] + (0.2 * far)[which, None] * rng.standard_normal((count, 3)) * [1.0, 1.0, 0.4]
     return Surface(points, np.zeros((count, 3)), 0.3)
 
 
 def blob_points(blobs: Blobs, count: int, rng: np.random.Generator) -> Surface:
-    """Points in clusters on the ellipsoids, outside of all the others; `count` of them, with repetition if few are."""
+    """Draw `count` points in clusters on the ellipsoids, outside of all others, repeated if there are fewer."""
     parts = len(blobs.centre)
     drawn = count + count // 2
     on = rng.choice(parts, drawn, p=rng.dirichlet(np.full(parts, 2.0)))
-    middle = rng.standard_normal((parts, CLUSTERS, 3))
+    cluster_centre = rng.standard_normal((parts, CLUSTERS, 3))
     spread = SPREAD[0] * (SPREAD[1] / SPREAD[0]) ** rng.random((parts, CLUSTERS))
     cluster = (CLUSTERS * rng.random(drawn) ** 1.5).astype(int)
-    unit = middle[on, cluster] / np.linalg.norm(middle[on, cluster], axis=-1, keepdims=True)
+    unit = cluster_centre[on, cluster] / np.linalg.norm(cluster_centre[on, cluster], axis=-1, keepdims=True)
     unit = unit + spread[on, cluster][:, None] * rng.standard_normal((drawn, 3))
     plain = rng.random(drawn) < rng.uniform(*PLAIN)
     unit[plain] = rng.standard_normal((int(plain.sum()), 3))
@@ -159,7 +166,7 @@ def blob_points(blobs: Blobs, count: int, rng: np.random.Generator) -> Surface:
 
 
 def _windows(walls: Walls, on: NDArray[np.int64], rng: np.random.Generator) -> Array:
-    """(3, n): along the wall, up, and out of it; corners of the windows of a grid and points in them, all alike."""
+    """Return points of a grid of windows, all alike: (3, n) along the wall, up, and out of it."""
     k = len(walls.width)
     columns = np.ceil(walls.width / (walls.cell * rng.uniform(0.6, 1.6, k)))
     rows = np.ceil(walls.height / (walls.cell * rng.uniform(0.8, 1.4, k)))
@@ -171,11 +178,11 @@ def _windows(walls: Walls, on: NDArray[np.int64], rng: np.random.Generator) -> A
     uneven = rng.uniform(0.6, 1.8, (2, k))  # windows at one end have more points
     which = rng.integers(0, WINDOW_POINTS, len(on))
     cells = np.array([columns, rows])
-    place = 0.012 * walls.cell[on] * rng.standard_normal((3, len(on)))
+    local = 0.012 * walls.cell[on] * rng.standard_normal((3, len(on)))
     cell = np.floor(rng.random((2, len(on))) ** uneven[:, on] * cells[:, on]) + 0.5
-    place[:2] += (cell + pattern[:, on, which]) * (np.array([walls.width, walls.height]) / cells)[:, on]
-    place[2] += recess[on, which]
-    return place
+    local[:2] += (cell + pattern[:, on, which]) * (np.array([walls.width, walls.height]) / cells)[:, on]
+    local[2] += recess[on, which]
+    return local
 
 
 def _ledges(walls: Walls, on: NDArray[np.int64], rng: np.random.Generator) -> Array:
@@ -183,62 +190,73 @@ def _ledges(walls: Walls, on: NDArray[np.int64], rng: np.random.Generator) -> Ar
     level = rng.random((k, LEDGES)) * walls.height[:, None]
     out = rng.uniform(0, 0.2, (k, LEDGES)) * walls.cell[:, None]
     which = rng.integers(0, LEDGES, len(on))
-    place = 0.02 * walls.cell[on] * rng.standard_normal((3, len(on)))
-    place[0] = rng.random(len(on)) * walls.width[on]
-    place[1] += level[on, which]
-    place[2] += out[on, which]
-    return place
+    local = 0.02 * walls.cell[on] * rng.standard_normal((3, len(on)))
+    local[0] = rng.random(len(on)) * walls.width[on]
+    local[1] += level[on, which]
+    local[2] += out[on, which]
+    return local
 
 
 def _patches(walls: Walls, on: NDArray[np.int64], rng: np.random.Generator) -> Array:
-    """Clusters such as doors, signs and statues, in relief."""
+    """Return clusters such as doors, signs and statues, in relief: (3, n) as `_windows`."""
     k = len(walls.width)
     centre = rng.random((2, k, PATCHES)) * np.array([walls.width, walls.height])[:, :, None]
     spread = rng.uniform(0.1, 0.8, (3, k, PATCHES)) * np.array([1.0, 1.0, 0.2])[:, None, None] * walls.cell[:, None]
     which = (PATCHES * rng.random(len(on)) ** 2).astype(np.int64)
-    place = spread[:, on, which] * rng.standard_normal((3, len(on)))
-    place[:2] += centre[:, on, which]
-    return place
+    local = spread[:, on, which] * rng.standard_normal((3, len(on)))
+    local[:2] += centre[:, on, which]
+    return local
 
 
 def _plain(walls: Walls, on: NDArray[np.int64], rng: np.random.Generator) -> Array:
     return rng.random((3, len(on))) * np.array([walls.width, walls.height, np.full(len(walls.width), 0.05)])[:, on]
 
 
-MAIN_WEIGHT = 3.0  # points on an area of the building that is looked at, of those on as much of another
-TELE = 0.15  # half of the image over the focal length; from narrower views the camera steps back no further
-CROSS_SECTION = 0.9  # of a pedestal, of its statue's radius
-EYE = (1.2, 2.0)  # metres above the ground, lowest and highest
+MAIN_WEIGHT = 3.0  # density of points on the main building, relative to the others
+TELE = 0.15  # half of the image over the focal length, below which the camera distance stays the same
+CROSS_SECTION = 0.9  # half width of a pedestal, relative to the radius of its statue
+EYE = (1.2, 2.0)  # smallest and largest height of the camera, metres
 
 
 def facades(count: int, half: float, rng: np.random.Generator) -> tuple[Scene, Viewpoint]:
-    """One to three walls in a line, each a corner with the last, mostly at right angles; columns, trees, boxes."""
+    """Draw a scene of one to three walls in a line with corners, mostly at right angles; columns, trees and boxes.
+
+    Args:
+        count: Number of points.
+        half: Half of the longer side of the image over the focal length.
+        rng: Random generator.
+    """
     main = _corner_walls(int(rng.integers(1, 4)), rng)
     boxes = int(rng.integers(0, 5))
     first = main.start[0] + main.width[0] / 2 * main.along[0]
     away = rng.uniform(20, 60, (boxes, 1)) * directions(rng.uniform(0, 2 * np.pi, boxes))
     size, yaw, tall = rng.uniform(3, 10, (boxes, 2)), rng.uniform(0, 2 * np.pi, boxes), rng.uniform(4, 20, boxes)
     view = _before_wall(main, int(rng.integers(len(main.width))), half, rng)
-    walls = joined([main, box_walls(first + away, size, yaw, tall)])
+    walls = join_walls([main, box_walls(first + away, size, yaw, tall)])
     shares = np.array([rng.random() < 0.6, 1, 1, 1])
     shares = rng.uniform([0.0, 0.02, 0.02, 0.0], [0.25, 0.2, 0.15, 0.1]) * shares
     on_columns, on_trees, on_ground, far = (shares * count).astype(int).tolist()
     low, high = first - main.width[0] * np.ones(2), first + main.width[0] * np.ones(2)
     yard, reach = first + rng.uniform(2, 20) * main.normal[0], main.width[0] / 2
     surfaces = [
-        wall_points(before(walls, view), count - on_columns - on_trees - on_ground - far, rng),
+        wall_points(thin_hidden_walls(walls, view), count - on_columns - on_trees - on_ground - far, rng),
         column_points(walls, on_columns, rng),
         tree_points(np.array([*low, 1.0]), np.array([*high, 7.0]), on_trees, rng),
         ground_points(yard - reach, yard + reach, on_ground, rng),
         horizon_points(np.array([*first, 0.0]), 60.0, far, rng),
     ]
-    return assembled(surfaces, walls, rng), view
+    return assemble(surfaces, walls, rng), view
 
 
 def street(count: int, half: float, rng: np.random.Generator) -> tuple[Scene, Viewpoint]:
-    """Houses on both sides of a street, some of them twins, cars, trees and poles; a walk along it.
+    """Draw a scene of houses on both sides of a street, some of them identical; cars, trees and poles.
 
-    The camera is within the scene: depths vary strongly, and other photos are near by.
+    The camera is within the scene: depths vary strongly, and other photos are near.
+
+    Args:
+        count: Number of points.
+        half: Not used.
+        rng: Random generator.
     """
     del half
     houses = int(rng.integers(3, 9))
@@ -256,40 +274,46 @@ def street(count: int, half: float, rng: np.random.Generator) -> tuple[Scene, Vi
     length = float(width.sum(1).min())
     parked = np.stack([rng.uniform(0, length, cars), rng.choice([-0.75, 0.75], cars) * across], -1)
     half_size = np.tile([2.2, 0.9], (cars, 1))
-    walls = joined([*sides, box_walls(parked, half_size, np.zeros(cars), np.full(cars, 1.5), cell=0.8, weight=3.0)])
-    place = np.array([length * rng.uniform(0.05, 0.7), rng.uniform(-0.8, 0.8) * across, rng.uniform(*EYE)])
+    walls = join_walls([*sides, box_walls(parked, half_size, np.zeros(cars), np.full(cars, 1.5), cell=0.8, weight=3.0)])
+    position = np.array([length * rng.uniform(0.05, 0.7), rng.uniform(-0.8, 0.8) * across, rng.uniform(*EYE)])
     heading, rising = rng.choice([0.0, np.pi]) + rng.normal(0, 0.5), 0.08 * rng.standard_normal()
     ahead = np.array([np.cos(rising) * np.cos(heading), np.cos(rising) * np.sin(heading), np.sin(rising)])
-    target = place + 8.0 * 4 ** rng.uniform(-0.5, 0.8) * ahead
-    view = Viewpoint(place, target, orbit=0.05, shift=0.08, heading=0.08, parallax=(5e-4, 0.1))
+    target = position + 8.0 * 4 ** rng.uniform(-0.5, 0.8) * ahead
+    view = Viewpoint(position, target, orbit=0.05, shift=0.08, heading=0.08, parallax=(5e-4, 0.1))
     shares = rng.uniform([0.02, 0.03, 0.0], [0.25, 0.2, 0.35])
     on_trees, on_ground, far = (shares * count).astype(int).tolist()
     surfaces = [
-        wall_points(before(walls, view), count - on_trees - on_ground - far, rng),
+        wall_points(thin_hidden_walls(walls, view), count - on_trees - on_ground - far, rng),
         tree_points(np.array([0.0, -across, 1.5]), np.array([length, across, 6.0]), on_trees, rng),
         ground_points(np.array([0.0, -across]), np.array([length, across]), on_ground, rng),
         horizon_points(np.zeros(3), 80.0, far, rng),
     ]
-    return assembled(surfaces, walls, rng), view
+    return assemble(surfaces, walls, rng), view
 
 
 def statue(count: int, half: float, rng: np.random.Generator) -> tuple[Scene, Viewpoint]:
-    """A figure of stacked and attached parts, often on a pedestal, before houses far away; 1 to 40 metres high."""
+    """Draw a figure of stacked parts, often on a pedestal, before distant houses; 1 to 40 metres high.
+
+    Args:
+        count: Number of points.
+        half: Half of the longer side of the image over the focal length.
+        rng: Random generator.
+    """
     tall, parts = 40 ** rng.random(), int(rng.integers(4, 13))
     foot = tall * (rng.uniform(0.1, 0.7) if rng.random() < 0.7 else 0.02)
     height = foot + tall * np.sort(rng.random(parts))
     radii = tall * rng.uniform(0.08, 0.3, (parts, 3)) * [0.6, 0.6, 1.2]
     centre = np.stack([*(0.5 * radii[:, :2].max() * rng.standard_normal((2, parts))), height], -1)
-    turn = Rotation.from_rotvec(0.5 * rng.standard_normal((parts, 3))).as_matrix()
-    blobs = Blobs(centre, turn.swapaxes(1, 2) / radii[:, :, None])
+    rotation = Rotation.from_rotvec(0.5 * rng.standard_normal((parts, 3))).as_matrix()
+    blobs = Blobs(centre, rotation.swapaxes(1, 2) / radii[:, :, None])
     side, yaw = np.full((1, 2), CROSS_SECTION * radii[:, :2].max()), rng.uniform(0, 1.5, 1)
     cell = max(0.1, 0.25 * foot)
     pedestal = box_walls(np.zeros((1, 2)), side, yaw, np.array([foot]), cell=cell, relief=0.02 * foot)
     houses = int(rng.integers(0, 4))
-    place = tall * rng.uniform(3, 10, (houses, 1)) * directions(rng.uniform(0, 2 * np.pi, houses))
+    position = tall * rng.uniform(3, 10, (houses, 1)) * directions(rng.uniform(0, 2 * np.pi, houses))
     size, yaw = tall * rng.uniform(0.5, 2, (houses, 2)), rng.uniform(0, 3, houses)
-    behind = box_walls(place, size, yaw, tall * rng.uniform(0.3, 1.5, houses), cell=0.2 * tall, weight=0.05)
-    walls = joined([pedestal, behind])
+    behind = box_walls(position, size, yaw, tall * rng.uniform(0.3, 1.5, houses), cell=0.2 * tall, weight=0.05)
+    walls = join_walls([pedestal, behind])
     on_walls, on_ground, far = (rng.uniform([0.1, 0.0, 0.0], [0.4, 0.15, 0.25]) * count).astype(int).tolist()
     surfaces = [
         blob_points(blobs, count - on_walls - on_ground - far, rng),
@@ -297,7 +321,7 @@ def statue(count: int, half: float, rng: np.random.Generator) -> tuple[Scene, Vi
         horizon_points(np.zeros(3), 8 * tall, far, rng),
         wall_points(walls, on_walls, rng),
     ]
-    scene = assembled(surfaces, walls, rng, blobs)
+    scene = assemble(surfaces, walls, rng, blobs)
     target = np.array([0.0, 0.0, foot + tall * rng.uniform(0.2, 0.7)])
     # Anywhere around, up to 25 degrees above or below; it fills 0.3 to 1.2 of the image.
     rising = math.radians(rng.uniform(-25, 25))
@@ -308,9 +332,9 @@ def statue(count: int, half: float, rng: np.random.Generator) -> tuple[Scene, Vi
 
 
 def _before_wall(walls: Walls, wall: int, half: float, rng: np.random.Generator) -> Viewpoint:
-    """A camera before a wall, mostly at eye level, at which the wall fills 0.4 to 2 of the image."""
+    """Draw a camera before a wall, mostly at eye level, so that the wall fills 0.4 to 2 of the image."""
     width, height = float(walls.width[wall]), float(walls.height[wall])
-    angle = float(np.clip(rng.normal(0, math.radians(30)), -1.15, 1.15))  # from the normal
+    angle = float(np.clip(rng.normal(0, math.radians(30)), -1.15, 1.15))  # to the normal
     away = math.cos(angle) * walls.normal[wall] + math.sin(angle) * walls.along[wall]
     distance = max(3.0, math.sqrt(width * height) / (2 * max(half, TELE)) * 5 ** rng.uniform(-0.45, 0.55))
     flat = walls.start[wall] + width * rng.uniform(0.15, 0.85) * walls.along[wall]

@@ -1,4 +1,4 @@
-"""Any number of random scenes, their sparse maps and one more photo of each: problems without a download."""
+"""Problems of random scenes: the sparse map of a scene and one more photo of it."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -31,26 +31,28 @@ from bpnp.poses import MIN_POINTS
 from bpnp.types import Batch
 
 Frame = Literal["upright", "view"]
-LONG_SIDE = 1200.0  # of an image, pixels
-LEAST_POINTS = 1500  # feature points of a scene
-MOST_ERROR_PX = 5.0  # of a match, pixels; beyond, a reconstruction drops the keypoint from its point
-CHANGED = 0.8  # share of the points that were not matched of which the photo has no keypoint
-ATTEMPTS = 50  # scenes drawn, until enough matches are found
+LONG_SIDE = 1200.0  # longer side of an image, pixels
+LEAST_POINTS = 1500  # least number of feature points of a scene
+MOST_ERROR_PX = 5.0  # largest error of a match, pixels; a reconstruction drops keypoints beyond it
+CHANGED = 0.8  # fraction of the unmatched points that have no keypoint in the photo
+ATTEMPTS = 50  # largest number of scenes drawn for one problem
 
 
-# How each kind is drawn, and feature points of its scene for each point of a problem: a photo sees a part of them.
+# Function that draws each kind, and number of feature points of its scene per point of a problem (a photo sees a part).
 KINDS = {"facades": (facades, 16), "street": (street, 24), "statue": (statue, 12)}
 WEIGHTS = {"facades": 0.5, "street": 0.25, "statue": 0.25}
-WITHIN = "street"  # the camera is within the scene, so its field of view is in the upper half of the range
+WITHIN = "street"  # kind whose camera is within the scene, with a field of view in the upper half of the range
 
 
 @dataclass(frozen=True)
 class MapOptions:
-    """How problems of synthetic maps are drawn; see `SyntheticMapDataModule`.
+    """Options of `draw_map_problem`; see `SyntheticMapDataModule` for those not listed.
 
-    frame: of the map, "upright" for the third axis upwards and any heading, "view" for the coordinates of the first of
-    the cameras whose map points are taken. tilt_deg: standard deviation of the upright frame's turn about each of its
-    horizontal axes, as where the vertical is known roughly.
+    Args:
+        frame: Frame of the map: "upright" for the third axis upwards and any heading, "view" for the coordinates of the
+            first of the cameras whose map points are taken.
+        tilt_deg: Standard deviation of the upright frame's rotation about each of its horizontal axes, degrees, as
+            where the vertical is known roughly.
     """
 
     num_points: int = 256
@@ -73,16 +75,24 @@ class MapOptions:
         check_within(1, math.inf, views=self.views)
         check_positive(scale_range=self.scale_range[0])
         if self.frame not in get_args(Frame):
-            raise ValueError(f"expected `frame` among {', '.join(get_args(Frame))}, got {self.frame!r}")
+            raise ValueError(f"`frame` is {self.frame!r}; it is one of {', '.join(get_args(Frame))}")
         weights = list(self.kinds.values())
         if not set(self.kinds) <= set(KINDS) or not all(weight >= 0 for weight in weights) or not any(weights):
             raise ValueError(f"expected `kinds` as weights of {', '.join(KINDS)}, got {dict(self.kinds)}")
 
 
 def draw_map_problem(name: str, options: MapOptions, rng: np.random.Generator) -> Problem:
-    """A new scene, a map of it by some photos, and one more photo's keypoints.
+    """Draw a scene, a map of it by some photos, and the keypoints of one more photo.
 
-    A scene whose photo shares fewer than `min_points` points with the map is drawn anew. Raises ValueError if 50 are.
+    If the photo shares fewer than `min_points` points with the map, another scene is drawn.
+
+    Args:
+        name: Name of the problem.
+        options: Options.
+        rng: Random generator.
+
+    Raises:
+        ValueError: 50 scenes shared too few points.
     """
     kinds = list(options.kinds)
     weights = np.array([options.kinds[kind] for kind in kinds])
@@ -94,13 +104,13 @@ def draw_map_problem(name: str, options: MapOptions, rng: np.random.Generator) -
         if (problem := _draw(name, kind, half, options, rng)) is not None:
             return problem
     raise ValueError(
-        f"expected a photo that shares {options.min_points} points with its map in {ATTEMPTS} scenes, got none in "
-        f"{name}; try a smaller `min_points` or a larger `num_points`"
+        f"no photo of {ATTEMPTS} scenes shares {options.min_points} points with its map in {name}; use a smaller "
+        "`min_points` or a larger `num_points`"
     )
 
 
 def _draw(name: str, kind: str, half: float, options: MapOptions, rng: np.random.Generator) -> Problem | None:
-    """A problem of a scene of this kind; None if photo and map share too few points."""
+    """Draw a problem of one kind of scene; None if photo and map share too few points."""
     draw_scene, density = KINDS[kind]
     scene, view = draw_scene(max(LEAST_POINTS, density * options.num_points), half, rng)
     reach = details(scene, view, half, rng)
@@ -112,77 +122,89 @@ def _draw(name: str, kind: str, half: float, options: MapOptions, rng: np.random
     sight = look(scene, photo, reach, rng, alone=True)
     keypoints = sight.image + noise_px / focal * rng.standard_normal(sight.image.shape)
     cameras = [nearby_camera(view, shape, rng) for _ in range(rng.integers(*options.views, endpoint=True))]
-    mapped, map_points = triangulated(scene, view, cameras, reach, noise_px / focal, rng)
+    map_index, map_points = triangulate(scene, view, cameras, reach, noise_px / focal, rng)
 
-    _, place2d, place3d = np.intersect1d(sight.of, mapped, assume_unique=True, return_indices=True)
-    matched = _matched(photo, cameras[0], map_points[place3d], keypoints[place2d], MOST_ERROR_PX / focal, rng)
-    matched2d, matched3d = place2d[matched], place3d[matched]
+    _, common2d, common3d = np.intersect1d(sight.of, map_index, assume_unique=True, return_indices=True)
+    matched = _draw_matches(photo, cameras[0], map_points[common3d], keypoints[common2d], MOST_ERROR_PX / focal, rng)
+    matched2d, matched3d = common2d[matched], common3d[matched]
     if len(matched2d) < options.min_points:
         return None
-    # A point that is seen from another side mostly has no keypoint either.
-    changed = place2d[~matched & (rng.random(len(matched)) < CHANGED)]
+    # A point seen from another side mostly has no keypoint either.
+    changed = common2d[~matched & (rng.random(len(matched)) < CHANGED)]
     others2d = np.setdiff1d(np.arange(len(keypoints)), np.concatenate([matched2d, changed]))
-    others3d = np.setdiff1d(np.arange(len(mapped)), matched3d)
+    others3d = np.setdiff1d(np.arange(len(map_index)), matched3d)
     matches, extra2d, extra3d = _amounts(len(matched2d), len(others2d), len(others3d), options, rng)
     if matches < options.min_points:
         return None
     heading = Rotation.from_rotvec([0.0, 0.0, rng.uniform(0, 2 * np.pi)]).as_matrix()
     tilt = Rotation.from_rotvec([*(math.radians(options.tilt_deg) * rng.standard_normal(2)), 0.0]).as_matrix()
     scale = _log_uniform(options.scale_range, rng)
-    turn, origin = tilt @ heading, 20 * scale * rng.standard_normal(3)  # of the map's axes
+    map_rotation, origin = tilt @ heading, 20 * scale * rng.standard_normal(3)
     if options.frame == "view":
-        turn, origin = cameras[0].rotation, scale * cameras[0].translation
+        map_rotation, origin = cameras[0].rotation, scale * cameras[0].translation
     pick = rng.permutation(len(matched2d))[:matches]
     chosen2d = np.concatenate([matched2d[pick], rng.permutation(others2d)[:extra2d]])
     chosen3d = np.concatenate([matched3d[pick], rng.permutation(others3d)[:extra3d]])
-    points3d = scale * map_points[chosen3d] @ turn.T + origin
-    rotation = photo.rotation @ turn.T
+    points3d = scale * map_points[chosen3d] @ map_rotation.T + origin
+    rotation = photo.rotation @ map_rotation.T
     translation = scale * photo.translation - rotation @ origin
     points2d = keypoints[chosen2d].astype(np.float32)
     return Problem(name, points2d, points3d.astype(np.float32), matches, rotation, translation, focal)
 
 
-def triangulated(
+def triangulate(
     scene: Scene, view: Viewpoint, cameras: list[Camera], reach: Array, noise: float, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], Array]:
-    """Which points of the scene one of the cameras and enough other photos have a keypoint of, and where in the map.
+    """Return the scene points in the map, and their map positions.
 
-    noise: of a keypoint, radians. A point is off along the ray of the camera by a normal error of its inverse depth,
-    noise / (baseline sqrt(photos)): with few photos from almost one place far points are anywhere along the ray.
+    A point is in the map if one of the cameras and enough other photos have a keypoint of it. Its position is off along
+    the ray of the camera by a normal error of its inverse depth, noise / (baseline sqrt(photos)): with few photos from
+    almost one position, far points are anywhere along the ray.
+
+    Args:
+        scene: Scene.
+        view: Viewpoint.
+        cameras: Cameras whose points are taken.
+        reach: As in `look`.
+        noise: Standard deviation of a keypoint, radians.
+        rng: Random generator.
+
+    Returns:
+        Indices of the points (k,), ascending, and their map positions (k, 3).
     """
-    photos = int(2 ** rng.uniform(1, 4))  # others that may see a point
-    least = int(rng.integers(1, 3))  # of them that have to
+    photos = int(2 ** rng.uniform(1, 4))  # number of other photos that may see a point
+    least = int(rng.integers(1, 3))  # number of them that have to see it
     distance = float(np.linalg.norm(view.centre - view.target))
     baseline = distance * _log_uniform(view.parallax, rng)
     index, points = [], []
-    known = np.zeros(len(scene.points), bool)
+    in_map = np.zeros(len(scene.points), bool)
     for camera in cameras:
         sight = look(scene, camera, reach, rng, alone=False)
         track = rng.binomial(photos, scene.repeatability[sight.of])
-        is_new = (track >= least) & ~known[sight.of]
-        seen = sight.of[is_new]
-        known[seen] = True
+        is_new = (track >= least) & ~in_map[sight.of]
+        added = sight.of[is_new]
+        in_map[added] = True
         depth = sight.depth[is_new]
-        inverse = 1 / depth + noise / (baseline * np.sqrt(track[is_new])) * rng.standard_normal(len(seen))
+        inverse = 1 / depth + noise / (baseline * np.sqrt(track[is_new])) * rng.standard_normal(len(added))
         along = 1 / (depth * np.maximum(inverse, 1e-5 / depth))
-        index.append(seen)
-        points.append(camera.centre + along[:, None] * (scene.points[seen] - camera.centre))
+        index.append(added)
+        points.append(camera.centre + along[:, None] * (scene.points[added] - camera.centre))
     order = np.argsort(np.concatenate(index))
     return np.concatenate(index)[order], np.concatenate(points)[order]
 
 
-def _matched(
+def _draw_matches(
     photo: Camera, other: Camera, points: Array, keypoints: Array, most: float, rng: np.random.Generator
 ) -> NDArray[np.bool_]:
-    """Which keypoints (k, 2) are matched with their map points (k, 3).
+    """Draw which keypoints (k, 2) are matched with their map points (k, 3).
 
     They have to be near the projection, and the map's first camera has to see the point at a similar angle.
     """
     camera = points @ photo.rotation.T + photo.translation
     near = camera[:, 2] > 0
     error = np.linalg.norm(camera[:, :2] / np.where(near, camera[:, 2], 1.0)[:, None] - keypoints, axis=-1)
-    ours, theirs = points - photo.centre, points - other.centre
-    cosine = (ours * theirs).sum(-1) / np.sqrt((ours**2).sum(-1) * (theirs**2).sum(-1))
+    ray, other_ray = points - photo.centre, points - other.centre
+    cosine = (ray * other_ray).sum(-1) / np.sqrt((ray**2).sum(-1) * (other_ray**2).sum(-1))
     angle = np.arccos(np.clip(cosine, -1, 1))
     return near & (error < most) & (rng.random(len(points)) < 0.95 * np.exp(-((angle / 0.6) ** 2)))
 
@@ -190,12 +212,15 @@ def _matched(
 def _amounts(
     matches: int, others2d: int, others3d: int, options: MapOptions, rng: np.random.Generator
 ) -> tuple[int, int, int]:
-    """Matches, and points of each side without a partner: thinned alike to `num_points` of the larger side."""
+    """Return the numbers of matches and of points of each side without correspondence.
+
+    They are reduced in proportion so that the larger side has `num_points`.
+    """
     outliers = _uniform(options.outliers, rng)
     allowed = np.inf if outliers >= 1 else matches * outliers / (1 - outliers)
     extra2d, extra3d = min(others2d, allowed), min(others3d, allowed)
-    share = min(1.0, options.num_points / (matches + max(extra2d, extra3d)))
-    return int(matches * share), int(extra2d * share), int(extra3d * share)
+    factor = min(1.0, options.num_points / (matches + max(extra2d, extra3d)))
+    return int(matches * factor), int(extra2d * factor), int(extra3d * factor)
 
 
 def _uniform(value: Drawn, rng: np.random.Generator) -> float:
@@ -209,9 +234,13 @@ def _log_uniform(value: Drawn, rng: np.random.Generator) -> float:
 
 
 class MapSource:
-    """A `ProblemSource` of scenes, one a problem, drawn when it is asked for: a function of (seed, epoch, index).
+    """Source of problems with one scene each, drawn on demand as a function of (seed, epoch, index).
 
-    Raises ValueError for no problems.
+    Args:
+        options: Options.
+        count: Number of problems, at least 1.
+        seed: Seeds.
+        label: Name of the split.
     """
 
     def __init__(self, options: MapOptions, *, count: int, seed: Sequence[int], label: str) -> None:
@@ -220,11 +249,12 @@ class MapSource:
 
     @property
     def counts(self) -> Counts:
-        """Most points of each problem; most have fewer."""
+        """Upper limits of the numbers of points of each problem."""
         most = np.full(self.count, self.options.num_points)
         return Counts(most, most, most)
 
     def batch(self, index: Int[Tensor, " b"], epoch: int) -> Batch:
+        """Return problems; see `ProblemSource.batch`."""
         rngs = ((i, np.random.default_rng([*self.seed, epoch, i])) for i in index.tolist())
         return stack_problems(
             [draw_map_problem(f"map/{self.label}/{i:06d}", self.options, rng) for i, rng in rngs], index
@@ -232,33 +262,34 @@ class MapSource:
 
 
 class SyntheticMapDataModule(ProblemDataModule):
-    """A photo's keypoints against the part of a sparse map that some other photos see, all of it drawn at random.
+    """Keypoints of a photo against the part of a sparse map that some other photos see, all drawn at random.
 
-    Every problem has a scene of its own, drawn when it is asked for. A point is in the map if enough photos have a
-    keypoint of it; it is off along its ray by the error of its triangulation. Keypoints of one photo alone, points out
-    of the photo's sight and matches that were missed are the points without a partner. Works without a Trainer:
+    Every problem has its own scene, drawn on demand. A point is in the map if enough photos have a keypoint of it; its
+    position is off along its ray by the error of its triangulation. Three kinds of points have no correspondence:
+    keypoints of one photo only, points that the photo does not see, and missed matches. Works without a Trainer:
     `setup()`, then the loaders.
 
     Args:
-        train_problems: training problems of an epoch.
-        fresh_views: draw new scenes and cameras every epoch; false for fixed problems.
-        val_problems: validation problems, fixed.
-        test_problems: problems to test and predict on, fixed.
-        num_points: largest number of points of a side; matches and others are thinned alike where there are more.
-        min_points: a scene with fewer matches is drawn anew; at least 4.
-        outliers: of each side at most this share of all points has no partner; 1 for all that there are. Two numbers,
-            [low, high], draw it for each problem, uniformly.
-        views: lowest and highest number of photos whose map points are taken.
-        kinds: weight of each kind of scene; none for half facades, and a quarter each street and statue.
-        frame: of the map: any, turned by a random rotation; upright, the third axis upwards and any heading; view, the
+        train_problems: Number of training problems in an epoch.
+        fresh_views: Draw new scenes and cameras every epoch; false for fixed problems.
+        val_problems: Number of validation problems, fixed.
+        test_problems: Number of problems to test and predict on, fixed.
+        num_points: Largest number of points of a side; of more, matches and others are reduced in proportion.
+        min_points: Least number of matches, at least 4; a scene with fewer is replaced.
+        outliers: Largest fraction of the points of each side without correspondence; 1 for all that there are. Two
+            numbers, [low, high], draw it uniformly for each problem.
+        views: Smallest and largest number of photos whose map points are taken.
+        kinds: Weight of each kind of scene; none for half facades, and a quarter each street and statue.
+        frame: Frame of the map: any, rotated at random; upright, the third axis upwards and any heading; view, the
             coordinates of the first of the cameras whose map points are taken.
-        tilt_deg: by how much an upright frame is off, about each of its horizontal axes, standard deviation in degrees.
-        scale_range: lowest and highest number of scene units in a metre, drawn for each scene, uniformly in its
+        tilt_deg: Standard deviation of an upright frame's rotation about each of its horizontal axes, degrees.
+        scale_range: Smallest and largest number of scene units in a metre, drawn for each scene, uniform in its
             logarithm.
-        field_of_view: of the longer side of an image, degrees; a number or [low, high], uniform in the logarithm.
-        noise_px: standard deviation of the noise on 2D points, pixels of an image with 1200 on its longer side; a
+        field_of_view: Field of view of the longer side of an image, degrees; a number or [low, high], uniform in the
+            logarithm.
+        noise_px: Standard deviation of the noise of 2D points, pixels of an image with 1200 on its longer side; a
             number or [low, high], uniform in the logarithm.
-        loading: options of `ProblemDataModule`: batch_size, eval_batch_size, train_outliers, test_outliers, seed, ...
+        loading: Options of `ProblemDataModule`: batch_size, eval_batch_size, train_outliers, test_outliers, seed, ...
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Scenes and photos of them: feature points, the walls and blobs that hide them, and where a photo has a keypoint."""
+"""Scenes and photos of them: feature points, the walls and blobs that hide them, and the keypoints of a photo."""
 
 import math
 from collections.abc import Sequence
@@ -8,17 +8,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-MIN_DEPTH = 0.1  # metres; nothing nearer to the camera is seen
+MIN_DEPTH = 0.1  # least depth of a visible point, metres
 GRAZING = 0.35  # cosine between a normal and the direction to the camera, below which detections get rarer
 ONE_PHOTO = 0.5  # probability of a keypoint at a visible point that no other photo has a keypoint of
-REACHED = 0.985  # share of the way to a point; a blob that the ray enters later is the surface of the point itself
+REACHED = 0.985  # fraction of the segment to a point; a blob entered later is the point's own surface
 
 
 class Walls(NamedTuple):
-    """Upright rectangles on the ground: from start (k, 2) by width (k,) along (k, 2); normal (k, 2) is the outside.
+    """Upright rectangles on the ground.
 
-    weight (k,): points on an area of a wall, relative. cell (k,): size of what is repeated on it, metres.
-    relief (k,): a wall hides nothing that is nearer to its plane, metres.
+    Attributes:
+        start: Lower corners (k, 2), metres.
+        along: Unit directions (k, 2).
+        normal: Outward normals (k, 2).
+        width: Widths (k,), metres.
+        height: Heights (k,), metres.
+        weight: Relative density of points (k,).
+        cell: Size of the repeated pattern (k,), metres.
+        relief: Depth of the relief (k,), metres; a wall does not hide points nearer to its plane.
     """
 
     start: Array
@@ -32,17 +39,27 @@ class Walls(NamedTuple):
 
 
 class Blobs(NamedTuple):
-    """Ellipsoids centre (k, 3), to_sphere (k, 3, 3): p is on the surface where ||to_sphere (p - centre)|| = 1."""
+    """Ellipsoids; p is on the surface where ||to_sphere (p - centre)|| = 1.
+
+    Attributes:
+        centre: Centres (k, 3), metres.
+        to_sphere: Maps to the unit sphere (k, 3, 3).
+    """
 
     centre: Array
     to_sphere: Array
 
 
 class Scene(NamedTuple):
-    """Feature points, metres, third axis upwards.
+    """Feature points of a scene, metres, third axis upwards.
 
-    points (n, 3); normals (n, 3), or 0 for points seen from every side; repeatability (n,): probability that a photo in
-    which the point is visible has a keypoint there, 0 for points that one photo alone has a keypoint of.
+    Attributes:
+        points: Points (n, 3).
+        normals: Normals (n, 3), 0 for points visible from every side.
+        repeatability: Probability (n,) that a photo in which the point is visible has a keypoint there; 0 for points
+            that only one photo has a keypoint of.
+        walls: Walls.
+        blobs: Blobs.
     """
 
     points: Array
@@ -53,12 +70,16 @@ class Scene(NamedTuple):
 
 
 class Viewpoint(NamedTuple):
-    """Where a photo of a scene is taken, and how other photos of the same part differ from it.
+    """Position of a photo of a scene, and how other photos of the same part differ from it.
 
-    centre, target (3,): the camera and what it looks at, metres. orbit: standard deviation of the angle by which the
-    others go around the target, radians. shift: of their distance from there, of the distance to the target. heading:
-    of the direction that they look in, radians. parallax: lowest and highest baseline between the photos that
-    saw a point, as a share of the distance to the target.
+    Attributes:
+        centre: Camera centre (3,), metres.
+        target: Point that the camera looks at (3,), metres.
+        orbit: Standard deviation of the angle by which other photos go around the target, radians.
+        shift: Standard deviation of their distance from there, as a fraction of the distance to the target.
+        heading: Standard deviation of their viewing direction, radians.
+        parallax: Smallest and largest baseline between the photos that saw a point, as a fraction of the distance to
+            the target.
     """
 
     centre: Array
@@ -70,63 +91,69 @@ class Viewpoint(NamedTuple):
 
 
 class Surface(NamedTuple):
-    """Points (n, 3) with normals (n, 3) and the share of them that is found again in other photos."""
+    """Points of a surface.
+
+    Attributes:
+        points: Points (n, 3).
+        normals: Normals (n, 3).
+        repeatable: Fraction of the points that are detected in other photos too.
+    """
 
     points: Array
     normals: Array
-    found_again: float
+    repeatable: float
 
 
 NO_BLOBS = Blobs(np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
 
-def assembled(surfaces: Sequence[Surface], walls: Walls, rng: np.random.Generator, blobs: Blobs = NO_BLOBS) -> Scene:
-    """A scene of several surfaces; the repeatability of points that are found again is drawn from Beta(3, 2).
+def assemble(surfaces: Sequence[Surface], walls: Walls, rng: np.random.Generator, blobs: Blobs = NO_BLOBS) -> Scene:
+    """Combine surfaces to a scene; the repeatability of repeatable points is drawn from Beta(3, 2).
 
-    Their share varies in waves over the scene, up to four of them: some parts are hardly ever in a map.
+    Their fraction varies in waves over the scene, up to four of them, so that some parts are hardly ever in a map.
     """
-    shares = np.repeat([part.found_again for part in surfaces], [len(part.points) for part in surfaces])
+    fractions = np.repeat([part.repeatable for part in surfaces], [len(part.points) for part in surfaces])
     points = np.concatenate([part.points for part in surfaces])
     wave = rng.standard_normal(3) * rng.uniform(1, 12) / np.median(np.abs(points - np.median(points, 0)))
-    shares = np.minimum(1, shares * (1 + np.cos(points @ wave + rng.uniform(0, 2 * np.pi))))
+    fractions = np.minimum(1, fractions * (1 + np.cos(points @ wave + rng.uniform(0, 2 * np.pi))))
     return Scene(
         points=points,
         normals=np.concatenate([part.normals for part in surfaces]),
-        repeatability=rng.beta(3.0, 2.0, len(shares)) * (rng.random(len(shares)) < shares),
+        repeatability=rng.beta(3.0, 2.0, len(fractions)) * (rng.random(len(fractions)) < fractions),
         walls=walls,
         blobs=blobs,
     )
 
 
-def joined(parts: Sequence[Walls]) -> Walls:
-    """All walls of several groups."""
+def join_walls(parts: Sequence[Walls]) -> Walls:
+    """Concatenate groups of walls."""
     return Walls(*(np.concatenate(field) for field in zip(*parts, strict=True)))
 
 
 def directions(angle: Array) -> Array:
-    """Unit vectors (..., 2) of angles (...)."""
+    """Return the unit vectors (..., 2) of angles (...), radians."""
     return np.stack([np.cos(angle), np.sin(angle)], -1)
 
 
 def right_of(along: Array) -> Array:
-    """Directions (k, 2) turned by a right angle, clockwise."""
+    """Rotate directions (k, 2) by a right angle, clockwise."""
     return along[:, ::-1] * [1.0, -1.0]
 
 
 def hidden_by_walls(walls: Walls, centre: Array, points: Array) -> NDArray[np.bool_]:
-    """Whether the segment from the centre to each point crosses a wall."""
+    """Return True where the segment from the centre to a point crosses a wall."""
     offset = np.einsum("ij,ij->i", walls.start, walls.normal)
-    ours, theirs = centre[:2] @ walls.normal.T - offset, points[:, :2] @ walls.normal.T - offset
-    apart = (ours * theirs < 0) & (np.abs(theirs) > walls.relief)
-    share = ours / np.where(apart, ours - theirs, 1.0)  # of the way to the point, where it crosses the wall's plane
+    from_centre, from_point = centre[:2] @ walls.normal.T - offset, points[:, :2] @ walls.normal.T - offset
+    crosses = (from_centre * from_point < 0) & (np.abs(from_point) > walls.relief)
+    fraction = from_centre / np.where(crosses, from_centre - from_point, 1.0)  # of the segment, at the wall's plane
     first = np.einsum("ij,ij->i", walls.start, walls.along)
-    place = centre[:2] @ walls.along.T - first + share * ((points[:, :2] - centre[:2]) @ walls.along.T)
-    up = centre[2] + share * (points[:, 2:] - centre[2])
-    return np.asarray((apart & (place > 0) & (place < walls.width) & (up < walls.height)).any(1))
+    along = centre[:2] @ walls.along.T - first + fraction * ((points[:, :2] - centre[:2]) @ walls.along.T)
+    up = centre[2] + fraction * (points[:, 2:] - centre[2])
+    return np.asarray((crosses & (along > 0) & (along < walls.width) & (up < walls.height)).any(1))
 
 
 def hidden_by_blobs(blobs: Blobs, centre: Array, points: Array) -> NDArray[np.bool_]:
-    """Whether the segment from the centre to each point enters an ellipsoid before it reaches the point."""
+    """Return True where the segment from the centre to a point enters an ellipsoid before it reaches the point."""
     start = np.einsum("kij,kj->ki", blobs.to_sphere, centre - blobs.centre)
     way = ((points - centre) @ blobs.to_sphere.reshape(-1, 3).T).reshape(len(points), len(blobs.centre), 3)
     square, half = (way**2).sum(-1), (way * start).sum(-1)
@@ -136,7 +163,14 @@ def hidden_by_blobs(blobs: Blobs, centre: Array, points: Array) -> NDArray[np.bo
 
 
 class Camera(NamedTuple):
-    """camera = rotation p + translation, metres; half (2,): half the image's width and height over the focal length."""
+    """Pinhole camera; camera = rotation p + translation, metres.
+
+    Attributes:
+        rotation: R (3, 3).
+        translation: t (3,).
+        centre: Camera centre (3,).
+        half: Half of the image's width and height over the focal length (2,).
+    """
 
     rotation: Array
     translation: Array
@@ -145,7 +179,13 @@ class Camera(NamedTuple):
 
 
 class Sight(NamedTuple):
-    """Keypoints of a photo: the scene's points that they are, of (k,); projections image (k, 2); depth (k,), metres."""
+    """Keypoints of a photo.
+
+    Attributes:
+        of: Index of the scene point of each keypoint (k,).
+        image: Projections (k, 2).
+        depth: Depths (k,), metres.
+    """
 
     of: NDArray[np.int64]
     image: Array
@@ -153,13 +193,18 @@ class Sight(NamedTuple):
 
 
 def image_shape(half: float, rng: np.random.Generator) -> Array:
-    """Half of the image's width and height over the focal length: 4:3, 3:2 or 16:9, upright or not."""
+    """Draw half of the image's width and height over the focal length: 4:3, 3:2 or 16:9, upright or not.
+
+    Args:
+        half: Half of the longer side over the focal length.
+        rng: Random generator.
+    """
     shape = half * np.array([1.0, rng.choice([3 / 4, 2 / 3, 9 / 16])])
     return shape if rng.random() < 0.75 else shape[::-1]
 
 
 def camera_at(centre: Array, target: Array, half: Array, rng: np.random.Generator) -> Camera:
-    """A camera that looks at a place (3,), held level to within a few degrees, rarely more."""
+    """Return a camera that looks at a target (3,), held level to within a few degrees, rarely more."""
     ahead = (target - centre) / np.linalg.norm(target - centre)
     level = math.hypot(ahead[0], ahead[1])
     right = np.array([ahead[1], -ahead[0], 0.0]) / level
@@ -171,7 +216,7 @@ def camera_at(centre: Array, target: Array, half: Array, rng: np.random.Generato
 
 
 def nearby_camera(view: Viewpoint, half: Array, rng: np.random.Generator) -> Camera:
-    """Another photo of the same part: around the target, somewhat nearer or farther, and not quite at the target."""
+    """Draw another photo of the same part: from around the target, and not quite directed at it."""
     from_target = view.centre - view.target
     distance = float(np.linalg.norm(from_target))
     angle = view.orbit * rng.standard_normal()
@@ -183,10 +228,14 @@ def nearby_camera(view: Viewpoint, half: Array, rng: np.random.Generator) -> Cam
 
 
 def look(scene: Scene, camera: Camera, reach: Array, rng: np.random.Generator, *, alone: bool) -> Sight:
-    """The points at which a photo has a keypoint: in the image, in front of their surface and not hidden, by chance.
+    """Draw the keypoints of a photo, among points in the image, in front of their surface and not hidden.
 
-    reach (n,): metres from which a camera of unit `half` can tell the details at a point. alone: also such points as no
-    other photo has a keypoint of.
+    Args:
+        scene: Scene.
+        camera: Camera of the photo.
+        reach: Largest distance from which a camera of unit `half` resolves the details at each point (n,), metres.
+        rng: Random generator.
+        alone: Include points that no other photo has a keypoint of.
     """
     x, y, depth = camera.rotation @ scene.points.T + camera.translation[:, None]
     inside = (np.abs(x) < camera.half[0] * depth) & (np.abs(y) < camera.half[1] * depth)
@@ -204,10 +253,10 @@ def look(scene: Scene, camera: Camera, reach: Array, rng: np.random.Generator, *
 
 
 def details(scene: Scene, view: Viewpoint, half: float, rng: np.random.Generator) -> Array:
-    """Metres (n,) from which a camera of unit `half` can still tell the details at each point.
+    """Draw the largest distance (n,) from which a camera of unit `half` resolves the details at each point, metres.
 
-    Sizes follow a power law, so that the number of points that can be told falls with the square of the distance; all
-    can be told from the distance to the target.
+    Sizes follow a power law, so that the number of resolved points falls with the square of the distance; all are
+    resolved from the distance to the target.
     """
     distance = half * float(np.linalg.norm(view.centre - view.target))
     return distance / np.sqrt(rng.random(len(scene.points)))
