@@ -204,13 +204,13 @@ def judged(
         if off >= HALF_TURN or not (rig or is_redundant(sets, count)):
             reason = reasons.against(f"its {count:.0f} matches do not fix the rotation", alarms)
             return SearchResult(candidates, "ambiguous", reason, batches, settled)
-        most = rule.focal if count >= rule.zoomed.fewest else rule.focal_few
-        if sets.focal is not None and (share := focal_bound(sets, linear, count)) > most:
+        share = 0.0 if sets.focal is None else focal_bound(sets, linear, count)
+        if share > (rule.focal_few if is_object(sets, rule) else rule.focal):
             off_by = f"{100 * share:.0f} % off" if share < 10 else "anything"
             what = f"the points do not fix the focal length: it and the distance may be {off_by}"
             reason = reasons.against(what, alarms)
             return SearchResult(candidates, "ambiguous", reason, batches, settled)
-        reason = reasons.confident(alarms, rule.lead, off)
+        reason = reasons.confident(alarms, rule.lead, off, share)
         against += [misfit(linear, count, rule), contesting(seen, rule)]
     doubts = [one for one in against if one is not None and one.decades < rule.lead]
     if certain and not doubts:
@@ -222,6 +222,11 @@ def judged(
     else:
         reason = reasons.against(reasons.incomplete(unseen), alarms)
     return SearchResult(candidates, "ambiguous", reason, batches, settled)
+
+
+def is_object(sets: PointSets, rule: Evidence) -> bool:
+    """Return whether the scene points are those of an object, few and not of a map, whose points have viewing cones."""
+    return sets.cosines3d is None and len(sets.points3d) <= rule.repetitions.whole
 
 
 def is_certain(candidates: Hypotheses, sets: PointSets, rule: Evidence = DEFAULT.evidence) -> bool:

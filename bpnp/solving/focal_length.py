@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from bpnp.cameras import (
     Camera,
@@ -28,6 +29,7 @@ from bpnp.search.annealing import polished
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.evidence.reasons import number
 from bpnp.search.evidence.settings import OtherFocal
+from bpnp.search.evidence.uncertainty import POSE, is_within
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.point_sets import UnknownFocal
 from bpnp.search.propose.lens import fit_lens
@@ -54,6 +56,8 @@ class FocalSettings:
     sigmas: of the error of a rough focal length within which it is looked for.
     turns: of the first search with each. alternations: searches and refinements, in turns, from each. rounds: of a
     refinement, until the logarithm moves by less than `same`.
+    bends: radial distortions from which it is fitted beside none: what they move a point at the corner of the image by,
+    a fraction of its distance from the principal point. From none too few points match to lead to a larger one.
     bend_sigma: standard deviation of what an unknown radial distortion moves a point at the corner of the image by, a
     fraction of its distance from the principal point; most_bend: the largest. fewest_bent: matches from which it is
     fitted.
@@ -71,6 +75,7 @@ class FocalSettings:
     alternations: int = 3
     rounds: int = 12
     same: float = 5e-4
+    bends: tuple[float, ...] = (-0.2, 0.2)
     bend_sigma: float = 0.05
     most_bend: float = OtherFocal.bend
     fewest_bent: int = 24
@@ -272,7 +277,8 @@ class _Ladder:
         return fitted.camera, max(abs(math.log(zoom / before)), bend) < RULE.same
 
     def contested(self) -> Solution:
-        """The best solution, ambiguous where another focal length led to a different pose that fits about as well."""
+        """The best solution, ambiguous where another focal length led to a different pose that fits about as well and
+        is beyond what the best one claims."""
         best, rule = self.best, SEARCH.evidence
         if best.verdict != "confident":
             return best
@@ -283,12 +289,28 @@ class _Ladder:
                 rotations = np.stack([best.rotation, other.rotation])
                 moved = rotations @ middle + np.stack([best.translation, other.translation])
                 shift = rule.other_shift * float(np.linalg.norm(moved[0]))
-                if behind < rule.lead and not same_pose(rotations, moved, 0, rule.other_deg, shift)[1]:
+                zoom = end.focal_length / best.focal_length
+                if (
+                    behind < rule.lead
+                    and not same_pose(rotations, moved, 0, rule.other_deg, shift)[1]
+                    and not is_claimed(best, other.rotation, zoom)
+                ):
                     away = math.degrees(turned_by(best.rotation, other.rotation))
-                    zoom = end.focal_length / best.focal_length
                     what = f"with {zoom:.2f} times the focal length a pose {away:.0f} deg away fits about as well"
                     return replace(best, verdict="ambiguous", reason=f"{what} ({number(behind)} times the number)")
         return best
+
+
+def is_claimed(solution: Solution, rotation: Array, zoom: float) -> bool:
+    """Return whether a rotation and `zoom` times the focal length are within the 99.9 % bound of a solution.
+
+    Not one that is turned by more than `Contested.far` times what makes a different pose, whatever the bound.
+    """
+    turn, rule = Rotation.from_matrix(rotation @ solution.rotation.T).as_rotvec(), SEARCH.evidence
+    if math.degrees(float(np.linalg.norm(turn))) > rule.contested.far * rule.other_deg:
+        return False
+    chosen, free = [0, 1, 2, POSE], 2 * len(solution.matches) - (POSE + 1)
+    return is_within(np.r_[turn, math.log(zoom)], solution.covariance[np.ix_(chosen, chosen)], free)
 
 
 class FittedCamera(NamedTuple):
@@ -329,13 +351,14 @@ def fit_camera(
     """
     zoom, radial = unknown.parts(camera)
 
-    def fit(start: float | None) -> FittedCamera:
-        fits = (_fit_track(problem_at, unknown, (zoom * each, start), pose, scale, seed, each) for each in zooms)
+    def fit(starts: list[tuple[float, float | None]]) -> FittedCamera:
+        fits = (_fit_track(problem_at, unknown, (zoom * z, k), pose, scale, seed, z) for z, k in starts)
         return min(fits, key=lambda one: one.log10_false_alarms)
 
-    plain = fit(None)
-    if unknown.bends:
-        bent = fit(radial or 0.0)
+    plain = fit([(each, None) for each in zooms])
+    if unknown.bends and min(len(plain.problem.sets.bearings), len(plain.problem.sets.points3d)) >= RULE.fewest_bent:
+        others = [] if radial is not None else [each / unknown.outermost(zoom) ** 2 for each in RULE.bends]
+        bent = fit([*((each, radial or 0.0) for each in zooms), *((1.0, each) for each in others)])
         matches = match_count(bent.poses, bent.problem.sets)
         lead = math.inf if unknown.distorted else math.log10(SEARCH.evidence.focal_chance)
         if matches >= RULE.fewest_bent and bent.log10_false_alarms < plain.log10_false_alarms + lead:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from planted import directions
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.stats import chi2, norm, t
 
 from bpnp import solve
 from bpnp.search.evidence import uncertainty
@@ -51,6 +51,21 @@ def test_bounds_are_exceeded_once_in_a_thousand() -> None:
         exceeded = np.mean(np.linalg.norm(errors[:, :3], axis=1) > rotation_bound(sets, linear, float(count)))
         assert 0.75e-3 < exceeded < 1.25e-3
     assert rotation_bound(sets, linear, 3.0) == math.inf
+
+
+def test_errors_are_within_what_a_covariance_claims_but_once_in_a_thousand() -> None:
+    """Drawn as before, of a covariance that was widened by Student's t."""
+    rng = np.random.default_rng(1)
+    root = rng.standard_normal((4, 4)) * [1e-2, 1e-2, 1e-2, 0.3]
+    for free in (5, 13, 400):
+        shrunk = np.sqrt(chi2.rvs(free, size=(100_000, 1), random_state=rng) / free)
+        errors = rng.standard_normal((100_000, 4)) @ root.T / shrunk
+        widened = float(t.ppf(norm.cdf(1), free)) ** 2 * root @ root.T
+        beyond = np.linalg.norm(errors @ np.linalg.inv(root).T, axis=1)
+        some = np.argsort(beyond)[-200:]
+        claimed = [uncertainty.is_within(error, widened, free) for error in errors[some]]
+        assert 70 <= len(some) - sum(claimed) <= 130
+    assert not uncertainty.is_within(np.zeros(4), np.full((4, 4), math.nan), 10)
 
 
 def test_a_false_partner_among_few_is_allowed_for() -> None:

@@ -1,5 +1,6 @@
 """What a verdict asks for beside few false alarms: residuals that carry the evidence, a lead, a pose that is fixed."""
 
+import math
 import re
 from dataclasses import replace
 
@@ -7,12 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from planted import directions
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from scipy.special import stdtrit
 
 from bpnp.loops.parallel import NEVER, Deadline
 from bpnp.search.evidence.rivals import AtZoom, likeliest_zoom, other_camera
 from bpnp.search.hypotheses import Hypotheses
-from bpnp.search.point_sets import PointSets
+from bpnp.search.point_sets import PointSets, UnknownFocal
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT
 from bpnp.search.verdict import SearchResult, judged
@@ -60,6 +63,37 @@ def test_precision_is_no_ambiguity() -> None:
         assert found.verdict == "confident"
         known.append(float(re.search(r"known to (\S+) deg", found.reason)[1]))
     assert 5 * known[0] < known[1] < 20 * known[0]
+
+
+@pytest.mark.parametrize(
+    ("distance", "is_map", "verdict"),
+    [(2.0, False, "confident"), (2.0, True, "ambiguous"), (20.0, False, "ambiguous")],
+)
+def test_the_focal_length_of_an_object_may_be_loose(distance: float, is_map: bool, verdict: str) -> None:
+    """The bound in the reason is that of Student's t for the spread of repeated fits. Of a map it is too loose."""
+    rng, noise = np.random.default_rng(2), 4e-3
+    points, shift = rng.uniform(-1, 1, (12, 3)), np.array([0, 0, 3 * distance])
+    exact = directions(points + shift)
+
+    def fitted(seen: Array) -> float:
+        def residuals(step: Array) -> Array:
+            camera = points @ Rotation.from_rotvec(step[:3]).as_matrix().T + (1 + step[5]) * shift
+            camera += (*step[3:5], 0)
+            return (directions(camera * np.array([math.exp(step[6]), math.exp(step[6]), 1])) - seen).ravel()
+
+        return float(least_squares(residuals, np.zeros(7)).x[6])
+
+    draws = [directions(exact + noise / distance * rng.standard_normal((12, 3))) for _ in range(60)]
+    cones = {"normals3d": -exact, "cosines3d": np.full(12, -1.0)} if is_map else {}
+    sets = PointSets(draws[0], points, focal=UnknownFocal(math.log(6)), **cones)
+    found = verdict_on(sets, np.eye(3)[None], shift[None], noise / distance, 1.0)
+    bound = re.search(r"(?:focal length to|may be) (\d+) %", found.reason)
+    assert found.verdict == verdict
+    if distance < 20:
+        spread = np.std([fitted(seen) for seen in draws])
+        assert bound is not None
+        assert 25 < float(bound[1]) < 100
+        assert float(bound[1]) == pytest.approx(100 * math.expm1(spread * stdtrit(17, 0.9995)), rel=0.5)
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,11 @@ from planted_model import HEIGHT, WIDTH, plant_model
 from scipy.spatial.transform import Rotation
 
 from bpnp import SceneMap, Solution, solve
-from bpnp.cameras import camera_from, camera_to_json
+from bpnp.cameras import Camera, camera_from, camera_to_json
 from bpnp.cli import main
+from bpnp.search.point_sets import UnknownFocal
+from bpnp.solving.focal_length import fit_camera, unknown_camera
+from bpnp.solving.problem import Problem, problem_from
 
 Array = NDArray[np.float64]
 SIZE = (640, 480)
@@ -101,6 +104,27 @@ def test_distortion_is_found_where_it_is_significantly_better(radial: float) -> 
     assert degrees_between(solution.rotation, rotation) < 0.5
     assert abs(solution.focal_length - 600) < 3 * solution.focal_length_std < 30
     assert solution.verdict == "confident"
+
+
+@pytest.mark.parametrize("radial", [-0.4, 0.4])
+def test_a_strong_distortion_is_found_among_dense_points(radial: float) -> None:
+    """From the true pose and focal length. Without distortion hardly a point has the right partner, of 1,200."""
+    rng = np.random.default_rng(0)
+    scene = rng.uniform(-1, 1, (1200, 3)) * [2.2, 1.8, 1]
+    pose = Rotation.from_rotvec([0.2, -0.3, 0.4]).as_matrix(), np.array([0.1, -0.1, 4.0])
+    camera = camera_from(("SIMPLE_RADIAL", (600.0, 320.0, 240.0, radial)))
+    pixels = camera.project(scene @ pose[0].T + pose[1]) + 0.5 * rng.standard_normal((1200, 2))
+    pixels = pixels[((pixels >= 0) & (pixels <= SIZE)).all(1)]
+    pixels = np.concatenate([pixels[: len(pixels) // 2], SIZE * rng.random((600, 2))])
+
+    def problem_at(lens: Camera, focal: UnknownFocal | None = None) -> Problem:
+        return problem_from(pixels, scene, lens, focal=focal)
+
+    unknown = unknown_camera(None, SIZE, None)
+    unknown = unknown.seen_by(problem_at(unknown.reference))
+    fitted = camera_to_json(fit_camera(problem_at, unknown, unknown.at(600 / 640), pose, 1e-3, seed=0).camera)
+    assert isinstance(fitted, dict)
+    assert fitted["params"] == pytest.approx([600, 320, 240, radial], rel=0.01)
 
 
 def test_distortion_that_is_asked_for_is_always_fitted() -> None:

@@ -4,22 +4,25 @@ MIRRORED = "the mirror image of the scene has a significant pose: check the dire
 LEAST_SHOWN = 0.05  # decades that are shown as 0.0
 
 
-def confident(log10_false_alarms: float, lead: float, bound_deg: float) -> str:
+def confident(log10_false_alarms: float, lead: float, bound_deg: float, focal: float = 0.0) -> str:
     """Return the reason of a confident pose.
 
     Args:
         log10_false_alarms: of the pose.
         lead: decades within which no competing pose lies.
         bound_deg: 99.9 % bound of the rotation, degrees.
+        focal: 99.9 % bound of the focal length, as a fraction; 0 if it is given.
 
     Examples:
         >>> confident(-69.1, 3.0, 0.213)
         'No competing pose within 3 decades; log10 NFA -69.1; rotation known to 0.2 deg (99.9 %)'
+        >>> confident(-9.1, 3.0, 5.2, 0.634)
+        'No competing pose within 3 decades; log10 NFA -9.1; rotation known to 5 deg, focal length to 63 % (99.9 %)'
     """
-    bound = f"{bound_deg:.1g}" if bound_deg < 9.5 else f"{bound_deg:.0f}"
-    return (
-        f"No competing pose within {lead:g} decades; {nfa(log10_false_alarms)}; rotation known to {bound} deg (99.9 %)"
-    )
+    known = f"rotation known to {rounded(bound_deg)} deg"
+    if focal:
+        known += f", focal length to {rounded(100 * focal)} %"
+    return f"No competing pose within {lead:g} decades; {nfa(log10_false_alarms)}; {known} (99.9 %)"
 
 
 def against(what: str, log10_false_alarms: float) -> str:
@@ -50,6 +53,11 @@ def incomplete(log10_missed: float) -> str:
 def undecided(reason: str, seconds: float) -> str:
     """Return the reason of a pose that a search could not decide before its time limit."""
     return f"{reason}; not decided in {seconds:.3g} s, a longer time limit may decide it"
+
+
+def rounded(bound: float) -> str:
+    """Return a bound: one digit below ten, whole numbers above."""
+    return f"{bound:.1g}" if bound < 9.5 else f"{bound:.0f}"
 
 
 def nfa(log10_false_alarms: float) -> str:

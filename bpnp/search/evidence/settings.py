@@ -108,9 +108,10 @@ class Evidence:
         tenth wrong is believed half as often again.
     contested, repetitions, zoomed: constants of these alternatives.
     focal: fraction by which a focal length that is fitted may be off, once in a thousand; with it the distance is off,
-        and by `other_shift` the pose is a different one. focal_few: the same with fewer matches than
-        `OtherFocal.fewest`, as LEDs have: their rotation is right long before their distance, whose standard deviation
-        says how far it may be off. scale: the same of the scale of a rig's scene.
+        and by `other_shift` the pose is a different one. focal_few: the same of an object, a scene of at
+        most `Repetitions.whole` points that is no map, such as LEDs: its rotation is right long before its distance.
+        The reason says how far the focal length may be off; beyond a factor of two it is open. scale: the same of the
+        scale of a rig's scene.
     """
 
     false_alarms: float = -2.0
@@ -128,5 +129,5 @@ class Evidence:
     repetitions: Repetitions = Repetitions()
     zoomed: OtherFocal = OtherFocal()
     focal: float = 0.05
-    focal_few: float = 0.25
+    focal_few: float = 1.0
     scale: float = 0.2

@@ -107,6 +107,24 @@ def exceeded_once(covariance: Array, free: float) -> float:
     return math.sqrt(total * float(max(1 - b, 0.0) * quantiles[0] + b * quantiles[1]))
 
 
+def is_within(error: Array, covariance: Array, free: float) -> bool:
+    """Return whether an error is in the region that a covariance claims to hold it with a probability of 99.9 %.
+
+    Args:
+        error: (d,) of some of what is fitted.
+        covariance: (d, d) as `pose_covariance` gives it, widened for few residuals. With F's quantile it is not.
+        free: Degrees of freedom with which the scale of the residuals was estimated.
+
+    >>> is_within(np.array([3.0]), np.eye(1), MANY), is_within(np.array([3.4]), np.eye(1), MANY)
+    (True, False)
+    """
+    if not np.isfinite(covariance).all():
+        return False
+    free, size = max(free, 1.0), len(error)
+    squared = float(error @ np.linalg.pinv(covariance, hermitian=True) @ error) * stdtrit(free, ONE_SIGMA) ** 2
+    return bool(squared < size * fdtri(size, free, 1 - EXCEEDED))
+
+
 def pose_covariance(sets: PointSets, linear: "Linearised | None", count: float, origin: Array) -> Array | None:
     """Covariance (6, 6) of a pose, None where the points do not fix it; (7, 7) with the logarithm of a focal length
     that is fitted.
