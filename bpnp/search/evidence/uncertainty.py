@@ -107,7 +107,7 @@ def exceeded_once(covariance: Array, free: float) -> float:
     return math.sqrt(total * float(max(1 - b, 0.0) * quantiles[0] + b * quantiles[1]))
 
 
-def is_within(error: Array, covariance: Array, free: float) -> bool:
+def is_within(error: Array, covariance: Array, free: float | int) -> bool:
     """Return whether an error is in the region that a covariance claims to hold it with a probability of 99.9 %.
 
     Args:
@@ -120,7 +120,7 @@ def is_within(error: Array, covariance: Array, free: float) -> bool:
     """
     if not np.isfinite(covariance).all():
         return False
-    free, size = max(free, 1.0), len(error)
+    free, size = max(float(free), 1.0), len(error)
     squared = float(error @ np.linalg.pinv(covariance, hermitian=True) @ error) * stdtrit(free, ONE_SIGMA) ** 2
     return bool(squared < size * fdtri(size, free, 1 - EXCEEDED))
 
