@@ -394,7 +394,7 @@ def _pycolmap() -> Any:
 
 
 def _checked(lens: Lens, shown: str) -> Lens:
-    focal = lens.focal
+    focal = min([lens.focal, *np.asarray(lens.camera.params)[list(lens.camera.focal_length_idxs())].tolist()])
     if not focal > 0:
         raise ValueError(f"the focal length of a camera has to be positive; the parameters {shown} give {focal}")
     return lens

@@ -54,6 +54,10 @@ class Example:
     translation: Array
     normals3d: Array | None = None
 
+    def __repr__(self) -> str:
+        normals = "" if self.normals3d is None else " with normals"
+        return f"Example({len(self.points2d)} image points, {len(self.points3d)} scene points{normals})"
+
     def rotation_error_deg(self, rotation: Any) -> float:
         """Return the angle between a rotation and the true one, degrees.
 

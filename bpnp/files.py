@@ -54,6 +54,12 @@ def write_text(path: Path, text: str) -> Path:
     return path
 
 
+def require_new_folder(folder: Path) -> None:
+    """Raise ValueError unless a folder can be written: it does not exist, or it is empty."""
+    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+        raise ValueError(f"{folder} exists and would be replaced; name a new folder")
+
+
 @contextmanager
 def lock_folder(folder: Path, *, wait: bool = False) -> Iterator[None]:
     """Lock a folder for this process until the block ends; create it if it does not exist.

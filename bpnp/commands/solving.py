@@ -1,6 +1,8 @@
 """`bpnp solve` and `bpnp verify`: the pose of a camera from a file of image points and a file of scene points."""
 
+import re
 import time
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,8 +11,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bpnp.files import write_text
-from bpnp.report.terminal import console, progress, say
+from bpnp.files import require_new_folder, write_text
+from bpnp.report.terminal import console, fixed, number, progress, say
 
 if TYPE_CHECKING:
     from bpnp.solving.solution import Solution
@@ -30,6 +32,7 @@ def solve(
     photo: Path | None = None,
     colmap: Path | None = None,
     json: bool = False,
+    quiet: bool = False,
     surface: int | None = None,
     prior: Path | None = None,
     prior_degrees: float = 10.0,
@@ -58,14 +61,16 @@ def solve(
         camera: file with a 3x3 matrix, COLMAP's MODEL,PARAMETERS such as SIMPLE_PINHOLE,f,cx,cy, or a COLMAP model with
             one camera (its folder, or cameras.bin or .txt).
         image: name of the image whose camera to take, where the --camera model has several.
-        image_size: WIDTH,HEIGHT of the image in pixels, where its focal length is unknown: it is found with the pose.
+        image_size: WIDTH,HEIGHT or WIDTHxHEIGHT of the image in pixels, where its focal length is unknown: it is found
+            with the pose.
         focal_error: standard deviation of the focal length of --camera where that is rough, as a share of it.
         distortion: fit a radial coefficient with an unknown focal length even where it is not significantly better.
         output: write the solution as JSON.
         picture: draw it as .png, .svg or .pdf.
         photo: the photo, of the size of the --camera or smaller, under the points of --picture.
-        colmap: folder to write, a COLMAP model of this image.
+        colmap: new folder to write, a COLMAP model of this image.
         json: print JSON instead of a table.
+        quiet: print nothing but errors, and JSON if asked for.
         surface: points to draw from a mesh; its vertices by default.
         prior: rough pose, the JSON of a solution; or a network, packaged weights by name or a checkpoint.
         prior_degrees: standard deviation of its rotation, degrees.
@@ -116,12 +121,11 @@ def solve(
     under = None if photo is None or picture is None else read_photo(photo)
     if under is not None:
         size_in_camera(under, camera_from(lens))
-    for path in (output, picture):  # raises before the search where its result could not be written
-        if path is not None and path.is_dir():
-            raise ValueError(f"expected a file to write to, got the folder {path}; try a name in it")
-        if path is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
-    with progress(items=False) as shown:
+    inputs = [points2d, points3d, prior, photo, *(Path(text) for text in (camera, solver) if text is not None)]
+    _check_outputs([output, picture], inputs)
+    if colmap is not None:
+        require_new_folder(colmap)
+    with progress(items=False, quiet=quiet) as shown:
         task = shown.add_task("searching the pose", total=None)
         solution = find_pose(
             image_points,
@@ -141,7 +145,7 @@ def solve(
             device=device,
             progress=lambda _, batch, __: shown.update(task, description=f"searching the pose, round {batch}"),
         )
-    said = _tell(solution, json=json, output=output)
+    said = _tell(solution, annotations, json=json, quiet=quiet, output=output)
     if picture is not None:
         figure = solution_picture(solution, title=points2d.stem, photo=under)
         say(f"wrote {save_figure(figure, picture)}", to=said)
@@ -164,6 +168,7 @@ def verify(
     output: Path | None = None,
     page: Path | None = None,
     json: bool = False,
+    quiet: bool = False,
     surface: int | None = None,
     inlier_threshold: float | None = None,
     time_limit: float | None = None,
@@ -191,6 +196,7 @@ def verify(
         output: write the solution as JSON; of a model a file that ends in .json or .csv.
         page: of a model, write the table and a drawing of the map as one .html file.
         json: print JSON instead of a table.
+        quiet: print nothing but errors, and JSON if asked for.
         surface: points to draw from a mesh; its vertices by default.
         inlier_threshold: largest error of a match, pixels with a camera, else of x/z, y/z; three
             times the residuals' scale by default.
@@ -221,8 +227,10 @@ def verify(
         judged = read_pose(pose)
     else:
         raise ValueError("expected the JSON of a pose, or --rotation and --translation")
+    inputs = [points2d, points3d, pose, matches, None if camera is None else Path(camera)]
+    _check_outputs([output], inputs)
     image_points, scene_points, annotations = _read_sides(points2d, points3d, surface, seed)
-    with progress(items=False) as shown:
+    with progress(items=False, quiet=quiet) as shown:
         shown.add_task("looking around the pose", total=None)
         solution = judge_pose(
             image_points,
@@ -237,7 +245,20 @@ def verify(
             seed=seed,
             time_limit=time_limit,
         )
-    _tell(solution, json=json, output=output)
+    _tell(solution, annotations, json=json, quiet=quiet, output=output)
+
+
+def _check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | None]) -> None:
+    """Raise ValueError for a file that cannot be written, or that is an input; their folders are made."""
+    read = {path.resolve() for path in inputs if path is not None and path.is_file()}
+    for path in outputs:
+        if path is None:
+            continue
+        if path.is_dir():
+            raise ValueError(f"expected a file to write to, got the folder {path}; try a name in it")
+        if path.resolve() in read:
+            raise ValueError(f"{path} is an input and would be overwritten; name another file")
+        path.parent.mkdir(parents=True, exist_ok=True)
 
 
 def _read_sides(points2d: Path, points3d: Path, surface: int | None, seed: int) -> tuple[Any, Any, dict[str, Any]]:
@@ -249,34 +270,43 @@ def _read_sides(points2d: Path, points3d: Path, surface: int | None, seed: int) 
     return seen, scene, {"normals3d": normals3d, "labels2d": labels2d, "labels3d": labels3d}
 
 
-def _tell(solution: "Solution", *, json: bool, output: Path | None) -> Console:
-    """Print and write a solution; gives the console for what else was written, stderr beside JSON."""
-    out = Console(stderr=True) if json else console()
+def _tell(
+    solution: "Solution", annotations: Mapping[str, Any], *, json: bool, quiet: bool, output: Path | None
+) -> Console:
+    """Print and write a solution, and return the console for what else was written."""
+    out = console(json=json, quiet=quiet)
     if json:
         say(solution.to_json())
     else:
-        out.print(solution_table(solution))
+        out.print(solution_table(solution, annotations))
     if output is not None:
         write_text(output, solution.to_json() + "\n")
         say(f"wrote {output}", to=out)
     return out
 
 
-def solution_table(solution: "Solution") -> Table:
-    """Verdict, pose and matches; the next candidates, and how long it took."""
+def solution_table(solution: "Solution", annotations: Mapping[str, Any] | None = None) -> Table:
+    """Return a table of verdict, pose, matches and next candidates, and of which `annotations` the points have."""
     from bpnp.report.terminal import VERDICTS
 
     table = Table(box=box.SIMPLE, show_header=False, padding=(0, 1))
     table.add_column(no_wrap=True, style="dim")
     table.add_column(overflow="fold")
     table.add_row("verdict", Text.assemble((solution.verdict, VERDICTS[solution.verdict]), f": {solution.reason}"))
+    given = [name for name, values in (annotations or {}).items() if values is not None]
+    image, scene = (", ".join(name[:-2] for name in given if name.endswith(side)) for side in ("2d", "3d"))
+    counts = f"{len(solution.points2d)} image points", f"{len(solution.points3d)} scene points"
+    sides = (f"{count} with {kinds}" if kinds else count for count, kinds in zip(counts, (image, scene), strict=True))
+    table.add_row("points", ", ".join(sides))
     if solution.found:
         for name, row in zip(("rotation", "", ""), solution.rotation, strict=True):
-            table.add_row(name, _numbers(row))
+            table.add_row(name, "  ".join(f"{value:12.6f}" for value in row))
         table.add_row("translation", _numbers(solution.translation))
         table.add_row("camera centre", _numbers(solution.centre))
         if solution.focal_length_std:
-            table.add_row("focal length", f"{solution.focal_length:.6g} +- {solution.focal_length_std:.2g} px, found")
+            table.add_row(
+                "focal length", f"{fixed([solution.focal_length])[0]} +- {number(solution.focal_length_std)} px, found"
+            )
         smaller = min(len(solution.points2d), len(solution.points3d))
         table.add_row("inliers", f"{solution.inlier_count} of {smaller} ({100 * solution.inlier_ratio:.1f} %)")
         table.add_row(
@@ -294,14 +324,14 @@ def solution_table(solution: "Solution") -> Table:
 
 def _size(text: str) -> tuple[int, int]:
     try:
-        width, height = (int(side) for side in text.split(","))
+        width, height = (int(side) for side in re.split("[,x×]", text))
         return width, height
     except ValueError as error:
         raise ValueError(f"expected --image_size as WIDTH,HEIGHT in pixels, such as 640,480, got {text!r}") from error
 
 
 def _numbers(values: Any) -> str:
-    return "  ".join(f"{value:12.6g}" for value in values)
+    return "  ".join(f"{text:>12}" for text in fixed(values.tolist()))
 
 
 def warm_up() -> None:

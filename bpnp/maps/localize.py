@@ -75,9 +75,7 @@ def problem_near(
     return replace(problem, sets=replace(problem.sets, log10_views=math.log10(views)))
 
 
-def near_view(
-    region: Region, keypoints: Any, camera: Any, prior: PosePrior | None, options: Options, *, views: int = 1
-) -> Solution:
+def near_view(region: Region, keypoints: Any, camera: Any, prior: Any, options: Options, *, views: int = 1) -> Solution:
     """Return the best pose of a photo among the points of one region.
 
     Args:

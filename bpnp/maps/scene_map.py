@@ -5,6 +5,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -47,8 +48,14 @@ from bpnp.maps.views import (
 )
 from bpnp.poses import MIN_POINTS
 from bpnp.search.settings import SearchSettings
-from bpnp.search.starts import PosePrior
-from bpnp.solving.arguments import check_inside, pixels_from, positive, source_from
+from bpnp.solving.arguments import (
+    check_inside,
+    checked_prior,
+    checked_seed,
+    pixels_from,
+    positive,
+    source_from,
+)
 from bpnp.solving.focal_length import UnknownCamera, unknown_camera
 from bpnp.solving.solution import Solution
 from bpnp.solving.sources import Options
@@ -88,14 +95,18 @@ class SceneMap:
     views: tuple[View, ...]
 
     @classmethod
-    def from_colmap(cls, path: str | Path) -> "SceneMap":
-        """The map in a folder of cameras, images and points3D, all .bin or all .txt.
+    def from_colmap(cls, path: Any) -> "SceneMap":
+        """The map in a folder of cameras, images and points3D, all .bin or all .txt, or in a pycolmap.Reconstruction.
 
         Not used, and logged as a warning: images with a broken pose, and points that are not finite. A view without
         points stays in the map. Keypoints are not kept: 10^6 points and 10^4 views of 1,000 points take 80 MB. The
         first time that a large map is opened, an index is written beside the model (`bpnp.maps.index`).
         Raises ColmapError, a ValueError, for a model that cannot be read or has no view that sees a point.
         """
+        if callable(getattr(path, "write_binary", None)):
+            with TemporaryDirectory() as folder:
+                path.write_binary(folder)
+                return cls.from_colmap(folder)
         known = index.read_index(Path(path))
         if known is not None:
             scene = cls(*known[:4])
@@ -221,7 +232,7 @@ class SceneMap:
         distortion: bool = False,
         views: Iterable[str] | None = None,
         scores: Any = None,
-        prior: PosePrior | None = None,
+        prior: Any = None,
         solver: "str | Path | torch.nn.Module" = "auto",
         seed: int = 0,
         time_limit: float | int | None = None,
@@ -239,7 +250,8 @@ class SceneMap:
             that any of them sees are used near each; None to try the points of one view of the whole map after the
             other, those first where the density of its points is most like that of the keypoints.
         scores: (m,) strength of the keypoints; the strongest are used first.
-        prior: what is known of the photo's pose; None to expect it near that of the view that is tried.
+        prior: what is known of the photo's pose, as for `bpnp.solve`; None to expect it near that of the view that is
+            tried.
         solver: as for `bpnp.solve`; a network that expects the points in the camera of a view gets them in that of the
             view that is tried, or of the prior.
         seed: of the search.
@@ -260,7 +272,7 @@ class SceneMap:
         lens = self._lens(camera, image_size, focal_error, distortion)
         if image_size is not None:
             check_inside(pixels, image_size)
-        views = None if views is None else list(views)
+        views, prior = None if views is None else list(views), checked_prior(prior)
         deadline = Deadline.after(positive("time_limit", time_limit))
         strongest = None if scores is None else strongest_of(scores, np.shape(pixels)[:1])
         used = pixels if strongest is None else np.asarray(pixels)[strongest]
@@ -271,9 +283,9 @@ class SceneMap:
         def options_for(settings: SearchSettings) -> Options:
             limit = max(deadline.at - Clock.now(), 1e-3)
             asks = solver == "auto" and settings is LONGER  # not of every view of the map
-            return Options(module, asks, seed=seed, time_limit=limit, settings=settings, until=deadline)
+            return Options(module, asks, seed=checked_seed(seed), time_limit=limit, settings=settings, until=deadline)
 
-        def near(camera: Any, options: Options, region: Region, expected: PosePrior | None) -> Solution:
+        def near(camera: Any, options: Options, region: Region, expected: Any) -> Solution:
             return near_view(region, used, camera, expected, options, views=tries)
 
         def in_map(place: Place, solution: Solution, options: Options) -> Solution:

@@ -25,8 +25,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-SUFFIXES = (".png", ".svg", ".pdf")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".svg", ".pdf")
 POINTS = 981  # of a curve
+NUMBERED = 40  # 3D points up to which their indices are drawn
 MARGIN = 0.15  # of the extent of the image points, around them
 WIDTH, CLOSE_UP, CAPTIONS = 10.0, 3.5, 1.3  # inches, of an image beside its residuals
 LIMITS: dict[Error, float] = {"rotation_deg": 20.0, "translation": 1.0, "joint": 20.0, "reprojection_deg": 2.0}
@@ -164,7 +165,8 @@ def plot_image(
 
     estimate: whose pose, the first by default. lines: to the true matches or to those assigned by the solver, which a
     problem without known matches always has; those that are not the true ones are dotted. photo: (h, w, 3) uint8, as it
-    was taken with the camera; under it, 3D points without a match are not drawn. Returns the axes.
+    was taken with the camera; under it, 3D points without a match are not drawn. Points whose normals face away from
+    the camera are small dots. At most `NUMBERED` 3D points have their indices beside them. Returns the axes.
 
     Raises ValueError for a photo of a problem without a camera, or without an image point in front of it.
     """
@@ -184,7 +186,8 @@ def plot_image(
     visible = np.isfinite(projected).all(-1)
     joined = visible & (targets >= 0)
     matched = visible if lines is None else joined
-    free = visible & ~matched
+    away = _facing_away(problem, estimate) & visible & ~matched
+    free = visible & ~matched & ~away
     if matched.any():
         axes.plot(*projected[matched].T, "x", color=colour, ms=size, mew=0.9, label="3D points, matched", zorder=4)
         wrong = joined & (problem.match3d != targets) & (problem.match3d >= 0)
@@ -194,6 +197,16 @@ def plot_image(
                 axes.add_collection(LineCollection(list(ends), colors=ink, linestyles=style, linewidths=0.8, zorder=2))
     if free.any() and photo is None:
         axes.plot(*projected[free].T, "x", color=LIGHT[3], ms=size, mew=0.6, label="3D points, no match", zorder=1)
+    if away.any() and photo is None:
+        axes.plot(*projected[away].T, ".", color=QUIET, ms=size / 2, label="3D points, facing away", zorder=1)
+    if len(projected) <= NUMBERED:
+        shown = matched if photo is not None else visible
+        for number in np.flatnonzero(
+            shown & (projected >= (left, top)).all(-1) & (projected <= (right, bottom)).all(-1)
+        ):
+            ink = QUIET if away[number] else LIGHT[3] if free[number] else rim
+            text = str(problem.numbers()[1][number])
+            axes.annotate(text, projected[number], (4, 4), textcoords="offset points", fontsize=7, color=ink, zorder=5)
     unit = _unit(problem)
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel=unit, ylabel=unit)
     axes.tick_params(labelsize=8)
@@ -220,19 +233,35 @@ def plot_residuals(
     return axes
 
 
-def plot_matches(problem: ProblemPoints, *, colour: str, photo: Array | None = None) -> "Figure":
-    """The image of a problem and a close-up of its residuals below its id, in a colour; photo: as for `plot_image`."""
+def plot_matches(
+    problem: ProblemPoints, *, colour: str, photo: Array | None = None, competing: ProblemPoints | None = None
+) -> "Figure":
+    """Draw the image of a problem and a close-up of its residuals below its id.
+
+    Args:
+        problem: With an estimate.
+        colour: Of the id.
+        photo: As for `plot_image`.
+        competing: The problem with another estimate, to draw beside it.
+    """
     from matplotlib.figure import Figure
 
-    figure = Figure(layout="constrained")
-    axes, close = figure.subplots(1, 2, width_ratios=(WIDTH, CLOSE_UP))
-    plot_image(axes, problem, photo=photo)
+    figure, drawn = Figure(layout="constrained"), [problem] if competing is None else [problem, competing]
+    widths = (*[WIDTH / len(drawn)] * len(drawn), CLOSE_UP / len(drawn))
+    *images, close = figure.subplots(1, len(widths), width_ratios=widths)
+    for axes, one in zip(images, drawn, strict=True):
+        plot_image(axes, one, photo=photo)
+    if competing is not None:
+        images[0].set_title("best pose", fontsize=9)
+        images[1].set_title(shown_text(competing.id), fontsize=9)
+    axes = images[0]
     plot_residuals(close, problem)
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
-    height = float(np.clip(WIDTH * (bottom - top) / (right - left), 3, 10))
-    figure.set_size_inches(WIDTH + CLOSE_UP, height + CAPTIONS)
+    height = float(np.clip(widths[0] * (bottom - top) / (right - left), 3, 10))
+    figure.set_size_inches(sum(widths), height + CAPTIONS)
     figure.suptitle(problem.id.replace("$", r"\$"), fontsize=10, color=colour)
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8)
+    entries = {label: handle for one in images for handle, label in zip(*one.get_legend_handles_labels(), strict=True)}
+    figure.legend([*entries.values()], [*entries], loc="outside lower center", ncols=4, frameon=False, fontsize=8)
     return figure
 
 
@@ -271,6 +300,15 @@ def _prepare_drawing(
     targets = np.full(len(projected), -1) if lines is None else getattr(problem, lines)
     place = [*problem.estimates].index(name) if name else 0
     return seen, projected, targets, LIGHT[place % len(LIGHT)]
+
+
+def _facing_away(problem: ProblemPoints, estimate: str | None) -> Array:
+    """Return which 3D points (n,) have normals that face away from the camera of an estimate; none without normals."""
+    if problem.normals3d is None:
+        return np.zeros(len(problem.points3d), bool)
+    rotation, translation = _estimate(problem, estimate)[1]
+    camera = np.asarray(problem.points3d, float) @ rotation.T + translation
+    return np.asarray(((problem.normals3d @ rotation.T) * camera).sum(-1) >= 0)
 
 
 def _extent(points2d: Array) -> tuple[float, float, float, float]:

@@ -38,7 +38,8 @@ class ProblemPoints:
     pose: true rotation (3, 3) and translation (3,), None if unknown. estimates: the same by name; NaN without a pose.
     error: rotation error of the first estimate in degrees. ids2d, ids3d: the places of
     the points in the problem as it was solved, if only some of them are here; None for all. camera: in whose pixels the
-    problem is drawn, None for normalised coordinates; it is not kept on disk.
+    problem is drawn, None for normalised coordinates. normals3d: (n, 3) outward normals, None where points have none.
+    Camera and normals are not kept on disk.
     """
 
     index: int
@@ -53,6 +54,7 @@ class ProblemPoints:
     ids2d: Array | None = None
     ids3d: Array | None = None
     camera: Camera | None = None
+    normals3d: Array | None = None
 
     def numbers(self) -> tuple[Array, Array]:
         """`ids2d` and `ids3d`, counted where they are None."""

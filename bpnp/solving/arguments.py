@@ -23,6 +23,7 @@ Prior = Union[PosePrior, GravityPrior, "torch.nn.Module"]  # a TrainedNet
 ROUNDING = 1e-12  # of R R^T: a rotation in float64; others are made orthonormal
 UNIT = 1e-3  # largest error of a length, of a rotation, and of a sum of probabilities
 SURE = 0.97  # probability of a class from which a search matches a point to none of another one
+PRIOR_DEGREES = 10.0  # standard deviation of a rotation that is given without one, about each axis
 INSIDE_ONE_PIXEL = 3.0
 WIDEST_ROW = 8  # numbers of a keypoint; an array with more columns is the wrong way round
 
@@ -108,17 +109,49 @@ def each_camera(value: Any, count: int) -> list[Any]:
     return each_of("camera", value, count)
 
 
-def positive(name: str, value: float | int | None, *, finite: bool = False) -> float | None:
-    """The number as a float; None stays."""
-    if value is not None and not (value > 0 and (value < math.inf or not finite)):
-        raise ValueError(f"expected a positive `{name}`, got {value}")
+def positive(name: str, value: Any, *, finite: bool = False) -> float | None:
+    """Return the number as a float; None stays."""
+    real = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+    if value is not None and not (real and value > 0 and (value < math.inf or not finite)):
+        raise ValueError(f"expected a positive `{name}`, got {value!r}")
     return None if value is None else float(value)
+
+
+def checked_seed(seed: Any) -> int:
+    """Return a seed of random numbers. Raises ValueError unless it is a whole number of at least 0."""
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise ValueError(f"`seed` is {seed!r}; it is a whole number, 0 or more")
+    return int(seed)
+
+
+def pose_of(value: Any) -> tuple[Any, Any] | None:
+    """Return rotation and translation of what holds a pose, None for anything else.
+
+    Args:
+        value: (R, t); [R | t] of shape (3, 4) or (4, 4); an object with `rotation` and `translation`, such as a
+            `Solution`; or a pycolmap.Rigid3d.
+    """
+    if callable(getattr(value, "matrix", None)):
+        value = value.matrix()
+    elif hasattr(value, "rotation") and hasattr(value, "translation"):
+        return value.rotation, value.translation
+    if isinstance(value, (tuple, list)) and len(value) == 2:
+        return value[0], value[1]
+    shape = np.shape(value) if isinstance(value, (list, tuple)) else getattr(value, "shape", ())
+    if tuple(shape) not in ((3, 4), (4, 4)):
+        return None
+    matrix = numbers("prior", value)
+    if len(matrix) == 4 and not np.array_equal(matrix[3], [0, 0, 0, 1]):
+        raise ValueError(f"`prior` has the last row {matrix[3].tolist()}; that of a pose is 0, 0, 0, 1")
+    return matrix[:3, :3], matrix[:3, 3]
 
 
 def checked_prior(prior: Any) -> Prior | None:
     """A prior with its numbers as float64 arrays, or a net: itself, of a checkpoint, or "learned", the packaged one."""
     if prior is None:
         return None
+    if not isinstance(prior, (PosePrior, GravityPrior)) and (pose := pose_of(prior)) is not None:
+        prior = PosePrior(*pose, PRIOR_DEGREES)
     if isinstance(prior, PosePrior):
         rotation, shift = checked_pose("prior.", prior.rotation, prior.translation)
         for name in ("rotation_sigma_deg", "translation_sigma"):
@@ -136,7 +169,8 @@ def checked_prior(prior: Any) -> Prior | None:
     if isinstance(prior, TrainedNet):
         return prior
     raise ValueError(
-        f"expected `prior` as PosePrior, GravityPrior, BPnPNet, Matcher, a checkpoint or 'learned', got {prior!r:.60}"
+        "expected `prior` as PosePrior, GravityPrior, a pose, BPnPNet, Matcher, a checkpoint or 'learned', got "
+        f"{prior!r:.60}"
     )
 
 
@@ -228,7 +262,9 @@ def image_points(values: Any) -> Array:
 
 
 def scene_points(values: Any, name: str = "points3d") -> Array:
-    """Points (k, d), also from OpenCV's (k, 1, d)."""
+    """Return points (k, d), also of OpenCV's (k, 1, d), of the clouds and meshes of trimesh and of Open3D's."""
+    if not isinstance(values, np.ndarray):
+        values = getattr(values, "vertices", getattr(values, "points", values))
     points = numbers(name, values)
     return points[:, 0] if points.ndim == 3 and points.shape[1] == 1 else points
 

@@ -33,7 +33,7 @@ def finished(problem: Problem, result: SearchResult, seconds: float, inlier_thre
     """What a search of so many seconds found, with matches, a last fit to them, and the inliers of every candidate."""
     start, found = time.perf_counter(), result.candidates
     if not len(found):
-        return without_pose(problem, result.reason, inlier_threshold, seconds)
+        return without_pose(problem, _note_duplicates(problem, result), inlier_threshold, seconds)
     threshold = inlier_threshold or SCALES * result.residual * problem.per_radian
     poses = list(zip(found.rotation, found.translation, strict=True))
     if result.batches:  # an enumerated pose is a least-squares fit in float64 already
@@ -52,7 +52,7 @@ def finished(problem: Problem, result: SearchResult, seconds: float, inlier_thre
     matched = float(found.match_count[0])
     linear = None if result.verdict == "failed" else linearised(problem.sets, *poses[0], result.residual)
     solution = with_pose(
-        replace(without_pose(problem, result.reason, None), verdict=result.verdict),
+        replace(without_pose(problem, _note_duplicates(problem, result), None), verdict=result.verdict),
         candidates,
         np.stack([problem.usable[i], j], -1),
         np.linalg.norm(problem.image[i] - projected[j], axis=-1),
@@ -64,6 +64,16 @@ def finished(problem: Problem, result: SearchResult, seconds: float, inlier_thre
     )
     stats = replace(solution.stats, iterations=result.batches)
     return replace(solution, stats=stats, seconds=seconds + time.perf_counter() - start)
+
+
+def _note_duplicates(problem: Problem, result: SearchResult) -> str:
+    """Return the reason of a verdict; unless it is confident, with the number of points that are given twice."""
+    if result.verdict == "confident" or len(problem.points3d) > DENSE:
+        return result.reason
+    sides = {"image": problem.image, "scene": problem.points3d}
+    counts = {side: len(points) - len(np.unique(points, axis=0)) for side, points in sides.items()}
+    notes = [f"{count} of the {side} points are duplicates" for side, count in counts.items() if count]
+    return "; ".join([result.reason, *notes])
 
 
 def angles_between(bearings: Array, directions: Array) -> Array:
@@ -85,6 +95,7 @@ def without_pose(problem: Problem, reason: str, inlier_threshold: float | None, 
         seconds=seconds,
         points2d=problem.points2d,
         points3d=problem.points3d,
+        normals3d=problem.sets.normals3d if problem.sets.cosines3d is None else None,
         camera=problem.camera,
     )
 

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
-from bpnp.cameras import Camera, camera_from, camera_to_json
+from bpnp.cameras import Camera, camera_from, camera_to_json, in_front
 from bpnp.search.evidence.uncertainty import centre_covariance
 from bpnp.search.verdict import Verdict
 from bpnp.solving.problem import Unit
@@ -93,6 +94,7 @@ class Solution:
     view, point_ids: of a photo in a `SceneMap`: the view whose points gave the pose, and the ids (n,) of `points3d` in
         the map, to which `matches` then refer; `match_places` are their places. None for points without a map.
     points2d: (m, 2) normalised image coordinates, NaN where a given point has none. points3d: (n, 3) as given.
+    normals3d: (n, 3) outward unit normals as given, None without.
     camera: that of the pixels that were given, or was found; None for normalised coordinates and bearings.
     """
 
@@ -115,6 +117,7 @@ class Solution:
     seconds: float = 0.0
     points2d: Array = field(repr=False)
     points3d: Array = field(repr=False)
+    normals3d: Array | None = field(default=None, repr=False)
     camera: Camera | None = field(default=None, repr=False)
     view: str | None = None
     point_ids: npt.NDArray[np.int64] | None = field(default=None, repr=False)
@@ -171,11 +174,18 @@ class Solution:
         """Whether there is a pose at all; see `verdict` for whether to trust it."""
         return bool(np.isfinite(self.rotation).all() and np.isfinite(self.translation).all())
 
+    def __bool__(self) -> bool:
+        """Return `found`."""
+        return self.found
+
     def __repr__(self) -> str:
+        from bpnp.report.terminal import fixed
+
         rows = "\n            ".join("  ".join(f"{value: .6f}" for value in row) for row in self.rotation)
         return (
             f"Solution({self.verdict}: {self.reason}\n  rotation: {rows}\n"
-            f"  translation: {'  '.join(f'{value: .6g}' for value in self.translation)}\n"
+            f"  translation: {'  '.join(fixed(self.translation.tolist()))}\n"
+            f"  centre: {'  '.join(fixed(self.centre.tolist()))}\n"
             f"  matches: {self.inlier_count} of {min(len(self.points2d), len(self.points3d))}, "
             f"mean error {self.reprojection_error:.3g} {self.unit}\n"
             f"  candidates: {len(self.candidates)}, seconds: {self.seconds:.2f})"
@@ -306,15 +316,46 @@ def solution_points(solution: Solution, *, title: str | None = None) -> "Problem
     return ProblemPoints(
         0, "\n".join(lines), points2d, points3d, np.full_like(assigned, -1), assigned,
         estimates={"solution": (solution.rotation, solution.translation / solution.scale)}, camera=solution.camera,
+        normals3d=solution.normals3d,
     )  # fmt: skip
 
 
+def competing_points(solution: Solution, points: "ProblemPoints") -> "ProblemPoints | None":
+    """Return the points under the next candidate of an ambiguous solution, None if there is none.
+
+    Its matches are the pairs of points that are nearest to each other, within the inlier threshold.
+    """
+    if solution.verdict != "ambiguous" or len(solution.candidates) < 2:
+        return None
+    other = solution.candidates[1]
+    pose = other.rotation, other.translation / other.scale
+    projected, seen = in_front(points.points3d @ pose[0].T + pose[1])[:, :2], points.points2d
+    ahead, known = (np.flatnonzero(np.isfinite(side).all(-1)) for side in (projected, seen))
+    assigned = np.full(len(projected), -1, np.int32)
+    if len(ahead) and len(known):
+        reach = solution.inlier_threshold / (1.0 if solution.camera is None else solution.camera.focal)
+        distance, nearest = cKDTree(seen[known]).query(projected[ahead], distance_upper_bound=reach)
+        back = cKDTree(projected[ahead]).query(seen[known])[1]
+        mutual = np.flatnonzero(np.isfinite(distance))
+        mutual = mutual[back[nearest[mutual]] == mutual]
+        assigned[ahead[mutual]] = known[nearest[mutual]]
+    title = f"next candidate: {other.inlier_count} matches"
+    return replace(points, id=title, assigned3d=assigned, estimates={"next candidate": pose})
+
+
 def solution_picture(solution: Solution, *, title: str | None = None, photo: Any = None) -> "Figure":
-    """`solution_points` drawn, and a close-up of the residuals; photo: (h, w, 3) uint8 under the points."""
+    """Draw `solution_points`, a close-up of the residuals, and the next candidate of an ambiguous solution.
+
+    Args:
+        solution: What to draw.
+        title: First line of the caption.
+        photo: (h, w, 3) uint8, to draw under the points.
+    """
     from bpnp.report.figures import plot_matches
     from bpnp.report.terminal import VERDICTS
 
-    return plot_matches(solution_points(solution, title=title), colour=VERDICTS[solution.verdict], photo=photo)
+    points, colour = solution_points(solution, title=title), VERDICTS[solution.verdict]
+    return plot_matches(points, colour=colour, photo=photo, competing=competing_points(solution, points))
 
 
 def _largest(covariance: Array) -> float:
@@ -360,6 +401,7 @@ READERS: dict[str, Callable[[Any], Any]] = {  # of the fields that JSON holds in
     "covariance": lambda values: np.array([[_float(x) for x in row] for row in values], np.float64),
     "points2d": partial(_array, shape=(-1, 2)),
     "points3d": partial(_array, shape=(-1, 3)),
+    "normals3d": lambda values: None if values is None else _array(values, shape=(-1, 3)),
     "matches": lambda values: np.array(values, np.int64).reshape(-1, 2),
     "camera": lambda value: None if value is None else camera_from(value),
     "point_ids": lambda values: None if values is None else np.array(values, np.int64),

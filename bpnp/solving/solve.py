@@ -12,10 +12,10 @@ from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.point_sets import UnknownFocal
 from bpnp.solving.arguments import (
     Labels,
-    Prior,
     about,
     check_inside,
     checked_prior,
+    checked_seed,
     device_from,
     each_camera,
     each_of,
@@ -51,7 +51,7 @@ def solve(
     scores2d: Any = None,
     scores3d: Any = None,
     solver: "str | Path | torch.nn.Module" = "auto",
-    prior: Prior | str | Path | None = None,
+    prior: Any = None,
     inlier_threshold: float | int | None = None,
     clutter: float | int | None = None,
     at_infinity: bool = False,
@@ -89,7 +89,8 @@ def solve(
         "matcher-sfm" without a prior, if 2D points times 3D points are at most four million; a module from `Batch` to
         `Prediction`; or a checkpoint of a BPnPNet or a Matcher. Of a Matcher and many points not its own poses count,
         but those that a search finds from poses of triples of matches drawn from its assignment, and nowhere else.
-    prior: a `PosePrior`, a `GravityPrior`, or a BPnPNet or Matcher (or its checkpoint) whose pose is tried first.
+    prior: a `PosePrior`; a pose, known to 10 degrees: a `Solution`, (R, t), [R | t] of shape (3, 4) or (4, 4), a
+        pycolmap.Rigid3d; a `GravityPrior`, or a BPnPNet or Matcher (or its checkpoint) whose pose is tried first.
     inlier_threshold: largest reprojection error of a match, in pixels with a camera, else in units of the normalised
         image (radians for bearings). By default three times the scale of the residuals. Few points are also searched
         within this radius, by default within 3 pixels. Labels that pair each point with one other need no radius.
@@ -127,7 +128,7 @@ def solve(
     options = Options(
         inlier_threshold=positive("inlier_threshold", inlier_threshold, finite=True),
         clutter=clutter,
-        seed=seed,
+        seed=checked_seed(seed),
         time_limit=positive("time_limit", SECONDS if time_limit is None else time_limit),
     )
     beside: dict[str, Any] = {
@@ -220,7 +221,7 @@ def solve_many(
         solver == "auto",
         positive("inlier_threshold", inlier_threshold, finite=True),
         None if clutter is None else float(clutter),
-        seed,
+        checked_seed(seed),
         seconds,
         device_from(device),
         progress,

@@ -14,7 +14,7 @@ from bpnp.search.evidence.claimed import judge_claim
 from bpnp.search.evidence.uncertainty import linearised, pose_covariance
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.verdict import match_count
-from bpnp.solving.arguments import Array, Labels, checked_pose, numbers, positive
+from bpnp.solving.arguments import Array, Labels, checked_pose, checked_seed, numbers, positive
 from bpnp.solving.matches import finished, without_pose
 from bpnp.solving.problem import Problem, chosen, degenerate_points, problem_from
 from bpnp.solving.solution import Solution
@@ -93,7 +93,7 @@ def verify(
     )
     given = None if matches is None else _checked_matches(matches, problem)
     judged = problem if given is None else _of_matches(problem, given)
-    limits: dict[str, Any] = {"inlier_threshold": threshold, "seed": seed, "time_limit": limit}
+    limits: dict[str, Any] = {"inlier_threshold": threshold, "seed": checked_seed(seed), "time_limit": limit}
     solution = verify_problem(judged, rotation, translation, refine=refine, **limits)
     if given is None or judged.degenerate is not None:
         return solution

@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +11,12 @@ import numpy as np
 import pytest
 from PIL import Image
 from planted import plant
+from rich.console import Console
 
 import bpnp
 from bpnp import Solution
 from bpnp.cli import main
+from bpnp.commands.solving import solution_table
 from bpnp.examples import load
 
 PLANTED = plant(1, 40, seed=2)
@@ -110,7 +113,7 @@ def test_options_and_columns_reach_the_search_as_they_are_written(tmp_path: Path
         (lambda files: [*files, "--image", "a.jpg"], "--image with a COLMAP model as --camera, got 'a.jpg' alone"),
         (lambda files: [*files, "--photo", "a.jpg"], "expected --photo with --picture and --camera, got it without"),
         (lambda files: [*files, "--surface", "100"], "a mesh to draw 100 points from"),
-        (lambda files: [*files, "--picture", "a.jpeg"], "--picture that ends in .png, .svg, .pdf"),
+        (lambda files: [*files, "--picture", "a.gif"], "--picture that ends in .png, .jpg, .jpeg, .svg, .pdf"),
         (lambda files: [*files, "--output", str(Path(files[0]).parent)], "expected a file to write to, got the folder"),
     ],
 )
@@ -146,3 +149,52 @@ def test_a_colmap_model_is_scene_and_camera_and_the_photo_lies_under_the_picture
         assert next(line for line in lines if not line.startswith("#")).endswith(" 1 photo.png")
         shutil.rmtree(tmp_path / "found")
     assert "wrote" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("option", ["--output", "--picture"])
+def test_an_input_is_not_overwritten(
+    option: str, tmp_path: Path, fails: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bpnp.solving.solve.solve", None)
+    files = write(tmp_path)
+    Image.new("RGB", (640, 480)).save(tmp_path / "photo.png")
+    replaced = files[0] if option == "--output" else str(tmp_path / "photo.png")
+    photo = [] if option == "--output" else ["--photo", replaced, *CAMERA]
+    message = fails("solve", *files, *photo, option, replaced)
+    assert f"{replaced} is an input and would be overwritten; name another file" in message
+
+
+def test_a_folder_with_files_is_not_replaced_and_known_before_the_search(
+    tmp_path: Path, fails: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    main(["solve", *write(tmp_path), "--colmap", str(tmp_path / "out"), "--quiet"])
+    before = (tmp_path / "out/images.txt").read_text()
+    monkeypatch.setattr("bpnp.solving.solve.solve", None)
+    message = fails("solve", *write(tmp_path), "--colmap", str(tmp_path / "out"))
+    assert message == f"bpnp: error: {tmp_path / 'out'} exists and would be replaced; name a new folder\n"
+    assert (tmp_path / "out/images.txt").read_text() == before
+
+
+def test_quiet_prints_nothing_and_writes_all(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    main(["solve", *write(tmp_path), "--quiet", "--output", str(tmp_path / "r.json")])
+    assert capsys.readouterr() == ("", "")
+    main(["verify", *write(tmp_path), str(tmp_path / "r.json"), "--quiet", "--json"])
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["verdict"] == "confident"
+    assert printed.err == ""
+
+
+def test_coordinates_have_fixed_decimals_and_the_points_are_counted() -> None:
+    """Such as those of UTM, in metres."""
+    solution = bpnp.solve(X, P)
+    east = replace(solution, rotation=np.eye(3), translation=-np.array([500000.25, 5123456.789, 301.5]))
+    normals = {"normals3d": P, "labels2d": None, "labels3d": None}
+    console = Console(width=100, record=True)
+    console.print(solution_table(east, normals))
+    for text in (console.export_text(), repr(east)):
+        numbers = {tuple(line.split()[-3:]) for line in text.splitlines()}
+        assert ("500000.250", "5123456.789", "301.500") in numbers
+        assert ("-500000.250", "-5123456.789", "-301.500") in numbers
+        assert "e+" not in text
+    console.print(solution_table(east, normals))
+    assert "40 image points, 40 scene points with normals" in console.export_text()

@@ -110,3 +110,14 @@ def test_a_real_map_is_that_of_pycolmap(shared_data: Path) -> None:
         np.testing.assert_allclose(view.centre, image.projection_center(), atol=1e-9)
         seen = {point.point3D_id for point in image.points2D if point.has_point3D()}
         assert set(scene.point_ids[view.points].tolist()) == seen
+
+
+def test_a_reconstruction_of_pycolmap_is_a_map(tmp_path: Path) -> None:
+    plant_model(tmp_path, images=4, points=60, seen=25)
+    expected, scene = SceneMap.from_colmap(tmp_path), SceneMap.from_colmap(pycolmap.Reconstruction(str(tmp_path)))
+    np.testing.assert_array_equal(scene.points3d, expected.points3d)
+    np.testing.assert_array_equal(scene.point_ids, expected.point_ids)
+    for view, other in zip(scene.views, expected.views, strict=True):
+        assert view.name == other.name
+        np.testing.assert_allclose(view.rotation, other.rotation, atol=1e-12)
+        np.testing.assert_array_equal(view.points, other.points)

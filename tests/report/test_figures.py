@@ -59,8 +59,10 @@ def test_figures_are_written_whole(tmp_path: Path, suffix: str) -> None:
     assert [p.name for p in path.parent.iterdir()] == [path.name]
     heads = {".png": b"\x89PNG", ".svg": b"<?xml", ".pdf": b"%PDF"}
     assert path.read_bytes().startswith(heads[suffix])
-    with pytest.raises(ValueError, match=r"expected a file name that ends in .png, .svg, .pdf, got 'pair.jpg'"):
-        save_figure(plot_problem(drawn_problem(0, "")), tmp_path / "pair.jpg")
+    with pytest.raises(
+        ValueError, match=r"expected a file name that ends in .png, .jpg, .jpeg, .svg, .pdf, got 'pair.gif'"
+    ):
+        save_figure(plot_problem(drawn_problem(0, "")), tmp_path / "pair.gif")
 
 
 def test_a_photo_shows_the_points_where_the_camera_projects_them(tmp_path: Path) -> None:

@@ -8,7 +8,8 @@ import pytest
 from planted import plant
 
 from bpnp import GravityPrior, PosePrior, solve, solve_many, verify
-from bpnp.solving.arguments import check_inside
+from bpnp.cameras import camera_from
+from bpnp.solving.arguments import check_inside, checked_prior, checked_seed, positive
 
 K = np.array([[520.0, 1.5, 405.0], [0.0, 500.0, 290.0], [0.0, 0.0, 1.0]])
 CAMERA = ("SIMPLE_PINHOLE", [500.0, 320.0, 240.0])
@@ -126,7 +127,7 @@ NO_PRIOR = PosePrior(np.eye(3), np.zeros(3), 5.0, 1.0)
         ("many", {"points2d": [], "points3d": []}, "one array a problem in `points2d`, got 0"),
         ("many", {"points2d": 5}, "`points2d` as a sequence"),
         ("many", {"camera": [K]}, "2 of `camera`, one a problem, got 1"),
-        ("many", {"prior": 3}, "`prior` as PosePrior, GravityPrior, BPnPNet"),
+        ("many", {"prior": 3}, "`prior` as PosePrior, GravityPrior, a pose, BPnPNet"),
         ("many", {"prior": [None]}, "2 of `prior`, one a problem, got 1"),
         # A pose to verify.
         ("verify", {"rotation": 2 * np.eye(3)}, r"expected a rotation in `rotation`, R R\^T = I and det R = 1"),
@@ -161,3 +162,29 @@ def test_the_fraction_of_points_outside_tells_a_wrong_image_size(outside: float,
             check_inside(pixels, (640, 480))
     else:
         check_inside(pixels, (640, 480))
+
+
+@pytest.mark.parametrize("value", ["1", [1.0], True, 0, -1.0, np.nan])
+def test_what_is_no_positive_number_is_named(value: Any) -> None:
+    with pytest.raises(ValueError, match="expected a positive `time_limit`, got"):
+        positive("time_limit", value)
+
+
+@pytest.mark.parametrize("value", [1.5, "1", None, -1, True])
+def test_a_seed_is_a_whole_number(value: Any) -> None:
+    with pytest.raises(ValueError, match="`seed` is .*; it is a whole number, 0 or more"):
+        checked_seed(value)
+    assert checked_seed(np.int64(3)) == 3
+
+
+@pytest.mark.parametrize("params", [(-800, 800, 320, 240), (800, -800, 320, 240), (800, 0, 320, 240)])
+def test_each_focal_length_is_positive(params: tuple[float, ...]) -> None:
+    with pytest.raises(ValueError, match="positive focal length"):
+        camera_from(("PINHOLE", params))
+
+
+def test_a_pose_matrix_has_the_last_row_of_one() -> None:
+    with pytest.raises(ValueError, match=r"`prior` has the last row \[0.0, 0.0, 1.0, 1.0\]"):
+        checked_prior(np.eye(4) + np.eye(4, k=-1))
+    with pytest.raises(ValueError, match="a rotation in `prior.rotation`"):
+        checked_prior((2 * np.eye(3), np.zeros(3)))

@@ -1,11 +1,15 @@
 """Every option of `solve` changes the answer in a way that is known beforehand."""
 
 import math
+from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
+import pycolmap
 import pytest
 import torch
+import trimesh
 from numpy.typing import NDArray
 from planted import degrees_between, plant, seen
 from scipy.spatial.transform import Rotation
@@ -14,6 +18,7 @@ import bpnp
 from bpnp import GravityPrior, PosePrior, Solution, solve
 from bpnp.cli import main
 from bpnp.search.settings import DEFAULT
+from bpnp.solving.arguments import checked_prior, scene_points
 from bpnp.solving.sources import Options
 
 Array = NDArray[np.float64]
@@ -73,6 +78,48 @@ def test_twins_are_ambiguous_and_a_prior_says_which_it_is() -> None:
     up = np.array([1.0, 0, 0])  # of the scene: upside down in the twin
     solution = solve(image, points, prior=GravityPrior(rotation @ up, up, 1.0))  # type: ignore[arg-type]
     assert degrees_between(solution.rotation, rotation) < 1
+
+
+def prior_forms(rotation: Array, translation: Array) -> dict[str, object]:
+    matrix = np.eye(4)
+    matrix[:3] = np.c_[rotation, translation]
+    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation)
+    solution = solve(seen(OBJECT, rotation, translation), OBJECT)
+    forms = {"(R, t)": (rotation, translation), "4x4": matrix, "3x4": matrix[:3], "list": matrix.tolist()}
+    return forms | {"Rigid3d": pose, "Solution": solution, "Candidate": solution.candidates[0]}
+
+
+@pytest.mark.parametrize("likely", [0, 1])
+def test_whatever_holds_a_pose_is_a_prior(likely: int) -> None:
+    rotation, translation = POSES[likely]
+    for form, pose in prior_forms(rotation, translation).items():
+        prior = checked_prior(pose)
+        assert isinstance(prior, PosePrior), form
+        assert (prior.rotation_sigma_deg, prior.translation_sigma) == (10, math.inf)
+        np.testing.assert_allclose(prior.rotation, rotation, atol=1e-6)
+        np.testing.assert_allclose(prior.translation, translation, atol=1e-5)
+    assert which(solve(TWO_IN_THE_IMAGE, OBJECT, prior=(rotation, translation))) == likely
+
+
+def test_clouds_and_meshes_of_other_libraries_are_points() -> None:
+    faces = np.arange(78)[:, None] + np.arange(3)
+    open3d = SimpleNamespace(points=[tuple(point) for point in OBJECT.tolist()])  # a list of its own kind
+    for cloud in (trimesh.PointCloud(OBJECT), trimesh.Trimesh(OBJECT, faces, process=False), open3d):
+        np.testing.assert_allclose(scene_points(cloud), OBJECT)
+
+
+def test_a_solution_is_true_where_it_has_a_pose() -> None:
+    found = solve(seen(OBJECT, *POSES[0]), OBJECT)
+    assert found
+    assert not replace(found, rotation=np.full((3, 3), np.nan), verdict="failed")
+
+
+def test_duplicates_are_named_where_the_verdict_is_not_confident() -> None:
+    few, pose = OBJECT[:4], POSES[0]
+    image, scene = np.repeat(seen(few, *pose), 2, 0), np.repeat(few, 3, 0)
+    solution = solve(image, scene)
+    assert solution.verdict != "confident"
+    assert solution.reason.endswith("4 of the image points are duplicates; 8 of the scene points are duplicates")
 
 
 def test_normals_say_from_which_side_a_point_is_seen() -> None:

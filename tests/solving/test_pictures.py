@@ -19,6 +19,7 @@ import bpnp
 from bpnp.cameras import camera_from
 from bpnp.cli import main
 from bpnp.examples import load
+from bpnp.report.figures import save_figure
 from bpnp.solving.matches import without_pose
 from bpnp.solving.problem import problem_from
 
@@ -142,3 +143,55 @@ def test_a_photo_as_it_was_taken_fills_the_picture_and_is_not_faded() -> None:
     assert tuple(photo.get_extent()) == (0, 640, 480, 0)
     assert (axes.get_xlim(), axes.get_ylim()) == ((0, 640), (480, 0))
     assert photo.get_alpha() is None
+
+
+LEDS = load("leds")
+
+
+def drawn_lines(axes: Any) -> dict[str, np.ndarray]:
+    return {line.get_label(): line.get_xydata() for line in axes.lines}
+
+
+def test_leds_have_their_numbers_and_those_that_face_away_are_not_missing() -> None:
+    solution = bpnp.solve(LEDS.points2d, LEDS.points3d, LEDS.camera, normals3d=LEDS.normals3d)
+    camera = LEDS.points3d @ LEDS.rotation.T + LEDS.translation
+    away = (camera * (LEDS.normals3d @ LEDS.rotation.T)).sum(-1) > 0
+    assert 4 < away.sum() < 13
+    read = bpnp.Solution.from_json(solution.to_json())
+    for one in (solution, read):
+        axes = one.plot().axes[0]
+        lines = drawn_lines(axes)
+        assert len(lines["3D points, facing away"]) == away.sum()
+        assert len(lines["3D points, matched"]) == len(solution.matches) == (~away).sum()
+        assert "3D points, no match" not in lines
+        places = {int(text.get_text()): text.xy for text in axes.texts}
+        assert set(places) >= {*solution.matches[:, 1].tolist()}
+        assert set(places) & {*np.flatnonzero(away).tolist()}
+        for image, scene in solution.matches.tolist():
+            np.testing.assert_allclose(places[scene], LEDS.points2d[image], atol=3)
+    blind = bpnp.solve(LEDS.points2d, LEDS.points3d, LEDS.camera, time_limit=60)
+    assert "3D points, facing away" not in drawn_lines(blind.plot().axes[0])
+
+
+def test_an_ambiguous_solution_is_drawn_with_its_next_candidate(tmp_path: Path) -> None:
+    solution = bpnp.solve(LEDS.points2d, LEDS.points3d, LEDS.camera, normals3d=LEDS.normals3d)
+    assert len(solution.plot().axes) == 2
+    best = solution.candidates[0]
+    turned = replace(best, translation=best.translation + [0.005, 0, 0])  # metres, so 7 pixels to the right
+    ambiguous = replace(solution, verdict="ambiguous", candidates=(best, turned), inlier_threshold=10.0)
+    here, there, _ = ambiguous.plot().axes
+    assert (here.get_title(), there.get_title()) == ("best pose", f"next candidate: {best.inlier_count} matches")
+    places = [{text.get_text(): np.array(text.xy) for text in axes.texts} for axes in (here, there)]
+    both = places[0].keys() & places[1].keys()
+    assert len(both) > 8
+    for name in both:
+        np.testing.assert_allclose(places[1][name] - places[0][name], [800 * 0.005 / 0.6, 0], atol=1.5)
+    joined = there.collections[0].get_segments()  # within the threshold, each point once
+    assert 4 <= len(joined) == len({tuple(segment[0]) for segment in joined})
+    assert max(np.linalg.norm(segment[1] - segment[0]) for segment in joined) <= 10.0
+    ambiguous.plot().savefig(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".jpeg"])
+def test_a_picture_may_be_a_jpeg(suffix: str, tmp_path: Path) -> None:
+    assert Image.open(save_figure(SOLUTION.plot(), tmp_path / f"a{suffix}")).format == "JPEG"

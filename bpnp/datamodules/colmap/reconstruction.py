@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.cameras import Camera, Lens, camera_from, colmap_camera
 from bpnp.datamodules.colmap.model_files import ColmapError, ImageRecord, read_records
-from bpnp.files import write_atomically
+from bpnp.files import require_new_folder, write_atomically
 
 NEAR = 1e-4  # least depth, as a fraction of the median; below, float32 cannot separate in front from behind
 NOMINAL_FOCAL = 1000.0  # focal length for points without a camera, pixels
@@ -176,7 +176,7 @@ def write_image(
     """Write a COLMAP model of one image in text files.
 
     Args:
-        folder: New folder.
+        folder: New or empty folder.
         points2d: Normalised image points (m, 2).
         points3d: Scene points (n, 3).
         matches: Indices (k, 2) of matching 2D and 3D points.
@@ -189,10 +189,11 @@ def write_image(
         The folder.
 
     Raises:
-        ValueError: The name contains spaces, or the camera has skew.
+        ValueError: The name contains spaces, the camera has skew, or the folder has files.
     """
     if not name or name.split() != [name]:
         raise ValueError(f"`name` is {name!r}; names in COLMAP's text files have no spaces")
+    require_new_folder(folder)
     import pycolmap  # after bpnp.cameras, which imports zlib first
 
     lens, (rotation, translation) = _colmap_lens(camera, points2d), pose
