@@ -181,7 +181,7 @@ def verify(
 
     `bpnp verify MAP`, with the folder of a COLMAP model alone, verifies the pose of each of its images without the
     image's own observations, and prints the most doubtful first. Its options are --output, --page, --json,
-    --time_limit (an image) and --seed.
+    --quiet, --time_limit (an image) and --seed.
 
     Args:
         points2d: as for bpnp solve; or the folder of a COLMAP model, without other arguments.
@@ -213,7 +213,7 @@ def verify(
             raise ValueError(
                 f"--{wrong[0]} has no effect on the images of a COLMAP model; name points3d, or leave it out"
             )
-        verify_images(points2d, output=output, page=page, json=json, time_limit=time_limit, seed=seed)
+        verify_images(points2d, output=output, page=page, json=json, quiet=quiet, time_limit=time_limit, seed=seed)
         return
     if page is not None:
         raise ValueError("--page needs the folder of a COLMAP model alone: bpnp verify MAP --page FILE.html")

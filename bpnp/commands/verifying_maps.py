@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
 from rich.text import Text
 
 from bpnp.files import write_text
@@ -24,7 +23,14 @@ REASONS = 20  # doubtful images whose reason is printed
 
 
 def verify_images(
-    map: Path, *, output: Path | None, page: Path | None, json: bool, time_limit: float | None, seed: int
+    map: Path,
+    *,
+    output: Path | None,
+    page: Path | None,
+    json: bool,
+    quiet: bool = False,
+    time_limit: float | None,
+    seed: int,
 ) -> None:
     """Verify each image of a COLMAP model and print a row for each; the arguments are those of `bpnp verify`."""
     from bpnp.datamodules.colmap.model_files import model_format
@@ -46,10 +52,10 @@ def verify_images(
 
     limit = positive("time_limit", SECONDS if time_limit is None else time_limit)
     scene = SceneMap.from_colmap(map)
-    with progress() as shown:
+    with progress(quiet=quiet) as shown:
         bar = shown.add_task("verifying", total=len(scene.views))
         verified = verify_map(map, scene, seed=seed, time_limit=limit, done=lambda: shown.advance(bar))
-    out = Console(stderr=True) if json else console()
+    out = console(json=json, quiet=quiet)
     if json:
         say(as_json(verified, map))
     else:
