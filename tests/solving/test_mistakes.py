@@ -179,7 +179,7 @@ def test_a_seed_is_a_whole_number(value: Any) -> None:
 
 @pytest.mark.parametrize("params", [(-800, 800, 320, 240), (800, -800, 320, 240), (800, 0, 320, 240)])
 def test_each_focal_length_is_positive(params: tuple[float, ...]) -> None:
-    with pytest.raises(ValueError, match="positive focal length"):
+    with pytest.raises(ValueError, match="focal length of a camera has to be positive"):
         camera_from(("PINHOLE", params))
 
 
