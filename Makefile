@@ -16,10 +16,10 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	@touch $@
 
 quickstart: install
-	$(BIN)/bpnp test --config quickstart --results.folder $(RUN)/untrained
 	$(BIN)/bpnp fit --config quickstart
+	$(BIN)/bpnp test --config quickstart --ckpt_path $(RUN)/checkpoints/before_pose_loss.ckpt --results.folder $(RUN)/Lc
 	$(BIN)/bpnp test --config quickstart --ckpt_path $(RUN)/checkpoints/best.ckpt
-	$(BIN)/bpnp report $(RUN)/untrained $(RUN)/test --html $(RUN)/report.html --curves $(RUN)/curves.png
+	$(BIN)/bpnp report $(RUN)/Lc $(RUN)/test --html $(RUN)/report.html --curves $(RUN)/curves.png
 
 lint: install
 	$(BIN)/ruff check .

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -47,6 +48,7 @@ PICTURES = ROOT / "docs" / "images"
 
 ESTIMATES = {"pnp": "", "ransac": " R", "refined": ", refined"}
 BRANCHES = ("Lc", "Lc Lp")
+PAIRS = {"paper": BRANCHES, "training": ("paper-lc", "paper-lclp")}  # of a group, the rows without and with L_p
 
 
 @dataclass(frozen=True)
@@ -226,13 +228,13 @@ def measure(
                 found[f"{method.group}|{method.label}|{estimate}"] = chosen
                 record["rows"][key] = figures(chosen, table.recall) | {"steps": method.identity.get("steps")}
                 print(f"{key}: {record['rows'][key]}", flush=True)
-        for estimate in ("pnp", "ransac"):
-            before, after = (found.get(f"paper|{label}|{estimate}") for label in BRANCHES)
+        for (group, pair), estimate in product(PAIRS.items(), ("pnp", "ransac")):
+            before, after = (found.get(f"{group}|{label}|{estimate}") for label in pair)
             if before and after:
-                keys = (f"{name}|{options.seed}|paper|{label}|{estimate}" for label in BRANCHES)
+                keys = (f"{name}|{options.seed}|{group}|{label}|{estimate}" for label in pair)
                 compared = [record["rows"][key]["steps"] for key in keys]
                 found_effect = effect(before, after, table.recall) | {"steps": compared}
-                record["effects"][f"{name}|{options.seed}|{estimate}"] = found_effect
+                record["effects"][f"{name}|{options.seed}|{group}|{estimate}"] = found_effect
         write(options.output, record)
         curves = {
             label + ESTIMATES[estimate]: found[f"paper|{label}|{estimate}"]
@@ -285,16 +287,16 @@ def markdown(table: Table, record: Mapping[str, Any]) -> dict[str, str]:
         ours = [text for _, text in sorted(rows, key=lambda row: row[0])]
         result[title] = "".join([head(table.recall), *ours, *beside])
     named = {"pnp": "", "ransac": " R"}
-    for name in table.sets:
-        keys = {estimate: f"{name}|{lowest}|{estimate}" for estimate in named}
+    for name, (group, (first, second)) in product(table.sets, PAIRS.items()):
         texts = []
-        for estimate, key in keys.items():
-            if (one := record["effects"].get(key)) is not None:
+        for estimate, suffix in named.items():
+            if (one := record["effects"].get(f"{name}|{lowest}|{group}|{estimate}")) is not None:
                 before, after = one["steps"]
-                label = f"Lc Lp{named[estimate]} ({after:,} steps) minus Lc{named[estimate]} ({before:,} steps)"
+                label = f"{second}{suffix} ({after:,} steps) minus {first}{suffix} ({before:,} steps)"
                 texts.append(effect_text(label, one))
         if texts:
-            result[f"{name}-effect"] = effect_head(table.recall) + "".join(texts)
+            title = f"{name}-effect" if group == "paper" else f"{name}-{group}-effect"
+            result[title] = effect_head(table.recall) + "".join(texts)
     names = ("training", "steps until the switch", "steps of Lc", "steps of Lc Lp", "learning rate")
     trained = [
         (seed, one["switch"], *(one.get(label, 0) for label in BRANCHES), f"{one['learning_rate']:g}")

@@ -1,60 +1,78 @@
-"""The packaged weights `paper-lc` and `paper-lclp`: the paper's training on drawn shapes, which have no data licence.
+"""The packaged weights `paper-lc` and `paper-lclp`: the paper's losses on drawn shapes, which have no data licence.
 
-    python -m benchmarks paper_weights                 # hours; a run that was stopped goes on
-    python -m benchmarks paper_weights --steps 5000    # a longer training goes on from a shorter one
+    python -m benchmarks paper_weights                     # a quarter of an hour; a run that was stopped goes on
+    python -m benchmarks paper_weights --output elsewhere  # keeps the weights of the package
 
-The training is configs/paper/modelnet40.yaml but for data, steps and learning rate: 40,000 fixed problems of 4,000
-drawn shapes. `paper-lclp` goes on from `paper-lc` with the pose loss.
+The settings are those of configs/paper/modelnet40.yaml but for `SETTINGS` and for what each of `STAGES` has: 40,000
+fixed problems of 4,000 drawn shapes. The first stage starts from `procedural-euler`, which was trained on few points
+first (docs/model-card.md). `paper-lclp` goes on from `paper-lc` with the pose loss.
 """
 
 import argparse
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import torch
 from paper_tables import Training
 from record import ROOT
 
-from bpnp.files import write_atomically
-from bpnp.models.weights import PREFIX, WEIGHTS, read_checkpoint
+from bpnp.models.weights import WEIGHTS, pack_weights
 
-PACKED = ("solver", "epoch", "global_step", "pytorch-lightning_version")  # the last three for `bpnp test --ckpt_path`
+EPOCH = 25  # steps between checkpoints
+SOLVER = "--model.solver.init_args"
+SETTINGS = (
+    "--config=paper/modelnet40", "--data.root=null", "--data.train_shapes=4000", "--data.val_shapes=48",
+    f"{SOLVER}.features2d.class_path=bpnp.models.nets.ImageFeatures",
+    f"{SOLVER}.features2d.init_args.centre=true", f"{SOLVER}.features2d.init_args.scale=4.0",
+    f"{SOLVER}.features3d.class_path=bpnp.models.nets.SceneFeatures",
+    f"{SOLVER}.features3d.init_args.centre=true", f"{SOLVER}.features3d.init_args.normalise=true",
+    "--model.weights=procedural-euler", "--model.warmup_steps=10", "--trainer.limit_val_batches=0",
+)  # fmt: skip
 
 
-def pack(checkpoint: Path, out: Path) -> None:
-    """Write the network of a checkpoint and its settings in half precision.
+@dataclass(frozen=True)
+class Stage:
+    """The training of one of the packaged weights; it continues the one before.
 
-    Raises:
-        ValueError: A weight is beyond the range of float16.
+    learning_rate: falls by a half cosine within the stage.
     """
-    content = read_checkpoint(checkpoint)
-    state: dict[str, Any] = {}
-    for key, value in content["state_dict"].items():
-        if key.startswith(PREFIX):
-            state[key] = value.half() if value.is_floating_point() else value
-            if not state[key].isfinite().all():
-                raise ValueError(f"{key} of {checkpoint} has weights beyond the range of float16")
-    with write_atomically(out) as temporary, temporary.open("wb") as file:  # a path would become part of the file
-        torch.save({key: content[key] for key in PACKED if key in content} | {"state_dict": state}, file)
+
+    name: str
+    points: int
+    batch: int
+    steps: int
+    learning_rate: float
+    pose_loss: bool = False
+
+
+STAGES = (
+    Stage("paper-lc", points=1000, batch=8, steps=100, learning_rate=1e-4),
+    Stage("paper-lclp", points=1000, batch=8, steps=200, learning_rate=1e-4, pose_loss=True),
+)
+
+
+def trainings(folder: Path) -> Iterator[tuple[Stage, Training]]:
+    """Yield each stage with its training, which starts where the one before ends."""
+    switch = sum(stage.steps for stage in STAGES if not stage.pose_loss) // EPOCH
+    end, start = 0, None
+    for stage in STAGES:
+        decay = (f"--model.decay_start={end}", f"--model.decay_steps={stage.steps}")
+        end += stage.steps
+        arguments = (
+            *SETTINGS, f"--data.num_points={stage.points}", f"--data.batch_size={stage.batch}",
+            f"--model.learning_rate={stage.learning_rate}", f"--pose_loss.start_epoch={switch}", *decay,
+        )  # fmt: skip
+        training = Training(folder / stage.name, arguments, end, EPOCH, start)
+        yield stage, training
+        start = training.checkpoint
 
 
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--run", type=Path, default=ROOT / "runs" / "paper_weights", help="(default: %(default)s)")
-    options.add_argument("--steps", type=int, default=3000, help="with L_c (default: %(default)s)")
-    options.add_argument("--pose_steps", type=int, default=600, help="with L_c + L_p (default: %(default)s)")
-    options.add_argument("--epoch", type=int, default=100, help="steps between checkpoints (default: %(default)s)")
-    options.add_argument("--learning_rate", type=float, default=1e-4, help="the paper has 1e-5 (default: %(default)s)")
     options.add_argument("--output", type=Path, default=Path(str(WEIGHTS)), help="folder (default: the package's)")
     chosen = options.parse_args()
-    arguments = (
-        "--config=paper/modelnet40", "--data.root=null", "--data.train_shapes=4000", "--data.val_shapes=48",
-        f"--model.learning_rate={chosen.learning_rate}",
-    )  # fmt: skip
-    first = Training(chosen.run / "lc", arguments, chosen.steps, chosen.epoch)
-    posed = (*arguments, f"--pose_loss.start_epoch={chosen.steps // chosen.epoch}")
-    end = chosen.steps + chosen.pose_steps
-    second = Training(chosen.run / f"lclp-from{chosen.steps}", posed, end, chosen.epoch, first.checkpoint)
-    for name, training in {"paper-lc": first, "paper-lclp": second}.items():
-        pack(training.run(), chosen.output / f"{name}.ckpt")
-        print(f"wrote {chosen.output / name}.ckpt", flush=True)
+    for stage, training in trainings(chosen.run):
+        checkpoint = training.run()
+        pack_weights(checkpoint, chosen.output / f"{stage.name}.ckpt")
+        print(f"wrote {chosen.output / stage.name}.ckpt", flush=True)

@@ -1,12 +1,12 @@
-"""Every figure of the README and of docs/results.md: measured, kept in results.json, filled into their tables.
+"""The figures of the README and of the guides: measured, kept in results.json, filled into their tables.
 
     python -m benchmarks results                  # measures all (hours), writes results.json and the tables
     python -m benchmarks results --only leds      # the rows of one table
     python -m benchmarks results --quick --check  # few problems a row (minutes) against results.json
 
-Rows are data: `ROWS`. With --check nothing is written and the exit status is 1 where a figure lies outside the
-tolerance or a table is not what results.json says; times are shown and not compared. Rows whose data are
-not there are named and left out.
+Rows are data: `ROWS`. --check draws the problems of results.json again, with the seed that it has for each row; it
+writes nothing, and the exit status is 1 where a figure lies outside the tolerance or a table is not that of
+results.json. Times are shown and not compared. Rows whose data are not there are named and left out.
 """
 
 import argparse
@@ -14,26 +14,28 @@ import json
 import re
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import bench_rigs
+import bench_stars
 import leds
 import record
 import shapes
 import torch
 from record import ROOT, Outcome, Problem, measured, parser, write
-from view_problems import photos
+from view_problems import REPORTED, photos
 
 from bpnp.datamodules import MeshDataModule, Outliers
 from bpnp.metrics import rotation_error, translation_error
 from bpnp.models import TrainedNet
 
 FILE = ROOT / "benchmarks" / "results.json"
-SEEDS = {"quick": 9, "full": 506}  # of the figures in the file
-DOCUMENTS = (ROOT / "README.md", ROOT / "docs" / "results.md")
+SEEDS = {"quick": 9, "full": 506}  # defaults
+DOCUMENTS = (ROOT / "README.md", *(ROOT / "docs" / f"{name}.md" for name in ("results", "solve", "stars")))
 COLUMNS = ("data", "problems", "rotation, deg (quartiles)", "right", "confident", "and wrong", "CPU s")
 # What may differ between two runs of a row, on another machine and with other libraries: problems that are right or
 # confident, and the ratio of the median errors where one exceeds FLOOR_DEG.
@@ -76,6 +78,14 @@ def network(weights: str, options: dict[str, Any], limit: int, seed: int, data: 
         yield Outcome(batch.ids[0], turn, shift, "", seconds)
 
 
+def of_benchmark(
+    rows: Callable[[argparse.Namespace], Iterable[record.Row]], name: str, limit: int, seed: int, data: Path
+) -> Iterable[Problem | Outcome]:
+    """The problems of a row of another benchmark."""
+    known = argparse.Namespace(limit=limit, seed=seed, data=data, scenes=REPORTED, peers=False)
+    return next(row for row in rows(known) if row.name == name).draw()
+
+
 PAPER = (15.0, 0.5)  # degrees and scene units
 IN_README = ("ring, 3 lights", "headset, 3 lights", "drone, 3 lights")
 ROWS = (
@@ -108,6 +118,21 @@ ROWS = (
         for name in ("ring, 3 lights", "ring, 8 lights, 20 % missing", "headset, 3 lights",
                      "headset, 8 lights, 20 % missing", "ring, no normals, 3 lights", "drone, 3 lights")
     ),
+    *(
+        Row("rigs", name, partial(of_benchmark, bench_rigs.rows, name), (60, 3), bench_rigs.RIGHT_DEG)
+        for name in ("LEDs, one camera", "LEDs, 2 cameras", "LEDs, 4 cameras", "LEDs, 2 cameras, scale unknown",
+                     "LEDs, 4 cameras, scale unknown")
+    ),
+    *(
+        Row("rigs", f"photos, {name}", partial(of_benchmark, bench_rigs.rows, f"photos, {name}"), (8, 1),
+            bench_rigs.RIGHT_DEG, data="colmap")
+        for name in ("camera 1", "camera 2", "camera 3", "3 cameras")
+    ),
+    *(
+        Row("stars", f"{count:,} stars, {field:.0f} deg",
+            partial(of_benchmark, bench_stars.rows, f"{count}, {field:.0f} deg"), (170, 4), bench_stars.RIGHT_DEG)
+        for count in bench_stars.CATALOGUES for field in bench_stars.FIELDS
+    ),
     Row("networks", "`procedural-euler`, PSB meshes, the paper's protocol",
         partial(network, "procedural-euler", {"root": "psb", "rotation": "euler"}), (100, 3), *PAPER, "psb", True),
     Row("networks", "`procedural-so3`, PSB meshes, any rotation",
@@ -124,14 +149,16 @@ def key(row: Row) -> str:
     return f"{row.table}: {row.name}"
 
 
-def rows(options: argparse.Namespace) -> Iterator[record.Row]:
+def rows(options: argparse.Namespace, seeds: Mapping[str, int]) -> Iterator[record.Row]:
+    """The chosen rows; `seeds` has those that are not of the default seed."""
     for row in ROWS:
         if not any(part in key(row) for part in options.only):
             continue
         if row.data and not (options.data / row.data).is_dir():
             print(f"{key(row)}: left out, needs {options.data / row.data}", flush=True)
             continue
-        drawn = partial(row.measure, row.problems[options.quick], options.seed, options.data)
+        seed = seeds.get(key(row), options.seed)
+        drawn = partial(row.measure, row.problems[options.quick], seed, options.data)
         yield record.Row(key(row), drawn, row.right_deg, row.right_shift)
 
 
@@ -189,11 +216,12 @@ def main() -> None:
     chosen = options.parse_args()
     kept = json.loads(chosen.file.read_text()) if chosen.file.is_file() else {}
     part = "quick" if chosen.quick else "full"
-    chosen.seed = SEEDS[part] if chosen.seed is None else chosen.seed
     known: dict[str, Any] = kept.get(part, {})
+    seeds = {name: old["seed"] for name, old in known.items()} if chosen.check and chosen.seed is None else {}
+    chosen.seed = SEEDS[part] if chosen.seed is None else chosen.seed
     failures = []
-    for row, found, _ in measured(rows(chosen)):
-        result = found | {"seed": chosen.seed}
+    for row, found, _ in measured(rows(chosen, seeds)):
+        result = found | {"seed": seeds.get(row.name, chosen.seed)}
         if chosen.check:
             old = known.get(row.name)
             bad = ["never measured"] if old is None else differences(result, old)

@@ -8,7 +8,7 @@ import pytest
 import table1
 import torch
 from paper_tables import Training, effect, figures, filled, network, printed_rows, row_text, solve_problems
-from paper_weights import pack
+from paper_weights import EPOCH, STAGES, trainings
 from report_data import row
 from small_data import SMALL_FEATURES
 from torch import Tensor, nn
@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from bpnp import Batch, Pose, Prediction, SolveStats
 from bpnp.cli import main
 from bpnp.datamodules import MeshDataModule
+from bpnp.models.weights import pack_weights
 
 SHAPES = {"num_points": 20, "pool_size": 20, "train_shapes": 4, "val_shapes": 2, "test_shapes": 6, "train_problems": 4}
 
@@ -25,7 +26,8 @@ def test_a_training_goes_on_from_its_own_checkpoint_and_a_branch_from_anothers(
 ) -> None:
     monkeypatch.setattr(paper_tables.subprocess, "run", lambda command, check: main(command[3:]))
     shapes = [f"--data.{name}={value}" for name, value in SHAPES.items()]
-    small = ("--config=quickstart", *shapes, *SMALL_FEATURES, "--data.batch_size=2", f"--data.cache_dir={tmp_path}")
+    small = ("--config=quickstart", "--pose_loss.start_epoch=1", *shapes, *SMALL_FEATURES, "--data.batch_size=2",
+             f"--data.cache_dir={tmp_path}")  # fmt: skip
     first = Training(tmp_path / "first", small, steps=2, epoch=1)
     assert paper_tables.trained_steps(first.checkpoint) == 0
     assert paper_tables.trained_steps(first.run()) == 2
@@ -39,11 +41,28 @@ def test_a_training_goes_on_from_its_own_checkpoint_and_a_branch_from_anothers(
     assert (net.ransac.backend, net.ransac.threshold, net.pnp.solver, net.widths) == ("opencv", 0.01, "lbfgs", [])
     assert (net.estimates, ours.estimates) == (("ransac", "pnp"), ("ransac", "pnp", "refined"))
     assert len(ours.widths) == 8
-    pack(branch.checkpoint, tmp_path / "packed.ckpt")
+    pack_weights(branch.checkpoint, tmp_path / "packed.ckpt")
     packed = network(tmp_path / "packed.ckpt")
     assert (tmp_path / "packed.ckpt").stat().st_size < branch.checkpoint.stat().st_size / 4
     for name, value in net.state_dict().items():
         torch.testing.assert_close(packed.state_dict()[name], value, rtol=1e-3, atol=1e-4)
+
+
+def test_the_weights_with_the_pose_loss_go_on_from_those_without_and_switch_once(tmp_path: Path) -> None:
+    """Each stage starts where the one before ends, with more steps; the pose loss joins after the first weights."""
+    chain = list(trainings(tmp_path))
+    assert [(stage.name, stage.pose_loss) for stage, _ in chain] == [("paper-lc", False), ("paper-lclp", True)]
+    assert [training.start for _, training in chain] == [None, *(training.checkpoint for _, training in chain[:-1])]
+    steps = [0]
+    for stage, training in chain:
+        options = dict(argument.split("=", 1) for argument in training.arguments)
+        switch = EPOCH * int(options["--pose_loss.start_epoch"])
+        steps.append(training.steps)
+        assert stage.pose_loss == (steps[-1] > switch) == (steps[-2] >= switch)
+        assert (steps[-1] - steps[-2], steps[-1] % EPOCH) == (stage.steps, 0)
+        assert int(options["--model.decay_start"]) == steps[-2]
+        assert int(options["--model.decay_steps"]) == stage.steps
+    assert steps[-1] == sum(stage.steps for stage in STAGES)
 
 
 class Known(nn.Module):
@@ -126,7 +145,10 @@ def test_a_record_becomes_the_tables_of_the_page() -> None:
     keys = ("paper|Lc|ransac", "paper|Lc|pnp", "paper, our inference|Lc|refined", "baselines|search|search")
     record = {
         "rows": {f"modelnet10|0|{key}": one for key in keys},
-        "effects": {"modelnet10|0|pnp": effect(rows, rows, table1.TABLE.recall) | {"steps": [500, 400]}},
+        "effects": {
+            f"modelnet10|0|{group}|pnp": effect(rows, rows, table1.TABLE.recall) | {"steps": [500, 400]}
+            for group in ("paper", "training")
+        },
         "training": {"seed 0": {"Lc": 500, "Lc Lp": 500, "learning_rate": 1e-4, "switch": 400}},
     }
     tables = paper_tables.markdown(table1.TABLE, record)
@@ -138,6 +160,7 @@ def test_a_record_becomes_the_tables_of_the_page() -> None:
     assert "| *paper: GOSMA* |" in tables["modelnet10-baselines"]
     assert "| seed 0 | 400 | 500 | 500 | 0.0001 |" in tables["training"]
     assert "| Lc Lp (400 steps) minus Lc (500 steps) | 10 | +0 [+0, +0]" in tables["modelnet10-effect"]
+    assert "| paper-lclp (400 steps) minus paper-lc (500 steps) |" in tables["modelnet10-training-effect"]
 
 
 def test_the_picture_has_a_curve_a_row_and_the_papers_quartiles() -> None:

@@ -17,7 +17,15 @@ ROOT = Path(__file__).parents[1]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 NUMBER = re.compile(r"-?\d+\.?\d*(?:e-?\d+)?")
 VALUE = re.compile(rf"(?<!\w){NUMBER.pattern}(?!\.?\w)")  # not the number within a name such as 04.png
-SHORT = {"trainer": {"max_epochs": 1, "limit_train_batches": 1, "limit_val_batches": 1, "limit_test_batches": 2}}
+SHORT = {
+    "trainer": {
+        "max_epochs": 3,
+        "limit_train_batches": 1,
+        "log_every_n_steps": 1,
+        "limit_val_batches": 1,
+        "limit_test_batches": 2,
+    }
+}
 
 
 def run(language: str, code: str, names: dict[str, Any]) -> None:

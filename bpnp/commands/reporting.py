@@ -58,7 +58,7 @@ def report(
     if html is not None:
         say(f"wrote {write_page(paths, html, paper=paper)}")
     if recall is not None:
-        say(f"wrote {save_figure(recall_curve(paths), recall)}")
+        say(f"wrote {save_figure(recall_curve(paths, paper=paper), recall)}")
     results = read_runs(paths)
     console().print(results_table(results, paper=paper))
     console().print(interval_table(results))

@@ -71,7 +71,9 @@ class Search(nn.Module):
 
 
 def refine(batch: Batch, rotation: Float[Tensor, "b s 3 3"], translation: Float[Tensor, "b s 3"]) -> Pose:
-    """Refine poses by `refine_poses` and return the best one of each sample; iterations count the refined poses.
+    """Refine poses by `refine_poses` and return the best one of each sample.
+
+    Iterations count the refined poses; converged is true where there is a pose, since annealing always ends.
 
     Args:
         batch: Problems.
@@ -79,7 +81,8 @@ def refine(batch: Batch, rotation: Float[Tensor, "b s 3 3"], translation: Float[
         translation: Initial translations (b, s, 3).
     """
     samples = zip(point_sets(batch), rotation, translation, strict=True)
-    return best_poses((refine_poses(sets, _host(r), _host(t)) for sets, r, t in samples), batch.points3d)
+    pose = best_poses((refine_poses(sets, _host(r), _host(t)) for sets, r, t in samples), batch.points3d)
+    return replace(pose, stats=replace(pose.stats, converged=pose.rotation.isfinite().all(-1).all(-1)))
 
 
 def point_sets(batch: Batch) -> list[PointSets]:

@@ -16,6 +16,7 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 import torch
 from torch import Tensor, nn
 
+from bpnp.files import write_atomically
 from bpnp.layers.assignment import Sinkhorn
 from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import RansacPnP
@@ -27,6 +28,7 @@ PARTS = (ImageFeatures, SceneFeatures, PointFeatures, Sinkhorn, RansacPnP, Weigh
 WEIGHTS = resources.files("bpnp") / "weights"
 LEARNED = "procedural-so3"  # weights of `solve(prior="learned")`
 PLAIN = (bool, int, float, str, type(None))
+PACKED = ("solver", "epoch", "global_step", "pytorch-lightning_version")  # the last three for `bpnp test --ckpt_path`
 PREFIX = "solver."  # prefix of the weights of BlindPnPTask's solver
 # Settings that do not change the assignment, so that a run may override those of its checkpoint.
 ADJUSTABLE = {"ransac", "pnp", "refinement", "rounds", "tolerance", "max_iterations"}
@@ -155,6 +157,26 @@ def read_data(path: str | Path, *, map_location: Any = "cpu") -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ValueError(f"{file} is no checkpoint of `bpnp fit`: it has no `state_dict`")
     return content
+
+
+def pack_weights(checkpoint: str | Path, out: str | Path) -> None:
+    """Write the network of a checkpoint and its settings in half precision, the form of the packaged weights.
+
+    Args:
+        checkpoint: file that `bpnp fit` wrote.
+        out: file to write; `TrainedNet.from_checkpoint` and ``bpnp test --ckpt_path`` read it like any checkpoint.
+
+    Raises:
+        ValueError: a weight is beyond the range of float16.
+    """
+    content = read_checkpoint(checkpoint)
+    state = {key: value for key, value in content["state_dict"].items() if key.startswith(PREFIX)}
+    for key, value in state.items():
+        state[key] = value.half() if value.is_floating_point() else value
+        if not state[key].isfinite().all():
+            raise ValueError(f"{key} of {checkpoint} has weights beyond the range of float16")
+    with write_atomically(Path(out)) as temporary, temporary.open("wb") as file:  # a path would be part of the file
+        torch.save({key: content[key] for key in PACKED if key in content} | {"state_dict": state}, file)
 
 
 def solver_state(content: Mapping[str, Any]) -> dict[str, Tensor]:

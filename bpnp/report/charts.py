@@ -13,8 +13,8 @@ import torch
 
 from bpnp.metrics import joint_error, recall_curve
 from bpnp.report.results import Results
-from bpnp.report.tables import lines_of
-from bpnp.report.terminal import DASHES, INKS, LIGHT
+from bpnp.report.tables import lines_of, paper_quartiles
+from bpnp.report.terminal import DASHES, INKS, LIGHT, Paper
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
@@ -29,6 +29,7 @@ RECALLS: dict[Error, tuple[str, str, float]] = {
     "reprojection_deg": ("Reprojection", "reprojection error, degrees", 20.0),
 }
 JOINT_TRANSLATION = 0.5
+PAPER_MARKS = ("circle-open", "square-open", "diamond-open", "triangle-up-open")  # of the paper's networks
 INK = {name: light for name, (light, _) in INKS.items()}
 CLEAR = "rgba(0,0,0,0)"
 GRID = {"gridcolor": INK["line"], "zerolinecolor": INK["line"]}
@@ -53,10 +54,16 @@ def recall_of(results: Results, estimate: str, error: Error, limits: Array) -> A
     return recall_curve(errors_of(results, estimate, error), limits.tolist()).numpy()
 
 
-def recall_chart(runs: Mapping[str, Results], error: Error) -> "Figure | None":
-    """Share of problems with an error up to a threshold, on a logarithmic axis (paper Fig. 3).
+def recall_chart(runs: Mapping[str, Results], error: Error, *, paper: Paper | None = None) -> "Figure | None":
+    """Draw the share of problems with an error up to a threshold, on a logarithmic axis (paper Fig. 3).
 
-    runs: results by name. None if no problem has an error above zero.
+    Args:
+        runs: results by name.
+        error: of the horizontal axis.
+        paper: the paper's table whose quartiles are drawn as rings; None for none.
+
+    Returns:
+        The figure; None if no problem has an error above zero.
     """
     from plotly.graph_objects import Figure
 
@@ -80,12 +87,16 @@ def recall_chart(runs: Mapping[str, Results], error: Error) -> "Figure | None":
         points = {"x": limits.astype(np.float32), "y": shares.astype(np.float32)}
         # By the place of its estimate the page finds a line.
         figure.add_scatter(**points, name=line.label, mode="lines", meta=place, line=style, hovertemplate="%{y:.1%}")
+    for place, (name, quartiles) in enumerate(paper_quartiles(paper, error).items()):
+        marker = {"symbol": PAPER_MARKS[place], "size": 8, "color": INK["quiet"], "line": {"width": 1.5}}
+        points = {"x": np.array(quartiles, np.float32), "y": np.array([0.25, 0.5, 0.75], np.float32)}
+        figure.add_scatter(**points, name=f"paper: {name}", mode="markers", marker=marker, hovertemplate="%{y:.0%}")
     return figure
 
 
 def chart_text(figure: "Figure") -> str:
     """What a chart shows in words, for screen readers: the last value of each line."""
-    ends = [f"{trace.name} ends at {trace.y[-1]:.1%}" for trace in figure.data]
+    ends = [f"{trace.name} ends at {trace.y[-1]:.1%}" for trace in figure.data if trace.mode == "lines"]
     return f"{figure.layout.title.text}: {'; '.join(ends)}"
 
 

@@ -17,8 +17,8 @@ from bpnp.files import delay_interrupts, write_atomically
 from bpnp.report.charts import RECALLS, Error, recall_of
 from bpnp.report.points import Array, ProblemPoints, utf8
 from bpnp.report.results import Results
-from bpnp.report.tables import lines_of, read_runs
-from bpnp.report.terminal import DASHES, LIGHT, QUIET
+from bpnp.report.tables import lines_of, paper_quartiles, read_runs
+from bpnp.report.terminal import DASHES, LIGHT, QUIET, Paper
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,10 +34,15 @@ LIMITS: dict[Error, float] = {"rotation_deg": 20.0, "translation": 1.0, "joint":
 Lines = Literal["match3d", "assigned3d"]
 
 
-def recall_curve(runs: Sequence[Path | str] | Mapping[str, Results]) -> "Figure":
-    """Share of problems with an error up to a threshold: rotation, translation, both, reprojection (paper Fig. 3).
+def recall_curve(runs: Sequence[Path | str] | Mapping[str, Results], *, paper: Paper | None = None) -> "Figure":
+    """Draw the share of problems with an error up to a threshold: rotation, translation, both, reprojection (Fig. 3).
 
-    runs: results folders, or results by name. Raises ValueError if a folder cannot be read.
+    Args:
+        runs: results folders, or results by name.
+        paper: the paper's table whose quartiles are drawn as rings; None for none.
+
+    Raises:
+        ValueError: a folder cannot be read.
     """
     from matplotlib.figure import Figure
 
@@ -48,6 +53,8 @@ def recall_curve(runs: Sequence[Path | str] | Mapping[str, Results]) -> "Figure"
         for line in lines_of(runs):
             shares = recall_of(runs[line.run], line.estimate, key, limits)
             axes.plot(limits, shares, **line_style(line.colour, line.dashes), label=shown_text(line.label))
+        for marker, (name, quartiles) in zip("osD^", paper_quartiles(paper, key).items(), strict=False):
+            axes.plot(quartiles, [0.25, 0.5, 0.75], marker, mfc="none", color=QUIET, label=f"paper: {name}")
         axes.set(xlabel=RECALLS[key][1].replace(", of", ",\nof"), ylim=(0, 1.01), xlim=(0, limit))
         axes.grid(alpha=0.3)
     figure.axes[0].yaxis.set_major_formatter(lambda share, _: f"{100 * share:.0f} %")

@@ -74,7 +74,7 @@ def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None) -> str
     folders = named_runs(paths)
     runs = {name: read_results(path) for name, path in folders.items()}
     points = {name: read_points(path) for name, path in folders.items()}
-    charts = [chart for error in RECALLS if (chart := recall_chart(runs, error)) is not None]
+    charts = [chart for error in RECALLS if (chart := recall_chart(runs, error, paper=paper)) is not None]
     numbers = page_numbers(runs) | {
         "keys": list(COLUMNS),
         "causes": CAUSES,
@@ -96,7 +96,11 @@ def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None) -> str
         points=page_points(runs, points),
         plotly=plotly_script(),
         runs={
-            name: (describe_run(results), json.dumps({key: getattr(results, key) for key in FACTS}, indent=2))
+            name: (
+                describe_run(results),
+                ", ".join(_settings(results.settings)),
+                json.dumps({key: getattr(results, key) for key in FACTS}, indent=2),
+            )
             for name, results in runs.items()
         },
         folders=", ".join(folders),
@@ -146,15 +150,14 @@ def quartile_rows(runs: Mapping[str, Results], paper: Paper | None) -> list[Tabl
 
 
 def describe_run(results: Results) -> str:
-    """What was tested, with which settings and with which outcome."""
+    """Describe the problems and the outcome of a run."""
     rows = results.of(next(iter(results.estimates)))
     spans = {what: sorted(getattr(row, key) for row in rows) for key, what in SIZES.items()}
     sizes = (f"{span[0] if span[0] == span[-1] else f'{span[0]} to {span[-1]}'} {what}" for what, span in spans.items())
     best, values = min(results.estimates.items(), key=lambda item: item[1]["rotation_q2_deg"])
     solved = f"{100 * cause_shares(results.of(best))['solved']:.1f} % within {SOLVED_DEG:g} deg"
     outcome = f"{best}: median rotation error {cell(RESULT_COLUMNS[1], values)} deg, {solved}"
-    facts = [f"{len(rows)} problems with {', '.join(sizes)}", ", ".join(_settings(results.settings)), outcome]
-    return ". ".join(fact for fact in facts if fact)
+    return f"{len(rows)} problems with {', '.join(sizes)}. {outcome}"
 
 
 def _settings(settings: Mapping[str, Any]) -> Iterable[str]:

@@ -203,6 +203,13 @@ def paper_rows(paper: Paper | None) -> list[Row]:
     ]
 
 
+def paper_quartiles(paper: Paper | None, error: str) -> dict[str, list[float]]:
+    """Return the three printed quartiles of an error for each network of the paper; empty for an error without them."""
+    keys = [f"{error.removesuffix('_deg')}_q{i}{'_deg' if error.endswith('_deg') else ''}" for i in (1, 2, 3)]
+    rows = [row for row in paper_rows(paper) if row.label.startswith("Lc") and keys[0] in row.values]
+    return {row.label: [float(row.values[key]) for key in keys] for row in rows}
+
+
 def cell(column: Column, values: Values) -> str:
     """What a table shows of a column: a share in percent, a count whole, what was printed as it is, else `number`."""
     value = values.get(column.key)

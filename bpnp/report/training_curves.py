@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bpnp.report.figures import line_style, shown_text
+from bpnp.report.terminal import QUIET
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -100,7 +101,7 @@ def training_curves(run: Path | str) -> "Figure":
         axes.set_xlabel("step")
         axes.grid(alpha=0.3)
         if joined is not None:
-            axes.axvline(joined, color="black", lw=1, ls=":", label="pose loss joins")
+            axes.axvline(joined, color=QUIET, lw=1, ls=":", label="pose loss joins")
         if axes.get_legend_handles_labels()[0]:
             axes.legend(fontsize=8, frameon=False)
     return figure

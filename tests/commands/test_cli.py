@@ -129,7 +129,17 @@ def test_a_printed_configuration_and_that_of_a_run_can_be_used_again(
     root = f"--trainer.default_root_dir={tmp_path}/run"
     small = ["--data.train_problems=2", "--data.train_shapes=2", "--data.val_shapes=2", f"--data.cache_dir={tmp_path}"]
     with contextlib.suppress(SystemExit):
-        main(["fit", "--config=quickstart", *small, root, "--trainer.max_epochs=1", "--print_config"])
+        main(
+            [
+                "fit",
+                "--config=quickstart",
+                *small,
+                root,
+                "--trainer.max_epochs=1",
+                "--pose_loss.start_epoch=0",
+                "--print_config",
+            ]
+        )
     printed = tmp_path / "printed.yaml"
     printed.write_text(capsys.readouterr().out)
     main(["fit", f"--config={printed}", "--trainer.limit_train_batches=1", "--trainer.limit_val_batches=1"])

@@ -6,6 +6,7 @@ from torch import Tensor
 
 from bpnp import Batch, BPnPNet
 from bpnp.layers import sinkhorn
+from bpnp.metrics import rotation_error
 from bpnp.models import Refinement
 from bpnp.models.nets import PointFeatures
 from bpnp.report.results import rows_from
@@ -53,6 +54,14 @@ def test_only_evaluation_refines_and_only_if_asked() -> None:
     assert tuple(small_net().train()(batch).poses) == ("ransac", "pnp")
     without = small_net(refine=False).eval()
     assert tuple(without(batch).poses) == without.estimates == ("ransac", "pnp")
+
+
+def test_refinement_always_ends_and_says_so() -> None:
+    """Exact problems with the true matches: the pose is right, and a report must not call it unconverged."""
+    batch = different_sizes(30, dtype=torch.float32)
+    pose = small_net().eval()(batch).poses["refined"]
+    assert bool((rotation_error(pose.rotation, batch.rotation) < 1).all())
+    assert pose.stats.converged.all()
 
 
 def test_refinement_starts_from_hypotheses_too_unless_there_are_none() -> None:

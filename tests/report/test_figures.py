@@ -39,6 +39,20 @@ def test_recall_curves_are_the_shares_of_pairs_within(tmp_path: Path) -> None:
             np.testing.assert_allclose(y, [(errors <= limit).mean() for limit in np.asarray(x)])
 
 
+def test_recall_curves_show_the_quartiles_that_the_paper_prints(tmp_path: Path) -> None:
+    """Table 1: Lc Lp R has 3.33, 8.09 and 15.8 degrees, and 0.04, 0.08 and 0.16."""
+    figure = recall_curve({"run": write_run(tmp_path, 9, 0)}, paper="modelnet40")
+    for axes, printed in zip(
+        figure.axes, ([3.33, 8.09, 15.8], [0.04, 0.08, 0.16], None, [0.28, 0.52, 1.01]), strict=True
+    ):
+        lines = {str(line.get_label()): line.get_data() for line in axes.get_lines()}
+        assert ("paper: Lc Lp R" in lines) == (printed is not None)
+        if printed is not None:
+            x, y = lines["paper: Lc Lp R"]
+            assert (list(np.asarray(x)), list(np.asarray(y))) == (printed, [0.25, 0.5, 0.75])
+    assert len(recall_curve({"run": write_run(tmp_path, 9, 0)}).axes[0].get_lines()) == 2
+
+
 def test_the_true_pose_reprojects_each_point_onto_its_match() -> None:
     planted = drawn_problem(3, "<b>$x_1$</b>")
     figure = plot_problem(planted)

@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from plotly.offline import get_plotlyjs
-from report_data import HOSTILE, inflated, write_run
+from report_data import HOSTILE, inflated, rows, write_run
 
-from bpnp.report import write_page
+from bpnp.report import write_page, write_results
 from bpnp.report.charts import chart_text, recall_chart
 from bpnp.report.page import page_html
+from bpnp.report.points import write_points
 from bpnp.report.results import CAUSES
 from bpnp.report.terminal import number
 
@@ -68,6 +69,31 @@ def test_recall_curves_are_the_shares_of_the_rows(tmp_path: Path) -> None:
     assert chart_text(recall).endswith(f"pnp ends at {100 * (errors <= 90).mean():.1f}%")
     # The same line and colour as in the table: one a series.
     assert len({(trace.line.color, trace.line.dash) for trace in recall.data}) == len(recall.data)
+
+
+def test_the_charts_show_the_quartiles_that_the_paper_prints(tmp_path: Path) -> None:
+    """Table 2: Lc Lp has 1.32, 3.31 and 8.84 degrees. Rings belong to no run, and are no ends of curves."""
+    results = write_run(tmp_path, 9, 0)
+    chart = recall_chart({"run": results}, "rotation_deg", paper="megadepth")
+    assert chart is not None
+    (rings,) = (trace for trace in chart.data if trace.name == "paper: Lc Lp")
+    np.testing.assert_allclose(rings.x, [1.32, 3.31, 8.84], rtol=1e-6)
+    assert (list(rings.y), rings.mode, rings.meta) == ([0.25, 0.5, 0.75], "markers", None)
+    assert "paper" not in chart_text(chart)
+    joint = recall_chart({"run": results}, "joint", paper="megadepth")
+    assert joint is None or len(joint.data) == 2
+
+
+def test_the_page_opens_with_the_outcome_and_folds_the_settings(tmp_path: Path) -> None:
+    settings = {"checkpoint": "runs/mine/last.ckpt"}
+    write_results(tmp_path / "a" / "test", rows(9, 0), correspondence_loss=None, settings=settings)
+    write_points(tmp_path / "a" / "test", [])
+    page = page_html([tmp_path / "a"])
+    opening = page[page.index("<h1>") : page.index("<details>")]
+    assert "median rotation error" in opening
+    assert "last.ckpt" not in opening
+    assert "checkpoint runs/mine/last.ckpt" in page
+    assert page.index("<details>") < page.index('id="quartiles"')
 
 
 def test_nothing_on_the_page_comes_from_elsewhere_or_escapes_its_place(tmp_path: Path) -> None:

@@ -68,7 +68,7 @@ function watch(node, show) {
 
 function drawChart(node) {
   const figure = themed(DATA.charts[node.dataset.chart]);
-  for (const trace of figure.data) trace.visible = shown(trace.meta);
+  for (const trace of figure.data) trace.visible = trace.meta == null || shown(trace.meta);
   draw(node, figure);
 }
 
