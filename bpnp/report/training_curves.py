@@ -82,6 +82,7 @@ def training_curves(run: Path | str) -> "Figure":
         ValueError: As `read_curves`.
     """
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullFormatter
 
     curves, figure = read_curves(run), Figure(figsize=(11, 3.4), layout="constrained")
     losses, rotation, translation = figure.subplots(1, 3)
@@ -94,8 +95,9 @@ def training_curves(run: Path | str) -> "Figure":
     rotation.set(ylabel="median rotation error, degrees", yscale="log")
     translation.set(ylabel="median translation error", yscale="log")
     for axes in (rotation, translation):
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.yaxis.set_major_formatter(_plain)
-        axes.yaxis.set_minor_formatter(_plain)
+        axes.yaxis.set_minor_formatter(NullFormatter())
     joined = switch_step(curves)
     for axes in (losses, rotation, translation):
         axes.set_xlabel("step")
