@@ -23,7 +23,7 @@ from bpnp.search.scene import Scene
 from bpnp.search.schedule import turns
 from bpnp.search.settings import DEFAULT
 from bpnp.search.verdict import no_pose, starts_met
-from bpnp.solving.problem import problem_from
+from bpnp.solving.inputs import problem_from
 
 TURNS = 8
 HITS = (1, 2, 3, 4, 6, 8, 10)
@@ -37,8 +37,8 @@ BLIND = replace(
 def reached(problem: Problem) -> dict[int, bool]:
     """Return, for each number of hits that a best pose reached, whether the first one that did was right."""
     points2d, points3d = problem.solve.args  # type: ignore[attr-defined]
-    sets, settings = problem_from(points2d, points3d, None).sets, replace(DEFAULT, evidence=BLIND)
-    pool = Pool(Scene(sets, 0, settings), sets, no_pose("no pose was found"))
+    points, settings = problem_from(points2d, points3d, None), replace(DEFAULT, evidence=BLIND)
+    pool = Pool(Scene(points, 0, settings), points, no_pose("no pose was found"))
     found: dict[int, bool] = {}
     drawn = turns(pool, None, None)
     for _ in range(TURNS):
@@ -46,7 +46,7 @@ def reached(problem: Problem) -> dict[int, bool]:
         leaders = pool.leaders()
         if not len(leaders) or leaders.log10_false_alarms[0] > BLIND.false_alarms:
             continue
-        hits = starts_met(leaders, sets, BLIND)
+        hits = starts_met(leaders, points, BLIND)
         turn = leaders.rotation[0].T @ problem.poses[0][0]
         right = np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))) < RIGHT_DEG
         for least in HITS:
@@ -58,15 +58,16 @@ def reached(problem: Problem) -> dict[int, bool]:
 def leads_back(kind: symmetric.Kind, problem: Problem) -> bool:
     """Return whether the true pose is among the competitors of the pose that is turned by one part of the object."""
     points2d, points3d = problem.solve.args  # type: ignore[attr-defined]
-    sets, (rotation, translation) = problem_from(points2d, points3d, None).sets, problem.poses[0]
+    points, (rotation, translation) = problem_from(points2d, points3d, None), problem.poses[0]
     one, other = problem.points3d[: kind.each], problem.points3d[kind.each : 2 * kind.each]
     turn = Rotation.align_vectors(other - other.mean(0), one - one.mean(0))[0].as_matrix()
     turned = rotation @ turn.T
     shift = translation - turned @ (other.mean(0) - turn @ one.mean(0))
-    motions = registered(sets, turned, shift, symmetric.NOISE, DEFAULT.evidence)
-    rotations, translations = competing_poses(sets, turned, shift, motions, DEFAULT.evidence)
+    (turned, shift), (_, translation) = points.from_user(turned, shift), points.from_user(rotation, translation)
+    motions = registered(points, turned, shift, symmetric.NOISE, DEFAULT.evidence)
+    rotations, translations = competing_poses(points, turned, shift, motions, DEFAULT.evidence)
     poses = np.concatenate([rotation[None], rotations]), np.vstack([translation, translations])
-    return bool(sets.same_pose(*poses, RIGHT_DEG, DEFAULT.evidence.other_shift)[1:].any())
+    return bool(points.same_pose(*poses, RIGHT_DEG, DEFAULT.evidence.other_shift)[1:].any())
 
 
 def main() -> None:

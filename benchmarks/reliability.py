@@ -31,7 +31,7 @@ from view_problems import LEAST_MATCHES, REPORTED, Against, ViewProblem, scene_p
 
 from bpnp import Solution, solve
 from bpnp.cameras import camera_from
-from bpnp.solving.problem import problem_from
+from bpnp.solving.inputs import problem_from
 from bpnp.solving.sources import Options, solutions_of
 
 FACTORS = (0.67, 0.8, 0.9, 0.95, 1.05, 1.1, 1.2, 1.33)

@@ -20,7 +20,7 @@ from bpnp.search.evidence.alternatives import Alternative, fits_as_well
 from bpnp.search.evidence.rivals import against_rivals, other_camera
 from bpnp.search.evidence.settings import Evidence
 from bpnp.search.hypotheses import Hypotheses, to_user_frame
-from bpnp.search.point_sets import UnknownFocal, faces
+from bpnp.search.problem import Problem, UnknownFocal, faces
 from bpnp.search.raster_search import search_beside
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT
@@ -28,8 +28,8 @@ from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import judged
 from bpnp.solving.arguments import checked_prior
 from bpnp.solving.focal_length import AROUND, UnknownCamera, fit_camera, solved_with_focal_length
+from bpnp.solving.inputs import problem_from
 from bpnp.solving.matches import finished
-from bpnp.solving.problem import Problem, problem_from
 from bpnp.solving.solution import Candidate, Solution
 from bpnp.solving.sources import Options, solutions_of
 
@@ -72,7 +72,7 @@ def problem_near(
     lens, (axes, cosines) = camera_from(camera), region.cones
     known: dict[str, Any] = {"normals3d": axes, "cosines3d": cosines, "prior": prior, "focal": focal}
     problem = problem_from(keypoints, region.points3d, lens, **known)
-    return replace(problem, sets=replace(problem.sets, log10_views=math.log10(views)))
+    return replace(problem, log10_views=math.log10(views))
 
 
 def near_view(region: Region, keypoints: Any, camera: Any, prior: Any, options: Options, *, views: int = 1) -> Solution:
@@ -123,8 +123,8 @@ def with_ids(solution: Solution, region: Region) -> Solution:
 
 def in_picture(problem: Problem, pose: Solution | Candidate) -> NDArray[np.bool_]:
     """Which points (n,) of a problem a pose sees where the image points are."""
-    image = problem.view(pose.rotation, pose.translation + pose.rotation @ problem.origin)
-    inside = (image >= problem.image.min(0)) & (image <= problem.image.max(0))  # not NaN
+    seen, image = problem.project_scene(*problem.from_user(pose.rotation, pose.translation)), problem.image_points
+    inside = (seen >= image.min(0)) & (seen <= image.max(0))  # not NaN
     return np.asarray(inside.all(-1))
 
 
@@ -194,26 +194,27 @@ def on_all_points(solution: Solution, photo: Photo, lens: Camera | UnknownCamera
         rotation, shift = ends.rotation[0], ends.translation[0]
     else:
         problem = problem_at(lens)
-        rotation, shift = pose[0], pose[1] + pose[0] @ problem.origin
-        least = problem.sets.image.scales[0]
-        ends = polished(Scene(problem.sets, photo.seed, DEFAULT), rotation[None], shift[None], max(scale, least))
-    scene, sure = Scene(problem.sets, photo.seed, DEFAULT), solution.verdict == "confident"
+        rotation, shift = problem.from_user(*pose)
+        least = problem.image.scales[0]
+        ends = polished(Scene(problem, photo.seed, DEFAULT), rotation[None], shift[None], max(scale, least))
+    scene, sure = Scene(problem, photo.seed, DEFAULT), solution.verdict == "confident"
     # A coarse optimum may have a finer one beside it.
     looks = int(ends.scale[0] > scale) if sure else looks_for_certainty(rule)
     start = Hypotheses.from_poses(*scene.enter(rotation[None], shift[None]))
     others = [] if sure else [one for one in solution.candidates[1:] if one.log10_false_alarms < 0][:COMPETITORS]
     if others:
-        turns = np.stack([one.rotation for one in others])
-        shifts = np.stack([one.translation + one.rotation @ problem.origin for one in others])
-        ends = Hypotheses.concatenate([ends, polished(scene, turns, shifts, max(scale, problem.sets.image.scales[0]))])
+        turns, shifts = problem.from_user(
+            np.stack([one.rotation for one in others]), np.stack([one.translation for one in others])
+        )
+        ends = Hypotheses.concatenate([ends, polished(scene, turns, shifts, max(scale, problem.image.scales[0]))])
     for _ in range(looks):
         beside = finish(scene, search_beside(scene, start, DEFAULT.beside), DEFAULT.finished)
         ends = Hypotheses.concatenate([ends, to_user_frame(beside, scene)])
-    alone = judged(ends, problem.sets, batches=1, exhaustive=True, rule=rule)
-    result = against_rivals(alone, problem.sets, lambda: scene, rule, exhaustive=True)
+    alone = judged(ends, problem, batches=1, exhaustive=True, rule=rule)
+    result = against_rivals(alone, problem, lambda: scene, rule, exhaustive=True)
     rotations, shifts = np.stack([rotation, result.best[0]]), np.stack([shift, result.best[1]])
     behind = result.log10_false_alarms - solution.log10_false_alarms
-    if sure and not problem.sets.same_pose(rotations, shifts, rule.other_deg, rule.other_shift)[1]:
+    if sure and not problem.same_pose(rotations, shifts, rule.other_deg, rule.other_shift)[1]:
         return solution if behind >= rule.lead else _doubted(solution, fits_as_well(rotation, result.best[0], behind))
     if behind < 0 or (not sure and result.verdict == "confident"):
         found = finished(problem, result, solution.seconds, None)
@@ -223,7 +224,7 @@ def on_all_points(solution: Solution, photo: Photo, lens: Camera | UnknownCamera
     if not sure:
         return solution
     if alone.verdict != "confident":  # which other cameras have not been asked of
-        other = other_camera(alone, problem.sets, lambda: scene, rule)
+        other = other_camera(alone, problem, lambda: scene, rule)
         return solution if other is None else _doubted(solution, other)
     confident = result.verdict == "confident"
     return solution if confident else replace(solution, verdict=result.verdict, reason=result.reason)

@@ -21,13 +21,13 @@ from bpnp.search.evidence.reasons import number
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
 from bpnp.search.hypotheses import Hypotheses, to_user_frame
 from bpnp.search.kernels.raster import Raster
+from bpnp.search.problem import Problem
 from bpnp.search.raster_search import search_beside, search_near
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT, Draws, Narrowing, RasterSearch, RasterShape, Screens
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import weighed
 from bpnp.solving.matches import count_one_to_one
-from bpnp.solving.problem import Problem
 from bpnp.solving.solution import Candidate, Solution
 
 
@@ -62,17 +62,17 @@ def best_rival(photo: Photo, solution: Solution, met: Sequence[Solution]) -> tup
     """The different pose that explains the image points of a solution best, and by how many decades it explains all of
     them worse; None if there is none. met: solutions with the points of other views."""
     problem, rule = photo.problem, DEFAULT.evidence
-    sets, scale = problem.sets, max(solution.stats.residual, problem.sets.image.scales[0])
-    best = solution.rotation, solution.translation + solution.rotation @ problem.origin
-    repeated, _ = repeated_poses(sets, *best, scale, rule)
+    scale = max(solution.stats.residual, problem.image.scales[0])
+    best = problem.from_user(solution.rotation, solution.translation)
+    repeated, _ = repeated_poses(problem, *best, scale, rule)
     met_poses = [one for other in met for one in other.candidates if one.log10_false_alarms < 0]
-    poses = [(one.rotation, one.translation + one.rotation @ problem.origin) for one in met_poses]
+    poses = [problem.from_user(one.rotation, one.translation) for one in met_poses]
     poses += [*zip(repeated.rotation, repeated.translation, strict=True), *_looks(photo, solution, problem)]
-    matched = solution.points3d[solution.match_places[:, 1]] - problem.origin
+    matched = np.median(problem.points_from_user(solution.points3d[solution.match_places[:, 1]]), 0)
 
     def different(rotations: Array, translations: Array) -> NDArray[np.bool_]:
         rotations, translations = np.concatenate([best[0][None], rotations]), np.r_[best[1][None], translations]
-        middle = rotations @ np.median(matched, 0) + translations
+        middle = rotations @ matched + translations
         shift = rule.other_shift * float(np.linalg.norm(middle[0]))
         return np.asarray(~same_pose(rotations, middle, 0, rule.other_deg, shift)[1:])
 
@@ -80,23 +80,23 @@ def best_rival(photo: Photo, solution: Solution, met: Sequence[Solution]) -> tup
     apart = different(rotations, translations)
     if not apart.any():
         return None
-    scene = Scene(sets, photo.seed, DEFAULT)
+    scene = Scene(problem, photo.seed, DEFAULT)
     ends = polished(scene, rotations[apart], translations[apart], scale)
     ends = ends[different(ends.rotation, ends.translation)]
     if not len(ends):
         return None
     twins = ends.rotation, ends.translation
-    behind = decades_behind(sets, best, twins, twins, scale)
+    behind = decades_behind(problem, best, twins, twins, scale)
     k = int(np.argmin(behind))
     return float(behind[k]), _candidate(problem, solution, ends, k, float(behind[k]))
 
 
 def _candidate(problem: Problem, solution: Solution, ends: Hypotheses, k: int, behind: float) -> Candidate:
     rotation, translation = ends.rotation[k], ends.translation[k]
-    seen = problem.view(rotation, translation)
-    inliers = count_one_to_one(problem.image, seen, solution.inlier_threshold)
+    seen = problem.project_scene(rotation, translation)
+    inliers = count_one_to_one(problem.image_points, seen, solution.inlier_threshold)
     alarms = solution.log10_false_alarms + behind
-    return Candidate(rotation, translation - rotation @ problem.origin, float(ends.log_likelihood[k]), inliers, alarms)
+    return Candidate(*problem.to_user(rotation, translation), float(ends.log_likelihood[k]), inliers, alarms)
 
 
 def _looks(photo: Photo, solution: Solution, problem: Problem) -> Iterator[tuple[Array, Array]]:
@@ -114,21 +114,22 @@ def _looks(photo: Photo, solution: Solution, problem: Problem) -> Iterator[tuple
             continue
         looks += 1
         near = problem_near(region, explained, photo.camera, region.prior())
-        scene = Scene(near.sets, photo.seed, DEFAULT)
+        scene = Scene(near, photo.seed, DEFAULT)
         scene.rasters = rasters
-        known = scene.enter_prior(near.sets.prior or region.prior())
+        assert near.prior is not None
+        known = scene.enter_prior(near.prior)
         assert isinstance(known, PosePrior)
         found = _likeliest(finish(scene, search_near(scene, known, TWINS.look)), scene, near)
         if len(found) and found.log10_false_alarms[0] < 0:
             start = Hypotheses.from_poses(*scene.enter(found.rotation, found.translation))
             beside = _likeliest(finish(scene, search_beside(scene, start, DEFAULT.beside)), scene, near)
             for one in (found, beside):
-                yield one.rotation[0], one.translation[0] + one.rotation[0] @ (problem.origin - near.origin)
+                yield problem.from_user(*near.to_user(one.rotation[0], one.translation[0]))
 
 
 def _likeliest(poses: Hypotheses, scene: Scene, problem: Problem) -> Hypotheses:
     """(1,) of the poses that with the fewest false alarms, in the user's frame."""
-    return weighed(to_user_frame(poses, scene), problem.sets)[:1]
+    return weighed(to_user_frame(poses, scene), problem)[:1]
 
 
 def without_twins(

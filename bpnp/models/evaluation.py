@@ -21,7 +21,7 @@ from bpnp.checks import check_positive, check_within
 from bpnp.geometry import bearings, choose, chords
 from bpnp.loops.parallel import Deadline
 from bpnp.robust.proposals import pose_hypotheses
-from bpnp.search.point_sets import PointSets
+from bpnp.search.problem import Problem
 from bpnp.search.search import refine_poses, search_poses
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.verdict import SearchResult
@@ -64,10 +64,13 @@ class Search(nn.Module):
     def forward(self, batch: Batch) -> Prediction:
         """Return the pose "search" of each problem."""
         results = (
-            search_poses(sets, seed=self.seed, deadline=Deadline.after(self.time_limit), settings=self.settings)
-            for sets in point_sets(batch)
+            (problem, search_poses(problem, seed=self.seed, deadline=self._deadline(), settings=self.settings))
+            for problem in problems_of(batch)
         )
         return Prediction(poses={"search": best_poses(results, batch.points3d)})
+
+    def _deadline(self) -> Deadline:
+        return Deadline.after(self.time_limit)
 
 
 def refine(batch: Batch, rotation: Float[Tensor, "b s 3 3"], translation: Float[Tensor, "b s 3"]) -> Pose:
@@ -80,39 +83,42 @@ def refine(batch: Batch, rotation: Float[Tensor, "b s 3 3"], translation: Float[
         rotation: Initial rotations (b, s, 3, 3), NaN for a missing one.
         translation: Initial translations (b, s, 3).
     """
-    samples = zip(point_sets(batch), rotation, translation, strict=True)
-    pose = best_poses((refine_poses(sets, _host(r), _host(t)) for sets, r, t in samples), batch.points3d)
+    samples = zip(problems_of(batch), rotation, translation, strict=True)
+    results = ((problem, refine_poses(problem, *problem.from_user(_host(r), _host(t)))) for problem, r, t in samples)
+    pose = best_poses(results, batch.points3d)
     return replace(pose, stats=replace(pose.stats, converged=pose.rotation.isfinite().all(-1).all(-1)))
 
 
-def point_sets(batch: Batch) -> list[PointSets]:
+def problems_of(batch: Batch) -> list[Problem]:
     """Return the real points of each sample, on the host.
 
     A result then depends neither on the other samples nor on padding.
     """
     rays = bearings(batch.points2d)
     return [
-        PointSets(_host(rays[i, batch.mask2d[i]]), _host(batch.points3d[i, batch.mask3d[i]])) for i in range(len(batch))
+        Problem.of(_host(rays[i, batch.mask2d[i]]), _host(batch.points3d[i, batch.mask3d[i]]))
+        for i in range(len(batch))
     ]
 
 
-def best_poses(results: Iterable[SearchResult], like: Tensor) -> Pose:
-    """Return the best pose of each search result, without a gradient; NaN where there is none.
+def best_poses(results: Iterable[tuple[Problem, SearchResult]], like: Tensor) -> Pose:
+    """Return the best pose of each problem, without a gradient; NaN where there is none.
 
     In the stats, `iterations` counts batches of initial poses, `residual` is the scale of the residuals in radians, and
     `converged` is True for the verdict "confident".
 
     Args:
-        results: One result for each sample.
+        results: Each problem and its result.
         like: Tensor with the device and the dtype of the pose.
     """
-    results = list(results)
-    rotation = torch.tensor(np.array([result.best[0] for result in results]).reshape(-1, 3, 3)).to(like)
-    translation = torch.tensor(np.array([result.best[1] for result in results]).reshape(-1, 3)).to(like)
+    solved = list(results)
+    poses = [problem.to_user(*result.best) for problem, result in solved]
+    rotation = torch.tensor(np.array([pose[0] for pose in poses]).reshape(-1, 3, 3)).to(like)
+    translation = torch.tensor(np.array([pose[1] for pose in poses]).reshape(-1, 3)).to(like)
     stats = SolveStats(
-        torch.tensor([result.batches for result in results], device=like.device, dtype=torch.int64),
-        torch.tensor([result.residual for result in results]).to(like),
-        torch.tensor([result.verdict == "confident" for result in results], device=like.device, dtype=torch.bool),
+        torch.tensor([result.batches for _, result in solved], device=like.device, dtype=torch.int64),
+        torch.tensor([result.residual for _, result in solved]).to(like),
+        torch.tensor([result.verdict == "confident" for _, result in solved], device=like.device, dtype=torch.bool),
     )
     return Pose(rotation, translation, stats)
 

@@ -11,7 +11,7 @@ from bpnp.search.annealing import finish
 from bpnp.search.evidence.false_alarms import log10_tests
 from bpnp.search.evidence.rivals import against_rivals
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_scene_frame, to_user_frame
-from bpnp.search.point_sets import PointSets
+from bpnp.search.problem import Problem
 from bpnp.search.scene import Scene
 from bpnp.search.verdict import SearchResult, judged, missed, weighed, with_false_alarms
 
@@ -24,10 +24,10 @@ class Pool:
     surrounded, searched: poses around which was searched in vain, of those that exceed chance, and of others.
     """
 
-    def __init__(self, scene: Scene, sets: PointSets, enumerated: SearchResult) -> None:
-        self.scene, self.sets, self.enumerated = scene, sets, enumerated
+    def __init__(self, scene: Scene, problem: Problem, enumerated: SearchResult) -> None:
+        self.scene, self.problem, self.enumerated = scene, problem, enumerated
         self.turns = 0
-        self._tests = log10_tests(sets)
+        self._tests = log10_tests(problem)
         self.forget()
         if len(enumerated.candidates):
             self.candidates = to_scene_frame(enumerated.candidates, scene)
@@ -62,9 +62,9 @@ class Pool:
     def _weighed(self, candidates: Hypotheses, count: int | None = None) -> Hypotheses:
         """The candidates, of which the first `count`, by default as many as a verdict needs, have false alarms."""
         if count is None:
-            count = self.scene.settings.finished if self.sets.prior is None else self.scene.settings.kept
+            count = self.scene.settings.finished if self.problem.prior is None else self.scene.settings.kept
         places = np.flatnonzero(self._promising(candidates[:count]))
-        first = with_false_alarms(to_user_frame(candidates[places], self.scene), self.sets)
+        first = with_false_alarms(to_user_frame(candidates[places], self.scene), self.problem)
         alarms, rough = candidates.log10_false_alarms.copy(), candidates.log10_rough.copy()
         alarms[places], rough[places] = first.log10_false_alarms, first.log10_rough
         return replace(candidates, log10_false_alarms=alarms, log10_rough=rough)
@@ -73,12 +73,12 @@ class Pool:
         """Which poses may exceed chance: those that explain the bearings better than scene points would that are spread
         evenly over the view, or worse by less than three times the number of tests, in decades."""
         nats = candidates.log_likelihood - math.log(2 * math.pi / self.scene.solid_angle)
-        return np.asarray(nats * len(self.sets.bearings) > -3 * math.log(10) * self._tests)
+        return np.asarray(nats * len(self.problem.bearings) > -3 * math.log(10) * self._tests)
 
     def leaders(self) -> Hypotheses:
         """The candidates that have their false alarms, as a verdict needs them."""
         known = self.candidates[~np.isnan(self.candidates.log10_false_alarms)]
-        return weighed(to_user_frame(known, self.scene), self.sets, self.scene.settings.evidence)
+        return weighed(to_user_frame(known, self.scene), self.problem, self.scene.settings.evidence)
 
     @property
     def alarms(self) -> float:
@@ -92,7 +92,7 @@ class Pool:
         rule, looked = self.scene.settings.evidence, to_user_frame(self.surrounded, self.scene)
         rotation = np.concatenate([leaders.rotation[:1], looked.rotation])
         translation = np.concatenate([leaders.translation[:1], looked.translation])
-        return int(self.sets.same_pose(rotation, translation, rule.other_deg, rule.other_shift).sum()) - 1
+        return int(self.problem.same_pose(rotation, translation, rule.other_deg, rule.other_shift).sum()) - 1
 
     def is_searched(self, pose: Hypotheses) -> bool:
         """Whether the surroundings of a pose (1,), or of one much like it, were searched before one exceeded chance."""
@@ -102,19 +102,19 @@ class Pool:
 
     def _missed(self) -> float:
         leaders = self.leaders()
-        return missed(leaders, self.sets, self.looks(leaders), self.scene.settings.evidence)
+        return missed(leaders, self.problem, self.looks(leaders), self.scene.settings.evidence)
 
     def result(self, annealed: int | None = None) -> SearchResult:
         """The verdict on the best candidates, the first `annealed` of which are annealed to the end on all points."""
-        scene, sets, rule = self.scene, self.sets, self.scene.settings.evidence
+        scene, problem, rule = self.scene, self.problem, self.scene.settings.evidence
         annealed = scene.settings.finished if annealed is None else annealed
         ends = finish(scene, self.candidates, annealed) if len(self.candidates) else self.candidates
-        if len(ends) and sets.prior is not None:  # of a pose before and after, that which chance explains less
+        if len(ends) and problem.prior is not None:  # of a pose before and after, that which chance explains less
             ends = self._weighed(ends)
             ends = merge_hypotheses([ends, self.candidates.as_dependent()], scene)
-        leaders = weighed(to_user_frame(ends, scene), sets, rule)
+        leaders = weighed(to_user_frame(ends, scene), problem, rule)
         looks = self.looks(leaders)
-        result = judged(leaders, sets, batches=self.turns, looks=looks, rule=rule)
+        result = judged(leaders, problem, batches=self.turns, looks=looks, rule=rule)
         if self.enumerated.log10_false_alarms < result.log10_false_alarms:
             return replace(self.enumerated, batches=self.turns)
-        return against_rivals(result, sets, lambda: scene, rule, looks=looks)
+        return against_rivals(result, problem, lambda: scene, rule, looks=looks)

@@ -1,4 +1,4 @@
-"""A problem as the search sees it: normalised, shuffled, and summed up in weighted clusters."""
+"""A problem as the annealing reads it: in float32, in random order, and summed up in weighted clusters."""
 
 import math
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from bpnp.search.kernels.sides import (
     with_partners,
 )
 from bpnp.search.kernels.sparse import Tiles, build_tiles
-from bpnp.search.point_sets import PointSets
+from bpnp.search.problem import Problem, in_bulk
 from bpnp.search.settings import RasterShape, SearchSettings
 from bpnp.search.starts import Array, GravityPrior, Prior, turned_to
 
@@ -39,42 +39,38 @@ class Companion(NamedTuple):
 
 
 class Scene:
-    """A problem, the points centred and scaled to unit extent, the camera turned to the mean bearing, in random order.
+    """A problem in float32 and in random order, the camera turned to the mean bearing.
 
     offsets: (m, 3) of the unit bearings from (0, 0, 1), their mean direction after `frame` (3, 3) has turned the
     camera: float32 keeps the digits of a narrow view in them. points3d: (n, 3). bulk3d: those of them that decide
-    origin and unit; the few points of a reconstruction that lie orders of magnitude away do not.
+    origin and unit of the problem.
     spread: of the bearings, radians for a narrow view. shift_weight: (3,) of the axes in which translations are
     compared: along the view a narrow image hardly shows a shift. solid_angle: that they fill, steradians.
     image, seen: both sides with what is known of single points. smallest_scale: of the residuals, radians. rng: of all
     that is random. settings, deadline: of the search. rasters: of the bearings, those that were asked for.
     """
 
-    def __init__(self, sets: PointSets, seed: int, settings: SearchSettings, deadline: Deadline = NEVER) -> None:
-        bearings, points3d = sets.bearings, sets.points3d
+    def __init__(self, problem: Problem, seed: int, settings: SearchSettings, deadline: Deadline = NEVER) -> None:
+        bearings, points3d = problem.bearings, problem.points3d
         self.settings, self.deadline = settings, deadline
         self.rasters: dict[tuple[RasterShape, float], Raster] = {}
         self.companions: list[Companion] = []
         self._tiles: dict[int, tuple[Tiles, WeightedPoints]] = {}
         self._points: dict[int, WeightedPoints] = {}
         self.rng = np.random.default_rng(seed)
-        in_bulk = _in_bulk(points3d, settings.bulk)
-        bulk = points3d[in_bulk]
-        self.centre = bulk.mean(0)
-        self.size = max(float(np.sqrt(((bulk - self.centre) ** 2).sum(-1).mean())), 1e-30)
         self.frame = turned_to(bearings.mean(0))
         order2d = self.rng.permutation(len(bearings))
         self.offsets = (bearings @ self.frame.T - FORWARD)[order2d].astype(np.float32)
         order = self.rng.permutation(len(points3d))
-        self.points3d = ((points3d - self.centre) / self.size)[order].astype(np.float32)
-        self.bulk3d = self.points3d[in_bulk[order]]
-        self.image = side_of(self.offsets, sets.scores2d, sets.labels2d, None, order2d)
-        self.seen = side_of(self.points3d, sets.scores3d, sets.labels3d, sets.cones3d, order)
+        self.points3d = points3d[order].astype(np.float32)
+        self.bulk3d = self.points3d[in_bulk(points3d)[order]]
+        self.image = side_of(self.offsets, problem.scores2d, problem.labels2d, None, order2d)
+        self.seen = side_of(self.points3d, problem.scores3d, problem.labels3d, problem.cones3d, order)
         self.image, self.seen = with_partners(self.image, self.seen), with_partners(self.seen, self.image)
-        self.spread, self.solid_angle = sets.image.spread, sets.image.solid_angle
+        self.spread, self.solid_angle = problem.image.spread, problem.image.solid_angle
         self.shift_weight = np.array([1, 1, min(1, SHIFT_ALONG * self.spread)], np.float32)
         fine = settings.fine
-        floor = math.inf if sets.floor is None else sets.floor
+        floor = math.inf if problem.floor is None else problem.floor
         self.smallest_scale = min(fine.smallest_scale, fine.relative_smallest * self.spread, floor)
 
     def outlier_density(self, share: float) -> np.float32:
@@ -82,8 +78,8 @@ class Scene:
         return np.float32(2 * math.pi * share / ((1 - share) * self.solid_angle))
 
     def join(self, other: "Scene", turn: NDArray[np.float64], shift: NDArray[np.float64]) -> None:
-        """Add a companion with the same points: in the user's coordinates x' = turn x + shift."""
-        turned, moved = other.frame @ turn @ self.frame.T, other.frame @ shift / self.size
+        """Add a companion with the same points: in the coordinates of the problem x' = turn x + shift."""
+        turned, moved = other.frame @ turn @ self.frame.T, other.frame @ shift
         self.companions.append(Companion(other, turned.astype(np.float32), moved.astype(np.float32)))
 
     def enter_prior(self, prior: Prior) -> Prior:
@@ -94,18 +90,16 @@ class Scene:
         if prior.translation is None:
             return prior._replace(rotation=self.frame @ rotation)
         turned, moved = self.enter(rotation, np.asarray(prior.translation, np.float64))
-        sigma = prior.translation_sigma / self.size
-        return prior._replace(rotation=turned, translation=moved, translation_sigma=sigma)
+        return prior._replace(rotation=turned, translation=moved)
 
     def enter(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> tuple[Array, Array]:
-        """Poses of the user in this frame."""
-        moved = (translation + rotation @ self.centre) / self.size @ self.frame.T
-        return (self.frame @ rotation).astype(np.float32), moved.astype(np.float32)
+        """Return poses of the problem in this frame."""
+        return (self.frame @ rotation).astype(np.float32), (translation @ self.frame.T).astype(np.float32)
 
     def leave(self, rotation: Array, translation: Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Poses of this frame in the user's coordinates, in float64, their rotations orthogonal to its precision."""
+        """Return poses of this frame as poses of the problem, in float64, their rotations orthogonal to that."""
         turn = self.frame.T @ Rotation.from_matrix(rotation.astype(np.float64)).as_matrix()
-        return turn, translation.astype(np.float64) * self.size @ self.frame - turn @ self.centre
+        return turn, translation.astype(np.float64) @ self.frame
 
     def clusters(self, counts: Sequence[int]) -> list[Sides]:
         """Both sides in about so many clusters each, in the order of their labels: those of a count are clusters of
@@ -146,9 +140,3 @@ def degenerate(points: NDArray[np.float64]) -> bool:
     values = np.linalg.svd(points - points.mean(0), compute_uv=False)
     extent = max(float(np.abs(points).max()), float(values[0]))
     return bool(values[0] <= 1e-9 * extent or values[1] <= ON_A_LINE * values[0])
-
-
-def _in_bulk(points: NDArray[np.float64], most: float) -> NDArray[np.bool_]:
-    """Which points are within `most` median distances of the median."""
-    distance = np.linalg.norm(points - np.median(points, 0), axis=-1)
-    return np.asarray(distance <= most * max(float(np.median(distance)), 1e-30))

@@ -38,7 +38,7 @@ Proposals = Callable[[], tuple[NDArray[np.float64], NDArray[np.float64]]]  # rot
 def turns(pool: Pool, around: Prior | None, proposals: Proposals | None) -> Iterator[Hypotheses]:
     """The poses of one turn after the other; the pool has merged those of a turn before the next one begins."""
     scene, settings = pool.scene, pool.scene.settings
-    guess, known = (None if prior is None else scene.enter_prior(prior) for prior in (around, pool.sets.prior))
+    guess, known = (None if prior is None else scene.enter_prior(prior) for prior in (around, pool.problem.prior))
     if guess is not None:
         for number in range(settings.schedule.around):
             yield multistart(scene, number, guess).as_dependent()
@@ -79,8 +79,8 @@ def _sure(pool: Pool, drawn: Iterator[Hypotheses]) -> Iterator[Hypotheses]:
     """What excludes the likelier case: a raster search around the best pose, or more starts from anywhere."""
     leaders, settings = pool.leaders(), pool.scene.settings
     looks, rule = pool.looks(leaders), settings.evidence
-    symmetric = bool(pool.sets.registered) and is_symmetric(leaders, pool.sets, rule)
-    basin_count = starts_met(leaders, pool.sets, rule, symmetric=symmetric)
+    symmetric = bool(pool.problem.registered) and is_symmetric(leaders, pool.problem, rule)
+    basin_count = starts_met(leaders, pool.problem, rule, symmetric=symmetric)
     far = far_missed(basin_count, rule, symmetric=symmetric)
     if looks < settings.schedule.looks and near_missed(basin_count, looks, rule) > far:
         yield _look(pool)
@@ -126,7 +126,7 @@ def proposed(pool: Pool, proposals: Proposals) -> Hypotheses:
 
     Their basin counts are 0, since proposals depend on each other.
     """
-    poses = admitted(pool.scene, Hypotheses.from_poses(*pool.scene.enter(*proposals())), pool.sets.prior)
+    poses = admitted(pool.scene, Hypotheses.from_poses(*pool.scene.enter(*proposals())), pool.problem.prior)
     return raster_search(pool.scene, poses, pool.scene.settings.proposed)
 
 

@@ -18,8 +18,8 @@ from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_user_frame
 from bpnp.search.infinity.kernels import Image
 from bpnp.search.infinity.search import search_rotation
 from bpnp.search.kernels.sides import FORWARD
-from bpnp.search.point_sets import PointSets
 from bpnp.search.pool import Pool
+from bpnp.search.problem import Problem
 from bpnp.search.propose.known_matches import known_matches, poses_of_matches
 from bpnp.search.propose.minimal_solvers import p3p_poses
 from bpnp.search.propose.symmetries import self_motions
@@ -36,7 +36,7 @@ WARMING = 8  # points of the problem that compiles the loops
 
 @one_blas_thread
 def search_poses(
-    sets: PointSets,
+    problem: Problem,
     *,
     around: Prior | None = None,
     proposals: Proposals | None = None,
@@ -50,7 +50,7 @@ def search_poses(
 
     Maximises the likelihood of the bearings under the mixture
     p(f_i) = (1 - w)/n sum_j exp((f_i . g(R p_j + t) - 1)/s^2) / 2 pi s^2 + w/A, g(y) = y/|y|, over pose and scale s,
-    A the solid angle of the view, by annealing s from starts over all rotations, or around `sets.prior`.
+    A the solid angle of the view, by annealing s from starts over all rotations, or around `problem.prior`.
 
     Few points (`bpnp.search.enumeration`) are enumerated first, and annealed only if that leaves a doubt.
 
@@ -67,7 +67,7 @@ def search_poses(
     candidates. Raises ValueError for `clutter` out of range.
     """
     if clutter is not None:
-        settings, sets = settings.expecting(clutter), replace(sets, clutter=clutter)
+        settings, problem = settings.expecting(clutter), replace(problem, clutter=clutter)
     start, enumerated = time.monotonic(), no_pose("no pose was found")
 
     def tell(batches: int) -> None:
@@ -76,41 +76,41 @@ def search_poses(
 
     @cache
     def entered() -> Scene:
-        return Scene(sets, seed, settings, deadline)
+        return Scene(problem, seed, settings, deadline)
 
-    many = exceeds_enumeration(sets)
-    matches = known_matches(sets)
-    if matches is not None and (sets.prior is None or not is_enumerable(sets)):
-        return _of_known_matches(sets, *matches, entered, seed, settings)
+    many = exceeds_enumeration(problem)
+    matches = known_matches(problem)
+    if matches is not None and (problem.prior is None or not is_enumerable(problem)):
+        return _of_known_matches(problem, *matches, entered, seed, settings)
     if not many:
         settings = settings.limited(min(settings.schedule.turns, settings.schedule.enumerated))
-    if is_enumerable(sets) and not deadline.passed():
-        found, exhaustive = search_by_enumeration(sets, deadline, settings)
+    if is_enumerable(problem) and not deadline.passed():
+        found, exhaustive = search_by_enumeration(problem, deadline, settings)
         rule = settings.evidence
-        enumerated = judged(found, sets, batches=0, looks=REFINED, exhaustive=exhaustive, rule=rule)
+        enumerated = judged(found, problem, batches=0, looks=REFINED, exhaustive=exhaustive, rule=rule)
         enumerated = against_rivals(
-            enumerated, sets, entered, rule, looks=REFINED, exhaustive=exhaustive, contested=True
+            enumerated, problem, entered, rule, looks=REFINED, exhaustive=exhaustive, contested=True
         )
         if matches is not None and enumerated.log10_false_alarms > 0:  # their residuals may exceed its radius
-            return _of_known_matches(sets, *matches, entered, seed, settings)
+            return _of_known_matches(problem, *matches, entered, seed, settings)
         tell(0)
         # More search helps only where no pose exceeds chance yet, and there are enough points to anneal.
-        small = min(len(sets.bearings), len(sets.points3d)) < settings.least_annealed
+        small = min(len(problem.bearings), len(problem.points3d)) < settings.least_annealed
         settled = exhaustive or enumerated.log10_false_alarms <= 0
         if enumerated.verdict == "confident" or small or (settled and not many):
             return enumerated
-    if degenerate(sets.bearings) or degenerate(sets.points3d):
-        counts = f"{len(sets.bearings)} 2D and {len(sets.points3d)} 3D points"
+    if degenerate(problem.bearings) or degenerate(problem.points3d):
+        counts = f"{len(problem.bearings)} 2D and {len(problem.points3d)} 3D points"
         return no_pose(f"no pose fits: {counts}, too few or all on one line")
     scene = entered()
     if lacks_partners(scene):
         return no_pose("no pose fits: too few points with a label of the other side, or all on one line")
-    pool = Pool(scene, sets, enumerated)
+    pool = Pool(scene, problem, enumerated)
     return _until_certain(pool, turns(pool, around, proposals if many else None), tell)
 
 
 def _of_known_matches(
-    sets: PointSets,
+    problem: Problem,
     i: NDArray[np.int64],
     j: NDArray[np.int64],
     entered: Callable[[], Scene],
@@ -118,9 +118,9 @@ def _of_known_matches(
     settings: SearchSettings,
 ) -> SearchResult:
     """Judge the poses that known matches, indices (k,) of image points and of scene points, fit best."""
-    found, rule = poses_of_matches(sets, i, j, seed), settings.evidence
-    result = judged(found, sets, batches=0, exhaustive=True, rule=rule)
-    return against_rivals(result, sets, entered, rule, exhaustive=True)
+    found, rule = poses_of_matches(problem, i, j, seed), settings.evidence
+    result = judged(found, problem, batches=0, exhaustive=True, rule=rule)
+    return against_rivals(result, problem, entered, rule, exhaustive=True)
 
 
 def lacks_partners(scene: Scene) -> bool:
@@ -134,7 +134,7 @@ def _until_certain(
 ) -> SearchResult:
     """Turn after turn until the verdict is settled or the budget is spent."""
     settings, finished = pool.scene.settings, 0.0
-    thinned = len(pool.sets.bearings) > settings.fine.bearings
+    thinned = len(pool.problem.bearings) > settings.fine.bearings
     while pool.turns < settings.schedule.turns and not pool.scene.deadline.passed():
         found = next(turns, None)
         if found is None:
@@ -152,7 +152,7 @@ def _until_certain(
 
 @one_blas_thread
 def search_proposed(
-    sets: PointSets,
+    problem: Problem,
     proposals: Proposals,
     *,
     clutter: float | None = None,
@@ -164,16 +164,16 @@ def search_proposed(
 
     What `search_poses` does with proposals, without its own starts; the arguments are the same ones.
     """
-    if degenerate(sets.bearings) or degenerate(sets.points3d):
+    if degenerate(problem.bearings) or degenerate(problem.points3d):
         return no_pose("no pose fits: too few points, or all on one line")
     if clutter is not None:
-        settings, sets = settings.expecting(clutter), replace(sets, clutter=clutter)
-    pool = Pool(Scene(sets, seed, settings, deadline), sets, no_pose("no pose was proposed"))
+        settings, problem = settings.expecting(clutter), replace(problem, clutter=clutter)
+    pool = Pool(Scene(problem, seed, settings, deadline), problem, no_pose("no pose was proposed"))
     return _until_certain(pool, only_proposed(pool, proposals))
 
 
 @one_blas_thread
-def refine_poses(sets: PointSets, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> SearchResult:
+def refine_poses(problem: Problem, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> SearchResult:
     """The likeliest poses that annealing reaches from given ones and from poses around them.
 
     The objective is that of `search_poses`. A start may be some 10 degrees off, and more where there are many: those
@@ -184,9 +184,9 @@ def refine_poses(sets: PointSets, rotation: NDArray[np.float64], translation: ND
     `batches` of the result is the number of starts that were annealed. Without a start, or with points that fix no
     pose, there are no candidates.
     """
-    settings, scene = DEFAULT, Scene(sets, 0, DEFAULT)
+    settings, scene = DEFAULT, Scene(problem, 0, DEFAULT)
     starts = _entered(scene, rotation, translation)
-    if not len(starts) or degenerate(sets.bearings) or degenerate(sets.points3d):
+    if not len(starts) or degenerate(problem.bearings) or degenerate(problem.points3d):
         return no_pose("no start, or points that fix no pose")
     crowd = len(starts)
     if crowd > settings.refined_directly:
@@ -199,19 +199,19 @@ def refine_poses(sets: PointSets, rotation: NDArray[np.float64], translation: ND
     direct = anneal_on_points(scene, starts, first_scale)
     poses = finish(scene, merge_hypotheses([clustered, direct], scene))
     annealed = crowd + len(around) - len(starts)
-    return judged(to_user_frame(poses, scene), sets, batches=annealed, rule=settings.evidence)
+    return judged(to_user_frame(poses, scene), problem, batches=annealed, rule=settings.evidence)
 
 
 @one_blas_thread
 def score_poses(
-    sets: PointSets, rotation: NDArray[np.float64], translation: NDArray[np.float64], deadline: Deadline
+    problem: Problem, rotation: NDArray[np.float64], translation: NDArray[np.float64], deadline: Deadline
 ) -> SearchResult:
     """Poses (c, 3, 3), (c, 3) annealed a little and scored as those of a search; NaN for a missing one.
 
     Their residuals are taken to be the median distance of a point to the nearest bearing. Their basin counts are 0,
     since no other starts were tried: only overwhelming evidence makes the best of them certain.
     """
-    scene = Scene(sets, 0, DEFAULT, deadline)
+    scene = Scene(problem, 0, DEFAULT, deadline)
     starts = _entered(scene, rotation, translation)
     if not len(starts):
         return no_pose("the module found no pose")
@@ -220,7 +220,7 @@ def score_poses(
     distance, _ = cKDTree(scene.offsets + FORWARD).query(camera / length)
     scale = np.asarray(np.maximum(np.median(distance, -1), scene.smallest_scale), np.float32)
     poses = finish(scene, replace(starts, scale=scale))
-    return judged(to_user_frame(poses, scene), sets, batches=len(starts))
+    return judged(to_user_frame(poses, scene), problem, batches=len(starts))
 
 
 def _entered(scene: Scene, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Hypotheses:
@@ -238,12 +238,12 @@ def warm_up() -> None:
     points = np.random.default_rng(0).uniform(-1, 1, (WARMING, 3))
     rays = points + (0, 0, 6)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    sets = PointSets(rays, points)
-    search_by_enumeration(sets, NEVER, DEFAULT)
+    problem = Problem(rays, points)
+    search_by_enumeration(problem, NEVER, DEFAULT)
     p3p_poses(rays[None, :3], points[None, :3])
     self_motions(points, 0.1)
     search_rotation(Image(rays, np.full(WARMING, 1e-3)), rays)
-    scene = Scene(sets, 0, DEFAULT)
+    scene = Scene(problem, 0, DEFAULT)
     start = Hypotheses.from_poses(*scene.enter(np.eye(3)[None], np.array([[0, 0, 6.0]])))
     run_batch(scene, start)
     looks = DEFAULT.beside.raster, DEFAULT.beside.narrowing.first_scale

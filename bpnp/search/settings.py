@@ -50,7 +50,7 @@ class FineStage:
 
     bearings: used before the last stage, which uses all; more cost time and hardly change which pose is best.
     smallest_scale: radians, a tenth of a pixel at a focal length of 500 pixels; relative_smallest: in spreads of the
-        bearings, for narrow views. The smallest of both and of `PointSets.floor` is the end of the annealing.
+        bearings, for narrow views. The smallest of both and of `Problem.floor` is the end of the annealing.
     cooling: factor from one scale to the next. patience: scales after the likeliest one before a pose is left.
     """
 
@@ -185,7 +185,6 @@ class SearchSettings:
     copied, copies, copied_scale: of the first so many poses that come from elsewhere, so many copies are annealed too,
         whose points fall so many spreads of the bearings beside its own: about what separates optima of one basin.
     same_deg, same_shift: poses closer than both, in degrees and extents of the scene, are one.
-    bulk: in median distances from the median; 3D points further off decide neither the origin nor the unit of length.
     sampled, lloyd_iterations: points a cluster from which cluster centres are computed, and iterations.
     starts_a_check, lookups_a_check: starts that are annealed on clusters, and looked up in a raster, between two looks
         at the clock, if time is limited.
@@ -239,7 +238,6 @@ class SearchSettings:
     kept: int = 8
     same_deg: float = 3.0
     same_shift: float = 0.05
-    bulk: float = 20.0
     sampled: int = 8
     lloyd_iterations: int = 5
     starts_a_check: int = 32

@@ -21,7 +21,7 @@ from bpnp.search.evidence.repetitions import registered
 from bpnp.search.evidence.settings import Evidence
 from bpnp.search.evidence.uncertainty import focal_bound, is_redundant, linearised, rotation_bound
 from bpnp.search.hypotheses import Hypotheses
-from bpnp.search.point_sets import PointSets
+from bpnp.search.problem import Problem
 from bpnp.search.propose.symmetries import Motions
 from bpnp.search.settings import DEFAULT
 
@@ -63,18 +63,18 @@ class SearchResult:
         return float(self.candidates.log10_false_alarms[0]) if len(self.candidates) else math.inf
 
 
-def with_false_alarms(candidates: Hypotheses, sets: PointSets) -> Hypotheses:
+def with_false_alarms(candidates: Hypotheses, problem: Problem) -> Hypotheses:
     """The candidates, in the user's coordinates, with their false alarms; those that have them already keep them."""
     alarms, rough = candidates.log10_false_alarms.copy(), candidates.log10_rough.copy()
     new = np.isnan(alarms)
     if not new.any():
         return candidates
     unknown = candidates[new]
-    alarms[new], rough[new] = alarms_of(sets, unknown.rotation, unknown.translation, unknown.scale)
+    alarms[new], rough[new] = alarms_of(problem, unknown.rotation, unknown.translation, unknown.scale)
     return replace(candidates, log10_false_alarms=alarms, log10_rough=rough)
 
 
-def weighed(candidates: Hypotheses, sets: PointSets, rule: Evidence = DEFAULT.evidence) -> Hypotheses:
+def weighed(candidates: Hypotheses, problem: Problem, rule: Evidence = DEFAULT.evidence) -> Hypotheses:
     """The candidates, in the user's coordinates, with their false alarms; the best first, the others as they were.
 
     Best is the first one whose false alarms exceed the fewest by less than the lead that a verdict asks for: among
@@ -82,26 +82,26 @@ def weighed(candidates: Hypotheses, sets: PointSets, rule: Evidence = DEFAULT.ev
     """
     if not len(candidates):
         return candidates
-    candidates = with_false_alarms(candidates, sets)
+    candidates = with_false_alarms(candidates, problem)
     alarms = candidates.log10_false_alarms
     first = int(np.flatnonzero(alarms <= alarms.min() + rule.lead)[0])
     order = np.r_[first, np.delete(np.arange(len(alarms)), first)]
     return candidates[order]
 
 
-def match_count(candidates: Hypotheses, sets: PointSets) -> float:
+def match_count(candidates: Hypotheses, problem: Problem) -> float:
     """Expected number of matches of the best pose."""
     return float(candidates.match_count[0])
 
 
 def missed(
-    candidates: Hypotheses, sets: PointSets, looks: float | int, rule: Evidence, *, independent: bool = True
+    candidates: Hypotheses, problem: Problem, looks: float | int, rule: Evidence, *, independent: bool = True
 ) -> float:
     """Return log10 of the probability that weighed candidates lack a better optimum.
 
     Args:
         candidates: poses in the user's coordinates, best first.
-        sets: the points of the problem.
+        problem: the points of the problem.
         looks: number of local searches around the first candidate that found nothing better; `REFINED` of an
             enumeration, which leaves no better pose beside one.
         rule: constants of the verdict.
@@ -114,62 +114,62 @@ def missed(
     alarms = float(candidates.log10_false_alarms[0]) if len(candidates) else math.inf
     if alarms > 0:
         return 0.0
-    decades = -alarms / max(match_count(candidates, sets), 1.0) if independent else 0.0
-    value = log10_missed(starts_met(candidates, sets, rule), decades, looks, rule)
-    if value > rule.missed or not is_symmetric(candidates, sets, rule):
+    decades = -alarms / max(match_count(candidates, problem), 1.0) if independent else 0.0
+    value = log10_missed(starts_met(candidates, problem, rule), decades, looks, rule)
+    if value > rule.missed or not is_symmetric(candidates, problem, rule):
         return value
-    basin_count, share = starts_met(candidates, sets, rule, symmetric=True), 0.0
-    if sets.prior is not None:  # a better pose elsewhere is as unlikely as the prior makes it
-        share = sets.log10_share(candidates.rotation[0], candidates.translation[0])
+    basin_count, share = starts_met(candidates, problem, rule, symmetric=True), 0.0
+    if problem.prior is not None:  # a better pose elsewhere is as unlikely as the prior makes it
+        share = problem.log10_share(candidates.rotation[0], candidates.translation[0])
     return min(log10_missed(basin_count, 0.0, looks, rule, symmetric=True) + share, 0.0)
 
 
-def motions_of(candidates: Hypotheses, sets: PointSets, rule: Evidence) -> Motions:
+def motions_of(candidates: Hypotheses, problem: Problem, rule: Evidence) -> Motions:
     """Return the motions that map the matched points of the first candidate onto other scene points.
 
     They are computed once for a pose and those that are no different pose.
     """
     pose = candidates.rotation[:1], candidates.translation[:1]
-    for rotation, translation, motions in sets.registered:
+    for rotation, translation, motions in problem.registered:
         poses = np.concatenate([pose[0], rotation[None]]), np.vstack([pose[1], translation])
-        if sets.same_pose(*poses, rule.other_deg, rule.other_shift)[1]:
+        if problem.same_pose(*poses, rule.other_deg, rule.other_shift)[1]:
             return motions
-    scale = max(float(candidates.scale[0]), float(sets.image.scales[0]))
-    motions = registered(sets, pose[0][0], pose[1][0], scale, rule)
-    sets.registered.append((pose[0][0], pose[1][0], motions))
+    scale = max(float(candidates.scale[0]), float(problem.image.scales[0]))
+    motions = registered(problem, pose[0][0], pose[1][0], scale, rule)
+    problem.registered.append((pose[0][0], pose[1][0], motions))
     return motions
 
 
-def is_symmetric(candidates: Hypotheses, sets: PointSets, rule: Evidence) -> bool:
+def is_symmetric(candidates: Hypotheses, problem: Problem, rule: Evidence) -> bool:
     """Return whether a motion maps so many of the matched points of the first candidate onto other scene points that
     it could by itself explain a better pose."""
-    return float(motions_of(candidates, sets, rule).fraction.max(initial=0)) >= rule.repetitions.symmetric
+    return float(motions_of(candidates, problem, rule).fraction.max(initial=0)) >= rule.repetitions.symmetric
 
 
-def starts_met(candidates: Hypotheses, sets: PointSets, rule: Evidence, *, symmetric: bool = False) -> int:
+def starts_met(candidates: Hypotheses, problem: Problem, rule: Evidence, *, symmetric: bool = False) -> int:
     """Return the basin count of the first candidate and of others that are no different pose.
 
     Args:
         candidates: poses in the user's coordinates, best first.
-        sets: the points of the problem.
+        problem: the points of the problem.
         rule: constants of the verdict.
         symmetric: count the poses too that the motions of the scene confuse with the first one. These are compared with
             it one by one; a better pose elsewhere has as many copies.
     """
     first = candidates.rotation[:1], candidates.translation[:1]
     if symmetric:
-        copies = motions_of(candidates, sets, rule).competitors(first[0][0], first[1][0])
+        copies = motions_of(candidates, problem, rule).competitors(first[0][0], first[1][0])
         first = np.concatenate([first[0], copies[0]]), np.concatenate([first[1], copies[1]])
     counted = np.zeros(len(candidates), bool)
     for rotation, translation in zip(*first, strict=True):
         poses = np.concatenate([rotation[None], candidates.rotation]), np.vstack([translation, candidates.translation])
-        counted |= sets.same_pose(*poses, rule.other_deg, rule.other_shift)[1:]
+        counted |= problem.same_pose(*poses, rule.other_deg, rule.other_shift)[1:]
     return int(candidates.basin_count[counted].sum())
 
 
 def judged(
     candidates: Hypotheses,
-    sets: PointSets,
+    problem: Problem,
     *,
     batches: int,
     looks: float | int = 0,
@@ -181,31 +181,31 @@ def judged(
 
     looks: how often the surroundings of the best one were searched in vain. exhaustive: whether every pose that fits
     some points was looked at, so that none is unseen. rig: the candidates, best first, and the points of all cameras of
-    a rig, of which `sets` has one.
+    a rig, of which `problem` has one.
     """
     if not len(candidates):
         return no_pose("no pose was found", batches, settled=exhaustive)
-    candidates = weighed(candidates, sets, rule)
+    candidates = weighed(candidates, problem, rule)
     alarms = float(candidates.log10_false_alarms[0])
-    settled = exhaustive or missed(candidates, sets, looks, rule, independent=False) <= rule.missed
+    settled = exhaustive or missed(candidates, problem, looks, rule, independent=False) <= rule.missed
     if alarms > 0:
         reason = reasons.against("no pose fits better than chance", alarms)
         return SearchResult(candidates, "failed", reason, batches, settled)
-    unseen = -math.inf if exhaustive else missed(candidates, sets, looks, rule)
+    unseen = -math.inf if exhaustive else missed(candidates, problem, looks, rule)
     # What costs more is asked only where the verdict depends on it.
-    seen = rig or [(candidates, sets)]
+    seen = rig or [(candidates, problem)]
     against = [*(other_pose(*each, rule) for each in seen), rougher(candidates)]
     certain = alarms <= rule.false_alarms and unseen <= rule.missed
     reason = ""
     if certain and all(one is None or one.decades >= rule.lead for one in against):
-        count = match_count(candidates, sets)
-        linear = linearised(sets, candidates.rotation[0], candidates.translation[0], float(candidates.scale[0]))
-        off = math.degrees(rotation_bound(sets, linear, count))
-        if off >= HALF_TURN or not (rig or is_redundant(sets, count)):
+        count = match_count(candidates, problem)
+        linear = linearised(problem, candidates.rotation[0], candidates.translation[0], float(candidates.scale[0]))
+        off = math.degrees(rotation_bound(problem, linear, count))
+        if off >= HALF_TURN or not (rig or is_redundant(problem, count)):
             reason = reasons.against(f"its {count:.0f} matches do not fix the rotation", alarms)
             return SearchResult(candidates, "ambiguous", reason, batches, settled)
-        share = 0.0 if sets.focal is None else focal_bound(sets, linear, count)
-        if share > (rule.focal_few if is_object(sets, rule) else rule.focal):
+        share = 0.0 if problem.focal is None else focal_bound(problem, linear, count)
+        if share > (rule.focal_few if is_object(problem, rule) else rule.focal):
             off_by = f"{100 * share:.0f} % off" if share < 10 else "anything"
             what = f"the points do not fix the focal length: it and the distance may be {off_by}"
             reason = reasons.against(what, alarms)
@@ -224,19 +224,19 @@ def judged(
     return SearchResult(candidates, "ambiguous", reason, batches, settled)
 
 
-def is_object(sets: PointSets, rule: Evidence) -> bool:
+def is_object(problem: Problem, rule: Evidence) -> bool:
     """Return whether the scene points are those of an object, few and not of a map, whose points have viewing cones."""
-    return sets.cosines3d is None and len(sets.points3d) <= rule.repetitions.whole
+    return problem.cosines3d is None and len(problem.points3d) <= rule.repetitions.whole
 
 
-def is_certain(candidates: Hypotheses, sets: PointSets, rule: Evidence = DEFAULT.evidence) -> bool:
+def is_certain(candidates: Hypotheses, problem: Problem, rule: Evidence = DEFAULT.evidence) -> bool:
     """Whether weighed candidates of an enumeration leave no doubt about the first one, as far as is cheaply told."""
     if not len(candidates) or float(candidates.log10_false_alarms[0]) > rule.false_alarms:
         return False
-    other = other_pose(candidates, sets, rule)
+    other = other_pose(candidates, problem, rule)
     if (other is not None and other.decades < rule.lead) or rougher(candidates) is not None:
         return False
-    return missed(candidates, sets, REFINED, rule) <= rule.missed
+    return missed(candidates, problem, REFINED, rule) <= rule.missed
 
 
 def no_pose(reason: str, batches: int = 0, *, settled: bool = False) -> SearchResult:

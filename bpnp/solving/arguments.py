@@ -327,7 +327,7 @@ def checked_normals(values: Any, count: int) -> Array | None:
 
 
 def checked_labels(labels2d: Any, labels3d: Any, counts: tuple[int, int]) -> dict[str, Any]:
-    """The labels in `PointSets`, of integers for the 2D and the 3D points, -1 for any, or of probabilities (m, c),
+    """The labels in `Problem`, of integers for the 2D and the 3D points, -1 for any, or of probabilities (m, c),
     (n, c); both or neither.
 
     Of image point i with the probabilities p_i and scene point j with q_j, the appearance of i is likelier if they

@@ -31,13 +31,12 @@ from bpnp.search.evidence.reasons import number
 from bpnp.search.evidence.settings import OtherFocal
 from bpnp.search.evidence.uncertainty import POSE, is_within
 from bpnp.search.hypotheses import Hypotheses
-from bpnp.search.point_sets import UnknownFocal
+from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.propose.lens import fit_lens
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT as SEARCH
 from bpnp.search.verdict import match_count, weighed
 from bpnp.solving.arguments import Array, checked_size
-from bpnp.solving.problem import Problem
 from bpnp.solving.solution import Solution
 from bpnp.solving.sources import Options, solutions_of
 
@@ -156,7 +155,7 @@ class UnknownCamera(NamedTuple):
 
     def seen_by(self, problem: Problem) -> "UnknownCamera":
         """Return the same with the reach of the image points of a problem, whose camera is the reference."""
-        outermost = float(np.linalg.norm(problem.points2d[problem.usable], axis=-1).max())
+        outermost = float(np.linalg.norm(problem.all2d[problem.usable], axis=-1).max())
         return self._replace(reach=max(self.reach, outermost))
 
 
@@ -216,7 +215,7 @@ def solved_with_focal_length(problem_at: ProblemAt, unknown: UnknownCamera, opti
         return solutions_of({0: problem}, options)[0]
     unknown = unknown.seen_by(problem)
     search = _Ladder(problem_at, unknown, options)
-    few, most = is_enumerable(problem.sets), options.settings.schedule.turns
+    few, most = is_enumerable(problem), options.settings.schedule.turns
     for camera in (ladder := unknown.ladder(RULE.step_few if few else RULE.step)):
         search.climb(camera, min(RULE.turns, most), len(ladder))
         if search.best.verdict == "confident" and not few:
@@ -356,10 +355,10 @@ def fit_camera(
         return min(fits, key=lambda one: one.log10_false_alarms)
 
     plain = fit([(each, None) for each in zooms])
-    if unknown.bends and min(len(plain.problem.sets.bearings), len(plain.problem.sets.points3d)) >= RULE.fewest_bent:
+    if unknown.bends and min(len(plain.problem.bearings), len(plain.problem.points3d)) >= RULE.fewest_bent:
         others = [] if radial is not None else [each / unknown.outermost(zoom) ** 2 for each in RULE.bends]
         bent = fit([*((each, radial or 0.0) for each in zooms), *((1.0, each) for each in others)])
-        matches = match_count(bent.poses, bent.problem.sets)
+        matches = match_count(bent.poses, bent.problem)
         lead = math.inf if unknown.distorted else math.log10(SEARCH.evidence.focal_chance)
         if matches >= RULE.fewest_bent and bent.log10_false_alarms < plain.log10_false_alarms + lead:
             return bent
@@ -379,17 +378,18 @@ def _fit_track(
 
     farther: Factor of the distance of the scene to start with.
     """
-    (first, radial), (rotation, translation) = start, pose
+    first, radial = start
     zoom, camera = first, unknown.at(*start)
     problem = problem_at(camera, unknown.focal(camera))
-    middle = (rotation @ (problem.sets.middle + problem.origin) + translation) * (1, 1, farther)
-    translation = middle - rotation @ (problem.sets.middle + problem.origin)
-    end = _anneal_pose(problem, rotation, translation + rotation @ problem.origin, scale, seed)
+    rotation, translation = problem.from_user(*pose)
+    middle = (rotation @ problem.middle + translation) * (1, 1, farther)
+    translation = middle - rotation @ problem.middle
+    end = _anneal_pose(problem, rotation, translation, scale, seed)
     for _ in range(RULE.rounds):
         pinhole = unknown.at(zoom)
         flat = problem if radial is None else problem_at(pinhole, unknown.focal(pinhole))
-        middle = rotation @ (flat.sets.middle + flat.origin) + translation
-        fitted = fit_lens(flat.sets, rotation, middle, scale, radial)
+        middle = rotation @ flat.middle + translation
+        fitted = fit_lens(flat, rotation, middle, scale, radial)
         if fitted is None or not 1 / RULE.step < zoom * fitted.zoom / first < RULE.step:
             break
         bend = abs((fitted.radial or 0.0) - (radial or 0.0)) * unknown.outermost(zoom) ** 2
@@ -398,14 +398,14 @@ def _fit_track(
         zoom, radial, camera = zoom * fitted.zoom, fitted.radial, unknown.at(zoom * fitted.zoom, fitted.radial)
         problem = problem_at(camera, unknown.focal(camera))
         rotation = fitted.rotation
-        end = _anneal_pose(problem, rotation, fitted.middle - rotation @ problem.sets.middle, scale, seed)
+        end = _anneal_pose(problem, rotation, fitted.middle - rotation @ problem.middle, scale, seed)
         rotation, scale = end.rotation[0], min(scale, float(end.scale[0]))
-        translation = end.translation[0] - rotation @ problem.origin
+        translation = end.translation[0]
         if max(abs(math.log(fitted.zoom)), bend) < RULE.same:
             break
     return FittedCamera(camera, problem, end)
 
 
 def _anneal_pose(problem: Problem, rotation: Array, translation: Array, scale: float, seed: int) -> Hypotheses:
-    scene = Scene(problem.sets, seed, SEARCH)
-    return weighed(polished(scene, rotation[None], translation[None], scale), problem.sets)[:1]
+    scene = Scene(problem, seed, SEARCH)
+    return weighed(polished(scene, rotation[None], translation[None], scale), problem)[:1]

@@ -25,8 +25,8 @@ from bpnp.solving.arguments import (
     unit_vectors,
 )
 from bpnp.solving.focal_length import UnknownCamera
+from bpnp.solving.inputs import bearings_of, check_seen, unit_of
 from bpnp.solving.matches import SCALES, angles_between, count_one_to_one, one_to_one
-from bpnp.solving.problem import bearings_of, check_seen, unit_of
 from bpnp.solving.solution import Candidate, Solution, SolutionStats, with_pose
 from bpnp.solving.sources import Options
 

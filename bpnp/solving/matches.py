@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.poses import MIN_POINTS
 from bpnp.search.evidence.uncertainty import linearised, pose_covariance
+from bpnp.search.problem import Problem
 from bpnp.search.verdict import SearchResult
 from bpnp.solving.arguments import Array, Labels
-from bpnp.solving.problem import Problem
 from bpnp.solving.solution import Candidate, Solution, SolutionStats, with_pose
 
 Allowed = Callable[[Labels, Labels], NDArray[np.bool_]]
@@ -38,29 +38,30 @@ def finished(problem: Problem, result: SearchResult, seconds: float, inlier_thre
     poses = list(zip(found.rotation, found.translation, strict=True))
     if result.batches:  # an enumerated pose is a least-squares fit in float64 already
         poses[0] = _fitted(problem, *poses[0], threshold)
-    projected, *others = (problem.view(*pose) for pose in poses)
-    matches = one_to_one(problem.image, projected, threshold, problem.allowed)
-    counts = [len(matches), *(count_one_to_one(problem.image, seen, threshold, problem.allowed) for seen in others)]
+    projected, *others = (problem.project_scene(*pose) for pose in poses)
+    matches = one_to_one(problem.image_points, projected, threshold, problem.may_match)
+    image, may_match = problem.image_points, problem.may_match
+    counts = [len(matches), *(count_one_to_one(image, seen, threshold, may_match) for seen in others)]
     candidates = [
-        Candidate(rotation, translation - rotation @ problem.origin, score, count, alarms)
+        Candidate(*problem.to_user(rotation, translation), score, count, alarms)
         for (rotation, translation), score, count, alarms in zip(
             poses, found.log_likelihood.tolist(), counts, found.log10_false_alarms.tolist(), strict=True
         )
     ]
     i, j = matches.T
-    camera = problem.sets.points3d[j] @ poses[0][0].T + poses[0][1]
+    camera = problem.points3d[j] @ poses[0][0].T + poses[0][1]
     matched = float(found.match_count[0])
-    linear = None if result.verdict == "failed" else linearised(problem.sets, *poses[0], result.residual)
+    linear = None if result.verdict == "failed" else linearised(problem, *poses[0], result.residual)
     solution = with_pose(
         replace(without_pose(problem, _note_duplicates(problem, result), None), verdict=result.verdict),
         candidates,
         np.stack([problem.usable[i], j], -1),
-        np.linalg.norm(problem.image[i] - projected[j], axis=-1),
-        angles_between(problem.sets.bearings[i], camera),
-        most=min(len(problem.points2d), len(problem.points3d)),
+        np.linalg.norm(image[i] - projected[j], axis=-1),
+        angles_between(problem.bearings[i], camera),
+        most=min(len(problem.all2d), len(problem.points3d)),
         threshold=threshold,
         residual=result.residual,
-        covariance=_of_pixels(problem, pose_covariance(problem.sets, linear, matched, problem.origin)),
+        covariance=_of_pixels(problem, pose_covariance(problem, linear, matched)),
     )
     stats = replace(solution.stats, iterations=result.batches)
     return replace(solution, stats=stats, seconds=seconds + time.perf_counter() - start)
@@ -70,7 +71,7 @@ def _note_duplicates(problem: Problem, result: SearchResult) -> str:
     """Return the reason of a verdict; unless it is confident, with the number of points that are given twice."""
     if result.verdict == "confident" or len(problem.points3d) > DENSE:
         return result.reason
-    sides = {"image": problem.image, "scene": problem.points3d}
+    sides = {"image": problem.image_points, "scene": problem.points3d}
     counts = {side: len(points) - len(np.unique(points, axis=0)) for side, points in sides.items()}
     notes = [f"{count} of the {side} points are duplicates" for side, count in counts.items() if count]
     return "; ".join([result.reason, *notes])
@@ -84,25 +85,24 @@ def angles_between(bearings: Array, directions: Array) -> Array:
 
 def without_pose(problem: Problem, reason: str, inlier_threshold: float | None, seconds: float = 0.0) -> Solution:
     """The failed solution of a problem."""
-    dropped, taken = problem.left_out
     return Solution(
         inlier_threshold=math.nan if inlier_threshold is None else inlier_threshold,
         unit=problem.unit,
         covariance=_of_pixels(problem, None),
         verdict="failed",
         reason=reason,
-        stats=SolutionStats(dropped2d=dropped, taken2d=taken),
+        stats=SolutionStats(dropped2d=problem.dropped2d, taken2d=problem.taken2d),
         seconds=seconds,
-        points2d=problem.points2d,
-        points3d=problem.points3d,
-        normals3d=problem.sets.normals3d if problem.sets.cosines3d is None else None,
+        points2d=problem.all2d,
+        points3d=problem.all3d,
+        normals3d=problem.normals3d if problem.cosines3d is None else None,
         camera=problem.camera,
     )
 
 
 def _of_pixels(problem: Problem, covariance: Array | None) -> Array:
     """A covariance with the focal length in pixels instead of its logarithm, NaN for none."""
-    size = 6 if problem.sets.focal is None else 7
+    size = 6 if problem.focal is None else 7
     if covariance is None or problem.camera is None:
         return np.full((size, size), math.nan) if covariance is None else covariance
     unit = np.where(np.arange(size) < 6, 1.0, problem.camera.focal)
@@ -117,10 +117,12 @@ def _fitted(problem: Problem, rotation: Array, translation: Array, threshold: fl
     distributed as chi-squared with 6 degrees of freedom.
     """
     for _ in range(FIT_ROUNDS):
-        i, j = mutual_nearest(problem.image, problem.view(rotation, translation), threshold, problem.allowed).T
+        i, j = mutual_nearest(
+            problem.image_points, problem.project_scene(rotation, translation), threshold, problem.may_match
+        ).T
         if len(i) < MIN_POINTS:
             break
-        target, project = problem.image[i], partial(problem.project, points=problem.sets.points3d[j])
+        target, project = problem.image_points[i], partial(problem.project, points=problem.points3d[j])
         trial = fit_pose(project, target, rotation, translation, scale=threshold)
         before, after = (float(((project(*pose) - target) ** 2).sum()) for pose in ((rotation, translation), trial))
         if not before > after * math.exp(SIGNIFICANT / target.size):

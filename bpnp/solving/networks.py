@@ -9,16 +9,17 @@ import torch
 from torch import Tensor, nn
 
 from bpnp.loops.parallel import Deadline
+from bpnp.search.problem import Problem
 from bpnp.search.search import score_poses
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import SearchResult
 from bpnp.solving.arguments import Array
-from bpnp.solving.problem import Problem
 from bpnp.types import Batch
 
 if TYPE_CHECKING:
     from bpnp.models.matcher import Matcher
 
+FAR = 100.0  # sizes of the scene from the origin; further off float32 steps by 1e-5 of that distance
 ESTIMATES = ("refined", "ransac", "pnp")  # of a prediction, the one to trust most first
 DRAWN = 80_000  # triples of an assignment; one match in fifty is right, one triple in 10^5, but some nearly are
 NET_SIGMA_DEG, NET_SIGMA_SHIFT = 10.0, 0.1  # of a net's pose; the latter of its distance from the scene
@@ -48,7 +49,7 @@ def pose_prior(net: nn.Module, problem: Problem, deadline: Deadline) -> PosePrio
     if not len(asked.candidates):
         return None
     rotation, translation = asked.best
-    centre = rotation @ problem.sets.points3d.mean(0) + translation
+    centre = rotation @ problem.points3d.mean(0) + translation
     return PosePrior(rotation, translation, NET_SIGMA_DEG, NET_SIGMA_SHIFT * float(np.linalg.norm(centre)) + 1e-12)
 
 
@@ -63,7 +64,7 @@ def predicted(net: nn.Module, members: list[Problem], deadline: Deadline) -> lis
     rotation = _host(torch.stack([poses[name].rotation for name in order], 1))
     translation = _host(torch.stack([poses[name].translation for name in order], 1))
     return [
-        score_poses(problem.sets, *view.before(r, t), deadline)
+        score_poses(problem, *view.before(r, t), deadline)
         for problem, view, r, t in zip(members, views, rotation, translation, strict=True)
     ]
 
@@ -96,14 +97,19 @@ def packaged_matcher(weights: str) -> "Matcher":
 
 
 class View(NamedTuple):
-    """Coordinates R p + t of points p around a problem's origin, in which a network expects them."""
+    """Coordinates R s p + t, in the user's unit, in which a network expects the points p of a problem of size s."""
 
     rotation: Array
     translation: Array
+    size: float
+
+    def enter(self, points3d: Array) -> Array:
+        """Return points (n, 3) of the problem in these coordinates."""
+        return self.size * points3d @ self.rotation.T + self.translation
 
     def before(self, rotation: Array, translation: Array) -> tuple[Array, Array]:
-        """Poses (s, 3, 3), (s, 3) of points in these coordinates as poses of the points around the origin."""
-        return rotation @ self.rotation, rotation @ self.translation + translation
+        """Return poses (s, 3, 3), (s, 3) of points in these coordinates as poses of the problem."""
+        return rotation @ self.rotation, (rotation @ self.translation + translation) / self.size
 
 
 def view_for(net: nn.Module, problem: Problem) -> View:
@@ -113,7 +119,7 @@ def view_for(net: nn.Module, problem: Problem) -> View:
     Raises ValueError for a network of the frame "view" without a `PosePrior`.
     """
     if getattr(net, "frame", "any") == "any":
-        return View(np.eye(3), np.zeros(3))
+        return View(np.eye(3), _near_origin(problem), problem.size)
     if not isinstance(problem.prior, PosePrior):
         raise ValueError(
             "expected a view near the photo's for a network that was trained in the coordinates of one, got no "
@@ -121,17 +127,23 @@ def view_for(net: nn.Module, problem: Problem) -> View:
         )
     rotation = np.asarray(problem.prior.rotation, np.float64)
     if problem.prior.translation is not None:
-        return View(rotation, np.asarray(problem.prior.translation) + rotation @ problem.origin)
-    turned, image = problem.sets.points3d @ rotation.T, _seen(problem)
+        return View(rotation, problem.size * np.asarray(problem.prior.translation), problem.size)
+    turned, image = problem.size * problem.points3d @ rotation.T, _seen(problem)
     centre, middle = np.median(turned, 0), np.median(image, 0)
     across = np.median(np.linalg.norm((turned - centre)[:, :2], axis=1))
     depth = across / max(float(np.median(np.linalg.norm(image - middle, axis=1))), 1e-6)
-    return View(rotation, depth * np.append(middle, 1.0) - centre)
+    return View(rotation, depth * np.append(middle, 1.0) - centre, problem.size)
+
+
+def _near_origin(problem: Problem) -> Array:
+    """Return the origin of a problem in the user's coordinates; 0 where float32 would lose digits so far away."""
+    is_far = problem.origin is None or np.linalg.norm(problem.origin) > FAR * problem.size
+    return np.zeros(3) if is_far else np.asarray(problem.origin)
 
 
 def _seen(problem: Problem) -> Array:
     """The 2D points that an image can show (m, 2)."""
-    points2d = problem.points2d[problem.usable]
+    points2d = problem.all2d[problem.usable]
     return points2d[np.isfinite(points2d).all(-1)]
 
 
@@ -140,10 +152,7 @@ def _given(net: nn.Module, members: list[Problem]) -> tuple[list[View], Batch]:
     views = [view_for(net, problem) for problem in members]
     batch = Batch.from_arrays(
         [_seen(problem).astype(np.float32) for problem in members],
-        [
-            (problem.sets.points3d @ view.rotation.T + view.translation).astype(np.float32)
-            for problem, view in zip(members, views, strict=True)
-        ],
+        [view.enter(problem.points3d).astype(np.float32) for problem, view in zip(members, views, strict=True)],
     )
     return views, batch.to(device_of(net))
 

@@ -11,12 +11,13 @@ from scipy.special import stdtrit
 from bpnp.cameras import camera_from
 from bpnp.loops.parallel import Clock, Deadline
 from bpnp.search.evidence.uncertainty import ONE_SIGMA, crossed
+from bpnp.search.problem import Problem
 from bpnp.search.rig.cameras import Pose, Rig
 from bpnp.search.rig.search import search_rig
 from bpnp.search.verdict import SearchResult, no_pose
 from bpnp.solving.arguments import Array, about, checked_pose, each_camera, each_set, numbers
+from bpnp.solving.inputs import problem_from
 from bpnp.solving.matches import SCALES, one_to_one, without_pose
-from bpnp.solving.problem import Problem, problem_from
 from bpnp.solving.solution import Candidate, Solution, with_pose
 from bpnp.solving.sources import Options
 
@@ -44,7 +45,7 @@ def solve_rig(
         lens = None if one is None else camera_from(one)
         with about(f"camera {k}"):
             problems.append(problem_from(images[k], points3d, lens, **{**known, "labels2d": labels[k]}))
-    cameras = Rig([problem.sets for problem in problems], mounts, is_metric=not scale)
+    cameras = Rig(problems, mounts, is_metric=not scale)
     if scale and not cameras.apart:
         raise ValueError(
             "expected cameras that are apart in `rig` with `scale=True`, got one centre for all, which tells no scale"
@@ -81,45 +82,56 @@ def _finished(rig: Rig, problems: Sequence[Problem], result: SearchResult, inlie
     matches, errors, angles, count = [], [], [], 0
     for k, problem in enumerate(problems):
         threshold = inlier_threshold or SCALES * result.residual * problem.per_radian
-        seen = problem.view(*rig.pose_of(k, rotation, translation))
-        i, j = one_to_one(problem.image, seen, threshold, problem.allowed).T
-        errors.append(np.linalg.norm(problem.image[i] - seen[j], axis=-1))
+        seen = problem.project_scene(*rig.pose_of(k, rotation, translation))
+        i, j = one_to_one(problem.image_points, seen, threshold, problem.may_match).T
+        errors.append(np.linalg.norm(problem.image_points[i] - seen[j], axis=-1))
         angles.append(errors[-1] / problem.per_radian)
         matches.append(np.stack([problem.usable[i] + count, j], -1))
-        count += len(problem.points2d)
+        count += len(problem.all2d)
     matched = sum(map(len, matches))
     covariance = None if result.verdict == "failed" else rig.covariance(rotation, translation, result.residual)
     if covariance is not None:
-        middle = rotation @ (first.sets.middle + first.origin)
-        shift = translation[:3] - rotation @ first.origin
-        covariance = _about_origin(covariance, middle, shift, 1 / translation[3], max(2 * matched - rig.unknowns, 1))
+        middle = rotation @ first.middle_of_user
+        _, shift = first.to_user(rotation, translation[:3])
+        covariance = _about_origin(
+            covariance, first.size, middle, shift, 1 / translation[3], max(2 * matched - rig.unknowns, 1)
+        )
     alarms = found.log10_false_alarms.tolist()
-    points2d = np.concatenate([problem.points2d for problem in problems])
-    dropped = sum(problem.left_out[0] for problem in problems)
+    points2d = np.concatenate([problem.all2d for problem in problems])
+    dropped = sum(problem.dropped2d for problem in problems)
     stats = replace(solution.stats, iterations=result.batches, dropped2d=dropped)
     return with_pose(
         replace(solution, verdict=result.verdict, points2d=points2d, stats=stats),
         [
             Candidate(
-                r, (t[:3] - r @ first.origin) / t[3], -alarms[k], matched if k == 0 else 0, alarms[k], float(1 / t[3])
+                r, first.to_user(r, t[:3])[1] / t[3], -alarms[k], matched if k == 0 else 0, alarms[k], float(1 / t[3])
             )
             for k, (r, t) in enumerate(zip(found.rotation, found.translation, strict=True))
         ],
         np.concatenate(matches),
         np.concatenate(errors),
         np.concatenate(angles),
-        most=sum(min(len(problem.points2d), len(problem.points3d)) for problem in problems),
+        most=sum(min(len(problem.all2d), len(problem.points3d)) for problem in problems),
         threshold=inlier_threshold or SCALES * result.residual * first.per_radian,
         residual=result.residual,
         covariance=covariance,
     )
 
 
-def _about_origin(covariance: Array, middle: Array, shift: Array, scale: float, free: int) -> Array:
-    """That of a turn, the translation in units of the rig, and the scale if it is unknown, from that of the shift of
-    the middle of the scene in its units and of the logarithm of the scale; with Student's t."""
+def _about_origin(covariance: Array, size: float, middle: Array, shift: Array, scale: float, free: int) -> Array:
+    """Return the covariance of the turn, of the translation in units of the rig, and of the scale if it is unknown.
+
+    Args:
+        covariance: Of the turn, of the shift of the middle of the scene in unit size, and of the log of the scale.
+        size: Of the scene, user's unit.
+        middle: (3,) of the scene from its origin, in the axes of the rig, user's unit.
+        shift: (3,) translation, unit of the scene.
+        scale: Units of the rig in one of the scene.
+        free: Degrees of freedom of Student's t.
+    """
     moved = np.eye(7)
-    moved[3:, 3:] *= scale
+    moved[3:6, 3:6] *= scale * size
+    moved[6, 6] = scale
     moved[3:6, :3] = scale * crossed(middle)
     moved[3:6, 6] = scale * shift
     moved = moved[: len(covariance), : len(covariance)]

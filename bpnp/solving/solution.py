@@ -18,8 +18,8 @@ from scipy.spatial import cKDTree
 
 from bpnp.cameras import Camera, camera_from, camera_to_json, in_front
 from bpnp.search.evidence.uncertainty import centre_covariance
+from bpnp.search.problem import Unit
 from bpnp.search.verdict import Verdict
-from bpnp.solving.problem import Unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

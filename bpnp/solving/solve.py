@@ -9,7 +9,7 @@ import numpy as np
 from bpnp.cameras import Camera, camera_from
 from bpnp.loops.parallel import Clock, Deadline
 from bpnp.search.enumeration.search import is_enumerable
-from bpnp.search.point_sets import UnknownFocal
+from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.solving.arguments import (
     Labels,
     about,
@@ -26,7 +26,7 @@ from bpnp.solving.arguments import (
 )
 from bpnp.solving.focal_length import solved_with_focal_length, unknown_camera
 from bpnp.solving.infinity import solve_directions
-from bpnp.solving.problem import Problem, problem_from
+from bpnp.solving.inputs import problem_from
 from bpnp.solving.rig import solve_rig
 from bpnp.solving.solution import Solution
 from bpnp.solving.sources import Options, Progress, solutions_of
@@ -288,8 +288,8 @@ def share_points(
     """
     groups: dict[bytes, list[int]] = {}
     for i, problem in problems.items():
-        if len(problems) > 1 and problem.degenerate is None and is_enumerable(problem.sets):
-            groups.setdefault(problem.image.tobytes() + repr(problem.camera).encode(), []).append(i)
+        if len(problems) > 1 and problem.degenerate is None and is_enumerable(problem):
+            groups.setdefault(problem.image_points.tobytes() + repr(problem.camera).encode(), []).append(i)
     for members in groups.values():
         taken: set[int] = set()
         for i in sorted(members, key=lambda i: (solutions[i].log10_false_alarms, i)):

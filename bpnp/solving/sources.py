@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, NamedTuple
 from bpnp.loops.parallel import Clock, Deadline
 from bpnp.search.enumeration.search import exceeds_enumeration
 from bpnp.search.evidence import reasons
+from bpnp.search.problem import Problem
 from bpnp.search.propose.mirror import mirrored_alarms
 from bpnp.search.schedule import Proposals
 from bpnp.search.search import search_poses, search_proposed
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.starts import PosePrior
-from bpnp.solving.arguments import Array, is_network
+from bpnp.solving.arguments import Array
 from bpnp.solving.matches import finished, without_pose
-from bpnp.solving.problem import Problem
 from bpnp.solving.solution import Solution
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ class Options(NamedTuple):
         """When to leave off searching, so that all ends in time; of a problem that is begun now."""
         begun = Clock.now()
         end = min(self.until.at, Deadline.after(self.time_limit).at)
-        ending = ENDING + ENDING_A_POINT * (len(problem.image) + len(problem.points3d))
+        ending = ENDING + ENDING_A_POINT * (len(problem.bearings) + len(problem.points3d))
         return Deadline(max(end - ending, (begun + end) / 2))
 
 
@@ -66,7 +66,7 @@ def solutions_of(problems: Mapping[int, Problem], options: Options) -> dict[int,
         if problem.degenerate is not None:
             solutions[i] = without_pose(problem, problem.degenerate, options.inlier_threshold)
             continue
-        net = problem.prior if is_network(problem.prior) else None
+        net = problem.network
         if net is not None or options.solver is not None:
             from bpnp.solving.networks import evaluation_copy, view_for
 
@@ -75,7 +75,7 @@ def solutions_of(problems: Mapping[int, Problem], options: Options) -> dict[int,
                     view_for(module, problem)  # raises before anything is solved
             if net is not None:
                 copies[id(net)] = copies.get(id(net)) or evaluation_copy(net, options.device)
-                problem = replace(problem, prior=copies[id(net)])
+                problem = replace(problem, network=copies[id(net)])
         solvable[i] = problem
     if options.solver is not None and solvable:
         return solutions | dict(_by_module(evaluation_copy(options.solver, options.device), solvable, options))
@@ -86,8 +86,8 @@ def _by_search(i: int, problem: Problem, options: Options) -> Solution:
     start, deadline = time.perf_counter(), options.deadline(problem)
     radius = None if options.inlier_threshold is None else options.inlier_threshold / problem.per_radian
     result = search_poses(
-        replace(problem.sets, radius=radius),
-        around=_pose_of_network(problem.prior, problem, deadline) if is_network(problem.prior) else None,
+        replace(problem, radius=radius),
+        around=None if problem.network is None else _pose_of_network(problem.network, problem, deadline),
         clutter=options.clutter,
         proposals=_proposals_of_matcher(problem, options.seed) if options.asks else None,
         seed=options.seed,
@@ -101,7 +101,7 @@ def _by_search(i: int, problem: Problem, options: Options) -> Solution:
         result = replace(result, reason=f"no pose was found in {limit:.3g} s; try a longer time limit")
     elif result.verdict == "ambiguous" and not result.settled and deadline.passed():
         result = replace(result, reason=reasons.undecided(result.reason, options.time_limit or seconds))
-    if result.verdict == "failed" and mirrored_alarms(problem.sets, deadline) <= options.settings.evidence.false_alarms:
+    if result.verdict == "failed" and mirrored_alarms(problem, deadline) <= options.settings.evidence.false_alarms:
         result = replace(result, reason=f"{result.reason}; {reasons.MIRRORED}")
     return finished(problem, result, seconds, options.inlier_threshold)
 
@@ -119,8 +119,8 @@ def _proposals_of_matcher(problem: Problem, seed: int) -> Proposals | None:
     and for few enough points. Networks are imported when the function is called: the search is undecided only then.
     """
     weights = VIEW_MATCHER if isinstance(problem.prior, PosePrior) else SCENE_MATCHER
-    too_many = len(problem.image) * len(problem.points3d) > MOST_CELLS
-    if weights == SCENE_MATCHER and (too_many or problem.prior is not None):
+    too_many = len(problem.bearings) * len(problem.points3d) > MOST_CELLS
+    if weights == SCENE_MATCHER and (too_many or problem.prior is not None or problem.network is not None):
         return None
 
     def propose() -> tuple[Array, Array]:
@@ -140,12 +140,12 @@ def _by_module(
     from bpnp.solving.networks import device_of, predicted, proposed
 
     groups: list[list[int]] = []
-    cells = {i: len(problem.image) * len(problem.points3d) for i, problem in problems.items()}
+    cells = {i: len(problem.bearings) * len(problem.points3d) for i, problem in problems.items()}
     for i in sorted(problems, key=cells.__getitem__):
         start, problem = time.perf_counter(), problems[i]
-        if isinstance(net, Matcher) and exceeds_enumeration(problem.sets):
+        if isinstance(net, Matcher) and exceeds_enumeration(problem):
             result = search_proposed(
-                problem.sets,
+                problem,
                 partial(proposed, net, problem, options.seed),
                 clutter=options.clutter,
                 seed=options.seed,

@@ -13,10 +13,11 @@ from bpnp.loops.parallel import Deadline
 from bpnp.search.evidence.claimed import judge_claim
 from bpnp.search.evidence.uncertainty import linearised, pose_covariance
 from bpnp.search.hypotheses import Hypotheses
+from bpnp.search.problem import Problem
 from bpnp.search.verdict import match_count
 from bpnp.solving.arguments import Array, Labels, checked_pose, checked_seed, numbers, positive
+from bpnp.solving.inputs import problem_from
 from bpnp.solving.matches import finished, without_pose
-from bpnp.solving.problem import Problem, chosen, degenerate_points, problem_from
 from bpnp.solving.solution import Solution
 
 SECONDS = 10.0
@@ -101,8 +102,8 @@ def verify(
         solution,
         matches=given[solution.matches[:, 0]],
         inlier_ratio=solution.inlier_count / len(given),
-        points2d=problem.points2d,
-        points3d=problem.points3d,
+        points2d=problem.all2d,
+        points3d=problem.all3d,
     )
 
 
@@ -128,20 +129,23 @@ def verify_problem(
     begun, deadline = time.perf_counter(), Deadline.after(time_limit)
     if problem.degenerate is not None:
         return without_pose(problem, problem.degenerate, inlier_threshold)
-    moved = translation + rotation @ problem.origin
-    result, optimum = judge_claim(problem.sets, rotation, moved, refine=refine, seed=seed, deadline=deadline)
+    claim = problem.from_user(rotation, translation)
+    result, optimum = judge_claim(problem, *claim, refine=refine, seed=seed, deadline=deadline)
     if result.verdict == "confident" and deadline.passed():
         reason = f"not decided in {time_limit:.3g} s: its competitors were not tested"
         result = replace(result, verdict="ambiguous", reason=reason)
     solution = finished(problem, result, time.perf_counter() - begun, inlier_threshold)
+    if not refine and solution.found:  # to the last digit
+        first = replace(solution.candidates[0], translation=translation)
+        solution = replace(solution, translation=translation, candidates=(first, *solution.candidates[1:]))
     if not refine and solution.verdict != "failed" and len(optimum):
-        solution = replace(solution, covariance=_of_unrefined(problem, optimum, rotation, moved))
+        solution = replace(solution, covariance=_of_unrefined(problem, optimum, rotation, translation))
     return solution
 
 
 def _checked_matches(values: Any, problem: Problem) -> Labels:
     """Places (k, 2) of a 2D and a 3D point, each in one match; of those that the camera can see."""
-    matches, counts = numbers("matches", values), (len(problem.points2d), len(problem.points3d))
+    matches, counts = numbers("matches", values), (len(problem.all2d), len(problem.points3d))
     if matches.ndim != 2 or matches.shape[1] != 2 or (matches != np.round(matches)).any():
         raise ValueError(f"expected `matches` as integers of shape (k, 2), got shape {matches.shape}")
     if (matches < 0).any() or (matches >= counts).any():
@@ -156,28 +160,27 @@ def _checked_matches(values: Any, problem: Problem) -> Labels:
 
 
 def _of_matches(problem: Problem, matches: Labels) -> Problem:
-    """The matched points alone, each with a label that its partner alone has."""
+    """Return the matched points alone, each with a label that only its match has."""
     (i, j), own = matches.T, np.arange(len(matches))
-    usable = np.searchsorted(problem.usable, i)
-    sets = replace(chosen(problem.sets, usable, j), labels2d=own, labels3d=own, odds2d=None, classes3d=None)
+    matched = problem.choose(np.searchsorted(problem.usable, i), j)
     return replace(
-        problem,
-        sets=sets,
-        usable=own,
-        image=problem.image[usable],
-        points2d=problem.points2d[i],
-        points3d=problem.points3d[j],
-        degenerate=problem.degenerate or degenerate_points(sets.bearings, problem.points3d[j]),
+        matched,
+        labels2d=own,
+        labels3d=own,
+        odds2d=None,
+        classes3d=None,
+        indices2d=None,
+        given2d=problem.all2d[i],
     )
 
 
 def _of_unrefined(problem: Problem, optimum: Hypotheses, rotation: Array, translation: Array) -> Array:
-    """Covariance (6, 6) of a pose of which an optimum beside it is known: that of the optimum, and the way to it."""
-    best, shift, scale = optimum.rotation[0], optimum.translation[0], float(optimum.scale[0])
-    linear = linearised(problem.sets, best, shift, scale)
-    covariance = pose_covariance(problem.sets, linear, match_count(optimum, problem.sets), problem.origin)
+    """Return the covariance (6, 6) of a user's pose beside a known optimum: that of the optimum, and the way to it."""
+    best, scale = optimum.rotation[0], float(optimum.scale[0])
+    linear = linearised(problem, best, optimum.translation[0], scale)
+    covariance = pose_covariance(problem, linear, match_count(optimum, problem))
     if covariance is None:
         return np.full((6, 6), math.nan)
-    origin = shift - translation - (best - rotation) @ problem.origin
-    way = np.r_[Rotation.from_matrix(best @ rotation.T).as_rotvec(), origin]
+    _, shift = problem.to_user(best, optimum.translation[0])
+    way = np.r_[Rotation.from_matrix(best @ rotation.T).as_rotvec(), shift - translation]
     return np.asarray(covariance + np.outer(way, way))

@@ -251,7 +251,7 @@ def test_each_view_that_is_tried_counts_once(planted: tuple[SceneMap, Planted]) 
     counts = [on_all_points(alone, place, lens, views) for views in (1, 100)]
     # With 100 views the NFA of the refined pose is not smaller than that of the given one, which counts one.
     assert counts[1].log10_false_alarms == alone.log10_false_alarms
-    first, other = (problem_near(region, keypoints, PINHOLE, None, views=views).sets for views in (1, 100))
+    first, other = (problem_near(region, keypoints, PINHOLE, None, views=views) for views in (1, 100))
     pose = alone.rotation[None], alone.translation[None]
     assert alarms_of(other, *pose).own[0] - alarms_of(first, *pose).own[0] == pytest.approx(2)
 

@@ -10,7 +10,7 @@ from planted import directions
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from bpnp.search import point_sets
+from bpnp.search import problem as problem_module
 from bpnp.search.evidence.false_alarms import (
     alarms_of,
     camera_terms,
@@ -20,7 +20,7 @@ from bpnp.search.evidence.false_alarms import (
     point_evidence,
 )
 from bpnp.search.infinity.evidence import background_of, log10_false_alarms
-from bpnp.search.point_sets import PointSets
+from bpnp.search.problem import Problem
 from bpnp.search.starts import GravityPrior, PosePrior
 
 Array = NDArray[np.float64]
@@ -40,11 +40,11 @@ def scattered(rng: np.random.Generator, count: int, width: float) -> Array:
 
 
 def evidence(rays: Array, points: Array, rotation: Array, floor: float | None = 2e-4, **known: Any) -> float:
-    return alarms(PointSets(rays, points, floor=floor, **known), rotation, SHIFT)
+    return alarms(Problem(rays, points, floor=floor, **known), rotation, SHIFT)
 
 
-def alarms(sets: PointSets, rotation: Array, translation: Array) -> float:
-    return float(alarms_of(sets, rotation[None], translation[None]).own[0])
+def alarms(problem: Problem, rotation: Array, translation: Array) -> float:
+    return float(alarms_of(problem, rotation[None], translation[None]).own[0])
 
 
 @pytest.mark.parametrize(("count", "least"), [(7, -3), (12, -10), (100, -150)])
@@ -90,9 +90,9 @@ def test_the_bound_of_markov_holds_for_unrelated_points(count: int) -> None:
     for _ in range(400):
         seen = scattered(rng, count, 0.4) * rng.uniform(4, 8, (count, 1))
         turn = Rotation.random(random_state=rng).as_matrix()
-        sets = PointSets(scattered(rng, count, 0.25), seen @ turn)
-        tests = np.minimum(log10_cells(sets.image), matches)
-        products.append(-np.log10(np.mean(10.0**-tests)) - alarms(sets, turn, np.zeros(3)))
+        problem = Problem(scattered(rng, count, 0.25), seen @ turn)
+        tests = np.minimum(log10_cells(problem.image), matches)
+        products.append(-np.log10(np.mean(10.0**-tests)) - alarms(problem, turn, np.zeros(3)))
     for bound in (0.5, 1, 2):
         assert np.mean(np.array(products) > bound) <= 10**-bound
 
@@ -138,13 +138,13 @@ def test_an_image_point_whose_label_no_scene_point_has_is_an_outlier(
     pairs: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its evidence is that of a point without a near partner, log(1 - w), however the density is measured."""
-    monkeypatch.setattr(point_sets, "PAIRS_A_POINT", pairs)
+    monkeypatch.setattr(problem_module, "PAIRS_A_POINT", pairs)
     points = np.random.default_rng(3).uniform(-1, 1, (12, 3)) + [0, 0, 6]
     labels = np.arange(12)
-    sets = PointSets(directions(points), points, labels2d=np.r_[99, labels[1:]], labels3d=labels)
+    problem = Problem(directions(points), points, labels2d=np.r_[99, labels[1:]], labels3d=labels)
     for even in (True, False):
         with np.errstate(all="raise"):
-            logs = point_evidence(sets, directions(points), np.array([1e-3]), np.array([0.75]), even=even)
+            logs = point_evidence(problem, directions(points), np.array([1e-3]), np.array([0.75]), even=even)
         assert logs[0, 0, 0] == pytest.approx(math.log(0.25))
         assert (logs[1:] > 0).all()
 
@@ -169,8 +169,8 @@ def test_the_false_alarms_of_independent_cameras_multiply() -> None:
     """Two cameras that see the same: the evidence is that of one squared, with the matches that fix the pose left out
     in one of them; each match that is left out costs evidence."""
     rays, points, rotation = planted(np.random.default_rng(3), 30)
-    sets = PointSets(rays, points, floor=2e-4)
-    terms = camera_terms(sets, directions_of(sets, rotation, SHIFT), 4e-4)
+    problem = Problem(rays, points, floor=2e-4)
+    terms = camera_terms(problem, directions_of(problem, rotation, SHIFT), 4e-4)
     assert terms is not None
     whole, without = (terms.evidence(count)[0] / math.log(10) for count in (0, 3))
     assert without < whole - 1

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from bpnp.cameras import camera_from
 from bpnp.search.evidence.false_alarms import log10_lenses
 from bpnp.search.evidence.uncertainty import linearised, local_covariance
-from bpnp.search.point_sets import PointSets, UnknownFocal
+from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.propose.lens import centre_columns, fit_lens, lens_columns
 
 Array = NDArray[np.float64]
@@ -34,11 +34,11 @@ def planted(radial: float, seed: int, count: int = 200, zoom: float = 1.0) -> tu
 def test_pose_focal_length_and_distortion_are_fitted_together(radial: float) -> None:
     points, pixels = planted(radial, seed=1, zoom=1.03)
     pixels += np.random.default_rng(2).normal(0, 0.3, pixels.shape)
-    sets = PointSets(directions(np.c_[pixels / FOCAL, np.ones(len(pixels))]), points)
+    problem = Problem(directions(np.c_[pixels / FOCAL, np.ones(len(pixels))]), points)
     turn = Rotation.from_rotvec([0.002, -0.002, 0.003]).as_matrix()
-    fit = fit_lens(sets, turn, turn @ sets.middle * 0.99, 5e-3, radial=0.0)
+    fit = fit_lens(problem, turn, turn @ problem.middle * 0.99, 5e-3, radial=0.0)
     assert fit is not None
-    fit = fit_lens(sets, fit.rotation, fit.middle, 3e-4, radial=fit.radial)
+    fit = fit_lens(problem, fit.rotation, fit.middle, 3e-4, radial=fit.radial)
     assert fit is not None
     assert fit.radial == pytest.approx(radial, abs=0.01)
     assert fit.zoom == pytest.approx(1.03, rel=2e-3)
@@ -47,8 +47,8 @@ def test_pose_focal_length_and_distortion_are_fitted_together(radial: float) -> 
 
 def test_without_a_radial_coefficient_only_the_focal_length_is_fitted() -> None:
     points, pixels = planted(0.0, seed=3, zoom=0.95)
-    sets = PointSets(directions(np.c_[pixels / FOCAL, np.ones(len(pixels))]), points)
-    fit = fit_lens(sets, np.eye(3), sets.middle, 2e-3)
+    problem = Problem(directions(np.c_[pixels / FOCAL, np.ones(len(pixels))]), points)
+    fit = fit_lens(problem, np.eye(3), problem.middle, 2e-3)
     assert fit is not None
     assert fit.radial is None
     assert fit.zoom == pytest.approx(0.95, rel=1e-5)
@@ -78,23 +78,23 @@ def test_derivatives_by_the_lens_are_finite_differences_of_undistorted_pixels(ra
 
 def test_the_false_alarms_pay_for_each_unknown_of_the_lens() -> None:
     points, pixels = planted(0.0, seed=5)
-    sets = PointSets(directions(np.c_[pixels / FOCAL, np.ones(len(pixels))]), points)
+    problem = Problem(directions(np.c_[pixels / FOCAL, np.ones(len(pixels))]), points)
     known, focal, bent = (
-        log10_lenses(replace(sets, focal=lens))[0]
+        log10_lenses(replace(problem, focal=lens))[0]
         for lens in (None, UnknownFocal(1.0), UnknownFocal(1.0, radial_sigma=math.inf, radial_range=4.0))
     )
     assert known == 0
-    steps = sets.image.spread / sets.image.scales[0]
+    steps = problem.image.spread / problem.image.scales[0]
     assert focal == pytest.approx(math.log10(steps))
-    assert bent - focal == pytest.approx(math.log10(4.0 * sets.image.spread**2 * steps))
+    assert bent - focal == pytest.approx(math.log10(4.0 * problem.image.spread**2 * steps))
 
 
-def focal_sigmas(sets: PointSets, lens: UnknownFocal, scale: float) -> tuple[float, float]:
+def focal_sigmas(problem: Problem, lens: UnknownFocal, scale: float) -> tuple[float, float]:
     """Error of log f of a fit with distortion that starts at the truth (f = 1), and its standard deviation."""
-    fit = fit_lens(sets, np.eye(3), sets.middle, scale, radial=0.0)
+    fit = fit_lens(problem, np.eye(3), problem.middle, scale, radial=0.0)
     assert fit is not None
-    fitted = replace(sets, focal=lens._replace(radial_sigma=math.inf))
-    linear = linearised(fitted, fit.rotation, fit.middle - fit.rotation @ sets.middle, scale)
+    fitted = replace(problem, focal=lens._replace(radial_sigma=math.inf))
+    linear = linearised(fitted, fit.rotation, fit.middle - fit.rotation @ problem.middle, scale)
     covariance = local_covariance(linear)
     assert covariance is not None
     return math.log(fit.zoom), math.sqrt(covariance[6, 6])
@@ -110,8 +110,8 @@ def test_the_error_of_the_focal_length_allows_for_residuals_that_neighbours_shar
         waves = rng.normal(0, 1 / 150, (12, 2))
         field = np.cos(pixels @ waves.T + rng.uniform(0, 2 * math.pi, 12)) @ rng.normal(0, 12**-0.5, (12, 2))
         pixels = pixels + field + rng.normal(0, 0.3, pixels.shape)
-        sets = PointSets(directions(np.c_[pixels / FOCAL, np.ones(len(pixels))]), points)
-        off.append(focal_sigmas(sets, UnknownFocal(2.0), 8e-4))
+        problem = Problem(directions(np.c_[pixels / FOCAL, np.ones(len(pixels))]), points)
+        off.append(focal_sigmas(problem, UnknownFocal(2.0), 8e-4))
     ratio = np.array([abs(error) / sigma for error, sigma in off])
     assert (ratio < 3).mean() >= 0.95
     assert np.median([sigma for _, sigma in off]) < 0.01  # a bound that says something
@@ -120,9 +120,9 @@ def test_the_error_of_the_focal_length_allows_for_residuals_that_neighbours_shar
 def test_a_principal_point_that_is_not_in_the_middle_is_allowed_for() -> None:
     points, pixels = planted(0.0, seed=6)
     pixels = pixels + np.random.default_rng(7).normal(0, 0.3, pixels.shape)
-    sets = PointSets(directions(np.c_[pixels / FOCAL, np.ones(len(pixels))]), points)
-    fixed, loose = (focal_sigmas(sets, UnknownFocal(2.0, centre_sigma=sigma), 3e-4)[1] for sigma in (0.0, 0.004))
+    problem = Problem(directions(np.c_[pixels / FOCAL, np.ones(len(pixels))]), points)
+    fixed, loose = (focal_sigmas(problem, UnknownFocal(2.0, centre_sigma=sigma), 3e-4)[1] for sigma in (0.0, 0.004))
     moved = directions(np.c_[(pixels + 0.004 * FOCAL) / FOCAL, np.ones(len(pixels))])
-    error, _ = focal_sigmas(PointSets(moved, points), UnknownFocal(2.0), 3e-4)
+    error, _ = focal_sigmas(Problem(moved, points), UnknownFocal(2.0), 3e-4)
     assert fixed < loose
     assert abs(error) < 2 * math.sqrt(2) * loose

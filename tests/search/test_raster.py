@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from planted import degrees_between, view_with_outliers
 from scipy.spatial.transform import Rotation
 
-from bpnp.search.point_sets import PointSets
+from bpnp.search.problem import Problem
 from bpnp.search.search import search_poses
 from bpnp.search.starts import PosePrior
 
@@ -38,7 +38,7 @@ def test_a_rough_prior_is_certain_among_seven_outliers_a_true_pair(seed: int) ->
     """Likelier poses that chance explains come up in every batch annealed around the prior."""
     bearings, points, rotation, translation = cluttered(seed, outliers=600)
     found = search_poses(
-        PointSets(bearings, points, prior=off(rotation, translation, points, np.random.default_rng(seed)))
+        Problem.of(bearings, points, prior=off(rotation, translation, points, np.random.default_rng(seed)))
     )
     assert found.verdict == "confident"
     assert degrees_between(found.best[0], rotation) < 0.3
@@ -48,7 +48,7 @@ def test_noise_beyond_the_enumeration_leaves_no_doubt_near_a_prior() -> None:
     """A rotation known to 4 degrees lets 200 x 200 points be enumerated, with a radius narrower than this noise."""
     bearings, points, rotation, translation = cluttered(1, true=200, outliers=0, noise=0.01, frame=0.9)
     prior = off(rotation, translation, points, np.random.default_rng(1))
-    found = search_poses(PointSets(bearings, points, prior=prior))
+    found = search_poses(Problem.of(bearings, points, prior=prior))
     assert found.verdict == "confident"
     assert degrees_between(found.best[0], rotation) < 0.5
 
@@ -61,17 +61,19 @@ def test_a_prior_that_does_not_help_hides_no_pose_that_is_found_without(
     translation_sigma: float, degrees: float
 ) -> None:
     bearings, points, rotation, translation = cluttered(0, outliers=80)
-    assert search_poses(PointSets(bearings, points)).verdict == "confident"
+    assert search_poses(Problem.of(bearings, points)).verdict == "confident"
     wrong = Rotation.from_rotvec([0, 2, 0]).as_matrix() @ rotation
     where = None if math.isinf(translation_sigma) else translation
-    found = search_poses(PointSets(bearings, points, prior=PosePrior(wrong, where, degrees, translation_sigma)))
+    found = search_poses(Problem.of(bearings, points, prior=PosePrior(wrong, where, degrees, translation_sigma)))
     assert found.verdict == "confident"
     assert degrees_between(found.best[0], rotation) < 0.3
 
 
 def test_a_pose_among_six_outliers_a_match_is_found_without_a_prior() -> None:
     bearings, points, rotation, translation = view_with_outliers(np.random.default_rng(0), 150, 900)
-    found = search_poses(PointSets(bearings, points))
+    problem = Problem.of(bearings, points)
+    found = search_poses(problem)
     assert found.verdict == "confident"
-    np.testing.assert_allclose(found.best[0], rotation, atol=5e-3)
-    np.testing.assert_allclose(found.best[1], translation, atol=0.05)
+    best = problem.to_user(*found.best)
+    np.testing.assert_allclose(best[0], rotation, atol=5e-3)
+    np.testing.assert_allclose(best[1], translation, atol=0.05)

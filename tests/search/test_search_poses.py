@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from bpnp.metrics import rotation_error
 from bpnp.models import Search
 from bpnp.models.evaluation import best_poses
-from bpnp.search.point_sets import PointSets
+from bpnp.search.problem import Problem
 from bpnp.search.search import search_poses
 from bpnp.search.settings import DEFAULT, Schedule, SearchSettings
 from bpnp.search.starts import PosePrior
@@ -26,8 +26,8 @@ def problem():
 
 def search(f, p, prior=None, **options):
     """`search_poses` of each sample: rotation, translation and stats of the best pose."""
-    sets = (PointSets(x.double().numpy(), y.double().numpy(), prior=prior) for x, y in zip(f, p, strict=True))
-    pose = best_poses((search_poses(each, **options) for each in sets), p)
+    problems = [Problem.of(x.double().numpy(), y.double().numpy(), prior=prior) for x, y in zip(f, p, strict=True)]
+    pose = best_poses(((each, search_poses(each, **options)) for each in problems), p)
     return pose.rotation, pose.translation, pose.stats
 
 
@@ -35,8 +35,8 @@ def search(f, p, prior=None, **options):
 def test_a_guess_from_the_same_points_is_tried_first_and_not_believed(problem, off):
     """One near the true pose and one 57 degrees off: the search goes everywhere unless the matches are unique."""
     rotation, translation = (values[0].numpy() for values in problem.near(off, seed=1))
-    sets = PointSets(problem.bearings[0].numpy(), problem.points3d[0].numpy())
-    result = search_poses(sets, around=PosePrior(rotation, translation, 4.0, 0.1))
+    points = Problem.of(problem.bearings[0].numpy(), problem.points3d[0].numpy())
+    result = search_poses(points, around=points.prior_from_user(PosePrior(rotation, translation, 4.0, 0.1)))
     assert result.verdict == "confident"
     assert rotation_error(torch.as_tensor(result.best[0])[None], problem.rotation[:1]) < 0.5
     assert (result.batches <= DEFAULT.schedule.around) == (off < 0.1)
@@ -83,8 +83,9 @@ def test_narrow_views_are_solved_like_wide_ones(spread: float) -> None:
     rays = np.concatenate([directions(camera) + noise, outliers])
     aside = Rotation.random(rng=rng).as_matrix()  # the view is not along the camera's axis
     rays = directions(rays) @ aside.T
-    found = search_poses(PointSets(rays, points))
-    turned, moved = found.best
+    problem = Problem.of(rays, points)
+    found = search_poses(problem)
+    turned, moved = problem.to_user(*found.best)
     assert found.verdict == "confident"
     assert np.degrees(Rotation.from_matrix(turned.T @ aside @ rotation).magnitude()) < 0.2
     assert np.linalg.norm(moved - aside @ translation) < 0.002 * translation[2]
@@ -93,8 +94,8 @@ def test_narrow_views_are_solved_like_wide_ones(spread: float) -> None:
 
 def test_of_points_that_have_no_label_in_common_or_lie_on_a_line_no_pose_is_found():
     rng = np.random.default_rng(4)
-    sets = PointSets(directions(rng.normal(size=(300, 3)) + [0, 0, 4]), rng.normal(size=(280, 3)))
-    labelled = replace(sets, labels2d=np.ones(300, np.int64), labels3d=np.full(280, 2))
-    for lacking in (labelled, PointSets(sets.bearings, sets.points3d[:, :1] * [1.0, 2, 3])):
+    problem = Problem.of(directions(rng.normal(size=(300, 3)) + [0, 0, 4]), rng.normal(size=(280, 3)))
+    labelled = replace(problem, labels2d=np.ones(300, np.int64), labels3d=np.full(280, 2))
+    for lacking in (labelled, Problem.of(problem.bearings, problem.points3d[:, :1] * [1.0, 2, 3])):
         result = search_poses(lacking)
         assert (result.verdict, result.batches, len(result.candidates)) == ("failed", 0, 0)

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from planted import degrees_between, directions, seen
 from scipy.spatial.transform import Rotation
 
-from bpnp.search.point_sets import PointSets, faces
+from bpnp.search.problem import Problem, faces
 from bpnp.search.search import search_poses
 from bpnp.search.settings import DEFAULT
 
@@ -20,7 +20,7 @@ def rays(image: Array) -> Array:
     return np.asarray(directions(homogeneous))
 
 
-def wall(seed: int, side: int = 250, matches: int = 120, background: int = 200) -> tuple[PointSets, Array]:
+def wall(seed: int, side: int = 250, matches: int = 120, background: int = 200) -> tuple[Problem, Array]:
     """A wall with normals and other points on either face, of which the camera sees one; its rotation."""
     rng = np.random.default_rng(seed)
     rotation, facing = Rotation.random(rng=rng).as_matrix(), np.repeat([-1.0, 1.0], side)
@@ -29,7 +29,7 @@ def wall(seed: int, side: int = 250, matches: int = 120, background: int = 200) 
     visible = np.flatnonzero(faces(normals, None, points @ rotation.T + TRANSLATION, rotation))
     image = seen(points[visible[:matches]], rotation, TRANSLATION) + NOISE * rng.normal(size=(matches, 2))
     image = np.r_[image, rng.uniform(image.min(0), image.max(0), (background, 2))]
-    return PointSets(rays(rng.permutation(image)), points, normals3d=normals), rotation
+    return Problem.of(rays(rng.permutation(image)), points, normals3d=normals), rotation
 
 
 def cluttered(seed: int, outliers: int, shared: int = 100) -> tuple[Array, Array, Array, NDArray[np.int64]]:
@@ -42,30 +42,30 @@ def cluttered(seed: int, outliers: int, shared: int = 100) -> tuple[Array, Array
     return rays(image), points, rotation, np.arange(shared + outliers)
 
 
-def labelled(seed: int) -> tuple[PointSets, Array]:
+def labelled(seed: int) -> tuple[Problem, Array]:
     """100 pairs of two labels; an eighth of the 400 outliers a side has one of these, the rest one of its own."""
     bearings, points, rotation, number = cluttered(seed, 400)
     outlier = number >= 100
     labels2d = np.where(outlier, np.where(number % 8 == 0, 0, 3), number % 2)
     labels3d = np.where(outlier, np.where(number % 8 == 0, 0, 2), number % 2)
-    return PointSets(bearings, points, labels2d=labels2d, labels3d=labels3d), rotation
+    return Problem.of(bearings, points, labels2d=labels2d, labels3d=labels3d), rotation
 
 
-def scored(seed: int) -> tuple[PointSets, Array]:
+def scored(seed: int) -> tuple[Problem, Array]:
     """100 pairs among 300 outliers a side; four fifths of the pairs' points and a tenth of the others are strong."""
     bearings, points, rotation, number = cluttered(seed, 300)
     rng = np.random.default_rng(seed + 100)
     scores2d, scores3d = (np.where(rng.random(400) < np.where(number < 100, 0.8, 0.1), 0.8, 0.1) for _ in range(2))
-    return PointSets(bearings, points, scores2d=scores2d, scores3d=scores3d), rotation
+    return Problem.of(bearings, points, scores2d=scores2d, scores3d=scores3d), rotation
 
 
 @pytest.mark.parametrize(("known", "seed"), [(wall, 1), (labelled, 0), (scored, 0)])
 def test_what_is_known_of_the_points_finds_a_pose_that_the_points_alone_do_not(known, seed: int) -> None:
     """In as many batches of starts, before any other source is asked."""
-    sets, rotation = known(seed)
-    informed = search_poses(sets, settings=DEFAULT.limited(9))
+    problem, rotation = known(seed)
+    informed = search_poses(problem, settings=DEFAULT.limited(9))
     assert degrees_between(informed.best[0], rotation) < 0.5
-    assert search_poses(sets).verdict == "confident"
-    blind = search_poses(PointSets(sets.bearings, sets.points3d), settings=DEFAULT.limited(9))
+    assert search_poses(problem).verdict == "confident"
+    blind = search_poses(Problem.of(problem.bearings, problem.points3d), settings=DEFAULT.limited(9))
     assert degrees_between(blind.best[0], rotation) > 5
     assert blind.verdict == "failed"

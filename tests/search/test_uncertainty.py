@@ -13,7 +13,7 @@ from scipy.stats import chi2, norm, t
 from bpnp import solve
 from bpnp.search.evidence import uncertainty
 from bpnp.search.evidence.uncertainty import linearised, local_covariance, pose_covariance, rotation_bound
-from bpnp.search.point_sets import PointSets
+from bpnp.search.problem import Problem
 from bpnp.search.starts import GravityPrior, PosePrior
 
 Array = NDArray[np.float64]
@@ -25,9 +25,9 @@ def noisy(rays: Array, rng: np.random.Generator, noise: float = NOISE) -> Array:
     return directions(rays + noise * rng.standard_normal(rays.shape))
 
 
-def sigma_of(sets: PointSets, rotation: Array, translation: Array) -> float:
+def sigma_of(problem: Problem, rotation: Array, translation: Array) -> float:
     """Standard deviation about the least certain axis, radians."""
-    covariance = local_covariance(linearised(sets, rotation, translation, NOISE))
+    covariance = local_covariance(linearised(problem, rotation, translation, NOISE))
     return math.inf if covariance is None else math.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
 
 
@@ -41,16 +41,16 @@ def test_bounds_are_exceeded_once_in_a_thousand() -> None:
     """Drawn from a normal distribution with the covariance, over a scale of so many degrees of freedom."""
     rng = np.random.default_rng(0)
     points = rng.uniform(-1, 1, (8, 3))
-    sets = PointSets(noisy(directions(points + SHIFT), rng), points)
-    linear = linearised(sets, np.eye(3), SHIFT, NOISE)
+    problem = Problem(noisy(directions(points + SHIFT), rng), points)
+    linear = linearised(problem, np.eye(3), SHIFT, NOISE)
     covariance = local_covariance(linear)
     assert covariance is not None
     for count, free in ((5, 4), (8, 10), (500, 994)):
         errors = rng.multivariate_normal(np.zeros(6), covariance, 300_000)
         errors /= np.sqrt(chi2.rvs(free, size=(300_000, 1), random_state=rng) / free)
-        exceeded = np.mean(np.linalg.norm(errors[:, :3], axis=1) > rotation_bound(sets, linear, float(count)))
+        exceeded = np.mean(np.linalg.norm(errors[:, :3], axis=1) > rotation_bound(problem, linear, float(count)))
         assert 0.75e-3 < exceeded < 1.25e-3
-    assert rotation_bound(sets, linear, 3.0) == math.inf
+    assert rotation_bound(problem, linear, 3.0) == math.inf
 
 
 def test_errors_are_within_what_a_covariance_claims_but_once_in_a_thousand() -> None:
@@ -74,7 +74,7 @@ def test_a_false_partner_among_few_is_allowed_for() -> None:
     points = rng.uniform(-1, 1, (8, 3))
     rays = noisy(directions(points + SHIFT), rng, 0.3 * NOISE)
     rays[2] = directions(rays[2] + [2.5 * NOISE, 0, 0])
-    sets = PointSets(rays, points, labels2d=np.arange(8), labels3d=np.arange(8))
+    problem = Problem(rays, points, labels2d=np.arange(8), labels3d=np.arange(8))
 
     def fitted(kept: NDArray[np.int64]) -> Array:
         def residuals(step: Array) -> Array:
@@ -85,7 +85,7 @@ def test_a_false_partner_among_few_is_allowed_for() -> None:
 
     every = fitted(np.arange(8))
     rotation, translation = Rotation.from_rotvec(every[:3]).as_matrix(), SHIFT + every[3:]
-    covariance = pose_covariance(sets, linearised(sets, rotation, translation, NOISE), 1e9, np.zeros(3))
+    covariance = pose_covariance(problem, linearised(problem, rotation, translation, NOISE), 1e9)
     way = fitted(np.delete(np.arange(8), 2)) - every
     assert covariance is not None
     assert 0.5 < way @ np.linalg.solve(covariance, way) < 1.05
@@ -95,18 +95,18 @@ def test_a_prior_bounds_what_the_points_leave_loose() -> None:
     rng = np.random.default_rng(1)
     points = np.column_stack([1e-4 * rng.standard_normal((5, 2)), rng.uniform(-1, 1, 5)])  # nearly on one line
     rays = noisy(directions(points + [0, 0, 6.0]), rng)
-    free = sigma_of(PointSets(rays, points), np.eye(3), np.array([0, 0, 6.0]))
-    unseen = PointSets(rays, points, directions(points + [0, 0, 6.0]))  # with normals away from the camera
+    free = sigma_of(Problem(rays, points), np.eye(3), np.array([0, 0, 6.0]))
+    unseen = Problem(rays, points, directions(points + [0, 0, 6.0]))  # with normals away from the camera
     assert sigma_of(unseen, np.eye(3), np.array([0, 0, 6.0])) == math.inf
-    known = PointSets(rays, points, prior=PosePrior(np.eye(3), None, 2.0))
+    known = Problem(rays, points, prior=PosePrior(np.eye(3), None, 2.0))
     assert free > math.radians(60)
     assert sigma_of(known, np.eye(3), np.array([0, 0, 6.0])) < math.radians(2.001)
-    fixed = PointSets(rays, points, prior=PosePrior(np.eye(3), np.array([0, 0, 6.0]), 2.0, 1e-5))
-    covariance = pose_covariance(fixed, linearised(fixed, np.eye(3), np.array([0, 0, 6.0]), NOISE), 1e6, np.zeros(3))
+    fixed = Problem(rays, points, prior=PosePrior(np.eye(3), np.array([0, 0, 6.0]), 2.0, 1e-5))
+    covariance = pose_covariance(fixed, linearised(fixed, np.eye(3), np.array([0, 0, 6.0]), NOISE), 1e6)
     assert covariance is not None
     np.testing.assert_allclose(np.sqrt(np.diag(covariance[3:, 3:])), 1e-5, rtol=0.01)
     up = np.array([0.0, 1, 0])
-    upright = PointSets(rays, points, prior=GravityPrior(up, up, 1.0))  # the turn about the line tilts the vertical
+    upright = Problem(rays, points, prior=GravityPrior(up, up, 1.0))  # the turn about the line tilts the vertical
     assert sigma_of(upright, np.eye(3), np.array([0, 0, 6.0])) == pytest.approx(math.radians(1), rel=0.1)
 
 

@@ -15,7 +15,7 @@ from scipy.special import stdtrit
 from bpnp.loops.parallel import NEVER, Deadline
 from bpnp.search.evidence.rivals import AtZoom, likeliest_zoom, other_camera
 from bpnp.search.hypotheses import Hypotheses
-from bpnp.search.point_sets import PointSets, UnknownFocal
+from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT
 from bpnp.search.verdict import SearchResult, judged
@@ -24,16 +24,16 @@ Array = NDArray[np.float64]
 SHIFT = np.array([0.0, 0.0, 6.0])
 
 
-def verdict_on(sets: PointSets, rotations: Array, translations: Array, scale: float, matched: float) -> SearchResult:
+def verdict_on(problem: Problem, rotations: Array, translations: Array, scale: float, matched: float) -> SearchResult:
     c = len(rotations)
     poses = Hypotheses.from_poses(
         rotations,
         translations,
         log_likelihood=-np.arange(float(c)),
-        match_count=np.full(c, matched * min(len(sets.bearings), len(sets.points3d))),
+        match_count=np.full(c, matched * min(len(problem.bearings), len(problem.points3d))),
         scale=np.full(c, scale),
     )
-    return judged(poses, sets, batches=0, exhaustive=True)
+    return judged(poses, problem, batches=0, exhaustive=True)
 
 
 def test_a_few_exact_matches_do_not_make_a_rough_alignment_precise() -> None:
@@ -44,7 +44,7 @@ def test_a_few_exact_matches_do_not_make_a_rough_alignment_precise() -> None:
     exact = directions(points + SHIFT)
     for spread, scale, verdict in ((noise, 3e-4, "ambiguous"), (noise, 4e-3, "confident"), (3e-4, 3e-4, "confident")):
         rays = directions(exact + spread * rng.standard_normal((80, 3)))
-        found = verdict_on(PointSets(rays, points), np.eye(3)[None], SHIFT[None], scale, 0.2)
+        found = verdict_on(Problem(rays, points), np.eye(3)[None], SHIFT[None], scale, 0.2)
         assert found.log10_false_alarms < -2
         assert found.verdict == verdict
         assert ("residuals far larger" in found.reason) == (verdict == "ambiguous")
@@ -58,7 +58,7 @@ def test_precision_is_no_ambiguity() -> None:
     known = []
     for noise in (1e-5, 1e-4):
         rays = directions(directions(points + shift) + noise * rng.standard_normal((40, 3)))
-        found = verdict_on(PointSets(rays, points), np.eye(3)[None], shift[None], noise, 1.0)
+        found = verdict_on(Problem(rays, points), np.eye(3)[None], shift[None], noise, 1.0)
         assert found.log10_false_alarms < -2
         assert found.verdict == "confident"
         known.append(float(re.search(r"known to (\S+) deg", found.reason)[1]))
@@ -85,8 +85,8 @@ def test_the_focal_length_of_an_object_may_be_loose(distance: float, is_map: boo
 
     draws = [directions(exact + noise / distance * rng.standard_normal((12, 3))) for _ in range(60)]
     cones = {"normals3d": -exact, "cosines3d": np.full(12, -1.0)} if is_map else {}
-    sets = PointSets(draws[0], points, focal=UnknownFocal(math.log(6)), **cones)
-    found = verdict_on(sets, np.eye(3)[None], shift[None], noise / distance, 1.0)
+    problem = Problem(draws[0], points, focal=UnknownFocal(math.log(6)), **cones)
+    found = verdict_on(problem, np.eye(3)[None], shift[None], noise / distance, 1.0)
     bound = re.search(r"(?:focal length to|may be) (\d+) %", found.reason)
     assert found.verdict == verdict
     if distance < 20:
@@ -108,7 +108,7 @@ def test_matches_that_say_little_ask_for_starts_that_end_alike(basin_count: int,
     rays = directions(directions(points + SHIFT) + 5e-3 * rng.standard_normal((400, 3)))
     columns = {"match_count": np.array([320.0]), "scale": np.array([5e-3])}
     pose = Hypotheses.from_poses(np.eye(3)[None], SHIFT[None], basin_count=basin_count, **columns)
-    found = judged(pose, PointSets(rays, points), batches=1, looks=looks)
+    found = judged(pose, Problem(rays, points), batches=1, looks=looks)
     assert -10 > found.log10_false_alarms > -60
     assert found.verdict == verdict
     assert ("miss probability" in found.reason) == (verdict == "ambiguous")
@@ -124,7 +124,7 @@ def test_starts_that_end_beside_a_pose_met_it(degrees: float, verdict: str) -> N
     columns = {"match_count": np.array([320.0, 200.0]), "scale": np.array([5e-3, 5e-3])}
     poses = Hypotheses.from_poses(rotations, np.stack([SHIFT, SHIFT]), **columns)
     poses = replace(poses, basin_count=np.array([0, 10]))
-    found = judged(poses, PointSets(rays, points), batches=1, looks=1)
+    found = judged(poses, Problem(rays, points), batches=1, looks=1)
     assert found.verdict == verdict
     assert ("miss probability" in found.reason) == (verdict == "ambiguous")
 
@@ -137,8 +137,8 @@ def test_two_poses_that_explain_points_of_their_own_leave_a_doubt(others: int, v
     points = rng.uniform(-1, 1, (60, 3))
     turn = Rotation.from_euler("y", 50, degrees=True).as_matrix()
     rays = np.concatenate([points[:20] + SHIFT, points[20 : 20 + others] @ turn.T + SHIFT])
-    sets = PointSets(directions(directions(rays) + 1e-3 * rng.standard_normal(rays.shape)), points)
-    found = verdict_on(sets, np.stack([np.eye(3), turn]), np.stack([SHIFT, SHIFT]), 1e-3, 0.5)
+    problem = Problem(directions(directions(rays) + 1e-3 * rng.standard_normal(rays.shape)), points)
+    found = verdict_on(problem, np.stack([np.eye(3), turn]), np.stack([SHIFT, SHIFT]), 1e-3, 0.5)
     alarms = found.candidates.log10_false_alarms
     assert alarms[0] < min(alarms[1] - 3, -5)
     assert found.verdict == verdict
@@ -152,15 +152,15 @@ def test_another_focal_length_is_climbed_to(factor: float) -> None:
     rng = np.random.default_rng(2)
     points, shift = rng.uniform(-1, 1, (1500, 3)), np.array([0.0, 0.0, 4.0])
     exact = directions(points + shift) + 4e-3 * rng.standard_normal((1500, 3))
-    sets = PointSets(directions(exact / (factor, factor, 1)), points)
+    problem = Problem(directions(exact / (factor, factor, 1)), points)
     turned = Rotation.from_euler("x", 3, degrees=True).as_matrix()
-    met = AtZoom(1.0, sets, turned, shift * (1, 1, factor), 4e-3)
-    climbed = likeliest_zoom(met, Scene(sets, 0, DEFAULT), DEFAULT.evidence.zoomed)
+    met = AtZoom(1.0, problem, turned, shift * (1, 1, factor), 4e-3)
+    climbed = likeliest_zoom(met, Scene(problem, 0, DEFAULT), DEFAULT.evidence.zoomed)
     assert climbed.zoom == pytest.approx(1 / factor, rel=0.09 if factor == 1 else 0.045)  # half a step; never none
     assert np.degrees(Rotation.from_matrix(climbed.rotation).magnitude()) < 0.5
-    seen = verdict_on(sets, np.eye(3)[None], met.middle[None], 4e-3, 0.6)
-    scenes = [Scene(sets, 0, DEFAULT, end) for end in (NEVER, Deadline(0.0))]
-    other, untried = (other_camera(seen, sets, lambda one=one: one, DEFAULT.evidence) for one in scenes)
+    seen = verdict_on(problem, np.eye(3)[None], met.middle[None], 4e-3, 0.6)
+    scenes = [Scene(problem, 0, DEFAULT, end) for end in (NEVER, Deadline(0.0))]
+    other, untried = (other_camera(seen, problem, lambda one=one: one, DEFAULT.evidence) for one in scenes)
     assert untried is not None
     if other is None:
         assert (factor, untried.what) == (1.0, "there was no time to try other focal lengths")

@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 from bpnp import SceneMap, Solution, solve
 from bpnp.cameras import Camera, camera_from, camera_to_json
 from bpnp.cli import main
-from bpnp.search.point_sets import UnknownFocal
+from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.solving.focal_length import fit_camera, unknown_camera
-from bpnp.solving.problem import Problem, problem_from
+from bpnp.solving.inputs import problem_from
 
 Array = NDArray[np.float64]
 SIZE = (640, 480)

@@ -13,7 +13,7 @@ from bpnp import GravityPrior, PosePrior, solve, solve_many
 from bpnp.models import Matcher
 from bpnp.search.settings import DEFAULT
 from bpnp.solving import networks
-from bpnp.solving.problem import problem_from
+from bpnp.solving.inputs import problem_from
 from bpnp.solving.sources import Options, solutions_of
 from bpnp.types import Batch, Prediction
 

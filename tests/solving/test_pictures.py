@@ -20,8 +20,8 @@ from bpnp.cameras import camera_from
 from bpnp.cli import main
 from bpnp.examples import load
 from bpnp.report.figures import save_figure
+from bpnp.solving.inputs import problem_from
 from bpnp.solving.matches import without_pose
-from bpnp.solving.problem import problem_from
 
 EXAMPLE = load("mesh")
 SOLUTION = bpnp.solve(EXAMPLE.points2d, EXAMPLE.points3d, EXAMPLE.camera)

@@ -15,7 +15,7 @@ from bpnp.loops.parallel import Deadline
 from bpnp.models import Search
 from bpnp.search.search import search_poses
 from bpnp.solving import sources
-from bpnp.solving.problem import problem_from
+from bpnp.solving.inputs import problem_from
 
 FISHEYE = ("OPENCV_FISHEYE", [300.0, 310.0, 400.0, 300.0, 0.05, -0.02, 0.01, 0.001])
 K = np.array([[520.0, 1.5, 405.0], [0.0, 500.0, 290.0], [0.0, 0.0, 1.0]])
@@ -246,7 +246,7 @@ def test_a_pose_that_the_time_limit_left_open_says_so(monkeypatch: pytest.Monkey
     """The search returns an open verdict, with its deadline passed or not."""
     planted = plant(2, 40)
     points = planted.points2d[0].numpy(), planted.points3d[0].numpy()
-    result = replace(search_poses(problem_from(*points, None).sets), verdict="ambiguous", settled=False)
+    result = replace(search_poses(problem_from(*points, None)), verdict="ambiguous", settled=False)
     monkeypatch.setattr(sources, "search_poses", lambda *_, **__: result)
     assert "not decided" not in solve(*points, time_limit=60).reason
     monkeypatch.setattr(sources.Options, "deadline", lambda *_: Deadline.after(-1.0))

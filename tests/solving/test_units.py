@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp import solve
 from bpnp.search.evidence.uncertainty import linearised, systematic_misfit
-from bpnp.search.point_sets import PointSets
+from bpnp.search.problem import Problem
 
 
 def view(focal: float, noise: float, count: int = 90) -> Any:
@@ -29,7 +29,7 @@ def test_a_wrong_camera_is_noticed_in_any_unit(unit: float) -> None:
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     translation = np.array([0.1, -0.05, 5.75])
     both = [
-        systematic_misfit(linearised(PointSets(rays, u * points), rotation, u * translation, 2e-3), 90.0)
+        systematic_misfit(linearised(Problem(rays, u * points), rotation, u * translation, 2e-3), 90.0)
         for u in (1.0, unit)
     ]
     assert both[0].zoom != 1

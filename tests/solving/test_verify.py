@@ -201,14 +201,14 @@ def test_four_matches_without_redundancy_do_not_fix_a_pose() -> None:
 
 def test_thousands_of_matches_are_judged_as_labels_of_one_pair_each(monkeypatch: pytest.MonkeyPatch) -> None:
     """The pairs of a label in one sum, and one label after the other, are the same number."""
-    from bpnp.search import point_sets
+    from bpnp.search import problem
     from bpnp.search.evidence.false_alarms import alarms_of
-    from bpnp.search.point_sets import PointSets
+    from bpnp.search.problem import Problem
 
     bearings, points, rotation, translation = view_with_outliers(np.random.default_rng(2), 40, 20)
     labels2d, labels3d = np.arange(60) % 7 - 1, np.arange(60) % 9 - 1
     poses = rotation[None], translation[None]
-    together = alarms_of(PointSets(bearings, points, labels2d=labels2d, labels3d=labels3d), *poses).own
-    monkeypatch.setattr(point_sets, "PAIRS_A_POINT", 0)
-    one_by_one = alarms_of(PointSets(bearings, points, labels2d=labels2d, labels3d=labels3d), *poses).own
+    together = alarms_of(Problem(bearings, points, labels2d=labels2d, labels3d=labels3d), *poses).own
+    monkeypatch.setattr(problem, "PAIRS_A_POINT", 0)
+    one_by_one = alarms_of(Problem(bearings, points, labels2d=labels2d, labels3d=labels3d), *poses).own
     assert together == pytest.approx(one_by_one, rel=1e-6)

@@ -16,7 +16,7 @@ from bpnp.search.kernels.dense import solve_normal_equations
 from bpnp.search.propose.minimal_solvers import part
 
 
-class Problem(NamedTuple):
+class EnumerationTables(NamedTuple):
     """What the compiled loops read. heading: where two matches fix a pose. fixing: matches that fix a pose, which its
     freedom takes up. density: chance that one scene point lies within one radius of an image point that is anywhere."""
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bpnp.search.enumeration.settings import RULES, EnumerationSettings
-from bpnp.search.point_sets import PointSets
+from bpnp.search.problem import Problem
 from bpnp.search.propose.minimal_solvers import Triangles, triangles_of
 from bpnp.search.starts import GravityPrior, PosePrior, Prior, turned_to
 
@@ -24,7 +24,7 @@ EDGE_ON = 0.15  # sine of an angle to the triangle's plane, below which either o
 
 
 class ScenePoints(NamedTuple):
-    """points: (n, 3) around their centre in units of their extent. normals: (n, 3), (0, 3) if every point can be seen.
+    """points: (n, 3) in unit size. normals: (n, 3), (0, 3) if every point can be seen.
     labels: (n,), -1 fits any."""
 
     points: Array
@@ -91,18 +91,15 @@ class Heading(NamedTuple):
 
 
 class SceneSide:
-    """The scene of one problem, or of many: a device is seen in frame after frame. size: the extent that is the unit.
+    """The scene of one problem, or of many: a device is seen in frame after frame.
 
     nearest: (n, k) each point's nearest. tables: of (size, near), the triangles that are there already.
     """
 
     def __init__(self, points3d: Array, normals3d: Array | None, labels3d: Places | None) -> None:
-        self.centre = points3d.mean(0)
-        local = points3d - self.centre
-        self.size = max(float(np.sqrt((local**2).sum(-1).mean())), 1e-300)
         normals = np.empty((0, 3)) if normals3d is None else np.array(normals3d, np.float64, order="C")
-        labels = np.full(len(local), -1) if labels3d is None else np.array(labels3d, np.int64)
-        self.arrays = ScenePoints(np.ascontiguousarray(local / self.size), normals, labels)
+        labels = np.full(len(points3d), -1) if labels3d is None else np.array(labels3d, np.int64)
+        self.arrays = ScenePoints(np.array(points3d, np.float64, order="C"), normals, labels)
         self.nearest = nearest_of(self.arrays.points, normals)
         self.tables: dict[tuple[int, int], Triangles] = {}
 
@@ -252,14 +249,14 @@ def predicted_pose(prior: Prior | None) -> tuple[Array, Array] | None:
 
 
 def prior_arrays(
-    sets: PointSets, scene: SceneSide, image: ImageSide, settings: EnumerationSettings
+    problem: Problem, scene: SceneSide, image: ImageSide, settings: EnumerationSettings
 ) -> tuple[PriorArrays, Heading, float]:
     """The prior in the frames of both sides, as the loops read it, and the log of the share of poses that it allows.
 
     Where two matches fix a pose, a direction is taken as known: the vertical, or that of the view, about which the
     image shows a turn best.
     """
-    prior, none = sets.prior, np.empty((0, 3))
+    prior, none = problem.prior, np.empty((0, 3))
     translation, farthest_shift2, log_share, sine2 = np.zeros(3), math.inf, 0.0, 1.0
     if prior is None:
         arrays = PriorArrays(none, none, 0.0, 0.0, translation, farthest_shift2)
@@ -274,8 +271,8 @@ def prior_arrays(
         from_camera, from_scene = np.eye(3), rotation
         in_scene, in_camera, off = np.eye(3), np.ascontiguousarray(rotation.T), math.sqrt(2) * sigma
         if (predicted := predicted_pose(prior)) is not None:
-            translation = image.turn @ (known @ scene.centre + predicted[1]) / scene.size
-            farthest_shift2 = (settings.sigmas * prior.translation_sigma / scene.size) ** 2
+            translation = image.turn @ predicted[1]
+            farthest_shift2 = (settings.sigmas * prior.translation_sigma) ** 2
         most = min(settings.sigmas * sigma, math.pi)
         log_share, sine2 = math.log((most - math.sin(most)) / math.pi), math.sin(min(most, math.pi / 2)) ** 2
     about = np.array([np.diag([0.0, 0, 1]), np.diag([1.0, 1, 0]), [[0, -1, 0], [1, 0, 0], [0, 0, 0]]])

@@ -14,11 +14,10 @@ import numpy as np
 
 from bpnp.loops.parallel import Clock, Deadline
 from bpnp.search.enumeration.hypotheses import Block, Kept, Work, explore
-from bpnp.search.enumeration.matching import Matches, Problem
+from bpnp.search.enumeration.matching import EnumerationTables, Matches
 from bpnp.search.enumeration.points import (
     Array,
     ImageSide,
-    SceneSide,
     pairs,
     predicted_pose,
     prior_arrays,
@@ -29,7 +28,7 @@ from bpnp.search.enumeration.settings import DEFAULT, RULES, EnumerationSettings
 from bpnp.search.evidence.partners import explained
 from bpnp.search.evidence.repetitions import competing_poses, registered
 from bpnp.search.hypotheses import Hypotheses
-from bpnp.search.point_sets import PointSets
+from bpnp.search.problem import Problem
 from bpnp.search.settings import SearchSettings
 from bpnp.search.starts import GravityPrior, PosePrior
 from bpnp.search.verdict import is_certain, weighed, with_false_alarms
@@ -70,16 +69,16 @@ class Enumeration:
     many were solved.
     """
 
-    def __init__(self, sets: PointSets, radius: float, settings: EnumerationSettings) -> None:
-        scene = scene_side(sets.points3d, sets.normals3d, sets.labels3d)
-        self.reach = _reach(sets, scene, radius, settings)
-        image = ImageSide(sets.bearings, radius, sets.labels2d, self.reach)
-        (prior, heading, log_share), fixing = prior_arrays(sets, scene, image, settings), sets.pairs_that_fix
+    def __init__(self, problem: Problem, radius: float, settings: EnumerationSettings) -> None:
+        scene = scene_side(problem.points3d, problem.normals3d, problem.labels3d)
+        self.reach = _reach(problem, radius, settings)
+        image = ImageSide(problem.bearings, radius, problem.labels2d, self.reach)
+        (prior, heading, log_share), fixing = prior_arrays(problem, scene, image, settings), problem.pairs_that_fix
         self.scene, self.image, self.settings = scene, image, settings
         self.fixing, self.solved, self._pace = fixing, 0, SLOWEST
         self.contested: list[Array] = []  # rotations (3, 3) of poses whose competitors were proposed
         m, n, kept = len(image.arrays.rays), len(scene.arrays.points), settings.kept
-        self.problem = Problem(scene.arrays, image.arrays, prior, heading, fixing, image.density)
+        self.tables = EnumerationTables(scene.arrays, image.arrays, prior, heading, fixing, image.density)
         self.kept = Kept(
             np.zeros((kept, 4, 3)),
             np.full(kept, -math.inf),
@@ -151,9 +150,9 @@ class Enumeration:
             self._pace = (Clock.now() - start) / solved
 
     def propose(self, rotation: Array, translation: Array, reach: float) -> None:
-        """Refine a pose (3, 3), (3,) of the user from matches within `reach` radii, and keep it."""
-        turn, middle = self.image.turn, rotation @ self.scene.centre + translation
-        self.refine(np.vstack([turn @ rotation, turn @ middle / self.scene.size]), reach)
+        """Refine a pose (3, 3), (3,) from matches within `reach` radii, and keep it."""
+        turn = self.image.turn
+        self.refine(np.vstack([turn @ rotation, turn @ translation]), reach)
 
     def refine(self, pose: Array, reach: float) -> None:
         """Refine a pose (4, 3) of these frames from matches within `reach` radii, and keep it."""
@@ -161,11 +160,11 @@ class Enumeration:
         self._explored(0, 0, 0, 0.0, reach)
 
     def _explored(self, *where: int | float) -> tuple[int, int, int]:
-        return explore(*where, self._block, self.problem, self.kept, self.work)
+        return explore(*where, self._block, self.tables, self.kept, self.work)
 
 
 def enumerate_poses(
-    sets: PointSets,
+    problem: Problem,
     *,
     radius: float | None = None,
     deadline: float = math.inf,
@@ -179,7 +178,7 @@ def enumerate_poses(
     tried first.
 
     Args:
-        sets: Points of the problem.
+        problem: Points.
         radius: Largest residual of a match, radians; None for that of the points.
         deadline: When to stop (`Clock.now`).
         is_safe: Called once the best pose exceeds chance and every other pose; True stops. None stops always.
@@ -190,12 +189,12 @@ def enumerate_poses(
     >>> rng = np.random.default_rng(0)
     >>> points = rng.uniform(-1, 1, (8, 3))
     >>> seen = points[:6] + [0, 0, 5]
-    >>> sets = PointSets(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
-    >>> found = enumerate_poses(sets, radius=2e-3).poses
+    >>> problem = Problem(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
+    >>> found = enumerate_poses(problem, radius=2e-3).poses
     >>> np.allclose(found.rotation[0], np.eye(3)), found.matches[0].tolist()
     (True, [0, 1, 2, 3, 4, 5])
     """
-    run = Enumeration(sets, sets.match_radius if radius is None else radius, settings)
+    run = Enumeration(problem, problem.match_radius if radius is None else radius, settings)
 
     def enough(safe: float = settings.safe) -> Enumerated | None:
         if run.best < run.tests:
@@ -210,7 +209,7 @@ def enumerate_poses(
         return Enumerated(poses, "most") if run.solved >= 2 * settings.patience else None
 
     complete = False
-    if (predicted := predicted_pose(sets.prior)) is not None:
+    if (predicted := predicted_pose(problem.prior)) is not None:
         run.propose(*predicted, run.reach)
         if (found := enough(0.0)) is not None:
             return found
@@ -227,7 +226,7 @@ def enumerate_poses(
             late = deadline - Clock.now() < SHORTEST
             if late or run.solved > settings.most:
                 return Enumerated(_poses(run), "interrupted" if late else "most")
-        complete = stage.near2d >= len(sets.bearings) - 1 and stage.near3d >= len(sets.points3d) - 1
+        complete = stage.near2d >= len(problem.bearings) - 1 and stage.near3d >= len(problem.points3d) - 1
         if complete and stage.matches == 3 and stage.reach == settings.stages[-1].reach:
             break
     return Enumerated(_poses(run), "exhausted" if complete else "most")
@@ -245,13 +244,13 @@ def _with_competitors(run: Enumeration, poses: Hypotheses, competitors: Competit
         poses = _poses(run)
 
 
-def _reach(sets: PointSets, scene: SceneSide, radius: float, settings: EnumerationSettings) -> float:
+def _reach(problem: Problem, radius: float, settings: EnumerationSettings) -> float:
     """Radii within which points are looked up: as far as a predicted pose may be off, `settings.widest` at most."""
     needed = max([1.0, *(stage.reach for stage in settings.stages)])
-    if (predicted := predicted_pose(sets.prior)) is not None and isinstance(sets.prior, PosePrior):
-        distance = max(float(np.linalg.norm(predicted[0] @ scene.centre + predicted[1])), 1e-12)
-        turn = math.radians(sets.prior.rotation_sigma_deg) * min(scene.size / distance, 1.0)
-        off = 2 * math.hypot(turn, sets.prior.translation_sigma / distance)
+    if (predicted := predicted_pose(problem.prior)) is not None and isinstance(problem.prior, PosePrior):
+        distance = max(float(np.linalg.norm(predicted[1])), 1e-12)
+        turn = math.radians(problem.prior.rotation_sigma_deg) * min(1 / distance, 1.0)
+        off = 2 * math.hypot(turn, problem.prior.translation_sigma / distance)
         needed = max(needed, min(off / radius, settings.widest))
     return needed
 
@@ -264,7 +263,7 @@ def _poses(run: Enumeration) -> Hypotheses:
     order = np.argsort(-kept.evidence, kind="stable")
     order = order[np.isfinite(kept.evidence[order])]
     rotation = run.image.turn.T @ kept.poses[order, :3]
-    translation = run.scene.size * kept.poses[order, 3] @ run.image.turn - rotation @ run.scene.centre
+    translation = kept.poses[order, 3] @ run.image.turn
     matches, radii = kept.point[order], np.sqrt(kept.distance2[order])
     matched, angle = matches >= 0, radii / run.image.arrays.per_radian
     count = matched.sum(-1)
@@ -295,18 +294,18 @@ def _log_choose(n: int, k: int) -> float:
     return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1) if n >= k else 0.0
 
 
-def is_enumerable(sets: PointSets) -> bool:
+def is_enumerable(problem: Problem) -> bool:
     """Whether the points have so few hypotheses that they are enumerated."""
-    products = len(sets.bearings) * len(sets.points3d)
-    return products <= (DEFAULT.most_products if sets.pairs_that_fix == 3 else DEFAULT.most_products_known)
+    products = len(problem.bearings) * len(problem.points3d)
+    return products <= (DEFAULT.most_products if problem.pairs_that_fix == 3 else DEFAULT.most_products_known)
 
 
-def exceeds_enumeration(sets: PointSets) -> bool:
+def exceeds_enumeration(problem: Problem) -> bool:
     """Whether there are more points than are enumerated without a prior; with one the enumeration may miss a pose."""
-    return not is_enumerable(replace(sets, prior=None))
+    return not is_enumerable(replace(problem, prior=None))
 
 
-def search_by_enumeration(sets: PointSets, deadline: Deadline, settings: SearchSettings) -> tuple[Hypotheses, bool]:
+def search_by_enumeration(problem: Problem, deadline: Deadline, settings: SearchSettings) -> tuple[Hypotheses, bool]:
     """The poses of few points in the user's coordinates, best first; and whether every hypothesis was tried.
 
     Where the whole pose is known closely, as when a device is tracked, it is tried, and if it does not hold the search
@@ -315,48 +314,48 @@ def search_by_enumeration(sets: PointSets, deadline: Deadline, settings: SearchS
     error of the prior.
     """
     certain: Hypotheses | None = None
-    annotated = sets
-    if sets.cosines3d is not None:
-        sets = replace(sets, normals3d=None, cosines3d=None)
+    annotated = problem
+    if problem.cosines3d is not None:
+        problem = replace(problem, normals3d=None, cosines3d=None)
 
     def is_safe(poses: Hypotheses) -> bool:
         nonlocal certain
-        candidates = weighed(_candidates(poses, annotated, settings), sets, settings.evidence)
-        certain = candidates if is_certain(candidates, sets, settings.evidence) else None
+        candidates = weighed(_candidates(poses, annotated, settings), problem, settings.evidence)
+        certain = candidates if is_certain(candidates, problem, settings.evidence) else None
         return certain is not None
 
     def competitors(poses: Hypotheses) -> tuple[Array, Array]:
         pose = poses.rotation[0], poses.translation[0]
-        scale = max(float(poses.scale[0]), sets.floor or 1e-5)
+        scale = max(float(poses.scale[0]), problem.floor or 1e-5)
         motions = registered(annotated, *pose, scale, settings.evidence)
         return competing_poses(annotated, *pose, motions, settings.evidence)
 
-    def enumerated(sets: PointSets, rule: EnumerationSettings) -> tuple[Enumerated, Hypotheses]:
-        found = enumerate_poses(sets, deadline=deadline.at, is_safe=is_safe, competitors=competitors, settings=rule)
+    def enumerated(problem: Problem, rule: EnumerationSettings) -> tuple[Enumerated, Hypotheses]:
+        found = enumerate_poses(problem, deadline=deadline.at, is_safe=is_safe, competitors=competitors, settings=rule)
         return found, _candidates(found.poses, annotated, settings) if certain is None else certain
 
-    tracked = predicted_pose(sets.prior) is not None
-    near = tracked and sets.pairs_that_fix == 2
-    found, candidates = enumerated(sets, replace(DEFAULT, stages=()) if near else DEFAULT)
-    if certain is None and isinstance(sets.prior, GravityPrior):
-        candidates = with_false_alarms(candidates, sets)
+    tracked = predicted_pose(problem.prior) is not None
+    near = tracked and problem.pairs_that_fix == 2
+    found, candidates = enumerated(problem, replace(DEFAULT, stages=()) if near else DEFAULT)
+    if certain is None and isinstance(problem.prior, GravityPrior):
+        candidates = with_false_alarms(candidates, problem)
         if candidates.log10_false_alarms.min(initial=math.inf) > settings.evidence.false_alarms:
-            found, others = enumerated(replace(sets, prior=None), DEFAULT)
-            candidates = with_false_alarms(Hypotheses.concatenate([candidates, others]), sets)
+            found, others = enumerated(replace(problem, prior=None), DEFAULT)
+            candidates = with_false_alarms(Hypotheses.concatenate([candidates, others]), problem)
             candidates = candidates[np.argsort(candidates.log10_false_alarms, kind="stable")[: settings.kept]]
     elif certain is None and tracked and (near or margin(found.poses) < 0):
-        found, others = enumerated(replace(sets, prior=None), DEFAULT)
+        found, others = enumerated(replace(problem, prior=None), DEFAULT)
         candidates = Hypotheses.concatenate([candidates, others])
         candidates = candidates[np.argsort(-candidates.log_likelihood, kind="stable")[: settings.kept]]
     return candidates, found.ended == "exhausted"
 
 
-def _candidates(poses: Hypotheses, sets: PointSets, settings: SearchSettings) -> Hypotheses:
+def _candidates(poses: Hypotheses, problem: Problem, settings: SearchSettings) -> Hypotheses:
     """Return the poses that are not far less likely than the best one, with scale and likelihood as the annealing
     defines them."""
     if poses.evidence is None or not len(poses):
         return poses
     poses = poses[poses.evidence >= poses.evidence.max() - DEFAULT.near_nats][: settings.kept]
-    scale = np.maximum(poses.scale, sets.floor or 1e-5)
+    scale = np.maximum(poses.scale, problem.floor or 1e-5)
     each = zip(poses.rotation, poses.translation, scale, strict=True)
-    return replace(poses, scale=scale, log_likelihood=np.array([explained(sets, *one)[0] for one in each]))
+    return replace(poses, scale=scale, log_likelihood=np.array([explained(problem, *one)[0] for one in each]))

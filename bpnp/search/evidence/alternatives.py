@@ -20,11 +20,11 @@ from bpnp.search.evidence.false_alarms import directions_of, own_evidence
 from bpnp.search.evidence.settings import Evidence
 from bpnp.search.evidence.uncertainty import Linearised, Misfit, systematic_misfit
 from bpnp.search.hypotheses import Hypotheses
-from bpnp.search.point_sets import PointSets, label_groups
+from bpnp.search.problem import Problem, label_groups
 
 SAME_ZOOM = 0.005  # change of the focal length that is not worth a word
 Array = NDArray[np.float64]
-Seen = Sequence[tuple[Hypotheses, PointSets]]
+Seen = Sequence[tuple[Hypotheses, Problem]]
 
 
 class Alternative(NamedTuple):
@@ -39,13 +39,13 @@ class Alternative(NamedTuple):
     what: str
 
 
-def other_pose(candidates: Hypotheses, sets: PointSets, rule: Evidence) -> Alternative | None:
+def other_pose(candidates: Hypotheses, problem: Problem, rule: Evidence) -> Alternative | None:
     """The different pose with the fewest false alarms; None if there is none.
 
     Different: turned by more than `other_deg`, or the middle of the scene moved by more than `other_shift` of its
     distance.
     """
-    same = sets.same_pose(candidates.rotation, candidates.translation, rule.other_deg, rule.other_shift)
+    same = problem.same_pose(candidates.rotation, candidates.translation, rule.other_deg, rule.other_shift)
     others = np.flatnonzero(~same)
     if not len(others):
         return None
@@ -113,18 +113,18 @@ def contesting(seen: Seen, rule: Evidence) -> Alternative | None:
     Source: W. Hoeffding, Probability inequalities for sums of bounded random variables, JASA 1963.
     """
     limits, least = rule.contested, 2 * math.log(10) * rule.lead
-    seen = [(candidates, sets) for candidates, sets in seen if len(sets.image.chosen) >= least]
+    seen = [(candidates, problem) for candidates, problem in seen if len(problem.image.chosen) >= least]
     if not seen:
         return None
-    candidates, sets = seen[0]
+    candidates, problem = seen[0]
     poses, chosen = (candidates.rotation, candidates.translation), sum(len(each.image.chosen) for _, each in seen)
-    others = np.flatnonzero(~sets.same_pose(*poses, limits.far * rule.other_deg, limits.far * rule.other_shift))
+    others = np.flatnonzero(~problem.same_pose(*poses, limits.far * rule.other_deg, limits.far * rule.other_shift))
     # A lead that would be no chance if all gaps were as large as they can be needs no second look.
     decisive = limits.most * math.sqrt(least * chosen) / math.log(10)
     others = others[candidates.log10_false_alarms[others] - candidates.log10_false_alarms[0] < decisive]
     if not len(others):
         return None
-    scales = np.maximum(candidates.scale, sets.image.scales[0])
+    scales = np.maximum(candidates.scale, problem.image.scales[0])
     best, first = _explained(seen, 0, scales[0], limits.near)
     for k in others.tolist():
         evidence, other = _explained(seen, k, scales[k], limits.near)
@@ -156,30 +156,30 @@ class _Partners(NamedTuple):
 def _explained(seen: Seen, k: int, scale: float, near: float) -> tuple[Array, _Partners]:
     """The evidence of the image points of all cameras for candidate k, with residuals of a scale, and their partners
     within `near` scales."""
-    poses = [(sets, candidates.rotation[k], candidates.translation[k], scale) for candidates, sets in seen]
+    poses = [(problem, candidates.rotation[k], candidates.translation[k], scale) for candidates, problem in seen]
     parts = zip(*(_partners(near, *pose) for pose in poses), strict=True)
     return np.concatenate([own_evidence(*pose) for pose in poses]), _Partners(*map(np.concatenate, parts))
 
 
-def _partners(near: float, sets: PointSets, rotation: Array, translation: Array, scale: float) -> _Partners:
-    seen, chosen = directions_of(sets, rotation, translation), sets.image.chosen
+def _partners(near: float, problem: Problem, rotation: Array, translation: Array, scale: float) -> _Partners:
+    seen, chosen = directions_of(problem, rotation, translation), problem.image.chosen
     chord, points = np.full(len(chosen), np.inf), np.full(len(chosen), -1)
-    if sets.labelled_pairs is not None:
-        i, j = sets.labelled_pairs
-        distance = np.linalg.norm(sets.bearings[chosen[i]] - seen[j], axis=-1)
+    if problem.labelled_pairs is not None:
+        i, j = problem.labelled_pairs
+        distance = np.linalg.norm(problem.bearings[chosen[i]] - seen[j], axis=-1)
         distance = np.where(distance < near * scale, distance, np.inf)  # also where a point is not seen
         order = np.lexsort((distance, i))
         rows, first = np.unique(i[order], return_index=True)
         chord[rows] = distance[order][first]
         points[rows] = np.where(np.isfinite(chord[rows]), j[order][first], -1)
-        return _Partners(points, sets.points3d[points] @ rotation.T + translation, np.isfinite(chord))
-    for rows, columns in label_groups(chosen, sets.labels2d, sets.labels3d, len(seen)):
+        return _Partners(points, problem.points3d[points] @ rotation.T + translation, np.isfinite(chord))
+    for rows, columns in label_groups(chosen, problem.labels2d, problem.labels3d, len(seen)):
         ahead = columns[np.isfinite(seen[columns, 0])]
         if len(ahead):
-            bearings = sets.bearings[chosen[rows]]
+            bearings = problem.bearings[chosen[rows]]
             chord[rows], nearest = cKDTree(seen[ahead]).query(bearings, distance_upper_bound=near * scale)
             points[rows] = np.r_[ahead, -1][nearest]
-    return _Partners(points, sets.points3d[points] @ rotation.T + translation, np.isfinite(chord))
+    return _Partners(points, problem.points3d[points] @ rotation.T + translation, np.isfinite(chord))
 
 
 def log10_missed(

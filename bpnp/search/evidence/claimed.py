@@ -25,7 +25,7 @@ from bpnp.search.evidence.rivals import against_rivals
 from bpnp.search.evidence.settings import Evidence
 from bpnp.search.evidence.uncertainty import linearised, local_covariance
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_scene_frame, to_user_frame
-from bpnp.search.point_sets import SIGMAS, PointSets
+from bpnp.search.problem import SIGMAS, Problem
 from bpnp.search.raster_search import around_each
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT
@@ -39,7 +39,7 @@ WITHIN = 22.5  # chi-squared with 6 degrees of freedom, one in a thousand: of a 
 
 @one_blas_thread
 def judge_claim(
-    sets: PointSets,
+    problem: Problem,
     rotation: Array,
     translation: Array,
     *,
@@ -50,7 +50,7 @@ def judge_claim(
     """Judge a given pose, or the optimum near it.
 
     Args:
-        sets: Points of the problem.
+        problem: Points of the problem.
         rotation: (3, 3) of the pose.
         translation: (3,) of the pose, scene units.
         refine: Judge the optimum near the pose. It is the same pose: turned and moved by no more than the verdict
@@ -63,9 +63,9 @@ def judge_claim(
         if there is none.
     """
     rule = DEFAULT.evidence
-    one = replace(sets, log10_tried=0.0)
+    one = replace(problem, log10_tried=0.0)
     claim = _unrefined(one, rotation, translation)
-    scene, few = Scene(one, seed, DEFAULT, deadline), is_enumerable(sets)
+    scene, few = Scene(one, seed, DEFAULT, deadline), is_enumerable(problem)
     others = _proposed(claim, scene)
     if few:  # as in an enumeration, whose candidates have been refined
         motions = registered(one, rotation, translation, float(claim.scale[0]), rule)
@@ -79,10 +79,10 @@ def judge_claim(
     better = len(optimum) and optimum.log10_false_alarms[0] <= claim.log10_false_alarms[0]
     if refine and better:
         scale = float(optimum.scale[0])
-        distance = float(np.linalg.norm(rotation @ sets.middle + translation))
+        distance = float(np.linalg.norm(rotation @ problem.middle + translation))
         prior = PosePrior(rotation, translation, math.degrees(scale) / SIGMAS, scale * distance / SIGMAS)
-        near = replace(sets, prior=prior).log10_share(optimum.rotation[0], optimum.translation[0])
-        one = replace(sets, log10_tried=max(log10_tests(sets) + near, 0.0))
+        near = replace(problem, prior=prior).log10_share(optimum.rotation[0], optimum.translation[0])
+        one = replace(problem, log10_tried=max(log10_tests(problem) + near, 0.0))
         claim = optimum
     competing = others[~same & (others.log10_false_alarms <= 0)]  # chance explains the rest
     candidates = _weighed_anew(Hypotheses.concatenate([claim, competing]), one)
@@ -112,9 +112,9 @@ def _proposed(claim: Hypotheses, scene: Scene) -> Hypotheses:
     return to_user_frame(poses, scene)
 
 
-def _weighed_anew(candidates: Hypotheses, sets: PointSets) -> Hypotheses:
-    """With the false alarms of as many tests as these sets have."""
-    return with_false_alarms(candidates.unweighed(), sets)
+def _weighed_anew(candidates: Hypotheses, problem: Problem) -> Hypotheses:
+    """With the false alarms of as many tests as the problem has."""
+    return with_false_alarms(candidates.unweighed(), problem)
 
 
 def _mirrored(scene: Scene, pose: Hypotheses) -> Hypotheses:
@@ -129,10 +129,10 @@ def _mirrored(scene: Scene, pose: Hypotheses) -> Hypotheses:
     return Hypotheses.from_poses(rotation[None], (seen - rotation @ middle)[None].astype(np.float32))
 
 
-def _unrefined(sets: PointSets, rotation: Array, translation: Array) -> Hypotheses:
+def _unrefined(problem: Problem, rotation: Array, translation: Array) -> Hypotheses:
     """Return a pose (1,) without refinement, at the scale of residuals with the fewest false alarms."""
-    scale = likeliest_scale(sets, rotation, translation)
-    score, count = explained(sets, rotation, translation, scale)
+    scale = likeliest_scale(problem, rotation, translation)
+    score, count = explained(problem, rotation, translation, scale)
     pose = Hypotheses.from_poses(
         rotation[None],
         translation[None],
@@ -140,24 +140,24 @@ def _unrefined(sets: PointSets, rotation: Array, translation: Array) -> Hypothes
         match_count=np.array([count]),
         scale=np.array([scale]),
     )
-    return with_false_alarms(pose, sets)
+    return with_false_alarms(pose, problem)
 
 
-def _is_same(sets: PointSets, claim: Hypotheses, pose: Hypotheses, rule: Evidence) -> bool:
+def _is_same(problem: Problem, claim: Hypotheses, pose: Hypotheses, rule: Evidence) -> bool:
     """Return whether a pose (1,) is the given one, or within what its points leave open of it."""
     rotations = np.concatenate([claim.rotation, pose.rotation])
     translations = np.concatenate([claim.translation, pose.translation])
-    if sets.same_pose(rotations, translations, rule.other_deg, rule.other_shift)[1]:
+    if problem.same_pose(rotations, translations, rule.other_deg, rule.other_shift)[1]:
         return True
     turn = claim.rotation[0] @ pose.rotation[0].T
     if pose.log10_false_alarms[0] > rule.false_alarms or np.trace(turn) <= 1:  # over 90 degrees away
         return False
-    linear = linearised(sets, pose.rotation[0], pose.translation[0], float(pose.scale[0]))
+    linear = linearised(problem, pose.rotation[0], pose.translation[0], float(pose.scale[0]))
     covariance = local_covariance(linear)
     if covariance is None:
         return False
     vector = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    middles = rotations @ sets.middle + translations
+    middles = rotations @ problem.middle + translations
     step = np.r_[vector, middles[0] - middles[1]]
     return bool(step @ np.linalg.solve(covariance, step) < WITHIN)
 

@@ -41,8 +41,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.search.image_statistics import ImageStatistics
 from bpnp.search.kernels.neighbours import sums_near
-from bpnp.search.point_sets import ImageStatistics, PointSets, faces, label_groups
+from bpnp.search.problem import Problem, faces, label_groups
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
@@ -126,71 +127,71 @@ class Alarms(NamedTuple):
     rough: Array
 
 
-def alarms_of(sets: PointSets, rotations: Array, translations: Array, scales: Array | None = None) -> Alarms:
+def alarms_of(problem: Problem, rotations: Array, translations: Array, scales: Array | None = None) -> Alarms:
     """Of poses (c, 3, 3), (c, 3) with residuals of `scales` (c,), radians; all s are a pose's own if that is None.
 
     A pose under which three points or fewer are seen has as many as there are tests: no evidence at all. With each of
-    several sets of scene points (`PointSets.log10_views`) there are as many tests again.
+    several sets of scene points (`Problem.log10_views`) there are as many tests again.
 
     >>> import numpy as np
     >>> points = np.random.default_rng(0).uniform(-1, 1, (12, 3))
     >>> seen = points + [0, 0, 6]
-    >>> sets = PointSets(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
-    >>> alarms = alarms_of(sets, np.stack([np.eye(3)] * 2), np.array([[0.0, 0, 6], [0.3, 0, 5]])).own
+    >>> problem = Problem(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
+    >>> alarms = alarms_of(problem, np.stack([np.eye(3)] * 2), np.array([[0.0, 0, 6], [0.3, 0, 5]])).own
     >>> bool(alarms[0] < -10), bool(alarms[1] > 0)
     (True, True)
     """
-    tests = log10_tests(sets)
-    cells = np.minimum(log10_cells(sets.image) + log10_lenses(sets), tests)
-    share = [sets.log10_share(r, t) for r, t in zip(rotations, translations, strict=True)]
+    tests = log10_tests(problem)
+    cells = np.minimum(log10_cells(problem.image) + log10_lenses(problem), tests)
+    share = [problem.log10_share(r, t) for r, t in zip(rotations, translations, strict=True)]
     none = np.array([max(tests + one, 0.0) for one in share])
     result = Alarms(none, none.copy())
     for k in range(len(none)):
-        seen = directions_of(sets, rotations[k], translations[k])
+        seen = directions_of(problem, rotations[k], translations[k])
         # Fewer tests at a scale are as much more evidence, but a pose has no less chance than all of them.
         fewer = math.log(10) * (np.maximum(cells + share[k], 0.0) - none[k])
         scale = None if scales is None else float(scales[k])
-        terms = camera_terms(sets, seen, scale, fewer=fewer)
-        result.own[k], result.rough[k] = log10_nfa([terms], float(none[k]), [[_fixing(sets)]])
-    return Alarms(result.own + sets.log10_views, result.rough + sets.log10_views)
+        terms = camera_terms(problem, seen, scale, fewer=fewer)
+        result.own[k], result.rough[k] = log10_nfa([terms], float(none[k]), [[_fixing(problem)]])
+    return Alarms(result.own + problem.log10_views, result.rough + problem.log10_views)
 
 
-def log10_tests(sets: PointSets) -> float:
+def log10_tests(problem: Problem) -> float:
     """log10 of 2 (m)_3 (n)_3 / 3!: choices of three matches with about two poses each; of labels that agree, if given.
 
-    The number of poses that were tried, where the sets say it.
+    The number of poses that were tried, where the problem has it.
     """
-    if sets.log10_tried is not None:
-        return sets.log10_tried
-    tests = _log10_choices(sets, FIXING)
-    if sets.focal is None:
+    if problem.log10_tried is not None:
+        return problem.log10_tried
+    tests = _log10_choices(problem, FIXING)
+    if problem.focal is None:
         return tests
-    return min(_log10_choices(sets, FIXING + 1), tests + float(log10_lenses(sets)[0]))
+    return min(_log10_choices(problem, FIXING + 1), tests + float(log10_lenses(problem)[0]))
 
 
-def _log10_choices(sets: PointSets, pairs: int) -> float:
-    m, n = len(sets.bearings), len(sets.points3d)
+def _log10_choices(problem: Problem, pairs: int) -> float:
+    m, n = len(problem.bearings), len(problem.points3d)
     choices = math.prod((m - i) * (n - i) / (i + 1) for i in range(pairs))
-    if sets.labels2d is not None and sets.labels3d is not None:
-        groups = label_groups(np.arange(m), sets.labels2d, sets.labels3d, n)
+    if problem.labels2d is not None and problem.labels3d is not None:
+        groups = label_groups(np.arange(m), problem.labels2d, problem.labels3d, n)
         agreeing = sum(len(rows) * len(columns) for rows, columns in groups)
         choices = min(choices, math.prod((agreeing - i) / (i + 1) for i in range(pairs)))
     return math.log10(2 * max(choices, 1.0))
 
 
-def _fixing(sets: PointSets) -> int:
-    return FIXING + (sets.focal is not None)
+def _fixing(problem: Problem) -> int:
+    return FIXING + (problem.focal is not None)
 
 
-def log10_lenses(sets: PointSets) -> Array:
+def log10_lenses(problem: Problem) -> Array:
     """Return log10 (S,) of the number of lenses that differ at each scale s of the image, 0 for a known lens.
 
     A focal length moves points at the spread h by h d log f, a radial coefficient by h^3 dk.
     """
-    if sets.focal is None:
-        return np.zeros(len(sets.image.scales))
-    h, scales = sets.image.spread, sets.image.scales
-    moved = sets.focal.log_range * h, sets.focal.radial_range * h**3
+    if problem.focal is None:
+        return np.zeros(len(problem.image.scales))
+    h, scales = problem.image.spread, problem.image.scales
+    moved = problem.focal.log_range * h, problem.focal.radial_range * h**3
     return np.asarray(sum(np.log10(np.maximum(each / scales, 1.0)) for each in moved))
 
 
@@ -213,23 +214,23 @@ def log10_rotations(spread: float, scales: Array) -> Array:
     return np.asarray(np.log10(np.maximum(8 * math.pi**2 * spread / scales**3, 1.0)))
 
 
-def directions_of(sets: PointSets, rotation: Array, translation: Array) -> Array:
+def directions_of(problem: Problem, rotation: Array, translation: Array) -> Array:
     """Unit directions (n, 3) in the camera's frame; NaN for a point in the camera or facing away."""
-    camera = sets.points3d @ rotation.T + translation
+    camera = problem.points3d @ rotation.T + translation
     length = np.linalg.norm(camera, axis=-1, keepdims=True)
     seen = np.divide(camera, length, out=np.full_like(camera, np.nan), where=length > 0)
-    if sets.normals3d is not None:
-        seen[~faces(sets.normals3d, sets.cosines3d, camera, rotation)] = np.nan
+    if problem.normals3d is not None:
+        seen[~faces(problem.normals3d, problem.cosines3d, camera, rotation)] = np.nan
     return seen
 
 
 def camera_terms(
-    sets: PointSets, seen: Array, scale: float | None = None, *, fewer: Array | float = 0.0
+    problem: Problem, seen: Array, scale: float | None = None, *, fewer: Array | float = 0.0
 ) -> Terms | None:
     """Return the evidence of one camera for points seen in directions.
 
     Args:
-        sets: Points of the problem.
+        problem: Points of the problem.
         seen: (n, 3) unit directions, NaN for points that are not seen.
         scale: Scale of the residuals, radians; None counts all scales as their own.
         fewer: (S,) log of the number of tests at each scale of the image, over the number of all.
@@ -237,27 +238,27 @@ def camera_terms(
     Returns:
         The terms from the finest own scale on; None where no more points are seen than fix the pose.
     """
-    if min(len(sets.bearings), int(np.isfinite(seen[:, 0]).sum())) <= _fixing(sets):
+    if min(len(problem.bearings), int(np.isfinite(seen[:, 0]).sum())) <= _fixing(problem):
         return None
-    ratio = np.ones(len(sets.image.scales)) if scale is None else _ratio(sets.image, scale)
+    ratio = np.ones(len(problem.image.scales)) if scale is None else _ratio(problem.image, scale)
     own, rough = _is_own(ratio), ratio >= ROUGH
     finest = int(own.argmax())
-    logs, less = _terms(sets, seen, finest), np.broadcast_to(fewer, own.shape)[finest:]
+    logs, less = _terms(problem, seen, finest), np.broadcast_to(fewer, own.shape)[finest:]
     pairs = len(own) * logs.shape[2]
-    return Terms(logs, sets.image.together[:, finest:], own[finest:], rough[finest:], pairs, less)
+    return Terms(logs, problem.image.together[:, finest:], own[finest:], rough[finest:], pairs, less)
 
 
-def own_evidence(sets: PointSets, rotation: Array, translation: Array, scale: float) -> Array:
+def own_evidence(problem: Problem, rotation: Array, translation: Array, scale: float) -> Array:
     """Return log x_i / c_i (k,) of each chosen image point under a pose, clumps weighted, at the fraction and the s
     within a factor of two of the scale of its residuals, radians, at which their sum is largest."""
-    terms = camera_terms(sets, directions_of(sets, rotation, translation), scale)
-    return np.zeros(len(sets.image.chosen)) if terms is None else terms.of_points()
+    terms = camera_terms(problem, directions_of(problem, rotation, translation), scale)
+    return np.zeros(len(problem.image.chosen)) if terms is None else terms.of_points()
 
 
-def likeliest_scale(sets: PointSets, rotation: Array, translation: Array) -> float:
+def likeliest_scale(problem: Problem, rotation: Array, translation: Array) -> float:
     """Return the scale of the residuals, radians, with the most evidence; the largest if a pose sees nothing."""
-    terms = camera_terms(sets, directions_of(sets, rotation, translation))
-    return float(sets.image.scales[-1 if terms is None else terms.by_scale(_fixing(sets)).argmax()])
+    terms = camera_terms(problem, directions_of(problem, rotation, translation))
+    return float(problem.image.scales[-1 if terms is None else terms.by_scale(_fixing(problem)).argmax()])
 
 
 def _ratio(image: ImageStatistics, scale: float) -> Array:
@@ -269,23 +270,23 @@ def _is_own(ratio: Array) -> NDArray[np.bool_]:
     return (ratio >= 1 / OWN) & (ratio <= OWN)
 
 
-def _shares(sets: PointSets) -> Array:
+def _shares(problem: Problem) -> Array:
     """Return the fractions w of image points with a partner that are tried: (W,), or (k, 1, W) of each chosen point in
     proportion to its score."""
-    shares = SHARES if sets.clutter is None else np.array([1 - sets.clutter])
-    if sets.scores2d is not None:
-        shares = shares * (sets.scores2d[sets.image.chosen] / sets.scores2d.mean())[:, None, None]
-    elif sets.clutter is None:
+    shares = SHARES if problem.clutter is None else np.array([1 - problem.clutter])
+    if problem.scores2d is not None:
+        shares = shares * (problem.scores2d[problem.image.chosen] / problem.scores2d.mean())[:, None, None]
+    elif problem.clutter is None:
         return shares
     return np.asarray(np.clip(shares, LEAST_SHARE, MOST_SHARE))
 
 
-def _terms(sets: PointSets, seen: Array, finest: int) -> Array:
+def _terms(problem: Problem, seen: Array, finest: int) -> Array:
     """log x_i / c_i (k, S', W), clumps weighted, at the scales from the finest one on, of points seen in directions
     (n, 3)."""
-    image = sets.image
+    image = problem.image
     return np.asarray(
-        image.weights[:, finest:, finest:] @ point_evidence(sets, seen, image.scales[finest:], _shares(sets))
+        image.weights[:, finest:, finest:] @ point_evidence(problem, seen, image.scales[finest:], _shares(problem))
     )
 
 
@@ -299,25 +300,25 @@ def sum_of_largest(values: Array, count: int) -> Array:
     return total
 
 
-def point_evidence(sets: PointSets, seen: Array, scales: Array, shares: Array, *, even: bool = False) -> Array:
+def point_evidence(problem: Problem, seen: Array, scales: Array, shares: Array, *, even: bool = False) -> Array:
     """log x_i (k, S, W) of each chosen image point, at `scales` (S,) and `shares` (W,), of points seen in directions
     (n, 3).
 
     even: against scene points that are spread evenly over the view instead of as they are seen.
     """
-    image = sets.image
-    predicted, smooth, inside, every = _sums(sets, seen, scales, even)
+    image = problem.image
+    predicted, smooth, inside, every = _sums(problem, seen, scales, even)
     # A point without a possible partner has no density to be compared with: it counts as one that has none near.
     density = (np.where(every > 0, every, 1) if even else np.maximum(inside, 1)) / image.solid_angle
     ratio = predicted / (2 * math.pi * scales**2 * np.maximum(density, smooth)[:, None])
     return np.asarray(np.log1p(shares * (ratio - 1)[:, :, None]))
 
 
-def _sums(sets: PointSets, seen: Array, scales: Array, even: bool) -> tuple[Array, Array, Array, Array]:
+def _sums(problem: Problem, seen: Array, scales: Array, even: bool) -> tuple[Array, Array, Array, Array]:
     """Sum kernels and counts over the possible partners of each chosen image point.
 
     Args:
-        sets: Points of the problem, with k chosen image points.
+        problem: Points of the problem, with k chosen image points.
         seen: (n, 3) directions in which the scene points are seen; NaN for those that are not.
         scales: (S,) standard deviations of the kernels, radians.
         even: Leave the outline out.
@@ -325,19 +326,19 @@ def _sums(sets: PointSets, seen: Array, scales: Array, even: bool) -> tuple[Arra
     Returns:
         Kernels (k, S); density of the outline (k,), 0 if `even`; number of partners in view (k,) and of all (k,).
     """
-    image, count = sets.image, len(sets.image.chosen)
-    weight = np.ones(len(seen)) if sets.scores3d is None else sets.scores3d / sets.scores3d.mean()
+    image, count = problem.image, len(problem.image.chosen)
+    weight = np.ones(len(seen)) if problem.scores3d is None else problem.scores3d / problem.scores3d.mean()
     in_view, ahead = np.zeros(len(seen), np.bool_), np.flatnonzero(np.isfinite(seen[:, 0]))
     across = (np.abs((seen[ahead] - image.centre) @ image.axes) <= image.half_widths).all(-1)
     in_view[ahead] = across & (seen[ahead] @ image.centre > 0)
-    if sets.labelled_pairs is not None:
-        return _sums_of_pairs(sets, *sets.labelled_pairs, seen, weight, in_view, scales, even)
+    if problem.labelled_pairs is not None:
+        return _sums_of_pairs(problem, *problem.labelled_pairs, seen, weight, in_view, scales, even)
     predicted, smooth, inside, every = np.zeros((count, len(scales))), np.zeros(count), np.zeros(count), np.zeros(count)
-    for rows, columns, odds, share in _partners(sets, weight):
+    for rows, columns, odds, share in _partners(problem, weight):
         ahead = np.isfinite(seen[columns, 0])
         every[rows] += odds * share.sum()
         inside[rows] += odds * share[in_view[columns]].sum()
-        used, share, bearings = seen[columns][ahead], share[ahead], sets.bearings[image.chosen[rows]]
+        used, share, bearings = seen[columns][ahead], share[ahead], problem.bearings[image.chosen[rows]]
         near = sums_near(bearings, used, image.axes, FARTHEST * scales, 0.5 / scales**2, share)
         predicted[rows] += odds[:, None] * near
         if not even:
@@ -346,7 +347,7 @@ def _sums(sets: PointSets, seen: Array, scales: Array, even: bool) -> tuple[Arra
 
 
 def _sums_of_pairs(
-    sets: PointSets,
+    problem: Problem,
     i: Labels,
     j: Labels,
     seen: Array,
@@ -356,29 +357,29 @@ def _sums_of_pairs(
     even: bool,
 ) -> tuple[Array, Array, Array, Array]:
     """Compute `_sums` over given pairs (p,) of a chosen image point and a scene point."""
-    count = len(sets.image.chosen)
+    count = len(problem.image.chosen)
     every, inside = (np.asarray(np.bincount(i, of[j], count), np.float64) for of in (weight, weight * in_view))
     ahead = np.isfinite(seen[j, 0])
     i, j = i[ahead], j[ahead]
-    squared = ((sets.bearings[sets.image.chosen[i]] - seen[j]) ** 2).sum(-1)
+    squared = ((problem.bearings[problem.image.chosen[i]] - seen[j]) ** 2).sum(-1)
     near = (np.where(squared < (FARTHEST * s) ** 2, np.exp(-0.5 * squared / s**2), 0.0) for s in scales.tolist())
     predicted = np.stack([np.bincount(i, weight[j] * kernel, count) for kernel in near], -1)
-    width2 = (OUTLINE * sets.image.spread) ** 2
+    width2 = (OUTLINE * problem.image.spread) ** 2
     outline = weight[j] * np.exp(-0.5 * squared / width2) / (2 * math.pi * width2)
     smooth = np.zeros(count) if even else np.asarray(np.bincount(i, outline, count), np.float64)
     return np.asarray(predicted, np.float64), smooth, inside, every
 
 
-def _partners(sets: PointSets, weight: Array) -> Iterator[tuple[Labels, Labels, Array, Array]]:
+def _partners(problem: Problem, weight: Array) -> Iterator[tuple[Labels, Labels, Array, Array]]:
     """Places in the chosen image points (k,) and in the scene of possible partners, the odds (k,) of the former and the
     share (n,) of the latter, times its weight: those of a label, or all with their probability of a class, one class
     after the other."""
-    chosen, n = sets.image.chosen, len(weight)
-    if sets.odds2d is None or sets.classes3d is None:
-        for rows, columns in label_groups(chosen, sets.labels2d, sets.labels3d, n):
+    chosen, n = problem.image.chosen, len(weight)
+    if problem.odds2d is None or problem.classes3d is None:
+        for rows, columns in label_groups(chosen, problem.labels2d, problem.labels3d, n):
             yield rows, columns, np.ones(len(rows)), weight[columns]
         return
-    for odds, share in zip(sets.odds2d[chosen].T, sets.classes3d.T, strict=True):
+    for odds, share in zip(problem.odds2d[chosen].T, problem.classes3d.T, strict=True):
         yield np.arange(len(chosen)), np.arange(n), odds, weight * share
 
 

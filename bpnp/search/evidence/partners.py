@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.search.point_sets import PointSets, faces
+from bpnp.search.problem import Problem, faces
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
@@ -17,11 +17,11 @@ DENSE = 4096  # possible matches up to which all distances are computed
 OUTLIERS = 0.3  # share of the image points without a partner that the assignment expects
 
 
-def facing(sets: PointSets, camera: Array, rotation: Array) -> Labels:
+def facing(problem: Problem, camera: Array, rotation: Array) -> Labels:
     """Places of the scene points (n, 3), in the camera's frame, that it may see."""
     used = np.einsum("ki,ki->k", camera, camera) > 0
-    if sets.normals3d is not None:
-        used &= faces(sets.normals3d, sets.cosines3d, camera, rotation)
+    if problem.normals3d is not None:
+        used &= faces(problem.normals3d, problem.cosines3d, camera, rotation)
     return np.flatnonzero(used)
 
 
@@ -31,7 +31,7 @@ def across(seen: Array) -> Array:
 
 
 def partners(
-    sets: PointSets, seen: Array, places: Labels, chosen: Labels, scale: float, most: int = NEIGHBOURS
+    problem: Problem, seen: Array, places: Labels, chosen: Labels, scale: float, most: int = NEIGHBOURS
 ) -> tuple[Any, Any, Array, Array]:
     """Possible matches (k,) of a chosen image point and a scene point near it, and the density (k,) of each; and the
     density (m,) of the image points, with that of having no partner.
@@ -39,7 +39,7 @@ def partners(
     seen: (n, 3) directions of the scene points at `places`. Points of different labels are no match. most: neighbours
     of an image point that are looked up.
     """
-    bearings, reach = sets.bearings[chosen], FARTHEST * scale
+    bearings, reach = problem.bearings[chosen], FARTHEST * scale
     if len(bearings) * len(seen) <= DENSE:
         squared = ((bearings[:, None] - seen) ** 2).sum(-1)
         i, j = np.nonzero(squared < reach**2)
@@ -54,27 +54,29 @@ def partners(
         j, squared = nearest[i, nth].astype(np.int64), distance[i, nth] ** 2
     candidates = np.full(len(bearings), len(seen))
     odds = np.ones(len(i))
-    if sets.odds2d is not None and sets.classes3d is not None:
-        odds = (sets.odds2d[chosen[i]] * sets.classes3d[places[j]]).sum(-1)
-    elif sets.labels2d is not None and sets.labels3d is not None:
-        label, others = sets.labels2d[chosen], sets.labels3d[places]
+    if problem.odds2d is not None and problem.classes3d is not None:
+        odds = (problem.odds2d[chosen[i]] * problem.classes3d[places[j]]).sum(-1)
+    elif problem.labels2d is not None and problem.labels3d is not None:
+        label, others = problem.labels2d[chosen], problem.labels3d[places]
         agree = (label[i] == others[j]) | (label[i] < 0) | (others[j] < 0)
         i, j, squared, odds = i[agree], j[agree], squared[agree], odds[agree]
         of_label = np.bincount(others + 1, minlength=int(label.max(initial=0)) + 2)
         candidates = np.where(label < 0, len(seen), of_label[label + 1] + of_label[0])
     density = odds * np.exp(squared * (-0.5 / scale**2)) * (1 - OUTLIERS) / (candidates[i] * 2 * math.pi * scale**2)
-    every = np.bincount(i, density, len(bearings)) + OUTLIERS / sets.image.solid_angle
+    every = np.bincount(i, density, len(bearings)) + OUTLIERS / problem.image.solid_angle
     return i, j, np.asarray(density, np.float64), np.asarray(every, np.float64)
 
 
-def explained(sets: PointSets, rotation: Array, translation: Array, scale: float) -> tuple[float, float]:
+def explained(problem: Problem, rotation: Array, translation: Array, scale: float) -> tuple[float, float]:
     """Mean log-likelihood of the bearings under a pose with residuals of `scale`, radians, in nats as the annealing has
     it: in units in which a kernel is 1 / s^2 where it is largest; and the expected number of matches."""
-    camera, chosen = sets.points3d @ rotation.T + translation, sets.image.chosen
-    places = facing(sets, camera, rotation)
+    camera, chosen = problem.points3d @ rotation.T + translation, problem.image.chosen
+    places = facing(problem, camera, rotation)
     if not len(places):
         return -math.inf, 0.0
     seen = camera[places] / np.linalg.norm(camera[places], axis=-1, keepdims=True)
-    i, _, density, every = partners(sets, seen, places, chosen, scale)
-    matched = float((density / every[i]).sum()) * len(sets.bearings) / len(chosen)
-    return float(np.log(2 * math.pi * every).mean()), min(matched, float(min(len(sets.bearings), len(sets.points3d))))
+    i, _, density, every = partners(problem, seen, places, chosen, scale)
+    matched = float((density / every[i]).sum()) * len(problem.bearings) / len(chosen)
+    return float(np.log(2 * math.pi * every).mean()), min(
+        matched, float(min(len(problem.bearings), len(problem.points3d)))
+    )

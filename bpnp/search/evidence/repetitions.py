@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 from bpnp.search.evidence.false_alarms import SHARES, alarms_of, directions_of, point_evidence
 from bpnp.search.evidence.settings import Evidence, Repetitions
 from bpnp.search.hypotheses import Hypotheses
-from bpnp.search.point_sets import PointSets
+from bpnp.search.problem import Problem
 from bpnp.search.propose.symmetries import Motions, matching_tolerance, mirror_pose, self_motions
 
 Array = NDArray[np.float64]
@@ -19,14 +19,14 @@ Pose = tuple[Array, Array]
 DEFAULT = Repetitions()
 
 
-def registered(sets: PointSets, rotation: Array, translation: Array, scale: float, rule: Evidence) -> Motions:
+def registered(problem: Problem, rotation: Array, translation: Array, scale: float, rule: Evidence) -> Motions:
     """Return the rigid motions that map the matched points of a pose onto other scene points.
 
     If a pose is wrong because of a symmetry or a repetition, one of these motions maps (nearly) all of its matched
     points onto those of the right pose, whatever fraction of the scene they are.
 
     Args:
-        sets: the points of a problem.
+        problem: the points of a problem.
         rotation: (3, 3), translation: (3,) of the pose.
         scale: standard deviation of its residuals, radians.
         rule: constants of the verdict.
@@ -34,15 +34,15 @@ def registered(sets: PointSets, rotation: Array, translation: Array, scale: floa
     Returns:
         Motions with the fraction of the matched points that each maps, the largest first; none of too few points.
     """
-    limits, points = rule.repetitions, sets.points3d
+    limits, points = rule.repetitions, problem.points3d
     camera = points @ rotation.T + translation
     depth = np.linalg.norm(camera, axis=-1)
-    away, nearest = cKDTree(camera / np.maximum(depth, 1e-300)[:, None]).query(sets.bearings)
+    away, nearest = cKDTree(camera / np.maximum(depth, 1e-300)[:, None]).query(problem.bearings)
     matched = np.unique(nearest[away < limits.near * scale])
     if len(matched) < limits.fewest:
         return Motions.none()
     noise = scale * float(np.median(depth[matched]))
-    labels, normals = sets.labels3d, sets.normals3d if sets.cosines3d is None else None
+    labels, normals = problem.labels3d, problem.normals3d if problem.cosines3d is None else None
     if len(points) <= limits.whole:
         tolerance = matching_tolerance(points, np.arange(len(points)), noise)
         motions = _of_scene(*(_frozen(x) for x in (points, labels, normals)), tolerance)
@@ -87,26 +87,26 @@ def _of_scene(points: Frozen, labels: Frozen, normals: Frozen, tolerance: float)
     )
 
 
-def competing_poses(sets: PointSets, rotation: Array, translation: Array, motions: Motions, rule: Evidence) -> Pose:
+def competing_poses(problem: Problem, rotation: Array, translation: Array, motions: Motions, rule: Evidence) -> Pose:
     """Return the poses (c, 3, 3), (c, 3) that motions, and the mirror image of a flat scene, confuse with a pose; those
     that a verdict takes for different from it."""
     poses = motions.competitors(rotation, translation)
     every = [rotation[None], poses[0]], [translation[None], poses[1]]
-    if (mirrored := mirror_pose(sets.points3d, rotation, translation)) is not None:
+    if (mirrored := mirror_pose(problem.points3d, rotation, translation)) is not None:
         for parts, one in zip(every, mirrored, strict=True):
             parts.append(one[None])
     rotations, translations = (np.concatenate(parts) for parts in every)
-    other = np.flatnonzero(~sets.same_pose(rotations, translations, rule.other_deg, rule.other_shift))
+    other = np.flatnonzero(~problem.same_pose(rotations, translations, rule.other_deg, rule.other_shift))
     return rotations[other], translations[other]
 
 
 def repeated_poses(
-    sets: PointSets, rotation: Array, translation: Array, scale: float, rule: Evidence, *, least: float = 0.0
+    problem: Problem, rotation: Array, translation: Array, scale: float, rule: Evidence, *, least: float = 0.0
 ) -> tuple[Hypotheses, Motions]:
     """Return the poses that the scene's own motions confuse with one, and these motions.
 
     Args:
-        sets: the points of a problem.
+        problem: the points of a problem.
         rotation: (3, 3), translation: (3,) of the pose.
         scale: standard deviation of its residuals, radians.
         rule: constants of the verdict.
@@ -121,15 +121,15 @@ def repeated_poses(
         >>> motif = np.random.default_rng(0).uniform(0, 1, (12, 3))
         >>> scene = np.concatenate([motif + [2 * k, 0, 6] for k in range(3)])
         >>> image = motif + [0, 0, 6]  # the first of three equal things
-        >>> sets = PointSets(image / np.linalg.norm(image, axis=1, keepdims=True), scene)
-        >>> repeated, _ = repeated_poses(sets, np.eye(3), np.zeros(3), 1e-3, Evidence())
+        >>> problem = Problem(image / np.linalg.norm(image, axis=1, keepdims=True), scene)
+        >>> repeated, _ = repeated_poses(problem, np.eye(3), np.zeros(3), 1e-3, Evidence())
         >>> sorted(repeated.translation[:2, 0].round(6).tolist())
         [-4.0, -2.0]
     """
-    motions = registered(sets, rotation, translation, scale, rule).mapping(least)
-    rotations, translations = competing_poses(sets, rotation, translation, motions, rule)
+    motions = registered(problem, rotation, translation, scale, rule).mapping(least)
+    rotations, translations = competing_poses(problem, rotation, translation, motions, rule)
     scales = np.full(len(rotations), scale)
-    alarms = alarms_of(sets, rotations, translations, scales).own
+    alarms = alarms_of(problem, rotations, translations, scales).own
     poses = Hypotheses.from_poses(
         rotations, translations, scale=scales, log10_false_alarms=alarms, log10_rough=alarms.copy()
     )
@@ -137,7 +137,7 @@ def repeated_poses(
 
 
 def decades_behind(
-    sets: PointSets,
+    problem: Problem,
     best: Pose,
     repeated: Pose,
     rivals: Pose,
@@ -154,24 +154,24 @@ def decades_behind(
     poses take onto others. Any point may be missing in the map, as is the share q of the image points that the best
     pose does not explain: none counts for more than (1 - q) / q.
     """
-    seen = [directions_of(sets, *best), *(directions_of(sets, r, t) for r, t in zip(*rivals, strict=True))]
-    logs = np.stack([point_evidence(sets, one, np.array([scale]), SHARES[-1:], even=True)[:, 0, 0] for one in seen])
+    seen = [directions_of(problem, *best), *(directions_of(problem, r, t) for r, t in zip(*rivals, strict=True))]
+    logs = np.stack([point_evidence(problem, one, np.array([scale]), SHARES[-1:], even=True)[:, 0, 0] for one in seen])
     count = logs.shape[1]
     missing = min((int((logs[0] < 0).sum()) + 1) / (count + 2), (count * (1 - fraction) + 1) / (count + 2))
     missing = min(missing, limits.most_missing)
     most = math.log((1 - missing) / missing)
-    is_repeated = _is_repeated(sets, best, repeated, limits.near * scale)
-    counted = np.stack([_among(sets, one) for one in seen[1:]]) | ~is_repeated
+    is_repeated = _is_repeated(problem, best, repeated, limits.near * scale)
+    counted = np.stack([_among(problem, one) for one in seen[1:]]) | ~is_repeated
     return np.asarray(np.where(counted, np.clip(logs[0] - logs[1:], -most, most), 0).sum(-1) / math.log(10))
 
 
-def _is_repeated(sets: PointSets, best: Pose, repeated: Pose, reach: float) -> NDArray[np.bool_]:
+def _is_repeated(problem: Problem, best: Pose, repeated: Pose, reach: float) -> NDArray[np.bool_]:
     """Of which of the chosen image points (k,) a motion p -> Q p + d, or its inverse, takes the scene point onto
     another one; Q p + d is the point that a repeated pose sees where the best one sees p."""
-    points, (rotation, translation) = sets.points3d, best
+    points, (rotation, translation) = problem.points3d, best
     camera = points @ rotation.T + translation
     depth = np.linalg.norm(camera, axis=-1)
-    _, nearest = cKDTree(camera / np.maximum(depth, 1e-300)[:, None]).query(sets.bearings[sets.image.chosen])
+    _, nearest = cKDTree(camera / np.maximum(depth, 1e-300)[:, None]).query(problem.bearings[problem.image.chosen])
     own, reach = points[nearest], reach * float(np.median(depth[nearest]))
     moved = [
         target
@@ -181,11 +181,11 @@ def _is_repeated(sets: PointSets, best: Pose, repeated: Pose, reach: float) -> N
     return np.asarray(np.isfinite(cKDTree(points).query(moved, distance_upper_bound=reach)[0]).any(0))
 
 
-def _among(sets: PointSets, seen: Array) -> NDArray[np.bool_]:
+def _among(problem: Problem, seen: Array) -> NDArray[np.bool_]:
     """Which of the chosen image points lie in the convex hull of the directions (n, 3) that a pose sees."""
-    image = sets.image
+    image = problem.image
     ahead = seen[seen @ image.centre > 0]  # none that is NaN
-    plane, points = (x @ image.axes / (x @ image.centre)[:, None] for x in (ahead, sets.bearings[image.chosen]))
+    plane, points = (x @ image.axes / (x @ image.centre)[:, None] for x in (ahead, problem.bearings[image.chosen]))
     try:
         sides = ConvexHull(plane).equations
     except (QhullError, ValueError):  # on a line, or too few

@@ -17,7 +17,7 @@ from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
 from bpnp.search.evidence.settings import Evidence, OtherFocal
 from bpnp.search.evidence.uncertainty import bends_significantly, linearised, misfit_of
 from bpnp.search.hypotheses import Hypotheses, to_user_frame
-from bpnp.search.point_sets import PointSets, UnknownFocal
+from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.propose.lens import LensFit, fit_lens, undistort
 from bpnp.search.raster_search import search_beside
 from bpnp.search.scene import Scene
@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 def against_rivals(
     result: SearchResult,
-    sets: PointSets,
+    problem: Problem,
     entered: Callable[[], Scene],
     rule: Evidence,
     *,
@@ -42,17 +42,17 @@ def against_rivals(
     contested: whether the poses of a repeated structure were proposed before. The camera is believed as it was given
     unless another focal length, which is paid for as an unknown, has fewer false
     alarms by the factor `rule.focal_chance`."""
-    result = _against_repetitions(result, sets, entered, rule, looks, exhaustive, contested)
+    result = _against_repetitions(result, problem, entered, rule, looks, exhaustive, contested)
     if result.verdict != "confident":
         return result
-    other = other_camera(result, sets, entered, rule)
+    other = other_camera(result, problem, entered, rule)
     if other is None:
         return result
     return replace(result, verdict="ambiguous", reason=reasons.against(other.what, result.log10_false_alarms))
 
 
 def other_camera(
-    result: SearchResult, sets: PointSets, entered: Callable[[], Scene], rule: Evidence
+    result: SearchResult, problem: Problem, entered: Callable[[], Scene], rule: Evidence
 ) -> Alternative | None:
     """Return another lens with which a different pose fits better than the best one, or None.
 
@@ -60,24 +60,24 @@ def other_camera(
     radial coefficient as unknowns. The lens is fitted from the best pose; and, where three matches may be coincidences,
     from the likeliest pose beside it at other focal lengths. If there was no time for these, that is returned.
     """
-    count = match_count(result.candidates, sets)
-    if sets.focal is not None or count < rule.zoomed.fewest:
+    count = match_count(result.candidates, problem)
+    if problem.focal is not None or count < rule.zoomed.fewest:
         return None
-    (rotation, translation), scale = result.best, max(result.residual, sets.image.scales[0])
-    middle = rotation @ sets.middle + translation
-    linear = linearised(sets, rotation, translation, scale)
+    (rotation, translation), scale = result.best, max(result.residual, problem.image.scales[0])
+    middle = rotation @ problem.middle + translation
+    linear = linearised(problem, rotation, translation, scale)
     starts = (None, 0.0) if bends_significantly(linear, count, rule) else (None,)
 
     def better(found: AtZoom) -> Alternative | None:
-        least = max(found.scale, found.sets.image.scales[0])
-        fits = (fit_lens(found.sets, found.rotation, found.middle, least, start) for start in starts)
+        least = max(found.scale, found.problem.image.scales[0])
+        fits = (fit_lens(found.problem, found.rotation, found.middle, least, start) for start in starts)
         others = [fit._replace(zoom=found.zoom * fit.zoom) for fit in fits if fit is not None]
-        alarms = [_alarms(sets, other, rule) for other in others]
+        alarms = [_alarms(problem, other, rule) for other in others]
         if min(alarms, default=math.inf) >= result.log10_false_alarms + math.log10(rule.focal_chance):
             return None
         return of_misfit(misfit_of(rotation, middle, others[int(np.argmin(alarms))]), rule)
 
-    known = AtZoom(1.0, sets, rotation, middle, scale)
+    known = AtZoom(1.0, problem, rotation, middle, scale)
     other = better(known)
     if other is not None or rule.independent * result.log10_false_alarms / count <= rule.missed:
         return other
@@ -93,7 +93,7 @@ class AtZoom(NamedTuple):
     against an even density over the view. middle: (3,) of the scene, seen from the camera."""
 
     zoom: float
-    sets: PointSets
+    problem: Problem
     rotation: Array
     middle: Array
     scale: float
@@ -116,40 +116,40 @@ def likeliest_zoom(start: AtZoom, scene: Scene, rule: OtherFocal) -> AtZoom:
 def beside(found: AtZoom, zoom: float, scene: Scene) -> AtZoom:
     """The likeliest pose at `zoom` times the focal length of one, beside that which sees the scene as large; the pose
     itself after the deadline."""
-    sets = at_focal_length(found.sets, zoom)
-    there = Scene(sets, 0, scene.settings, scene.deadline)
-    shift = found.middle * (1, 1, zoom) - found.rotation @ sets.middle
+    problem = at_focal_length(found.problem, zoom)
+    there = Scene(problem, 0, scene.settings, scene.deadline)
+    shift = found.middle * (1, 1, zoom) - found.rotation @ problem.middle
     start = Hypotheses.from_poses(*there.enter(found.rotation[None], shift[None]))
     poses = to_user_frame(search_beside(there, start, scene.settings.zoomed)[:1], there)
     if not len(poses):
         return found
-    rotation, likelihood = poses.rotation[0], float(poses.log_likelihood[0]) + math.log(sets.image.solid_angle)
-    middle = rotation @ sets.middle + poses.translation[0]
-    return AtZoom(zoom * found.zoom, sets, rotation, middle, float(poses.scale[0]), likelihood)
+    rotation, likelihood = poses.rotation[0], float(poses.log_likelihood[0]) + math.log(problem.image.solid_angle)
+    middle = rotation @ problem.middle + poses.translation[0]
+    return AtZoom(zoom * found.zoom, problem, rotation, middle, float(poses.scale[0]), likelihood)
 
 
-def _alarms(sets: PointSets, other: LensFit, rule: Evidence) -> float:
+def _alarms(problem: Problem, other: LensFit, rule: Evidence) -> float:
     """Return log10 of the number of false alarms of a pose whose lens is unknown too."""
     lens = UnknownFocal(2 * math.log(rule.zoomed.widest))
-    zoomed = replace(at_focal_length(sets, other.zoom), focal=lens)
+    zoomed = replace(at_focal_length(problem, other.zoom), focal=lens)
     if other.radial is not None:
-        bearings = undistort(sets.bearings, other.zoom, other.radial)
+        bearings = undistort(problem.bearings, other.zoom, other.radial)
         outermost = float(((bearings[:, :2] / bearings[:, 2:]) ** 2).sum(-1).max())
         lens = lens._replace(radial_sigma=math.inf, radial_range=2 * rule.zoomed.bend / outermost)
-        zoomed = replace(sets, bearings=bearings, focal=lens)
-    translation = other.middle - other.rotation @ sets.middle
+        zoomed = replace(problem, bearings=bearings, focal=lens)
+    translation = other.middle - other.rotation @ problem.middle
     return float(alarms_of(zoomed, other.rotation[None], translation[None]).own[0])
 
 
-def at_focal_length(sets: PointSets, zoom: float) -> PointSets:
+def at_focal_length(problem: Problem, zoom: float) -> Problem:
     """The same image points, seen with `zoom` times the focal length."""
-    bearings = sets.bearings * (1 / zoom, 1 / zoom, 1)
-    return replace(sets, bearings=bearings / np.linalg.norm(bearings, axis=-1, keepdims=True))
+    bearings = problem.bearings * (1 / zoom, 1 / zoom, 1)
+    return replace(problem, bearings=bearings / np.linalg.norm(bearings, axis=-1, keepdims=True))
 
 
 def _against_repetitions(
     result: SearchResult,
-    sets: PointSets,
+    problem: Problem,
     entered: Callable[[], Scene],
     rule: Evidence,
     looks: float | int,
@@ -163,11 +163,11 @@ def _against_repetitions(
     """
     if result.verdict != "confident":
         return result
-    if contested and not is_symmetric(result.candidates, sets, rule):
+    if contested and not is_symmetric(result.candidates, problem, rule):
         return result
-    best, scale = result.best, max(result.residual, sets.image.scales[0])
+    best, scale = result.best, max(result.residual, problem.image.scales[0])
     least = rule.repetitions.symmetric if contested else 0.0
-    repeated, motions = repeated_poses(sets, *best, scale, rule, least=least)
+    repeated, motions = repeated_poses(problem, *best, scale, rule, least=least)
     if not len(repeated):
         return result
     poses, limits = (repeated.rotation, repeated.translation), rule.repetitions
@@ -175,15 +175,17 @@ def _against_repetitions(
         rivals = repeated
         limits = replace(limits, most_missing=1e-12)
     else:
-        rivals = with_false_alarms(polished(entered(), *poses, scale), sets)
+        rivals = with_false_alarms(polished(entered(), *poses, scale), problem)
     others = rivals.rotation, rivals.translation
-    behind = decades_behind(sets, best, poses, others, scale, limits, fraction=float(motions.fraction.min(initial=1.0)))
+    behind = decades_behind(
+        problem, best, poses, others, scale, limits, fraction=float(motions.fraction.min(initial=1.0))
+    )
     behind = np.maximum(behind, 0) if motions.complete else np.zeros(len(rivals))
     if contested and (behind >= rule.lead).all():
         return result
     alarms = np.minimum(rivals.log10_false_alarms, result.log10_false_alarms + behind)
     candidates = Hypotheses.concatenate([result.candidates, replace(rivals, log10_false_alarms=alarms)])
-    beside = judged(candidates, sets, batches=result.batches, looks=looks, exhaustive=exhaustive, rule=rule)
+    beside = judged(candidates, problem, batches=result.batches, looks=looks, exhaustive=exhaustive, rule=rule)
     if np.array_equal(beside.best[1], best[1]):
         return beside
-    return _against_repetitions(beside, sets, entered, rule, looks, exhaustive, contested)
+    return _against_repetitions(beside, problem, entered, rule, looks, exhaustive, contested)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ImagePoints:
-    """What is evidence of image points (`bpnp.search.point_sets`).
+    """What is evidence of image points (`bpnp.search.problem`).
 
     scale_step: from one scale of the residuals to the next. coarsest: scale in spacings sqrt(A / m) of the points;
     beyond, only the outline fits. floor: smallest scale in spreads of the bearings, some hundredths of a pixel of an

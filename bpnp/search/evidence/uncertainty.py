@@ -12,7 +12,7 @@ from scipy.special import fdtrc, fdtri, stdtrit
 from bpnp.poses import turned_by
 from bpnp.search.evidence.partners import across, facing, partners
 from bpnp.search.evidence.settings import Evidence
-from bpnp.search.point_sets import PointSets
+from bpnp.search.problem import Problem
 from bpnp.search.propose.lens import LensFit, centre_columns, fit_lens, lens_columns
 from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import GravityPrior, PosePrior
@@ -40,7 +40,7 @@ BLOCKS = 4  # of image points, along each axis of the image
 FIXED = 1e-9  # least eigenvalue of the information, in units of its own size, of points that fix a pose
 
 
-def rotation_bound(sets: PointSets, linear: "Linearised | None", count: float) -> float:
+def rotation_bound(problem: Problem, linear: "Linearised | None", count: float) -> float:
     """Angle, radians, that the error of the rotation exceeds once in a thousand; see `exceeded_once`.
 
     linear: `linearised` with the standard deviation of the residuals, estimated from `count` matches.
@@ -49,34 +49,34 @@ def rotation_bound(sets: PointSets, linear: "Linearised | None", count: float) -
     >>> rng = np.random.default_rng(0)
     >>> points = rng.uniform(-1, 1, (12, 3))
     >>> seen = points + [0, 0, 6]
-    >>> sets = PointSets(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
-    >>> linear = linearised(sets, np.eye(3), np.array([0.0, 0, 6]), 1e-3)
-    >>> bounds = [rotation_bound(sets, linear, count) for count in (4.0, 12.0)]
+    >>> problem = Problem(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
+    >>> linear = linearised(problem, np.eye(3), np.array([0.0, 0, 6]), 1e-3)
+    >>> bounds = [rotation_bound(problem, linear, count) for count in (4.0, 12.0)]
     >>> [round(math.degrees(bound), 1) for bound in bounds]
     [7.8, 0.7]
     """
     covariance = local_covariance(linear)
-    return math.inf if covariance is None else exceeded_once(covariance[:3, :3], 2 * count - sets.fitted)
+    return math.inf if covariance is None else exceeded_once(covariance[:3, :3], 2 * count - problem.fitted)
 
 
-def is_redundant(sets: PointSets, count: float) -> bool:
+def is_redundant(problem: Problem, count: float) -> bool:
     """Return whether a pose stays overdetermined without one of its matches.
 
     Args:
-        sets: Points of the problem; `sets.fitted` is the number of unknowns.
+        problem: Points of the problem; `problem.fitted` is the number of unknowns.
         count: Expected number of matches. Each one gives two equations.
 
-    >>> sets = PointSets(np.eye(3), np.eye(3))
-    >>> [is_redundant(sets, count) for count in (4.0, 4.9)]
+    >>> problem = Problem(np.eye(3), np.eye(3))
+    >>> [is_redundant(problem, count) for count in (4.0, 4.9)]
     [False, True]
     """
-    return 2 * (round(count) - 1) > sets.fitted
+    return 2 * (round(count) - 1) > problem.fitted
 
 
-def focal_bound(sets: PointSets, linear: "Linearised | None", count: float) -> float:
+def focal_bound(problem: Problem, linear: "Linearised | None", count: float) -> float:
     """Share by which the focal length may be wrong, exceeded once in a thousand; see `exceeded_once`."""
     covariance = local_covariance(linear)
-    return math.inf if covariance is None else share_bound(covariance[POSE:, POSE:], 2 * count - sets.fitted)
+    return math.inf if covariance is None else share_bound(covariance[POSE:, POSE:], 2 * count - problem.fitted)
 
 
 def share_bound(covariance: Array, free: float) -> float:
@@ -125,20 +125,21 @@ def is_within(error: Array, covariance: Array, free: float | int) -> bool:
     return bool(squared < size * fdtri(size, free, 1 - EXCEEDED))
 
 
-def pose_covariance(sets: PointSets, linear: "Linearised | None", count: float, origin: Array) -> Array | None:
+def pose_covariance(problem: Problem, linear: "Linearised | None", count: float) -> Array | None:
     """Covariance (6, 6) of a pose, None where the points do not fix it; (7, 7) with the logarithm of a focal length
     that is fitted.
 
-    Of (w, v): the true pose is R' = exp([w]x) R, t' = t + v, w in radians in the camera's axes, v in scene units; of a
-    scene whose points are `sets.points3d` plus `origin`. `local_covariance`, times the square of the quantile of
+    Of (w, v): the true pose is R' = exp([w]x) R, t' = t + v, w in radians in the camera's axes, v in the user's unit,
+    and t the translation in the user's coordinates. `local_covariance`, times the square of the quantile of
     Student's t that has one sigma of a normal distribution, as the scale is estimated from `count` matches.
     """
     covariance = local_covariance(linear)
     if covariance is None or linear is None:
         return None
-    free = max(2 * count - sets.fitted, 1.0)
+    free = max(2 * count - problem.fitted, 1.0)
     moved = np.eye(len(covariance))  # the shift of the middle, as that of the origin: v = s + (R m) x w
-    moved[3:POSE, :3] = crossed(linear.rotation @ (sets.middle + origin))
+    moved[3:POSE, 3:POSE] *= problem.size
+    moved[3:POSE, :3] = crossed(linear.rotation @ problem.middle_of_user)
     return np.asarray(float(stdtrit(free, ONE_SIGMA)) ** 2 * moved @ covariance @ moved.T)
 
 
@@ -192,24 +193,24 @@ def local_covariance(linear: "Linearised | None") -> Array | None:
     covariance = _of_louis(linear)
     if covariance is not None:
         return covariance
-    sharper = linearised(linear.sets, linear.rotation, linear.translation, linear.scale / math.sqrt(2))
+    sharper = linearised(linear.problem, linear.rotation, linear.translation, linear.scale / math.sqrt(2))
     covariance = None if sharper is None else _of_louis(sharper)
     return None if covariance is None else 2 * covariance
 
 
 def _of_louis(linear: "Linearised") -> Array | None:
     """See `local_covariance`; None where the information is not positive definite."""
-    sets, probability, chosen = linear.sets, linear.probability, linear.sets.image.chosen
+    problem, probability, chosen = linear.problem, linear.probability, linear.problem.image.chosen
     score = np.einsum("kab,ka->kb", linear.jacobian, linear.residual)
     count, size = score.shape
     of_point = csr_array((probability, (linear.image, np.arange(count))), (len(chosen), count))
     expected = of_point @ score
     each = linear.jacobian.transpose(0, 2, 1) @ linear.jacobian - score[:, :, None] * score[:, None]
     own = (of_point @ each.reshape(count, -1)).reshape(-1, size, size) + expected[:, :, None] * expected[:, None]
-    if sets.focal is not None:
-        block = _blocks(sets, of_point.sum(1))
+    if problem.focal is not None:
+        block = _blocks(problem, of_point.sum(1))
         expected, own = (np.stack([each[block == b].sum(0) for b in np.unique(block)]) for each in (expected, own))
-    share = len(sets.bearings) / len(chosen)
+    share = len(problem.bearings) / len(chosen)
     known = _known(linear)
     observed = share * own.sum(0) + known
     complete = np.einsum("k,kab,kab->b", probability, linear.jacobian, linear.jacobian)
@@ -221,7 +222,7 @@ def _of_louis(linear: "Linearised") -> Array | None:
     root = unit[:, None] * vectors / np.sqrt(values)
     steps = expected @ root
     matters = np.flatnonzero(own.reshape(-1, size * size) @ (root @ root.T).ravel() > SLIGHT)
-    if not is_redundant(sets, float(probability.sum()) * share):
+    if not is_redundant(problem, float(probability.sum()) * share):
         matters = matters[:0]  # without one of so few matches the others fix several poses, or none
     without = np.eye(size) - root.T @ own[matters] @ root
     fixed = np.linalg.eigvalsh(without)[:, 0] > FIXED  # also without the point
@@ -229,22 +230,22 @@ def _of_louis(linear: "Linearised") -> Array | None:
     ratio, axes = np.linalg.eigh(share * steps.T @ steps + root.T @ known @ root)
     along = root @ axes
     covariance = along * np.maximum(ratio, 1.0) @ along.T
-    if sets.focal is None:
+    if problem.focal is None:
         return np.asarray(covariance)
     considered = centre_columns(linear.seen) / linear.scale
     moved = root @ root.T @ (share * np.einsum("k,kia,kib->ab", probability, linear.jacobian, considered))
-    covariance = covariance + sets.focal.centre_sigma**2 * moved @ moved.T
+    covariance = covariance + problem.focal.centre_sigma**2 * moved @ moved.T
     return np.asarray(covariance[: POSE + 1, : POSE + 1])
 
 
-def _blocks(sets: PointSets, matched: Array) -> Labels:
+def _blocks(problem: Problem, matched: Array) -> Labels:
     """Return the block (k,) of each chosen image point, of at most `BLOCKS`^2 with as many matched points each.
 
     Args:
-        sets: Points.
+        problem: Points.
         matched: (k,) probability that an image point has a match.
     """
-    x, y = ((sets.bearings[sets.image.chosen] - sets.image.centre) @ sets.image.axes).T
+    x, y = ((problem.bearings[problem.image.chosen] - problem.image.centre) @ problem.image.axes).T
     column, row = _quantile(x, matched), np.zeros(len(x), np.int64)
     for k in range(BLOCKS):
         row[column == k] = _quantile(y[column == k], matched[column == k])
@@ -269,7 +270,7 @@ class Linearised(NamedTuple):
     scale: standard deviation of the residuals, radians.
     """
 
-    sets: PointSets
+    problem: Problem
     rotation: Array
     translation: Array
     image: Labels
@@ -283,34 +284,34 @@ class Linearised(NamedTuple):
     @property
     def middle(self) -> Array:
         """(3,) of the scene, seen from the camera, in its axes."""
-        return np.asarray(self.rotation @ self.sets.middle + self.translation)
+        return np.asarray(self.rotation @ self.problem.middle + self.translation)
 
 
-def linearised(sets: PointSets, rotation: Array, translation: Array, scale: float) -> Linearised | None:
+def linearised(problem: Problem, rotation: Array, translation: Array, scale: float) -> Linearised | None:
     """A pose with the matches that are within a few scales, radians, of each other; None if there is none."""
-    camera = sets.points3d @ rotation.T + translation
-    places = facing(sets, camera, rotation)
+    camera = problem.points3d @ rotation.T + translation
+    places = facing(problem, camera, rotation)
     if not len(places):
         return None
     camera = camera[places]
     depth = np.linalg.norm(camera, axis=-1, keepdims=True)
     seen = camera / depth
-    i, j, density, every = partners(sets, seen, places, sets.image.chosen, scale)
+    i, j, density, every = partners(problem, seen, places, problem.image.chosen, scale)
     if not len(i):
         return None
-    p, u = camera[j] - rotation @ sets.middle - translation, seen[j]
+    p, u = camera[j] - rotation @ problem.middle - translation, seen[j]
     by_shift = across(u) / depth[j, None]
     columns = [np.cross(p[:, None], by_shift, axisb=2, axisc=2), by_shift]
-    if sets.focal is not None:
-        columns.append(lens_columns(u, sets.focal.radial)[..., : 1 + (sets.focal.radial_sigma > 0)])
+    if problem.focal is not None:
+        columns.append(lens_columns(u, problem.focal.radial)[..., : 1 + (problem.focal.radial_sigma > 0)])
     jacobian = np.concatenate(columns, -1) / scale
-    residual = (sets.bearings[sets.image.chosen[i]] - u) / scale
-    return Linearised(sets, rotation, translation, i, density / every[i], u, p, residual, jacobian, scale)
+    residual = (problem.bearings[problem.image.chosen[i]] - u) / scale
+    return Linearised(problem, rotation, translation, i, density / every[i], u, p, residual, jacobian, scale)
 
 
 def _known(linear: Linearised) -> Array:
     """Return the information (p, p) of the priors about rotation, shift and the fitted parameters of the lens."""
-    focal, prior = linear.sets.focal, linear.sets.prior
+    focal, prior = linear.problem.focal, linear.problem.prior
     size = linear.jacobian.shape[-1]
     information = np.zeros((size, size))
     if focal is not None:
@@ -322,7 +323,7 @@ def _known(linear: Linearised) -> Array:
     elif isinstance(prior, PosePrior):
         information[:3, :3] = np.eye(3) / math.radians(prior.rotation_sigma_deg) ** 2
         if prior.translation is not None:
-            moved = np.concatenate([crossed(linear.rotation @ linear.sets.middle), np.eye(3)], 1)
+            moved = np.concatenate([crossed(linear.rotation @ linear.problem.middle), np.eye(3)], 1)
             information[:POSE, :POSE] += moved.T @ moved / prior.translation_sigma**2
     return information
 
@@ -359,8 +360,8 @@ def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = 
     >>> rng = np.random.default_rng(0)
     >>> points = rng.uniform(-1, 1, (40, 3))
     >>> seen = points + [0, 0, 5] + 1e-3 * rng.standard_normal((40, 3))
-    >>> sets = PointSets(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
-    >>> systematic_misfit(linearised(sets, np.eye(3), np.array([0, 0, 5.0]), 2e-4), 40.0)
+    >>> problem = Problem(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
+    >>> systematic_misfit(linearised(problem, np.eye(3), np.array([0, 0, 5.0]), 2e-4), 40.0)
     Misfit(turn=0.0, shift=0.0, zoom=1.0, radial=0.0)
     """
     if linear is None:
@@ -380,7 +381,7 @@ def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = 
         moved, step = _moved(products, pose, fitted, free, chance)
         zoom = math.exp(float(step[0])) if len(step) == 1 else 1.0
         found.append(Misfit(float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:])), zoom))
-    pose_of = linear.sets, linear.rotation, linear.middle, linear.scale
+    pose_of = linear.problem, linear.rotation, linear.middle, linear.scale
     other = fit_lens(*pose_of) if found[0].zoom != 1 else None
     if other is not None:
         found.append(misfit_of(linear.rotation, linear.middle, other))
@@ -407,7 +408,7 @@ def bends_significantly(linear: Linearised | None, count: float, rule: Evidence 
         count: Number of matches.
         rule: Settings.
     """
-    if linear is None or not (linear.sets.bearings[:, 2] > 0).all():
+    if linear is None or not (linear.problem.bearings[:, 2] > 0).all():
         return False
     free = 2 * min(count, float(linear.probability.sum())) - POSE - 2
     lens = lens_columns(linear.seen, 0.0) / linear.scale

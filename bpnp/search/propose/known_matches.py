@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.search.evidence.partners import across, explained
 from bpnp.search.hypotheses import Hypotheses
-from bpnp.search.point_sets import PointSets
+from bpnp.search.problem import Problem
 from bpnp.search.propose.minimal_solvers import p3p_poses
 
 Array = NDArray[np.float64]
@@ -29,31 +29,31 @@ SETTLED, EXACT = 1e-6, 1e-24  # relative and absolute change of a sum of squares
 SAME_DEG, SAME_SHIFT = 0.1, 2e-3  # of refined poses that are one optimum, the shift in distances
 
 
-def known_matches(sets: PointSets) -> tuple[Labels, Labels] | None:
+def known_matches(problem: Problem) -> tuple[Labels, Labels] | None:
     """Return the matches that the labels leave, or None.
 
     Returns:
         Indices (k,) of image points and (k,) of scene points, where each point with a possible partner has one alone,
         and there are more matches than fix a pose. Otherwise None.
 
-    >>> sets = PointSets(np.eye(4, 3), np.eye(4, 3), labels2d=np.array([3, 2, 1, 0]), labels3d=np.arange(4))
-    >>> known_matches(sets)
+    >>> problem = Problem(np.eye(4, 3), np.eye(4, 3), labels2d=np.array([3, 2, 1, 0]), labels3d=np.arange(4))
+    >>> known_matches(problem)
     (array([3, 2, 1, 0]), array([0, 1, 2, 3]))
     """
-    if sets.labels2d is None or sets.labels3d is None or sets.odds2d is not None:
+    if problem.labels2d is None or problem.labels3d is None or problem.odds2d is not None:
         return None
-    if min(sets.labels2d.min(), sets.labels3d.min()) < 0:
+    if min(problem.labels2d.min(), problem.labels3d.min()) < 0:
         return None
-    values, j, i = np.intersect1d(sets.labels3d, sets.labels2d, return_indices=True)
-    counts = [np.isin(side, values).sum() for side in (sets.labels2d, sets.labels3d)]
+    values, j, i = np.intersect1d(problem.labels3d, problem.labels2d, return_indices=True)
+    counts = [np.isin(side, values).sum() for side in (problem.labels2d, problem.labels3d)]
     return (i, j) if FIXING < len(values) == counts[0] == counts[1] else None
 
 
-def poses_of_matches(sets: PointSets, i: Labels, j: Labels, seed: int = 0) -> Hypotheses:
+def poses_of_matches(problem: Problem, i: Labels, j: Labels, seed: int = 0) -> Hypotheses:
     """Return distinct poses that matches fit best, in the user's coordinates.
 
     Args:
-        sets: Points of the problem.
+        problem: Points of the problem.
         i: (k,) indices of image points, more than three.
         j: (k,) indices of their scene points.
         seed: Of the triples that are drawn where there are more than `TRIPLES`.
@@ -62,7 +62,7 @@ def poses_of_matches(sets: PointSets, i: Labels, j: Labels, seed: int = 0) -> Hy
         The least-squares poses of all matches, then those of the matches that agree, each with the fewest residuals
         first; empty if no triple has a pose.
     """
-    rays, points = sets.bearings[i], sets.points3d[j]
+    rays, points = problem.bearings[i], problem.points3d[j]
     middle = points.mean(0)
     size = max(float(np.sqrt(((points - middle) ** 2).sum(-1).mean())), 1e-300)
     points = (points - middle) / size
@@ -74,8 +74,8 @@ def poses_of_matches(sets: PointSets, i: Labels, j: Labels, seed: int = 0) -> Hy
         return Hypotheses.empty()
     some = np.arange(len(i)) if len(i) <= SCORED else rng.choice(len(i), SCORED, replace=False)
     squared = _squared(rays[some], points[some], poses)
-    scales = _scales(sets)
-    density = 1 / sets.image.solid_angle
+    scales = _scales(problem)
+    density = 1 / problem.image.solid_angle
     agreeing, scale_of = _agreement(squared, scales, density)
     every = poses[np.argsort(np.sort(np.minimum(squared, 1.0), 1)[:, : -(len(some) // 4) or None].sum(1))[:REFINED]]
     every = _refined(rays, points, every, np.ones((len(every), len(i))))
@@ -98,7 +98,7 @@ def poses_of_matches(sets: PointSets, i: Labels, j: Labels, seed: int = 0) -> Hy
     poses = _distinct(np.concatenate(ends)) if ends else poses[:0]
     rotation = poses[:, :3]
     translation = size * poses[:, 3] - rotation @ middle
-    return _scored(sets, i, j, rotation, translation, scales)
+    return _scored(problem, i, j, rotation, translation, scales)
 
 
 def _triples(count: int, rng: np.random.Generator) -> Labels:
@@ -109,10 +109,10 @@ def _triples(count: int, rng: np.random.Generator) -> Labels:
     return np.argsort(rng.random((TRIPLES, count)), 1)[:, :3] if count < 64 else rng.integers(count, size=(TRIPLES, 3))
 
 
-def _scales(sets: PointSets) -> Array:
+def _scales(problem: Problem) -> Array:
     """Return scales (S,) of residuals, radians: from the smallest of the image up to its spread."""
-    smallest = float(sets.image.scales[0])
-    return np.geomspace(smallest, max(2 * smallest, sets.image.spread), 12)
+    smallest = float(problem.image.scales[0])
+    return np.geomspace(smallest, max(2 * smallest, problem.image.spread), 12)
 
 
 def _squared(rays: Array, points: Array, poses: Array) -> Array:
@@ -184,14 +184,14 @@ def _distinct(poses: Array) -> Array:
     return poses[kept]
 
 
-def _scored(sets: PointSets, i: Labels, j: Labels, rotation: Array, translation: Array, scales: Array) -> Hypotheses:
+def _scored(problem: Problem, i: Labels, j: Labels, rotation: Array, translation: Array, scales: Array) -> Hypotheses:
     """Return poses (h, 3, 3), (h, 3) with the scale of their residuals, and score and matches at it."""
     poses = np.concatenate([rotation, translation[:, None]], 1)
-    squared, density = _squared(sets.bearings[i], sets.points3d[j], poses), 1 / sets.image.solid_angle
+    squared, density = _squared(problem.bearings[i], problem.points3d[j], poses), 1 / problem.image.solid_angle
     own = scales[_agreement(squared, scales, density)[1]]
     weight = _inlier_probability(squared, own[:, None], density)
     free = np.maximum(2 * weight.sum(1) - 2 * FIXING, 1.0)
     scale = np.clip(np.sqrt((weight * squared).sum(1) / free), scales[0], scales[-1])
-    found = [explained(sets, *each) for each in zip(rotation, translation, scale, strict=True)]
+    found = [explained(problem, *each) for each in zip(rotation, translation, scale, strict=True)]
     score, count = (np.array([one[k] for one in found]) for k in (0, 1))
     return Hypotheses.from_poses(rotation, translation, log_likelihood=score, match_count=count, scale=scale)

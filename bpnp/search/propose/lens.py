@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.search.evidence.partners import across, facing, partners
 from bpnp.search.evidence.settings import OtherFocal
-from bpnp.search.point_sets import PointSets
+from bpnp.search.problem import Problem
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
@@ -49,7 +49,7 @@ class LensFit(NamedTuple):
 
 
 def fit_lens(
-    sets: PointSets, rotation: Array, middle: Array, scale: float, radial: float | None = None
+    problem: Problem, rotation: Array, middle: Array, scale: float, radial: float | None = None
 ) -> LensFit | None:
     """Fit pose and focal length, and the radial coefficient if wanted, to soft matches by Gauss-Newton steps.
 
@@ -57,7 +57,7 @@ def fit_lens(
     focal length has converged.
 
     Args:
-        sets: Points; the bearings are those of a camera without distortion.
+        problem: Points; the bearings are those of a camera without distortion.
         rotation: (3, 3) rotation to start from.
         middle: (3,) middle of the scene in the camera's frame, to start from.
         scale: Scale of the residuals, radians.
@@ -70,23 +70,23 @@ def fit_lens(
     >>> points = rng.uniform(-1, 1, (80, 3)) + [0, 0, 3]
     >>> x = points[:, :2] / points[:, 2:]
     >>> seen = np.c_[1.05 * (1 - 0.1 * (x**2).sum(1, keepdims=True)) * x, np.ones(80)]
-    >>> sets = PointSets(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
-    >>> fit = fit_lens(sets, np.eye(3), sets.middle, 1e-3, radial=0.0)
+    >>> problem = Problem(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
+    >>> fit = fit_lens(problem, np.eye(3), problem.middle, 1e-3, radial=0.0)
     >>> round(fit.zoom, 3), round(fit.radial, 3)
     (1.05, -0.1)
     """
-    chosen = sets.image.chosen
+    chosen = problem.image.chosen
     some = chosen[:: max(len(chosen) // OtherFocal.bearings, 1)]
     start = LensFit(rotation, middle, 1.0, radial, np.empty((0, 0)), np.empty(0))
-    step = _linearise(sets, some, WIDTHS[0] * scale, start)
+    step = _linearise(problem, some, WIDTHS[0] * scale, start)
     for _ in range(MOST_ROUNDS):
         before = 0.0 if step is None else math.log(step.zoom)
         for width in WIDTHS:
-            step = None if step is None else _take_step(sets, some, width * scale, step)
+            step = None if step is None else _take_step(problem, some, width * scale, step)
         if step is None or abs(math.log(step.zoom) - before) < SAME_ZOOM:
             break
     for _ in range(MOST_STEPS):
-        last, step = step, None if step is None else _take_step(sets, chosen, scale, step)
+        last, step = step, None if step is None else _take_step(problem, chosen, scale, step)
         if last is None or step is None or abs(math.log(step.zoom / last.zoom)) < SETTLED_ZOOM:
             break
     return step
@@ -139,10 +139,10 @@ def centre_columns(seen: Array) -> Array:
     return np.asarray(across(seen)[:, :, :2] * np.maximum(seen[:, 2], 0.0)[:, None, None])
 
 
-def _linearise(sets: PointSets, chosen: Labels, scale: float, at: LensFit) -> LensFit | None:
+def _linearise(problem: Problem, chosen: Labels, scale: float, at: LensFit) -> LensFit | None:
     """Return the same pose and lens with its normal equations, None without a match."""
-    turned = (sets.points3d - sets.middle) @ at.rotation.T
-    places = facing(sets, turned + at.middle, at.rotation)
+    turned = (problem.points3d - problem.middle) @ at.rotation.T
+    places = facing(problem, turned + at.middle, at.rotation)
     camera = turned[places] + at.middle
     x, squared = np.zeros((len(camera), 2)), np.zeros(len(camera))
     if at.radial is not None:
@@ -154,13 +154,13 @@ def _linearise(sets: PointSets, chosen: Labels, scale: float, at: LensFit) -> Le
     seen = camera * np.column_stack([stretch, stretch, np.ones(len(camera))])
     length = np.linalg.norm(seen, axis=-1)
     seen /= length[:, None]
-    i, j, density, every = partners(sets, seen, places, chosen, scale, FEW_PARTNERS)
+    i, j, density, every = partners(problem, seen, places, chosen, scale, FEW_PARTNERS)
     if not len(i):
         return None
     probability = density / every[i]
     weights = np.bincount(j, probability, len(seen))
     used = np.flatnonzero(weights)
-    seen_as = np.stack([np.bincount(j, probability * axis, len(seen)) for axis in sets.bearings[chosen[i]].T], -1)
+    seen_as = np.stack([np.bincount(j, probability * axis, len(seen)) for axis in problem.bearings[chosen[i]].T], -1)
     u, weights, camera, stretch, squared = seen[used], weights[used], camera[used], stretch[used], squared[used]
     on_sphere = across(u) / length[used, None, None]
     outwards = on_sphere[:, :, :2] @ camera[:, :2, None]
@@ -178,9 +178,9 @@ def _linearise(sets: PointSets, chosen: Labels, scale: float, at: LensFit) -> Le
     return at._replace(products=products, gradient=gradient)
 
 
-def _take_step(sets: PointSets, chosen: Labels, scale: float, at: LensFit) -> LensFit | None:
+def _take_step(problem: Problem, chosen: Labels, scale: float, at: LensFit) -> LensFit | None:
     """Take a Gauss-Newton step, and linearise with matches of the given scale."""
-    products, gradient, focal = at.products, at.gradient, sets.focal
+    products, gradient, focal = at.products, at.gradient, problem.focal
     if focal is not None and math.isfinite(focal.sigma):
         products, gradient = products.copy(), gradient.copy()
         products[6, 6] += (scale / focal.sigma) ** 2
@@ -191,7 +191,9 @@ def _take_step(sets: PointSets, chosen: Labels, scale: float, at: LensFit) -> Le
     zoom = at.zoom * math.exp(float(np.clip(step[6], -MOST_ZOOM, MOST_ZOOM)))
     radial = at.radial
     if radial is not None:
-        outermost = float(((sets.bearings[:, :2] / sets.bearings[:, 2:]) ** 2).sum(-1).max())
+        outermost = float(((problem.bearings[:, :2] / problem.bearings[:, 2:]) ** 2).sum(-1).max())
         radial += float(np.clip(step[7], -MOST_BEND / outermost, MOST_BEND / outermost))
     rotation = Rotation.from_rotvec(step[:3]).as_matrix() @ at.rotation
-    return _linearise(sets, chosen, scale, LensFit(rotation, at.middle + step[3:6], zoom, radial, products, gradient))
+    return _linearise(
+        problem, chosen, scale, LensFit(rotation, at.middle + step[3:6], zoom, radial, products, gradient)
+    )

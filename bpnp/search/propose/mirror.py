@@ -8,17 +8,17 @@ from bpnp.loops.parallel import Deadline
 from bpnp.search.enumeration.search import enumerate_poses, is_enumerable
 from bpnp.search.enumeration.settings import DEFAULT
 from bpnp.search.evidence.false_alarms import alarms_of
-from bpnp.search.point_sets import PointSets
+from bpnp.search.problem import Problem
 
 HYPOTHESES = 20_000  # that are tried, some 10 ms: a right pose of clean points is among the first thousands
 MIRROR = np.array([1.0, 1.0, -1.0])
 
 
-def mirrored_alarms(sets: PointSets, deadline: Deadline) -> float:
+def mirrored_alarms(problem: Problem, deadline: Deadline) -> float:
     """Compute log10 of the false alarms of a mirrored scene.
 
     Args:
-        sets: Points of a problem without a significant pose.
+        problem: Points of a problem without a significant pose.
         deadline: When to stop.
 
     Returns:
@@ -27,14 +27,14 @@ def mirrored_alarms(sets: PointSets, deadline: Deadline) -> float:
 
     >>> points = np.random.default_rng(0).uniform(-1, 1, (9, 3))
     >>> seen = points * MIRROR + [0, 0, 6]
-    >>> sets = PointSets(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
-    >>> mirrored_alarms(sets, Deadline()) < -5
+    >>> problem = Problem(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
+    >>> mirrored_alarms(problem, Deadline()) < -5
     True
     """
-    if sets.prior is not None or not is_enumerable(sets) or deadline.passed():
+    if problem.prior is not None or not is_enumerable(problem) or deadline.passed():
         return np.inf
-    normals = None if sets.normals3d is None or sets.cosines3d is not None else sets.normals3d * MIRROR
-    mirrored = replace(sets, points3d=sets.points3d * MIRROR, normals3d=normals, cosines3d=None)
+    normals = None if problem.normals3d is None or problem.cosines3d is not None else problem.normals3d * MIRROR
+    mirrored = replace(problem, points3d=problem.points3d * MIRROR, normals3d=normals, cosines3d=None)
     found = enumerate_poses(mirrored, deadline=deadline.at, settings=replace(DEFAULT, most=HYPOTHESES)).poses
     if not len(found):
         return np.inf

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from bpnp.search.evidence.false_alarms import FIXING, Terms, camera_terms, directions_of, log10_nfa, log10_tests
 from bpnp.search.evidence.uncertainty import Linearised, linearised, local_covariance
 from bpnp.search.hypotheses import Hypotheses
-from bpnp.search.point_sets import PointSets
+from bpnp.search.problem import Problem
 from bpnp.search.scene import Scene
 
 Array = NDArray[np.float64]
@@ -35,11 +35,15 @@ SAME_CENTRE = 1e-6  # of the farthest centre from the origin of the rig
 
 class Rig:
     """Cameras with their points, all of the same scene; `mounts`, camera_k = C_k rig + c_k. Its translations are
-    homogeneous; is_metric: whether their last number is 1, else it is looked for."""
+    homogeneous; is_metric: whether their last number is 1, else it is looked for.
 
-    def __init__(self, sets: Sequence[PointSets], mounts: Sequence[Pose], *, is_metric: bool = True) -> None:
-        self.sets, self.mounts = sets, mounts
-        self.floor = max(each.floor or float(each.image.scales[0]) for each in self.sets)
+    c_k is in sizes of the scene, as are the translations: a rig and a scene in one unit are divided by the same number.
+    """
+
+    def __init__(self, problems: Sequence[Problem], mounts: Sequence[Pose], *, is_metric: bool = True) -> None:
+        self.problems = problems
+        self.mounts = [(turn, shift / problem.size) for problem, (turn, shift) in zip(problems, mounts, strict=True)]
+        self.floor = max(each.floor or float(each.image.scales[0]) for each in self.problems)
         self.unknowns = 6 if is_metric else 7
         centres = np.array([-turn.T @ shift for turn, shift in mounts])
         least = SAME_CENTRE * np.abs(centres).max()
@@ -72,8 +76,8 @@ class Rig:
         """Each camera that sees a point near an image point, and the matrix (6, unknowns) that makes a step of the rig
         one of it; the seventh number is the logarithm of the scale."""
         found = []
-        for k, sets in enumerate(self.sets):
-            linear = linearised(sets, *self.pose_of(k, rotation, translation), scale)
+        for k, problem in enumerate(self.problems):
+            linear = linearised(problem, *self.pose_of(k, rotation, translation), scale)
             if linear is not None:
                 turn, shift = self.mounts[k]
                 by_scale = np.r_[np.zeros(3), -translation[3] * shift]
@@ -83,14 +87,16 @@ class Rig:
 
     def refined(self, rotation: Array, translation: Array) -> Iterator[tuple[Array, Array, float, float]]:
         """The optimum beside a pose at ever smaller scales, radians, with that scale and the number of matches."""
-        middle = self.sets[0].middle
+        middle = self.problems[0].middle
         for scale in np.geomspace(WIDE, 1.0, STEPS).repeat(AGAIN) * self.floor:
             information, gradient, count = np.zeros((self.unknowns, self.unknowns)), np.zeros(self.unknowns), 0.0
             for turn, linear in self.linearised(rotation, translation, scale):
                 rows = linear.jacobian @ turn
                 information = information + np.einsum("k,kia,kib->ab", linear.probability, rows, rows)
                 gradient = gradient + np.einsum("k,kia,ki->a", linear.probability, rows, linear.residual)
-                count += float(linear.probability.sum()) * len(linear.sets.bearings) / len(linear.sets.image.chosen)
+                count += (
+                    float(linear.probability.sum()) * len(linear.problem.bearings) / len(linear.problem.image.chosen)
+                )
             if count <= self.unknowns - 3:
                 return
             step = np.linalg.lstsq(information, gradient, rcond=None)[0]
@@ -105,17 +111,19 @@ class Rig:
 
         Three matches of a camera fix the pose; of an unknown scale, one more of a camera that is apart from it.
         """
-        tests = math.log10(sum(10 ** log10_tests(each) for each in self.sets))
+        tests = math.log10(sum(10 ** log10_tests(each) for each in self.problems))
         if self.unknowns == 7:
-            tests += math.log10(sum(len(each.bearings) * len(each.points3d) for each in self.sets))
-        cameras, one = self._terms(rotation, translation, scale), np.eye(len(self.sets), dtype=np.int64)
+            tests += math.log10(sum(len(each.bearings) * len(each.points3d) for each in self.problems))
+        cameras, one = self._terms(rotation, translation, scale), np.eye(len(self.problems), dtype=np.int64)
         either = [*self.apart, *(pair[::-1] for pair in self.apart)]
         fixing = FIXING * one if self.unknowns == 6 else np.array([FIXING * one[k] + one[other] for k, other in either])
         return log10_nfa(cameras, tests, fixing.tolist())
 
     def _terms(self, rotation: Array, translation: Array, scale: float | None) -> list[Terms | None]:
-        seen = (directions_of(sets, *self.pose_of(k, rotation, translation)) for k, sets in enumerate(self.sets))
-        return [camera_terms(*each, scale) for each in zip(self.sets, seen, strict=True)]
+        seen = (
+            directions_of(problem, *self.pose_of(k, rotation, translation)) for k, problem in enumerate(self.problems)
+        )
+        return [camera_terms(*each, scale) for each in zip(self.problems, seen, strict=True)]
 
     def evidence(self, rotation: Array, translation: Array, scale: float | None = None) -> Array:
         """log (cameras,) of how much likelier the bearings of each are under a pose than by chance, at the scale of the

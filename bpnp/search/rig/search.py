@@ -44,17 +44,17 @@ def search_rig(rig: Rig, *, clutter: float | None = None, seed: int = 0, deadlin
     """Distinct poses of the rig, best first, and the verdict on the first one; arguments as for `search_poses`."""
     settings = DEFAULT if clutter is None else DEFAULT.expecting(clutter)
     together, searches, few = Together(rig), dict[int, Iterator[Hypotheses]](), dict[int, Hypotheses]()
-    for k, sets in enumerate(rig.sets):
-        if is_enumerable(sets):
-            until = (Clock.now() * (len(rig.sets) - k - 1) + deadline.at) / (len(rig.sets) - k)
-            found = enumerate_poses(sets, deadline=until, is_safe=lambda _: False, settings=PROPOSING)
+    for k, problem in enumerate(rig.problems):
+        if is_enumerable(problem):
+            until = (Clock.now() * (len(rig.problems) - k - 1) + deadline.at) / (len(rig.problems) - k)
+            found = enumerate_poses(problem, deadline=until, is_safe=lambda _: False, settings=PROPOSING)
             few[k] = Hypotheses.from_poses(found.poses.rotation, found.poses.translation)
             together.exhaustive &= found.ended == "exhausted"
             continue
         together.exhaustive = False
-        scene = Scene(sets, seed + k, settings, deadline)
+        scene = Scene(problem, seed + k, settings, deadline)
         if not lacks_partners(scene):
-            together.pools[k] = Pool(scene, sets, no_pose("no pose was found"))
+            together.pools[k] = Pool(scene, problem, no_pose("no pose was found"))
             searches[k] = turns(together.pools[k], None, None)
     rig.join({k: pool.scene for k, pool in together.pools.items()})
     together.take(few, REFINED)
@@ -85,7 +85,7 @@ class Together:
 
     def __init__(self, rig: Rig) -> None:
         self.rig, self.rule, self.exhaustive = rig, DEFAULT.evidence, True
-        self.met = [Hypotheses.empty() for _ in rig.sets]
+        self.met = [Hypotheses.empty() for _ in rig.problems]
         self.starts = Hypotheses.empty(4)
         self.best, self.looked, self.pools = self.starts, self.starts, dict[int, Pool]()
 
@@ -121,7 +121,7 @@ class Together:
         order = distinct(poses.rotation, poses.translation, score, len(self.looked) + 1, apart, math.inf)
         new = poses[order[len(self.looked) :]]
         self.looked = Hypotheses.concatenate([self.looked, new])
-        k = max(self.pools, key=lambda k: len(self.rig.sets[k].bearings))
+        k = max(self.pools, key=lambda k: len(self.rig.problems[k].bearings))
         turn, shift = self.rig.pose_of(k, new.rotation, new.translation)
         if len(new):
             scene = self.pools[k].scene
@@ -140,9 +140,9 @@ class Together:
     def _distinct(self, poses: Hypotheses, score: Array, count: int) -> NDArray[np.int64]:
         """The places of the best poses, of which no two show the middle of the scene to all cameras alike."""
         places = []
-        for k, sets in enumerate(self.rig.sets):
+        for k, problem in enumerate(self.rig.problems):
             turns, shifts = self.rig.pose_of(k, poses.rotation, poses.translation)
-            middle = turns @ sets.middle + shifts
+            middle = turns @ problem.middle + shifts
             distance = np.maximum(np.linalg.norm(middle, axis=-1, keepdims=True), 1e-300)
             places += [middle / distance, np.log(distance)]
         return distinct(poses.rotation, np.concatenate(places, -1), score, count, *SAME)
@@ -157,14 +157,14 @@ class Together:
         """Which poses of a camera are the best one."""
         turn, shift = self.rig.pose_of(k, self.best.rotation[:1], self.best.translation[:1])
         both = np.concatenate([turn, poses.rotation]), np.concatenate([shift, poses.translation])
-        return self.rig.sets[k].same_pose(*both, self.rule.other_deg, self.rule.other_shift)[1:]
+        return self.rig.problems[k].same_pose(*both, self.rule.other_deg, self.rule.other_shift)[1:]
 
     def may_be_certain(self) -> bool:
         """Whether chance is excluded, and that a better pose was missed."""
         if not len(self.best) or self.best.log10_false_alarms[0] > self.rule.false_alarms:
             return False
         strongest, seen = self._strongest()
-        return missed(seen, self.rig.sets[strongest], self._looks(), self.rule) <= self.rule.missed
+        return missed(seen, self.rig.problems[strongest], self._looks(), self.rule) <= self.rule.missed
 
     def _strongest(self) -> tuple[int, Hypotheses]:
         """The camera in which the best pose has most evidence, and the poses as its own."""
@@ -179,7 +179,7 @@ class Together:
         if result.verdict == "confident":
             strongest, seen = self._strongest()
             known = seen.rotation[0], seen.translation[0], float(seen.scale[0])
-            repeated, _ = repeated_poses(self.rig.sets[strongest], *known, self.rule)
+            repeated, _ = repeated_poses(self.rig.problems[strongest], *known, self.rule)
             turns, shifts = repeated.rotation, repeated.translation
             self._add(self.rig.candidates(*self.rig.rig_of(strongest, turns, shifts, self.best.translation[0, 3])))
             result = self._judged()
@@ -197,12 +197,12 @@ class Together:
         strongest, seen = self._strongest()
         return judged(
             seen,
-            self.rig.sets[strongest],
+            self.rig.problems[strongest],
             batches=self.turns,
             looks=self._looks(),
             exhaustive=self.exhaustive,
             rule=self.rule,
-            rig=[(self.rig.seen(k, self.best), sets) for k, sets in enumerate(self.rig.sets)],
+            rig=[(self.rig.seen(k, self.best), problem) for k, problem in enumerate(self.rig.problems)],
         )
 
 
@@ -227,7 +227,7 @@ def _proposals(rig: Rig, new: Mapping[int, Hypotheses], met: Sequence[Hypotheses
 def _told_by(rig: Rig, pair: tuple[int, int], first: Hypotheses, second: Hypotheses) -> Pose:
     """Poses of the rig in which two cameras agree."""
     (turn, shift), (other, moved) = (rig.mounts[k] for k in pair)
-    middle = rig.sets[0].middle
+    middle = rig.problems[0].middle
     turns, others = (turn.T @ first.rotation).reshape(-1, 9), (other.T @ second.rotation).reshape(-1, 9)
     traces = turns.astype(np.float32) @ others.T.astype(np.float32)
     near = np.flatnonzero(traces.ravel() > 1 + 2 * math.cos(math.radians(AGREE_DEG)))
@@ -248,10 +248,10 @@ def _told_by(rig: Rig, pair: tuple[int, int], first: Hypotheses, second: Hypothe
 def _agreement(rig: Rig, rotations: Array, translations: Array) -> Array:
     """How well poses (p, 3, 3), (p, 4) explain the bearings of all cameras at a wide scale, nats (p,)."""
     total, scale = np.zeros(len(rotations)), WIDE * rig.floor
-    for k, sets in enumerate(rig.sets):
+    for k, problem in enumerate(rig.problems):
         turns, shifts = rig.pose_of(k, rotations, translations)
-        seen = sets.points3d @ turns.transpose(0, 2, 1) + shifts[:, None]
+        seen = problem.points3d @ turns.transpose(0, 2, 1) + shifts[:, None]
         seen /= np.maximum(np.linalg.norm(seen, axis=-1, keepdims=True), 1e-300)
-        nearest = (sets.bearings @ seen.transpose(0, 2, 1)).max(-1)
+        nearest = (problem.bearings @ seen.transpose(0, 2, 1)).max(-1)
         total += np.logaddexp((nearest - 1) / scale**2, -4.0).sum(-1)
     return total

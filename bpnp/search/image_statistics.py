@@ -1,0 +1,64 @@
+"""Statistics of image points: their extent, the scales of their residuals, and which of them lie together."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bpnp.search.evidence.settings import ImagePoints
+from bpnp.search.kernels.neighbours import sums_near
+
+Array = NDArray[np.float64]
+IMAGE = ImagePoints()
+
+
+class ImageStatistics:
+    """Of bearings (m, 3).
+
+    centre: their mean (3,). spread: root mean square distance from it. axes: (3, 2) principal axes on the tangent
+    plane, half_widths: (2,) of the rectangle with their standard deviations, solid_angle: its area, steradians, at
+    most 4 pi.
+    scales: (S,) of residuals, radians, from the smallest that is believed to the largest that is no mere outline.
+    chosen: (k,) places of the image points that are looked at. together: (k, S) how many of them lie within
+    `rule.together` scales.
+    weights: (k, S, S) of the evidence, see `_weights`.
+    """
+
+    def __init__(self, bearings: Array, floor: float | None, rule: ImagePoints = IMAGE) -> None:
+        m = len(bearings)
+        self.centre = bearings.mean(0)
+        centred = bearings - self.centre
+        self.spread = max(float(np.sqrt((centred**2).sum(-1).mean())), 1e-12)
+        variance, axes = np.linalg.eigh(centred.T @ centred / max(m - 1, 1))
+        self.half_widths, self.axes = np.sqrt(3 * np.maximum(variance[1:], 1e-24)), axes[:, 1:]
+        area = 12 * math.sqrt(max(float(variance[1:].prod()), 0.0))
+        self.solid_angle = float(np.clip(area, 1e-24, 4 * math.pi))
+        smallest = max(floor or 0.0, rule.floor * self.spread)
+        largest = max(rule.coarsest * math.sqrt(self.solid_angle / m), 2 * smallest)
+        steps = max(3, 1 + math.ceil(math.log(largest / smallest) / math.log(rule.scale_step)))
+        self.scales = np.geomspace(smallest, largest, steps)
+        self.chosen = np.arange(m) if m <= rule.most else np.linspace(0, m - 1, rule.most).astype(np.int64)
+        within = rule.together * self.scales
+        looked_at = bearings[self.chosen]
+        together = sums_near(looked_at, looked_at, self.axes, within, np.zeros(steps))
+        self.together = together.astype(np.int64)
+        expected = 1 + (len(looked_at) - 1) * math.pi * within**2 / self.solid_angle
+        self.weights = _weights(self.together, expected, rule.crowded)
+
+
+def _weights(together: NDArray[np.int64], expected: Array, crowded_sigmas: float) -> Array:
+    """(k, S, S): weight of log x_i at the scale s_q in the evidence of image point i at the scale s_r.
+
+    log x_i at s_r is a sum of steps, from the largest scale to s_r. A step from 2 s to s counts with 1 / c_i(s), and
+    with 1 / c_i(s_r) if that is less, where c_i(s) is the number of image points within 2 s of i, if it is more than an
+    even spread explains: over their expected number. So the place of a clump of points is one observation, and where
+    each of them lies within it one each.
+
+    together: (k, S) image points within `ImagePoints.together` scales of each. expected: (S,) of them, spread evenly
+    over the view. crowded_sigmas: standard deviations above it from which they are a clump.
+    """
+    clump = together > expected + crowded_sigmas * np.sqrt(expected)
+    crowded = np.where(clump, together / expected, 1.0)
+    steps = np.triu(1 / np.maximum(together[:, :, None], crowded[:, None, :]))
+    steps[:, :, 1:] -= steps[:, :, :-1]
+    return np.asarray(steps)

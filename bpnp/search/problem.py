@@ -1,0 +1,430 @@
+"""The one record of the points of a problem: image points and scene points, with what is known of them and of the pose.
+
+The scene is divided by its size once, where a `Problem` is made. Nothing after it depends on the unit or on the origin
+of the scene; `to_user` takes a pose back to the user's coordinates.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bpnp.cameras import Camera, in_front
+from bpnp.poses import MIN_POINTS, same_pose, turned_by
+from bpnp.search.image_statistics import ImageStatistics
+from bpnp.search.propose.symmetries import Motions
+from bpnp.search.starts import GravityPrior, PosePrior, Prior
+
+Array = NDArray[np.float64]
+Labels = NDArray[np.int64]
+Unit = Literal["px", "normalised", "rad"]
+BULK = 20.0  # median distances from the median; scene points farther off decide neither the origin nor the unit
+TURNED_DEG = 5.0  # standard deviation up to which a known rotation lets two matches fix a pose
+RADIUS = 3e-3  # radians, of a match, where the size of a pixel is not known
+FLOORS = 30.0  # radius of a match in smallest believable scales: 3 pixels, where that is a tenth of one
+TILTED = 2.0  # radii by which a tilt may move image points for two matches to fix a pose: those of the last stage
+SIGMAS = 2.0  # of a prior: poses farther off could not have been tried
+LOG_DEPTHS = math.log(30.0)  # the farthest over the nearest distance at which a scene could stand
+PAIRS_A_POINT = 32  # pairs of one label, for each point, up to which each pair is computed
+LIKELY = 0.1  # by their classes, over a mean match, at least, of two points that are matched
+FLAT = 1e-6  # of the points' longest extent; what float32 leaves of the other extents of a line
+OF_IMAGE = "bearings", "labels2d", "scores2d", "odds2d", "points2d"  # fields with one row per image point
+OF_SCENE = "points3d", "normals3d", "labels3d", "cosines3d", "scores3d", "classes3d"  # one row per scene point
+
+
+class UnknownFocal(NamedTuple):
+    """What is known of a lens whose focal length is fitted with the pose.
+
+    Attributes:
+        log_range: Logarithm of the largest over the smallest focal length that was possible.
+        sigma: Standard deviation of the logarithm of the focal length; infinite if nothing is known of it.
+        offset: Logarithm of the focal length of these bearings over the expected one.
+        radial: Radial coefficient k of the lens with which the bearings were undistorted.
+        radial_sigma: Standard deviation of k; 0 if the distortion is known, infinite if k is fitted.
+        radial_range: Range of k that was possible; 0 if k is not fitted.
+        centre_sigma: Standard deviation of the principal point, in focal lengths. It is not fitted.
+    """
+
+    log_range: float
+    sigma: float = math.inf
+    offset: float = 0.0
+    radial: float = 0.0
+    radial_sigma: float = 0.0
+    radial_range: float = 0.0
+    centre_sigma: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Image points and scene points that nobody has matched, and what is known of them and of the pose.
+
+    `Problem.of` makes one from the user's coordinates. Poses are those of the scene in unit size, camera = R p + t;
+    `from_user` and `to_user` convert them.
+
+    Attributes:
+        bearings: (m, 3) unit vectors of the image points, in the camera's frame.
+        points3d: (n, 3) scene points, (x - origin) / size of the user's points x.
+        normals3d: (n, 3) outward unit normals; a point that faces away from the camera is not seen.
+        labels2d: (m,) only points of one label match, -1 fits any.
+        labels3d: (n,) the same of the scene points.
+        cosines3d: (n,) least cosine between a normal and the direction to a camera that sees the point; None for 0.
+            With them the enumeration leaves the normals aside.
+        scores2d: (m,) probability in (0, 1] that an image point has a match; None for equal ones.
+        scores3d: (n,) the same of the scene points.
+        floor: Smallest scale of the residuals that is believed, radians; None for a fraction of the bearings' spread.
+        radius: Largest residual of a match in an enumeration, radians; None for that of its settings.
+        clutter: Fraction of the image points without a match; None if it is unknown.
+        prior: What is known of the pose, in unit size.
+        log10_tried: Logarithm of the number of poses that were tried; None for as many as triples of matches give.
+        odds2d: (m, c) with `classes3d`: their scalar product is how much likelier a match is by its classes than a
+            mean one. The labels are then those of points whose class is certain.
+        classes3d: (n, c) probabilities of the classes.
+        focal: What is known of the lens with which the bearings were made; None if it is given.
+        log10_views: Logarithm of the number of sets of scene points, such as the views of a map, that are tried with
+            these bearings.
+        origin: (3,) of the user's coordinates that is the origin here.
+        size: RMS distance of the scene points from it, user's unit.
+        points2d: (m, 2) image points in which residuals are measured: pixels with a camera, normalised without; None
+            for bearings.
+        camera: Camera of the pixels.
+        indices2d: (m,) index of each image point among the user's; None if all are used.
+        given2d: All image points of the user, normalised, NaN for one without such coordinates; None for `bearings`.
+        given3d: The scene points in the user's coordinates; None if they are these.
+        taken2d: Number of image points that were left to another problem.
+        network: Trained network whose pose is tried first.
+
+    Examples:
+        >>> rng = np.random.default_rng(0)
+        >>> points = 1000 * rng.uniform(-1, 1, (20, 3)) + [5000, 0, 0]
+        >>> seen = points - [5000, 0, -4000]
+        >>> problem = Problem.of(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
+        >>> round(float((problem.points3d**2).sum(1).mean()), 6)
+        1.0
+        >>> _, translation = problem.to_user(*problem.from_user(np.eye(3), np.array([-5000, 0, 4000.0])))
+        >>> translation.round(6).tolist()
+        [-5000.0, 0.0, 4000.0]
+    """
+
+    bearings: Array
+    points3d: Array
+    normals3d: Array | None = None
+    labels2d: Labels | None = None
+    labels3d: Labels | None = None
+    cosines3d: Array | None = None
+    scores2d: Array | None = None
+    scores3d: Array | None = None
+    floor: float | None = None
+    radius: float | None = None
+    clutter: float | None = None
+    prior: Prior | None = None
+    log10_tried: float | None = None
+    odds2d: Array | None = None
+    classes3d: Array | None = None
+    focal: UnknownFocal | None = None
+    log10_views: float = 0.0
+    origin: Array | None = None
+    size: float = 1.0
+    points2d: Array | None = None
+    camera: Camera | None = None
+    indices2d: Labels | None = None
+    given2d: Array | None = None
+    given3d: Array | None = None
+    taken2d: int = 0
+    network: Any = None
+
+    @classmethod
+    def of(cls, bearings: Array, points3d: Array, *, prior: Prior | None = None, **known: Any) -> "Problem":
+        """Make a problem from points and a prior in the user's coordinates.
+
+        Args:
+            bearings: (m, 3) unit vectors.
+            points3d: (n, 3) scene points, in any unit.
+            prior: What is known of the pose, in the user's coordinates.
+            **known: The other attributes.
+        """
+        bulk = points3d[in_bulk(points3d)]
+        bulk = bulk if np.ptp(bulk, axis=0).any() else points3d
+        origin = bulk.mean(0)
+        size = float(np.sqrt(((bulk - origin) ** 2).sum(-1).mean())) or 1.0
+        problem = cls(bearings, points3d, origin=origin, size=size, given3d=points3d, **known)
+        known_pose = None if prior is None else problem.prior_from_user(prior)
+        return replace(problem, points3d=problem.points_from_user(points3d), prior=known_pose)
+
+    def points_from_user(self, points3d: Array) -> Array:
+        """Return points (k, 3) of the user's coordinates in those of the scene in unit size."""
+        return (points3d if self.origin is None else points3d - self.origin) / self.size
+
+    def from_user(self, rotation: Array, translation: Array) -> tuple[Array, Array]:
+        """Return poses (..., 3, 3), (..., 3) of the user's coordinates as poses of the scene in unit size."""
+        moved = translation if self.origin is None else translation + rotation @ self.origin
+        return rotation, moved / self.size
+
+    def to_user(self, rotation: Array, translation: Array) -> tuple[Array, Array]:
+        """Return poses (..., 3, 3), (..., 3) of the scene in unit size as poses of the user's coordinates."""
+        scaled = translation * self.size
+        return rotation, scaled if self.origin is None else scaled - rotation @ self.origin
+
+    def prior_from_user(self, prior: Prior) -> Prior:
+        """Return a prior in the user's coordinates as one of the scene in unit size."""
+        if isinstance(prior, GravityPrior) or prior.translation is None:
+            return prior
+        rotation, translation = self.from_user(np.asarray(prior.rotation), np.asarray(prior.translation))
+        return prior._replace(
+            rotation=rotation, translation=translation, translation_sigma=prior.translation_sigma / self.size
+        )
+
+    def choose(self, image: Labels | slice = slice(None), scene: Labels | slice = slice(None)) -> "Problem":
+        """Return the same problem with these image points and scene points alone."""
+        rows = dict.fromkeys(OF_IMAGE, image) | dict.fromkeys(OF_SCENE, scene)
+        known = {name: values[rows[name]] for name in rows if (values := getattr(self, name)) is not None}
+        given3d = None if self.given3d is None else self.given3d[scene]
+        return replace(self, indices2d=self.usable[image], given3d=given3d, given2d=self.all2d, **known)
+
+    def without(self, taken: Labels) -> "Problem":
+        """Return the same problem without the image points that have these indices among the user's."""
+        stay = np.flatnonzero(~np.isin(self.usable, taken))
+        return replace(self.choose(stay), taken2d=len(self.bearings) - len(stay))
+
+    @property
+    def usable(self) -> Labels:
+        """(m,) index of each image point among the user's."""
+        return np.arange(len(self.bearings)) if self.indices2d is None else self.indices2d
+
+    @property
+    def all2d(self) -> Array:
+        """(k, 2) all image points of the user, normalised; NaN for one without such coordinates."""
+        return in_front(self.bearings)[:, :2] if self.given2d is None else self.given2d
+
+    @property
+    def all3d(self) -> Array:
+        """(n, 3) scene points in the user's coordinates."""
+        return self.points3d if self.given3d is None else self.given3d
+
+    @property
+    def dropped2d(self) -> int:
+        """Number of image points of the user that could not be undistorted."""
+        return len(self.all2d) - len(self.usable) - self.taken2d
+
+    @property
+    def unit(self) -> Unit:
+        """Unit in which residuals are measured."""
+        return "rad" if self.points2d is None else "normalised" if self.camera is None else "px"
+
+    @property
+    def image_points(self) -> Array:
+        """(m, d) image points in which residuals are measured, in `unit`."""
+        return self.bearings if self.points2d is None else self.points2d
+
+    @cached_property
+    def per_radian(self) -> float:
+        """Units of `image_points` per radian, at the median image point."""
+        return units_per_radian(self.all2d[self.usable], self.unit, self.camera)
+
+    @cached_property
+    def degenerate(self) -> str | None:
+        """Why no pose can follow from these points; None if one may."""
+        fewest = MIN_POINTS - isinstance(self.prior, GravityPrior)
+        reason = why_degenerate(self.bearings, self.points3d, fewest)
+        return f"of the lights that no other problem has, {reason}" if reason and self.taken2d else reason
+
+    def project(self, rotation: Array, translation: Array, points: Array) -> Array:
+        """Return where points (p, 3) in unit size are seen, in the coordinates of `image_points`; NaN if nowhere."""
+        camera = points @ rotation.T + translation
+        if self.camera is not None:
+            return self.camera.project(camera)
+        if self.points2d is not None:
+            return in_front(camera)[:, :2]
+        length = np.linalg.norm(camera, axis=-1, keepdims=True)
+        return np.divide(camera, length, out=np.full_like(camera, np.nan), where=length > 0)
+
+    def project_scene(self, rotation: Array, translation: Array) -> Array:
+        """Return where the scene points are seen (n, d); NaN for those that are not, or face away."""
+        seen = self.project(rotation, translation, self.points3d)
+        if self.normals3d is not None:
+            camera = self.points3d @ rotation.T + translation
+            seen[~faces(self.normals3d, self.cosines3d, camera, rotation)] = np.nan
+        return seen
+
+    def may_match(self, i: Labels, j: Labels) -> NDArray[np.bool_]:
+        """Return whether image points i (k,) and scene points j (k,) can be matched by their labels or classes."""
+        if self.odds2d is not None and self.classes3d is not None:
+            return np.asarray((self.odds2d[i] * self.classes3d[j]).sum(-1) > LIKELY)
+        if self.labels2d is None or self.labels3d is None:
+            return np.ones(len(i), np.bool_)
+        label2d, label3d = self.labels2d[i], self.labels3d[j]
+        return (label2d == label3d) | (label2d < 0) | (label3d < 0)
+
+    @property
+    def cones3d(self) -> Array | None:
+        """(n, 4) normals and `cosines3d`; None if nothing is known of them."""
+        if self.normals3d is None:
+            return None
+        cosines = np.zeros(len(self.normals3d)) if self.cosines3d is None else self.cosines3d
+        return np.column_stack([self.normals3d, cosines])
+
+    @cached_property
+    def image(self) -> ImageStatistics:
+        """Statistics of the image points."""
+        return ImageStatistics(self.bearings, self.floor)
+
+    @cached_property
+    def labelled_pairs(self) -> tuple[Labels, Labels] | None:
+        """Every pair of points whose labels agree.
+
+        Returns:
+            Indices (k,) among `image.chosen` and (k,) of scene points. None where the labels leave so many pairs that
+            sums over neighbours are faster, or where class probabilities or no labels are given.
+        """
+        if self.labels2d is None or self.labels3d is None or self.odds2d is not None:
+            return None
+        chosen, n = self.image.chosen, len(self.points3d)
+        groups = label_groups(chosen, self.labels2d, self.labels3d, n)
+        if sum(len(rows) * len(columns) for rows, columns in groups) > PAIRS_A_POINT * (len(chosen) + n):
+            return None
+        i = [np.repeat(rows, len(columns)) for rows, columns in groups]
+        j = [np.tile(columns, len(rows)) for rows, columns in groups]
+        return np.concatenate(i), np.concatenate(j)
+
+    @cached_property
+    def registered(self) -> list[tuple[Array, Array, Motions]]:
+        """Poses (3, 3), (3,) and the motions of the scene that were found from their matched points."""
+        return []
+
+    @cached_property
+    def middle(self) -> Array:
+        """(3,) median of the scene points."""
+        return np.median(self.points3d, 0)
+
+    @property
+    def middle_of_user(self) -> Array:
+        """(3,) median of the scene points in the user's coordinates."""
+        middle = self.size * self.middle
+        return middle if self.origin is None else middle + self.origin
+
+    def same_pose(self, rotation: Array, translation: Array, degrees: float, share: float) -> NDArray[np.bool_]:
+        """Return which poses (c, 3, 3), (c, 3) are the first one: turned by `degrees` at most, and the middle of the
+        scene moved by this fraction of its distance."""
+        middle = rotation @ self.middle + translation
+        return same_pose(rotation, middle, 0, degrees, share * float(np.linalg.norm(middle[0])))
+
+    @property
+    def knows_rotation(self) -> bool:
+        """Whether a prior has the rotation to 5 degrees: a half turn then has 10^3.5 times the false alarms."""
+        return isinstance(self.prior, PosePrior) and self.prior.rotation_sigma_deg <= TURNED_DEG
+
+    @property
+    def match_radius(self) -> float:
+        """Largest residual of a match in an enumeration, radians: `radius`, or 3 pixels where a pixel is known."""
+        if self.radius is not None:
+            return self.radius
+        return RADIUS if self.floor is None else FLOORS * self.floor
+
+    @property
+    def knows_vertical(self) -> bool:
+        """Whether gravity is known so well that a tilt within its error moves no image point out of reach of its match;
+        always of three points, which fix no pose without it."""
+        if not isinstance(self.prior, GravityPrior):
+            return False
+        if min(len(self.bearings), len(self.points3d)) == 3:
+            return True
+        return math.radians(self.prior.sigma_deg) * self.image.spread <= TILTED * self.match_radius
+
+    @property
+    def pairs_that_fix(self) -> int:
+        """Number of matches that fix a pose: 2 where the vertical, or the rotation to a few degrees, is known, else
+        3."""
+        return 2 if self.knows_rotation or self.knows_vertical else 3
+
+    @property
+    def fitted(self) -> int:
+        """Numbers that are fitted to the image points."""
+        lens = 0 if self.focal is None else 1 + (self.focal.radial_range > 0)
+        return 2 * self.pairs_that_fix + lens
+
+    def log10_share(self, rotation: Array, translation: Array) -> float:
+        """log10 of the share of all poses that are as near to the prior as this one, or within two standard deviations.
+
+        Of poses that fit matches of these points: their rotations fill SO(3) evenly, the directions to the middle of
+        the scene fill the view, and the logarithms of its distance a factor of 30.
+        """
+        if self.prior is None:
+            return 0.0
+        if isinstance(self.prior, GravityPrior):
+            up = rotation @ (np.asarray(self.prior.up_scene) / np.linalg.norm(self.prior.up_scene))
+            camera = np.asarray(self.prior.up_camera, np.float64)
+            off = math.atan2(float(np.linalg.norm(np.cross(up, camera))), float(up @ camera))
+            off = min(max(off, math.radians(SIGMAS * self.prior.sigma_deg)), math.pi)
+            return math.log10(max((1 - math.cos(off)) / 2, 1e-12))
+        known = np.asarray(self.prior.rotation, np.float64)
+        off = min(max(turned_by(rotation, known), math.radians(SIGMAS * self.prior.rotation_sigma_deg)), math.pi)
+        share = max((off - math.sin(off)) / math.pi, 1e-15)
+        if self.prior.translation is not None and math.isfinite(self.prior.translation_sigma):
+            expected = known @ self.middle + np.asarray(self.prior.translation)
+            distance = max(float(np.linalg.norm(expected)), 1e-12)
+            shift = float(np.linalg.norm(rotation @ self.middle + translation - expected))
+            relative = max(shift, SIGMAS * self.prior.translation_sigma) / distance
+            share *= min(1.0, math.pi * relative**2 / self.image.solid_angle) * min(1.0, 2 * relative / LOG_DEPTHS)
+        return math.log10(share)
+
+
+def faces(normals3d: Array, cosines3d: Array | None, camera: Array, rotation: Array) -> NDArray[np.bool_]:
+    """Which points (n, 3) in the camera's frame face it: n . c > cosine, c the unit vector to the camera's centre."""
+    towards = -((normals3d @ rotation.T) * camera).sum(-1)
+    if cosines3d is None:
+        return np.asarray(towards > 0)
+    return np.asarray(towards > cosines3d * np.linalg.norm(camera, axis=-1))
+
+
+def label_groups(
+    chosen: Labels, labels2d: Labels | None, labels3d: Labels | None, n: int
+) -> list[tuple[Labels, Labels]]:
+    """Places in `chosen` and in the scene that can be partners, a group for each label in the image."""
+    if labels2d is None or labels3d is None:
+        return [(np.arange(len(chosen)), np.arange(n))]
+    order, any_label = np.argsort(labels3d, kind="stable"), np.flatnonzero(labels3d == -1)
+    values, rows = np.unique(labels2d[chosen], return_inverse=True)
+    groups = np.split(np.argsort(rows, kind="stable"), np.cumsum(np.bincount(rows, minlength=len(values)))[:-1])
+    first, last = (np.searchsorted(labels3d[order], values, side) for side in ("left", "right"))
+    columns = [order[i:j] for i, j in zip(first.tolist(), last.tolist(), strict=True)]
+    if len(any_label):
+        columns = [np.sort(np.r_[one, any_label]) for one in columns]
+    if len(values) and values[0] == -1:
+        columns[0] = np.arange(n)
+    return list(zip(groups, columns, strict=True))
+
+
+def in_bulk(points3d: Array) -> NDArray[np.bool_]:
+    """Return which points (n, 3) are within `BULK` median distances of the median."""
+    distance = np.linalg.norm(points3d - np.median(points3d, 0), axis=-1)
+    return np.asarray(distance <= BULK * float(np.median(distance)))
+
+
+def units_per_radian(points2d: Array, unit: Unit, camera: Camera | None) -> float:
+    """Return image units per radian at the median point: a plane stretches by (1 + r^2)^(3/4) at the distance r.
+
+    Args:
+        points2d: (m, 2) normalised image points.
+        unit: In which residuals are measured.
+        camera: Camera of the pixels.
+    """
+    if unit == "rad":
+        return 1.0
+    stretch = (1 + (points2d**2).sum(-1)) ** 0.75
+    return float(np.median(stretch) * (1.0 if camera is None else camera.focal))
+
+
+def why_degenerate(bearings: Array, points3d: Array, fewest: int = MIN_POINTS) -> str | None:
+    """Return why no pose can follow from points, of which `fewest` different ones fix one; None if one may."""
+    for name, points in (("2D", bearings), ("3D", points3d)):
+        count, others = 0, points
+        while len(others) and count < fewest:
+            count, others = count + 1, others[(others != others[0]).any(-1)]
+        if count < fewest:
+            return f"only {count} different {name} point{'s' if count > 1 else ''}: {fewest} or more fix a pose"
+    extents = np.linalg.svd(points3d - points3d.mean(0), compute_uv=False)
+    if extents[1] <= FLAT * extents[0]:
+        return "the 3D points lie on one line: the camera can turn about it"
+    return None
