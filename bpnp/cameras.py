@@ -164,7 +164,7 @@ def camera_from(camera: Any) -> Camera:
         ValueError: K is singular or not finite, the model is unknown, the number of parameters is wrong, or the focal
             length is not positive.
 
-    >>> camera_from([[800, 0, 320], [0, 800, 240], [0, 0, 1]]).focal
+    >>> camera_from(("PINHOLE", 640, 480, [800, 800, 320, 240])).focal
     800.0
     """
     if isinstance(camera, (Pinhole, Lens)):

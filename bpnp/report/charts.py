@@ -1,7 +1,7 @@
-"""The recall curves of the page as plotly figures, and the figures that it fills with a problem or with two runs.
+"""Plotly figures of the page: recall curves, and figures that the page fills with a problem or with two runs.
 
-In a notebook: `recall_chart({"mine": results}, "rotation_deg").show()`. Colours are those of the light
-scheme, which the page replaces where the dark one is asked for.
+In a notebook: `recall_chart({"mine": results}, "rotation_deg").show()`. Colours are those of the light scheme; the page
+replaces them for the dark one.
 """
 
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 Error = Literal["rotation_deg", "translation", "joint", "reprojection_deg"]
 Array = npt.NDArray[Any]
-POINTS = 200  # of a curve
+POINTS = 200  # points of a curve
 RECALLS: dict[Error, tuple[str, str, float]] = {
     "rotation_deg": ("Rotation", "rotation error, degrees", 90.0),
     "translation": ("Translation", "translation error, scene units", 10.0),
@@ -34,7 +34,7 @@ INK = {name: light for name, (light, _) in INKS.items()}
 CLEAR = "rgba(0,0,0,0)"
 GRID = {"gridcolor": INK["line"], "zerolinecolor": INK["line"]}
 HIDDEN = ["sendChartToCloud", "select2d", "lasso2d", "autoScale2d", "tableRotation", "resetCameraLastSave3d"]
-CONFIG = {  # of every figure
+CONFIG = {  # plotly's options of every figure
     "responsive": True,
     "displaylogo": False,
     "toImageButtonOptions": {"scale": 2, "filename": "bpnp"},
@@ -43,27 +43,42 @@ CONFIG = {  # of every figure
 
 
 def errors_of(results: Results, estimate: str, error: Error) -> torch.Tensor:
-    """Errors of the problems that have one; in the joint curve one that is too far away is infinite."""
+    """Return the errors of the problems that have one (not NaN).
+
+    In "joint", the rotation error of a problem beyond the translation limit is infinite.
+
+    Args:
+        results: Results of a test.
+        estimate: Name of the estimate.
+        error: Kind of error.
+    """
     errors = results.errors(estimate)
     values: torch.Tensor = joint_error(errors, JOINT_TRANSLATION) if error == "joint" else getattr(errors, error)
     return values[~values.isnan()]
 
 
 def recall_of(results: Results, estimate: str, error: Error, limits: Array) -> Array:
-    """Share of these problems with an error up to each limit."""
+    """Return the fraction of problems with an error up to each limit.
+
+    Args:
+        results: Results of a test.
+        estimate: Name of the estimate.
+        error: Kind of error.
+        limits: Limits (k,).
+    """
     return recall_curve(errors_of(results, estimate, error), limits.tolist()).numpy()
 
 
 def recall_chart(runs: Mapping[str, Results], error: Error, *, paper: Paper | None = None) -> "Figure | None":
-    """Draw the share of problems with an error up to a threshold, on a logarithmic axis (paper Fig. 3).
+    """Draw the fraction of problems with an error up to a threshold, on a logarithmic axis (paper Fig. 3).
 
     Args:
-        runs: results by name.
-        error: of the horizontal axis.
-        paper: the paper's table whose quartiles are drawn as rings; None for none.
+        runs: Results by name.
+        error: Kind of error.
+        paper: Table of the paper whose quartiles are drawn as rings. Default: none.
 
     Returns:
-        The figure; None if no problem has an error above zero.
+        The figure, or None if no problem has an error above zero.
     """
     from plotly.graph_objects import Figure
 
@@ -76,32 +91,32 @@ def recall_chart(runs: Mapping[str, Results], error: Error, *, paper: Paper | No
     limits = np.geomspace(low, max(most, 2 * low), POINTS)
     figure = Figure(layout={"title": {"text": title}, "hovermode": "x unified", "template": "none"})
     figure.update_yaxes(title={"text": "problems up to this error"}, range=[0, 1.01], tickformat=".0%")
-    # Of one to two decades plotly labels every digit, which overlap, unless it is asked for fewer: then 1, 2 and 5.
+    # On one to two decades plotly labels every digit, and the labels overlap; with fewer ticks it labels 1, 2 and 5.
     decades = float(np.log10(limits[-1] / limits[0]))
-    few = {"nticks": int(decades / 0.31)} if 1 <= decades < 2.2 else {}  # more than 0.3 decades a label
+    few = {"nticks": int(decades / 0.31)} if 1 <= decades < 2.2 else {}  # at least 0.3 decades between labels
     figure.update_xaxes(title={"text": unit}, hoverformat=".3~g", type="log", tickformat="~g", **few)
-    for place, line in enumerate(lines_of(runs)):
+    for index, line in enumerate(lines_of(runs)):
         dash = ",".join(f"{length:g}px" for length in DASHES[line.dashes % len(DASHES)]) or "solid"
         style = {"color": LIGHT[line.colour % len(LIGHT)], "dash": dash, "width": 2}
-        shares = recall_of(runs[line.run], line.estimate, error, limits)
-        points = {"x": limits.astype(np.float32), "y": shares.astype(np.float32)}
-        # By the place of its estimate the page finds a line.
-        figure.add_scatter(**points, name=line.label, mode="lines", meta=place, line=style, hovertemplate="%{y:.1%}")
-    for place, (name, quartiles) in enumerate(paper_quartiles(paper, error).items()):
-        marker = {"symbol": PAPER_MARKS[place], "size": 8, "color": INK["quiet"], "line": {"width": 1.5}}
+        fractions = recall_of(runs[line.run], line.estimate, error, limits)
+        points = {"x": limits.astype(np.float32), "y": fractions.astype(np.float32)}
+        # `meta` identifies the estimate of the line for the page.
+        figure.add_scatter(**points, name=line.label, mode="lines", meta=index, line=style, hovertemplate="%{y:.1%}")
+    for index, (name, quartiles) in enumerate(paper_quartiles(paper, error).items()):
+        marker = {"symbol": PAPER_MARKS[index], "size": 8, "color": INK["quiet"], "line": {"width": 1.5}}
         points = {"x": np.array(quartiles, np.float32), "y": np.array([0.25, 0.5, 0.75], np.float32)}
         figure.add_scatter(**points, name=f"paper: {name}", mode="markers", marker=marker, hovertemplate="%{y:.0%}")
     return figure
 
 
 def chart_text(figure: "Figure") -> str:
-    """What a chart shows in words, for screen readers: the last value of each line."""
+    """Describe a chart for screen readers: the last value of each line."""
     ends = [f"{trace.name} ends at {trace.y[-1]:.1%}" for trace in figure.data if trace.mode == "lines"]
     return f"{figure.layout.title.text}: {'; '.join(ends)}"
 
 
 def look() -> dict[str, Any]:
-    """The plotly template of every figure."""
+    """Return the plotly template of all figures."""
     axis = GRID | {"linecolor": INK["quiet"], "automargin": True}
     axis3d = GRID | {"color": INK["quiet"], "backgroundcolor": CLEAR, "showspikes": False}
     layout = {
@@ -121,7 +136,7 @@ def look() -> dict[str, Any]:
 
 
 def figures() -> dict[str, dict[str, Any]]:
-    """By the id of their element: run against run, a problem in space, a problem in the image."""
+    """Return the figures that the page fills, by the id of their element."""
     degrees = {"type": "log", "tickformat": "~g", "dtick": "D2"}
     diagonal = {"type": "line", "x0": 0, "y0": 0, "x1": 1, "y1": 1, "xref": "paper", "yref": "paper"}
     diagonal |= {"line": {"color": INK["quiet"], "width": 1, "dash": "dash"}}
@@ -131,7 +146,7 @@ def figures() -> dict[str, dict[str, Any]]:
         {
             "title": {"text": "Rotation error of each problem"},
             "xaxis": degrees,
-            "yaxis": degrees | {"matches": "x"},  # so that the diagonal of the picture is x = y
+            "yaxis": degrees | {"matches": "x"},  # equal ranges, so that the diagonal is x = y
             "shapes": [diagonal],
         },
     )

@@ -1,8 +1,8 @@
 """Recall curves and problems as matplotlib figures, for papers, notebooks and loggers.
 
-Figures are made without pyplot: they need no display, no backend, and no closing. `plot_scene`, `plot_image` and
-`plot_residuals` draw into axes that they are given; an image and its residuals are in pixels of the problem's camera,
-in normalised coordinates where there is none.
+Figures are made without pyplot, so they need no display, no backend, and no closing. `plot_scene`, `plot_image` and
+`plot_residuals` draw into given axes. An image and its residuals are in pixels of the problem's camera, or in
+normalised coordinates without a camera.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,23 +26,25 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".svg", ".pdf")
-POINTS = 981  # of a curve
-NUMBERED = 40  # 3D points up to which their indices are drawn
-MARGIN = 0.15  # of the extent of the image points, around them
-WIDTH, CLOSE_UP, CAPTIONS = 10.0, 3.5, 1.3  # inches, of an image beside its residuals
+POINTS = 981  # points of a curve
+NUMBERED = 40  # largest number of 3D points whose indices are drawn
+MARGIN = 0.15  # margin around the image points, relative to their extent
+WIDTH, CLOSE_UP, CAPTIONS = 10.0, 3.5, 1.3  # width of an image, of its residuals, and height of the captions, inches
 LIMITS: dict[Error, float] = {"rotation_deg": 20.0, "translation": 1.0, "joint": 20.0, "reprojection_deg": 2.0}
 Lines = Literal["match3d", "assigned3d"]
 
 
 def recall_curve(runs: Sequence[Path | str] | Mapping[str, Results], *, paper: Paper | None = None) -> "Figure":
-    """Draw the share of problems with an error up to a threshold: rotation, translation, both, reprojection (Fig. 3).
+    """Draw the fraction of problems with an error up to a threshold (paper Fig. 3).
+
+    The panels are rotation, translation, both, and reprojection.
 
     Args:
-        runs: results folders, or results by name.
-        paper: the paper's table whose quartiles are drawn as rings; None for none.
+        runs: Results folders, or results by name.
+        paper: Table of the paper whose quartiles are drawn as rings. Default: none.
 
     Raises:
-        ValueError: a folder cannot be read.
+        ValueError: A folder cannot be read.
     """
     from matplotlib.figure import Figure
 
@@ -51,22 +53,25 @@ def recall_curve(runs: Sequence[Path | str] | Mapping[str, Results], *, paper: P
     for axes, (key, limit) in zip(figure.subplots(1, 4, sharey=True), LIMITS.items(), strict=True):
         limits = np.linspace(0, limit, POINTS)
         for line in lines_of(runs):
-            shares = recall_of(runs[line.run], line.estimate, key, limits)
-            axes.plot(limits, shares, **line_style(line.colour, line.dashes), label=shown_text(line.label))
+            fractions = recall_of(runs[line.run], line.estimate, key, limits)
+            axes.plot(limits, fractions, **line_style(line.colour, line.dashes), label=shown_text(line.label))
         for marker, (name, quartiles) in zip("osD^", paper_quartiles(paper, key).items(), strict=False):
             axes.plot(quartiles, [0.25, 0.5, 0.75], marker, mfc="none", color=QUIET, label=f"paper: {name}")
         axes.set(xlabel=RECALLS[key][1].replace(", of", ",\nof"), ylim=(0, 1.01), xlim=(0, limit))
         axes.grid(alpha=0.3)
-    figure.axes[0].yaxis.set_major_formatter(lambda share, _: f"{100 * share:.0f} %")
+    figure.axes[0].yaxis.set_major_formatter(lambda fraction, _: f"{100 * fraction:.0f} %")
     figure.axes[0].set_ylabel("problems within")
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False)
     return figure
 
 
 def outlier_curves(frame: "DataFrame") -> "Figure":
-    """Median rotation error and recall against the share of outliers, a curve for each method.
+    """Draw the median rotation error and the recall against the outlier ratio, a curve for each method.
 
-    frame: `bpnp.report.tables.table_frame`; rows without a share and standard deviations are not drawn.
+    Rows without an outlier ratio, and standard deviations, are not drawn.
+
+    Args:
+        frame: Result of `bpnp.report.tables.table_frame`.
     """
     from matplotlib.figure import Figure
 
@@ -78,7 +83,7 @@ def outlier_curves(frame: "DataFrame") -> "Figure":
         for i, (method, rows) in enumerate(drawn.sort_values("rho").groupby("method", sort=False)):
             style = line_style(i, i // len(LIGHT)) | {"marker": "o", "ms": 3.5, "label": shown_text(str(method))}
             axes.plot(rows.rho, scale * rows[key].astype(float), **style)
-        axes.set_xlabel("outliers a match, on both sides")
+        axes.set_xlabel("outliers per match, on both sides")
         axes.grid(alpha=0.3)
     figure.axes[0].set(yscale="log", ylabel="median rotation error, degrees", ylim=(None, 1.2 * 180))
     figure.axes[1].set(ylabel="% of problems within 15 degrees and 0.5", ylim=(0, 101))
@@ -87,15 +92,26 @@ def outlier_curves(frame: "DataFrame") -> "Figure":
 
 
 def line_style(colour: int, dashes: int) -> dict[str, Any]:
-    """Matplotlib's options of a line from indices of the palette."""
+    """Return matplotlib's options of a line.
+
+    Args:
+        colour: Index of the palette.
+        dashes: Index of the dash patterns.
+    """
     lengths = DASHES[dashes % len(DASHES)]
     return {"color": LIGHT[colour % len(LIGHT)], "linestyle": (0, lengths) if lengths else "-"}
 
 
 def plot_problem(problem: ProblemPoints, *, estimate: str | None = None, lines: Lines | None = "match3d") -> "Figure":
-    """A problem in space, points with true and estimated cameras, and in the image, seen and reprojected points.
+    """Draw a problem in space, with true and estimated cameras, and in the image, with reprojected points.
 
-    estimate, lines: see `plot_image`. Raises ValueError for an unknown estimate.
+    Args:
+        problem: Problem.
+        estimate: As in `plot_image`.
+        lines: As in `plot_image`.
+
+    Raises:
+        ValueError: The estimate is unknown.
     """
     from matplotlib.figure import Figure
 
@@ -113,9 +129,9 @@ def plot_photo(problem: ProblemPoints, photo: Array, *, estimates: Sequence[str]
     """Draw the 3D points over the photo as each pose projects them, an image per estimate (paper Fig. 4).
 
     Args:
-        problem: with the camera of the photo.
-        photo: (h, w, 3), uint8.
-        estimates: whose poses; all by default.
+        problem: Problem with the camera of the photo.
+        photo: Photo (h, w, 3), uint8.
+        estimates: Names of the estimates to draw. Default: all.
 
     Raises:
         ValueError: The camera is missing or of another image shape, or an estimate is unknown.
@@ -133,9 +149,14 @@ def plot_photo(problem: ProblemPoints, photo: Array, *, estimates: Sequence[str]
 
 
 def plot_scene(axes: Any, problem: ProblemPoints) -> Any:
-    """3D points, true and estimated cameras, in the axes of the true camera (right, forward, up). Returns the axes.
+    """Draw 3D points, true and estimated cameras, in the axes of the true camera (right, forward, up).
 
-    axes: a matplotlib axes with projection="3d".
+    Args:
+        axes: Matplotlib axes with projection="3d".
+        problem: Problem.
+
+    Returns:
+        The axes.
     """
     colours = dict(zip(problem.estimates, cycle(LIGHT), strict=False))
     poses = {name: pose for name, pose in problem.estimates.items() if np.isfinite(np.c_[pose]).all()}
@@ -168,39 +189,51 @@ def plot_image(
     axes: "Axes", problem: ProblemPoints, *, estimate: str | None = None, lines: Lines | None = "match3d",
     photo: Array | None = None,
 ) -> "Axes":  # fmt: skip
-    """Rings around the image points, crosses where a pose puts 3D points, and a line from each to its match.
+    """Draw rings around image points, crosses at projected 3D points, and lines between matches.
 
-    estimate: whose pose, the first by default. lines: to the true matches or to those assigned by the solver, which a
-    problem without known matches always has; those that are not the true ones are dotted. photo: (h, w, 3) uint8, as it
-    was taken with the camera; under it, 3D points without a match are not drawn. Points whose normals face away from
-    the camera are small dots. At most `NUMBERED` 3D points have their indices beside them. Returns the axes.
+    Points whose normals face away from the camera are small dots. The indices of 3D points are drawn if there are at
+    most `NUMBERED`.
 
-    Raises ValueError for a photo of a problem without a camera, or without an image point in front of it.
+    Args:
+        axes: Matplotlib axes.
+        problem: Problem.
+        estimate: Name of the estimate whose pose projects the 3D points. Default: the first.
+        lines: Draw lines to the true matches ("match3d"), or to those assigned by the solver ("assigned3d"), which are
+            also drawn for a problem without true matches. Assigned matches that are not true are dotted. None: no
+            lines.
+        photo: Photo by the problem's camera (h, w, 3), uint8, drawn under the points. 3D points without a match are
+            then left out.
+
+    Returns:
+        The axes.
+
+    Raises:
+        ValueError: There is a photo but no camera, or no image point in front of the camera.
     """
     from matplotlib.collections import LineCollection
     from matplotlib.patheffects import withStroke
 
-    seen, projected, targets, colour = _prepare_drawing(problem, estimate, lines)
+    image, projected, targets, colour = _prepare_drawing(problem, estimate, lines)
     if photo is not None and problem.camera is None:
-        raise ValueError("expected a camera to draw a photo under the points, got none")
-    left, top, right, bottom = _extent(seen) if photo is None else (0, 0, *size_in_camera(photo, problem.camera))
-    size = float(np.clip(80 / np.sqrt(len(seen)), 2, 7))
+        raise ValueError("the problem has no camera, which is needed to draw a photo under its points")
+    left, top, right, bottom = _extent(image) if photo is None else (0, 0, *size_in_camera(photo, problem.camera))
+    size = float(np.clip(80 / np.sqrt(len(image)), 2, 7))
     rim = "black" if photo is None else "white"
-    rims = axes.plot(*seen.T, "o", mfc="none", mec=rim, mew=0.7, ms=size, label="image points", zorder=3)
+    rims = axes.plot(*image.T, "o", mfc="none", mec=rim, mew=0.7, ms=size, label="image points", zorder=3)
     if photo is not None:
         axes.imshow(photo, extent=(left, right, bottom, top), zorder=0)
         rims[0].set_path_effects([withStroke(linewidth=1.7, foreground="black")])  # for bright photos and the legend
     visible = np.isfinite(projected).all(-1)
-    joined = visible & (targets >= 0)
-    matched = visible if lines is None else joined
+    linked = visible & (targets >= 0)
+    matched = visible if lines is None else linked
     away = _facing_away(problem, estimate) & visible & ~matched
     free = visible & ~matched & ~away
     if matched.any():
         axes.plot(*projected[matched].T, "x", color=colour, ms=size, mew=0.9, label="3D points, matched", zorder=4)
-        wrong = joined & (problem.match3d != targets) & (problem.match3d >= 0)
-        for some, ink, style in ((joined & ~wrong, colour, "-"), (wrong, LIGHT[3], ":")):
+        wrong = linked & (problem.match3d != targets) & (problem.match3d >= 0)
+        for some, ink, style in ((linked & ~wrong, colour, "-"), (wrong, LIGHT[3], ":")):
             if some.any():
-                ends = np.stack([seen[targets[some]], projected[some]], 1)
+                ends = np.stack([image[targets[some]], projected[some]], 1)
                 axes.add_collection(LineCollection(list(ends), colors=ink, linestyles=style, linewidths=0.8, zorder=2))
     if free.any() and photo is None:
         axes.plot(*projected[free].T, "x", color=LIGHT[3], ms=size, mew=0.6, label="3D points, no match", zorder=1)
@@ -223,10 +256,20 @@ def plot_image(
 def plot_residuals(
     axes: "Axes", problem: ProblemPoints, *, estimate: str | None = None, lines: Lines = "match3d"
 ) -> "Axes":
-    """A close-up: image point minus reprojected 3D point of each match; arguments as for `plot_image`."""
-    seen, projected, targets, colour = _prepare_drawing(problem, estimate, lines)
+    """Draw image point minus projected 3D point of each match.
+
+    Args:
+        axes: Matplotlib axes.
+        problem: Problem.
+        estimate: As in `plot_image`.
+        lines: Matches to draw, as in `plot_image`.
+
+    Returns:
+        The axes.
+    """
+    image, projected, targets, colour = _prepare_drawing(problem, estimate, lines)
     matched = targets >= 0
-    residuals = seen[targets[matched]] - projected[matched]
+    residuals = image[targets[matched]] - projected[matched]
     if not np.isfinite(residuals).any():
         axes.set_axis_off()
         return axes
@@ -243,13 +286,13 @@ def plot_residuals(
 def plot_matches(
     problem: ProblemPoints, *, colour: str, photo: Array | None = None, competing: ProblemPoints | None = None
 ) -> "Figure":
-    """Draw the image of a problem and a close-up of its residuals below its id.
+    """Draw the image of a problem and a close-up of its residuals, under its id.
 
     Args:
-        problem: With an estimate.
-        colour: Of the id.
-        photo: As for `plot_image`.
-        competing: The problem with another estimate, to draw beside it.
+        problem: Problem with an estimate.
+        colour: Colour of the id.
+        photo: As in `plot_image`.
+        competing: The problem with another estimate, drawn next to it. Default: none.
     """
     from matplotlib.figure import Figure
 
@@ -273,19 +316,28 @@ def plot_matches(
 
 
 def save_figure(figure: "Figure", path: Path | str, *, dpi: int = 110) -> Path:
-    """Write a figure whole or not at all. Raises ValueError if the name does not end in .png, .svg or .pdf."""
+    """Write a figure atomically and return its path.
+
+    Args:
+        figure: Matplotlib figure.
+        path: File name that ends in .png, .jpg, .svg or .pdf.
+        dpi: Resolution of .png and .jpg.
+
+    Raises:
+        ValueError: The name has another suffix.
+    """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"expected a file name that ends in {', '.join(SUFFIXES)}, got {path.name!r}")
-    with write_atomically(path) as temporary, delay_interrupts():  # matplotlib takes Ctrl-C for an error of its input
+        raise ValueError(f"the file name {path.name!r} has to end in {', '.join(SUFFIXES)}")
+    with write_atomically(path) as temporary, delay_interrupts():  # matplotlib reports Ctrl-C as an input error
         figure.savefig(temporary, format=path.suffix[1:].lower(), dpi=dpi)
     return path
 
 
 def _estimate(problem: ProblemPoints, estimate: str | None) -> tuple[str, tuple[Array, Array]]:
-    """Name and pose, of the first estimate by default; NaN if there is none. Raises ValueError for an unknown name."""
+    """Return the name and the pose of an estimate, by default the first; the pose is NaN if there is none."""
     if estimate is not None and estimate not in problem.estimates:
-        raise ValueError(f"expected an estimate among {list(problem.estimates)}, got {estimate!r}")
+        raise ValueError(f"there is no estimate {estimate!r}; the estimates are {list(problem.estimates)}")
     name = estimate or next(iter(problem.estimates), "")
     return name, problem.estimates.get(name, (np.full((3, 3), np.nan), np.full(3, np.nan)))
 
@@ -293,20 +345,24 @@ def _estimate(problem: ProblemPoints, estimate: str | None) -> tuple[str, tuple[
 def _prepare_drawing(
     problem: ProblemPoints, estimate: str | None, lines: Lines | None
 ) -> tuple[Array, Array, Array, str]:
-    """Image points and projected 3D points (NaN without a pose) in the units of the axes, the image point that each 3D
-    point is joined to, and the colour of the estimate."""
+    """Return what `plot_image` draws.
+
+    Returns:
+        Image points (m, 2), projected 3D points (n, 2), NaN without a pose, both in the units of the axes; the image
+        point that each 3D point is linked to (n,), -1 for none; and the colour of the estimate.
+    """
     name, (rotation, translation) = _estimate(problem, estimate)
-    seen = problem.points2d
+    image = problem.points2d
     projected = in_front(np.asarray(problem.points3d, float) @ rotation.T + translation)[:, :2]
     if problem.camera is not None:
-        seen, projected = (
-            problem.camera.project(np.column_stack([points, np.ones(len(points))])) for points in (seen, projected)
+        image, projected = (
+            problem.camera.project(np.column_stack([points, np.ones(len(points))])) for points in (image, projected)
         )
     if lines == "match3d" and (problem.match3d < 0).all():
         lines = "assigned3d"
     targets = np.full(len(projected), -1) if lines is None else getattr(problem, lines)
-    place = [*problem.estimates].index(name) if name else 0
-    return seen, projected, targets, LIGHT[place % len(LIGHT)]
+    number = [*problem.estimates].index(name) if name else 0
+    return image, projected, targets, LIGHT[number % len(LIGHT)]
 
 
 def _facing_away(problem: ProblemPoints, estimate: str | None) -> Array:
@@ -319,11 +375,11 @@ def _facing_away(problem: ProblemPoints, estimate: str | None) -> Array:
 
 
 def _extent(points2d: Array) -> tuple[float, float, float, float]:
-    """Left, top, right and bottom of what image points span, and a little more."""
-    seen = points2d[np.isfinite(points2d).all(-1)].astype(float)
-    if not len(seen):
-        raise ValueError("expected image points in front of the camera to draw, got none")
-    low, high = seen.min(0), seen.max(0)
+    """Return left, top, right and bottom of the image points, with a margin."""
+    finite = points2d[np.isfinite(points2d).all(-1)].astype(float)
+    if not len(finite):
+        raise ValueError("the problem has no image point in front of the camera to draw")
+    low, high = finite.min(0), finite.max(0)
     margin = MARGIN * np.maximum(high - low, 1e-6)
     return *(low - margin).tolist(), *(high + margin).tolist()
 
@@ -333,41 +389,56 @@ def _unit(problem: ProblemPoints) -> str:
 
 
 def shown_text(name: str) -> str:
-    """A name as matplotlib shows it letter by letter: no formulas, no bytes of no text, no hidden label."""
+    """Escape a name for matplotlib: no formulas, no bytes that are not text, no hidden label."""
     shown = utf8(name).replace("$", r"\$")
     return f" {shown}" if shown.startswith("_") else shown
 
 
 def _upright(points: Array, frame: tuple[Array, Array]) -> Array:
-    """Scene points in the axes right, forward, up of a camera."""
+    """Transform scene points to the axes right, forward, up of a camera."""
     rotation, translation = frame
     x, y, z = (points @ rotation.T + translation).T
     return np.stack([x, z, -y], -1)
 
 
 def read_photo(path: Path | str) -> Array:
-    """The picture in a file (h, w, 3), uint8. Raises ValueError that names a file that is none."""
+    """Read a picture.
+
+    Args:
+        path: File.
+
+    Returns:
+        Pixels (h, w, 3), uint8.
+
+    Raises:
+        ValueError: The file is no picture.
+    """
     from PIL import Image
 
     try:
         with Image.open(path) as photo:
             return np.asarray(photo.convert("RGB"))
     except OSError as error:
-        raise ValueError(f"expected a picture, got {path}: {error}") from error
+        raise ValueError(f"{path} is no picture: {error}") from error
 
 
 def size_in_camera(photo: Array, camera: Camera | None) -> tuple[int, int]:
-    """Width and height of a whole photo in pixels of its camera, where the photo may have been made smaller since.
+    """Return the width and height of a photo in pixels of its camera, which differ if the photo was resized.
 
-    Raises ValueError for a photo of another shape than the camera's images.
+    Args:
+        photo: Photo (h, w, 3).
+        camera: Its camera.
+
+    Raises:
+        ValueError: The photo has another aspect ratio than the camera's images.
     """
     height, width = photo.shape[:2]
-    known = None if camera is None else image_size(camera)
-    if known is None:
+    size = None if camera is None else image_size(camera)
+    if size is None:
         return width, height
-    if not same_aspect_ratio((width, height), known):
+    if not same_aspect_ratio((width, height), size):
         raise ValueError(
-            f"expected a photo of {known[0]} x {known[1]} pixels as its camera has, or of that shape, got {width} x "
-            f"{height}; try the photo of this camera"
+            f"the photo has {width} x {height} pixels, and its camera {size[0]} x {size[1]}, another aspect ratio; use "
+            "the photo of this camera"
         )
-    return known
+    return size

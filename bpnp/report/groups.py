@@ -1,4 +1,4 @@
-"""Results by the class, scene or landmark of the problems, and the settings in which runs differ."""
+"""Results by class, scene or landmark of the problems, and the settings in which runs differ."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -15,14 +15,17 @@ MOST_DIFFERENCES = 8
 
 
 def group_of(name: str) -> str:
-    """Return the group of a problem: what stands before the first "/" of its name, such as a class or a scene."""
+    """Return the group of a problem: the part of its name before the first "/", such as a class or a scene."""
     return name.partition("/")[0]
 
 
 def group_rows(runs: Mapping[str, Results]) -> list[tuple[str, int, list[str]]]:
-    """Return group, number of problems, and the median rotation error of each run and estimate.
+    """Return the group, the number of problems, and the median rotation error of each run and estimate.
 
-    The largest groups come first. Empty if the problems have no groups, or are all of one.
+    The largest groups come first. The list is empty unless the problems belong to two or more groups.
+
+    Args:
+        runs: Results by name.
     """
     counts = Counter(group_of(row.id) for row in _problems(runs) if "/" in row.id)
     if len(counts) < 2 or max(counts.values()) < 2:
@@ -31,8 +34,8 @@ def group_rows(runs: Mapping[str, Results]) -> list[tuple[str, int, list[str]]]:
     for group, count in counts.most_common(MOST_GROUPS):
         cells = []
         for line in lines_of(runs):
-            found = [row for row in runs[line.run].of(line.estimate) if group_of(row.id) == group]
-            cells.append(number(float(np.median([row.rotation_error_deg for row in found]))) if found else "")
+            members = [row for row in runs[line.run].of(line.estimate) if group_of(row.id) == group]
+            cells.append(number(float(np.median([row.rotation_error_deg for row in members]))) if members else "")
         rows.append((group, count, cells))
     return rows
 
@@ -55,7 +58,7 @@ def differences(runs: Mapping[str, Results]) -> list[str]:
 
 
 def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Settings by their dotted names, without the levels of class_path and init_args."""
+    """Return settings by their dotted names, without the levels of class_path and init_args."""
     found: dict[str, Any] = {}
     for key, value in settings.items():
         name = prefix if key == "init_args" else f"{prefix}.{key}".strip(".")

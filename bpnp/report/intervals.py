@@ -1,4 +1,4 @@
-"""Bootstrap intervals of figures of a test, and of the difference of two estimates on the same problems."""
+"""Bootstrap intervals of test statistics, and of the difference of two estimates on the same problems."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from bpnp.report.terminal import SplitTable, number
 
 LEVEL = 0.95
 DRAWS = 2000
-FINITE = 1e12  # in place of infinity, so that an interpolation with it is defined
+FINITE = 1e12  # replaces infinity, so that interpolation is defined
 
 JOINT = (15.0, 0.5)  # degrees, scene units
 HEADERS = (
@@ -27,14 +27,20 @@ HEADERS = (
 )
 CAPTION = (
     "Medians in degrees. Intervals: 95 %, bootstrap over the problems. - first: difference of the medians to the first "
-    "row, paired over the same problems; an interval on one side of zero is a difference that the problems show."
+    "row, paired over the same problems; it is significant if its interval excludes zero."
 )
-Statistic = Callable[[NDArray[np.float64]], NDArray[np.float64]]  # of the last axis
+Statistic = Callable[[NDArray[np.float64]], NDArray[np.float64]]  # reduces the last axis
 
 
 @dataclass(frozen=True)
 class Interval:
-    """A figure and its percentile bootstrap interval of 95 %."""
+    """Statistic and its 95 % percentile bootstrap interval.
+
+    Attributes:
+        value: Statistic of the problems.
+        low: Lower end.
+        high: Upper end.
+    """
 
     value: float
     low: float
@@ -47,12 +53,12 @@ def median(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def bootstrap(values: NDArray[np.float64], statistic: Statistic = median, *, seed: int = 0) -> Interval:
-    """Return a statistic of some problems and its interval over draws of as many problems with replacement.
+    """Return a statistic of some problems with its bootstrap interval, from draws of as many problems with replacement.
 
     Args:
-        values: one number per problem (k,); infinity for a problem without a pose.
-        statistic: of the last axis.
-        seed: of the draws.
+        values: One number per problem (k,); infinity for a problem without a pose.
+        statistic: Reduces the last axis. Default: median.
+        seed: Seed of the draws.
 
     Raises:
         ValueError: There are no values, or one is NaN.
@@ -65,15 +71,15 @@ def bootstrap(values: NDArray[np.float64], statistic: Statistic = median, *, see
 def paired_difference(
     first: NDArray[np.float64], second: NDArray[np.float64], statistic: Statistic = median, *, seed: int = 0
 ) -> Interval:
-    """Return statistic(second) - statistic(first) and its interval over draws of the same problems for both.
+    """Return statistic(second) - statistic(first) with its bootstrap interval.
 
-    An interval on one side of zero is a difference that the problems show.
+    Each draw takes the same problems for both. The difference is significant if the interval excludes zero.
 
     Args:
-        first: one number per problem (k,).
-        second: numbers of the same problems in the same order.
-        statistic: of the last axis.
-        seed: of the draws.
+        first: One number per problem (k,).
+        second: Numbers of the same problems in the same order.
+        statistic: Reduces the last axis. Default: median.
+        seed: Seed of the draws.
 
     Raises:
         ValueError: The lengths differ, there are no values, or one is NaN.
@@ -87,12 +93,16 @@ def paired_difference(
 
 
 def quantile(fraction: float) -> Statistic:
-    """Return the statistic of this quantile."""
+    """Return the statistic that computes a quantile.
+
+    Args:
+        fraction: Quantile in [0, 1].
+    """
     return lambda values: np.asarray(np.quantile(values, fraction, axis=-1))
 
 
 def share(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean of zeros and ones along the last axis."""
+    """Return the mean along the last axis, the fraction of ones among zeros and ones."""
     return np.asarray(np.mean(values, axis=-1))
 
 
@@ -114,7 +124,13 @@ def _interval(value: float, drawn: NDArray[np.float64]) -> Interval:
 
 
 def interval_table(runs: Mapping[str, Results]) -> SplitTable:
-    """Return medians and recalls with intervals, differences to the first row, and seconds, a row per estimate."""
+    """Return a table of medians and recalls with intervals, differences to the first row, and seconds.
+
+    It has one row per run and estimate.
+
+    Args:
+        runs: Results by name.
+    """
     lines = lines_of(runs)
     shown = [
         (Text(line.label), list(map(Text, cells))) for line, cells in zip(lines, interval_cells(runs), strict=True)
@@ -123,14 +139,14 @@ def interval_table(runs: Mapping[str, Results]) -> SplitTable:
 
 
 def interval_cells(runs: Mapping[str, Results]) -> list[list[str]]:
-    """The texts of `interval_table`, a row per run and estimate, a cell per header."""
+    """Return the texts of `interval_table`: a row per run and estimate, a cell per header."""
     lines = lines_of(runs)
     first, rows = lines[0], []
     for line in lines:
-        found = runs[line.run].of(line.estimate)
-        angles = _angles(found)
+        tested = runs[line.run].of(line.estimate)
+        angles = _angles(tested)
         rotation = bootstrap(angles)
-        within = [row.rotation_error_deg < JOINT[0] and row.translation_error < JOINT[1] for row in found]
+        within = [row.rotation_error_deg < JOINT[0] and row.translation_error < JOINT[1] for row in tested]
         recall = bootstrap(100 * np.array(within, float), share)
         paired = ["", ""]
         if line != first and tested_problems(runs[line.run]) == tested_problems(runs[first.run]):

@@ -1,7 +1,7 @@
-"""Results as one HTML file that needs nothing else: no network, no server.
+"""Results as one HTML file that needs neither network nor server.
 
-plotly's script is inside, compressed: 2.0 MB of text. The numbers and points travel as compressed JSON: eight runs of
-ten thousand problems stay under 20 MB. The template and what is drawn by the browser are in `assets`.
+It contains plotly's script, compressed: 2.0 MB of text. Numbers and points are compressed JSON: eight runs of ten
+thousand problems stay under 20 MB. The template and the scripts that draw in the browser are in `assets`.
 """
 
 import base64
@@ -32,29 +32,35 @@ from bpnp.report.tables import CAPTION, LOADING, RESULT_COLUMNS, Line, best_text
 from bpnp.report.terminal import DASHES, INKS, Paper
 from bpnp.report.training_curves import training_curves, training_folder
 
-FACTS = ("written", "bpnp_version", "correspondence_loss", "settings")  # of a run
+FACTS = ("written", "bpnp_version", "correspondence_loss", "settings")  # facts of a run that the page shows
 SCRIPTS = ("page.js", "problem.js")
 SIZES = {"m": "2D points", "n": "3D points", "matches": "true matches"}
-COLUMNS = {  # of the table of problems: head and hover text
+COLUMNS = {  # columns of the table of problems: head and hover text
     "rotation_error_deg": ("rot deg", "rotation error, degrees"),
     "translation_error": ("trans", "translation error, scene units"),
     "centre_error": ("centre", "distance of the camera centres, scene units"),
     "reprojection_error_deg": ("repr deg", "mean reprojection error of the true matches, degrees"),
-    "inliers": ("inliers", "2D points with a reprojected 3D point beside them"),
+    "inliers": ("inliers", "2D points with a projected 3D point within the inlier threshold"),
     "m": ("2D points", "2D points of the problem"),
     "n": ("3D points", "3D points of the problem"),
     "matches": ("matches", "3D points with a true match"),
     "iterations": ("iterations", "iterations of the solver"),
-    "seconds": ("sec", "seconds, the problem's share of its batch"),
+    "seconds": ("sec", "seconds, an equal part of those of its batch"),
 }
-PROBLEMS = 500  # whose points are on the page
-DIGITS = 5  # significant ones of errors; of points and poses, of their extent
+PROBLEMS = 500  # number of problems whose points are on the page
+DIGITS = 5  # significant digits of errors; for points and poses, relative to their extent
 ERRORS = ("rotation_error_deg", "translation_error", "centre_error", "reprojection_error_deg", "seconds")
 COUNTS = ("inliers", "m", "n", "matches", "iterations")
 
 
 class TableRow(NamedTuple):
-    """line: None for a published row. cells: text, number and whether it is the best of its column."""
+    """Row of the table of quartiles.
+
+    Attributes:
+        name: Name.
+        line: Estimate, None for a published row.
+        cells: Text, number, and True for the best of its column.
+    """
 
     name: str
     line: Line | None
@@ -62,15 +68,21 @@ class TableRow(NamedTuple):
 
 
 def write_page(paths: Sequence[Path | str], output: Path | str, *, paper: Paper | None = None) -> Path:
-    """Write the page of one or several results folders, whole or not at all, and return where it is.
+    """Write the page of one or several results folders atomically, and return its path.
 
-    Raises ValueError if a folder or its points cannot be read.
+    Args:
+        paths: Results folders.
+        output: File.
+        paper: Data set whose published rows are added. Default: none.
+
+    Raises:
+        ValueError: A folder or its points cannot be read.
     """
     return write_text(Path(output), page_html(paths, paper=paper))
 
 
 def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None) -> str:
-    """The page as text. Raises ValueError as `write_page`."""
+    """Return the page as text; arguments and errors are those of `write_page`."""
     folders = named_runs(paths)
     runs = {name: read_results(path) for name, path in folders.items()}
     points = {name: read_points(path) for name, path in folders.items()}
@@ -85,7 +97,7 @@ def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None) -> str
         "look": json.dumps(look()),
     }
     lines = lines_of(runs)
-    # Names are text, whatever is in them: what is not Markup is escaped, bytes that are no UTF-8 are replaced.
+    # Names may contain anything: all text but Markup is escaped, and bytes that are not UTF-8 are replaced.
     page = Environment(
         autoescape=True, finalize=lambda it: utf8(it) if type(it) is str else it, trim_blocks=True, lstrip_blocks=True
     )
@@ -138,7 +150,7 @@ def training_pictures(folders: Mapping[str, Path]) -> dict[str, str]:
 
 
 def quartile_rows(runs: Mapping[str, Results], paper: Paper | None) -> list[TableRow]:
-    """The rows of the table of quartiles, with the terminal's texts."""
+    """Return the rows of the table of quartiles, with the texts of the terminal."""
     rows = run_rows(runs, paper)
     best = best_texts(RESULT_COLUMNS, rows)
     shown = []
@@ -161,7 +173,7 @@ def describe_run(results: Results) -> str:
 
 
 def _settings(settings: Mapping[str, Any]) -> Iterable[str]:
-    """Solver, data and checkpoint of a test, as far as they were recorded."""
+    """Yield the solver, data and checkpoint of a test that were recorded."""
     for name in ("solver", "data"):
         part = settings.get(name)
         if isinstance(part, Mapping) and "class_path" in part:
@@ -176,14 +188,14 @@ def _settings(settings: Mapping[str, Any]) -> Iterable[str]:
 
 
 def _shares(results: Results, estimate: str) -> tuple[list[float], float]:
-    """Percent of the problems with each cause, and that the solver calls converged."""
+    """Return the percentages of problems with each cause, and of those that converged."""
     shares = np.array(list(cause_shares(results.of(estimate)).values()))
     return (100 * shares).tolist(), 100 * results.estimates[estimate].get("converged", float("nan"))
 
 
 @cache
 def plotly_script() -> str:
-    """plotly.js, compressed, in base64."""
+    """Return plotly.js, compressed, in base64."""
     from plotly.offline import get_plotlyjs
 
     return compress_text(get_plotlyjs())
@@ -194,12 +206,12 @@ def _asset(name: str) -> str:
 
 
 def compress_text(text: str) -> str:
-    """gzip in base64, which the page's `inflated` reads."""
+    """Return a text as gzip in base64, which the function `inflated` of the page reads."""
     return base64.b64encode(gzip.compress(text.encode(), 6, mtime=0)).decode()
 
 
 def page_numbers(runs: Mapping[str, Results]) -> dict[str, Any]:
-    """The numbers of all problems: a series for each run and estimate. Columns of several series are there once."""
+    """Return the numbers of all problems: a series for each run and estimate. Equal columns are stored once."""
     columns: dict[tuple[Any, ...], int] = {}
 
     def place(values: Iterable[Any]) -> int:
@@ -215,10 +227,10 @@ def page_numbers(runs: Mapping[str, Results]) -> dict[str, Any]:
 
 
 def page_points(runs: Mapping[str, Results], points: Mapping[str, Sequence[ProblemPoints]]) -> str:
-    """The points of the `PROBLEMS` worst problems of all runs: compressed lines of JSON.
+    """Return the points of the `PROBLEMS` worst problems of all runs: compressed lines of JSON.
 
-    The first line has, by run, the number of the line after it for each of the run's problems, -1 for none. Runs on the
-    same points share lines.
+    The first line has, by run, the number of the following line for each of the run's problems, -1 for none. Runs on
+    the same points share lines.
     """
     keys = {name: {problem.index: _key(problem) for problem in points[name]} for name in runs}
     shared: dict[Hashable, dict[str, ProblemPoints]] = {}
@@ -227,17 +239,17 @@ def page_points(runs: Mapping[str, Results], points: Mapping[str, Sequence[Probl
             shared.setdefault(keys[name][problem.index], {})[name] = problem
     error = {key: max(problem.error for problem in by_run.values()) for key, by_run in shared.items()}
     worst = sorted(error, key=lambda key: -error[key])[:PROBLEMS]
-    place = {key: number for number, key in enumerate(worst)}
-    places = {
-        name: [place.get(keys[name].get(row.index), -1) for row in results.of(next(iter(results.estimates)))]
+    number = {key: i for i, key in enumerate(worst)}
+    line_numbers = {
+        name: [number.get(keys[name].get(row.index), -1) for row in results.of(next(iter(results.estimates)))]
         for name, results in runs.items()
     }
     lines = [json.dumps(_line(shared[key]), separators=(",", ":")) for key in worst]
-    return compress_text("\n".join([json.dumps(places), *lines]))
+    return compress_text("\n".join([json.dumps(line_numbers), *lines]))
 
 
 def _key(problem: ProblemPoints) -> Hashable:
-    """The same for problems of the same points: the name, the points that are there and the true pose."""
+    """Return a key that is equal for problems with the same name, points and true pose."""
     pose = None if problem.pose is None else np.c_[problem.pose].tobytes()
     return problem.id, problem.points2d.tobytes(), problem.points3d.tobytes(), pose
 
@@ -251,14 +263,14 @@ def _columns(rows: Sequence[ProblemRow]) -> dict[str, list[Any]]:
 
 
 def _shorten_number(value: float) -> float | str:
-    """`DIGITS` significant digits; of what JSON has no number for, the name that JavaScript's `Number` reads."""
+    """Round to `DIGITS` significant digits; NaN and infinity become the names that JavaScript's `Number` reads."""
     if math.isfinite(value):
         return float(f"{value:.{DIGITS}g}")
     return "NaN" if math.isnan(value) else "Infinity"
 
 
 def _line(runs: Mapping[str, ProblemPoints]) -> dict[str, Any]:
-    """Points, true matches and pose; of each run the poses and the assigned matches."""
+    """Return points, true matches and true pose, and the poses and assigned matches of each run."""
     shown = next(iter(runs.values()))
     ids2d, ids3d = (ids.tolist() for ids in shown.numbers())
     decimals = _decimals(shown.points3d)
@@ -279,13 +291,13 @@ def _line(runs: Mapping[str, ProblemPoints]) -> dict[str, Any]:
 
 
 def _decimals(points: Array) -> int:
-    """Decimal places of `DIGITS` digits of the points' extent."""
+    """Return the number of decimal places for `DIGITS` digits of the points' extent."""
     extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
     return DIGITS - math.floor(math.log10(extent)) if extent > 0 else DIGITS
 
 
 def _pose(pose: tuple[Array, Array] | None, decimals: int) -> list[float] | None:
-    """Quaternion (x, y, z, w) and translation; none without a pose."""
+    """Return quaternion (x, y, z, w) and translation; None without a pose."""
     if pose is None or not np.isfinite(np.c_[pose]).all():
         return None
     quaternion = Rotation.from_matrix(pose[0]).as_quat()

@@ -1,5 +1,4 @@
-"""The points of the problems of a test, `points.npz`: up to `MOST` a side of each, enough to draw what the cameras
-see."""
+"""Points of the problems of a test, `points.npz`: up to `MOST` points on each side, enough to draw them."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,9 +17,9 @@ from bpnp.types import Batch, Prediction
 
 FORMAT = 2
 FILE = "points.npz"
-MOST = 100  # points a side
+MOST = 100  # largest number of points on a side
 IDS = ("ids2d", "ids3d")
-POINTS: dict[str, tuple[Any, ...]] = {  # columns of all problems one after the other: type and width
+POINTS: dict[str, tuple[Any, ...]] = {  # type and width of the columns, with all problems one after the other
     "points2d": (np.float32, 2),
     "points3d": (np.float32, 3),
     **dict.fromkeys(("match3d", "assigned3d", *IDS), (np.int32,)),
@@ -31,15 +30,22 @@ Array = npt.NDArray[Any]
 
 @dataclass(frozen=True)
 class ProblemPoints:
-    """One problem, ready to draw. Conventions as in `bpnp.types`: camera = R p + t, normalised image coordinates.
+    """Problem to draw. Conventions are those of `bpnp.types`: camera = R p + t, normalised image coordinates.
 
-    points2d: (m, 2). points3d: (n, 3). match3d: (n,) the 2D point that each 3D point truly is, -1 for none.
-    assigned3d: (n,) the 2D point to which the solver's assignment gives most of each 3D point, -1 if it has none.
-    pose: true rotation (3, 3) and translation (3,), None if unknown. estimates: the same by name; NaN without a pose.
-    error: rotation error of the first estimate in degrees. ids2d, ids3d: the places of
-    the points in the problem as it was solved, if only some of them are here; None for all. camera: in whose pixels the
-    problem is drawn, None for normalised coordinates. normals3d: (n, 3) outward normals, None where points have none.
-    Camera and normals are not kept on disk.
+    Attributes:
+        index: `Batch.index`.
+        id: Name.
+        points2d: Image points (m, 2).
+        points3d: Scene points (n, 3).
+        match3d: Index of the true 2D point of each 3D point (n,), -1 for none.
+        assigned3d: Index of the 2D point with the largest probability in the solver's assignment (n,), -1 for none.
+        pose: True R (3, 3) and t (3,), None if unknown.
+        estimates: R (3, 3) and t (3,) by the name of the estimate; NaN without a pose.
+        error: Rotation error of the first estimate, degrees.
+        ids2d: Indices of the 2D points in the whole problem, None if all points are here.
+        ids3d: Indices of the 3D points in the whole problem, None if all points are here.
+        camera: Camera in whose pixels the problem is drawn, None for normalised coordinates; not stored on disk.
+        normals3d: Outward normals (n, 3), None for points without normals; not stored on disk.
     """
 
     index: int
@@ -57,25 +63,25 @@ class ProblemPoints:
     normals3d: Array | None = None
 
     def numbers(self) -> tuple[Array, Array]:
-        """`ids2d` and `ids3d`, counted where they are None."""
+        """Return `ids2d` and `ids3d`, counted where they are None."""
         count2d, count3d = np.arange(len(self.points2d)), np.arange(len(self.points3d))
         return count2d if self.ids2d is None else self.ids2d, count3d if self.ids3d is None else self.ids3d
 
 
 def utf8(name: str) -> str:
-    """A problem's name with replacements for bytes that are no UTF-8, which reach us as surrogates."""
+    """Replace bytes of a problem's name that are not UTF-8 and appear as surrogates."""
     return name.encode("utf-8", "replace").decode()
 
 
 def points_from(
     prediction: Prediction, batch: Batch, errors: Mapping[str, PoseErrors] | None = None
 ) -> list[ProblemPoints]:
-    """Return the points of each problem, at most `MOST` of each side, evenly spaced, matched ones first.
+    """Return the points of each problem, at most `MOST` on each side, evenly spaced, matched ones first.
 
     Args:
-        prediction: of the batch.
-        batch: problems, with or without their true poses.
-        errors: `prediction_errors`, if they are known.
+        prediction: Prediction for the batch.
+        batch: Problems, with or without their true poses.
+        errors: Result of `prediction_errors`, if computed before.
     """
     points2d, points3d, mask2d, mask3d = map(_host, (batch.points2d, batch.points3d, batch.mask2d, batch.mask3d))
     unknown = np.full(mask3d.shape, -1)
@@ -107,7 +113,7 @@ def points_from(
 
 
 def thin(problem: ProblemPoints, most: int = MOST) -> ProblemPoints:
-    """The problem with at most `most` points on each side, evenly spaced, matched ones first."""
+    """Return the problem with at most `most` points on each side, evenly spaced, matched ones first."""
     count2d = len(problem.points2d)
     keep3d = _first_then_rest(problem.match3d >= 0, most)
     keep2d = _first_then_rest(np.isin(np.arange(count2d), problem.match3d[keep3d]), most)
@@ -124,9 +130,16 @@ def thin(problem: ProblemPoints, most: int = MOST) -> ProblemPoints:
 
 
 def write_points(folder: Path | str, problems: Iterable[ProblemPoints]) -> None:
-    """Write `points.npz` whole or not at all: columns with the points of all problems one after the other.
+    """Write `points.npz` atomically: columns with the points of all problems one after the other.
 
-    Of several with one index the first is kept. Raises ValueError if they have different estimates.
+    The first of several problems with one index is kept.
+
+    Args:
+        folder: Results folder.
+        problems: Problems.
+
+    Raises:
+        ValueError: The problems have different estimates.
     """
     first: dict[int, ProblemPoints] = {}
     for problem in problems:
@@ -134,7 +147,7 @@ def write_points(folder: Path | str, problems: Iterable[ProblemPoints]) -> None:
     ordered = [first[index] for index in sorted(first)]
     names = list(ordered[0].estimates) if ordered else []
     if any(list(problem.estimates) != names for problem in ordered):
-        raise ValueError(f"expected problems with the estimates {names}, got others; try a folder for each solver")
+        raise ValueError(f"some problems have other estimates than {names}; use one folder for each solver")
     arrays = {
         "format": np.array(FORMAT),
         "ids": np.frombuffer(json.dumps([problem.id for problem in ordered]).encode(), np.uint8),
@@ -153,7 +166,14 @@ def write_points(folder: Path | str, problems: Iterable[ProblemPoints]) -> None:
 
 
 def read_points(folder: Path | str) -> tuple[ProblemPoints, ...]:
-    """Read what `write_points` wrote; empty if the folder has none. Raises ValueError that names an unreadable file."""
+    """Read the file of `write_points`; the result is empty if the folder has none.
+
+    Args:
+        folder: Results folder.
+
+    Raises:
+        ValueError: The file cannot be read.
+    """
     path = Path(folder) / FILE
     if not path.is_file():
         return ()
@@ -163,9 +183,9 @@ def read_points(folder: Path | str) -> tuple[ProblemPoints, ...]:
         version = int(arrays["format"])
         if version == FORMAT:
             return tuple(_unpack_problems(arrays))
-    except Exception as error:  # noqa: BLE001 - zipfile, numpy and json each have errors of their own
-        raise ValueError(f"expected points of a test in {path}, got {error}; try `bpnp test` again") from error
-    raise ValueError(f"expected points of format {FORMAT} in {path}, got {version}; try the bpnp that wrote them")
+    except Exception as error:  # noqa: BLE001 - zipfile, numpy and json have different errors
+        raise ValueError(f"cannot read the points of a test in {path} ({error}); run `bpnp test` again") from error
+    raise ValueError(f"{path} has format {version}, not {FORMAT}; use the version of bpnp that wrote it")
 
 
 def _unpack_problems(arrays: dict[str, Array]) -> Iterable[ProblemPoints]:
@@ -185,7 +205,7 @@ def _unpack_problems(arrays: dict[str, Array]) -> Iterable[ProblemPoints]:
 
 
 def _stack_poses(poses: Sequence[tuple[Array, Array] | None]) -> Array:
-    """[R | t] of each problem, (k, 3, 4), NaN for none."""
+    """Return [R | t] of each problem (k, 3, 4), NaN for none."""
     missing = np.full((3, 4), np.nan)
     return np.array([missing if pose is None else np.c_[pose] for pose in poses], np.float64).reshape(-1, 3, 4)
 
@@ -199,7 +219,7 @@ def _host(values: Tensor) -> Array:
 
 
 def _first_then_rest(first: Array, most: int) -> Array:
-    """Indices where `first` holds and then of the rest, each thinned evenly where there is no room; ascending."""
+    """Return indices where `first` holds, then of the rest, each thinned evenly where there is no room; ascending."""
     head = _thin_rows(np.flatnonzero(first), most)
     return np.sort(np.r_[head, _thin_rows(np.flatnonzero(~first), most - len(head))]).astype(np.int64)
 
@@ -211,7 +231,7 @@ def _thin_rows(values: Array, most: int) -> Array:
 
 
 def _renumber_targets(targets: Array, chosen: Array, count: int) -> Array:
-    """Positions of `targets` in `chosen`, both indices of `count` points; -1 for those that are not among them."""
-    place = np.full(count + 1, -1, np.int32)  # the last for targets of -1
-    place[chosen] = np.arange(len(chosen))
-    return place[targets]
+    """Return the positions of `targets` in `chosen`, both indices of `count` points, or -1."""
+    position = np.full(count + 1, -1, np.int32)  # the last entry is for targets of -1
+    position[chosen] = np.arange(len(chosen))
+    return position[targets]

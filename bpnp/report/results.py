@@ -1,8 +1,8 @@
-"""What a test found, in memory and in its folder: a row per problem and estimate, and the aggregates of the rows.
+"""Results of a test, in memory and in its folder: a row per problem and estimate, and their aggregates.
 
-`problems.csv` has the rows, `summary.json` the aggregates. Angles in degrees, lengths in scene units, as in
-`bpnp.metrics`. Infinite and undefined numbers are "inf" and "nan" in both files (strings in the JSON, which has no such
-numbers).
+`problems.csv` has the rows, `summary.json` the aggregates. Angles are in degrees, lengths in scene units, as in
+`bpnp.metrics`. Infinite and undefined numbers are "inf" and "nan" in both files (as strings in the JSON, which has no
+such numbers).
 """
 
 import json
@@ -26,12 +26,12 @@ from bpnp.types import Batch, Pose, Prediction
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-FORMAT = 2  # 1 had pairs.csv
+FORMAT = 2  # format 1 had pairs.csv
 ROWS, SUMMARY = "problems.csv", "summary.json"
-PIPELINE = ("ransac", "pnp", "refined")  # estimates are listed in this order, others after them
+PIPELINE = ("ransac", "pnp", "refined")  # order of the estimates; others follow
 SOLVED_DEG = 5.0  # largest rotation error of a solved problem
 INLIER_THRESHOLD = 0.01  # largest distance of an inlier, normalised image units
-PLAUSIBLE_INLIERS = 0.5  # share of the 2D points from which a wrong pose counts as fitting the image
+PLAUSIBLE_INLIERS = 0.5  # least fraction of inlier 2D points of a wrong pose that fits the image
 CAUSES = ("solved", "no pose", "wrong, not converged", "wrong, but fits the image", "wrong")
 
 
@@ -39,9 +39,23 @@ CAUSES = ("solved", "no pose", "wrong, not converged", "wrong, but fits the imag
 class ProblemRow:
     """One estimate of one problem.
 
-    index, id: the problem in its data set. Errors: see `bpnp.metrics`. inliers: see `count_inliers`. m, n: 2D and 3D
-    points. matches: 3D points with a known match. iterations, residual, converged: the solver's `SolveStats`. found:
-    whether there is a pose. seconds: share of the time until the estimates of the problem's batch were found.
+    Attributes:
+        index: Index of the problem in its data set.
+        id: Name of the problem.
+        estimate: Name of the estimate.
+        rotation_error_deg: See `bpnp.metrics`, as the other errors.
+        translation_error: Scene units.
+        centre_error: Scene units.
+        reprojection_error_deg: Degrees.
+        inliers: See `count_inliers`.
+        m: Number of 2D points.
+        n: Number of 3D points.
+        matches: Number of 3D points with a true match.
+        iterations: Iterations of the solver.
+        residual: Residual of the solver.
+        converged: True if the solver converged.
+        found: True if there is a pose.
+        seconds: Time until the estimates of the problem's batch were found, divided by the number of its problems.
     """
 
     index: int
@@ -63,13 +77,13 @@ class ProblemRow:
 
     @property
     def cause(self) -> str:
-        """One of `CAUSES`: the first of these that holds.
+        """Outcome, the first of `CAUSES` that holds.
 
-        - "no pose": the solver gave none;
-        - "solved": rotation error up to `SOLVED_DEG` degrees, whether the solver reports convergence or not;
-        - "wrong, not converged": the solver itself reports that it did not converge;
-        - "wrong, but fits the image": `PLAUSIBLE_INLIERS` of the 2D points have a reprojected 3D point beside them:
-          another minimum, or a symmetric scene, that the solver cannot tell from the true pose;
+        - "no pose": the solver returned none;
+        - "solved": rotation error up to `SOLVED_DEG` degrees, whether the solver converged or not;
+        - "wrong, not converged": the solver did not converge;
+        - "wrong, but fits the image": `PLAUSIBLE_INLIERS` of the 2D points are inliers: another minimum, or a symmetric
+          scene, whose image does not differ from that of the true pose;
         - "wrong": none of these.
         """
         if not self.found:
@@ -87,7 +101,16 @@ PARSE = {field.name: TYPES[field.type] for field in fields(ProblemRow)}
 
 @dataclass(frozen=True)
 class Results:
-    """The rows of a test and, by estimate, what `summarise` makes of them; `settings` is what the caller recorded."""
+    """Results of a test.
+
+    Attributes:
+        rows: Rows of all problems and estimates.
+        estimates: Result of `summarise`, by estimate.
+        correspondence_loss: Mean of L_c (paper Eq. 11), None if unknown.
+        settings: Settings recorded by the caller.
+        bpnp_version: Version that wrote the results.
+        written: Time, ISO 8601.
+    """
 
     rows: tuple[ProblemRow, ...]
     estimates: dict[str, dict[str, float]]
@@ -97,11 +120,11 @@ class Results:
     written: str
 
     def of(self, estimate: str) -> list[ProblemRow]:
-        """The rows of one estimate, in the order of the data set."""
+        """Return the rows of one estimate, in the order of the data set."""
         return [row for row in self.rows if row.estimate == estimate]
 
     def errors(self, estimate: str) -> PoseErrors:
-        """Errors of one estimate in the order of the rows."""
+        """Return the errors of one estimate, in the order of its rows."""
         return _errors(self.of(estimate))
 
     @property
@@ -110,7 +133,7 @@ class Results:
         return len({row.index for row in self.rows})
 
     def frame(self) -> "DataFrame":
-        """The rows as a DataFrame for notebooks: the columns of `ProblemRow`, and "cause".
+        """Return the rows as a DataFrame with the columns of `ProblemRow`, and "cause".
 
         `read_results("runs/quickstart/test").frame().groupby("estimate").rotation_error_deg.median()`
         """
@@ -125,10 +148,10 @@ def rows_from(
     """Return one row per problem and estimate.
 
     Args:
-        prediction: of the batch. Where it has the seconds until an estimate was found, these count.
-        batch: problems with their true poses.
-        seconds: time of the whole batch. Each problem has an equal share.
-        errors: `prediction_errors`, if they are known.
+        prediction: Prediction for the batch. Its own `seconds` of an estimate, if any, are used.
+        batch: Problems with their true poses.
+        seconds: Time of the whole batch, divided equally among its problems.
+        errors: Result of `prediction_errors`, if computed before.
 
     Raises:
         ValueError: The batch has no true pose.
@@ -139,49 +162,55 @@ def rows_from(
     errors = prediction_errors(prediction, batch) if errors is None else errors
     rows = []
     for estimate, pose in prediction.poses.items():
-        known, stats = errors[estimate], pose.stats
-        columns = (known.rotation_deg, known.translation, known.centre, known.reprojection_deg)
+        error, stats = errors[estimate], pose.stats
+        columns = (error.rotation_deg, error.translation, error.centre, error.reprojection_deg)
         figures, inliers = torch.stack(columns, -1).tolist(), count_inliers(pose, batch)
-        told = (stats.iterations, stats.residual.double(), stats.converged, pose.found)
-        states = zip(*(values.tolist() for values in told), strict=True)
-        share = prediction.seconds.get(estimate, seconds) / len(batch)
+        state_columns = (stats.iterations, stats.residual.double(), stats.converged, pose.found)
+        states = zip(*(values.tolist() for values in state_columns), strict=True)
+        each = prediction.seconds.get(estimate, seconds) / len(batch)
         for i, state in enumerate(states):
-            values: Any = (indices[i], batch.ids[i], estimate, *figures[i], inliers[i], *sizes[i], *state, share)
+            values: Any = (indices[i], batch.ids[i], estimate, *figures[i], inliers[i], *sizes[i], *state, each)
             rows.append(ProblemRow(*values))
     return rows
 
 
 def count_inliers(pose: Pose, batch: Batch, *, threshold: float = INLIER_THRESHOLD) -> list[int]:
-    """2D points of each problem with a projected 3D point nearer than `threshold` (normalised image units).
+    """Count the 2D points of each problem with a projected 3D point nearer than `threshold`.
 
-    Needs no true match: it is what a user of the pose can check. Points behind the camera do not count; without a pose
-    there is no inlier.
+    No true match is needed, so a user of the pose can compute it. Points behind the camera do not count; there are no
+    inliers without a pose.
+
+    Args:
+        pose: Poses.
+        batch: Problems.
+        threshold: Distance, normalised image units.
     """
     camera = transform(pose.rotation.double(), pose.translation.double(), batch.points3d.double())
     projected = project(camera)
     visible = batch.mask3d & (camera[..., 2] > 0) & projected.isfinite().all(-1)
     counts = []
     for i in range(len(batch)):
-        shown, seen = projected[i, visible[i]].cpu().numpy(), batch.points2d[i, batch.mask2d[i]].cpu().numpy()
-        # An empty tree answers infinity.
-        distance, _ = cKDTree(shown).query(seen, distance_upper_bound=threshold)
+        targets, image = projected[i, visible[i]].cpu().numpy(), batch.points2d[i, batch.mask2d[i]].cpu().numpy()
+        # An empty tree returns infinity.
+        distance, _ = cKDTree(targets).query(image, distance_upper_bound=threshold)
         counts.append(int((distance < math.inf).sum()))
     return counts
 
 
 def cause_shares(rows: Iterable[ProblemRow]) -> dict[str, float]:
-    """Share of the rows with each cause, in the order of `CAUSES`; they sum to one.
+    """Return the fraction of the rows with each cause, in the order of `CAUSES`; they sum to one.
 
-    Raises ValueError if there is no row.
+    Raises:
+        ValueError: There is no row.
     """
     causes = [row.cause for row in rows]
     if not causes:
-        raise ValueError("expected at least one row, got none")
+        raise ValueError("there are no rows to count causes of")
     return {cause: causes.count(cause) / len(causes) for cause in CAUSES}
 
 
 def summarise(rows: Sequence[ProblemRow]) -> dict[str, dict[str, float]]:
-    """By estimate: quartiles and recalls of its rows, the share that converged and the mean seconds per problem."""
+    """Return quartiles, recalls, the fraction that converged and the mean seconds per problem, by estimate."""
     summary = {}
     for estimate in sorted({row.estimate for row in rows}, key=pipeline_order):
         chosen = [row for row in rows if row.estimate == estimate]
@@ -195,7 +224,7 @@ def summarise(rows: Sequence[ProblemRow]) -> dict[str, dict[str, float]]:
 
 
 def pipeline_order(estimate: str) -> tuple[int, str]:
-    """Sorts estimates by the step of the pipeline that makes them."""
+    """Return the sort key of an estimate: its step of the pipeline, then its name."""
     return PIPELINE.index(estimate) if estimate in PIPELINE else len(PIPELINE), estimate
 
 
@@ -206,12 +235,20 @@ def write_results(
     correspondence_loss: float | None = None,
     settings: Mapping[str, Any] | None = None,
 ) -> Results:
-    """Write `problems.csv` and `summary.json`, each whole or not at all, and return what was written.
+    """Write `problems.csv` and `summary.json` atomically, and return the results.
 
-    A problem that several processes tested is written once, its first row; rows are sorted by index, so that the files
-    do not depend on the order of batches or processes. `settings` (the command, the configuration) are kept as they
-    are; what JSON cannot hold becomes text. Raises ValueError if there is no row, if an estimate is missing for some
-    problem, or if one index has two ids, as when two data sets are mixed.
+    A problem that several processes tested is written once, its first row. Rows are sorted by index, so that the files
+    do not depend on the order of batches or processes.
+
+    Args:
+        folder: Results folder.
+        rows: Rows.
+        correspondence_loss: Mean of L_c, if known.
+        settings: Settings to record (the command, the configuration); values that JSON cannot hold become text.
+
+    Raises:
+        ValueError: There is no row, an estimate is missing for a problem, or one index has two ids, as when two data
+            sets are mixed.
     """
     from pandas import DataFrame
 
@@ -224,41 +261,48 @@ def write_results(
     del summary["rows"]
     frame = DataFrame(map(astuple, ordered), columns=list(PARSE), dtype=object)
     folder = Path(folder)
-    # Old aggregates must not stand beside new rows, should the process end between the two files.
+    # Remove the old aggregates first, in case the process ends between the two files.
     (folder / SUMMARY).unlink(missing_ok=True)
     with write_atomically(folder / ROWS) as temporary:
-        # File names that are not UTF-8 reach us, and leave, as surrogates.
+        # File names that are not UTF-8 are read and written as surrogates.
         frame.to_csv(temporary, index=False, na_rep="nan", lineterminator="\r\n", errors="surrogateescape")
     write_text(folder / SUMMARY, json.dumps(plain(summary), indent=2, allow_nan=False) + "\n")
     return results
 
 
 def read_results(folder: Path | str) -> Results:
-    """Read what `write_results` wrote. Raises ValueError that names the file: missing, of another format, incomplete,
-    or with a value that is no number."""
+    """Read the files of `write_results`.
+
+    Args:
+        folder: Results folder.
+
+    Raises:
+        ValueError: A file is missing, of another format, incomplete, or has a value that is no number. The message
+            names it.
+    """
     path, table = Path(folder) / SUMMARY, Path(folder) / ROWS
     for file in (path, table):
         if not file.is_file():
-            raise ValueError(f"expected a results folder with {file.name}, got no {file}; try `bpnp test` first")
+            raise ValueError(f"{folder} is no results folder: it has no {file.name}; run `bpnp test` first")
     rows = _read_rows(table)
     try:
         summary = dict(json.loads(path.read_bytes()))
         if (version := summary.pop("format", None)) != FORMAT:
-            raise ValueError(f"format {version!r} in place of {FORMAT}; try `bpnp test` again")
+            raise ValueError(f"format {version!r} in place of {FORMAT}; run `bpnp test` again")
         count, loss = summary.pop("problems"), summary.pop("correspondence_loss")
         estimates = {
             name: {k: float(v) for k, v in values.items()} for name, values in summary.pop("estimates").items()
         }
         results = Results(rows, estimates, None if loss is None else float(loss), **summary)
     except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise ValueError(f"expected what `bpnp test` writes in {path}, got {type(error).__name__}: {error}") from error
+        raise ValueError(f"{path} is no summary of `bpnp test`: {type(error).__name__}: {error}") from error
     if len(rows) != count * len(estimates):
-        raise ValueError(f"expected {count} x {len(estimates)} rows in {ROWS}, as {path} says, got {len(rows)}")
+        raise ValueError(f"{table} has {len(rows)} rows, but {path} counts {count} x {len(estimates)}")
     return results
 
 
 def plain(value: Any) -> Any:
-    """The same in the types of strict JSON."""
+    """Convert a value to the types of strict JSON; others become text."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -275,29 +319,29 @@ def _read_rows(path: Path) -> tuple[ProblemRow, ...]:
         frame = read_csv(path, dtype=object, keep_default_na=False, encoding_errors="surrogateescape", index_col=False)
         columns = [[parse(text) for text in frame[name]] for name, parse in PARSE.items()]
     except (ValueError, KeyError) as error:
-        raise ValueError(f"expected the rows of a test in {path}, got {error}") from error
+        raise ValueError(f"cannot read the rows of a test in {path}: {error}") from error
     if frame.empty:
-        raise ValueError(f"expected at least one row in {path}, got none")
+        raise ValueError(f"{path} has no rows")
     return tuple(ProblemRow(*values) for values in zip(*columns, strict=True))
 
 
 def _sort_rows(rows: Iterable[ProblemRow]) -> tuple[ProblemRow, ...]:
-    """The first row of each problem and estimate, sorted."""
+    """Return the first row of each problem and estimate, sorted."""
     problems: dict[int, tuple[str, int, int]] = {}
     first: dict[tuple[int, str], ProblemRow] = {}
     for row in rows:
-        described = row.id, row.m, row.n
-        if (other := problems.setdefault(row.index, described)) != described:
+        problem = row.id, row.m, row.n
+        if (other := problems.setdefault(row.index, problem)) != problem:
             raise ValueError(
-                f"expected one number in `Batch.index` for each problem, got {row.index} for {other} and {described} "
-                "(id, 2D and 3D points); try Batch.from_arrays(..., index=...), and a folder for each data set"
+                f"`Batch.index` {row.index} is used for two problems, {other} and {problem} (id, 2D and 3D points); "
+                "use Batch.from_arrays(..., index=...), and a folder for each data set"
             )
         first.setdefault((row.index, row.estimate), row)
     counts = Counter(row.estimate for row in first.values())
     if not counts:
-        raise ValueError("expected at least one row, got none; try a test set with a problem in it")
+        raise ValueError("there are no rows to write; the test set needs at least one problem")
     if len(first) != len(problems) * len(counts):
-        raise ValueError(f"expected each estimate for all {len(problems)} problems, got {dict(counts)}")
+        raise ValueError(f"an estimate is missing for some of the {len(problems)} problems: {dict(counts)}")
     return tuple(sorted(first.values(), key=lambda row: (row.index, pipeline_order(row.estimate))))
 
 

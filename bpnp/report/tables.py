@@ -1,6 +1,4 @@
-"""Several runs side by side: their names, how each is drawn, and tables of their figures and of the paper's, as a
-DataFrame, on the terminal and in files.
-"""
+"""Tables of several runs and of the paper's rows: as a DataFrame, on the terminal, and in files."""
 
 import json
 import math
@@ -24,20 +22,26 @@ CAPTION = (
     "rot, repr: errors in degrees; trans: in scene units; quartiles Q1, Q2, Q3. 15deg 0.5, 10deg 1.0: % of problems "
     "with both rotation and translation error within. sec: mean seconds a problem. No pose counts as 180 deg and inf."
 )
-# Options of the data that change no problem of a test.
+# Options of the data that do not change the problems of a test.
 LOADING = {"batch_size", "eval_batch_size", "max_cells", "num_workers", "max_points", "fresh_subsets", "val_fraction"}
 
 
 def read_runs(paths: Sequence[Path | str]) -> dict[str, Results]:
-    """Results by the names of `named_runs`."""
+    """Read results, by the names of `named_runs`."""
     return {name: read_results(path) for name, path in named_runs(paths).items()}
 
 
 def table(runs: Sequence[Path | str] | Mapping[str, Results]) -> "DataFrame":
-    """Aggregates of one or several results: a DataFrame with a row per run and estimate, and the columns "run",
-    "estimate", "correspondence_loss" and all numbers of `summarise`.
+    """Return the aggregates of one or several results as a DataFrame with a row per run and estimate.
 
-    runs: results folders, or results by name. Raises ValueError if a folder cannot be read.
+    Args:
+        runs: Results folders, or results by name.
+
+    Returns:
+        Columns "run", "estimate", "correspondence_loss" and all numbers of `summarise`.
+
+    Raises:
+        ValueError: A folder cannot be read.
     """
     from pandas import DataFrame
 
@@ -49,7 +53,15 @@ def table(runs: Sequence[Path | str] | Mapping[str, Results]) -> "DataFrame":
 
 
 class Line(NamedTuple):
-    """An estimate of a run as tables and figures show it. colour, dashes: indices of the palette."""
+    """Estimate of a run, as tables and figures show it.
+
+    Attributes:
+        run: Name of the run.
+        estimate: Name of the estimate.
+        label: Text to show.
+        colour: Index of the palette.
+        dashes: Index of the dash patterns.
+    """
 
     run: str
     estimate: str
@@ -59,29 +71,36 @@ class Line(NamedTuple):
 
 
 def lines_of(runs: Mapping[str, Results]) -> list[Line]:
-    """Every estimate of every run, with the run's name only where there are several.
+    """Return every estimate of every run; labels have the name of the run only if there are several runs.
 
     With at most eight lines each has its own colour; with more, each run has one. Estimates of one name share dashes.
+
+    Args:
+        runs: Results by name.
     """
     keys = [(run, estimate) for run, results in runs.items() for estimate in results.estimates]
-    places, names = list(runs), list(dict.fromkeys(estimate for _, estimate in keys))
+    order, names = list(runs), list(dict.fromkeys(estimate for _, estimate in keys))
     lines = []
     for i, (run, estimate) in enumerate(keys):
-        colour = i if len(keys) <= len(LIGHT) else places.index(run) % len(LIGHT)
+        colour = i if len(keys) <= len(LIGHT) else order.index(run) % len(LIGHT)
         label = estimate if len(runs) == 1 else f"{run}: {estimate}"
         lines.append(Line(run, estimate, label, colour, names.index(estimate) % len(DASHES)))
     return lines
 
 
 def named_runs(paths: Sequence[Path | str]) -> dict[str, Path]:
-    """Results folders by what their paths do not share, at the start or at the end; a single one by its run.
+    """Return results folders by the parts of their paths that differ; a single one by the name of its run.
 
-    Of a run's folder, its `test`; of a folder of several results, such as that of `bpnp table`, all of them. Raises
-    ValueError if there is none.
+    Args:
+        paths: Results folders. A run's folder stands for its `test`, and a folder of several results, such as that of
+            `bpnp table`, for all of them.
+
+    Raises:
+        ValueError: There is no path.
     """
     if not paths:
-        raise ValueError("expected at least one results folder, got none; try the folder that `bpnp test` wrote")
-    folders = [place for path in paths for place in _results_in(Path(path).absolute())]
+        raise ValueError("no results folder is given; give one that `bpnp test` wrote")
+    folders = [folder for path in paths for folder in _results_in(Path(path).absolute())]
     if len(folders) == 1:
         (folder,) = folders
         return {(folder.parent if folder.name == "test" else folder).name: folder}
@@ -93,16 +112,22 @@ def named_runs(paths: Sequence[Path | str]) -> dict[str, Path]:
 
 
 def _results_in(folder: Path) -> list[Path]:
-    for place in (folder, folder / "test"):
-        if (place / SUMMARY).is_file():
-            return [place]
+    for candidate in (folder, folder / "test"):
+        if (candidate / SUMMARY).is_file():
+            return [candidate]
     return sorted(path.parent for path in folder.rglob(SUMMARY)) or [folder]
 
 
 @dataclass(frozen=True)
 class Column:
-    """Where a column's number is found, what is written above it, and whether it is a share (shown in %, more is
-    better), a count, or an error or a time (less is better)."""
+    """Column of a table.
+
+    Attributes:
+        key: Key of its number.
+        header: Text above it.
+        share: True for a fraction, shown in %, of which more is better.
+        count: True for a count. Other columns are errors or times, of which less is better.
+    """
 
     key: str
     header: str
@@ -112,10 +137,14 @@ class Column:
 
 @dataclass(frozen=True)
 class Row:
-    """One row: an estimate of a run or a method, its figures by column, and the share of outliers it was given.
+    """Row of a table: an estimate of a run, or a method.
 
-    source: "here", or the paper, whose figures are texts as printed. problems: equal for rows of the same problems,
-    among which the best figures are marked; None for a row that takes no part.
+    Attributes:
+        label: Name.
+        values: Numbers by column; texts for published rows.
+        source: "here", or the paper.
+        rho: Outlier ratio of the data, None if it does not apply.
+        problems: Equal for rows of the same problems, among which the best numbers are marked; None to take no part.
     """
 
     label: str
@@ -126,7 +155,7 @@ class Row:
 
     @property
     def name(self) -> str:
-        """The label with the source or the share of outliers."""
+        """Label with the source or the outlier ratio."""
         name = self.label if self.source == HERE else f"{self.source}: {self.label}"
         return name if self.rho is None else f"{name}, rho {self.rho:g}"
 
@@ -152,7 +181,7 @@ LATEX_COLUMNS = {
 
 # Campbell, Liu, Gould, ECCV 2020, tables 1 and 2, recalls from the text. R: the RANSAC estimate. SoftPOSIT, RANSAC and
 # GOSMA were stopped after 30 s; SoftPOSIT started from the mean pose (table 1) or near the true one (table 2).
-# A line a row: label | nine quartiles, seconds and, for some, the recall in %. Other data than ours, another machine.
+# Each line is a row: label | nine quartiles, seconds and, for some, the recall in %. Other data, another machine.
 PRINTED: Mapping[Paper, tuple[str, Column, str]] = {
     "modelnet40": ("ModelNet40", RECALLS[0], """
         SoftPOSIT | 16.1 21.8 28.0 0.33 0.49 0.72 2.82 3.98 5.21 27
@@ -174,7 +203,7 @@ PRINTED: Mapping[Paper, tuple[str, Column, str]] = {
 
 
 def run_rows(runs: Mapping[str, Results], paper: Paper | None = None) -> list[Row]:
-    """A row per run and estimate, then what is printed."""
+    """Return a row per run and estimate, then the published rows."""
     tested = {name: tested_problems(results) for name, results in runs.items()}
     rows = [
         Row(line.label, runs[line.run].estimates[line.estimate], problems=tested[line.run]) for line in lines_of(runs)
@@ -183,7 +212,7 @@ def run_rows(runs: Mapping[str, Results], paper: Paper | None = None) -> list[Ro
 
 
 def tested_problems(results: Results) -> Hashable:
-    """Equal for results of the same problems: the same data, names and numbers of points."""
+    """Return a key that is equal for results of the same problems: the same data, names and numbers of points."""
     data = results.settings.get("data")
     if isinstance(data, Mapping) and isinstance(data.get("init_args"), Mapping):
         options = {key: value for key, value in data["init_args"].items() if key not in LOADING}
@@ -192,7 +221,7 @@ def tested_problems(results: Results) -> Hashable:
 
 
 def paper_rows(paper: Paper | None) -> list[Row]:
-    """The printed rows of a data set; none without one."""
+    """Return the published rows of a data set; none for None."""
     if paper is None:
         return []
     name, recall, text = PRINTED[paper]
@@ -211,7 +240,7 @@ def paper_quartiles(paper: Paper | None, error: str) -> dict[str, list[float]]:
 
 
 def cell(column: Column, values: Values) -> str:
-    """What a table shows of a column: a share in percent, a count whole, what was printed as it is, else `number`."""
+    """Return the text of a cell: fractions in percent, counts whole, published texts unchanged, else `number`."""
     value = values.get(column.key)
     if value is None or isinstance(value, str):
         return value or "-"
@@ -221,31 +250,39 @@ def cell(column: Column, values: Values) -> str:
 
 
 def best_texts(columns: Sequence[Column], rows: Sequence[Row]) -> dict[tuple[Hashable, str], str]:
-    """By problems and column the best number of several rows as it is shown, so that what reads the same is marked the
-    same."""
+    """Return the best number of each column among rows of the same problems, as text.
+
+    Comparing texts marks all cells that read the same.
+
+    Returns:
+        Texts by (problems, key of the column).
+    """
     best = {}
     for problems in {row.problems for row in rows} - {None}:
         alike = [row.values for row in rows if row.problems == problems]
         for column in columns:
-            shown = [value for values in alike if isinstance(value := values.get(column.key), float)]
-            known = [value for value in shown if math.isfinite(value)]
-            if len(alike) > 1 and known and not column.count:
-                best[problems, column.key] = cell(column, {column.key: (max if column.share else min)(known)})
+            numbers = [value for values in alike if isinstance(value := values.get(column.key), float)]
+            finite = [value for value in numbers if math.isfinite(value)]
+            if len(alike) > 1 and finite and not column.count:
+                best[problems, column.key] = cell(column, {column.key: (max if column.share else min)(finite)})
     return best
 
 
 def results_table(runs: Mapping[str, Results], *, paper: Paper | None = None) -> SplitTable:
-    """Quartiles, joint recalls, share of problems with a pose and seconds per problem, a row per run and estimate.
+    """Return quartiles, joint recalls, the fraction of problems with a pose and seconds, a row per run and estimate.
 
-    The best number of each column is bold, among runs of the same problems. `paper` adds the published rows of that
-    data set, for orientation only: they are of other data and take no part in the comparison.
+    The best number of each column is bold, among runs of the same problems.
+
+    Args:
+        runs: Results by name.
+        paper: Data set whose published rows are added for orientation. They are of other data and are not compared.
     """
     sizes = " or ".join(str(size) for size in sorted({results.problems for results in runs.values()}))
     return table_of_rows(f"Pose errors, {sizes} problems", RESULT_COLUMNS, run_rows(runs, paper), CAPTION)
 
 
 def table_of_rows(title: str, columns: Sequence[Column], rows: Sequence[Row], caption: str) -> SplitTable:
-    """The rows on the terminal: ours with the best numbers bold, beneath them those of the paper."""
+    """Return a table for the terminal: our rows with the best numbers bold, below them those of the paper."""
     best = best_texts(columns, rows)
     groups: tuple[list[tuple[Text, list[Text]]], ...] = ([], [])
     for row in rows:
@@ -257,7 +294,7 @@ def table_of_rows(title: str, columns: Sequence[Column], rows: Sequence[Row], ca
 
 
 def table_frame(rows: Sequence[Row]) -> "DataFrame":
-    """Every figure in full, the paper's as printed, shares from 0 to 1; `source` tells them apart."""
+    """Return all numbers as a DataFrame, fractions from 0 to 1, the paper's as published; `source` separates them."""
     from pandas import DataFrame
 
     def full(column: Column, row: Row) -> float | int | str | None:
@@ -269,7 +306,7 @@ def table_frame(rows: Sequence[Row]) -> "DataFrame":
 
 
 def as_latex(rows: Sequence[Row]) -> str:
-    """A booktabs table with the paper's columns: quartiles, seconds, and both recalls."""
+    """Return a booktabs table with the paper's columns: quartiles, seconds, and both recalls."""
     from pandas import DataFrame, MultiIndex
 
     cells = [[row.name, *(cell(column, row.values) for column in LATEX_COLUMNS.values())] for row in rows]
@@ -280,6 +317,6 @@ def as_latex(rows: Sequence[Row]) -> str:
 
 
 def note(rows: Sequence[Row]) -> list[str]:
-    """A line on each source that is not ours."""
+    """Return a line for each source other than this run."""
     sources = dict.fromkeys(row.source for row in rows if row.source != HERE)
     return [f"{source}: another data set than ours." for source in sources]

@@ -1,6 +1,4 @@
-"""How results look: colours; on the terminal lines as they are, progress on stderr, and tables that keep every name and
-number whole in 80 columns.
-"""
+"""Colours of results, and output on the terminal: lines, progress on stderr, and tables that fit in 80 columns."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -14,12 +12,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 from rich.table import Table
 from rich.text import Text
 
-# Colours of runs and estimates, for the page and for figures: eight of each scheme that stay apart for readers with
-# normal vision, protanopia and deuteranopia (at least 30 in CIE Lab) and tritanopia (23), at a contrast of 3 or more
-# against the background. Estimates also differ by their dashes.
+# Colours of runs and estimates, for the page and for figures: eight in each scheme. Their distance in CIE Lab is at
+# least 30 for readers with normal vision, protanopia and deuteranopia and 23 with tritanopia, and their contrast to the
+# background is at least 3. Estimates also differ by their dashes.
 LIGHT = ("#002ed0", "#c68500", "#08a76d", "#91290f", "#977dea", "#916393", "#58006e", "#201816")
 DARK = ("#12cdff", "#ffb006", "#009b6b", "#986e9f", "#f3d783", "#cd5e1c", "#e7eee7", "#887bff")
-# The page itself, light and dark: quiet text, lines between rows, panels, what has the focus, wrong matches.
+# Colours of the page, light and dark.
 INKS = {
     "background": ("#ffffff", "#14171c"),
     "text": ("#1b1f24", "#e6e8eb"),
@@ -32,17 +30,26 @@ INKS = {
 QUIET = INKS["quiet"][0]
 VERDICTS = {"confident": LIGHT[2], "ambiguous": LIGHT[1], "failed": LIGHT[3]}
 DASHES = ((), (6.0, 3.0), (2.0, 2.0), (9.0, 3.0, 2.0, 3.0))
-Paper = Literal["modelnet40", "megadepth"]  # data sets of the paper, whose printed rows can be shown
-WIDTH = 80  # columns of the narrowest terminal; narrower ones wrap
+Paper = Literal["modelnet40", "megadepth"]  # data sets of the paper, whose published rows can be shown
+WIDTH = 80  # columns; narrower terminals wrap
 
 
 def say(line: object, *, to: Console | None = None) -> None:
-    """A line as it is: not wrapped, not coloured."""
+    """Print a line without wrapping or colours.
+
+    Args:
+        line: Text.
+        to: Console. Default: standard output.
+    """
     (to or Console()).print(str(line), markup=False, highlight=False, soft_wrap=True)
 
 
 def progress(*, items: bool = True, quiet: bool = False) -> Progress:
-    """What is going on and since when, and of several items how many are done; gone when the block ends."""
+    """Return a progress display on stderr, removed when its block ends.
+
+    Args:
+        items: Show how many items are done.
+    """
     columns = (BarColumn(), MofNCompleteColumn()) if items else ()
     console = Console(stderr=True, quiet=quiet)
     return Progress(
@@ -80,7 +87,7 @@ def count_items(what: str, total: int, *, quiet: bool = False) -> Iterator[Calla
 
 
 def console(*, json: bool = False, quiet: bool = False) -> Console:
-    """Return the console for results, `WIDTH` columns at least: standard output, stderr beside JSON, none if quiet."""
+    """Return a console on standard output, at least `WIDTH` columns wide."""
     terminal = Console(stderr=json, quiet=quiet)
     terminal.width = max(terminal.width, WIDTH)
     return terminal
@@ -88,9 +95,13 @@ def console(*, json: bool = False, quiet: bool = False) -> Console:
 
 @dataclass(frozen=True)
 class SplitTable:
-    """A table that is split into several, one below the other, where its columns do not fit side by side.
+    """Table that is split into several, one below the other, where its columns do not fit side by side.
 
-    headers: of the number columns. groups: rows (name, cells), with a line between groups.
+    Attributes:
+        title: Title.
+        headers: Headers of the number columns.
+        groups: Groups of rows (name, cells), with a line between groups.
+        caption: Text below the table.
     """
 
     title: str
@@ -140,7 +151,7 @@ def shorten(names: Sequence[str], width: int) -> list[str]:
     return [cut(name, best) for name in names]
 
 
-def fixed(values: Sequence[float]) -> list[str]:
+def fixed(values: Sequence[float | int]) -> list[str]:
     """Write numbers of one kind, such as coordinates, without exponents: three decimals, more if all are small.
 
     >>> fixed([500000.25, 5123456.789, 0]), fixed([0.02, -1.5, 0])
@@ -152,7 +163,9 @@ def fixed(values: Sequence[float]) -> list[str]:
 
 
 def number(value: float | None) -> str:
-    """Three significant digits in at most six characters: two digits below 0.01; "-" for none.
+    """Format a number with three significant digits in at most six characters.
+
+    Below 0.01 there are two digits. None gives "-".
 
     >>> [number(value) for value in (12.34, 0.00126, 12345.6, None)]
     ['12.3', '0.0013', '12346', '-']

@@ -1,5 +1,4 @@
-"""The curves of a training: its losses and the errors of its validation over the steps, with the switch of the pose
-loss."""
+"""Curves of a training: losses and validation errors over the steps, with the switch of the pose loss."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,24 +22,25 @@ LOSSES = {
     "val/correspondence_loss": "$L_c$, validation",
 }
 SWITCH = "train/pose_loss"
-SMOOTH = 0.05  # of the steps are averaged
+SMOOTH = 0.05  # fraction of the steps in a moving average
 
 
 def training_folder(path: Path | str) -> Path | None:
-    """Find the run of a test or of a run's folder that has the logs of a training; None if there is none."""
-    place = Path(path).absolute()
-    for folder in (place, place.parent):
+    """Return the folder of a run with the logs of a training, given it or its test folder; None if there is none."""
+    start = Path(path).absolute()
+    for folder in (start, start.parent):
         if any((folder / "logs").glob(f"version_*/{METRICS}")):
             return folder
     return None
 
 
 def read_curves(run: Path | str) -> "DataFrame":
-    """Read what a training logged, a row per step.
+    """Read the log of a training, a row per step.
+
+    A resumed training has several logs; from the first step of each on, it replaces the earlier ones.
 
     Args:
-        run: folder of the run. A training that was resumed has several logs: from the first step of each on, it counts
-            instead of the earlier ones.
+        run: Folder of the run.
 
     Raises:
         ValueError: The folder has no log of a training, or one that cannot be read.
@@ -73,24 +73,26 @@ def switch_step(curves: "DataFrame") -> int | None:
 
 
 def training_curves(run: Path | str) -> "Figure":
-    """Draw the losses of a training and the median errors of its validation; a line marks the switch of the pose loss.
+    """Draw the losses of a training and the median errors of its validation.
+
+    A line marks the switch of the pose loss.
 
     Args:
-        run: folder of the run.
+        run: Folder of the run.
 
     Raises:
-        ValueError: As `read_curves`.
+        ValueError: As in `read_curves`.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, NullFormatter
 
     curves, figure = read_curves(run), Figure(figsize=(11, 3.4), layout="constrained")
     losses, rotation, translation = figure.subplots(1, 3)
-    for place, (key, label) in enumerate(LOSSES.items()):
-        _draw(losses, curves, key, label, place, smooth=key.startswith("train/"))
-    for place, estimate in enumerate(_estimates(curves)):
+    for i, (key, label) in enumerate(LOSSES.items()):
+        _draw(losses, curves, key, label, i, smooth=key.startswith("train/"))
+    for i, estimate in enumerate(_estimates(curves)):
         for axes, error in ((rotation, "rotation_q2_deg"), (translation, "translation_q2")):
-            _draw(axes, curves, f"val/{estimate}/{error}", shown_text(estimate), place, marker="o", ms=3)
+            _draw(axes, curves, f"val/{estimate}/{error}", shown_text(estimate), i, marker="o", ms=3)
     losses.set(ylabel="loss")
     rotation.set(ylabel="median rotation error, degrees", yscale="log")
     translation.set(ylabel="median translation error", yscale="log")
@@ -98,19 +100,19 @@ def training_curves(run: Path | str) -> "Figure":
         axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.yaxis.set_major_formatter(_plain)
         axes.yaxis.set_minor_formatter(NullFormatter())
-    joined = switch_step(curves)
+    switch = switch_step(curves)
     for axes in (losses, rotation, translation):
         axes.set_xlabel("step")
         axes.grid(alpha=0.3)
-        if joined is not None:
-            axes.axvline(joined, color=QUIET, lw=1, ls=":", label="pose loss joins")
+        if switch is not None:
+            axes.axvline(switch, color=QUIET, lw=1, ls=":", label="pose loss joins")
         if axes.get_legend_handles_labels()[0]:
             axes.legend(fontsize=8, frameon=False)
     return figure
 
 
 def _plain(value: float, _: int) -> str:
-    """A tick of a logarithmic axis without powers of ten."""
+    """Format a tick of a logarithmic axis without powers of ten."""
     return f"{value:g}"
 
 
@@ -120,12 +122,12 @@ def _estimates(curves: "DataFrame") -> list[str]:
 
 
 def _draw(
-    axes: Any, curves: "DataFrame", key: str, label: str, place: int, *, smooth: bool = False, **style: Any
+    axes: Any, curves: "DataFrame", key: str, label: str, index: int, *, smooth: bool = False, **style: Any
 ) -> None:
     if key not in curves or not curves[key].notna().any():
         return
-    known = curves[curves[key].notna() & np.isfinite(curves[key])]
-    values = known[key]
+    finite = curves[curves[key].notna() & np.isfinite(curves[key])]
+    values = finite[key]
     if smooth:
         values = values.rolling(max(1, int(SMOOTH * len(values))), min_periods=1).mean()
-    axes.plot(known["step"], values, label=label, **line_style(place, place), **style)
+    axes.plot(finite["step"], values, label=label, **line_style(index, index), **style)

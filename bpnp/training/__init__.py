@@ -1,4 +1,4 @@
-"""The LightningModule, its losses, and the callbacks of a training."""
+"""LightningModule, losses and callbacks of a training."""
 
 from bpnp.training.callbacks import PoseLossWarmup, ResultsWriter, TrainingMonitor
 from bpnp.training.checkpoints import BestCheckpoint, SafeCheckpointIO

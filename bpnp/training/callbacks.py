@@ -1,5 +1,4 @@
-"""Callbacks of a training and of a test: the pose loss that joins later, what is watched, and the files that a test
-leaves."""
+"""Callbacks of a training and of a test: the pose loss warm-up, progress, monitoring, and the results files."""
 
 import json
 import math
@@ -27,19 +26,19 @@ from bpnp.report.terminal import console, say
 from bpnp.training.task import BlindPnPTask, number_globally
 from bpnp.types import Batch, Prediction, map_tensors
 
-COLLAPSED = 0.05  # spread of unit features below which an assignment is all but uniform
-LINE = ("train/loss", "val/correspondence_loss", "val/pnp/rotation_q2_deg", "val/pnp/translation_q2")  # of an epoch
+COLLAPSED = 0.05  # spread of unit features below which the assignment is nearly uniform
+LINE = ("train/loss", "val/correspondence_loss", "val/pnp/rotation_q2_deg", "val/pnp/translation_q2")  # per epoch
 RETURNED = 'a dictionary with "prediction", "seconds" and "losses", as BlindPnPTask\'s does'
 
 
 class PoseLossWarmup(Callback):
     """Switch from L_c alone to L_c + weight * L_p at an epoch (paper section 3.5).
 
-    No pose is solved in training before the switch. A run resumed after the switch stays switched.
+    Before the switch, no pose is computed in training. A run resumed after the switch stays switched.
 
     Args:
-        start_epoch: first epoch with the pose loss, counted from 0; 120 in the paper.
-        weight: gamma_p of Eq. 15; None for the task's `pose_weight`, or 1 if that is 0.
+        start_epoch: First epoch with the pose loss, counted from 0; 120 in the paper.
+        weight: gamma_p of Eq. 15. Default: None, the task's `pose_weight`, or 1 if that is 0.
     """
 
     def __init__(self, start_epoch: int = 120, weight: float | None = None) -> None:
@@ -51,10 +50,10 @@ class PoseLossWarmup(Callback):
         self.configured = 0.0  # `pose_weight` of the task
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Take the weight of the task.
+        """Read the weight of the task.
 
         Raises:
-            ValueError: the task has another weight, or no pose for the loss.
+            ValueError: The task has another weight, or no pose for the loss.
         """
         configured = getattr(pl_module, "pose_weight", None)
         if not isinstance(configured, float | int):
@@ -91,15 +90,17 @@ class PoseLossWarmup(Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.switched_at = state_dict["switched_at"]
-        for name in ("start_epoch", "weight"):  # which version 0.2 did not save
+        for name in ("start_epoch", "weight"):  # not saved by version 0.2
             saved, own = state_dict.get(name, getattr(self, name)), getattr(self, name)
             if saved != own:
                 rank_zero_info(f"The pose loss has {name}={own} (saved: {saved}).")
 
 
 class ProgressLines(Callback):
-    """Print a line after each epoch of a training and each tenth of a test or prediction: for pipes, where a progress
-    bar shows nothing."""
+    """Print a line after each epoch of a training and after each tenth of a test or prediction.
+
+    It replaces the progress bar where output is not a terminal.
+    """
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         names = [name for name in LINE if name in trainer.callback_metrics] or list(trainer.callback_metrics)[:4]
@@ -128,14 +129,15 @@ class ProgressLines(Callback):
 
 
 class TrainingMonitor(Callback):
-    """Log values of the first few validation problems that show how a training goes.
+    """Log values of the first few validation problems that show the progress of a training.
 
     "val/true_match_mass" is the probability of the true matches in the assignment, "val/<estimate>_iterations" are
     those of each pose, "val/feature_spread_2d" and "val/feature_spread_3d" are `feature_spreads`. A spread below 0.05
-    brings a warning: if all points of a set have one feature, the assignment is uniform and the loss does not change.
+    causes a warning: if all points of a set have the same feature, the assignment is uniform and the loss does not
+    change.
 
     Args:
-        problems: number of validation problems.
+        problems: Number of validation problems.
     """
 
     def __init__(self, problems: int = 4) -> None:
@@ -196,15 +198,15 @@ class ResultsWriter(Callback):
     """Write `problems.csv`, `summary.json` and the points of every problem after a test.
 
     Args:
-        folder: of the files; null for `test` in the trainer's default_root_dir.
+        folder: Folder of the files; null for `test` in the trainer's default_root_dir.
     """
 
     rows: list[ProblemRow]
     losses: dict[int, float]
     points: list[ProblemPoints]
-    numbers: set[int]  # of the problems so far
+    numbers: set[int]  # indices of the problems so far
 
-    settings: Mapping[str, Any] | None = None  # recorded in place of those of the command; then no table is printed
+    settings: Mapping[str, Any] | None = None  # recorded instead of those of the command; if set, no table is printed
 
     def __init__(self, folder: str | None = None) -> None:
         self.folder = folder
@@ -216,15 +218,15 @@ class ResultsWriter(Callback):
     def on_test_batch_start(
         self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int, *_: int
     ) -> None:
-        if isinstance(batch, Batch):  # else of a task of the user's own
+        if isinstance(batch, Batch):  # a user's own task may have other batches
             number_globally(batch, self.numbers, processes=trainer.world_size)
 
     def on_test_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
     ) -> None:
         if not isinstance(outputs, dict) or not {"prediction", "seconds", "losses"} <= outputs.keys():
-            return  # of a task of the user's own
-        errors = outputs.get("errors")  # which a task of the user's own may leave out
+            return  # a user's own task
+        errors = outputs.get("errors")  # absent in some users' own tasks
         self.rows += rows_from(outputs["prediction"], batch, outputs["seconds"], errors)
         self.points += points_from(outputs["prediction"], batch, errors)
         if outputs["losses"] is not None:
@@ -232,8 +234,8 @@ class ResultsWriter(Callback):
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         gathered = _gather((self.rows, self.losses, self.points))
-        tabled = getattr(pl_module, "tabled", ())
-        others = {name: value for name, value in trainer.callback_metrics.items() if name not in tabled}
+        table_metrics = getattr(pl_module, "table_metrics", ())
+        others = {name: value for name, value in trainer.callback_metrics.items() if name not in table_metrics}
         logged = ", ".join(f"{name} {float(value):.6g}" for name, value in others.items())
         if any(rows for rows, *_ in gathered):
             self._write_test(trainer, gathered, complete=True)
@@ -243,7 +245,7 @@ class ResultsWriter(Callback):
             rank_zero_info(f"logged: {logged or 'nothing'}; no results folder: `test_step` does not return {RETURNED}")
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Write the finished problems of an interrupted test; of several processes, those of the first."""
+        """Write the finished problems of an interrupted test; with several processes, those of the first."""
         if isinstance(exception, KeyboardInterrupt) and trainer.state.fn == "test" and self.rows:
             self._write_test(trainer, [(self.rows, self.losses, self.points)], complete=False)
 
@@ -262,9 +264,9 @@ class ResultsWriter(Callback):
             rank_zero_info(f"{'' if complete else 'interrupted: '}results of {count} problems in {folder}")
 
     def _check_replaced(self, trainer: Trainer) -> None:
-        """Raise ValueError if results of a checkpoint would be replaced by those of a test without one.
+        """Raise ValueError if a test without a checkpoint would replace the results of a checkpoint.
 
-        Print the checkpoint whose results are replaced by those of another.
+        If the results of another checkpoint will be replaced, print its path.
         """
         summary = self._folder(trainer) / SUMMARY
         if self.settings is not None or not summary.is_file():
@@ -272,8 +274,8 @@ class ResultsWriter(Callback):
         checkpoint = json.loads(summary.read_bytes()).get("settings", {}).get("checkpoint")
         if checkpoint is not None and trainer.ckpt_path is None:
             raise ValueError(
-                f"expected --ckpt_path, since {summary.parent} has the results of {checkpoint}, got none, which "
-                "would replace them; try --ckpt_path last, or --results.folder for another folder"
+                f"{summary.parent} has the results of {checkpoint}, which a test without --ckpt_path would replace; "
+                "use --ckpt_path last, or --results.folder for another folder"
             )
         if checkpoint != (None if trainer.ckpt_path is None else str(trainer.ckpt_path)):
             rank_zero_info(f"the results of {checkpoint} in {summary.parent} are replaced")

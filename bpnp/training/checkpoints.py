@@ -24,8 +24,11 @@ WEIGHTS_ALONE = "weights_alone"
 def newest_checkpoint(folder: Path) -> Path:
     """Return the checkpoint that `--ckpt_path last` continues: the last one, or a newer one of an interruption.
 
+    Args:
+        folder: Folder of the checkpoints.
+
     Raises:
-        ValueError: there is none.
+        ValueError: There is none.
     """
     files = [*folder.glob("last*.ckpt"), *folder.glob(f"{INTERRUPTED}.ckpt")]
     if not files:
@@ -34,10 +37,10 @@ def newest_checkpoint(folder: Path) -> Path:
 
 
 class SafeCheckpointIO(TorchCheckpointIO):
-    """Write checkpoints whole or not at all, and read them as data only, with one clear error for another file.
+    """Write checkpoints atomically, and read them as data only, with one clear error for another file.
 
     A strategy that starts its processes itself (`ddp_spawn`, `ddp_notebook`) passes the trained weights to the main
-    process in a file of weights alone, which is written under `WEIGHTS_ALONE`.
+    process in a file of weights only, which is written under `WEIGHTS_ALONE`.
     """
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
@@ -56,12 +59,12 @@ class SafeCheckpointIO(TorchCheckpointIO):
 
 
 class InterruptedCheckpoint(Callback):
-    """Save `interrupted.ckpt` when Ctrl-C or an error stops a training; a training that ends removes it.
+    """Save `interrupted.ckpt` when Ctrl-C or an error stops a training; remove it when a training ends.
 
     With Lightning's `OnExceptionCheckpoint` instead, every `fit` without a checkpoint would resume the last one.
 
     Args:
-        folder: where the file is written.
+        folder: Folder of the file.
     """
 
     def __init__(self, folder: str | Path) -> None:
@@ -69,7 +72,7 @@ class InterruptedCheckpoint(Callback):
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         if trainer.world_size > 1 and not isinstance(exception, KeyboardInterrupt):
-            return  # processes without the error would not take part in the saving
+            return  # saving needs all processes, and those without the error would not take part
         if trainer.state.fn == "fit" and trainer.global_step > 0 and not trainer.fast_dev_run:  # type: ignore[attr-defined]
             trainer.save_checkpoint(self.path, weights_only=False)
             rank_zero_info(f"stopped in epoch {trainer.current_epoch}; continue with --ckpt_path {self.path}")
@@ -80,14 +83,14 @@ class InterruptedCheckpoint(Callback):
 
 
 class BestCheckpoint(ModelCheckpoint):
-    """The checkpoint with the best `monitor`, chosen among epochs of one objective.
+    """Keep the checkpoint with the best `monitor` among epochs of one objective.
 
-    When the pose loss joins the correspondence loss, the choice starts again: values from before the switch are of
-    another objective. The network at the switch is kept as `before_pose_loss.ckpt`. Arguments are those of Lightning's
+    When the pose loss joins the correspondence loss, the choice starts again, because earlier values are of another
+    objective. The network at the switch is kept as `before_pose_loss.ckpt`. Arguments are those of Lightning's
     `ModelCheckpoint`.
     """
 
-    has_pose_loss: bool | None = None  # in the last epoch
+    has_pose_loss: bool | None = None  # True if the last epoch had the pose loss
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         has_pose_loss = float(getattr(pl_module, "pose_weight", 0)) > 0

@@ -1,4 +1,4 @@
-"""`bpnp table`: methods as they are named on the command line, and a `Trainer.test` of each on the same problems."""
+"""Methods of `bpnp table`, as named on the command line, and a `Trainer.test` of each on the same problems."""
 
 import json
 import logging
@@ -34,12 +34,20 @@ SHORT_NAMES = {
     "search": "bpnp.models.Search",
 }
 TRAINED = (SHORT_NAMES["bpnpnet"], SHORT_NAMES["matcher"])
-ORDER_SEED = 0  # of the order in which `--limit` takes problems: the same for every method, and longer tables only add
+ORDER_SEED = 0  # seed of the order in which `--limit` takes problems, equal for all methods and limits
 
 
 @dataclass(frozen=True)
 class Method:
-    """A row group of the table: a solver's class, its settings, and the checkpoint of its weights."""
+    """Method of the table: a solver's class, its settings, and the checkpoint of its weights.
+
+    Attributes:
+        label: Name in the table.
+        class_path: Class of the solver.
+        init_args: Settings.
+        checkpoint: File of the weights.
+        time_limit: Seconds for each problem, for solvers with a limit.
+    """
 
     label: str
     class_path: str
@@ -49,26 +57,30 @@ class Method:
 
     @property
     def folder_name(self) -> str:
-        """The label as the name of a folder."""
+        """Label as the name of a folder."""
         return re.sub(r"[^\w.-]", "-", self.label)
 
     @property
     def identity(self) -> dict[str, Any]:
-        """All that the results depend on, as JSON has it; a checkpoint counts by its size and time too."""
-        described = asdict(self)
+        """Everything that the results depend on, as JSON; a checkpoint counts with its size and time."""
+        identity = asdict(self)
         if self.checkpoint is not None:
             state = Path(self.checkpoint).stat()
-            described["checkpoint_state"] = [state.st_size, int(state.st_mtime)]
-        return dict(plain(described))
+            identity["checkpoint_state"] = [state.st_size, int(state.st_mtime)]
+        return dict(plain(identity))
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The class and all arguments of its constructor."""
+        """Class and all arguments of its constructor."""
         init_args = self.init_args | ({} if self.checkpoint is None else {"checkpoint": self.checkpoint})
         return {"class_path": self.class_path, "init_args": init_args}
 
     def build(self) -> nn.Module:
-        """The solver in evaluation mode. Raises ValueError for settings that its class does not have."""
+        """Build the solver in evaluation mode.
+
+        Raises:
+            ValueError: Its class does not have a setting.
+        """
         if self.class_path in TRAINED and self.checkpoint is not None:
             return TrainedNet.from_checkpoint(self.checkpoint)
         solver: nn.Module = build(nn.Module, "solver", self.settings)
@@ -78,10 +90,16 @@ class Method:
 
 
 def parse_methods(texts: Sequence[str], *, time_limit: float | None = None) -> list[Method]:
-    """Methods from `[LABEL=]WHAT[@CHECKPOINT]`, WHAT a short name, a class path or a YAML file with a solver in it.
+    """Parse methods from `[LABEL=]WHAT[@CHECKPOINT]`, WHAT a short name, a class path, or a YAML file with a solver.
 
-    Raises ValueError for what names no method, settings that it does not have, a missing checkpoint, a label that is no
-    name of a folder, or two methods whose folders would be the same.
+    Args:
+        texts: Methods.
+        time_limit: Seconds for each problem.
+
+    Raises:
+        ValueError: A text names no method, a setting does not exist, a label cannot name a folder, or two methods have
+            the same folder.
+        FileNotFoundError: A checkpoint or a configuration is missing.
     """
     methods: dict[str, Method] = {}
     for text in texts:
@@ -95,7 +113,7 @@ def parse_methods(texts: Sequence[str], *, time_limit: float | None = None) -> l
         if not method.folder_name.strip("."):
             raise ValueError(f"the label {label!r} of {text!r} cannot name a folder of results. Use LABEL=METHOD.")
         if method.folder_name in methods:
-            raise ValueError(f"expected a label for each method, got {label!r} twice; try LABEL=METHOD")
+            raise ValueError(f"two methods have the label {label!r}; use LABEL=METHOD")
         methods[method.folder_name] = method
         if class_path not in TRAINED or weights is None:
             _parse_settings(nn.Module, "solver", method.settings)  # before any test runs
@@ -110,21 +128,26 @@ def _solver(what: str, text: str) -> tuple[str, dict[str, Any]]:
         solver = (_recipe(Path(what), "a solver").get("model") or {}).get("solver")
         solver = {"class_path": solver} if isinstance(solver, str) else solver
         if not isinstance(solver, dict) or "class_path" not in solver:
-            raise ValueError(f"expected model.solver.class_path in {what}, got none")
+            raise ValueError(f"{what} has no model.solver.class_path")
         return solver["class_path"], solver.get("init_args") or {}
     if "." in what:
         return what, {}
-    raise ValueError(f"expected a method among {', '.join(SHORT_NAMES)}, a class path or a .yaml file, got {text!r}")
+    raise ValueError(f"{text!r} is no method; give one of {', '.join(SHORT_NAMES)}, a class path or a .yaml file")
 
 
 def read_data(recipe: Path, overrides: Sequence[str]) -> dict[str, Any]:
-    """`data` of a recipe's YAML with `--data.NAME=VALUE` overrides, as class_path and all init_args.
+    """Read `data` of a configuration with `--data.NAME=VALUE` overrides, as class_path and all init_args.
 
-    Raises ValueError for a file without it, for a class that cannot be imported, or for what it does not accept.
+    Args:
+        recipe: YAML file.
+        overrides: Options.
+
+    Raises:
+        ValueError: The file has no `data`, its class cannot be imported, or it does not accept an option.
     """
     data = _recipe(recipe, "`data`").get("data")
     if not data:
-        raise ValueError(f"expected `data` in {recipe}, got none; try --data psb")
+        raise ValueError(f"{recipe} has no `data`; try --data psb")
     settings = data if isinstance(data, dict) else {"class_path": data}
     return dict(_parse_settings(LightningDataModule, "data", settings, overrides)[1].as_dict()["data"])
 
@@ -132,14 +155,21 @@ def read_data(recipe: Path, overrides: Sequence[str]) -> dict[str, Any]:
 def _recipe(path: Path, what: str) -> dict[str, Any]:
     if not path.is_file():
         raise FileNotFoundError(
-            f"expected a recipe with {what}, got no file {path}; try the name of a packaged one, such as psb"
+            f"there is no file {path}; give a configuration with {what}, or the name of a packaged one, such as psb"
         )
     return config_content(path)
 
 
 @dataclass(frozen=True)
 class MethodTest:
-    """A test of one method on one data set, into a folder; limit: problems, None for all."""
+    """Test of one method on one data set.
+
+    Attributes:
+        method: Method.
+        data: Class path and arguments of the data.
+        folder: Results folder.
+        limit: Number of problems, None for all.
+    """
 
     method: Method
     data: dict[str, Any]
@@ -147,20 +177,18 @@ class MethodTest:
     limit: int | None = None
 
     def results(self) -> Results | None:
-        """The results that are there, of the wanted problems; None unless the test of all of these was finished.
+        """Return the existing results of the requested problems, or None unless the test of all of them was finished.
 
-        Raises ValueError if the folder holds results of another method or of other data.
+        Raises:
+            ValueError: The folder holds results of another method or of other data.
         """
         if not (self.folder / SUMMARY).is_file():
             return None
         results = read_results(self.folder)
-        wanted = plain({"method": self.method.identity, "data": self.data})
-        other = [key for key, value in wanted.items() if results.settings.get(key) != value]
+        expected = plain({"method": self.method.identity, "data": self.data})
+        other = [key for key, value in expected.items() if results.settings.get(key) != value]
         if other:
-            raise ValueError(
-                f"expected {self.folder} without results of other settings, got other {', '.join(other)}; try another "
-                "--output"
-            )
+            raise ValueError(f"{self.folder} has results of another {' and '.join(other)}; use another --output")
         chosen = set(problem_order(results.settings.get("size", 0))[: self.limit])
         rows = tuple(row for row in results.rows if row.index in chosen)
         if not results.settings.get("complete") or len({row.index for row in rows}) < max(len(chosen), 1):
@@ -168,15 +196,20 @@ class MethodTest:
         return replace(results, rows=rows, estimates=summarise(rows))
 
     def run(self, *, progress_bar: bool = False) -> None:
-        """`test` the problems, each alone in its batch, so that its time is known; results go into the folder.
+        """Test the problems, each alone in its batch, so that its time is measured; write the results to the folder.
 
-        Raises ValueError for a method that gives no pose."""
+        Args:
+            progress_bar: Show a progress bar instead of lines.
+
+        Raises:
+            ValueError: The data module is not of bpnp, or the method returns no pose.
+        """
         module = build(LightningDataModule, "data", self.data)
         module.setup("test")
         loader = module.test_dataloader()
         if not isinstance(loader.sampler, DistributedSampler):
             raise ValueError(
-                f"expected a data module of bpnp, whose problems can be chosen, got {self.data['class_path']}; try "
+                f"the problems of {self.data['class_path']} cannot be chosen, as those of bpnp's data modules can; use "
                 "`bpnp test` for each method, and `bpnp report` with their folders"
             )
         size = len(loader.dataset)
@@ -191,7 +224,7 @@ class MethodTest:
         level, threads = messages.level, torch.get_num_threads()
         messages.setLevel(logging.WARNING)
         torch.set_num_threads(1)
-        torch.manual_seed(0)  # of a network without a checkpoint
+        torch.manual_seed(0)  # for the weights of a network without a checkpoint
         callbacks: list[Callback] = [writer] if progress_bar else [writer, ProgressLines()]
         trainer = Trainer(
             accelerator="cpu", devices=1, callbacks=callbacks, logger=False, enable_checkpointing=False,
@@ -204,18 +237,28 @@ class MethodTest:
             messages.setLevel(level)
             torch.set_num_threads(threads)
         if not writer.rows:
-            raise ValueError(f"expected a pose from {self.method.label!r}, got predictions without one")
+            raise ValueError(f"the predictions of {self.method.label!r} have no pose")
 
 
 def problem_order(size: int) -> list[int]:
-    """The fixed random order in which a limited table takes the problems of a data set of this size."""
+    """Return the fixed random order in which a limited table takes the problems of a data set of this size."""
     return np.random.default_rng(ORDER_SEED).permutation(size).tolist()
 
 
 def build(base: type, name: str, settings: Mapping[str, Any]) -> Any:
-    """A subclass of `base`. Raises ValueError for settings that its class does not accept, and as its constructor."""
+    """Build an instance of a subclass of `base`.
+
+    Args:
+        base: Base class.
+        name: Name of the option, for messages.
+        settings: Class path and arguments.
+
+    Raises:
+        ValueError: The class does not accept the settings.
+    """
     parser, chosen = _parse_settings(base, name, settings)
-    instantiate = parser.instantiate if hasattr(parser, "instantiate") else parser.instantiate_classes  # by release
+    # The name of the method depends on the release of jsonargparse.
+    instantiate = parser.instantiate if hasattr(parser, "instantiate") else parser.instantiate_classes
     return instantiate(chosen)[name]
 
 
@@ -228,5 +271,5 @@ def _parse_settings(
         return parser, parser.parse_args([f"--{name}={json.dumps(settings)}", *overrides])
     except Exception as error:
         raise ValueError(
-            f"expected {settings.get('class_path')} as a {base.__name__} and arguments of its own, got: {error}"
+            f"{settings.get('class_path')} is no {base.__name__}, or does not accept its arguments: {error}"
         ) from error

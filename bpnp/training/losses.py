@@ -1,4 +1,4 @@
-"""Losses of an assignment and of a pose (paper Eqs. 11 to 15), one value a sample."""
+"""Losses of an assignment and of a pose (paper Eqs. 11 to 15), one value per sample."""
 
 import math
 from dataclasses import dataclass
@@ -12,18 +12,18 @@ from bpnp.geometry import bearings, chords, rotation_angle
 from bpnp.types import Batch, Pose, Prediction
 
 MatchingLoss = Literal["correspondence", "likelihood"]
-SMALLEST = 1e-12  # probability; keeps the logarithm of a padded point finite
+SMALLEST = 1e-12  # least probability, which keeps the logarithm of a padded point finite
 
 
 @dataclass(frozen=True)
 class Losses:
     """Terms of L = L_c + gamma_p L_p (paper Eq. 15) of each sample; zero, without a gradient, where undefined.
 
-    Args:
-        matching: L_c, or the matching loss in its place, (b,).
-        matched: samples that have a matching loss, (b,).
-        pose: terms of L_p by name, (b,) each; None without a pose loss.
-        posed: samples that have a pose loss, (b,).
+    Attributes:
+        matching: L_c, or the matching loss in its place (b,).
+        matched: Samples that have a matching loss (b,).
+        pose: Terms of L_p by name, (b,) each; None without a pose loss.
+        posed: Samples that have a pose loss (b,).
         pose_weight: gamma_p.
     """
 
@@ -54,13 +54,13 @@ def matching_losses(prediction: Prediction, batch: Batch, *, kind: MatchingLoss,
     """Return the loss of each sample's assignment.
 
     Args:
-        prediction: with an assignment.
-        batch: with the labels that the kind needs.
+        prediction: Prediction with an assignment.
+        batch: Problems with the labels that the kind needs.
         kind: correspondence for `correspondence_losses`, likelihood for `matching_likelihood_loss`.
-        angle: as in `correspondence_losses`.
+        angle: As in `correspondence_losses`.
 
     Raises:
-        ValueError: the prediction has no assignment, or the batch no labels.
+        ValueError: The prediction has no assignment, or the batch no labels.
     """
     if prediction.assignment is None:
         raise ValueError("the solver returns no assignment to train; use one that does, such as bpnp.models.BPnPNet")
@@ -79,8 +79,13 @@ def matching_losses(prediction: Prediction, batch: Batch, *, kind: MatchingLoss,
 def own_losses(loss: nn.Module, prediction: Prediction, batch: Batch) -> Losses:
     """Return the values of a user's loss; NaN marks a sample without one.
 
+    Args:
+        loss: Maps (Prediction, Batch) to one value per problem.
+        prediction: Prediction.
+        batch: Problems.
+
     Raises:
-        ValueError: the loss does not return one number a problem.
+        ValueError: The loss does not return one number per problem.
     """
     values = loss(prediction, batch)
     if not isinstance(values, Tensor) or values.shape != (len(batch),):
@@ -94,9 +99,9 @@ def correspondence_losses(prediction: Prediction, batch: Batch, *, angle: float 
     """Return L_c of each sample (paper Eq. 11).
 
     Args:
-        prediction: with or without an assignment.
-        batch: with true matches, or true poses for an `angle`.
-        angle: None for the true matches. Else, in radians, supervision by the pose alone with
+        prediction: Prediction, with or without an assignment.
+        batch: Problems with true matches, or true poses for an `angle`.
+        angle: None for the true matches. Otherwise, in radians, supervision by the pose alone with
             C_ij = [angle(f_i, R_gt p_j + t_gt) <= angle]; a point may then have several correspondences.
 
     Returns:
@@ -111,9 +116,9 @@ def correspondence_losses(prediction: Prediction, batch: Batch, *, angle: float 
 
 
 def pose_losses(pose: Pose, batch: Batch) -> dict[str, Float[Tensor, " b"]]:
-    """Return the terms of L_p as `pose_terms`, zero and without a gradient where the pose did not converge."""
+    """Return the terms of L_p as `pose_terms` does, zero and without a gradient where the pose did not converge."""
     solved, truth = pose.stats.converged, _true_pose(batch)
-    # A missing pose is NaN. The true pose in its place has a loss without a gradient, which is then masked.
+    # Replace a missing pose (NaN) by the true one, whose loss has no gradient, and mask it.
     rotation = torch.where(solved[:, None, None], pose.rotation, truth[0])
     translation = torch.where(solved[:, None], pose.translation, truth[1])
     return {name: values * solved for name, values in pose_terms(rotation, translation, *truth).items()}
@@ -126,53 +131,53 @@ def _true_pose(batch: Batch) -> tuple[Tensor, Tensor]:
 
 
 def correspondence_loss(assignment: Float[Tensor, "b m n"], match3d: Int[Tensor, "b n"]) -> Float[Tensor, " b"]:
-    """Return L_c = sum_ij P_ij (1 - 2 C_ij) (paper Eq. 11) with C from indices; in [-1, 1) where P sums to one.
+    """Return L_c = sum_ij P_ij (1 - 2 C_ij) (paper Eq. 11) with C from indices; in [-1, 1) if P sums to one.
 
     Args:
-        assignment: P.
-        match3d: index of the 2D point of each 3D point, -1 for none and for padding.
+        assignment: P (b, m, n).
+        match3d: Index of the 2D point of each 3D point (b, n), -1 for none and for padding.
     """
     matched = assignment.gather(1, match3d.clamp_min(0).unsqueeze(1)).squeeze(1)
     return assignment.sum((-2, -1)) - 2 * (matched * (match3d >= 0)).sum(-1)
 
 
 def matching_likelihood_loss(prediction: Prediction, batch: Batch) -> Float[Tensor, " b"]:
-    """Return the negative log likelihood of the true correspondence of each point, -log P(j | i) and -log P(i | j).
+    """Return the negative log-likelihood of the true correspondence of each point, -log P(j | i) and -log P(i | j).
 
-    The mean over the true matches, in both directions, plus, with bins, the mean of -log P(bin | i) over the points
-    without a match, so that the numbers of either do not matter. Unlike that of `correspondence_loss`, the gradient
-    does not vanish where the probability of the true match is small.
+    It is the mean over the true matches, in both directions. With dustbins, the mean of -log P(dustbin | i) over the
+    points without a match is added, so that their numbers do not matter. Unlike that of `correspondence_loss`, the
+    gradient does not vanish where the probability of the true match is small.
 
     Args:
-        prediction: with an assignment; with bins, `unmatched2d` and `unmatched3d`.
-        batch: with `match3d`.
+        prediction: Prediction with an assignment; with dustbins, also `unmatched2d` and `unmatched3d`.
+        batch: Problems with `match3d`.
 
     Returns:
-        Losses (b,) in nats.
+        Losses (b,), nats.
 
     Raises:
-        ValueError: there is no assignment or no `match3d`.
+        ValueError: There is no assignment or no `match3d`.
     """
     assignment, match3d = prediction.assignment, batch.match3d
     if assignment is None or match3d is None:
         missing = "the solver returns no assignment" if assignment is None else "the batch has no `match3d`"
         raise ValueError(f"{missing}; matching_loss likelihood needs both")
-    partner = match3d.clamp_min(0)
+    index2d = match3d.clamp_min(0)
     paired = (match3d >= 0).to(assignment.dtype)
-    # Several 3D points may have been seen as one 2D point.
-    paired2d = torch.zeros_like(assignment[:, :, 0]).scatter_reduce(1, partner, paired, "amax")
+    # Several 3D points may have the same 2D point.
+    paired2d = torch.zeros_like(assignment[:, :, 0]).scatter_reduce(1, index2d, paired, "amax")
     rows, cols = assignment.sum(2), assignment.sum(1)
     rows = rows if prediction.unmatched2d is None else rows + prediction.unmatched2d
     cols = cols if prediction.unmatched3d is None else cols + prediction.unmatched3d
-    joint = _log(assignment.gather(1, partner.unsqueeze(1)).squeeze(1))
-    both = 2 * joint - _log(cols) - _log(rows).gather(1, partner)
+    joint = _log(assignment.gather(1, index2d.unsqueeze(1)).squeeze(1))
+    both = 2 * joint - _log(cols) - _log(rows).gather(1, index2d)
     loss = -(both * paired).sum(1) / (2 * paired.sum(1)).clamp_min(1)
     if prediction.unmatched2d is None or prediction.unmatched3d is None:
         return loss
-    lone2d, lone3d = batch.mask2d * (1 - paired2d), batch.mask3d * (1 - paired)
-    left = ((_log(prediction.unmatched2d) - _log(rows)) * lone2d).sum(1)
-    left = left + ((_log(prediction.unmatched3d) - _log(cols)) * lone3d).sum(1)
-    return loss - left / (lone2d.sum(1) + lone3d.sum(1)).clamp_min(1)
+    unmatched2d, unmatched3d = batch.mask2d * (1 - paired2d), batch.mask3d * (1 - paired)
+    log_bins = ((_log(prediction.unmatched2d) - _log(rows)) * unmatched2d).sum(1)
+    log_bins = log_bins + ((_log(prediction.unmatched3d) - _log(cols)) * unmatched3d).sum(1)
+    return loss - log_bins / (unmatched2d.sum(1) + unmatched3d.sum(1)).clamp_min(1)
 
 
 def _log(probability: Tensor) -> Tensor:
@@ -186,7 +191,18 @@ def within_angle(
     translation: Float[Tensor, "b 3"],
     angle: float,
 ) -> Bool[Tensor, "b m n"]:
-    """Return [angle(f_i, R p_j + t) <= angle] (paper Eq. 3) from the chord between unit vectors; angle in radians."""
+    """Return [angle(f_i, R p_j + t) <= angle] (paper Eq. 3), computed from the chord between unit vectors.
+
+    Args:
+        points2d: Normalised image coordinates (b, m, 2).
+        points3d: Scene points (b, n, 3).
+        rotation: R (b, 3, 3).
+        translation: t (b, 3).
+        angle: Angle, radians.
+
+    Returns:
+        Mask (b, m, n).
+    """
     return chords(bearings(points2d), points3d, rotation, translation) <= 2 * math.sin(angle / 2)
 
 
@@ -198,9 +214,15 @@ def pose_terms(
 ) -> dict[str, Float[Tensor, " b"]]:
     """Return the two terms of the pose loss L_p = L_r + L_t (paper Eq. 12).
 
+    Args:
+        rotation: Estimated R (b, 3, 3).
+        translation: Estimated t (b, 3), scene units.
+        rotation_gt: True R (b, 3, 3).
+        translation_gt: True t (b, 3), scene units.
+
     Returns:
-        "rotation", L_r = angle(R, R_gt) in radians (Eq. 13), and "translation", L_t = ||t - t_gt|| in scene units
-        (Eq. 14), (b,) each.
+        "rotation", L_r = angle(R, R_gt) in radians (Eq. 13), and "translation", L_t = ||t - t_gt|| in scene units (Eq.
+        14), (b,) each.
     """
     return {
         "rotation": rotation_angle(rotation_gt, rotation),

@@ -23,15 +23,15 @@ COLUMNS = ("id", "estimate", "found", "converged", "qw", "qx", "qy", "qz", "tx",
 
 
 def in_scene_frame(prediction: Prediction, batch: Batch) -> Prediction:
-    """Name the problems of a prediction, and undo what was subtracted from the coordinates of their scenes.
+    """Name the problems of a prediction, and transform the poses to the original coordinates of their scenes.
 
     Args:
-        prediction: poses of the problems of the batch.
-        batch: its `origin` o (b, 3) is None if nothing was subtracted.
+        prediction: Poses of the problems of the batch.
+        batch: Problems; its `origin` o (b, 3) is None if nothing was subtracted from the coordinates.
 
     Returns:
-        The prediction with `ids` and `index` of the batch and, with an origin, poses (R, t - R o) in float64, R being
-        the rotation nearest to that of the solver.
+        The prediction with `ids` and `index` of the batch and, with an origin, poses (R, t - R o) in float64, where R
+        is the rotation nearest to that of the solver.
     """
     poses = prediction.poses
     if batch.origin is not None:
@@ -40,7 +40,7 @@ def in_scene_frame(prediction: Prediction, batch: Batch) -> Prediction:
 
 
 def _translate(pose: Pose, origin: Tensor) -> Pose:
-    # The origin multiplies the rounding of a float32 rotation, so the rotation is made exact first.
+    # A large origin amplifies the rounding of a float32 rotation, so make it exact first.
     rotation = quaternion_rotation(roma.rotmat_to_unitquat(pose.rotation.double()))
     return replace(
         pose,
@@ -51,7 +51,7 @@ def _translate(pose: Pose, origin: Tensor) -> Pose:
 
 @dataclass(frozen=True)
 class PoseRow:
-    """One estimate of one problem: camera = R p + t, as COLMAP's `cam_from_world`; NaN where there is none."""
+    """One estimate of one problem: camera = R p + t, COLMAP's `cam_from_world`; NaN without a pose."""
 
     index: int
     id: str
@@ -79,12 +79,12 @@ def pose_rows(prediction: Prediction) -> list[PoseRow]:
 
 
 class PredictionWriter(BasePredictionWriter):
-    """Write the poses of a prediction, sorted by problem, when it ends: whole, or not at all.
+    """Write the poses of a prediction atomically when it ends, sorted by problem.
 
     Args:
-        folder: where; null for the trainer's default_root_dir.
+        folder: Folder of the file; null for the trainer's default_root_dir.
         format: csv for quaternions (w, x, y, z) and translations; json for rotation matrices and translations.
-        overwrite: replace the file of an earlier prediction.
+        overwrite: Replace the file of an earlier prediction.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class PredictionWriter(BasePredictionWriter):
         self.rows: list[PoseRow] = []
 
     def path(self, trainer: Trainer) -> Path:
-        """Return the file that is written."""
+        """Return the path of the file."""
         return Path(self.folder or trainer.default_root_dir) / f"predictions.{self.format}"
 
     def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -116,7 +116,7 @@ class PredictionWriter(BasePredictionWriter):
         batch_idx: int,
         dataloader_idx: int,
     ) -> None:
-        if isinstance(prediction, Prediction) and prediction.ids:  # else of a task of the user's own
+        if isinstance(prediction, Prediction) and prediction.ids:  # a user's own task may predict something else
             self.rows += pose_rows(prediction)
 
     def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -126,7 +126,7 @@ class PredictionWriter(BasePredictionWriter):
         else:
             gathered = [self.rows]
         if trainer.is_global_zero and not trainer.fast_dev_run and any(gathered):  # type: ignore[attr-defined]
-            # A problem that several processes had counts once; a sort keeps the order of the estimates.
+            # Count problems of several processes once; the sort is stable and keeps the order of the estimates.
             rows = {(row.index, row.estimate): row for part in gathered for row in part}
             ordered = sorted(rows.values(), key=lambda row: row.index)
             path = write_text(self.path(trainer), as_csv(ordered) if self.format == "csv" else as_json(ordered))
@@ -144,7 +144,7 @@ def as_csv(rows: Sequence[PoseRow]) -> str:
 
 
 def as_json(rows: Sequence[PoseRow]) -> str:
-    """Return a list of poses; rotation and translation are null where there is none."""
+    """Return a JSON list of poses; rotation and translation are null without a pose."""
     content = [
         {
             "id": row.id,

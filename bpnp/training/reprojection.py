@@ -1,4 +1,4 @@
-"""A loss without labels: the reprojection error of the pose that a network finds from its own assignment."""
+"""Loss without labels: the reprojection error of the pose that a network computes from its own assignment."""
 
 import torch
 from jaxtyping import Float
@@ -11,9 +11,9 @@ from bpnp.types import Batch, Prediction
 class ReprojectionLoss(nn.Module):
     """Reprojection error of the pose "pnp", weighted by the assignment: Eq. 2 of the paper with P in place of C.
 
-    It needs neither true poses nor true matches, and so fine-tunes a trained network to a scene without labels (section
-    5 of the paper). The gradient reaches the assignment directly and through the pose. It sharpens what a network finds
-    already: it cannot tell that a pose is wrong.
+    It needs neither true poses nor true matches, and can fine-tune a trained network to a scene without labels (section
+    5 of the paper). The gradient reaches the assignment directly and through the pose. It sharpens existing
+    assignments; it cannot detect a wrong pose.
 
     >>> from bpnp import Batch, BPnPNet
     >>> batch = Batch.from_arrays(torch.rand(20, 2), torch.rand(20, 3))
@@ -36,8 +36,8 @@ class ReprojectionLoss(nn.Module):
         solved = pose.stats.converged
         rotation = torch.where(solved[:, None, None], pose.rotation, torch.eye(3).to(pose.rotation))
         translation = torch.where(solved[:, None], pose.translation, 0)
-        seen = transform(rotation, translation, batch.points3d)
-        angles = angle_between(bearings(batch.points2d).unsqueeze(2), seen.unsqueeze(1))
+        camera = transform(rotation, translation, batch.points3d)
+        angles = angle_between(bearings(batch.points2d).unsqueeze(2), camera.unsqueeze(1))
         real = batch.mask2d.unsqueeze(2) & batch.mask3d.unsqueeze(1)
         mean = (assignment * angles).where(real, 0).sum((-2, -1)) / assignment.where(real, 0).sum((-2, -1))
         return mean.where(solved, torch.nan)

@@ -1,4 +1,4 @@
-"""Training and evaluation of a blind PnP solver: losses, metrics and the optimizer around any `Batch -> Prediction`."""
+"""Training and evaluation of a blind PnP solver: losses, metrics and the optimiser around any `Batch -> Prediction`."""
 
 import inspect
 import math
@@ -43,41 +43,42 @@ from bpnp.types import Batch, Prediction
 
 Stage = Literal["val", "test"]
 REBUILT = {"solver", "weights"}  # options that are not saved under "task": the checkpoint has their result
-POSED = "pnp"  # the estimate that has a derivative, for the pose loss
-WARMUP = "PoseLossWarmup"  # the callback that sets `pose_weight`; its module imports this one
+POSED = "pnp"  # estimate of the pose loss, which has a derivative
+WARMUP = "PoseLossWarmup"  # callback that sets `pose_weight`; its module imports this one
 DECAYED = 0.02  # factor on the learning rate after the decay
-WIDEST_MATCH = 0.5  # radians; every point matches many others beyond it, and degrees are mistaken for radians
+WIDEST_MATCH = 0.5  # largest `correspondence_angle`, radians; larger values are probably degrees
 MOST_SKIPPED = 20  # consecutive steps without a finite gradient that end the run
 
 
 class TrainingDivergedError(RuntimeError):
-    """`MOST_SKIPPED` consecutive optimizer steps without a finite loss and gradient."""
+    """Error after `MOST_SKIPPED` consecutive optimiser steps without a finite loss and gradient."""
 
 
 class BlindPnPTask(LightningModule):
-    """Any solver, trained with L = L_c + pose_weight * L_p (paper Eqs. 11 to 15) and Adam.
+    """Training and evaluation of any solver, with L = L_c + pose_weight * L_p (paper Eqs. 11 to 15) and Adam.
 
     Args:
-        solver: module that maps a Batch to a Prediction; its class attribute `estimates` names its poses. The error
-            that selects checkpoints, `val/pose_error`, is that of "pnp", or of the first where there is none. A
-            callback may also monitor the first without its name (`val/rotation_q2_deg`). If the solver has a method
-            `match(batch)` for a prediction without poses, a training step without a pose calls it.
-        weights: packaged weights (a name of `docs/model-card.md`) or a checkpoint that the solver starts from; none for
-            those of the solver. The optimizer and the step start from zero; `--ckpt_path` continues them.
-        learning_rate: of Adam; 1e-5 in the paper.
-        weight_decay: of Adam; 0 in the paper, 1e-3 in the authors' code.
-        warmup_steps: optimizer steps in which the learning rate rises from zero.
-        decay_start: first step of the decay, a half cosine to a fiftieth of the learning rate; none for no decay.
-        decay_steps: steps of the decay.
-        pose_weight: gamma_p of Eq. 15, for the pose "pnp". While it is 0 no pose is solved in training;
+        solver: Module that maps a Batch to a Prediction; its class attribute `estimates` names its poses. The error
+            that selects checkpoints, `val/pose_error`, is that of "pnp", or of the first estimate if there is no "pnp".
+            A callback may also monitor the first estimate without its name (`val/rotation_q2_deg`). If the solver has a
+            method `match(batch)` for a prediction without poses, a training step without a pose calls it.
+        weights: Packaged weights (a name of `docs/model-card.md`) or a checkpoint that the solver starts from; none for
+            the solver's own. The optimiser and the step start from zero; `--ckpt_path` continues them.
+        learning_rate: Learning rate of Adam; 1e-5 in the paper.
+        weight_decay: Weight decay of Adam; 0 in the paper, 1e-3 in the authors' code.
+        warmup_steps: Number of optimiser steps in which the learning rate rises from zero.
+        decay_start: First step of the decay, a half cosine to a fiftieth of the learning rate; none for no decay.
+        decay_steps: Number of steps of the decay.
+        pose_weight: gamma_p of Eq. 15, for the pose "pnp". While it is 0 no pose is computed in training;
             `PoseLossWarmup` sets it from an epoch on.
-        matching_loss: loss of the assignment: correspondence for the paper's L_c (Eq. 11); likelihood for the negative
-            log likelihood of each point's correspondence (`matching_likelihood_loss`).
-        correspondence_angle: with L_c, supervision by the pose alone: points within this angle (radians, at most 0.5)
+        matching_loss: Loss of the assignment: correspondence for the paper's L_c (Eq. 11); likelihood for the negative
+            log-likelihood of each point's correspondence (`matching_likelihood_loss`).
+        correspondence_angle: With L_c, supervision by the pose alone: points within this angle (radians, at most 0.5)
             count as correspondences; null for the true ones.
-        loss: module in place of `matching_loss`, from (Prediction, Batch) to a value a problem (b,), NaN for a problem
-            without a loss. With its attribute `needs_pose = False` it gets a prediction without poses in training.
-        refine_validation: whether validation refines poses as tests do, which takes most of its time.
+        loss: Module in place of `matching_loss`, from (Prediction, Batch) to one value per problem (b,), NaN for a
+            problem without a loss. With its attribute `needs_pose = False` it gets a prediction without poses in
+            training.
+        refine_validation: Refine poses in validation as in tests, which takes most of its time.
     """
 
     def __init__(
@@ -134,11 +135,11 @@ class BlindPnPTask(LightningModule):
         self.matching_loss, self.correspondence_angle = matching_loss, correspondence_angle
         self.skipped_steps = 0
         self.consecutive_skipped_steps = 0
-        self.optimizer_names: list[str] | None = None  # classes of the optimizers of this run or of its checkpoint
+        self.optimizer_names: list[str] | None = None  # optimiser classes of this run or of its checkpoint
         self.optimizer_settings: list[list[dict[str, Any]]] = []  # configured settings by optimizer and group
         self.refine_validation = refine_validation
-        self.numbers: set[int] = set()  # of the problems of this epoch of evaluation
-        self.tabled: set[str] = set()  # names of the figures that the tables of a test show
+        self.numbers: set[int] = set()  # indices of the problems of this evaluation epoch
+        self.table_metrics: set[str] = set()  # names of the metrics in the tables of a test
         estimates: tuple[str, ...] | str = getattr(self.solver, "estimates", ())
         if isinstance(estimates, str):
             raise ValueError(f"expected `estimates` as a tuple of names, got {estimates!r}; try ({estimates!r},)")
@@ -164,22 +165,22 @@ class BlindPnPTask(LightningModule):
         parts: Iterable[type[nn.Module]] = (),
         **kwargs: Any,
     ) -> "BlindPnPTask":
-        """Build the task of a checkpoint: the solver that it describes, the weights, the options of its training.
+        """Build the task of a checkpoint: its solver, its weights, and the options of its training.
 
         Args:
-            checkpoint_path: a file, or the name of packaged weights.
-            map_location: device of the weights; the CPU by default.
-            hparams_file: refused; the checkpoint has the hyperparameters.
+            checkpoint_path: File, or the name of packaged weights.
+            map_location: Device of the weights. Default: the CPU.
+            hparams_file: Rejected; the checkpoint has the hyperparameters.
             strict: False allows missing and unexpected weights.
-            weights_only: refused if False; a checkpoint is read as data.
-            parts: classes outside this package that the solver or the loss is made of.
-            kwargs: constructor arguments in place of those of the checkpoint.
+            weights_only: False is rejected; a checkpoint is read as data.
+            parts: Classes outside this package that the solver or the loss is made of.
+            kwargs: Constructor arguments that replace those of the checkpoint.
 
         Returns:
-            The task, in training mode as Lightning returns it; call `eval()` before you predict without a Trainer.
+            The task in training mode, as Lightning returns it; call `eval()` to predict without a Trainer.
 
         Raises:
-            ValueError: the file is no checkpoint of a task, or does not fit a `solver` among `kwargs`.
+            ValueError: The file is no checkpoint of a task, or does not fit a `solver` among `kwargs`.
 
         >>> BlindPnPTask.load_from_checkpoint("procedural-so3").solver.rounds
         8
@@ -187,8 +188,8 @@ class BlindPnPTask(LightningModule):
         if hparams_file is not None or weights_only is False:
             raise ValueError("hparams_file and weights_only=False are not accepted: a checkpoint is read as data")
         content = read_checkpoint(checkpoint_path, map_location=map_location)
-        known = inspect.signature(cls.__init__).parameters
-        options = {key: value for key, value in content.get("task", {}).items() if key in known} | kwargs
+        accepted = inspect.signature(cls.__init__).parameters
+        options = {key: value for key, value in content.get("task", {}).items() if key in accepted} | kwargs
         try:
             if is_description(options.get("loss")):
                 options["loss"] = build_module(options["loss"], parts)
@@ -216,7 +217,7 @@ class BlindPnPTask(LightningModule):
             figures = self._figures(losses, prediction, batch)
         loss = losses.total
         self._log_train(loss=loss, skipped_steps=float(self.skipped_steps), **figures)
-        # A loss that is not finite makes every gradient NaN, in every process, and the step is skipped.
+        # Make every gradient NaN in every process if the loss is not finite; the step is then skipped.
         return loss * torch.where(loss.isfinite(), 1.0, torch.nan)
 
     def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
@@ -273,7 +274,7 @@ class BlindPnPTask(LightningModule):
         for each in counts:
             each.reset()
         # In the last epoch of StochasticWeightAveraging, which only updates batch norms, Lightning steps without a
-        # backward pass, with the gradients that it finds.
+        # backward pass, with the remaining gradients.
         self.zero_grad()
         clipped = [module.clipped for module in self.solver.modules() if isinstance(module, WeightedPnP)]
         if columns := sum(each.columns for each in clipped):
@@ -282,9 +283,9 @@ class BlindPnPTask(LightningModule):
             column_count.reset()
 
     def on_before_optimizer_step(self, optimizer: Optimizer) -> None:
-        """Log the gradient norm; without a finite gradient, count the step and drop all gradients.
+        """Log the gradient norm; if it is not finite, count the step and drop all gradients.
 
-        No optimizer of torch changes a parameter without a gradient, or its state.
+        No optimiser of torch changes a parameter without a gradient, or its state.
 
         Raises:
             TrainingDivergedError: `MOST_SKIPPED` consecutive steps had no finite gradient.
@@ -312,19 +313,19 @@ class BlindPnPTask(LightningModule):
         return self.with_schedule(Adam(trained, lr=self.learning_rate, weight_decay=self.weight_decay, fused=fused))
 
     def with_schedule(self, optimizer: Optimizer) -> OptimizerLRScheduler:
-        """Return an optimizer with the warm-up and the decay of this task, or alone if it has neither."""
+        """Return an optimiser with the warm-up and the decay of this task, or alone if it has neither."""
         if not self.warmup_steps and self.decay_start is None:
             return optimizer
-        # A function of the step alone: a resumed run may have another schedule. `SequentialLR` would take its
-        # milestones and its rate from the checkpoint.
+        # The factor depends only on the step, because a resumed run may have another schedule; `SequentialLR` would
+        # restore its milestones and its rate from the checkpoint.
         schedule = LambdaLR(optimizer, lambda _: self.rate_factor(self.trainer.global_step))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_fit_start(self) -> None:
-        """Record the configured optimizers before a checkpoint replaces their settings.
+        """Record the configured optimisers before a checkpoint replaces their settings.
 
         Raises:
-            ValueError: the checkpoint was trained with other optimizers.
+            ValueError: The checkpoint was trained with other optimisers.
         """
         optimizers = self.trainer.optimizers
         names = [type(optimizer).__name__ for optimizer in optimizers]
@@ -369,9 +370,10 @@ class BlindPnPTask(LightningModule):
         return rise * (DECAYED + (1 - DECAYED) * (1 + math.cos(math.pi * done)) / 2)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Describe the solver, from which it is built again, and the task, under names of their own.
+        """Add descriptions of the solver and of the task, from which they are built again.
 
-        A LightningCLI overwrites options of the command line by what it finds under Lightning's "hyper_parameters".
+        They have their own names, because a LightningCLI overwrites options of the command line by what it finds under
+        Lightning's "hyper_parameters".
         """
         checkpoint["solver"] = describe_module(self.solver)
         saved = checkpoint.pop(self.CHECKPOINT_HYPER_PARAMS_KEY, {})
@@ -384,11 +386,11 @@ class BlindPnPTask(LightningModule):
         checkpoint["pose_weight"] = self.pose_weight
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        checkpoint |= upgrade(checkpoint)  # of a Trainer without SafeCheckpointIO
+        checkpoint |= upgrade(checkpoint)  # not done yet by a Trainer without SafeCheckpointIO
         self._adopt(checkpoint)
         self._check_pose_loss_continues(checkpoint)
         self.skipped_steps, self.consecutive_skipped_steps = checkpoint.get("skipped_steps", (0, 0))
-        self.optimizer_names = checkpoint.get("optimizer_names", ["Adam"])  # of versions that had no other
+        self.optimizer_names = checkpoint.get("optimizer_names", ["Adam"])  # older versions only had Adam
 
     def _check_pose_loss_continues(self, checkpoint: Mapping[str, Any]) -> None:
         """Raise ValueError if a training with a pose loss, now or later, is resumed without one."""
@@ -436,15 +438,14 @@ class BlindPnPTask(LightningModule):
 
     def _log_train(self, **values: Tensor | float) -> None:
         for name, value in values.items():
-            shown = name == "loss"  # in the progress bar
-            self.log(f"train/{name}", value, on_step=True, on_epoch=False, prog_bar=shown, batch_size=1)
+            self.log(f"train/{name}", value, on_step=True, on_epoch=False, prog_bar=name == "loss", batch_size=1)
 
     def _figures(self, losses: Losses, prediction: Prediction, batch: Batch) -> dict[str, Tensor]:
         """Return the values that a training step logs in addition to its loss."""
         figures: dict[str, Tensor] = {}
-        known = correspondence_losses(prediction, batch, angle=self.correspondence_angle)
-        if known is not None:
-            figures["correspondence_loss"] = known.detach().mean()
+        correspondence = correspondence_losses(prediction, batch, angle=self.correspondence_angle)
+        if correspondence is not None:
+            figures["correspondence_loss"] = correspondence.detach().mean()
         if self.loss is not None or self.matching_loss != "correspondence":
             figures["matching_loss"] = losses.matching.sum() / losses.matched.sum()
             figures["left_out"] = 1 - losses.matched.float().mean()
@@ -464,27 +465,27 @@ class BlindPnPTask(LightningModule):
             metrics = cast(MetricCollection, self.metrics[f"{stage}_{name}"])
             values = metrics.compute()
             metrics.reset()
-            for place in (f"{stage}/{name}", stage) if i == 0 else (f"{stage}/{name}",):
+            for prefix in (f"{stage}/{name}", stage) if i == 0 else (f"{stage}/{name}",):
                 # The metrics have already been gathered over processes.
-                figures = {f"{place}/{key}": value.float() for key, value in values.items()}
-                # Once in the logs, with its name; without it to monitor, whatever the solver.
-                self.log_dict(figures, logger=place != stage)
-                self.tabled |= figures.keys()
+                figures = {f"{prefix}/{key}": value.float() for key, value in values.items()}
+                # The logs have the estimate's name; without it, callbacks can monitor any solver.
+                self.log_dict(figures, logger=prefix != stage)
+                self.table_metrics |= figures.keys()
             if name == (POSED if POSED in self.estimates[stage] else self.estimates[stage][0]):
                 # L_p of the median errors (paper Eq. 12), which selects checkpoints.
                 error = torch.deg2rad(values["rotation_q2_deg"]) + values["translation_q2"]
                 self.log(f"{stage}/pose_error", error.float())
-                self.tabled.add(f"{stage}/pose_error")
+                self.table_metrics.add(f"{stage}/pose_error")
         loss = cast(MeanOverProblems, self.metrics[stage])
         # compute() is a collective call: all processes make it, or none.
         if self.trainer.strategy.reduce_boolean_decision(loss.update_called, all=False):
             self.log(f"{stage}/correspondence_loss", loss.compute().float())
-            self.tabled.add(f"{stage}/correspondence_loss")
+            self.table_metrics.add(f"{stage}/correspondence_loss")
             loss.reset()
 
 
 def _scale_schedule(scheduler: Any) -> None:
-    """Use a rate that was set after the scheduler was made, as by `LearningRateFinder`, as the initial one."""
+    """Use a rate that was set after the scheduler was made, such as by `LearningRateFinder`, as the initial one."""
     groups, rates = scheduler.optimizer.param_groups, getattr(scheduler, "base_lrs", ())
     for group, last, initial in zip(groups, scheduler.get_last_lr(), rates, strict=False):
         if initial and group["lr"] != last:
@@ -492,19 +493,26 @@ def _scale_schedule(scheduler: Any) -> None:
 
 
 def check_batch(batch: object) -> None:
-    """Raise ValueError if a data module gives something other than a Batch."""
+    """Raise ValueError if the data module returns something other than a Batch."""
     if not isinstance(batch, Batch):
         raise ValueError(
-            f"expected a Batch from the loaders of the data module, got {type(batch).__name__}; try a `collate_fn` "
-            "that returns Batch.from_arrays(...)"
+            f"the loaders of the data module return a {type(batch).__name__}, not a Batch; use a `collate_fn` that "
+            "returns Batch.from_arrays(...)"
         )
 
 
 def check_prediction(prediction: object, batch: Batch, estimates: tuple[str, ...], solver: str) -> None:
-    """Raise ValueError unless a solver returns a Prediction with all its estimates, one pose a problem."""
+    """Raise ValueError unless a solver returns a Prediction with all its estimates, one pose per problem.
+
+    Args:
+        prediction: Output of the solver.
+        batch: Problems.
+        estimates: Names of the estimates.
+        solver: Name of the solver, for messages.
+    """
     if not isinstance(prediction, Prediction):
         raise ValueError(
-            f"expected a Prediction from {solver}, got {type(prediction).__name__}; try "
+            f"{solver} returned a {type(prediction).__name__}, not a Prediction; use "
             "`return Prediction(poses={name: Pose(rotation, translation, stats)})`"
         )
     if absent := [name for name in estimates if name not in prediction.poses]:
@@ -512,33 +520,33 @@ def check_prediction(prediction: object, batch: Batch, estimates: tuple[str, ...
             f"Prediction.poses of {solver} has no {', '.join(absent)}, which its `estimates` name, among "
             f"{list(prediction.poses)}; use one name in both"
         )
-    wanted = (len(batch), 3, 3), (len(batch), 3)
+    required = (len(batch), 3, 3), (len(batch), 3)
     for name, pose in prediction.poses.items():
-        got = tuple(pose.rotation.shape), tuple(pose.translation.shape)
-        if got != wanted:
+        shapes = tuple(pose.rotation.shape), tuple(pose.translation.shape)
+        if shapes != required:
             raise ValueError(
-                f"expected rotations {wanted[0]} and translations {wanted[1]} of {name!r} from {solver}, got {got[0]} "
-                f"and {got[1]}; try one pose a problem, NaN where none was found"
+                f"{solver} returned rotations {shapes[0]} and translations {shapes[1]} of {name!r} instead of "
+                f"{required[0]} and {required[1]}; return one pose per problem, NaN where none was found"
             )
 
 
 def number_globally(batch: Batch, numbers: set[int], *, processes: int) -> None:
-    """Number the problems of a batch after all earlier ones if one of its own numbers was used before.
+    """Renumber the problems of a batch after all earlier ones if one of its numbers was used before.
 
     Args:
-        batch: whose `index`, and `ids` made from it, may be replaced.
-        numbers: of all earlier problems; those of the batch are added.
-        processes: that evaluate together.
+        batch: Problems whose `index`, and `ids` made from it, may be replaced.
+        numbers: Numbers of all earlier problems; those of the batch are added.
+        processes: Number of processes that evaluate together.
 
     Raises:
-        ValueError: numbers repeat among several processes, which do not have the numbers of the others.
+        ValueError: Numbers repeat among several processes, which do not have each other's numbers.
     """
     index = batch.index.tolist()
     if len(set(index)) < len(index) or not numbers.isdisjoint(index):
         if processes > 1:
             raise ValueError(
-                f"expected one number in `Batch.index` for each problem, got some of {index} again; try "
-                "Batch.from_arrays(..., index=...) with the position of each problem in its data set"
+                f"some of the numbers {index} in `Batch.index` repeat; use Batch.from_arrays(..., index=...) with the "
+                "position of each problem in its data set"
             )
         first = max(numbers, default=-1) + 1
         unnamed = [name == str(number) for name, number in zip(batch.ids, index, strict=True)]

@@ -71,7 +71,7 @@ def test_options_of_the_network_and_its_parts_are_explained(
         (["fit", "--config", "quickstrat"], "got 'quickstrat'; did you mean quickstart?"),
         (["fit", *MESHES, "--trainer.fast_dev_run=-1"], "fast_dev_run=-1 is not a valid configuration"),
         (["test", *MESHES, "--ckpt_path=nothing.ckpt"], "nothing.ckpt"),
-        (["report", "nowhere"], "expected a results folder"),
+        (["report", "nowhere"], "nowhere is no results folder"),
         (
             ["view", "nowhere"],
             "expected the folder of a test or the JSON of a solution, got nowhere, which is not there",
@@ -210,7 +210,7 @@ def test_fit_test_report(
     assert f"the results of {tmp_path}/run/checkpoints/last.ckpt in {tmp_path}/run/test are replaced" in caplog.messages
     assert "━" not in capsys.readouterr().out
     trained = (tmp_path / "run" / "test" / "summary.json").read_bytes()
-    assert "best.ckpt, got none, which would replace them; try --ckpt_path last" in fails("test", *common)
+    assert "best.ckpt, which a test without --ckpt_path would replace; use --ckpt_path last" in fails("test", *common)
     assert (tmp_path / "run" / "test" / "summary.json").read_bytes() == trained
     main(["test", *common, f"--results.folder={tmp_path}/run/untrained"])
     assert (tmp_path / "run" / "untrained" / "summary.json").is_file()

@@ -123,14 +123,14 @@ class Poseless(nn.Module):
 @pytest.mark.parametrize(
     ("method", "error"),
     [
-        ("Poseless", "expected a pose from 'it', got predictions without one"),
+        ("Poseless", "the predictions of 'it' have no pose"),
         (
             "Nowhere",
             "Problem with given class_path 'test_table_command.Nowhere': module .* has no attribute",
         ),
         (
             "functools.partial",
-            'as a Module and arguments of its own, got: Parser key "solver": Import path functools.partial does not',
+            'no Module, or does not accept its arguments: Parser key "solver": Import path functools.partial does not',
         ),
     ],
 )
@@ -188,9 +188,9 @@ def test_a_table_of_several_seeds_has_their_mean_and_spread(recipes: list[str], 
 @pytest.mark.parametrize(
     ("extra", "message"),
     [
-        (["--methods", "nonsense"], "expected a method among softposit, ransac"),
-        (["--methods", "ransac", "ransac"], "expected a label for each method"),
-        (["--methods", "a-b=ransac", "a/b=search"], "expected a label for each method"),
+        (["--methods", "nonsense"], "'nonsense' is no method; give one of softposit, ransac"),
+        (["--methods", "ransac", "ransac"], "two methods have the label 'ransac'"),
+        (["--methods", "a-b=ransac", "a/b=search"], "two methods have the label 'a/b'"),
         (["--methods", "..=ransac"], "the label '..' of '..=ransac' cannot name a folder of results"),
         (["--methods", "=ransac"], "the label '' of '=ransac' cannot name a folder of results"),
         (["--methods", "bpnpnet@nothing.ckpt"], "there is no checkpoint nothing.ckpt"),
@@ -200,7 +200,7 @@ def test_a_table_of_several_seeds_has_their_mean_and_spread(recipes: list[str], 
         (["--limit=x"], "Parser key \"limit\": Expected a <class 'int'> Given value: x"),
         (["--limit=0"], "expected --limit of 1 or more, got 0"),
         (["--rho", "0", "-1"], "expected --rho of 0 or more, got -1"),
-        (["--data=nowhere.yaml"], "got no file nowhere.yaml"),
+        (["--data=nowhere.yaml"], "there is no file nowhere.yaml"),
     ],
 )
 def test_a_users_mistake_is_one_clear_error(
@@ -213,9 +213,9 @@ def test_other_settings_in_the_same_folder_are_refused(
     recipes: list[str], tmp_path: Path, fails: Callable[..., str]
 ) -> None:
     main([*recipes, "--limit=1"])
-    assert "got other data" in fails(*recipes, "--limit=1", "--data.noise_px=0")
+    assert "has results of another data" in fails(*recipes, "--limit=1", "--data.noise_px=0")
     (tmp_path / "ransac.yaml").write_text(RANSAC.replace("64", "65"))
-    assert "got other method" in fails(*recipes, "--limit=1")
+    assert "has results of another method" in fails(*recipes, "--limit=1")
 
 
 def test_a_checkpoint_becomes_rows_per_estimate(tmp_path: Path) -> None:

@@ -56,9 +56,9 @@ def test_views_are_read_as_they_were_written(tmp_path: Path) -> None:
             np.testing.assert_array_equal(np.c_[pose], np.c_[after.estimates[name]])
     assert read_points(tmp_path / "nowhere") == ()
     (tmp_path / "points.npz").write_bytes(b"")
-    with pytest.raises(ValueError, match=r"expected points of a test in .*points.npz"):
+    with pytest.raises(ValueError, match=r"cannot read the points of a test in .*points.npz"):
         read_points(tmp_path)
-    with pytest.raises(ValueError, match=r"expected problems with the estimates \['pnp'\], got others"):
+    with pytest.raises(ValueError, match=r"some problems have other estimates than \['pnp'\]"):
         write_points(tmp_path, [problems[0], replace(problems[1], estimates={})])
 
 

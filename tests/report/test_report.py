@@ -116,12 +116,12 @@ def test_the_files_are_plain_csv_and_strict_json(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
-        ([], "expected at least one row, got none"),
+        ([], "no rows to write"),
         (
             [row(0), row(0, "ransac", id="other")],
-            r"one number in `Batch.index` for each problem, got 0 for \('problem 0', .* and \('other'",
+            r"`Batch.index` 0 is used for two problems, \('problem 0', .* and \('other'",
         ),
-        ([row(0), row(1), row(1, "ransac")], "expected each estimate for all 2 problems, got"),
+        ([row(0), row(1), row(1, "ransac")], "an estimate is missing for some of the 2 problems: "),
     ],
 )
 def test_rows_that_cannot_be_a_test_are_refused(tmp_path: Path, rows: list[ProblemRow], message: str) -> None:
@@ -142,31 +142,34 @@ def _edit(name: str, old: str, new: str) -> Callable[[Path], object]:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda folder: (folder / "problems.csv").unlink(), r"expected a results folder with problems\.csv, got no"),
+        (lambda folder: (folder / "problems.csv").unlink(), r"is no results folder: it has no problems\.csv"),
         (
             _edit("summary.json", '"format": 2', '"format": 1'),
-            "in .*summary.json, got ValueError: format 1 in place of 2",
+            "summary.json is no summary of `bpnp test`: ValueError: format 1 in place of 2",
         ),
-        (_edit("summary.json", '"problems": 3', '"problems": 4'), "expected 4 x 1 rows in problems.csv"),
+        (
+            _edit("summary.json", '"problems": 3', '"problems": 4'),
+            "problems.csv has 3 rows, but .*summary.json counts 4 x 1",
+        ),
         (
             _edit("summary.json", '"settings"', '"things"'),
-            "expected what `bpnp test` writes in .*TypeError: .*'settings'",
+            "summary.json is no summary of `bpnp test`: TypeError: .*'settings'",
         ),
         (
             lambda folder: (folder / "summary.json").write_text('{"format": 2, '),
-            r"expected what `bpnp test` writes in .*summary\.json, got JSONDecodeError",
+            r"summary\.json is no summary of `bpnp test`: JSONDecodeError",
         ),
         (lambda folder: (folder / "summary.json").write_text("[]"), "format None in place of 2"),
-        (_edit("problems.csv", "inliers", "inlyers"), r"problems\.csv, got .*'inliers'"),
-        (_edit("problems.csv", "True", "maybe"), r"expected the rows of a test in .*problems\.csv, got 'maybe'"),
-        (_edit("problems.csv", ",10,12,", ",10,x,"), r"expected the rows of a test in .*problems\.csv, got .*'x'"),
-        (_edit("problems.csv", ",10,12,", ",10,"), r"problems\.csv, got "),
-        (lambda folder: (folder / "problems.csv").write_text(""), r"problems\.csv, got No columns"),
+        (_edit("problems.csv", "inliers", "inlyers"), r"problems\.csv: .*'inliers'"),
+        (_edit("problems.csv", "True", "maybe"), r"cannot read the rows of a test in .*problems\.csv: 'maybe'"),
+        (_edit("problems.csv", ",10,12,", ",10,x,"), r"cannot read the rows of a test in .*problems\.csv: .*'x'"),
+        (_edit("problems.csv", ",10,12,", ",10,"), r"problems\.csv: "),
+        (lambda folder: (folder / "problems.csv").write_text(""), r"problems\.csv: No columns"),
         (
             lambda folder: (folder / "problems.csv").write_bytes(
                 (folder / "problems.csv").read_bytes().split(b"\r\n")[0]
             ),
-            r"expected at least one row in .*problems\.csv, got none",
+            r"problems\.csv has no rows",
         ),
     ],
 )
@@ -202,5 +205,5 @@ def test_each_row_has_the_cause_that_its_numbers_say() -> None:
     assert [row.cause for row in planted] == list(cases)
     shares = cause_shares([*planted, planted[0]])
     assert shares == {cause: (2 if cause == "solved" else 1) / 6 for cause in cases}
-    with pytest.raises(ValueError, match="expected at least one row"):
+    with pytest.raises(ValueError, match="no rows to count"):
         cause_shares([])

@@ -265,7 +265,7 @@ def test_problems_that_are_numbered_within_their_batch_are_all_counted(tmp_path:
 @pytest.mark.parametrize(
     ("answer", "estimates", "error"),
     [
-        (lambda batch: batch.points2d, ("a",), "expected a Prediction from Answering, got Tensor"),
+        (lambda batch: batch.points2d, ("a",), "Answering returned a Tensor, not a Prediction"),
         (
             lambda batch: Prediction(poses={"b": posed(batch.rotation, batch.translation)}),
             ("a",),
@@ -279,7 +279,7 @@ def test_problems_that_are_numbered_within_their_batch_are_all_counted(tmp_path:
         (
             lambda batch: Prediction(poses={"a": posed(batch.rotation[:1], batch.translation[:1])}),
             ("a",),
-            r"\(2, 3, 3\) and .* got \(1, 3, 3\)",
+            r"rotations \(1, 3, 3\) .* instead of \(2, 3, 3\)",
         ),
     ],
 )
@@ -294,7 +294,7 @@ def test_what_a_solver_returns_is_checked(answer: Any, estimates: Any, error: st
 
 def test_a_loader_that_gives_no_batch_is_named(tmp_path: Path) -> None:
     for run in (quiet_trainer(tmp_path).fit, quiet_trainer(tmp_path).test):
-        with pytest.raises(ValueError, match=r"expected a Batch from the loaders .* got list; try a `collate_fn`"):
+        with pytest.raises(ValueError, match=r"the loaders .* return a list, not a Batch; use a `collate_fn`"):
             run(BlindPnPTask(small_net()), DataLoader([(torch.rand(5, 2), torch.rand(5, 3))] * 2, 2))
 
 
@@ -303,9 +303,7 @@ def test_several_processes_cannot_number_anew() -> None:
     numbers = set[int]()
     number_globally(first, numbers, processes=2)
     assert numbers == {0, 1}
-    with pytest.raises(
-        ValueError, match=r"expected one number in `Batch.index` for each problem, got some of \[0, 1\]"
-    ):
+    with pytest.raises(ValueError, match=r"some of the numbers \[0, 1\] in `Batch.index` repeat"):
         number_globally(second, numbers, processes=2)
 
 

@@ -56,7 +56,7 @@ function drawProblem() {
   byId("lines").querySelector("[value=assigned]").disabled = !assigned;
   if (!assigned && byId("lines").value === "assigned") byId("lines").value = "true";
   open.targets = { true: drawn.match3d, assigned }[byId("lines").value] ?? [];
-  byId("picked").textContent = "Click a point to see its number and its partner.";
+  byId("picked").textContent = "Click a point to see its number and its match.";
   drawScene(drawn);
   open.ends = drawn.points3d.map((p) => camera && projected(camera.pose, p));
   draw(byId("image"), image(drawn, camera, open.targets), { scrollZoom: true },
