@@ -5,7 +5,7 @@ RUN := runs/quickstart
 # Percent of lines and branches that the tests run; compiled loops are not counted.
 FLOOR := 88
 
-.PHONY: quickstart check test coverage results lint docs wheel install clean
+.PHONY: quickstart check test coverage results lint docs notebooks wheel install clean
 
 install: $(VENV)/.installed
 
@@ -41,6 +41,10 @@ results: install
 docs: install
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
 	$(BIN)/mkdocs build --strict --site-dir build/site
+
+notebooks: install
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt nbclient ipykernel
+	$(BIN)/python examples/store_outputs.py
 
 wheel: install
 	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .

@@ -11,7 +11,7 @@ import textwrap
 import traceback
 import warnings
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
+from importlib.metadata import metadata, version
 
 from bpnp.commands import COMMANDS
 from bpnp.commands.parser import LIGHTNING, first_line, parse_arguments, plain, short_help
@@ -156,6 +156,7 @@ def help_text() -> str:
             "",
             "bpnp COMMAND --help shows the options of a command, bpnp --version the version.",
             textwrap.fill(f"Packaged configurations, for --config: {', '.join(config_names())}.", WIDTH),
+            *(url.replace(", ", ": ", 1) for url in metadata("bpnp").get_all("Project-URL", [])),
         ]
     )
 

@@ -175,7 +175,7 @@ def _attempts(cluster: str | None) -> Callable[..., Any]:
     try:
         from bpnp.maps.on_cluster import attempts_on_cluster
     except ImportError as error:
-        raise ValueError(f"expected Dask for --cluster, got {error}; try `pip install 'bpnp[cluster]'`") from error
+        raise ValueError(f"--cluster needs Dask: {error}; install it with `pip install distributed`") from error
     return partial(attempts_on_cluster, cluster=cluster)
 
 

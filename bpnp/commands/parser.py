@@ -33,7 +33,8 @@ class OneLineParser(ArgumentParser):
                 parent, _, name = path.rpartition(".")  # `fit.data` is an option of `bpnp fit`
                 command = f"{self.prog} {parent}".rstrip()
                 options.append(f"--{name}" if parent or f"--{name}" in known else name)
-            raise ValueError(f"missing {', '.join(options)}; try: {command} --help") from ex
+            known_start = f"{command} --config quickstart, or " if parent in LIGHTNING else ""
+            raise ValueError(f"missing {', '.join(options)}; try: {known_start}{command} --help") from ex
         close = difflib.get_close_matches(unknown.split("=")[0].split(" ")[0], known, n=1) if found else []
         hint = f"; did you mean {close[0]}?" if close else f"; try: {self.prog} --help" if found else ""
         renamed = (new for old, new in RENAMED.items() if text.endswith(f"Option '{old}' is not accepted"))

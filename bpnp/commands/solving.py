@@ -51,7 +51,7 @@ def solve(
     """Find the pose of a camera from image points and scene points that nobody has matched.
 
     The verdict is confident, ambiguous (the other candidates fit about as well), or failed: then the pose is a guess.
-    Files: docs/solve.md.
+    The kinds of files stand under points2d and points3d.
 
     Args:
         points2d: .npy, .csv or .txt with columns x y or u v; pixels with --camera or --image_size, else x/z y/z; a

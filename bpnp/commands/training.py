@@ -17,7 +17,7 @@ from typing import Any
 
 from jsonargparse import Namespace
 from lightning import Callback, LightningDataModule, LightningModule, Trainer
-from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar, RichProgressBar
+from lightning.pytorch.callbacks import ModelCheckpoint, ModelSummary, ProgressBar, RichProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.loggers import CSVLogger, Logger
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
@@ -29,7 +29,7 @@ from bpnp.commands.parser import OneLineParser
 from bpnp.files import config_content, lock_folder, write_text
 from bpnp.models.weights import PARTS, class_name, is_description, networks, read_checkpoint
 from bpnp.report.terminal import console, say
-from bpnp.training.callbacks import PoseLossWarmup, ProgressLines, ResultsWriter
+from bpnp.training.callbacks import ParameterCount, PoseLossWarmup, ProgressLines, ResultsWriter
 from bpnp.training.checkpoints import (
     BestCheckpoint,
     InterruptedCheckpoint,
@@ -198,6 +198,10 @@ class BpnpCLI(LightningCLI):
         if not any(isinstance(callback, ProgressBar) for callback in _as_list(options["callbacks"])):
             callbacks.append(RichProgressBar() if bar else ProgressLines())
             kwargs["enable_progress_bar"] = bar
+        own = any(isinstance(callback, ModelSummary) for callback in _as_list(options["callbacks"]))
+        if options["enable_model_summary"] is None and not own:  # Lightning's counts operations, of which it sees none
+            callbacks.append(ParameterCount())
+            kwargs["enable_model_summary"] = False
         self.trainer_defaults["callbacks"] = callbacks
         # Not a default of the trainer: an object among the defaults could not be written to config.yaml.
         kwargs["plugins"] = [*_as_list(options["plugins"]), SafeCheckpointIO()]

@@ -176,5 +176,5 @@ def _h5py(needed_for: Path) -> Any:
     try:
         import h5py
     except ImportError as error:
-        raise ImportError(f"h5py is needed to read {needed_for}; install it with `pip install bpnp[hdf5]`") from error
+        raise ImportError(f"h5py is needed to read {needed_for}; install it with `pip install h5py`") from error
     return h5py

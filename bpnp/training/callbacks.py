@@ -128,6 +128,21 @@ class ProgressLines(Callback):
             sys.stdout.flush()
 
 
+class ParameterCount(Callback):
+    """Print how many parameters each part of the solver has when a training starts."""
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if not trainer.is_global_zero:
+            return
+        solver = getattr(pl_module, "solver", pl_module)
+        parts = {name: sum(p.numel() for p in part.parameters()) for name, part in solver.named_children()}
+        total, trained = (
+            sum(p.numel() for p in pl_module.parameters() if p.requires_grad or not only) for only in (False, True)
+        )
+        listed = ", ".join(f"{name} {count:,}" for name, count in parts.items() if count)
+        say(f"{type(solver).__name__}: {total:,} parameters, {trained:,} trained ({listed})")
+
+
 class TrainingMonitor(Callback):
     """Log values of the first few validation problems that show the progress of a training.
 

@@ -53,7 +53,7 @@ def test_options_of_the_network_and_its_parts_are_explained(
         (["prepare", "megadepth", ".", "--min_points=3"], "min_points"),
         (["localize", "--veiws=x"], "did you mean --views?"),
         (["fit", *MESHES, "--trainer.max_epoch=3"], "did you mean --trainer.max_epochs?"),
-        (["fit"], "missing --data; try: bpnp fit --help"),
+        (["fit"], "missing --data; try: bpnp fit --config quickstart, or bpnp fit --help"),
         (["table"], "missing --data, --methods; try: bpnp table --help"),
         (["solve", "points2d.csv"], "missing points3d; try: bpnp solve --help"),
         (["fit", *MESHES, "--model.learning_rat=3"], "unrecognized arguments: --model.learning_rat"),

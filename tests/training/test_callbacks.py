@@ -9,6 +9,7 @@ from small_data import quiet_trainer, small_net
 from torch.optim import Optimizer
 from torch.utils.data import DataLoader
 
+from bpnp.training.callbacks import ParameterCount
 from bpnp.training.task import BlindPnPTask
 
 
@@ -43,3 +44,13 @@ def test_a_resumed_run_goes_on_at_the_rate_of_its_step_or_on_another_schedule(tm
     assert rates[2:] == pytest.approx([0.02 * k / 10 * 1e-12 for k in range(8, 11)])
     fit(2, half, rate=4e-12)
     assert rates[1:] == pytest.approx([k / 10 * 4e-12 for k in range(7, 11)])
+
+
+def test_the_parameters_of_each_part_are_printed(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    task = BlindPnPTask(small_net(8, 1))
+    frozen = next(iter(task.solver.features2d.parameters())).requires_grad_(False).numel()
+    ParameterCount().on_fit_start(quiet_trainer(tmp_path, max_epochs=1), task)
+    line = capsys.readouterr().out
+    total = sum(parameter.numel() for parameter in task.parameters())
+    assert line.startswith(f"BPnPNet: {total:,} parameters, {total - frozen:,} trained (features2d ")
+    assert "FLOPs" not in line

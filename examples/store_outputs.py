@@ -1,0 +1,41 @@
+"""Run the notebooks of this folder and store their outputs in them.
+
+    python examples/store_outputs.py [NOTEBOOK...]
+
+It needs `pip install nbclient ipykernel`. Cells with the tag `photo` are stored without their pictures, which would
+make the repository large.
+"""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import nbformat
+from nbclient import NotebookClient
+
+
+def store_outputs(path: Path) -> None:
+    """Run a notebook from the first cell to the last, and write it with its outputs."""
+    notebook = nbformat.read(path, as_version=4)
+    NotebookClient(notebook, timeout=1200, record_timing=False).execute()
+    for cell in notebook.cells:
+        if "photo" in cell.metadata.get("tags", []):
+            for output in cell.outputs:
+                output.get("data", {}).pop("image/png", None)
+    notebook.metadata = {
+        "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
+        "language_info": {"name": "python"},
+    }
+    path.write_text(nbformat.writes(notebook, indent=1) + "\n", encoding="utf-8")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the given notebooks, all of them by default."""
+    names = sys.argv[1:] if arguments is None else arguments
+    for path in [Path(name) for name in names] or sorted(Path(__file__).parent.glob("*.ipynb")):
+        store_outputs(path)
+        print(f"stored the outputs of {path}")
+
+
+if __name__ == "__main__":
+    main()
