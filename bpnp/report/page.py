@@ -139,13 +139,16 @@ def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None) -> str
 
 
 def training_pictures(folders: Mapping[str, Path]) -> dict[str, str]:
-    """Draw the training of each run that has logs, as SVG in base64."""
-    pictures = {}
+    """Draw each training that has logs, once for all its tests, as SVG in base64 by the names of these."""
+    tests: dict[Path, list[str]] = {}
     for name, folder in folders.items():
         if (run := training_folder(folder)) is not None:
-            drawing = io.BytesIO()
-            training_curves(run).savefig(drawing, format="svg", metadata={"Date": None})
-            pictures[name] = base64.b64encode(drawing.getvalue()).decode()
+            tests.setdefault(run, []).append(name)
+    pictures = {}
+    for run, names in tests.items():
+        drawing = io.BytesIO()
+        training_curves(run).savefig(drawing, format="svg", metadata={"Date": None})
+        pictures[", ".join(names)] = base64.b64encode(drawing.getvalue()).decode()
     return pictures
 
 

@@ -73,6 +73,14 @@ def test_the_report_draws_the_training_of_a_test(run: Path, capsys: pytest.Captu
     assert "Intervals and differences" in printed
 
 
+def test_a_training_with_two_tests_is_drawn_once(run: Path) -> None:
+    for name in ("before", "after"):
+        write_results(run / name, rows(12, seed=1))
+    page = page_html([run / "before", run / "after"])
+    assert page.count('src="data:image/svg+xml;base64,') == 1
+    assert "<figcaption>before, after</figcaption>" in page
+
+
 def test_a_page_without_a_training_has_no_section_for_it_and_curves_are_one_error(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
