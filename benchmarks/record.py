@@ -16,11 +16,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.special import fdtri, stdtrit
+from scipy.special import fdtri
 
 from bpnp import Solution, warm_up
 from bpnp.files import write_atomically
-from bpnp.search.evidence.uncertainty import ONE_SIGMA
+from bpnp.search.evidence.covariance import student_factor
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("BPNP_SHARED_DATA", ROOT.parent / "shared" / "data"))
@@ -144,7 +144,7 @@ def beyond_bound(found: Solution, pose: Pose) -> bool:
     The promise of a confident pose is broken by one that is wrong (some degrees off) and beyond its bound.
     """
     squared, free = np.square(sigmas(found, pose, np.zeros(3))), max(2 * len(found.matches) - len(found.covariance), 1)
-    widened = stdtrit(free, ONE_SIGMA) ** 2
+    widened = student_factor(free)
     return not len(squared) or any(squared[:d].sum() > d * fdtri(d, free, BOUND) / widened for d in {3, len(squared)})
 
 

@@ -7,11 +7,9 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from scipy.special import stdtrit
 
 from bpnp.cameras import Camera, camera_from, in_front, scale_focal_length
 from bpnp.loops.parallel import Clock, Deadline, one_blas_thread
-from bpnp.search.evidence.uncertainty import ONE_SIGMA
 from bpnp.search.infinity.evidence import how_well_known, noise_of
 from bpnp.search.infinity.kernels import Image
 from bpnp.search.infinity.search import DEFAULT, InfinitySettings, search_rotation
@@ -98,15 +96,14 @@ def _fitted(camera: Camera, image: Array, scene: Array, solution: Solution) -> C
     )
 
 
-def _with_focal_length(camera: Camera, pixels: Array, seen: Array, noise: float) -> Array:
-    """Covariance (4, 4) of the turn and of the focal length, pixels, of matches with directions `seen` (k, 3)."""
+def _with_focal_length(camera: Camera, pixels: Array, seen: Array) -> Array:
+    """Return the covariance (4, 4) of the turn and of the focal length, pixels, of matches with directions (k, 3)."""
     step = 1e-5
-    ends = [_bearings(pixels, scale_focal_length(camera, math.exp(sign * step))) for sign in (1, -1)]
-    turned = np.cross(np.eye(3)[None], seen[:, None]).swapaxes(1, 2)
-    rows = np.concatenate([turned, (ends[1][0] - ends[0][0])[:, :, None] / (2 * step)], -1) / ends[0][2][:, None, None]
-    rows = rows.reshape(-1, 4) * [1, 1, 1, 1 / camera.focal]
-    free = max(2 * len(seen) - 4, 1)
-    return np.asarray((noise * stdtrit(free, ONE_SIGMA)) ** 2 * np.linalg.pinv(rows.T @ rows, rcond=1e-15))
+    bearings, _, pixel = _bearings(pixels, camera)
+    ends = [_bearings(pixels, scale_focal_length(camera, math.exp(sign * step)))[0] for sign in (1, -1)]
+    by_focal = (ends[1] - ends[0])[:, :, None] / (2 * step)
+    unit = np.array([1, 1, 1, camera.focal])
+    return how_well_known(seen, bearings, pixel, by_focal).covariance * np.outer(unit, unit)
 
 
 def _seen_by(
@@ -162,7 +159,7 @@ def _seen_by(
     matched = seen[0][j], bearings[i], pixel[i]
     covariance = how_well_known(*matched).covariance
     if unknown is not None and lens is not None:
-        covariance = _with_focal_length(lens, image[usable[i]], seen[0][j], noise_of(*matched))
+        covariance = _with_focal_length(lens, image[usable[i]], seen[0][j])
     angles = angles_between(bearings[i], seen[0][j])
     return with_pose(
         solution,

@@ -6,11 +6,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.special import stdtrit
 
 from bpnp.cameras import camera_from
 from bpnp.loops.parallel import Clock, Deadline
-from bpnp.search.evidence.uncertainty import ONE_SIGMA, crossed
+from bpnp.search.evidence.covariance import student_factor
+from bpnp.search.evidence.uncertainty import crossed
 from bpnp.search.problem import Problem
 from bpnp.search.rig.cameras import Pose, Rig
 from bpnp.search.rig.search import search_rig
@@ -135,4 +135,4 @@ def _about_origin(covariance: Array, size: float, middle: Array, shift: Array, s
     moved[3:6, :3] = scale * crossed(middle)
     moved[3:6, 6] = scale * shift
     moved = moved[: len(covariance), : len(covariance)]
-    return np.asarray(float(stdtrit(free, ONE_SIGMA)) ** 2 * moved @ covariance @ moved.T)
+    return np.asarray(student_factor(free) * moved @ covariance @ moved.T)

@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.special import fdtrc, fdtri, stdtrit
+from scipy.special import fdtrc, fdtri
 
 from bpnp.poses import turned_by
+from bpnp.search.evidence.covariance import Linearisation, covariance_of, student_factor
 from bpnp.search.evidence.partners import across, facing, partners
 from bpnp.search.evidence.settings import Evidence
 from bpnp.search.problem import Problem
@@ -21,7 +21,6 @@ Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
 MANY = 1e9  # degrees of freedom, of a number that does not vary
 EXCEEDED = 1e-3  # probability that a pose is farther off than its bound, and of a test
-ONE_SIGMA = 0.8413447460685429  # probability of a normal variable below one standard deviation
 
 # Strains that leave the volume as it is, a basis; the sixth is the unit of length, which no image shows.
 STRAINS = np.array(
@@ -34,10 +33,8 @@ STRAINS = np.array(
     ],
     np.float64,
 )
-SLIGHT = 0.01  # share of an image point in the information below which the pose hardly moves by leaving it out
 POSE = 6  # numbers that are fitted with every pose
 BLOCKS = 4  # of image points, along each axis of the image
-FIXED = 1e-9  # least eigenvalue of the information, in units of its own size, of points that fix a pose
 
 
 def rotation_bound(problem: Problem, linear: "Linearised | None", count: float) -> float:
@@ -121,7 +118,7 @@ def is_within(error: Array, covariance: Array, free: float | int) -> bool:
     if not np.isfinite(covariance).all():
         return False
     free, size = max(float(free), 1.0), len(error)
-    squared = float(error @ np.linalg.pinv(covariance, hermitian=True) @ error) * stdtrit(free, ONE_SIGMA) ** 2
+    squared = float(error @ np.linalg.pinv(covariance, hermitian=True) @ error) * student_factor(free)
     return bool(squared < size * fdtri(size, free, 1 - EXCEEDED))
 
 
@@ -140,7 +137,7 @@ def pose_covariance(problem: Problem, linear: "Linearised | None", count: float)
     moved = np.eye(len(covariance))  # the shift of the middle, as that of the origin: v = s + (R m) x w
     moved[3:POSE, 3:POSE] *= problem.size
     moved[3:POSE, :3] = crossed(linear.rotation @ problem.middle_of_user)
-    return np.asarray(float(stdtrit(free, ONE_SIGMA)) ** 2 * moved @ covariance @ moved.T)
+    return np.asarray(student_factor(free) * moved @ covariance @ moved.T)
 
 
 def centre_covariance(covariance: Array, translation: Array, scale: float | None = None) -> Array:
@@ -198,44 +195,23 @@ def local_covariance(linear: "Linearised | None") -> Array | None:
     return None if covariance is None else 2 * covariance
 
 
+def matches_of(linear: "Linearised") -> Linearisation:
+    """Return the matches of a pose as `covariance_of` takes them."""
+    chosen = linear.problem.image.chosen
+    weight = np.full(len(chosen), len(linear.problem.bearings) / len(chosen))
+    return Linearisation(linear.residual, linear.jacobian, linear.probability, linear.image, weight, _known(linear))
+
+
 def _of_louis(linear: "Linearised") -> Array | None:
     """See `local_covariance`; None where the information is not positive definite."""
-    problem, probability, chosen = linear.problem, linear.probability, linear.problem.image.chosen
-    score = np.einsum("kab,ka->kb", linear.jacobian, linear.residual)
-    count, size = score.shape
-    of_point = csr_array((probability, (linear.image, np.arange(count))), (len(chosen), count))
-    expected = of_point @ score
-    each = linear.jacobian.transpose(0, 2, 1) @ linear.jacobian - score[:, :, None] * score[:, None]
-    own = (of_point @ each.reshape(count, -1)).reshape(-1, size, size) + expected[:, :, None] * expected[:, None]
-    if problem.focal is not None:
-        block = _blocks(problem, of_point.sum(1))
-        expected, own = (np.stack([each[block == b].sum(0) for b in np.unique(block)]) for each in (expected, own))
-    share = len(problem.bearings) / len(chosen)
-    known = _known(linear)
-    observed = share * own.sum(0) + known
-    complete = np.einsum("k,kab,kab->b", probability, linear.jacobian, linear.jacobian)
-    # In units in which the complete information is one, so that its rank can be told.
-    unit = 1 / np.sqrt(np.maximum(share * complete + np.diag(known), 1e-300))
-    values, vectors = np.linalg.eigh(observed * np.outer(unit, unit))
-    if values[0] <= FIXED:
-        return None
-    root = unit[:, None] * vectors / np.sqrt(values)
-    steps = expected @ root
-    matters = np.flatnonzero(own.reshape(-1, size * size) @ (root @ root.T).ravel() > SLIGHT)
-    if not is_redundant(problem, float(probability.sum()) * share):
-        matters = matters[:0]  # without one of so few matches the others fix several poses, or none
-    without = np.eye(size) - root.T @ own[matters] @ root
-    fixed = np.linalg.eigvalsh(without)[:, 0] > FIXED  # also without the point
-    steps[matters[fixed]] = np.linalg.solve(without[fixed], steps[matters[fixed], :, None])[..., 0]
-    ratio, axes = np.linalg.eigh(share * steps.T @ steps + root.T @ known @ root)
-    along = root @ axes
-    covariance = along * np.maximum(ratio, 1.0) @ along.T
+    problem, matches = linear.problem, matches_of(linear)
     if problem.focal is None:
-        return np.asarray(covariance)
-    considered = centre_columns(linear.seen) / linear.scale
-    moved = root @ root.T @ (share * np.einsum("k,kia,kib->ab", probability, linear.jacobian, considered))
-    covariance = covariance + problem.focal.centre_sigma**2 * moved @ moved.T
-    return np.asarray(covariance[: POSE + 1, : POSE + 1])
+        return covariance_of(matches, fitted=problem.fitted)
+    matched = np.asarray(np.bincount(linear.image, linear.probability, len(problem.image.chosen)), np.float64)
+    blocks = _blocks(problem, matched)
+    centre = problem.focal.centre_sigma / linear.scale * centre_columns(linear.seen)
+    covariance = covariance_of(matches, fitted=problem.fitted, blocks=blocks, considered=centre)
+    return None if covariance is None else covariance[: POSE + 1, : POSE + 1]
 
 
 def _blocks(problem: Problem, matched: Array) -> Labels:

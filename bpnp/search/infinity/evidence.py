@@ -24,14 +24,16 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import fdtrc, stdtrit
+from scipy.special import fdtrc
 
+from bpnp.search.evidence.covariance import covariance_of, of_sure_matches, student_factor
 from bpnp.search.evidence.false_alarms import FIXING_ROTATION, SHARES, Terms, log10_nfa, log10_rotations
-from bpnp.search.evidence.uncertainty import EXCEEDED, ONE_SIGMA, STRAINS, exceeded_once
+from bpnp.search.evidence.uncertainty import EXCEEDED, STRAINS, exceeded_once
 from bpnp.search.kernels.neighbours import sums_near
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
+EXACT = 1e-12  # pixels; matches without noise count as so exact
 STEPS = 5  # scales s, each half of the one before, from the largest noise that is searched for
 
 
@@ -79,8 +81,12 @@ def log10_false_alarms(squared: Array, density: Array, known: Background) -> tup
 
 
 class Known(NamedTuple):
-    """Covariance (3, 3) of the turn w, R' = exp([w]x) R, radians squared, and the angle that its error exceeds once in
-    a thousand, radians."""
+    """How well a rotation is known.
+
+    Attributes:
+        covariance: (3, 3) of the turn w, R' = exp([w]x) R, radians squared; larger with other fitted numbers.
+        bound: Angle that its error exceeds once in a thousand, radians.
+    """
 
     covariance: Array
     bound: float
@@ -93,22 +99,41 @@ def noise_of(seen: Array, bearings: Array, pixel: Array) -> float:
     return float(np.linalg.norm((bearings - seen) / pixel[:, None])) / math.sqrt(free) if free > 0 else math.nan
 
 
-def how_well_known(seen: Array, bearings: Array, pixel: Array) -> Known:
-    """Of matches as for `noise_of`. For the turn w of a direction v the normal matrix is that of I - v v^T."""
-    free = 2 * len(seen) - 3
-    if free <= 0:
-        return Known(np.full((3, 3), math.nan), math.inf)
-    noise, weight = noise_of(seen, bearings, pixel), pixel**-2
-    inverse = np.linalg.pinv(weight.sum() * np.eye(3) - (weight[:, None] * seen).T @ seen, rcond=1e-12)
-    covariance = np.asarray(noise**2 * float(stdtrit(free, ONE_SIGMA)) ** 2 * inverse, np.float64)
-    return Known(covariance, noise * exceeded_once(inverse, float(free)))
+def how_well_known(seen: Array, bearings: Array, pixel: Array, others: Array | None = None) -> Known:
+    """Compute how well matches fix a rotation, and other numbers that are fitted with it.
+
+    Args:
+        seen: (k, 3) directions in the camera.
+        bearings: (k, 3) of the image points.
+        pixel: (k,) angle of a pixel, radians.
+        others: (k, 3, q) derivatives of `seen` by the other numbers; None for the rotation alone.
+
+    Returns:
+        The covariance (3 + q, 3 + q), NaN where the matches do not fix them, and the bound of the rotation.
+    """
+    jacobian = _turned(seen) if others is None else np.concatenate([_turned(seen), others], -1)
+    size = jacobian.shape[-1]
+    free, noise = 2 * len(seen) - size, noise_of(seen, bearings, pixel)
+    covariance = None
+    if free > 0:
+        unit = (pixel * max(noise, EXACT))[:, None]
+        matches = of_sure_matches((bearings - seen) / unit, jacobian / unit[:, None])
+        covariance = covariance_of(matches, fitted=size)
+    if covariance is None:
+        return Known(np.full((size, size), math.nan), math.inf)
+    return Known(student_factor(free) * covariance, exceeded_once(covariance[:3, :3], float(free)))
+
+
+def _turned(seen: Array) -> Array:
+    """Return the derivatives (k, 3, 3) of directions (k, 3) by a turn w, w x v."""
+    return np.cross(np.eye(3)[None], seen[:, None]).swapaxes(1, 2)
 
 
 def strain_of(seen: Array, bearings: Array, pixel: Array, all_bearings: Array) -> float:
     """How far the strain of the image that the residuals of matches show moves a point of it, pixels; 0 where none is
     significant. A strain, f ~ (I + S) f, is another focal length or a camera that is not as given."""
     weight = np.repeat(1 / pixel, 3)[:, None]
-    cross = np.cross(np.eye(3)[None], seen[:, None]).swapaxes(1, 2).reshape(-1, 3)  # w x v
+    cross = _turned(seen).reshape(-1, 3)
     residual = (bearings - seen).ravel() * weight[:, 0]
 
     def moved(points: Array) -> Array:

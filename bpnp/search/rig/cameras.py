@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bpnp.search.evidence.covariance import covariance_of, join
 from bpnp.search.evidence.false_alarms import FIXING, Terms, camera_terms, directions_of, log10_nfa, log10_tests
-from bpnp.search.evidence.uncertainty import Linearised, linearised, local_covariance
+from bpnp.search.evidence.uncertainty import Linearised, linearised, matches_of
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem
 from bpnp.search.scene import Scene
@@ -134,13 +135,15 @@ class Rig:
     def covariance(self, rotation: Array, translation: Array, scale: float) -> Array | None:
         """Covariance of the turn, of the shift of the middle of the scene, in the axes of the rig, and of the logarithm
         of the scale if that is unknown."""
-        information = np.zeros((self.unknowns, self.unknowns))
-        for turn, linear in self.linearised(rotation, translation, scale):
-            own = local_covariance(linear)
-            if own is not None:
-                information += turn.T @ np.linalg.solve(own, turn)
-        is_fixed = np.linalg.matrix_rank(information) == self.unknowns
-        return np.asarray(np.linalg.inv(information), np.float64) if is_fixed else None
+        for sharper in (1.0, 1 / math.sqrt(2)):  # as `local_covariance`
+            parts = []
+            for turn, linear in self.linearised(rotation, translation, sharper * scale):
+                own = matches_of(linear)
+                parts.append(own._replace(jacobian=own.jacobian @ turn, known=turn.T @ own.known @ turn))
+            covariance = covariance_of(join(parts), fitted=self.unknowns) if parts else None
+            if covariance is not None:
+                return covariance / sharper**2
+        return None
 
     def candidates(self, rotations: Array, translations: Array) -> Hypotheses:
         """Return poses refined on all cameras, at the scale at which their false alarms are fewest."""
