@@ -13,12 +13,16 @@ from pathlib import Path
 import nbformat
 from nbclient import NotebookClient
 
+COMPILING = "compiling bpnp's loops"  # once an installation
+
 
 def store_outputs(path: Path) -> None:
     """Run a notebook from the first cell to the last, and write it with its outputs."""
     notebook = nbformat.read(path, as_version=4)
     NotebookClient(notebook, timeout=1200, record_timing=False).execute()
     for cell in notebook.cells:
+        if cell.cell_type == "code":
+            cell.outputs = [output for output in cell.outputs if not output.get("text", "").startswith(COMPILING)]
         if "photo" in cell.metadata.get("tags", []):
             for output in cell.outputs:
                 output.get("data", {}).pop("image/png", None)

@@ -8,6 +8,7 @@ with its checksum in the manifest when the store is opened.
 import json
 import os
 import shutil
+import sys
 import warnings
 import zlib
 from collections import defaultdict
@@ -325,10 +326,11 @@ def open_or_prepare(recipe: Recipe, label: str, cache_dir: str | None) -> Store:
 def _make(recipe: Recipe, output: Path, processes: int) -> None:
     for remnant in (output, *output.parent.glob(f".{output.name}.[0-9]*")):  # left by a killed process
         shutil.rmtree(remnant, ignore_errors=True)
-    made, console = _make_store(recipe, processes), Console(stderr=True)
+    made, console = _make_store(recipe, processes), Console(stderr=True, force_jupyter=False)
     with new_store(output, recipe.kind, recipe.widths) as writer:
         writer.parameters |= recipe.parameters
-        for rows, skipped in track(made, f"reading {recipe.source}", len(recipe), console=console, transient=True):
+        shown: Any = {"console": console, "transient": True, "disable": not sys.stderr.isatty()}
+        for rows, skipped in track(made, f"reading {recipe.source}", len(recipe), **shown):
             writer.skipped |= skipped
             for row in rows:
                 writer.add(*row)

@@ -1,6 +1,7 @@
 """Colours of results, and output on the terminal: lines, progress on stderr, and tables that fit in 80 columns."""
 
 import math
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -51,7 +52,7 @@ def progress(*, items: bool = True, quiet: bool = False) -> Progress:
         items: Show how many items are done.
     """
     columns = (BarColumn(), MofNCompleteColumn()) if items else ()
-    console = Console(stderr=True, quiet=quiet)
+    console = Console(stderr=True, quiet=quiet, force_jupyter=False)  # a notebook's needs ipywidgets
     return Progress(
         SpinnerColumn(),
         TextColumn("{task.description}", markup=False),
@@ -59,7 +60,7 @@ def progress(*, items: bool = True, quiet: bool = False) -> Progress:
         TimeElapsedColumn(),
         console=console,
         transient=True,
-        disable=quiet or not console.is_interactive,
+        disable=quiet or not sys.stderr.isatty(),  # FORCE_COLOR makes rich take any stream for a terminal
     )
 
 

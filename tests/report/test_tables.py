@@ -11,7 +11,7 @@ from rich.table import Table
 from bpnp.report import Results, write_results
 from bpnp.report.page import quartile_rows
 from bpnp.report.tables import results_table
-from bpnp.report.terminal import SplitTable
+from bpnp.report.terminal import SplitTable, count_items, progress
 
 
 def rendered(table: Table | SplitTable, width: int = 80) -> list[str]:
@@ -82,3 +82,17 @@ def test_the_best_of_a_column_is_that_of_runs_on_the_same_problems(tmp_path: Pat
     best = {value for row in quartile_rows(other, None) for _, value, best in row.cells if best}
     assert 1.0 in best
     assert 0.1 not in best
+
+
+def test_progress_is_drawn_on_a_terminal_alone(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """FORCE_COLOR, which Jupyter and build servers set, makes no terminal of a pipe: there each item has a line."""
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    with count_items("photos", 2) as done:
+        done("a.jpg: confident")
+        done("b.jpg: failed")
+    assert capsys.readouterr() == ("", "1/2 a.jpg: confident\n2/2 b.jpg: failed\n")
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
+    assert not progress().disable
+    assert progress(quiet=True).disable
