@@ -26,7 +26,7 @@ from bpnp.models import BPnPNet, TrainedNet
 from bpnp.models.evaluation import round_widths
 from bpnp.models.weights import read_checkpoint
 from bpnp.report.figures import line_style, save_figure
-from bpnp.report.intervals import Interval, bootstrap, paired_difference, quantile, share
+from bpnp.report.intervals import Interval, bootstrap, fraction, paired_difference, quantile
 from bpnp.report.results import ProblemRow, rows_from
 from bpnp.report.tables import PRINTED
 from bpnp.report.terminal import Paper
@@ -362,7 +362,7 @@ def figures(rows: Sequence[ProblemRow], recall: tuple[float, float]) -> dict[str
     for name, field in ERRORS.items():
         values = np.array([getattr(row, field) for row in rows])
         found[name] = [_rounded(bootstrap(values, quantile(quarter))) for quarter in QUARTERS]
-    found["recall"] = _rounded(bootstrap(successes(rows, recall), share))
+    found["recall"] = _rounded(bootstrap(successes(rows, recall), fraction))
     found["seconds"] = round(float(np.mean([row.seconds for row in rows])), 4)
     return found
 
@@ -382,7 +382,7 @@ def effect(first: Sequence[ProblemRow], second: Sequence[ProblemRow], recall: tu
         before, after = (np.array([getattr(row, field) for row in rows]) for rows in (one, other))
         found[name] = _rounded(paired_difference(before, after))
         found[f"{name} better"] = round(float(np.mean(after < before)), 3)
-    found["recall"] = _rounded(paired_difference(successes(one, recall), successes(other, recall), share))
+    found["recall"] = _rounded(paired_difference(successes(one, recall), successes(other, recall), fraction))
     return found
 
 

@@ -170,7 +170,7 @@ def camera_from(camera: Any) -> Camera:
     if isinstance(camera, (Pinhole, Lens)):
         return camera
     if hasattr(camera, "cam_from_img") and hasattr(camera, "img_from_cam"):
-        return _checked(Lens(camera), f"{camera.params}")
+        return _check_focal_length(Lens(camera), f"{camera.params}")
     if isinstance(camera, Mapping):
         if not {"model", "params"} <= set(camera):
             raise ValueError(f"`camera` needs the keys `model` and `params`; it has {', '.join(camera) or 'no keys'}")
@@ -348,7 +348,7 @@ def colmap_camera(model: str, params: Any, size: Any = (0, 0)) -> Lens:
     if min(width, height) < 0 or max(width, height) > MOST_PIXELS:
         raise ValueError(f"expected width and height of a {model} camera in pixels, got {tuple(size)}")
     lens = Lens(_pycolmap().Camera(model=model, width=width, height=height, params=values.tolist()))
-    return _checked(lens, f"{values.tolist()}")
+    return _check_focal_length(lens, f"{values.tolist()}")
 
 
 def read_text_model(folder: Path) -> Any:
@@ -393,7 +393,7 @@ def _pycolmap() -> Any:
     return pycolmap
 
 
-def _checked(lens: Lens, shown: str) -> Lens:
+def _check_focal_length(lens: Lens, shown: str) -> Lens:
     focal = min([lens.focal, *np.asarray(lens.camera.params)[list(lens.camera.focal_length_idxs())].tolist()])
     if not focal > 0:
         raise ValueError(f"the focal length of a camera has to be positive; the parameters {shown} give {focal}")

@@ -52,7 +52,7 @@ def check_shapes(function: _F) -> _F:
 
 
 class _Probe(torch.autograd.Function):
-    """A function without `setup_context`, which torch rejects within its transforms."""
+    """Function without `setup_context`, which torch rejects within its transforms."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor) -> Tensor:

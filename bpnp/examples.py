@@ -105,8 +105,8 @@ def _mesh(rng: np.random.Generator) -> Example:
     points = (points - points.mean(0)) / np.abs(points - points.mean(0)).max()
     rotation = Rotation.from_quat(rng.standard_normal(4)).as_matrix()
     translation = np.array([0.1, -0.2, 4.0])
-    seen = _pixels(points, rotation, translation) + rng.normal(0, NOISE_PX, (len(points), 2))
-    return Example(rng.permutation(seen), points, CAMERA, rotation, translation)
+    pixels = _pixels(points, rotation, translation) + rng.normal(0, NOISE_PX, (len(points), 2))
+    return Example(rng.permutation(pixels), points, CAMERA, rotation, translation)
 
 
 def _photo(rng: np.random.Generator) -> Example:
@@ -128,9 +128,9 @@ def _leds(rng: np.random.Generator) -> Example:
     rotation = Rotation.from_euler("xyz", [75, 10, 40], degrees=True).as_matrix()
     translation = np.array([0.02, 0.01, 0.6])  # metres
     facing = ((points @ rotation.T + translation) * (normals @ rotation.T)).sum(-1) < 0
-    seen = _pixels(points[facing], rotation, translation) + rng.normal(0, NOISE_PX, (facing.sum(), 2))
-    lights = rng.uniform(seen.min(0) - 40, seen.max(0) + 40, (LIGHTS, 2))
-    return Example(rng.permutation(np.concatenate([seen, lights])), points, CAMERA, rotation, translation, normals)
+    pixels = _pixels(points[facing], rotation, translation) + rng.normal(0, NOISE_PX, (facing.sum(), 2))
+    lights = rng.uniform(pixels.min(0) - 40, pixels.max(0) + 40, (LIGHTS, 2))
+    return Example(rng.permutation(np.concatenate([pixels, lights])), points, CAMERA, rotation, translation, normals)
 
 
 def _stars(rng: np.random.Generator) -> Example:
@@ -139,8 +139,8 @@ def _stars(rng: np.random.Generator) -> Example:
     rotation, size = Rotation.from_quat(rng.standard_normal(4)).as_matrix(), 2 * CAMERA[:2, 2]
     front = directions[(directions @ rotation.T)[:, 2] > 0]
     pixels = _pixels(front, rotation, np.zeros(3))
-    seen = rng.permutation(pixels[((pixels > 1) & (pixels < size - 1)).all(-1)])[:STARS]
-    lights = np.concatenate([seen + rng.normal(0, NOISE_PX / 2, seen.shape), rng.uniform(0, size, (FALSE_STARS, 2))])
+    stars = rng.permutation(pixels[((pixels > 1) & (pixels < size - 1)).all(-1)])[:STARS]
+    lights = np.concatenate([stars + rng.normal(0, NOISE_PX / 2, stars.shape), rng.uniform(0, size, (FALSE_STARS, 2))])
     return Example(rng.permutation(np.clip(lights, 0, size)), directions, CAMERA, rotation, np.zeros(3))
 
 
@@ -203,9 +203,9 @@ def draw_map(folder: Path | str, *, seed: int = 0) -> dict[str, tuple[Array, Arr
         raise ValueError(f"{path} is not empty; name a new folder for the map")
     rng = np.random.default_rng(seed)
     house = rng.uniform((-5, -6, -1), (5, 1, 1), (90, 3))  # x to the right, y down, z away, metres
-    beside = [rng.uniform((-9, -2, -3), (9, 1, 3), (60, 3)) for _ in range(2)]
-    apart = np.array([HOUSES_APART, 0.0, 0.0])
-    points = np.concatenate([house, house + apart, beside[0], beside[1] + apart])
+    surroundings = [rng.uniform((-9, -2, -3), (9, 1, 3), (60, 3)) for _ in range(2)]
+    offset = np.array([HOUSES_APART, 0.0, 0.0])
+    points = np.concatenate([house, house + offset, surroundings[0], surroundings[1] + offset])
     poses, parts = dict[str, tuple[Array, Array]](), np.split(np.arange(len(points)), (90, 180, 240))
     model, (kind, width, height, parameters) = pycolmap.Reconstruction(), PHOTO_CAMERA
     lens = pycolmap.Camera(camera_id=1, model=kind, width=width, height=height, params=parameters)
@@ -213,20 +213,22 @@ def draw_map(folder: Path | str, *, seed: int = 0) -> dict[str, tuple[Array, Arr
     tracks = [pycolmap.Track() for _ in points]
     for number in range(11):
         second = number % 2
-        name, turn = f"{number:02d}.jpg", Rotation.from_euler("yx", rng.normal(0, 6, 2), degrees=True).as_matrix()
-        centre = np.array([rng.uniform(-5, 5), rng.uniform(-1, 0.5), rng.uniform(-16, -12)]) + second * apart
-        seen = np.concatenate([parts[second], parts[2 + second]])
-        seen = np.sort(rng.choice(seen, round(0.8 * len(seen)), replace=False))
-        pixels = np.asarray(lens.img_from_cam((points[seen] - centre) @ turn.T)) + rng.normal(0, 0.4, (len(seen), 2))
-        poses[name] = turn, -turn @ centre
+        name, rotation = f"{number:02d}.jpg", Rotation.from_euler("yx", rng.normal(0, 6, 2), degrees=True).as_matrix()
+        centre = np.array([rng.uniform(-5, 5), rng.uniform(-1, 0.5), rng.uniform(-16, -12)]) + second * offset
+        visible = np.concatenate([parts[second], parts[2 + second]])
+        visible = np.sort(rng.choice(visible, round(0.8 * len(visible)), replace=False))
+        pixels = np.asarray(lens.img_from_cam((points[visible] - centre) @ rotation.T)) + rng.normal(
+            0, 0.4, (len(visible), 2)
+        )
+        poses[name] = rotation, -rotation @ centre
         if name == WRONG_IMAGE:  # its points are those of the first house, the others have none
-            centre, seen = centre - apart, np.where(seen < 180, seen - 90, -1)
+            centre, visible = centre - offset, np.where(visible < 180, visible - 90, -1)
         others = rng.uniform((0, 0), (width, height), (80, 2))  # keypoints without a point
         model.add_image_with_trivial_frame(
             pycolmap.Image(name, np.concatenate([pixels, others]), 1, number + 1),
-            pycolmap.Rigid3d(pycolmap.Rotation3d(turn), -turn @ centre),
+            pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ centre),
         )
-        for element, point in enumerate(seen):
+        for element, point in enumerate(visible):
             if point >= 0:
                 tracks[point].add_element(number + 1, element)
     for point, track in zip(points, tracks, strict=True):
@@ -289,13 +291,13 @@ def _render(faces: Sequence[Face], rotation: Array, translation: Array) -> Image
     for corner, a, b, texture in faces:
         to_pixels = camera @ np.column_stack([rotation @ a, rotation @ b, rotation @ corner + translation])
         if np.linalg.det(to_pixels) >= 0:
-            continue  # seen from behind
+            continue  # a back face
         to_face = np.linalg.inv(to_pixels).astype(np.float32)
         u, v, inverse_depth = (to_face @ pixels).reshape(3, *x.shape)
-        seen = (np.minimum(u, v) >= 0) & (np.maximum(u, v) <= inverse_depth) & (inverse_depth > nearest)
-        nearest[seen] = inverse_depth[seen]
+        visible = (np.minimum(u, v) >= 0) & (np.maximum(u, v) <= inverse_depth) & (inverse_depth > nearest)
+        nearest[visible] = inverse_depth[visible]
         to_texels = np.diag([*texture.size, 1]) @ to_face
         mapping = (to_texels / to_texels[2, 2]).ravel()[:8]
         warped = texture.transform(photo.size, Image.Transform.PERSPECTIVE, mapping, Image.Resampling.BILINEAR)
-        photo.paste(warped, mask=Image.fromarray(seen))
+        photo.paste(warped, mask=Image.fromarray(visible))
     return photo.resize((width, height), Image.Resampling.BOX)

@@ -294,11 +294,11 @@ def known_errors(errors: PoseErrors) -> Iterator[tuple[str, str, Tensor]]:
         raise ValueError(NO_PROBLEM)
     for name, unit in (("rotation", "deg"), ("translation", ""), ("centre", ""), ("reprojection", "deg")):
         error: Tensor = getattr(errors, f"{name}_{unit}".rstrip("_"))
-        known = error[~error.isnan()].double()
-        if len(known) < len(error) and name != "reprojection":
+        values = error[~error.isnan()].double()
+        if len(values) < len(error) and name != "reprojection":
             raise ValueError(f"a {name} error is NaN; a problem without a pose has 180 deg or infinity")
-        if len(known):
-            yield name, unit, known
+        if len(values):
+            yield name, unit, values
 
 
 class ProblemMetric(Metric):

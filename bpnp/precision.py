@@ -25,13 +25,13 @@ def full_precision(function: _F) -> _F:
     The first argument has to be a tensor. Autocast is switched off for its device.
     """
 
-    def widened(value: Any) -> Any:
+    def widen(value: Any) -> Any:
         return value.float() if isinstance(value, Tensor) and value.dtype in HALF else value
 
     @functools.wraps(function)
     def run(first: Tensor, *rest: Any, **options: Any) -> Any:
         with exact_products(first.device):
-            return function(widened(first), *map(widened, rest), **{k: widened(v) for k, v in options.items()})
+            return function(widen(first), *map(widen, rest), **{k: widen(v) for k, v in options.items()})
 
     return run  # type: ignore[return-value]
 

@@ -1,4 +1,4 @@
-"""The commands beside Lightning's own: one typed function each, whose signature and docstring are its options."""
+"""Commands other than Lightning's: one typed function each, whose signature and docstring define its options."""
 
 from collections.abc import Callable, Mapping
 

@@ -1,4 +1,4 @@
-"""`bpnp localize`: where photos were taken, in a map of the place."""
+"""`bpnp localize`: poses of photos in a COLMAP map."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from bpnp.maps.scene_map import SceneMap
 
 CAPTION = (
-    "error px: mean distance between the keypoints of the matches and their points. log10 false: logarithm of the "
-    "number of poses that would fit as well by chance; smaller is better."
+    "error px: mean distance between matched keypoints and their projected points. log10 false: log10 of the number of "
+    "false alarms, the number of poses expected to fit as well by chance."
 )
-FOCAL = "focal px: the focal length that was found."
-OFF = "off: from the map's own pose of the photo, degrees and scene units."
-LEAST = 8  # columns of a name
+FOCAL = "focal px: estimated focal length."
+OFF = "off: difference to the map's own pose of the photo, degrees and scene units."
+LEAST = 8  # least width of a name, columns
 
 
 def localize(
@@ -47,33 +47,33 @@ def localize(
     time_limit: float | None = None,
     seed: int = 0,
 ) -> None:
-    """Find where photos were taken in a map.
+    """Find the poses of photos in a map.
 
-    Writes solutions/<photo>.json, pictures/<photo>.png, and of all that were solved in this folder results.json and
-    poses.txt (confident poses in the frame of the map). A photo that was solved there before is kept, unless the photo,
-    the map or an option has changed.
+    Writes solutions/<photo>.json and pictures/<photo>.png. results.json and poses.txt (confident poses in the frame of
+    the map) cover all photos that were solved in this folder. A photo that was solved there before is kept, unless the
+    photo, the map or an option has changed.
 
     Args:
-        map: COLMAP model of the place, such as sparse/0.
-        photos: photos, or folders of them; a photo in a folder has its path within it as its name, as in hloc.
-        camera: of the photos, a file with a 3x3 matrix or COLMAP's MODEL,PARAMETERS; or a COLMAP model, such as MAP
-            itself, for that of its images, scaled to the photo's size; or unknown, to find the focal length with the
-            pose. By default that of EXIF, else of images of the map that have the photo's size, else unknown.
+        map: folder of a COLMAP model, such as sparse/0.
+        photos: photos, or folders of them; a photo in a folder is named by its path within it, as in hloc.
+        camera: camera of the photos: a file with a 3x3 matrix; COLMAP's MODEL,PARAMETERS; a COLMAP model, such as MAP
+            itself, for the camera of its images, scaled to the photo's size; or unknown, to find the focal length with
+            the pose. By default that of EXIF, else of images of the map with the photo's size, else unknown.
         focal_error: relative standard deviation of the focal length of the camera, such as 0.1; it is then found with
             the pose. No effect on photos whose camera is unknown.
         distortion: fit a radial coefficient with an unknown focal length even where it is not significantly better.
         views: text file of lines "photo view", the views of the map to try; the whole map by default.
         keypoints: hloc's HDF5 file of features or COLMAP's database; SIFT is detected by default.
-        leave_one_out: the photos are views of the map, and each is taken out of it first.
-        cluster: address of a Dask scheduler whose workers localize the photos, or a number of processes here.
+        leave_one_out: the photos are views of the map; remove each from the map before it is localized.
+        cluster: address of a Dask scheduler whose workers localize the photos, or a number of local processes.
         output: folder of the results.
         no_pictures: write no pictures.
-        json: print JSON instead of a table: what results.json has of these photos.
-        quiet: print nothing but errors, and JSON if asked for.
-        solver: auto, which asks the packaged matcher about a known view when the search is in doubt; search; or a
+        solver: auto, which also runs the packaged matcher on a view if the search is not confident; search; or a
             checkpoint of a network.
-        time_limit: seconds a photo.
-        seed: of the search.
+        time_limit: seconds for each photo.
+        seed: random seed of the search.
+        json: print JSON instead of a table: the entries of results.json for these photos.
+        quiet: print only errors, and JSON with --json.
     """
     from bpnp.datamodules.colmap.model_files import model_format
     from bpnp.maps.many_photos import SolutionFolder, content_of_map, localize_photos, read_views
@@ -87,7 +87,7 @@ def localize(
         raise ValueError(f"expected MAP as the folder of a COLMAP model, got {map}{hint}")
     if keypoints is not None and not keypoints.is_file():
         raise ValueError(f"expected hloc's or COLMAP's file of keypoints, got {keypoints}, which is no file")
-    source_from(solver)  # raises, where each photo would
+    source_from(solver)  # raise once here, not for each photo
     positive("time_limit", time_limit)
     if focal_error is not None and not 0 < focal_error < 1:
         raise ValueError(f"`focal_error` is {focal_error}; it is a fraction of the focal length, above 0 and below 1")
@@ -136,7 +136,7 @@ def _report(
     *,
     pictures: bool,
 ) -> None:
-    """Print where the cameras are from, what was kept and what was written."""
+    """Print the source of the cameras, and what was kept and written."""
     if records:
         cameras = Counter(record["made_with"]["camera_from"] for record in records.values())
         say(f"camera: {', '.join(f'{source} ({count})' for source, count in cameras.items())}", to=out)
@@ -151,7 +151,7 @@ def _report(
 
 
 def _camera(text: str, map: Path, scene: "SceneMap") -> Any:
-    """The camera of all photos, or the map whose cameras are scaled to each."""
+    """Return the camera of all photos, or the map whose cameras are scaled to each."""
     from bpnp.cameras import camera_from
     from bpnp.commands.point_files import COLMAP_CAMERAS, read_camera
     from bpnp.maps.scene_map import UNKNOWN, SceneMap
@@ -167,7 +167,7 @@ def _camera(text: str, map: Path, scene: "SceneMap") -> Any:
 
 
 def _attempts(cluster: str | None) -> Callable[..., Any]:
-    """What localises the photos: here, or on the workers of a cluster."""
+    """Return the function that localizes the photos: in this process, or on the workers of a cluster."""
     if cluster is None:
         from bpnp.maps.many_photos import attempts
 
@@ -180,7 +180,12 @@ def _attempts(cluster: str | None) -> Callable[..., Any]:
 
 
 def _table(records: Mapping[str, Mapping[str, Any]], width: int) -> Table:
-    """Return a table of so many characters with a row for each photo; long names of photos and views are cut."""
+    """Return a table with a row for each photo; long names of photos and views are shortened.
+
+    Args:
+        records: Records of the solutions, by the name of the photo.
+        width: Width of the terminal, columns.
+    """
     from bpnp.maps.many_photos import ERROR
     from bpnp.report.terminal import VERDICTS, number, shorten
 

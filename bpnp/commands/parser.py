@@ -1,5 +1,7 @@
-"""Command lines for typed functions: positional parameters are arguments, keyword-only ones are options; and the short
-help of Lightning's commands, without importing Lightning."""
+"""Command lines of typed functions, and the short help of Lightning's commands, without importing Lightning.
+
+Positional parameters become arguments, keyword-only ones options.
+"""
 
 import difflib
 import inspect
@@ -13,7 +15,7 @@ from typing import Any, NoReturn
 from docstring_parser import parse as parse_docstring
 from jsonargparse import ArgumentParser
 
-OVERRIDES = "overrides"  # parameter that receives the options `--data.NAME=VALUE`
+OVERRIDES = "overrides"  # name of the parameter that receives the options `--data.NAME=VALUE`
 RENAMED = {f"{part}_pairs": f"{part}_problems" for part in ("train", "val", "test")} | {
     "pairs_factor": "matches_factor",
     "pairs": "problems",
@@ -21,21 +23,22 @@ RENAMED = {f"{part}_pairs": f"{part}_problems" for part in ("train", "val", "tes
 
 
 class OneLineParser(ArgumentParser):
-    """A parser whose errors are one line: what is wrong, and the option that was probably meant."""
+    """Parser whose errors are one line: what is wrong, and the option that was probably meant."""
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
+        """Raise ValueError with the message in one line, and a hint."""
         text = plain(message)
         _, found, unknown = text.rpartition("nrecognized arguments: ")
-        known = [option for action in self._actions for option in action.option_strings]
+        option_strings = [option for action in self._actions for option in action.option_strings]
         if required := text.partition("arguments are required: ")[2]:
             command, options = self.prog, []
             for path in required.split(", "):
                 parent, _, name = path.rpartition(".")  # `fit.data` is an option of `bpnp fit`
                 command = f"{self.prog} {parent}".rstrip()
-                options.append(f"--{name}" if parent or f"--{name}" in known else name)
-            known_start = f"{command} --config quickstart, or " if parent in LIGHTNING else ""
-            raise ValueError(f"missing {', '.join(options)}; try: {known_start}{command} --help") from ex
-        close = difflib.get_close_matches(unknown.split("=")[0].split(" ")[0], known, n=1) if found else []
+                options.append(f"--{name}" if parent or f"--{name}" in option_strings else name)
+            start = f"{command} --config quickstart, or " if parent in LIGHTNING else ""
+            raise ValueError(f"missing {', '.join(options)}; try: {start}{command} --help") from ex
+        close = difflib.get_close_matches(unknown.split("=")[0].split(" ")[0], option_strings, n=1) if found else []
         hint = f"; did you mean {close[0]}?" if close else f"; try: {self.prog} --help" if found else ""
         renamed = (new for old, new in RENAMED.items() if text.endswith(f"Option '{old}' is not accepted"))
         if new := next(renamed, None):
@@ -43,7 +46,7 @@ class OneLineParser(ArgumentParser):
         raise ValueError(text + hint) from ex
 
 
-# Lines of jsonargparse's messages that list what an option may be besides, and the value that it was made from.
+# Beginnings of lines of jsonargparse's messages that list other types of an option, and its value.
 NOISE = (
     "Does not validate against",
     "Subtypes:",
@@ -58,15 +61,26 @@ NOISE = (
 
 
 def plain(message: str) -> str:
-    """Join the lines of a message, without those of jsonargparse that are no reason."""
+    """Join the lines of a message, without those in `NOISE`."""
     lines = (line.strip() for line in message.splitlines())
     return " ".join(dict.fromkeys(line.removeprefix("- ") for line in lines if line and not line.startswith(NOISE)))
 
 
 def parse_arguments(name: str, command: Callable[..., None], arguments: Sequence[str]) -> dict[str, Any]:
-    """The arguments of a command by name. Raises ValueError for arguments that it does not take.
+    """Parse the arguments of a command.
 
     A hyphen in the name of an option is read as an underscore.
+
+    Args:
+        name: Name of the command.
+        command: Function of the command.
+        arguments: Words of the command line.
+
+    Returns:
+        Values by the name of the parameter.
+
+    Raises:
+        ValueError: The command does not take these arguments.
     """
     words = [re.sub(r"^--[\w-]+", lambda name: f"--{name[0][2:].replace('-', '_')}", text) for text in arguments]
     extra = {}
@@ -87,14 +101,18 @@ def parse_arguments(name: str, command: Callable[..., None], arguments: Sequence
 
 
 def command_parser(name: str, command: Callable[..., None]) -> OneLineParser:
-    """The parser of a function, its help from the docstring.
+    """Build the parser of a function; its help comes from the docstring.
 
-    A list takes several words, a tuple as many as it has; a bool is a flag without a value; anything else is read as
-    its annotation says.
+    A list takes several words and a tuple as many as it has. A bool is a flag without a value. Anything else is parsed
+    as its annotation says.
+
+    Args:
+        name: Name of the command.
+        command: Function of the command.
     """
-    told = parse_docstring(inspect.getdoc(command) or "")
-    help_of = {parameter.arg_name: parameter.description for parameter in told.params}
-    description = "\n".join(filter(None, (told.short_description, told.long_description)))
+    docstring = parse_docstring(inspect.getdoc(command) or "")
+    help_of = {parameter.arg_name: parameter.description for parameter in docstring.params}
+    description = "\n".join(filter(None, (docstring.short_description, docstring.long_description)))
     parser = OneLineParser(
         prog=f"bpnp {name}", description=description, allow_abbrev=False, formatter_class=HelpFormatter
     )
@@ -118,7 +136,12 @@ def command_parser(name: str, command: Callable[..., None]) -> OneLineParser:
 
 
 def at_least(least: int, **options: float | int | None) -> None:
-    """Raise ValueError for an option below `least` or not finite; None is none."""
+    """Raise ValueError for an option below `least` or not finite; None is ignored.
+
+    Args:
+        least: Least value.
+        **options: Values by the name of the option.
+    """
     for name, value in options.items():
         if value is not None and not least <= value < math.inf:
             raise ValueError(f"expected --{name} of {least:g} or more, got {value}")
@@ -130,7 +153,7 @@ def first_line(command: Callable[..., None]) -> str:
 
 
 def _word(kind: Any) -> tuple[Any, str | int | None]:
-    """The type of a word, and how many there are: "+" for a list, a number for a tuple, None for other kinds."""
+    """Return the type of a word and the number of words: "+" for a list, a number for a tuple, else None."""
     for option in (kind, *typing.get_args(kind)):
         if typing.get_origin(option) in (list, tuple):
             words = typing.get_args(option)
@@ -145,27 +168,27 @@ LIGHTNING = {
     "predict": "Write the poses of a solver on the test problems, as CSV or JSON.",
 }
 OPTIONS = {
-    "--config NAME": "packaged configuration or a YAML file; of several, later ones override",
+    "--config NAME": "packaged configuration or a YAML file; later ones override earlier ones",
     "--ckpt_path FILE": "checkpoint, `last` or `best` of the run, or the name of packaged weights",
     "--print_config": "print all options with their values, to use as --config",
     "--seed_everything N": "seed",
     "--data CLASS": "class path of the data, such as bpnp.datamodules.MeshDataModule",
-    "--data.root FOLDER": "where they are; procedural shapes without it",
-    "--data.num_points N": "points a problem",
-    "--data.batch_size N": "problems a step",
+    "--data.root FOLDER": "folder of the data; procedural shapes without it",
+    "--data.num_points N": "points of a problem",
+    "--data.batch_size N": "problems of a step",
     "--model CLASS": "class path of a LightningModule in place of BlindPnPTask",
-    "--model.solver CLASS": "class path of an nn.Module from Batch to Prediction",
+    "--model.solver CLASS": "class path of an nn.Module that maps a Batch to a Prediction",
     "--model.weights NAME": "start from packaged weights, or from a checkpoint",
     "--model.loss CLASS": "class path of a loss in place of --model.matching_loss",
     "--model.matching_loss KIND": "correspondence (the paper's) or likelihood",
-    "--model.learning_rate X": "of Adam",
+    "--model.learning_rate X": "learning rate of Adam",
     "--optimizer CLASS": "torch.optim.AdamW, SGD, ..., with --optimizer.lr; also --lr_scheduler",
     "--pose_loss.start_epoch N": "first epoch with the pose loss; --pose_loss.weight X",
     "--trainer.default_root_dir FOLDER": "folder of the run: checkpoints, logs, results",
-    "--trainer.max_epochs N": "epochs",
+    "--trainer.max_epochs N": "number of epochs",
     "--trainer.max_time DD:HH:MM:SS": "time limit",
     "--trainer.accelerator NAME": "cpu, gpu or auto",
-    "--trainer.fast_dev_run true": "one batch of each stage, nothing is written",
+    "--trainer.fast_dev_run true": "run one batch of each stage and write nothing",
 }
 COLUMN = 36
 
@@ -182,6 +205,6 @@ def short_help(command: str) -> str:
             *options,
             "",
             f"bpnp {command} --help all lists every option,",
-            f"bpnp {command} --data.help=CLASS, --model.solver.help=CLASS and so on those of a class.",
+            f"bpnp {command} --data.help=CLASS, --model.solver.help=CLASS and so on list those of a class.",
         ]
     )

@@ -1,4 +1,4 @@
-"""Files of points, cameras and rough poses, as arrays."""
+"""Readers of files of points, cameras and poses."""
 
 import csv
 import io
@@ -15,32 +15,32 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]
 ARRAYS = (".npy", ".csv", ".txt", ".xyz")
-COLMAP_POINTS, COLMAP_CAMERAS = "points3D", "cameras"  # the files of a COLMAP model, .bin or .txt
+COLMAP_POINTS, COLMAP_CAMERAS = "points3D", "cameras"  # files of a COLMAP model, .bin or .txt
 NORMAL, LABEL = ("nx", "ny", "nz"), "label"
-# After x, y, z in a file that does not name its columns, by their number.
+# Columns after x, y, z in a file that does not name them, by the number of columns.
 COLUMNS: dict[int, tuple[str, ...]] = {3: (), 4: (LABEL,), 6: NORMAL, 7: (*NORMAL, LABEL)}
 IMAGE_COLUMNS = (("x", "y", "z"), ("x", "y"), ("u", "v"))
 STANDARD_INPUT = Path("-")
-NUMPY = b"\x93NUMPY"  # the first bytes of a .npy file
+NUMPY = b"\x93NUMPY"  # first bytes of a .npy file
 
 
 def read_points2d(path: Path) -> tuple[Array, Labels | None]:
     """Read image points.
 
     Args:
-        path: .npy or text as for `read_points3d`. Of named columns x and y are taken, and z if there is one, or u and
-            v; of others the first two: a detector's rows go on with scale and angle.
+        path: .npy or text as for `read_points3d`. Named columns x and y are read, and z if there is one, or u and v; of
+            unnamed columns the first two, since a detector's rows continue with scale and angle.
 
     Returns:
-        Points (m, 2) or unit bearings (m, 3); labels (m,) of a column named label, else None.
+        Points (m, 2) or unit bearings (m, 3), and labels (m,) of a column named label, else None.
 
     Raises:
         ValueError: As `read_points3d`.
     """
     _check_suffix(path, ARRAYS)
-    values, names = _columns(path, {name for known in IMAGE_COLUMNS for name in known} | {LABEL})
+    values, names = _columns(path, {name for columns in IMAGE_COLUMNS for name in columns} | {LABEL})
     if names:
-        coordinates = next((known for known in IMAGE_COLUMNS if set(known) <= set(names)), ("x", "y"))
+        coordinates = next((columns for columns in IMAGE_COLUMNS if set(columns) <= set(names)), ("x", "y"))
         points, _, labels = _read_annotation(path, values, names, coordinates, hint=", or u, v")
         return points, labels
     if values.shape[1] < 2:
@@ -54,17 +54,19 @@ def read_points3d(
     """Read scene points.
 
     Args:
-        path: .npy; .csv, .txt, .xyz with numbers in columns, separated by commas, semicolons, tabs or spaces; beside
-            semicolons and tabs a comma is a decimal mark. The first line may name the columns, else they are x, y, z,
-            then nx, ny, nz or label or both; # starts a comment. Also .ply and meshes (.obj, .off, .stl, .glb): their
-            different vertices, or `surface` points drawn from their triangles; a COLMAP model, its folder or its
-            points3D; `-` or a pipe with the content of a .npy or of a text.
-        surface: Number of points to draw from a mesh.
-        seed: Of these.
+        path: One of:
+            .npy; .csv, .txt or .xyz with columns of numbers separated by commas, semicolons, tabs or spaces (a comma is
+            a decimal mark if the separator is a semicolon or a tab). The first line may name the columns; otherwise
+            they are x, y, z, then nx, ny, nz or label or both. # starts a comment.
+            .ply or a mesh (.obj, .off, .stl, .glb): its distinct vertices, or `surface` points drawn from its
+            triangles. A COLMAP model: its folder or its points3D.
+            `-` or a pipe with the content of a .npy or of a text.
+        surface: Number of points to draw from a mesh. Default: its vertices.
+        seed: Random seed of these.
 
     Returns:
-        Points (n, 3); their outward normals (n, 3) and labels (n,), None where the file has none. The normals of a
-        .ply without faces count, but not if all of them are zero.
+        Points (n, 3); their outward normals (n, 3) and labels (n,), None if the file has none. The normals of a .ply
+        without faces are read unless all of them are zero.
 
     Raises:
         ValueError: The file cannot be read. The message names it and what is wrong in it.
@@ -89,26 +91,30 @@ def read_points3d(
 
 
 def read_camera(text: str, image: str | None = None) -> Any:
-    """The camera that `--camera` names: a file with a 3x3 matrix, or a COLMAP model with its parameters.
+    """Read the camera that `--camera` names.
 
-    Also a camera of a COLMAP reconstruction, named by its folder or by its file of cameras: its only one, or that of
-    an `image`.
-    "PINHOLE 500 500 320 240" and "PINHOLE,640,480,500,500,320,240" (with width and height, as in cameras.txt) are both
-    understood. Raises ValueError for anything else.
+    Args:
+        text: A file with a 3x3 matrix; a COLMAP camera model with its parameters, "PINHOLE 500 500 320 240" or
+            "PINHOLE,640,480,500,500,320,240" (with width and height, as in cameras.txt); or a COLMAP model, its folder
+            or its file of cameras.
+        image: Name of the image of the COLMAP model whose camera is read. Default: the only camera of the model.
+
+    Raises:
+        ValueError: The text is something else.
     """
     path = Path(text)
     if (text and path.is_dir()) or (path.stem == COLMAP_CAMERAS and path.is_file()):
         return _camera_of(path, image)
     if image is not None:
-        raise ValueError(f"expected --image with a COLMAP model as --camera, got it with {text!r}")
+        raise ValueError(f"--image needs a COLMAP model as --camera, which is {text!r}")
     if path.is_file() or _is_stream(path):
         return _columns(path)[0]
     model, *words = text.replace(",", " ").split() or [""]
     numbers = [_number(word) for word in words]
     if not numbers or None in numbers or not model.replace("_", "").isalnum() or model[0].isdigit():
         raise ValueError(
-            f"expected --camera as a file with a 3x3 matrix or as MODEL,PARAMETERS such as SIMPLE_PINHOLE,800,320,240; "
-            f"got {text!r}, which is neither"
+            f"--camera {text!r} is neither a file with a 3x3 matrix nor MODEL,PARAMETERS such as "
+            "SIMPLE_PINHOLE,800,320,240"
         )
     from bpnp.cameras import camera_models
 
@@ -118,8 +124,17 @@ def read_camera(text: str, image: str | None = None) -> Any:
 
 
 def read_prior(path: Path, degrees: float, distance: float | None) -> Any:
-    """The rough pose in a JSON file with `rotation` and `translation`, as wide as `degrees` and `distance`; the path of
-    anything else, a checkpoint. Raises ValueError for JSON without a pose."""
+    """Read a rough pose as a prior.
+
+    Args:
+        path: JSON with `rotation` and `translation`, or a pipe with it. Any other path is returned unchanged, as a
+            checkpoint.
+        degrees: Standard deviation of the rotation, degrees.
+        distance: Standard deviation of the translation, scene units; None if unknown.
+
+    Raises:
+        ValueError: The JSON has no pose.
+    """
     from bpnp.search.starts import PosePrior
 
     if path.suffix.lower() != ".json" and not _is_stream(path):
@@ -129,18 +144,26 @@ def read_prior(path: Path, degrees: float, distance: float | None) -> Any:
 
 
 def read_pose(path: Path) -> tuple[Array, Array]:
-    """Rotation and translation in a JSON file with both, such as that of a solution. Raises ValueError without them."""
+    """Read rotation and translation from a JSON file, such as that of a solution.
+
+    Args:
+        path: File.
+
+    Raises:
+        ValueError: The file has no pose.
+    """
     try:
         content = json.loads(_content(path))
         return np.array(content["rotation"], np.float64), np.array(content["translation"], np.float64)
     except (OSError, ValueError, KeyError, TypeError) as error:
-        missing = "no file" if isinstance(error, FileNotFoundError) else error
-        reason = f"no {error}" if isinstance(error, KeyError) else missing
-        raise ValueError(f"expected JSON with `rotation` and `translation` in {path}, got {reason}") from error
+        if isinstance(error, FileNotFoundError):
+            raise ValueError(f"there is no file {path}") from error
+        reason = f"{error} is missing" if isinstance(error, KeyError) else error
+        raise ValueError(f"{path} is no JSON with `rotation` and `translation`: {reason}") from error
 
 
 def read_pairs(path: Path) -> Array:
-    """Rows of two numbers, such as matches: .npy or text as for `read_points3d`."""
+    """Read rows of two numbers, such as matches, from a .npy or a text as for `read_points3d`."""
     _check_suffix(path, ARRAYS)
     values = _columns(path)[0]
     if values.shape[1] != 2:
@@ -158,29 +181,37 @@ def _content(path: Path) -> bytes:
     return sys.stdin.buffer.read() if path == STANDARD_INPUT else path.read_bytes()
 
 
-def _check_suffix(path: Path, known: tuple[str, ...]) -> None:
+def _check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
     if _is_stream(path):
         return
     if not path.is_file():
-        raise ValueError(f"expected a file of points, got no file {path}")
-    if path.suffix.lower() not in known:
-        raise ValueError(f"expected a file that ends in {', '.join(known)}, got {path}")
+        raise ValueError(f"there is no file {path}")
+    if path.suffix.lower() not in suffixes:
+        raise ValueError(f"{path} has to end in {', '.join(suffixes)}")
 
 
 def _read_annotation(
     path: Path, values: Array, names: list[str], coordinates: tuple[str, ...], *, hint: str = ""
 ) -> tuple[Array, Array | None, Labels | None]:
-    """Take points, normals and labels from columns; `hint` follows the coordinates in the message that misses them."""
+    """Take points, normals and labels from columns.
+
+    Args:
+        path: File, for messages.
+        values: Columns (k, c).
+        names: Names of the columns; empty if the file has none.
+        coordinates: Names of the coordinates.
+        hint: Text after the coordinates in the message that they are missing.
+    """
     swapped = " (are the two files swapped?)" if values.shape[1] == 2 else ""
     if not names and values.shape[1] not in COLUMNS:
-        known = "3 to 4 or 6 to 7 columns (x, y, z, normal, label)"
-        raise ValueError(f"expected {known} in {path}, got shape {values.shape}{swapped}")
+        expected = "3 to 4 or 6 to 7 columns (x, y, z, normal, label)"
+        raise ValueError(f"expected {expected} in {path}, got shape {values.shape}{swapped}")
     names = names or [*coordinates, *COLUMNS[values.shape[1]]]
     if not set(coordinates) <= set(names):
         raise ValueError(f"expected columns {', '.join(coordinates)}{hint} in {path}, got {', '.join(names)}{swapped}")
-    place = {name: column for column, name in enumerate(names)}
-    points = values[:, [place[name] for name in coordinates]]
-    return points, *_normals_and_labels(path, lambda name: values[:, place[name]], names)
+    index = {name: column for column, name in enumerate(names)}
+    points = values[:, [index[name] for name in coordinates]]
+    return points, *_normals_and_labels(path, lambda name: values[:, index[name]], names)
 
 
 def _normals_and_labels(
@@ -197,16 +228,16 @@ def _normals_and_labels(
 
 
 def _camera_of(path: Path, image: str | None) -> tuple[Any, ...]:
-    """The camera of an image of a COLMAP model, or the only one that it has."""
+    """Return the camera of an image of a COLMAP model, or its only camera."""
     from bpnp.datamodules.colmap.model_files import read_records
 
     model = read_records(path if path.is_dir() else path.parent)
     used = {record.name: record.camera_id for record in sorted(model.images, key=lambda record: record.name)}
     some = ", ".join([*used][:8])
     if image is not None and used.get(image) not in model.cameras:
-        raise ValueError(f"expected an image of {path}, got {image!r}; try one of {some}")
+        raise ValueError(f"{path} has no image {image!r} with a camera; its images are {some}")
     if image is None and len(model.cameras) != 1:
-        raise ValueError(f"expected one camera in {path}, got {len(model.cameras)}; try --image with one of {some}")
+        raise ValueError(f"{path} has {len(model.cameras)} cameras; choose one by --image, such as {some}")
     camera = next(iter(model.cameras.values())) if image is None else model.cameras[used[image]]
     return camera.model, *camera.size, camera.params
 
@@ -227,7 +258,7 @@ def _columns(path: Path, wanted: Collection[str] = ()) -> tuple[Array, list[str]
         content = _content(path)
         if path.suffix.lower() == ".npy" or content.startswith(NUMPY):
             array = np.load(io.BytesIO(content), allow_pickle=False)
-            array = array[:, 0] if array.ndim == 3 and array.shape[1] == 1 else array  # OpenCV's points are (k, 1, 2)
+            array = array[:, 0] if array.ndim == 3 and array.shape[1] == 1 else array  # OpenCV points are (k, 1, 2)
             if array.dtype.kind not in "fiu" or array.ndim != 2:
                 raise ValueError(f"{array.dtype} of shape {array.shape}")
             return array.astype(np.float64), []
@@ -239,7 +270,7 @@ def _columns(path: Path, wanted: Collection[str] = ()) -> tuple[Array, list[str]
     names = [] if any(_number(name) is not None for name in names) else names
     rows = lines[1:] if names else lines
     if not rows:
-        raise ValueError(f"expected lines of numbers in {path}, got none")
+        raise ValueError(f"{path} has no lines of numbers")
     mark, count = _separator(rows[0]), len(_words(rows[0]))
     if names and count == len(names) + 1:
         names = ["", *names]
@@ -259,7 +290,7 @@ def _columns(path: Path, wanted: Collection[str] = ()) -> tuple[Array, list[str]
 
 
 def _separator(line: str) -> str | None:
-    """Return what separates the words of a line, None for spaces and tabs, beside which a comma is a decimal mark."""
+    """Return the separator of the words of a line, None for spaces and tabs, where a comma is a decimal mark."""
     if ";" in line:
         return ";"
     decimal_commas = "\t" in line and not re.search(r",(?!\d)", line)

@@ -1,4 +1,4 @@
-"""`bpnp prepare`, a data set as it was published, packed once as a memory-mapped store; `bpnp convert-weights`."""
+"""`bpnp prepare`, which packs a published data set as a memory-mapped store, and `bpnp convert-weights`."""
 
 import os
 from collections import Counter
@@ -24,14 +24,14 @@ def prepare_modelnet40(
     normalisation: Literal["unit_sphere", "unit_cube", "none"] = "unit_sphere",
     processes: int = PROCESSES,
 ) -> None:
-    """Pack ModelNet40, or any folder of meshes in its layout. A run that is stopped leaves nothing.
+    """Pack ModelNet40, or any folder of meshes in its layout. An interrupted run leaves no files.
 
     Args:
         source: folder of <class>/{train,test}/*.{off,obj,ply,stl,glb}.
         output: new folder.
-        points: surface samples of a mesh.
-        normalisation: of each mesh.
-        processes: worker processes.
+        points: surface samples of each mesh.
+        normalisation: frame of each mesh.
+        processes: number of worker processes.
     """
     from bpnp.datamodules.clouds import open_shapes
     from bpnp.datamodules.meshes import surfaces_recipe
@@ -52,14 +52,14 @@ def prepare_megadepth(
     clutter: float = 0.0,
     processes: int = PROCESSES,
 ) -> None:
-    """Pack MegaDepth, or any folder of COLMAP models. A run that is stopped leaves nothing.
+    """Pack MegaDepth, or any folder of COLMAP models. An interrupted run leaves no files.
 
     Args:
-        source: the folder of scenes, <scene>/sparse/manhattan/<k>/{cameras,images,points3D}.bin.
+        source: folder of scenes, <scene>/sparse/manhattan/<k>/{cameras,images,points3D}.bin.
         output: new folder.
-        min_points: fewest matches of an image.
+        min_points: least number of matches of an image.
         clutter: natural clutter to keep, as a ratio to the matches; 0.5 adds half as many points.
-        processes: worker processes.
+        processes: number of worker processes.
     """
     from bpnp.datamodules.colmap.module import colmap_recipe
     from bpnp.datamodules.store import prepare
@@ -76,9 +76,9 @@ def prepare_authors(source: Path, *, output: Path = Path("data/authors"), datase
     """Pack the pickles that the authors of BPnPNet published.
 
     Args:
-        source: the folder with <dataset>_train and <dataset>_test.
+        source: folder with <dataset>_train and <dataset>_test.
         output: new folder.
-        dataset: where there are several, such as data61_2d3d.
+        dataset: name of the data set if there are several, such as data61_2d3d.
     """
     from bpnp.datamodules.authors import authors_recipe, split_rows
     from bpnp.datamodules.store import prepare
@@ -96,9 +96,9 @@ def _show(store: "Store", counts: Mapping[str, int]) -> None:
 
 
 def convert_weights(file: Path, out: Path, *, ransac: Literal["poselib", "opencv"] = "poselib") -> None:
-    """Convert the weights of the authors of BPnPNet into a checkpoint of bpnp.
+    """Convert the weights of the authors of BPnPNet to a checkpoint of bpnp.
 
-    The checkpoint is for `BPnPNet.from_checkpoint` and `bpnp test --ckpt_path`. No file is left half written.
+    The checkpoint is for `BPnPNet.from_checkpoint` and `bpnp test --ckpt_path`. An interrupted run leaves no file.
 
     Args:
         file: the authors' file, *.pth.tar.

@@ -1,5 +1,4 @@
-"""`bpnp report`, `view`, `wandb` and `table`: results as tables, a page, figures and in Weights & Biases, also those of
-several methods on the same problems in the form of the paper's tables."""
+"""`bpnp report`, `view`, `wandb` and `table`: results as tables, pages and figures, and tables of several methods."""
 
 import json
 import re
@@ -33,14 +32,14 @@ def report(
     recall: Path | None = None,
     curves: Path | None = None,
 ) -> None:
-    """Show results side by side: tables here, and on request a page, recall curves and the curves of a training.
+    """Show results side by side as tables; optionally write a page, recall curves and training curves.
 
     Args:
         runs: folders that `bpnp test` or `bpnp table` wrote, or their runs.
-        paper: modelnet40 or megadepth, the paper's rows beneath, for orientation.
+        paper: add the published rows of modelnet40 or megadepth, for orientation.
         html: write a page that needs no network.
-        recall: write the recall curves as .png, .svg or .pdf.
-        curves: write losses and validation of the first run's training as .png, .svg or .pdf.
+        recall: write the recall curves as .png, .jpg, .svg or .pdf.
+        curves: write losses and validation of the first run's training as .png, .jpg, .svg or .pdf.
     """
     from bpnp.report.figures import recall_curve, save_figure
     from bpnp.report.intervals import interval_table
@@ -74,50 +73,50 @@ def view(
     photo: Path | None = None,
     camera: str | None = None,
 ) -> None:
-    """Draw a problem of a test, or a solution: points and cameras in space, and what is seen in the image.
+    """Draw a problem of a test, or a solution: points and cameras in space, and points in the image.
 
     With a photo, the 3D points are drawn over it as each pose projects them.
 
     Args:
         run: folder that `bpnp test` wrote, or its run; or the JSON of a solution.
         problems: name of a problem, or part of it; the worst by default.
-        output: .png, .svg or .pdf; RUN/views/PROBLEM.png by default.
-        estimate: whose pose reprojects the 3D points; the first by default.
+        output: .png, .jpg, .svg or .pdf; RUN/views/PROBLEM.png by default.
+        estimate: estimate whose pose projects the 3D points; the first by default.
         lines: which matches to draw.
-        photo: picture of the problem; needs --camera.
-        camera: of the photo: a 3x3 matrix in a file, MODEL,PARAMETERS, or a COLMAP model that has the photo.
+        photo: photo of the problem; needs --camera.
+        camera: camera of the photo: a 3x3 matrix in a file, MODEL,PARAMETERS, or a COLMAP model that has the photo.
     """
     from bpnp.report.figures import plot_photo, plot_problem, read_photo, save_figure
     from bpnp.report.tables import named_runs
 
     names = problems or []
     if output is not None and len(names) > 1:
-        raise ValueError(f"expected one problem with --output, got {len(names)}; try without --output")
+        raise ValueError(f"--output takes one problem, and {len(names)} are given; leave out --output")
     if (photo is None) != (camera is None):
         raise ValueError("a photo is drawn with its camera; give --photo and --camera together")
     if not run.exists():
-        raise ValueError(f"expected the folder of a test or the JSON of a solution, got {run}, which is not there")
+        raise ValueError(f"{run} does not exist; give the folder of a test or the JSON of a solution")
     if run.is_file() and names:
-        raise ValueError(f"expected no problem beside the solution {run}, got {names[0]!r}")
+        raise ValueError(f"{run} is one solution, which has no problem {names[0]!r}")
     if run.is_file():
         drawn, folder = [_solution(run)], run.absolute().parent
     else:
         folder, *others = named_runs([run]).values()
         if others:
-            raise ValueError(f"expected the results of one test, got several below {run}; try {folder}")
+            raise ValueError(f"{run} holds the results of several tests; give one, such as {folder}")
         drawn = read_problems(folder, names)
     for problem in drawn:
         name = run.stem if run.is_file() else re.sub(r"[^A-Za-z0-9._-]+", "_", problem.id) or str(problem.index)
         if photo is None or camera is None:
             figure = plot_problem(problem, estimate=estimate, lines=LINES[lines])
         else:
-            seen = replace(problem, camera=_camera_of(camera, photo))
-            figure = plot_photo(seen, read_photo(photo), estimates=None if estimate is None else [estimate])
+            with_camera = replace(problem, camera=_camera_of(camera, photo))
+            figure = plot_photo(with_camera, read_photo(photo), estimates=None if estimate is None else [estimate])
         say(f"wrote {save_figure(figure, output or folder / 'views' / f'{name}.png')}")
 
 
 def _camera_of(text: str, photo: Path) -> "Camera":
-    """The camera of a photo, as `--camera` names it."""
+    """Return the camera of a photo, as `--camera` names it."""
     from bpnp.cameras import camera_from
     from bpnp.commands.point_files import COLMAP_CAMERAS, read_camera
 
@@ -126,7 +125,7 @@ def _camera_of(text: str, photo: Path) -> "Camera":
 
 
 def _solution(path: Path) -> "ProblemPoints":
-    """The points of a solution's file. Raises ValueError that names the file."""
+    """Return the points of a solution's file; a ValueError names the file."""
     from bpnp.solving.solution import Solution, solution_points
 
     try:
@@ -138,12 +137,20 @@ def _solution(path: Path) -> "ProblemPoints":
 
 
 def read_problems(folder: Path, names: Sequence[str]) -> list["ProblemPoints"]:
-    """The problems of these names; the worst if there is none. Raises ValueError for a name of none or of several."""
+    """Read the problems with these names, or parts of names.
+
+    Args:
+        folder: Results folder.
+        names: Names. Empty: the worst problem.
+
+    Raises:
+        ValueError: A name is that of no problem, or part of several names.
+    """
     from bpnp.report.points import read_points
 
     problems = {problem.id: problem for problem in read_points(folder)}
     if not problems:
-        raise ValueError(f"expected points.npz in {folder}, got none; try `bpnp test` again, which keeps points")
+        raise ValueError(f"{folder} has no points.npz; run `bpnp test` again, which writes it")
     if not names:
         return [max(problems.values(), key=lambda problem: problem.error)]
     chosen = []
@@ -151,7 +158,8 @@ def read_problems(folder: Path, names: Sequence[str]) -> list["ProblemPoints"]:
         alike = [id for id in problems if id == name] or [id for id in problems if name in id]
         if len(alike) != 1:
             some = ", ".join((alike or list(problems))[:20])
-            raise ValueError(f"expected the name of one problem in {folder}, got {name!r}; try one of {some}")
+            count = f"{len(alike)} problems" if alike else "no problem"
+            raise ValueError(f"{name!r} is in the names of {count} in {folder}; give one of {some}")
         chosen.append(problems[alike[0]])
     return chosen
 
@@ -162,7 +170,7 @@ def wandb_results(runs: list[Path], *, project: str = "bpnp", directory: Path | 
     Args:
         runs: folders that `bpnp test` wrote, or their runs.
         project: name of the project.
-        directory: where the folders of offline runs go; beside the results by default.
+        directory: parent of the folders of offline runs; that of the results by default.
     """
     from bpnp.report.dashboards import log_results
     from bpnp.report.tables import named_runs
@@ -186,20 +194,20 @@ def table(
 ) -> None:
     """Test several methods on the same problems and print the paper's table.
 
-    Each method has a folder of results, as of `bpnp test`. Started again, it skips the methods that are finished.
-    `--data.NAME=VALUE` overrides the recipe's data.
+    Each method has a folder of results, as of `bpnp test`. A second run skips the methods that are finished.
+    `--data.NAME=VALUE` overrides the data of the configuration.
 
     Args:
         data: name or file of a configuration with `data`.
-        methods: [LABEL=]METHOD[@CHECKPOINT]; METHOD is softposit, ransac, gosma, gopac, hungarian, bpnpnet,
-            matcher, search, a class path, or a .yaml file with model.solver. bpnpnet, matcher and hungarian need a
-            CHECKPOINT (a file, or the name of packaged weights) to be more than untrained.
-        limit: problems, a fixed random choice; all by default.
-        rho: outliers a match on both sides; a table and a plot over these.
-        seeds: of the data; the mean over these and its standard deviation.
-        time_limit: seconds a problem, for methods that have a limit.
+        methods: [LABEL=]METHOD[@CHECKPOINT]; METHOD is softposit, ransac, gosma, gopac, hungarian, bpnpnet, matcher,
+            search, a class path, or a .yaml file with model.solver. bpnpnet, matcher and hungarian are untrained
+            without a CHECKPOINT (a file, or the name of packaged weights).
+        limit: number of problems, a fixed random choice; all by default.
+        rho: ratios of outliers to matches, on both sides; a table and a plot over these.
+        seeds: seeds of the data; the table has the mean over these and its standard deviation.
+        time_limit: seconds for each problem, for methods that have a limit.
         output: folder of the results.
-        paper: published rows beneath.
+        paper: published rows to add.
     """
     from bpnp.datamodules import Outliers
     from bpnp.report.figures import outlier_curves, save_figure
@@ -210,20 +218,20 @@ def table(
     at_least(0, time_limit=time_limit, rho=min(rho, default=None) if rho else None)
     chosen = parse_methods(methods, time_limit=time_limit)
     recipe = Path(packaged_config(data))
-    tests: dict[tuple[float | None, str], list[MethodTest]] = {}  # by share of outliers and method, a test a seed
-    shares: list[float | None] = [*dict.fromkeys(rho)] if rho else [None]
-    drawn: list[int | None] = [*dict.fromkeys(seeds)] if seeds else [None]
-    for share, seed in product(shares, drawn):
+    tests: dict[tuple[float | None, str], list[MethodTest]] = {}  # by outlier ratio and method, one for each seed
+    ratios: list[float | None] = [*dict.fromkeys(rho)] if rho else [None]
+    data_seeds: list[int | None] = [*dict.fromkeys(seeds)] if seeds else [None]
+    for ratio, seed in product(ratios, data_seeds):
         changes, folder = list(overrides or []), output
-        if share is not None:
-            outliers = json.dumps(asdict(Outliers(share)))
-            changes, folder = [*changes, f"--data.test_outliers={outliers}"], folder / f"rho-{share:g}"
+        if ratio is not None:
+            outliers = json.dumps(asdict(Outliers(ratio)))
+            changes, folder = [*changes, f"--data.test_outliers={outliers}"], folder / f"rho-{ratio:g}"
         if seed is not None:
             changes, folder = [*changes, f"--data.seed={seed}"], folder / f"seed-{seed}"
-        described = read_data(recipe, changes)
+        data_settings = read_data(recipe, changes)
         for method in chosen:
-            test = MethodTest(method, described, folder / method.folder_name, limit)
-            tests.setdefault((share, method.label), []).append(test)
+            test = MethodTest(method, data_settings, folder / method.folder_name, limit)
+            tests.setdefault((ratio, method.label), []).append(test)
     every = [test for several in tests.values() for test in several]
     out = console()
     with ExitStack() as held:
@@ -235,8 +243,8 @@ def table(
         for test in missing:
             say(f"testing {test.method.label} in {test.folder}", to=out)
             test.run(progress_bar=out.is_interactive)
-        rows = [row for (share, label), repeated in tests.items() for row in _rows(label, share, repeated)]
-    published = PAPERS.get(described["class_path"].rpartition(".")[2]) if paper == "auto" else paper
+        rows = [row for (ratio, label), repeated in tests.items() for row in _rows(label, ratio, repeated)]
+    published = PAPERS.get(data_settings["class_path"].rpartition(".")[2]) if paper == "auto" else paper
     rows += paper_rows(None if published == "none" else published)
     out.print(table_of_rows("Pose errors", FILE_COLUMNS, rows, " ".join([CAPTION, *note(rows)])))
     frame = table_frame(rows)
@@ -246,8 +254,8 @@ def table(
         say(f"wrote {save_figure(outlier_curves(frame), output / 'outliers.png')}", to=out)
 
 
-def _rows(label: str, share: float | None, tests: "list[MethodTest]") -> "list[Row]":
-    """A row per estimate of a method; of several seeds their mean and standard deviation."""
+def _rows(label: str, ratio: float | None, tests: "list[MethodTest]") -> "list[Row]":
+    """Return a row per estimate of a method; for several seeds, their mean and standard deviation."""
     from pandas import DataFrame
 
     from bpnp.report.tables import Row
@@ -259,8 +267,8 @@ def _rows(label: str, share: float | None, tests: "list[MethodTest]") -> "list[R
         name = f"{label} {estimate}" if len(results[0].estimates) > 1 else label
         frame = DataFrame([result.estimates[estimate] for result in results])
         mean: dict[str, Any] = frame.mean(skipna=False).to_dict()
-        rows.append(Row(name, mean | count, rho=share, problems=("rho", share)))
+        rows.append(Row(name, mean | count, rho=ratio, problems=("rho", ratio)))
         if len(results) > 1:
-            spread = frame.std(skipna=False).to_dict()
-            rows.append(Row(f"{name}, standard deviation of {len(results)} seeds", spread | count, rho=share))
+            deviation = frame.std(skipna=False).to_dict()
+            rows.append(Row(f"{name}, standard deviation of {len(results)} seeds", deviation | count, rho=ratio))
     return rows

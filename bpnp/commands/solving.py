@@ -1,4 +1,4 @@
-"""`bpnp solve` and `bpnp verify`: the pose of a camera from a file of image points and a file of scene points."""
+"""`bpnp solve` and `bpnp verify`: the camera pose from a file of image points and a file of scene points."""
 
 import re
 import time
@@ -48,45 +48,44 @@ def solve(
     seed: int = 0,
     device: str | None = None,
 ) -> None:
-    """Find the pose of a camera from image points and scene points that nobody has matched.
+    """Find the camera pose from image points and scene points without correspondences.
 
-    The verdict is confident, ambiguous (the other candidates fit about as well), or failed: then the pose is a guess.
-    The kinds of files stand under points2d and points3d.
+    The verdict is one of: confident; ambiguous, if another pose may fit as well; failed, and then the pose is a guess.
 
     Args:
         points2d: .npy, .csv or .txt with columns x y or u v; pixels with --camera or --image_size, else x/z y/z; a
             column named label.
         points3d: .npy, .csv, .txt, .ply, or a mesh (.obj, .off, .stl, .glb); columns x y z, nx ny nz, label; or a
-            COLMAP model (its folder, or points3D.bin or .txt). `-` reads standard input, here and above.
+            COLMAP model (its folder, or points3D.bin or .txt). `-` reads standard input, for points2d too.
         camera: file with a 3x3 matrix, COLMAP's MODEL,PARAMETERS such as SIMPLE_PINHOLE,f,cx,cy, or a COLMAP model with
             one camera (its folder, or cameras.bin or .txt).
-        image: name of the image whose camera to take, where the --camera model has several.
-        image_size: WIDTH,HEIGHT or WIDTHxHEIGHT of the image in pixels, where its focal length is unknown: it is found
+        image: name of the image whose camera is used, if the --camera model has several.
+        image_size: WIDTH,HEIGHT or WIDTHxHEIGHT of the image in pixels, if its focal length is unknown; it is found
             with the pose.
-        focal_error: standard deviation of the focal length of --camera where that is rough, as a share of it.
+        focal_error: relative standard deviation of the focal length of --camera, if that is rough.
         distortion: fit a radial coefficient with an unknown focal length even where it is not significantly better.
         output: write the solution as JSON.
-        picture: draw it as .png, .svg or .pdf.
-        photo: the photo, of the size of the --camera or smaller, under the points of --picture.
-        colmap: new folder to write, a COLMAP model of this image.
+        picture: write a picture of it as .png, .jpg, .svg or .pdf.
+        photo: the photo, of the size of the --camera or smaller, to draw under the points of --picture.
+        colmap: write a COLMAP model of this image to this new folder.
         json: print JSON instead of a table.
-        quiet: print nothing but errors, and JSON if asked for.
-        surface: points to draw from a mesh; its vertices by default.
+        quiet: print only errors, and JSON with --json.
+        surface: number of points to draw from a mesh; its vertices by default.
         prior: rough pose, the JSON of a solution; or a network, packaged weights by name or a checkpoint.
         prior_degrees: standard deviation of its rotation, degrees.
         prior_distance: standard deviation of its translation, scene units; unknown by default.
-        up_camera: direction up in the camera (x right, y down, z forward), such as 0 -1 0, if gravity is known.
+        up_camera: direction up in the camera (x right, y down, z forward), such as 0 -1 0, if gravity is measured.
         up_scene: the same direction in the scene, such as 0 0 1.
         up_degrees: standard deviation of the direction up, degrees.
-        clutter: share of the points without a partner, if known.
-        at_infinity: points3d are unit directions, such as of stars; the rotation alone is found.
-        solver: auto, which asks a packaged matcher when the search is in doubt; search; or a
-            network, packaged weights by name or a checkpoint.
-        inlier_threshold: largest error of a match, pixels with a camera, else of x/z, y/z; three
-            times the residuals' scale by default.
-        time_limit: seconds, 10 by default; inf for no limit.
-        seed: of the search.
-        device: such as cuda; cpu by default.
+        clutter: expected fraction of points without a correspondence.
+        at_infinity: points3d are unit directions, such as of stars; only the rotation is found.
+        solver: auto, which also runs a packaged matcher if the search is not confident; search; or a network, packaged
+            weights by name or a checkpoint.
+        inlier_threshold: largest error of a match, pixels with a camera, else of x/z, y/z; three times the scale of the
+            residuals by default.
+        time_limit: time limit in seconds, 10 by default; inf for no limit.
+        seed: random seed of the search.
+        device: torch device such as cuda; cpu by default.
     """
     from bpnp.cameras import camera_from
     from bpnp.commands.point_files import read_camera, read_prior
@@ -94,15 +93,15 @@ def solve(
     from bpnp.solving.solve import solve as find_pose
 
     if (up_camera is None) != (up_scene is None):
-        raise ValueError("expected --up_camera and --up_scene together, got one of them")
+        raise ValueError("give --up_camera and --up_scene together")
     if prior is not None and up_camera is not None:
-        raise ValueError("expected --prior or --up_camera with --up_scene, got both")
+        raise ValueError("give --prior, or --up_camera with --up_scene, not both")
     if image is not None and camera is None:
-        raise ValueError(f"expected --image with a COLMAP model as --camera, got {image!r} alone")
+        raise ValueError(f"--image {image!r} needs a COLMAP model as --camera")
     if photo is not None and (picture is None or camera is None):
-        raise ValueError("expected --photo with --picture and --camera, got it without")
+        raise ValueError("--photo needs --picture and --camera")
     if picture is not None:
-        from bpnp.report.figures import (  # matplotlib, where something is drawn
+        from bpnp.report.figures import (  # imports matplotlib
             SUFFIXES,
             read_photo,
             save_figure,
@@ -111,16 +110,16 @@ def solve(
         from bpnp.solving.solution import solution_picture
 
         if picture.suffix.lower() not in SUFFIXES:
-            raise ValueError(f"expected a --picture that ends in {', '.join(SUFFIXES)}, got {picture.name!r}")
-    known: Any = None if prior is None else read_prior(prior, prior_degrees, prior_distance)
+            raise ValueError(f"--picture {picture.name!r} has to end in {', '.join(SUFFIXES)}")
+    pose_prior: Any = None if prior is None else read_prior(prior, prior_degrees, prior_distance)
     if up_camera is not None and up_scene is not None:
-        known = GravityPrior(up_camera, up_scene, up_degrees)
+        pose_prior = GravityPrior(up_camera, up_scene, up_degrees)
     image_points, scene_points, annotations = _read_sides(points2d, points3d, surface, seed)
     lens = None if camera is None else read_camera(camera, image)
     size = None if image_size is None else _size(image_size)
-    under = None if photo is None or picture is None else read_photo(photo)
-    if under is not None:
-        size_in_camera(under, camera_from(lens))
+    background = None if photo is None or picture is None else read_photo(photo)
+    if background is not None:
+        size_in_camera(background, camera_from(lens))
     inputs = [points2d, points3d, prior, photo, *(Path(text) for text in (camera, solver) if text is not None)]
     _check_outputs([output, picture], inputs)
     if colmap is not None:
@@ -136,7 +135,7 @@ def solve(
             distortion=distortion,
             **annotations,
             solver=solver,
-            prior=known,
+            prior=pose_prior,
             inlier_threshold=inlier_threshold,
             clutter=clutter,
             at_infinity=at_infinity,
@@ -145,13 +144,13 @@ def solve(
             device=device,
             progress=lambda _, batch, __: shown.update(task, description=f"searching the pose, round {batch}"),
         )
-    said = _tell(solution, annotations, json=json, quiet=quiet, output=output)
+    messages = _print_solution(solution, annotations, json=json, quiet=quiet, output=output)
     if picture is not None:
-        figure = solution_picture(solution, title=points2d.stem, photo=under)
-        say(f"wrote {save_figure(figure, picture)}", to=said)
+        figure = solution_picture(solution, title=points2d.stem, photo=background)
+        say(f"wrote {save_figure(figure, picture)}", to=messages)
     if colmap is not None:
         written = solution.to_colmap(colmap, name="image.jpg" if photo is None else photo.name)
-        say(f"wrote {written}", to=said)
+        say(f"wrote {written}", to=messages)
 
 
 def verify(
@@ -174,14 +173,14 @@ def verify(
     time_limit: float | None = None,
     seed: int = 0,
 ) -> None:
-    """Say whether a pose from elsewhere is right, and how well it is known.
+    """Verify a given pose, and estimate its uncertainty.
 
-    confident; ambiguous (something else may fit as well); or failed: it fits no better than chance, or another pose
-    fits better. Files: as for `bpnp solve`.
+    The verdict is one of: confident; ambiguous, if another pose may fit as well; failed, if the pose is not significant
+    or another pose fits better.
 
-    `bpnp verify MAP`, with the folder of a COLMAP model alone, verifies the pose of each of its images without the
-    image's own observations, and prints the most doubtful first. Its options are --output, --page, --json,
-    --quiet, --time_limit (an image) and --seed.
+    `bpnp verify MAP`, with only the folder of a COLMAP model, verifies the pose of each of its images without the
+    image's own observations, and prints the least certain first. Its options are --output, --page, --json,
+    --quiet, --time_limit (for each image) and --seed.
 
     Args:
         points2d: as for bpnp solve; or the folder of a COLMAP model, without other arguments.
@@ -191,17 +190,17 @@ def verify(
         translation: the three numbers of t.
         camera: as for bpnp solve.
         image: as for bpnp solve.
-        matches: .npy, .csv or .txt with two columns, places of a 2D and of a 3D point, counted from 0.
+        matches: .npy, .csv or .txt with two columns, indices of a 2D and of a 3D point, counted from 0.
         as_it_is: do not refine the pose.
-        output: write the solution as JSON; of a model a file that ends in .json or .csv.
-        page: of a model, write the table and a drawing of the map as one .html file.
+        output: write the solution as JSON; for a model, a file that ends in .json or .csv.
+        page: for a model, write the table and a drawing of the map as one .html file.
         json: print JSON instead of a table.
-        quiet: print nothing but errors, and JSON if asked for.
-        surface: points to draw from a mesh; its vertices by default.
-        inlier_threshold: largest error of a match, pixels with a camera, else of x/z, y/z; three
-            times the residuals' scale by default.
-        time_limit: seconds, 10 by default; inf for no limit.
-        seed: of the search around the pose.
+        quiet: print only errors, and JSON with --json.
+        surface: number of points to draw from a mesh; its vertices by default.
+        inlier_threshold: largest error of a match, pixels with a camera, else of x/z, y/z; three times the scale of the
+            residuals by default.
+        time_limit: time limit in seconds, 10 by default; inf for no limit.
+        seed: random seed of the local search.
     """
     if points3d is None:
         from bpnp.commands.verifying_maps import verify_images
@@ -220,23 +219,23 @@ def verify(
     from bpnp.commands.point_files import read_camera, read_pairs, read_pose
     from bpnp.solving.verify import verify as judge_pose
 
-    judged: tuple[Any, Any]
+    given_pose: tuple[Any, Any]
     if pose is None and rotation is not None and translation is not None:
-        judged = [rotation[:3], rotation[3:6], rotation[6:]], translation
+        given_pose = [rotation[:3], rotation[3:6], rotation[6:]], translation
     elif pose is not None and rotation is None and translation is None:
-        judged = read_pose(pose)
+        given_pose = read_pose(pose)
     else:
-        raise ValueError("expected the JSON of a pose, or --rotation and --translation")
+        raise ValueError("give the JSON of a pose, or --rotation and --translation")
     inputs = [points2d, points3d, pose, matches, None if camera is None else Path(camera)]
     _check_outputs([output], inputs)
     image_points, scene_points, annotations = _read_sides(points2d, points3d, surface, seed)
     with progress(items=False, quiet=quiet) as shown:
-        shown.add_task("looking around the pose", total=None)
+        shown.add_task("verifying the pose", total=None)
         solution = judge_pose(
             image_points,
             scene_points,
-            judged[0],
-            judged[1],
+            given_pose[0],
+            given_pose[1],
             None if camera is None else read_camera(camera, image),
             **annotations,
             matches=None if matches is None else read_pairs(matches),
@@ -245,35 +244,35 @@ def verify(
             seed=seed,
             time_limit=time_limit,
         )
-    _tell(solution, annotations, json=json, quiet=quiet, output=output)
+    _print_solution(solution, annotations, json=json, quiet=quiet, output=output)
 
 
 def _check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | None]) -> None:
-    """Raise ValueError for a file that cannot be written, or that is an input; their folders are made."""
-    read = {path.resolve() for path in inputs if path is not None and path.is_file()}
+    """Create the folders of output files; raise ValueError for a folder, or for a file that is also an input."""
+    input_files = {path.resolve() for path in inputs if path is not None and path.is_file()}
     for path in outputs:
         if path is None:
             continue
         if path.is_dir():
-            raise ValueError(f"expected a file to write to, got the folder {path}; try a name in it")
-        if path.resolve() in read:
+            raise ValueError(f"{path} is a folder; give a file name to write to")
+        if path.resolve() in input_files:
             raise ValueError(f"{path} is an input and would be overwritten; name another file")
         path.parent.mkdir(parents=True, exist_ok=True)
 
 
 def _read_sides(points2d: Path, points3d: Path, surface: int | None, seed: int) -> tuple[Any, Any, dict[str, Any]]:
-    """Image points, scene points, and the normals and labels that their files have."""
+    """Return image points, scene points, and the normals and labels that their files have."""
     from bpnp.commands.point_files import read_points2d, read_points3d
 
-    seen, labels2d = read_points2d(points2d)
+    image, labels2d = read_points2d(points2d)
     scene, normals3d, labels3d = read_points3d(points3d, surface=surface, seed=seed)
-    return seen, scene, {"normals3d": normals3d, "labels2d": labels2d, "labels3d": labels3d}
+    return image, scene, {"normals3d": normals3d, "labels2d": labels2d, "labels3d": labels3d}
 
 
-def _tell(
+def _print_solution(
     solution: "Solution", annotations: Mapping[str, Any], *, json: bool, quiet: bool, output: Path | None
 ) -> Console:
-    """Print and write a solution, and return the console for what else was written."""
+    """Print and write a solution, and return the console for further messages."""
     out = console(json=json, quiet=quiet)
     if json:
         say(solution.to_json())
@@ -286,15 +285,15 @@ def _tell(
 
 
 def solution_table(solution: "Solution", annotations: Mapping[str, Any] | None = None) -> Table:
-    """Return a table of verdict, pose, matches and next candidates, and of which `annotations` the points have."""
+    """Return a table of verdict, points with their annotations, pose, matches and next candidates."""
     from bpnp.report.terminal import VERDICTS
 
     table = Table(box=box.SIMPLE, show_header=False, padding=(0, 1))
     table.add_column(no_wrap=True, style="dim")
     table.add_column(overflow="fold")
     table.add_row("verdict", Text.assemble((solution.verdict, VERDICTS[solution.verdict]), f": {solution.reason}"))
-    given = [name for name, values in (annotations or {}).items() if values is not None]
-    image, scene = (", ".join(name[:-2] for name in given if name.endswith(side)) for side in ("2d", "3d"))
+    present = [name for name, values in (annotations or {}).items() if values is not None]
+    image, scene = (", ".join(name[:-2] for name in present if name.endswith(side)) for side in ("2d", "3d"))
     counts = f"{len(solution.points2d)} image points", f"{len(solution.points3d)} scene points"
     sides = (f"{count} with {kinds}" if kinds else count for count, kinds in zip(counts, (image, scene), strict=True))
     table.add_row("points", ", ".join(sides))
@@ -327,7 +326,7 @@ def _size(text: str) -> tuple[int, int]:
         width, height = (int(side) for side in re.split("[,x×]", text))
         return width, height
     except ValueError as error:
-        raise ValueError(f"expected --image_size as WIDTH,HEIGHT in pixels, such as 640,480, got {text!r}") from error
+        raise ValueError(f"--image_size {text!r} is not WIDTH,HEIGHT in pixels, such as 640,480") from error
 
 
 def _numbers(values: Any) -> str:

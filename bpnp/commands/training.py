@@ -1,8 +1,8 @@
-"""`bpnp fit`, `validate`, `test` and `predict`: Lightning's own command line, with this project's run folder.
+"""`bpnp fit`, `validate`, `test` and `predict`: Lightning's command line with the run folder of this project.
 
-The network is that of the checkpoint: what `--ckpt_path` or `--model.weights` describes are the defaults of
-`model.solver`, so options that a configuration leaves out are the checkpoint's, and `BlindPnPTask` refuses those that
-contradict it.
+The network is that of the checkpoint: the description in `--ckpt_path` or `--model.weights` gives the defaults of
+`model.solver`. Options that a configuration leaves out are those of the checkpoint, and `BlindPnPTask` rejects options
+that contradict it.
 """
 
 import re
@@ -59,6 +59,7 @@ class RunConfig(SaveConfigCallback):
         super().__init__(*args, **kwargs | {"save_to_log_dir": False})
 
     def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Write the configuration as YAML, and log its main options."""
         numbered = [logger.log_dir for logger in trainer.loggers if isinstance(logger, CSVLogger)]
         name = "config.yaml" if numbered or stage == "fit" else f"config-{stage}.yaml"
         text = self.parser.dump(self.config, skip_none=False)
@@ -74,11 +75,11 @@ class RunConfig(SaveConfigCallback):
 
 
 class BpnpCLI(LightningCLI):
-    """Lightning's CLI with this project's run folder: checkpoints, logs and results under trainer.default_root_dir.
+    """Lightning's CLI with the run folder of this project: checkpoints, logs and results in trainer.default_root_dir.
 
     Args:
-        command: the one to parse and run.
-        held: what has to end after the run.
+        command: Command to parse and run.
+        held: Context managers that end after the run.
     """
 
     def __init__(self, command: str, held: ExitStack, *args: Any, **kwargs: Any) -> None:
@@ -86,19 +87,21 @@ class BpnpCLI(LightningCLI):
         super().__init__(*args, **kwargs)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what this process holds: `ddp_spawn` pickles the parser, which refers to the CLI."""
+        """Leave out open context managers, because `ddp_spawn` pickles the parser, which refers to the CLI."""
         return self.__dict__ | {"held": None}
 
     def subcommands(self) -> dict[str, set[str]]:  # type: ignore[override]
-        """Return the command that is run: the parser of each takes a second to build."""
+        """Return only the command that is run, because building the parser of each takes a second."""
         return {self.command: super().subcommands()[self.command]}
 
     def init_parser(self, **kwargs: Any) -> LightningArgumentParser:
+        """Return the parser with `--config`."""
         parser = _Parser(**kwargs)
         parser.add_argument("-c", "--config", action="config", help="configuration file, or the name of a packaged one")
         return parser
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        """Add the options of the callbacks and of the pose loss, and this project's defaults."""
         self.options = parser
         parser.add_lightning_class_args(BestCheckpoint, "best_checkpoint")
         parser.add_lightning_class_args(ModelCheckpoint, "last_checkpoint")
@@ -122,9 +125,9 @@ class BpnpCLI(LightningCLI):
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
         """Parse the arguments with the network of the checkpoint as the default of `model.solver`."""
         if self.command == "test":
-            self.options.set_defaults({"verbose": False})  # our own tables in place of a list of all metrics
+            self.options.set_defaults({"verbose": False})  # disable Lightning's table of all metrics
         elif self.command == "predict":
-            self.options.set_defaults({"return_predictions": False})  # which are written
+            self.options.set_defaults({"return_predictions": False})  # PredictionWriter writes them
         self.config = parser.parse_args([word for word in args if not word.startswith("--print_config")])
         config = self.config[self.command]
         path = config.get("ckpt_path")
@@ -151,27 +154,27 @@ class BpnpCLI(LightningCLI):
         """Merge `--pose_loss` into the `PoseLossWarmup` of the configuration, or add one.
 
         Raises:
-            ValueError: a weight is set without an epoch.
+            ValueError: A weight is set without an epoch.
         """
-        given = {
+        options = {
             name: value for name, value in vars(self.config[self.command]["pose_loss"]).items() if value is not None
         }
-        if not given:
+        if not options:
             return
         trainer = self.config[self.command]["trainer"]
-        listed = trainer.callbacks or []
-        trainer.callbacks = list(listed) if isinstance(listed, list) else [listed]
+        callbacks = trainer.callbacks or []
+        trainer.callbacks = list(callbacks) if isinstance(callbacks, list) else [callbacks]
         for callback in trainer.callbacks:
             if callback.class_path.rpartition(".")[2] == PoseLossWarmup.__name__:
-                callback.init_args.update(Namespace(**given))
+                callback.init_args.update(Namespace(**options))
                 return
-        if "start_epoch" not in given:
+        if "start_epoch" not in options:
             raise ValueError(
                 "--pose_loss.weight needs --pose_loss.start_epoch, the first epoch with the pose loss. "
                 "Use --model.pose_weight for a pose loss in all epochs."
             )
         path = f"{PoseLossWarmup.__module__}.{PoseLossWarmup.__name__}"
-        settings = Namespace(start_epoch=given["start_epoch"], weight=given.get("weight"))
+        settings = Namespace(start_epoch=options["start_epoch"], weight=options.get("weight"))
         trainer.callbacks.append(Namespace(class_path=path, init_args=settings))
 
     @staticmethod
@@ -190,7 +193,7 @@ class BpnpCLI(LightningCLI):
         return LightningCLI.configure_optimizers(lightning_module, optimizer, lr_scheduler)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
-        """Add a CSV log and safe checkpoints; show progress as a bar in a terminal, else as a line an epoch."""
+        """Add a CSV log and safe checkpoints; show progress as a bar in a terminal, else as one line per epoch."""
         options = self.config_init[self.command]["trainer"]
         root = options["default_root_dir"]
         callbacks: list[Callback] = [InterruptedCheckpoint(_checkpoint_folder(root))]
@@ -216,7 +219,11 @@ class BpnpCLI(LightningCLI):
         self.held.enter_context(raise_on_interrupt(self.trainer))
 
     def before_fit(self) -> None:
-        """Hold the run folder. Raises ValueError if another process does, or if a training would be overwritten."""
+        """Lock the run folder.
+
+        Raises:
+            ValueError: Another process has locked it, or a training would be overwritten.
+        """
         root = Path(self.trainer.default_root_dir)
         if self.trainer.fast_dev_run or self.trainer.global_rank != 0:  # type: ignore[attr-defined]
             return
@@ -230,7 +237,7 @@ class BpnpCLI(LightningCLI):
             )
 
     def after_fit(self) -> None:
-        """Print where the checkpoints are."""
+        """Print the paths of the checkpoints."""
         for path in sorted(Path(_checkpoint_folder(self.trainer.default_root_dir)).glob("*.ckpt")):
             if self.trainer.is_global_zero and not self.trainer.fast_dev_run:  # type: ignore[attr-defined]
                 say(f"wrote {path}")
@@ -245,15 +252,15 @@ class BpnpCLI(LightningCLI):
     before_test = before_predict = before_validate
 
     def after_test(self) -> None:
-        """Raise ValueError if there was nothing to test: Lightning is silent."""
+        """Raise ValueError if there was nothing to test, since Lightning does not report it."""
         if not sum(self.trainer.num_test_batches):
             raise ValueError(f"{type(self.datamodule).__name__} has no problems to test on.")
 
 
 def _solver_options(path: str, model: Namespace) -> dict[str, Any] | None:
-    """The solver that a checkpoint describes as an option, class path and arguments; None if it describes none.
+    """Return the solver that a checkpoint describes as an option (class path and arguments), or None.
 
-    Classes are those of this package and those that the options of the model name: a checkpoint imports nothing.
+    Classes are those of this package and those that the options of the model name; the checkpoint imports nothing.
     """
     description = read_checkpoint(path).get("solver")
     named = [_find_class(name) for name in _class_paths(model.as_dict())]
@@ -275,7 +282,7 @@ def _solver_options(path: str, model: Namespace) -> dict[str, Any] | None:
 
 
 def _class_paths(options: Any) -> Iterator[str]:
-    """All class paths in options of any depth."""
+    """Yield all class paths in options of any depth."""
     if isinstance(options, Mapping):
         if isinstance(options.get("class_path"), str):
             yield options["class_path"]
@@ -284,9 +291,9 @@ def _class_paths(options: Any) -> Iterator[str]:
 
 
 def _find_class(class_path: str) -> type[Any]:
-    """The class of a path that the parser has accepted."""
-    found = locate(class_path)
-    return found if isinstance(found, type) else object
+    """Return the class of a path that the parser has accepted."""
+    located = locate(class_path)
+    return located if isinstance(located, type) else object
 
 
 def _log_in(logger: Any, root: str) -> None:
@@ -306,12 +313,15 @@ def _checkpoint_folder(root: str) -> str:
 
 
 def run_training(arguments: Sequence[str]) -> None:
-    """Parse the arguments of fit, validate, test or predict, and run it.
+    """Parse the arguments of fit, validate, test or predict, and run the command.
+
+    Args:
+        arguments: Words of the command line, the command first.
 
     Raises:
-        ValueError: the options are wrong, or the training diverged.
+        ValueError: The options are wrong, or the training diverged.
     """
-    for name in dir(bpnp.datamodules):  # those that are imported are listed by --help and have short names
+    for name in dir(bpnp.datamodules):  # import them all, so that --help lists them and short names are accepted
         getattr(bpnp.datamodules, name)
     own_task = _names_a_task(arguments)
     with ExitStack() as held:

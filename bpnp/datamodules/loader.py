@@ -184,9 +184,11 @@ class ProblemLoader(DataLoader[Batch]):
             yield batch
 
     def state_dict(self) -> dict[str, int]:
+        """Return the epoch and the number of batches served in it."""
         return {"epoch": getattr(self.sampler, "epoch", 0), "served": self.served}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Resume the epoch of this state at its next iteration."""
         self.resumed = dict(state_dict)
 
 
@@ -254,15 +256,19 @@ class ProblemDataModule(LightningDataModule):
                 self.datasets[part] = ProblemDataset(source, augmentation, seed=seed, fresh=fresh)
 
     def train_dataloader(self) -> DataLoader[Batch]:
+        """Return the loader of the training problems."""
         return self._loader("train")
 
     def val_dataloader(self) -> DataLoader[Batch] | list[DataLoader[Batch]]:
+        """Return the loader of the validation problems; none if there are no such problems."""
         return self._loader("val") if "val" in self.datasets or not self.datasets else []
 
     def test_dataloader(self) -> DataLoader[Batch]:
+        """Return the loader of the test problems."""
         return self._loader("test")
 
     def predict_dataloader(self) -> DataLoader[Batch]:
+        """Return the loader of the problems to predict."""
         return self._loader("predict")
 
     def _loader(self, part: str) -> DataLoader[Batch]:

@@ -139,7 +139,7 @@ class Sinkhorn(nn.Module):
     `backward_stats.unconverged` at the end of an epoch, then call `backward_stats.reset()`.
 
     Args:
-        mu: Entropy weight.
+        mu: Entropy weight of the transport.
         learn_mu: Learn the entropy weight, starting from `mu`.
         dustbin: Cost of leaving a point unmatched. Default: null, every point is matched.
         tolerance: L1 error of the marginals at which a sample stops.

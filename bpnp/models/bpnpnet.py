@@ -111,7 +111,7 @@ class BPnPNet(TrainedNet):
             return prediction
         again = match_again(prediction, cost, batch, transport=self.transport, pnp=self.pnp, widths=self.widths)
         clock.record("pnp")
-        return clock.timed(self.refinement(again, batch))
+        return clock.add_times(self.refinement(again, batch))
 
     def match(self, batch: Batch) -> Prediction:
         """Return the assignment without poses, which is all that training without the pose loss needs."""

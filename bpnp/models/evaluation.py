@@ -38,7 +38,7 @@ class Clock:
         """Record the time of an estimate."""
         self.seconds[estimate] = time.perf_counter() - self.start
 
-    def timed(self, prediction: Prediction) -> Prediction:
+    def add_times(self, prediction: Prediction) -> Prediction:
         """Return the prediction with its `seconds`; poses that were not recorded get the current time."""
         for estimate in prediction.poses.keys() - self.seconds.keys():
             self.record(estimate)

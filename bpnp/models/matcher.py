@@ -102,7 +102,7 @@ class Matcher(TrainedNet):
         pnp = pnp_pose(self.pnp, prediction.assignment, batch, ransac)
         clock.record("pnp")
         prediction = replace(prediction, poses={"ransac": ransac, "pnp": pnp})
-        return prediction if self.training else clock.timed(self.refinement(prediction, batch))
+        return prediction if self.training else clock.add_times(self.refinement(prediction, batch))
 
     def match(self, batch: Batch) -> Prediction:
         """Return the assignment and the unmatched probabilities, without poses."""

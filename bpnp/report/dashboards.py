@@ -12,7 +12,7 @@ from typing import Any
 from bpnp.report.charts import RECALLS, recall_chart
 from bpnp.report.figures import plot_problem, recall_curve
 from bpnp.report.points import ProblemPoints, read_points, utf8
-from bpnp.report.results import Results, cause_shares, read_results
+from bpnp.report.results import Results, cause_fractions, read_results
 from bpnp.report.training_curves import training_folder
 
 MOST_PICTURES = 12
@@ -89,7 +89,7 @@ def training_run_id(run: Path, config: Mapping[str, Any]) -> str | None:
 
 
 def scalars(results: Results) -> dict[str, float]:
-    """The numbers of `summary.json` under the names that a test logs."""
+    """Return the numbers of `summary.json`, under the names that a test logs."""
     estimates = results.estimates.items()
     values = {f"test/{estimate}/{key}": value for estimate, numbers in estimates for key, value in numbers.items()}
     loss = results.correspondence_loss
@@ -97,11 +97,11 @@ def scalars(results: Results) -> dict[str, float]:
 
 
 def _media(results: Results, problems: Sequence[ProblemPoints]) -> dict[str, Any]:
-    """Tables, recall curves and the worst problems."""
+    """Return tables, recall curves and pictures of the worst problems."""
     import wandb
     from pandas import DataFrame
 
-    causes = {name: cause_shares(results.of(name)) for name in results.estimates}
+    causes = {name: cause_fractions(results.of(name)) for name in results.estimates}
     tables = {
         "quartiles": DataFrame.from_dict(results.estimates, orient="index").reset_index(names="estimate"),
         "causes": DataFrame.from_dict(causes, orient="index").reset_index(names="estimate"),

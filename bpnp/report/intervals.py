@@ -63,7 +63,7 @@ def bootstrap(values: NDArray[np.float64], statistic: Statistic = median, *, see
     Raises:
         ValueError: There are no values, or one is NaN.
     """
-    clean = _checked(values)
+    clean = _check_values(values)
     drawn = statistic(clean[_draws(len(clean), seed)])
     return _interval(float(statistic(clean)), drawn)
 
@@ -86,22 +86,22 @@ def paired_difference(
     """
     if len(first) != len(second):
         raise ValueError(f"a paired difference needs the same problems, got {len(first)} and {len(second)}")
-    one, other = _checked(first), _checked(second)
+    one, other = _check_values(first), _check_values(second)
     draws = _draws(len(one), seed)
     drawn = statistic(other[draws]) - statistic(one[draws])
     return _interval(float(statistic(other) - statistic(one)), drawn)
 
 
-def quantile(fraction: float) -> Statistic:
+def quantile(probability: float) -> Statistic:
     """Return the statistic that computes a quantile.
 
     Args:
-        fraction: Quantile in [0, 1].
+        probability: Quantile in [0, 1].
     """
-    return lambda values: np.asarray(np.quantile(values, fraction, axis=-1))
+    return lambda values: np.asarray(np.quantile(values, probability, axis=-1))
 
 
-def share(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def fraction(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the mean along the last axis, the fraction of ones among zeros and ones."""
     return np.asarray(np.mean(values, axis=-1))
 
@@ -110,7 +110,7 @@ def _draws(count: int, seed: int) -> NDArray[np.int64]:
     return np.random.default_rng(seed).integers(0, count, (DRAWS, count))
 
 
-def _checked(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _check_values(values: NDArray[np.float64]) -> NDArray[np.float64]:
     array = np.asarray(values, np.float64)
     if not len(array) or np.isnan(array).any():
         raise ValueError(f"a bootstrap needs numbers, got {len(array)} with {int(np.isnan(array).sum())} NaN")
@@ -147,7 +147,7 @@ def interval_cells(runs: Mapping[str, Results]) -> list[list[str]]:
         angles = _angles(tested)
         rotation = bootstrap(angles)
         within = [row.rotation_error_deg < JOINT[0] and row.translation_error < JOINT[1] for row in tested]
-        recall = bootstrap(100 * np.array(within, float), share)
+        recall = bootstrap(100 * np.array(within, float), fraction)
         paired = ["", ""]
         if line != first and tested_problems(runs[line.run]) == tested_problems(runs[first.run]):
             difference = paired_difference(_angles(runs[first.run].of(first.estimate)), angles)

@@ -27,7 +27,15 @@ from bpnp.report.groups import differences, group_rows
 from bpnp.report.intervals import CAPTION as INTERVALS
 from bpnp.report.intervals import HEADERS, interval_cells
 from bpnp.report.points import Array, ProblemPoints, read_points, utf8
-from bpnp.report.results import CAUSES, PLAUSIBLE_INLIERS, SOLVED_DEG, ProblemRow, Results, cause_shares, read_results
+from bpnp.report.results import (
+    CAUSES,
+    PLAUSIBLE_INLIERS,
+    SOLVED_DEG,
+    ProblemRow,
+    Results,
+    cause_fractions,
+    read_results,
+)
 from bpnp.report.tables import CAPTION, LOADING, RESULT_COLUMNS, Line, best_texts, cell, lines_of, named_runs, run_rows
 from bpnp.report.terminal import DASHES, INKS, Paper
 from bpnp.report.training_curves import training_curves, training_folder
@@ -170,7 +178,7 @@ def describe_run(results: Results) -> str:
     spans = {what: sorted(getattr(row, key) for row in rows) for key, what in SIZES.items()}
     sizes = (f"{span[0] if span[0] == span[-1] else f'{span[0]} to {span[-1]}'} {what}" for what, span in spans.items())
     best, values = min(results.estimates.items(), key=lambda item: item[1]["rotation_q2_deg"])
-    solved = f"{100 * cause_shares(results.of(best))['solved']:.1f} % within {SOLVED_DEG:g} deg"
+    solved = f"{100 * cause_fractions(results.of(best))['solved']:.1f} % within {SOLVED_DEG:g} deg"
     outcome = f"{best}: median rotation error {cell(RESULT_COLUMNS[1], values)} deg, {solved}"
     return f"{len(rows)} problems with {', '.join(sizes)}. {outcome}"
 
@@ -192,7 +200,7 @@ def _settings(settings: Mapping[str, Any]) -> Iterable[str]:
 
 def _shares(results: Results, estimate: str) -> tuple[list[float], float]:
     """Return the percentages of problems with each cause, and of those that converged."""
-    shares = np.array(list(cause_shares(results.of(estimate)).values()))
+    shares = np.array(list(cause_fractions(results.of(estimate)).values()))
     return (100 * shares).tolist(), 100 * results.estimates[estimate].get("converged", float("nan"))
 
 

@@ -197,7 +197,7 @@ def count_inliers(pose: Pose, batch: Batch, *, threshold: float = INLIER_THRESHO
     return counts
 
 
-def cause_shares(rows: Iterable[ProblemRow]) -> dict[str, float]:
+def cause_fractions(rows: Iterable[ProblemRow]) -> dict[str, float]:
     """Return the fraction of the rows with each cause, in the order of `CAUSES`; they sum to one.
 
     Raises:

@@ -125,13 +125,13 @@ class Column:
     Attributes:
         key: Key of its number.
         header: Text above it.
-        share: True for a fraction, shown in %, of which more is better.
-        count: True for a count. Other columns are errors or times, of which less is better.
+        percent: True for a fraction, shown in %; larger is better.
+        count: True for a count. In other columns, errors and times, smaller is better.
     """
 
     key: str
     header: str
-    share: bool = False
+    percent: bool = False
     count: bool = False
 
 
@@ -165,11 +165,11 @@ QUARTILES = tuple(
     Column(f"{error}_q{i}{unit}", f"{short}\nQ{i}") for error, unit, short in ERRORS for i in (1, 2, 3)
 )  # fmt: skip
 RECALLS = (
-    Column("recall_joint_15deg_0.5", "15deg\n0.5", share=True),
-    Column("recall_joint_10deg_1", "10deg\n1.0", share=True),
+    Column("recall_joint_15deg_0.5", "15deg\n0.5", percent=True),
+    Column("recall_joint_10deg_1", "10deg\n1.0", percent=True),
 )
 SECONDS = Column("seconds_mean", "sec")
-RESULT_COLUMNS = (*QUARTILES, *RECALLS, Column("found", "found\n%", share=True), SECONDS)
+RESULT_COLUMNS = (*QUARTILES, *RECALLS, Column("found", "found\n%", percent=True), SECONDS)
 FILE_COLUMNS = (Column("problems", "problems", count=True), *RESULT_COLUMNS)
 HEADS = ("Rotation Error", "Translation Error", "Reproj. Error")
 LATEX_COLUMNS = {
@@ -246,7 +246,7 @@ def cell(column: Column, values: Values) -> str:
         return value or "-"
     if column.count:
         return f"{value:.0f}"
-    return f"{100 * value:.1f}" if column.share else number(value)
+    return f"{100 * value:.1f}" if column.percent else number(value)
 
 
 def best_texts(columns: Sequence[Column], rows: Sequence[Row]) -> dict[tuple[Hashable, str], str]:
@@ -264,7 +264,7 @@ def best_texts(columns: Sequence[Column], rows: Sequence[Row]) -> dict[tuple[Has
             numbers = [value for values in alike if isinstance(value := values.get(column.key), float)]
             finite = [value for value in numbers if math.isfinite(value)]
             if len(alike) > 1 and finite and not column.count:
-                best[problems, column.key] = cell(column, {column.key: (max if column.share else min)(finite)})
+                best[problems, column.key] = cell(column, {column.key: (max if column.percent else min)(finite)})
     return best
 
 
@@ -297,11 +297,11 @@ def table_frame(rows: Sequence[Row]) -> "DataFrame":
     """Return all numbers as a DataFrame, fractions from 0 to 1, the paper's as published; `source` separates them."""
     from pandas import DataFrame
 
-    def full(column: Column, row: Row) -> float | int | str | None:
+    def value_of(column: Column, row: Row) -> float | int | str | None:
         value = row.values.get(column.key)
-        return float(value) / 100 if column.share and isinstance(value, str) else value  # printed in percent
+        return float(value) / 100 if column.percent and isinstance(value, str) else value  # published in percent
 
-    records = [[row.label, row.source, row.rho, *(full(column, row) for column in FILE_COLUMNS)] for row in rows]
+    records = [[row.label, row.source, row.rho, *(value_of(column, row) for column in FILE_COLUMNS)] for row in rows]
     return DataFrame(records, columns=["method", "source", "rho", *(c.key for c in FILE_COLUMNS)], dtype=object)
 
 

@@ -86,9 +86,11 @@ class PoseLossWarmup(Callback):
         pl_module.pose_weight = self.configured  # type: ignore[assignment]
 
     def state_dict(self) -> dict[str, Any]:
+        """Return the epoch of the switch and the options."""
         return {"switched_at": self.switched_at, "start_epoch": self.start_epoch, "weight": self.weight}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore the epoch of the switch, and print options that differ from the saved ones."""
         self.switched_at = state_dict["switched_at"]
         for name in ("start_epoch", "weight"):  # not saved by version 0.2
             saved, own = state_dict.get(name, getattr(self, name)), getattr(self, name)
@@ -103,6 +105,7 @@ class ProgressLines(Callback):
     """
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Print the epoch, the step and the main metrics."""
         names = [name for name in LINE if name in trainer.callback_metrics] or list(trainer.callback_metrics)[:4]
         values = ", ".join(f"{name} {float(trainer.callback_metrics[name]):.4g}" for name in names)
         last = f"/{trainer.max_epochs}" if (trainer.max_epochs or 0) > 0 else ""
@@ -111,11 +114,13 @@ class ProgressLines(Callback):
     def on_test_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
     ) -> None:
+        """Print the number of finished batches after each tenth."""
         self._print_tenth(trainer, batch_idx + 1, sum(trainer.num_test_batches))
 
     def on_predict_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
     ) -> None:
+        """Print the number of finished batches after each tenth."""
         self._print_tenth(trainer, batch_idx + 1, sum(trainer.num_predict_batches))
 
     def _print_tenth(self, trainer: Trainer, done: int, total: int | float) -> None:
@@ -163,11 +168,13 @@ class TrainingMonitor(Callback):
     def on_validation_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
     ) -> None:
+        """Keep the first validation problems."""
         if batch_idx == 0 and self.watched is None:
             some = map_tensors(batch, lambda values: values[: self.problems].cpu())
             self.watched = replace(some, ids=batch.ids[: self.problems])
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Log the values, and warn if the features have collapsed."""
         if self.watched is None or trainer.sanity_checking:
             return
         batch = self.watched.to(pl_module.device)
@@ -227,18 +234,21 @@ class ResultsWriter(Callback):
         self.folder = folder
 
     def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start with no rows, and check which results will be replaced."""
         self.rows, self.losses, self.points, self.numbers = [], {}, [], set()
         self._check_replaced(trainer)
 
     def on_test_batch_start(
         self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int, *_: int
     ) -> None:
+        """Number the problems over all batches."""
         if isinstance(batch, Batch):  # a user's own task may have other batches
             number_globally(batch, self.numbers, processes=trainer.world_size)
 
     def on_test_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
     ) -> None:
+        """Keep the rows and the points of the batch."""
         if not isinstance(outputs, dict) or not {"prediction", "seconds", "losses"} <= outputs.keys():
             return  # a user's own task
         errors = outputs.get("errors")  # absent in some users' own tasks
@@ -248,6 +258,7 @@ class ResultsWriter(Callback):
             self.losses |= dict(zip(batch.index.tolist(), outputs["losses"].tolist(), strict=True))
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Gather the rows of all processes, write the files, and print other logged metrics."""
         gathered = _gather((self.rows, self.losses, self.points))
         table_metrics = getattr(pl_module, "table_metrics", ())
         others = {name: value for name, value in trainer.callback_metrics.items() if name not in table_metrics}

@@ -44,6 +44,7 @@ class SafeCheckpointIO(TorchCheckpointIO):
     """
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        """Write a checkpoint atomically."""
         content = io.BytesIO()
         torch.save(checkpoint if "state_dict" in checkpoint else {WEIGHTS_ALONE: dict(checkpoint)}, content)
         with write_atomically(Path(path)) as temporary:
@@ -52,6 +53,7 @@ class SafeCheckpointIO(TorchCheckpointIO):
     def load_checkpoint(
         self, path: Any, map_location: Any = lambda storage, loc: storage, weights_only: bool | None = None
     ) -> dict[str, Any]:
+        """Read a checkpoint as data, in the form of this version."""
         content = read_data(path, map_location=map_location)
         if WEIGHTS_ALONE in content:
             return dict(content[WEIGHTS_ALONE])
@@ -71,6 +73,7 @@ class InterruptedCheckpoint(Callback):
         self.path = Path(folder) / f"{INTERRUPTED}.ckpt"
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Save the checkpoint of an interrupted training."""
         if trainer.world_size > 1 and not isinstance(exception, KeyboardInterrupt):
             return  # saving needs all processes, and those without the error would not take part
         if trainer.state.fn == "fit" and trainer.global_step > 0 and not trainer.fast_dev_run:  # type: ignore[attr-defined]
@@ -78,6 +81,7 @@ class InterruptedCheckpoint(Callback):
             rank_zero_info(f"stopped in epoch {trainer.current_epoch}; continue with --ckpt_path {self.path}")
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Remove the checkpoint of an earlier interruption."""
         if trainer.is_global_zero and not trainer.fast_dev_run:  # type: ignore[attr-defined]
             self.path.unlink(missing_ok=True)
 
@@ -93,6 +97,7 @@ class BestCheckpoint(ModelCheckpoint):
     has_pose_loss: bool | None = None  # True if the last epoch had the pose loss
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Restart the choice when the pose loss joins, and keep the network before it."""
         has_pose_loss = float(getattr(pl_module, "pose_weight", 0)) > 0
         if has_pose_loss and self.has_pose_loss is False:
             if self.dirpath is not None and not trainer.fast_dev_run:  # type: ignore[attr-defined]
@@ -103,9 +108,11 @@ class BestCheckpoint(ModelCheckpoint):
         self.has_pose_loss = has_pose_loss
 
     def state_dict(self) -> dict[str, Any]:
+        """Return Lightning's state, and whether the last epoch had the pose loss."""
         return super().state_dict() | {"has_pose_loss": self.has_pose_loss}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore the state."""
         super().load_state_dict(state_dict)
         self.has_pose_loss = state_dict["has_pose_loss"]
 

@@ -99,6 +99,7 @@ class PredictionWriter(BasePredictionWriter):
         return Path(self.folder or trainer.default_root_dir) / f"predictions.{self.format}"
 
     def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Raise ValueError if the file exists and must not be replaced."""
         self.rows = []
         if self.path(trainer).exists() and not self.overwrite and not trainer.fast_dev_run:  # type: ignore[attr-defined]
             raise ValueError(
@@ -116,10 +117,12 @@ class PredictionWriter(BasePredictionWriter):
         batch_idx: int,
         dataloader_idx: int,
     ) -> None:
+        """Keep the poses of the batch."""
         if isinstance(prediction, Prediction) and prediction.ids:  # a user's own task may predict something else
             self.rows += pose_rows(prediction)
 
     def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Gather the poses of all processes and write the file."""
         gathered: list[Any] = [None] * trainer.world_size
         if trainer.world_size > 1:
             torch.distributed.all_gather_object(gathered, self.rows)

@@ -203,12 +203,15 @@ class BlindPnPTask(LightningModule):
         return task
 
     def forward(self, batch: Batch) -> Prediction:
+        """Return the prediction of the solver."""
         return self.solver(batch)
 
     def on_train_batch_start(self, batch: object, batch_idx: int) -> None:
+        """Check the batch."""
         check_batch(batch)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """Return the loss of a batch, NaN if it is not finite, and log its parts."""
         needs_pose = self.pose_weight > 0 or (self.loss is not None and getattr(self.loss, "needs_pose", True))
         solve = self.solver if needs_pose else getattr(self.solver, "match", self.solver)
         prediction = solve(batch)
@@ -221,10 +224,11 @@ class BlindPnPTask(LightningModule):
         return loss * torch.where(loss.isfinite(), 1.0, torch.nan)
 
     def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
+        """Return the prediction, its seconds, the loss of each problem, and the errors of each estimate."""
         return self._evaluate(batch, "val", first=batch_idx == 0)
 
     def test_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
-        """Return the prediction and its seconds, the loss of each problem, and the errors of each estimate."""
+        """Return the prediction, its seconds, the loss of each problem, and the errors of each estimate."""
         return self._evaluate(batch, "test", first=batch_idx == 0)
 
     def predict_step(self, batch: Batch, batch_idx: int) -> Prediction:
@@ -232,6 +236,7 @@ class BlindPnPTask(LightningModule):
         return in_scene_frame(self.solver(batch), batch)
 
     def on_validation_epoch_start(self) -> None:
+        """Forget the numbers of the problems of the last epoch."""
         self.numbers.clear()
 
     def on_validation_batch_start(self, batch: Any, batch_idx: int, dataloader_idx: int = 0) -> None:
@@ -386,6 +391,7 @@ class BlindPnPTask(LightningModule):
         checkpoint["pose_weight"] = self.pose_weight
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Load the solver's weights, and restore the counts of skipped steps."""
         checkpoint |= upgrade(checkpoint)  # not done yet by a Trainer without SafeCheckpointIO
         self._adopt(checkpoint)
         self._check_pose_loss_continues(checkpoint)
@@ -413,9 +419,11 @@ class BlindPnPTask(LightningModule):
             rank_zero_info(f"the network is that of the checkpoint with {', '.join(adjusted)}")
 
     def on_validation_epoch_end(self) -> None:
+        """Log the metrics of the validation."""
         self._log_metrics("val")
 
     def on_test_epoch_end(self) -> None:
+        """Log the metrics of the test."""
         self._log_metrics("test")
 
     def _evaluate(self, batch: Batch, stage: Stage, *, first: bool) -> dict[str, Any]:

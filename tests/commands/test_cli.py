@@ -30,7 +30,7 @@ def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     ("part", "told"),
     [
         ("solver.help=bpnp.models.BPnPNet", "cost (b, m, n) and both masks to the assignment"),
-        ("solver.transport.help=bpnp.layers.Sinkhorn", "entropy weight of the transport"),
+        ("solver.transport.help=bpnp.layers.Sinkhorn", "Entropy weight of the transport"),
     ],
 )
 def test_options_of_the_network_and_its_parts_are_explained(
@@ -74,10 +74,10 @@ def test_options_of_the_network_and_its_parts_are_explained(
         (["report", "nowhere"], "nowhere is no results folder"),
         (
             ["view", "nowhere"],
-            "expected the folder of a test or the JSON of a solution, got nowhere, which is not there",
+            "nowhere does not exist; give the folder of a test or the JSON of a solution",
         ),
         (["view", __file__], "test_cli.py: expected"),
-        (["view", __file__, "3"], "expected no problem beside the solution"),
+        (["view", __file__, "3"], "is one solution, which has no problem '3'"),
         (
             ["report", "nowhere", "--paper", "modelnet"],
             "Literal['modelnet40', 'megadepth'] Given value: modelnet",

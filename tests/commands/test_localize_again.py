@@ -72,8 +72,8 @@ def test_the_same_photo_is_kept_and_the_output_says_so(place: Place, capsys: pyt
     shown = " ".join(capsys.readouterr().out.split())
     assert "kept 2" not in shown
     # What the columns mean is said, once.
-    assert shown.count("error px: mean distance between the keypoints of the matches and their points") == 1
-    assert shown.count("log10 false: logarithm of the number of poses that would fit as well by chance") == 1
+    assert shown.count("error px: mean distance between matched keypoints and their projected points") == 1
+    assert shown.count("log10 false: log10 of the number of false alarms") == 1
     place.run("a.png", "b.png")
     assert "kept 2 of 2 photos, solved before with the same content and options" in capsys.readouterr().out
     assert file.stat().st_mtime_ns == before

@@ -33,9 +33,9 @@ def test_commands_write_what_they_say(
     capsys.readouterr()
     main(["report", str(tmp_path / "run"), "--paper", "megadepth"])
     assert "Lc Lp" in capsys.readouterr().out
-    assert "got 'nothing'; try one of" in fails("view", str(tmp_path / "run"), "nothing")
+    assert "'nothing' is in the names of no problem in" in fails("view", str(tmp_path / "run"), "nothing")
     (tmp_path / "run" / "test" / "points.npz").unlink()
-    assert "expected points.npz in" in fails("view", str(tmp_path / "run"))
+    assert "has no points.npz; run `bpnp test` again" in fails("view", str(tmp_path / "run"))
 
 
 def test_every_problem_of_a_test_can_be_viewed_by_name(tmp_path: Path, fails: Callable[..., str]) -> None:
@@ -44,6 +44,6 @@ def test_every_problem_of_a_test_can_be_viewed_by_name(tmp_path: Path, fails: Ca
     write_points(tmp_path / "test", [thin(drawn_problem(i, names[i])) for i in range(9)])
     main(["view", str(tmp_path), "scene/0004", "0007"])
     assert {path.name for path in (tmp_path / "test" / "views").iterdir()} == {"scene_0004.png", "scene_0007.png"}
-    assert "got 'scene'; try one of scene/000" in fails("view", str(tmp_path), "scene")
+    assert "give one of scene/000" in fails("view", str(tmp_path), "scene")
     several = ["view", str(tmp_path), "scene/0004", "0007", "--output", "x.png"]
-    assert "expected one problem with --output, got 2" in fails(*several)
+    assert "--output takes one problem, and 2 are given" in fails(*several)

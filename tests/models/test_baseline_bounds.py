@@ -19,9 +19,9 @@ from bpnp.models.baselines.branch_and_bound import (
 from bpnp.models.baselines.gosma import GOSMA, RayMixture, SceneMixture, distance, squared_norm
 
 
-def whole(turn: Tensor, turn_half: float, place: Tensor, place_half: float) -> Boxes:
+def whole(turn: Tensor, rotvec_half: float, place: Tensor, centre_half: float) -> Boxes:
     return Boxes(
-        turn.reshape(1, 3), turn.new_full((1,), turn_half), place.reshape(1, 3), turn.new_full((1, 3), place_half)
+        turn.reshape(1, 3), turn.new_full((1,), rotvec_half), place.reshape(1, 3), turn.new_full((1, 3), centre_half)
     )
 
 
@@ -31,15 +31,15 @@ def test_no_pose_of_a_box_turns_a_direction_by_more_than_its_uncertainty() -> No
     halves = 10 ** (-2 * torch.rand(1000, 1, generator=generator).double()) * torch.tensor([[0.3, 1.0, 0.6]]).double()
     boxes = Boxes(turn, halves[:, 0], 3 * place, halves)
     turning, moving = rotation_uncertainty(boxes), translation_uncertainty(boxes, points)
-    towards = points - boxes.place.unsqueeze(1)
+    towards = points - boxes.centre.unsqueeze(1)
     largest = torch.zeros(2)
     for trial in range(32):
         turned, moved = (2 * torch.rand(1000, 3, generator=generator).double() - 1 for _ in range(2))
         if trial % 2:  # corners
             turned, moved = turned.sign(), moved.sign()
-        rotation = roma.rotvec_to_rotmat(boxes.turn + turned * boxes.turn_half.unsqueeze(-1))
+        rotation = roma.rotvec_to_rotmat(boxes.rotvec + turned * boxes.rotvec_half.unsqueeze(-1))
         angles = angle_between(towards @ rotation.mT, towards @ boxes.rotation.mT) / turning.unsqueeze(-1)
-        shifts = angle_between(points - (boxes.place + moved * halves).unsqueeze(1), towards) / moving
+        shifts = angle_between(points - (boxes.centre + moved * halves).unsqueeze(1), towards) / moving
         largest = torch.maximum(largest, torch.stack([angles.max(), shifts.max()]))
     assert (largest <= 1).all()
     assert (largest > 0.9).all()  # bounds far above everything would pass as well
@@ -70,14 +70,14 @@ def test_gosma_finds_the_planted_pose_with_a_certificate_that_a_grid_confirms() 
     assert found.certified
     # The outliers' weight is missing elsewhere, which moves the optimum a little.
     assert float(roma.rotmat_geodesic_distance(found.rotation, rotation)) < math.radians(1)
-    assert float((found.place - place).norm()) < 0.1
+    assert float((found.centre - place).norm()) < 0.1
     steps = torch.linspace(-1, 1, 6).double()
     grid = torch.cartesian_prod(steps, steps, steps)
     norm = float(squared_norm(rays))
     lowest = math.inf
     for shift in grid:
         turned = roma.rotvec_to_rotmat(0.45 * grid)
-        values = distance(scene, rays, turned, (domain.place + 0.2 * shift).expand(len(grid), 3))
+        values = distance(scene, rays, turned, (domain.centre + 0.2 * shift).expand(len(grid), 3))
         lowest = min(lowest, float(values.min()) / norm + 1)
     assert found.bound <= lowest
     assert found.value <= lowest  # no grid point beats it
@@ -94,12 +94,12 @@ def test_gopac_finds_the_planted_inliers_with_a_certificate_that_a_grid_confirms
     assert found.value == found.bound
     count = round((1 - found.value) * len(rays))
     assert count >= 7
-    assert int(within(rays, points, found.rotation, found.place, 0.01).any(-1).sum()) == count
+    assert int(within(rays, points, found.rotation, found.centre, 0.01).any(-1).sum()) == count
     steps = torch.linspace(-1, 1, 7).double()
     grid = torch.cartesian_prod(steps, steps, steps)
     most = 0
     for shift in grid:
-        directions = torch.nn.functional.normalize(points - domain.place[0] - 0.15 * shift, dim=-1)
-        cosine = (rays @ roma.rotvec_to_rotmat(domain.turn + 0.15 * grid)) @ directions.mT
+        directions = torch.nn.functional.normalize(points - domain.centre[0] - 0.15 * shift, dim=-1)
+        cosine = (rays @ roma.rotvec_to_rotmat(domain.rotvec + 0.15 * grid)) @ directions.mT
         most = max(most, int((cosine >= math.cos(0.01)).any(-1).sum(-1).max()))
     assert most <= count

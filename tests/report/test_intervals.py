@@ -9,7 +9,7 @@ from report_data import rows
 from scipy import stats
 
 from bpnp.report import ProblemRow, Results
-from bpnp.report.intervals import bootstrap, interval_cells, paired_difference, quantile, share
+from bpnp.report.intervals import bootstrap, fraction, interval_cells, paired_difference, quantile
 from bpnp.report.results import summarise
 
 
@@ -29,7 +29,7 @@ def test_nineteen_of_twenty_intervals_hold_the_true_share() -> None:
     rng = np.random.default_rng(0)
     held = 0
     for seed in range(200):
-        found = bootstrap((rng.random(100) < 0.7).astype(float), share, seed=seed)
+        found = bootstrap((rng.random(100) < 0.7).astype(float), fraction, seed=seed)
         held += found.low <= 0.7 <= found.high
     assert 180 <= held <= 199
 

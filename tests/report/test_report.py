@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.metrics import PoseErrors
 from bpnp.report import ProblemRow, read_results, write_results
-from bpnp.report.results import cause_shares, count_inliers, rows_from
+from bpnp.report.results import cause_fractions, count_inliers, rows_from
 from bpnp.types import Batch, Pose, Prediction, SolveStats
 
 HOSTILE = [
@@ -203,7 +203,7 @@ def test_each_row_has_the_cause_that_its_numbers_say() -> None:
     }
     planted = [dataclasses.replace(good, **changes) for changes in cases.values()]  # type: ignore[arg-type]
     assert [row.cause for row in planted] == list(cases)
-    shares = cause_shares([*planted, planted[0]])
+    shares = cause_fractions([*planted, planted[0]])
     assert shares == {cause: (2 if cause == "solved" else 1) / 6 for cause in cases}
     with pytest.raises(ValueError, match="no rows to count"):
-        cause_shares([])
+        cause_fractions([])

@@ -42,9 +42,17 @@ class ColmapError(ValueError):
 
 
 class CameraRecord(NamedTuple):
+    """Record of a camera.
+
+    Attributes:
+        model: Name of the camera model.
+        params: Parameters in COLMAP's order.
+        size: Width and height of the image, pixels.
+    """
+
     model: str
     params: NDArray[np.float64]
-    size: tuple[int, int]  # width and height of the image, pixels
+    size: tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -147,7 +155,7 @@ def _rewrite_text(paths: list[Path], contents: list[bytes], target: str) -> None
         header = re.search(rb"^# Number of \w+: (\d+)", content, re.MULTILINE)
         records = sum(not line.startswith(b"#") for line in content.splitlines()) // FILES[path.stem]
         if path in without_break and (not header or int(header[1]) != records):
-            raise _truncated(path, content)
+            raise _truncation_error(path, content)
         if header and int(header[1]) > records:
             raise ColmapError(
                 f"{path} is truncated: it has {records} of the {int(header[1])} records in its header; copy the model "
@@ -161,7 +169,7 @@ def _rewrite_text(paths: list[Path], contents: list[bytes], target: str) -> None
         for path in without_break:
             content = contents[paths.index(path)]
             if not _last_record_agrees(model, path.stem, list(names), content.splitlines()[-1].split()):
-                raise _truncated(path, content)
+                raise _truncation_error(path, content)
         model.write_binary(target)
     except ValueError as error:
         if isinstance(error, ColmapError):
@@ -170,7 +178,7 @@ def _rewrite_text(paths: list[Path], contents: list[bytes], target: str) -> None
         raise ColmapError(f"pycolmap cannot read the model in {files}: {error}") from error
 
 
-def _truncated(path: Path, content: bytes) -> "ColmapError":
+def _truncation_error(path: Path, content: bytes) -> "ColmapError":
     return ColmapError(
         f"{path} ends without a line break, at {content[-20:]!r}, and looks truncated; copy the model again, or add "
         "the line break if the file is whole"
@@ -223,12 +231,15 @@ class _Cursor:
         return start
 
     def take(self, layout: struct.Struct) -> tuple:
+        """Read one struct."""
         return layout.unpack_from(self.content, self.skip(layout.size))
 
     def array(self, dtype: np.dtype, count: int) -> NDArray:
+        """Return a view of the next `count` items."""
         return np.frombuffer(self.content, dtype, count, self.skip(dtype.itemsize * count))
 
     def string(self) -> str:
+        """Read a string that ends with a zero byte."""
         end = self.content.find(b"\0", self.offset)
         start = self.skip((end if end >= 0 else len(self.content)) - self.offset + 1)
         return self.content[start:end].decode(errors="backslashreplace")

@@ -50,6 +50,7 @@ class RandomRansac(SingleSolver):
         self.max_hypotheses = math.inf if max_hypotheses is None else max_hypotheses
 
     def solve(self, problem: SingleProblem, deadline: Deadline) -> Answer:
+        """Return the pose with the most inliers among random triples."""
         sides, rays = (problem.points2d, problem.points3d), bearings(problem.points2d)
         m, n = map(len, sides)
         seed, best, tried, most, matches = 2 * problem.seed(self.seed), None, 0, 0, 0

@@ -25,41 +25,41 @@ from bpnp.models.baselines.single_problem import Answer, SingleProblem, SingleSo
 DOMAIN = 1.5  # half side of the cube of camera centres, weak-perspective distances
 CHUNK = 2**22  # angles computed at a time
 ROUNDING = 1e-9  # rounding error of a cosine
-SMALLEST_TURN = 1e-3  # half side of the smallest cubes of rotation vectors, radians
-SMALLEST_PLACE = 1e-3  # half side of the smallest boxes of camera centres, in root mean square radii of the scene
+SMALLEST_ROTATION = 1e-3  # half side of the smallest cubes of rotation vectors, radians
+SMALLEST_CENTRE = 1e-3  # half side of the smallest boxes of camera centres, in root mean square radii of the scene
 
 
 class Boxes(NamedTuple):
     """Boxes of poses: centres and half sides. The cubes of rotation vectors cover the ball of radius pi.
 
     Attributes:
-        turn: Centres of the rotation vectors (b, 3), radians.
-        turn_half: Half sides of their cubes (b,), radians.
-        place: Centres of the camera centres (b, 3).
-        place_half: Half sides of their cuboids (b, 3).
+        rotvec: Centres of the rotation vectors (b, 3), radians.
+        rotvec_half: Half sides of their cubes (b,), radians.
+        centre: Centres of the camera centres (b, 3).
+        centre_half: Half sides of their cuboids (b, 3).
     """
 
-    turn: Float[Tensor, "b 3"]
-    turn_half: Float[Tensor, " b"]
-    place: Float[Tensor, "b 3"]
-    place_half: Float[Tensor, "b 3"]
+    rotvec: Float[Tensor, "b 3"]
+    rotvec_half: Float[Tensor, " b"]
+    centre: Float[Tensor, "b 3"]
+    centre_half: Float[Tensor, "b 3"]
 
     @property
     def rotation(self) -> Float[Tensor, "b 3 3"]:
         """Rotations at the centres of the boxes (b, 3, 3)."""
-        return roma.rotvec_to_rotmat(self.turn)
+        return roma.rotvec_to_rotmat(self.rotvec)
 
     def pick(self, index: Tensor) -> "Boxes":
         """Return the boxes at the given indices."""
         return Boxes(*(values[index] for values in self))
 
 
-class Found(NamedTuple):
+class BestPose(NamedTuple):
     """Best pose of a search, camera = R (p - c).
 
     Attributes:
         rotation: R (3, 3), None if there is no pose.
-        place: c (3,).
+        centre: c (3,).
         value: Value of the pose, smaller is better.
         bound: Lower bound of the value over all poses of the domain.
         boxes: Number of boxes searched.
@@ -67,7 +67,7 @@ class Found(NamedTuple):
     """
 
     rotation: Float[Tensor, "3 3"] | None
-    place: Float[Tensor, "3"]
+    centre: Float[Tensor, "3"]
     value: float
     bound: float
     boxes: int
@@ -87,28 +87,34 @@ class BranchAndBound(SingleSolver):
         self.max_boxes = math.inf if max_boxes is None else max_boxes
 
     def solve(self, problem: SingleProblem, deadline: Deadline) -> Answer:
-        centre = problem.points3d.mean(0)
-        radius = root_mean_square((problem.points3d - centre).norm(dim=-1))
-        points = (problem.points3d - centre) / radius
-        away = weak_perspective_distance(problem.points2d, points)
+        """Normalise the scene, search, and return the pose in scene coordinates."""
+        scene_centre = problem.points3d.mean(0)
+        radius = root_mean_square((problem.points3d - scene_centre).norm(dim=-1))
+        points = (problem.points3d - scene_centre) / radius
+        camera_distance = weak_perspective_distance(problem.points2d, points)
         zero = points.new_zeros(1, 3)
-        domain = Boxes(zero, points.new_full((1,), math.pi), zero, points.new_full((1, 3), DOMAIN * away))
-        found = self.search(bearings(problem.points2d), points, domain, away, deadline)
+        domain = Boxes(zero, points.new_full((1,), math.pi), zero, points.new_full((1, 3), DOMAIN * camera_distance))
+        found = self.search(bearings(problem.points2d), points, domain, camera_distance, deadline)
         if found.rotation is None:
             return Answer(iterations=found.boxes)
-        translation = -found.rotation @ (radius * found.place + centre)
+        translation = -found.rotation @ (radius * found.centre + scene_centre)
         return Answer((found.rotation, translation), found.boxes, found.value, found.certified)
 
     def search(
-        self, rays: Float[Tensor, "m 3"], points: Float[Tensor, "n 3"], domain: Boxes, away: float, deadline: Deadline
-    ) -> Found:
+        self,
+        rays: Float[Tensor, "m 3"],
+        points: Float[Tensor, "n 3"],
+        domain: Boxes,
+        camera_distance: float,
+        deadline: Deadline,
+    ) -> BestPose:
         """Return the best pose, whose value is its residual, for a scene of root mean square radius 1 at the origin.
 
         Args:
             rays: Bearings (m, 3).
             points: Scene points (n, 3).
             domain: One box that holds all poses to search.
-            away: Weak-perspective distance of the camera.
+            camera_distance: Weak-perspective distance of the camera.
             deadline: Time limit.
         """
         raise NotImplementedError
@@ -164,7 +170,7 @@ def best_first(
 
 def rotation_uncertainty(boxes: Boxes) -> Float[Tensor, " b"]:
     """Return psi_r >= angle(R x, R_0 x) for all R in the cube around R_0 and all x: sqrt(3) times its half side."""
-    return (math.sqrt(3) * boxes.turn_half).clamp_max(math.pi)
+    return (math.sqrt(3) * boxes.rotvec_half).clamp_max(math.pi)
 
 
 def translation_uncertainty(boxes: Boxes, points: Float[Tensor, "a 3"]) -> Float[Tensor, "b a"]:
@@ -173,40 +179,40 @@ def translation_uncertainty(boxes: Boxes, points: Float[Tensor, "a 3"]) -> Float
     Directions to the points of a convex set lie in the cone that its corners span. Their angle to an axis is therefore
     largest at a corner, as long as that is below pi/2; otherwise the bound is pi.
     """
-    towards = points - boxes.place.unsqueeze(1)
+    towards = points - boxes.centre.unsqueeze(1)
     cosine = torch.ones_like(towards[..., 0])
     for signs in itertools.product((-1.0, 1.0), repeat=3):
-        corner = towards - (boxes.place_half * boxes.place_half.new_tensor(signs)).unsqueeze(1)
+        corner = towards - (boxes.centre_half * boxes.centre_half.new_tensor(signs)).unsqueeze(1)
         lengths = torch.linalg.vector_norm(corner, dim=-1) * torch.linalg.vector_norm(towards, dim=-1)
         cosine = torch.minimum(cosine, (corner * towards).sum(-1) / lengths.clamp_min(1e-300))
-    inside = (towards.abs() <= boxes.place_half.unsqueeze(1)).all(-1)
+    inside = (towards.abs() <= boxes.centre_half.unsqueeze(1)).all(-1)
     # Rounding of a cosine near 1 changes its angle by 1e-8.
     return torch.where(inside | (cosine <= 0), math.pi, torch.acos(cosine.clamp(max=1)) + 1e-7)
 
 
 def distance_range(boxes: Boxes, points: Float[Tensor, "a 3"]) -> tuple[Float[Tensor, "b a"], Float[Tensor, "b a"]]:
     """Return the least and the largest distance between each point and the camera centres of each box, (b, a)."""
-    offset = (points - boxes.place.unsqueeze(1)).abs()
-    half = boxes.place_half.unsqueeze(1)
+    offset = (points - boxes.centre.unsqueeze(1)).abs()
+    half = boxes.centre_half.unsqueeze(1)
     return (offset - half).clamp_min(0).norm(dim=-1), (offset + half).norm(dim=-1)
 
 
-def split(boxes: Boxes, turning: Bool[Tensor, " b"]) -> Boxes:
-    """Split each box into eight children, in rotation where `turning`, else in translation.
+def split(boxes: Boxes, rotating: Bool[Tensor, " b"]) -> Boxes:
+    """Split each box into eight children, in rotation where `rotating`, else in translation.
 
     Cubes without a rotation vector of length pi or less are left out.
     """
-    signs = boxes.turn.new_tensor(list(itertools.product((-0.5, 0.5), repeat=3)))
-    chosen = turning[:, None, None]
-    turn_shift = torch.where(chosen, boxes.turn_half[:, None, None] * signs, 0)
-    place_shift = torch.where(chosen, 0, boxes.place_half.unsqueeze(1) * signs)
+    signs = boxes.rotvec.new_tensor(list(itertools.product((-0.5, 0.5), repeat=3)))
+    chosen = rotating[:, None, None]
+    rotvec_shift = torch.where(chosen, boxes.rotvec_half[:, None, None] * signs, 0)
+    centre_shift = torch.where(chosen, 0, boxes.centre_half.unsqueeze(1) * signs)
     children = Boxes(
-        (boxes.turn.unsqueeze(1) + turn_shift).flatten(0, 1),
-        torch.where(turning, 0.5, 1.0).mul(boxes.turn_half).repeat_interleave(8),
-        (boxes.place.unsqueeze(1) + place_shift).flatten(0, 1),
-        (torch.where(turning, 1.0, 0.5).unsqueeze(-1) * boxes.place_half).repeat_interleave(8, 0),
+        (boxes.rotvec.unsqueeze(1) + rotvec_shift).flatten(0, 1),
+        torch.where(rotating, 0.5, 1.0).mul(boxes.rotvec_half).repeat_interleave(8),
+        (boxes.centre.unsqueeze(1) + centre_shift).flatten(0, 1),
+        (torch.where(rotating, 1.0, 0.5).unsqueeze(-1) * boxes.centre_half).repeat_interleave(8, 0),
     )
-    nearest = (children.turn.abs() - children.turn_half.unsqueeze(-1)).clamp_min(0).norm(dim=-1)
+    nearest = (children.rotvec.abs() - children.rotvec_half.unsqueeze(-1)).clamp_min(0).norm(dim=-1)
     return children.pick(nearest <= math.pi)
 
 
@@ -229,29 +235,32 @@ class GOPAC(BranchAndBound):
         check_positive(angle=angle)
         self.angle = angle
 
-    def search(self, rays: Tensor, points: Tensor, domain: Boxes, away: float, deadline: Deadline) -> Found:
+    def search(
+        self, rays: Tensor, points: Tensor, domain: Boxes, camera_distance: float, deadline: Deadline
+    ) -> BestPose:
         """Maximise nu(R, c) = sum_i max_j [angle(f_i, R (p_j - c)) <= angle], the number of inlier rays.
 
         The value and the bound are the fractions of rays that are no inliers. The outer search is over the camera
         centre c. For each box there are two inner searches over R. The first, at the centre of the box, looks for a
         better pose, which is refined. The second, with every angle widened by the uncertainty psi_t(p_j), decides
-        whether the box can hold one. Boxes under SMALLEST_PLACE are not split, so their bound may stay above the count.
+        whether the box can hold one. Boxes under SMALLEST_CENTRE are not split, so their bound may stay above the
+        count.
         """
-        del away
-        best: tuple[Tensor | None, Tensor, int] = (None, domain.place[0], 0)
+        del camera_distance
+        best: tuple[Tensor | None, Tensor, int] = (None, domain.centre[0], 0)
         inner = 1
 
         def expand(box: Boxes) -> tuple[Boxes, Tensor, int | float]:
             nonlocal best, inner
-            children = split(box, torch.zeros_like(box.turn_half, dtype=torch.bool))
+            children = split(box, torch.zeros_like(box.rotvec_half, dtype=torch.bool))
             bounds = []
-            for place, moving in zip(children.place, translation_uncertainty(children, points), strict=True):
+            for centre, moving in zip(children.centre, translation_uncertainty(children, points), strict=True):
                 reach = torch.full_like(moving, self.angle)
-                here = best_rotation(rays, points, place, reach, domain, floor=best[2], deadline=deadline)
+                here = best_rotation(rays, points, centre, reach, domain, floor=best[2], deadline=deadline)
                 if here.rotation is not None:
-                    best = _refined(rays, points, here.rotation, place, self.angle)
+                    best = _refine(rays, points, here.rotation, centre, self.angle)
                 wide = (reach + moving).clamp_max(math.pi)
-                there = best_rotation(rays, points, place, wide, domain, floor=best[2], first=True, deadline=deadline)
+                there = best_rotation(rays, points, centre, wide, domain, floor=best[2], first=True, deadline=deadline)
                 inner += here.boxes + there.boxes
                 bounds.append(there.bound)
             return children, rays.new_tensor(bounds), best[2]
@@ -261,58 +270,58 @@ class GOPAC(BranchAndBound):
             rays.new_full((1,), len(rays)),
             expand,
             at_once=1,
-            small=lambda boxes: boxes.place_half.amax(-1) < SMALLEST_PLACE,
+            small=lambda boxes: boxes.centre_half.amax(-1) < SMALLEST_CENTRE,
             until=lambda done: deadline.passed() or done + inner >= self.max_boxes,
         )
         value, bound = (1 - count / len(rays) for count in (best[2], max(best[2], left)))
-        return Found(*best[:2], value, bound, outer + inner, best[2] >= left)
+        return BestPose(*best[:2], value, bound, outer + inner, best[2] >= left)
 
 
-def _refined(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, angle: float) -> tuple[Tensor, Tensor, int]:
+def _refine(rays: Tensor, points: Tensor, rotation: Tensor, centre: Tensor, angle: float) -> tuple[Tensor, Tensor, int]:
     """Refine a pose by weighted PnP unless that loses inliers; return the pose and its number of inliers."""
-    near = within(rays, points, rotation, place, angle)
+    near = within(rays, points, rotation, centre, angle)
     count = int(near.any(-1).sum())
-    inputs = near.to(rays), rays, points, rotation, -rotation @ place
+    inputs = near.to(rays), rays, points, rotation, -rotation @ centre
     turned, shift, stats = weighted_pnp(*(x.unsqueeze(0) for x in inputs))
     if bool(stats.converged[0]):
         moved = -turned[0].mT @ shift[0]
         if (refined := int(within(rays, points, turned[0], moved, angle).any(-1).sum())) >= count:
             return turned[0], moved, refined
-    return rotation, place, count
+    return rotation, centre, count
 
 
 def best_rotation(
     rays: Float[Tensor, "m 3"],
     points: Float[Tensor, "n 3"],
-    place: Float[Tensor, "3"],
+    centre: Float[Tensor, "3"],
     reach: Float[Tensor, " n"],
     domain: Boxes,
     *,
     floor: int,
     first: bool = False,
     deadline: Deadline,
-) -> Found:
+) -> BestPose:
     """Maximise the number of rays f_i with some angle(f_i, R (p_j - c)) <= reach_j over rotations, at one centre c.
 
-    Boxes that cannot have more than `floor` such rays are dropped. Boxes under SMALLEST_TURN are not split; they, and
-    those left at the deadline, keep the bound above the count.
+    Boxes that cannot have more than `floor` such rays are dropped. Boxes under SMALLEST_ROTATION are not split; they,
+    and those left at the deadline, keep the bound above the count.
 
     Args:
         rays: Bearings (m, 3).
         points: Scene points (n, 3).
-        place: c (3,).
+        centre: c (3,).
         reach: Largest angle for each scene point (n,), radians.
         domain: Box whose rotations are searched.
         floor: Number of rays to exceed.
         first: Stop at the first rotation that exceeds `floor`.
         deadline: Time limit.
     """
-    directions = normalize(points - place, dim=-1)
+    directions = normalize(points - centre, dim=-1)
     count, rotation = floor, None
 
     def expand(parents: Boxes) -> tuple[Boxes, Tensor, int | float]:
         nonlocal count, rotation
-        children = split(parents, torch.ones_like(parents.turn_half, dtype=torch.bool))
+        children = split(parents, torch.ones_like(parents.rotvec_half, dtype=torch.bool))
         cosine = (rays @ children.rotation) @ directions.mT  # (b, m, n)
         widened = (reach + rotation_uncertainty(children).unsqueeze(-1)).clamp_max(math.pi)
         reached = (cosine >= reach.cos() - ROUNDING).any(-1).sum(-1)
@@ -327,12 +336,12 @@ def best_rotation(
         rays.new_full((1,), len(rays)),
         expand,
         at_once=max(1, CHUNK // (8 * len(rays) * len(directions))),
-        small=lambda boxes: boxes.turn_half < SMALLEST_TURN,
+        small=lambda boxes: boxes.rotvec_half < SMALLEST_ROTATION,
         until=lambda _: deadline.passed() or (first and rotation is not None),
     )
-    return Found(rotation, place, count, max(count, left), boxes, count >= left)
+    return BestPose(rotation, centre, count, max(count, left), boxes, count >= left)
 
 
-def within(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, angle: float) -> Bool[Tensor, "m n"]:
+def within(rays: Tensor, points: Tensor, rotation: Tensor, centre: Tensor, angle: float) -> Bool[Tensor, "m n"]:
     """Return which pairs have angle(f_i, R (p_j - c)) <= `angle`, (m, n)."""
-    return (rays @ rotation) @ normalize(points - place, dim=-1).mT >= math.cos(angle) - ROUNDING
+    return (rays @ rotation) @ normalize(points - centre, dim=-1).mT >= math.cos(angle) - ROUNDING

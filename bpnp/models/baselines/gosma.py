@@ -19,9 +19,9 @@ from bpnp.checks import check_positive
 from bpnp.geometry import angle_between, retract
 from bpnp.loops.parallel import NEVER, Deadline
 from bpnp.models.baselines.branch_and_bound import (
+    BestPose,
     Boxes,
     BranchAndBound,
-    Found,
     best_first,
     distance_range,
     root_mean_square,
@@ -55,9 +55,9 @@ class SceneMixture(NamedTuple):
     means: Float[Tensor, "a 3"]
     variances: Float[Tensor, " a"]
 
-    def seen(self, place: Float[Tensor, "b 3"]) -> tuple[Float[Tensor, "b a 3"], Float[Tensor, "b a"]]:
+    def view_from(self, centre: Float[Tensor, "b 3"]) -> tuple[Float[Tensor, "b a 3"], Float[Tensor, "b a"]]:
         """Return directions (b, a, 3) and concentrations (b, a) of the components, seen from camera centres (b, 3)."""
-        towards = self.means - place.unsqueeze(1)
+        towards = self.means - centre.unsqueeze(1)
         return normalize(towards, dim=-1), towards.square().sum(-1) / self.variances + 1
 
 
@@ -94,10 +94,13 @@ class GOSMA(BranchAndBound):
         check_positive(cluster2d=cluster2d, cluster3d=cluster3d)
         self.cluster2d, self.cluster3d, self.batch = cluster2d, cluster3d, batch
 
-    def search(self, rays: Tensor, points: Tensor, domain: Boxes, away: float, deadline: Deadline) -> Found:
+    def search(
+        self, rays: Tensor, points: Tensor, domain: Boxes, camera_distance: float, deadline: Deadline
+    ) -> BestPose:
+        """Align the mixtures of the scene and of the image; see `BranchAndBound.search`."""
         angle = root_mean_square(torch.acos((rays @ normalize(rays.sum(0), dim=0)).clamp(-1, 1)))
         scene, image = scene_mixture(points, self.cluster3d), ray_mixture(rays, self.cluster2d * angle)
-        return self.align(scene, image, domain, closest=CLOSEST * away, deadline=deadline)
+        return self.align(scene, image, domain, closest=CLOSEST * camera_distance, deadline=deadline)
 
     def align(
         self,
@@ -108,7 +111,7 @@ class GOSMA(BranchAndBound):
         gap: float = GAP,
         closest: float = 0.0,
         deadline: Deadline = NEVER,
-    ) -> Found:
+    ) -> BestPose:
         """Minimise d(R, c) over a domain with |c| >= `closest`, to within `gap` of the image mixture's squared norm.
 
         The `batch` boxes of lowest bound are split together, in rotation or in translation, whichever is less certain.
@@ -116,15 +119,15 @@ class GOSMA(BranchAndBound):
         image mixture's squared norm.
         """
         norm = float(squared_norm(rays))
-        best = (math.inf, domain.rotation[0], domain.place[0])
+        best = (math.inf, domain.rotation[0], domain.centre[0])
 
         def descend_from(boxes: Boxes) -> None:
             nonlocal best
-            if len(boxes.turn) == 0:
+            if len(boxes.rotvec) == 0:
                 return
-            values = distance(scene, rays, boxes.rotation, boxes.place)
+            values = distance(scene, rays, boxes.rotation, boxes.centre)
             chosen = boxes.pick(values.topk(min(DESCENTS, len(values)), largest=False).indices)
-            poses = descend(scene, rays, chosen.rotation, chosen.place)
+            poses = descend(scene, rays, chosen.rotation, chosen.centre)
             values = distance(scene, rays, *poses)
             i = int(values.argmin())
             if float(values[i]) < best[0]:
@@ -139,7 +142,7 @@ class GOSMA(BranchAndBound):
             _, farthest = distance_range(children, torch.zeros_like(scene.means[:1]))
             children = children.pick(farthest.squeeze(-1) >= closest)
             bounds = -lower_bound(scene, rays, children)
-            descend_from(children.pick(children.place.norm(dim=-1) >= closest))
+            descend_from(children.pick(children.centre.norm(dim=-1) >= closest))
             # Boxes whose bound is within the gap of the best cannot change the result by more than the gap.
             return children, bounds, gap * norm - best[0]
 
@@ -151,14 +154,14 @@ class GOSMA(BranchAndBound):
             at_once=self.batch,
             until=lambda done: deadline.passed() or done + 1 >= self.max_boxes,
         )
-        value, rotation, place = best
+        value, rotation, centre = best
         certified = -left >= value - gap * norm
         bound = value - gap * norm if certified else -left
-        return Found(rotation, place, value / norm + 1, bound / norm + 1, boxes + 1, certified)
+        return BestPose(rotation, centre, value / norm + 1, bound / norm + 1, boxes + 1, certified)
 
 
 def descend(
-    scene: SceneMixture, rays: RayMixture, rotation: Tensor, place: Tensor, *, finely: bool = False
+    scene: SceneMixture, rays: RayMixture, rotation: Tensor, centre: Tensor, *, finely: bool = False
 ) -> tuple[Tensor, Tensor]:
     """Descend from poses (b, 3, 3), (b, 3), by Adam with steps from a tenth of a unit to a thousandth, or by L-BFGS.
 
@@ -168,18 +171,18 @@ def descend(
         scene: Mixture of the scene.
         rays: Mixture of the image.
         rotation: Initial R (b, 3, 3).
-        place: Initial c (b, 3).
+        centre: Initial c (b, 3).
         finely: Use L-BFGS.
     """
-    away = torch.linalg.vector_norm(scene.means - place.unsqueeze(1), dim=-1).mean(-1, keepdim=True)
-    unit = torch.cat([torch.ones_like(place), away.expand_as(place)], -1)
+    mean_distance = torch.linalg.vector_norm(scene.means - centre.unsqueeze(1), dim=-1).mean(-1, keepdim=True)
+    unit = torch.cat([torch.ones_like(centre), mean_distance.expand_as(centre)], -1)
     step = torch.zeros_like(unit, requires_grad=True)
     lbfgs = torch.optim.LBFGS([step], max_iter=POLISH_STEPS, line_search_fn="strong_wolfe")
     optimiser = lbfgs if finely else torch.optim.Adam([step], lr=0.1)
 
     def loss() -> Tensor:
         step.grad = None
-        total = distance(scene, rays, *retract(unit * step, rotation, place)).sum()
+        total = distance(scene, rays, *retract(unit * step, rotation, centre)).sum()
         total.backward()
         return total
 
@@ -187,7 +190,7 @@ def descend(
         for _ in range(1 if finely else DESCENT_STEPS):
             optimiser.step(loss)
             optimiser.param_groups[0]["lr"] *= 0.01 ** (1 / DESCENT_STEPS)
-    return retract(unit * step.detach(), rotation, place)
+    return retract(unit * step.detach(), rotation, centre)
 
 
 def ray_mixture(rays: Float[Tensor, "m 3"], angle: float) -> RayMixture:
@@ -225,8 +228,8 @@ def _means(points: Tensor, limit: float, *, spherical: bool) -> Int[Tensor, " k"
     for _ in range(ITERATIONS):
         weights, sums = _totals(points, labels)
         centres = normalize(sums, dim=-1) if spherical else sums / weights.unsqueeze(-1)
-        away = angle_between(points.unsqueeze(1), centres) if spherical else torch.cdist(points, centres)
-        nearest, assigned = away.min(-1)
+        distances = angle_between(points.unsqueeze(1), centres) if spherical else torch.cdist(points, centres)
+        nearest, assigned = distances.min(-1)
         if bool((assigned == labels).all()):
             outermost = int(nearest.argmax())
             if float(nearest[outermost]) <= limit:
@@ -260,9 +263,9 @@ def squared_norm(rays: RayMixture) -> Float[Tensor, ""]:
     return rays.weights @ terms @ rays.weights
 
 
-def distance(scene: SceneMixture, rays: RayMixture, rotation: Tensor, place: Tensor) -> Float[Tensor, " b"]:
+def distance(scene: SceneMixture, rays: RayMixture, rotation: Tensor, centre: Tensor) -> Float[Tensor, " b"]:
     """Return d(R, c) of rotations (b, 3, 3) and centres (b, 3), without the constant `squared_norm(rays)`."""
-    directions, k = scene.seen(place)
+    directions, k = scene.view_from(centre)
     self_terms = overlap(k.unsqueeze(-1), k.unsqueeze(-2), directions @ directions.mT)
     cross_terms = overlap(k.unsqueeze(-1), rays.concentrations, directions @ rotation.mT @ rays.directions.mT)
     return _combine(scene, rays, self_terms, cross_terms)
@@ -275,19 +278,19 @@ def lower_bound(scene: SceneMixture, rays: RayMixture, boxes: Boxes) -> Float[Te
     largest distance. The angle between two means, seen from the camera centre, has a gradient of the length
     |mu - mu'| / (d d'), d and d' their distances, which bounds its change too.
     """
-    directions, _ = scene.seen(boxes.place)
-    turning, moving = rotation_uncertainty(boxes), translation_uncertainty(boxes, scene.means)
+    directions, _ = scene.view_from(boxes.centre)
+    rotating, moving = rotation_uncertainty(boxes), translation_uncertainty(boxes, scene.means)
     closest, farthest = distance_range(boxes, scene.means)
     least, largest = (values.square() / scene.variances + 1 for values in (closest, farthest))
 
-    half_diagonal = boxes.place_half.norm(dim=-1)[:, None, None]
+    half_diagonal = boxes.centre_half.norm(dim=-1)[:, None, None]
     gradient = torch.cdist(scene.means, scene.means) / (closest.unsqueeze(-1) * closest.unsqueeze(-2)).clamp_min(1e-12)
     parting = torch.minimum(moving.unsqueeze(-1) + moving.unsqueeze(-2), half_diagonal * gradient + 1e-7)
     wide = (torch.acos((directions @ directions.mT).clamp(-1, 1)) + parting).clamp_max(math.pi)
     wide = wide * (1 - torch.eye(len(scene.means), dtype=wide.dtype, device=wide.device))
     self_terms = _least_overlap(least, largest, wide.cos())
     angle = torch.acos((directions @ boxes.rotation.mT @ rays.directions.mT).clamp(-1, 1))
-    narrow = (angle - turning[:, None, None] - moving.unsqueeze(-1)).clamp_min(0)
+    narrow = (angle - rotating[:, None, None] - moving.unsqueeze(-1)).clamp_min(0)
     cross_terms = _largest_overlap(least.unsqueeze(-1), largest.unsqueeze(-1), rays.concentrations, narrow.cos())
     return _combine(scene, rays, self_terms * (1 - ROUNDING), cross_terms * (1 + ROUNDING))
 

@@ -64,6 +64,7 @@ class SoftPOSIT(SingleSolver):
         self.start, self.starts, self.seed, self.max_steps = start, starts, seed, max_steps
 
     def solve(self, problem: SingleProblem, deadline: Deadline) -> Answer:
+        """Return the best pose of all initial poses."""
         points = problem.points2d, problem.points3d
         m, n = map(len, points)
         best, most, finished = Answer(), -1, True
@@ -211,7 +212,7 @@ def _kernel(image: Tensor, rows: Tensor, depth: Tensor, beta: float) -> Tensor:
 
 
 def _residual(matched: Tensor, rows: Tensor, depth: Tensor) -> Tensor:
-    """sqrt(sum_jk m_jk d^2_jk / n) from the moments sum_j m_jk (1, x_j, y_j, x_j^2 + y_j^2)."""
+    """Return sqrt(sum_jk m_jk d^2_jk / n) from the moments sum_j m_jk (1, x_j, y_j, x_j^2 + y_j^2)."""
     mass, x, y, squared = matched.unbind(-1)
     a, b = rows.unbind(1)
     total = (a.square() + b.square()) * mass - 2 * depth * (a * x + b * y) + depth.square() * squared
@@ -219,10 +220,14 @@ def _residual(matched: Tensor, rows: Tensor, depth: Tensor) -> Tensor:
 
 
 def _fit(matched: Tensor, scene: Tensor, depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Pose whose first two rows fit the assignment in the least-squares sense, and whether it is determined."""
+    """Fit the pose whose first two rows match the assignment best in the least-squares sense.
+
+    Returns:
+        Rotations (s, 3, 3), translations (s, 3), and which poses are determined (s,).
+    """
     mass, targets = matched[..., 0], depth.unsqueeze(-1) * matched[..., 1:3]
     moments = (scene.mT * mass.unsqueeze(1)) @ scene  # L = sum_k m_k S_k S_k^T
-    # The eigenvalues of the equilibrated matrix, so that the unit of the scene does not matter.
+    # Equilibrate the matrix, so that its eigenvalues do not depend on the unit of the scene.
     scale = moments.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
     balanced = scale.unsqueeze(-1) * moments * scale.unsqueeze(-2)
     factor, info = torch.linalg.cholesky_ex(balanced)
