@@ -14,6 +14,12 @@ from mkdocs.structure.files import File, Files
 # What pymdownx.arithmatex makes of $...$ and $$...$$: \\(...\\) in a span, \\[...\\] in a div.
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 TIGHT = re.compile(r"<mo([^>]*>&#x0(?:002F|007C|2016);)</mo>")  # / | and ||, without space around them
+# A function before its argument, which stands beside it without a space.
+FUNCTION = re.compile(
+    r"((?<!<msub>)(?<!<msup>)(?<!<munder>)<mi>(?:log|ln|exp|sin|cos|tan|det|max|min)</mi>"
+    r"|<msub><mi>log</mi>(?:<mn>\d+</mn>|<mrow><mn>\d+</mn></mrow>)</msub>)"
+    r"(?=<m(?:i|n|sub|sup|subsup|frac)>)"
+)
 
 
 def on_files(files: Files, *, config: MkDocsConfig) -> Files:
@@ -31,4 +37,5 @@ def draw_formula(formula: re.Match[str]) -> str:
     tag, latex = formula[1], html.unescape(formula[2]).strip()
     display = "block" if tag == "div" else "inline"
     drawn = TIGHT.sub(r'<mo lspace="0" rspace="0"\1</mo>', convert(latex, display=display))
+    drawn = FUNCTION.sub(r'\1<mspace width="0.17em"/>', drawn)
     return f'<{tag} class="formula">{drawn}</{tag}>'
