@@ -45,6 +45,8 @@ def main(args: Sequence[str] | None = None) -> None:
     """
     arguments = list(sys.argv[1:] if args is None else args)
     _quieten()
+    if args is None:
+        warnings.formatwarning = one_line_warning
     try:
         if args is None and arguments and arguments[0] in LIGHTNING:
             keep_freed_memory()
@@ -65,6 +67,11 @@ def main(args: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         print(f"bpnp: interrupted{AFTER_CTRL_C.get(arguments[0], '')}", file=sys.stderr)
         raise SystemExit(130) from None
+
+
+def one_line_warning(message: Warning | str, *_: object, **__: object) -> str:
+    """Return the text of a warning for the terminal, without the line of code that gave it."""
+    return f"bpnp: warning: {plain(str(message))}\n"
 
 
 def _is_mistake(error: Exception) -> bool:

@@ -219,3 +219,9 @@ def test_fit_test_report(
     table = capsys.readouterr().out
     assert "ransac" in table
     assert "pnp" in table
+
+
+def test_a_warning_is_one_line() -> None:
+    code = "import warnings; from bpnp import cli; cli._run = lambda _: warnings.warn('two\\nlines'); cli.main()"
+    shown = subprocess.run([sys.executable, "-c", code, "solve"], capture_output=True, text=True, check=True)
+    assert (shown.stdout, shown.stderr) == ("", "bpnp: warning: two lines\n")
