@@ -178,8 +178,7 @@ def camera_from(camera: Any) -> Camera:
     if isinstance(camera, (tuple, list)) and len(camera) and isinstance(camera[0], str):
         if len(camera) not in (2, 4):
             raise ValueError(
-                f"expected `camera` as (model, parameters) or (model, width, height, parameters), got {len(camera)} "
-                "values"
+                f"`camera` has {len(camera)} values; give (model, parameters) or (model, width, height, parameters)"
             )
         return colmap_camera(camera[0], camera[-1], camera[1:-1] or (0, 0))
     return _opencv(*camera) if is_opencv(camera) else _pinhole(camera)
@@ -216,8 +215,8 @@ def check_normalised(points2d: Any, remedy: str) -> None:
     points = np.asarray(points2d)
     if np.median(np.linalg.norm(points, axis=-1)) > WIDEST:
         raise ValueError(
-            f"expected normalised image coordinates in `points2d`, got values up to {np.abs(points).max():g}, which "
-            f"look like pixels; try {remedy}"
+            f"`points2d` has values up to {np.abs(points).max():g}, not normalised image coordinates; they look like "
+            f"pixels; try {remedy}"
         )
 
 
@@ -336,17 +335,17 @@ def colmap_camera(model: str, params: Any, size: Any = (0, 0)) -> Lens:
     try:
         values = np.asarray(params, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"expected the parameters of a {model} camera as numbers, got {params!r:.60}") from error
+        raise ValueError(f"the parameters of a {model} camera are not numbers: {params!r:.60}") from error
     if values.shape != (counts[model],):
-        raise ValueError(f"expected {counts[model]} parameters of a {model} camera, got {values.tolist()}")
+        raise ValueError(f"a {model} camera has {counts[model]} parameters, not {values.tolist()}")
     if not np.isfinite(values).all():
-        raise ValueError(f"expected finite parameters of a {model} camera, got {values.tolist()}")
+        raise ValueError(f"the parameters of a {model} camera hold NaN or infinity: {values.tolist()}")
     try:
         width, height = (int(value) for value in size)
     except (TypeError, ValueError, OverflowError):
         width, height = -1, -1
     if min(width, height) < 0 or max(width, height) > MOST_PIXELS:
-        raise ValueError(f"expected width and height of a {model} camera in pixels, got {tuple(size)}")
+        raise ValueError(f"width and height of a {model} camera cannot be {tuple(size)} pixels")
     lens = Lens(_pycolmap().Camera(model=model, width=width, height=height, params=values.tolist()))
     return _check_focal_length(lens, f"{values.tolist()}")
 
@@ -405,7 +404,7 @@ def _opencv(matrix: Any, distortion: Any) -> Camera:
     pinhole = _pinhole(matrix)
     values = np.asarray([] if distortion is None else distortion, np.float64).ravel()
     if len(values) not in (0, 4, 5, 8) and (len(values) not in (12, 14) or values[8:].any()):
-        raise ValueError(f"expected the 4, 5 or 8 distortion coefficients of OpenCV, got {values.tolist()}")
+        raise ValueError(f"OpenCV's distortion has 4, 5 or 8 coefficients, not {values.tolist()}")
     if not values.any():
         return pinhole
     if pinhole.matrix[0, 1]:
@@ -422,18 +421,18 @@ def _pinhole(values: Any) -> Pinhole:
         matrix = np.asarray(values.detach().cpu() if hasattr(values, "detach") else values, dtype=np.float64)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(
-            f"expected `camera` as a 3x3 matrix, (COLMAP model, parameters) or a pycolmap.Camera, got {values!r:.60}"
+            f"`camera` is a 3x3 matrix, (COLMAP model, parameters) or a pycolmap.Camera, not {values!r:.60}"
         ) from error
     if matrix.shape != (3, 3):
-        raise ValueError(f"expected a `camera` matrix of shape (3, 3), got {matrix.shape}; try (model, parameters)")
+        raise ValueError(f"the `camera` matrix needs the shape (3, 3), not {matrix.shape}; or give (model, parameters)")
     if not np.isfinite(matrix).all():
-        raise ValueError(f"expected a finite `camera` matrix, got {matrix.tolist()}")
+        raise ValueError(f"the `camera` matrix holds NaN or infinity: {matrix.tolist()}")
     if np.any(matrix[2, :2] != 0) or matrix[2, 2] == 0:
-        raise ValueError(f"expected a `camera` matrix with the last row (0, 0, 1), got {matrix[2].tolist()}")
+        raise ValueError(f"the last row of the `camera` matrix is {matrix[2].tolist()} instead of (0, 0, 1)")
     matrix = matrix / matrix[2, 2]
     singular = np.linalg.svd(matrix[:2, :2], compute_uv=False)
     if not singular[1] > 1e-9 * singular[0]:
-        raise ValueError(f"expected an invertible `camera` matrix, got the singular {matrix.tolist()}")
+        raise ValueError(f"the `camera` matrix is singular: {matrix.tolist()}")
     (fx, _), (_, fy) = matrix[:2, :2].tolist()
     if np.linalg.det(matrix[:2, :2]) < 0 or min(fx, fy) < 0:
         raise ValueError(

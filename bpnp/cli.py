@@ -143,7 +143,7 @@ def _check_name(name: str, names: Sequence[str], what: str) -> str:
         return name
     close = difflib.get_close_matches(name, names, n=1)
     hint = f"did you mean {close[0]}?" if close else f"try {', '.join(names)}"
-    raise ValueError(f"expected {what}, got {name!r}; {hint}")
+    raise ValueError(f"{name!r} is not {what}; {hint}")
 
 
 def help_text() -> str:

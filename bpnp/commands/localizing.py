@@ -84,9 +84,9 @@ def localize(
     swapped = any(model_format(photo) for photo in photos)
     if map.is_file() or (swapped and not model_format(map)):
         hint = "; are MAP and PHOTO swapped?" if swapped else ""
-        raise ValueError(f"expected MAP as the folder of a COLMAP model, got {map}{hint}")
+        raise ValueError(f"MAP {map} is no folder of a COLMAP model{hint}")
     if keypoints is not None and not keypoints.is_file():
-        raise ValueError(f"expected hloc's or COLMAP's file of keypoints, got {keypoints}, which is no file")
+        raise ValueError(f"--keypoints {keypoints} does not exist; give hloc's or COLMAP's file of keypoints")
     source_from(solver)  # raise once here, not for each photo
     positive("time_limit", time_limit)
     if focal_error is not None and not 0 < focal_error < 1:

@@ -44,7 +44,7 @@ def read_points2d(path: Path) -> tuple[Array, Labels | None]:
         points, _, labels = _read_annotation(path, values, names, coordinates, hint=", or u, v")
         return points, labels
     if values.shape[1] < 2:
-        raise ValueError(f"expected points with 2 or 3 columns in {path}, got shape {values.shape}")
+        raise ValueError(f"{path} needs points with 2 or 3 columns; its shape is {values.shape}")
     return values if values.shape[1] == 3 else values[:, :2], None
 
 
@@ -86,7 +86,7 @@ def read_points3d(
         return points, None if normals is None or not normals.any() else normals, labels
     _check_suffix(path, ARRAYS)
     if surface is not None:
-        raise ValueError(f"expected a mesh to draw {surface} points from, got {path}; try without --surface")
+        raise ValueError(f"--surface draws points from a mesh, and {path} is none; leave it out")
     return _read_annotation(path, *_columns(path, {*"xyz", *NORMAL, LABEL}), ("x", "y", "z"))
 
 
@@ -167,7 +167,7 @@ def read_pairs(path: Path) -> Array:
     _check_suffix(path, ARRAYS)
     values = _columns(path)[0]
     if values.shape[1] != 2:
-        raise ValueError(f"expected two columns in {path}, got {values.shape[1]}")
+        raise ValueError(f"{path} needs two columns; it has {values.shape[1]}")
     return values
 
 
@@ -205,10 +205,12 @@ def _read_annotation(
     swapped = " (are the two files swapped?)" if values.shape[1] == 2 else ""
     if not names and values.shape[1] not in COLUMNS:
         expected = "3 to 4 or 6 to 7 columns (x, y, z, normal, label)"
-        raise ValueError(f"expected {expected} in {path}, got shape {values.shape}{swapped}")
+        raise ValueError(f"{path} needs {expected}; its shape is {values.shape}{swapped}")
     names = names or [*coordinates, *COLUMNS[values.shape[1]]]
     if not set(coordinates) <= set(names):
-        raise ValueError(f"expected columns {', '.join(coordinates)}{hint} in {path}, got {', '.join(names)}{swapped}")
+        raise ValueError(
+            f"{path} needs columns {', '.join(coordinates)}{hint}; its columns are {', '.join(names)}{swapped}"
+        )
     index = {name: column for column, name in enumerate(names)}
     points = values[:, [index[name] for name in coordinates]]
     return points, *_normals_and_labels(path, lambda name: values[:, index[name]], names)
@@ -223,7 +225,7 @@ def _normals_and_labels(
         return normals, None
     labels = column(LABEL)
     if len(fractions := labels[labels != np.round(labels)]):
-        raise ValueError(f"expected integers in the column label of {path}, got {fractions[0]:g}")
+        raise ValueError(f"the column label of {path} holds {fractions[0]:g}; labels are integers")
     return normals, labels.astype(np.int64)
 
 
@@ -264,7 +266,7 @@ def _columns(path: Path, wanted: Collection[str] = ()) -> tuple[Array, list[str]
             return array.astype(np.float64), []
         text = content.decode("utf-8-sig")
     except (ValueError, OSError, EOFError) as error:
-        raise ValueError(f"expected rows of numbers in {path}, got {error}") from error
+        raise ValueError(f"cannot read rows of numbers from {path}: {error}") from error
     lines = [line for commented in text.splitlines() if (line := commented.partition("#")[0].strip())]
     names = _words(lines[0]) if lines else []
     names = [] if any(_number(name) is not None for name in names) else names
@@ -285,7 +287,7 @@ def _columns(path: Path, wanted: Collection[str] = ()) -> tuple[Array, list[str]
         wrong = (
             row for row in rows if len(words := _words(row)) != count or None in [_number(words[i]) for i in needed]
         )
-        raise ValueError(f"expected rows of {count} numbers in {path}, got {next(wrong, rows[0])[:60]!r}") from error
+        raise ValueError(f"{path} needs rows of {count} numbers; it has {next(wrong, rows[0])[:60]!r}") from error
     return values, names
 
 

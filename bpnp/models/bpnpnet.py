@@ -205,8 +205,8 @@ def load_authors_weights(path: str | Path, *, backend: Backend = "auto") -> BPnP
     if problems:
         more = f" and {len(problems) - 3} more problems" if len(problems) > 3 else ""
         raise ValueError(
-            f"expected the {len(maps)} tensors of the authors' BPnPNet in {file}, got "
-            f"{'; '.join(sorted(problems)[:3])}{more}; try the authors' file as it was downloaded"
+            f"{file} does not hold the {len(maps)} tensors of the authors' BPnPNet: {'; '.join(sorted(problems)[:3])}"
+            f"{more}. Use the authors' file as it was downloaded"
         )
     net = BPnPNet(ransac=RansacPnP(backend=backend))
     shapes = {name: value.shape for name, value in net.state_dict().items()}
@@ -223,14 +223,13 @@ def _read_state(file: Path) -> Mapping[str, Any]:
             content = torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:
         refused = re.search(r"GLOBAL (\S+)", str(error))
-        reason = f"{refused[1]} in it" if refused else f"{type(error).__name__} while reading"
+        reason = f"{refused[1]} in it is refused" if refused else f"{type(error).__name__} while reading"
         raise ValueError(
-            f"expected a checkpoint of tensors, numbers and plain containers, got {reason} {file}; try downloading it "
-            "again"
+            f"cannot read {file}: {reason}. Only tensors, numbers and plain containers are read; download it again"
         ) from error
     state = content.get("state_dict") if isinstance(content, dict) else None
     if not isinstance(state, Mapping):
         found = ", ".join(map(repr, list(content)[:6])) if isinstance(content, dict) else type(content).__name__
-        raise ValueError(f"expected a dict with `state_dict` in {file}, got {found or 'an empty one'}")
+        raise ValueError(f"{file} has no `state_dict`; it holds {found or 'nothing'}")
     # DataParallel prefixes every name
     return {str(key).removeprefix("module."): value for key, value in state.items()}

@@ -69,7 +69,7 @@ class Matcher(TrainedNet):
         super().__init__()
         check_mu(mu)
         if frame not in ("any", "view"):
-            raise ValueError(f"expected `frame` any or view, got {frame!r}")
+            raise ValueError(f"`frame` is {frame!r}; it is any or view")
         self.frame = frame
         self.channels, self.depth, self.heads, self.neighbours = channels, depth, heads, neighbours
         self.mu, self.tolerance = mu, tolerance

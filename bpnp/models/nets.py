@@ -290,7 +290,7 @@ class Attention(nn.Module):
     def __init__(self, channels: int, heads: int) -> None:
         super().__init__()
         if channels % heads:
-            raise ValueError(f"expected `channels` a multiple of `heads`, got {channels} and {heads}")
+            raise ValueError(f"`channels` {channels} is no multiple of `heads` {heads}")
         self.heads = heads
         self.norm = nn.LayerNorm(channels)
         self.query = nn.Linear(channels, channels)

@@ -47,8 +47,8 @@ def test_options_of_the_network_and_its_parts_are_explained(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["slove"], "expected a command, got 'slove'; did you mean solve?"),
-        (["bogus"], "expected a command, got 'bogus'; try fit"),
+        (["slove"], "'slove' is not a command; did you mean solve?"),
+        (["bogus"], "'bogus' is not a command; try fit"),
         (["prepare", "megadpth", "."], "did you mean megadepth?"),
         (["prepare", "megadepth", ".", "--min_points=3"], "min_points"),
         (["localize", "--veiws=x"], "did you mean --views?"),
@@ -67,8 +67,14 @@ def test_options_of_the_network_and_its_parts_are_explained(
         (["fit", *MESHES, "--data.batch_size=0"], "error: expected `batch_size` of 1 or more, got 0\n"),
         (["fit", *MESHES, "--model.loss=torch.nn.Nothing"], "'torch.nn' has no attribute 'Nothing' "),
         (["fit", *MESHES, "--data.root=nowhere"], "nowhere is not a folder; a folder with <class>/{train,test}"),
-        (["fit", *MESHES, "--config=nowhere.yaml"], "expected a configuration file or the name of a packaged one"),
-        (["fit", "--config", "quickstrat"], "got 'quickstrat'; did you mean quickstart?"),
+        (
+            ["fit", *MESHES, "--config=nowhere.yaml"],
+            "'nowhere.yaml' is not a configuration file or the name of a packaged one",
+        ),
+        (
+            ["fit", "--config", "quickstrat"],
+            "'quickstrat' is not a configuration file or the name of a packaged one; did you mean quickstart?",
+        ),
         (["fit", *MESHES, "--trainer.fast_dev_run=-1"], "fast_dev_run=-1 is not a valid configuration"),
         (["test", *MESHES, "--ckpt_path=nothing.ckpt"], "nothing.ckpt"),
         (["report", "nowhere"], "nowhere is no results folder"),

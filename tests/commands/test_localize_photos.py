@@ -89,7 +89,7 @@ def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, 
     plain = ("localize", str(model), str(tmp_path / "plain.jpg"))
     # What no photo can be localised with is said once, before the first photo.
     for given, message in (
-        (("--camera", "PINHOLE,1"), "expected 4 parameters of a PINHOLE camera, got [1.0]"),
+        (("--camera", "PINHOLE,1"), "a PINHOLE camera has 4 parameters, not [1.0]"),
         (("--keypoints", "nothing.h5"), "of keypoints, got nothing.h5, which is no file"),
         (("--solver", "nothing"), "or packaged weights"),
         (("--model", str(model)), "nrecognized arguments: --model"),
@@ -103,8 +103,8 @@ def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, 
         assert not (tmp_path / "out").exists()
     for swapped in (tmp_path / "plain.jpg", photos):
         error = fails("localize", str(swapped), str(model), *out)
-        assert error.rstrip().endswith(f"got {swapped}; are MAP and PHOTO swapped?")
-    assert f"folder of a COLMAP model, got {plain[2]}\n" in fails("localize", plain[2], plain[2], *out)
+        assert error.rstrip().endswith(f"MAP {swapped} is no folder of a COLMAP model; are MAP and PHOTO swapped?")
+    assert f"MAP {plain[2]} is no folder of a COLMAP model\n" in fails("localize", plain[2], plain[2], *out)
     error = fails(*plain, *out)
     assert "expected a photo with keypoints, got none" in error
     assert "views of the shape of" in fails(*plain, "--camera", str(model), *out)

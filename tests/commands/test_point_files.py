@@ -74,20 +74,20 @@ def test_a_mesh_gives_its_corners_or_its_surface(suffix: str, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.csv", b"1,2,3\n4,5\n", "rows of 3 numbers in .*a.csv, got '4,5'"),
-        ("a.csv", b"1,2,3\n4,,6\n", "rows of 3 numbers in .*, got '4,,6'"),
-        ("a.csv", b"1,2,3\nx,y,z\n", "rows of 3 numbers in .*, got 'x,y,z'"),
+        ("a.csv", b"1,2,3\n4,5\n", "needs rows of 3 numbers; it has '4,5'"),
+        ("a.csv", b"1,2,3\n4,,6\n", "needs rows of 3 numbers; it has '4,,6'"),
+        ("a.csv", b"1,2,3\nx,y,z\n", "needs rows of 3 numbers; it has 'x,y,z'"),
         ("a.csv", b"", "a.csv has no lines of numbers"),
         ("a.csv", b"x,y,z\n", "lines of numbers"),
-        ("a.csv", b"1,2\n3,4\n", r"3 to 4 or .*got shape \(2, 2\) \(are the two files swapped\?\)"),
-        ("a.csv", b"1,2,3,4,5\n", r"3 to 4 or 6 to 7 columns .*got shape \(1, 5\)$"),
-        ("a.csv", b"x,y,z\nLED,2,3\n", "rows of 3 numbers in .*a.csv, got 'LED,2,3'"),
-        ("a.csv", b"x;y;z\n1.000,5;2;3\n", "rows of 3 numbers in .*a.csv, got '1.000,5;2;3'"),
-        ("a.csv", b"a,b,label\n1,2,3\n", "expected columns x, y, z in .*a.csv, got a, b, label"),
-        ("a.csv", b"x,y,z,label\n1,2,3,0.5\n", "expected integers in the column label"),
-        ("a.txt", b"\xff\xfe\x00", "rows of numbers in .*a.txt"),
-        ("a.npy", b"not numpy", "rows of numbers in .*a.npy"),
-        ("a.npy", b"", "rows of numbers in .*a.npy"),
+        ("a.csv", b"1,2\n3,4\n", r"needs 3 to 4 or .*its shape is \(2, 2\) \(are the two files swapped\?\)"),
+        ("a.csv", b"1,2,3,4,5\n", r"needs 3 to 4 or 6 to 7 columns .*its shape is \(1, 5\)$"),
+        ("a.csv", b"x,y,z\nLED,2,3\n", "needs rows of 3 numbers; it has 'LED,2,3'"),
+        ("a.csv", b"x;y;z\n1.000,5;2;3\n", "needs rows of 3 numbers; it has '1.000,5;2;3'"),
+        ("a.csv", b"a,b,label\n1,2,3\n", "a.csv needs columns x, y, z; its columns are a, b, label"),
+        ("a.csv", b"x,y,z,label\n1,2,3,0.5\n", "the column label of .*a.csv holds 0.5; labels are integers"),
+        ("a.txt", b"\xff\xfe\x00", "rows of numbers from .*a.txt"),
+        ("a.npy", b"not numpy", "rows of numbers from .*a.npy"),
+        ("a.npy", b"", "rows of numbers from .*a.npy"),
         ("a.jpg", b"", "a.jpg has to end in .npy, .csv, .txt, .xyz, .glb, .obj, .off, .ply, .stl"),
         ("a.ply", b"", "a.ply: the file is empty"),
         (
@@ -115,10 +115,10 @@ def test_what_is_no_file_of_points_is_named(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match="rows of numbers"):
             read_points3d(path)
     np.save(path, POINTS)
-    with pytest.raises(ValueError, match="a mesh to draw 9 points from"):
+    with pytest.raises(ValueError, match="--surface draws points from a mesh, and"):
         read_points3d(path, surface=9)
     np.save(path, POINTS[:, :1])
-    with pytest.raises(ValueError, match=r"2 or 3 columns in .*, got shape \(20, 1\)"):
+    with pytest.raises(ValueError, match=r"needs points with 2 or 3 columns; its shape is \(20, 1\)"):
         read_points2d(path)
     trimesh.creation.box().export(tmp_path / "a.ply")
     with pytest.raises(ValueError, match="has to end in .npy, .csv, .txt, .xyz$"):
@@ -175,7 +175,7 @@ def test_columns_of_normals_and_labels_by_name_and_by_place(tmp_path: Path) -> N
 def test_a_header_without_x_and_y_is_no_point(tmp_path: Path) -> None:
     """Its first two columns would be solved as if they were pixels."""
     (tmp_path / "a.csv").write_text("id,row,column\n1,10,20\n2,30,40\n")
-    with pytest.raises(ValueError, match=r"expected columns x, y, or u, v in .*a\.csv, got id, row, column"):
+    with pytest.raises(ValueError, match=r"a\.csv needs columns x, y, or u, v; its columns are id, row, column"):
         read_points2d(tmp_path / "a.csv")
     (tmp_path / "a.csv").write_text("id,y,x,scale\n1,10,20,3\n2,30,40,5\n")
     np.testing.assert_array_equal(read_points2d(tmp_path / "a.csv")[0], [[20, 10], [40, 30]])

@@ -107,7 +107,7 @@ def test_code_in_a_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.chdir(tmp_path)
     file = tmp_path / "x.pth.tar"
     torch.save({"state_dict": {}, "optimizer": Exploit()}, file, _use_new_zipfile_serialization=zipped)
-    with pytest.raises(ValueError, match=r"system in it .*x\.pth\.tar"):
+    with pytest.raises(ValueError, match=r"cannot read .*x\.pth\.tar: .*system in it is refused"):
         load_authors_weights(file)
     assert not Path("hacked").exists()
 
@@ -124,11 +124,11 @@ def test_foreign_and_broken_files(reference: Released, tmp_path: Path) -> None:
     }
     for name, content in contents.items():
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(ValueError, match=f"got .*{name};"):
+        with pytest.raises(ValueError, match=f"cannot read .*{name}: "):
             load_authors_weights(tmp_path / name)
     for name, value in {"list": [1], "bare": OrderedDict(a=torch.zeros(1)), "date": {"state_dict": 1}}.items():
         torch.save(value, tmp_path / name)
-        with pytest.raises(ValueError, match=f"state_dict.*{name}"):
+        with pytest.raises(ValueError, match=f"{name} has no `state_dict`"):
             load_authors_weights(tmp_path / name)
     torch.save({"state_dict": {}, "when": datetime.date(2020, 7, 1)}, tmp_path / "object")
     with pytest.raises(ValueError, match=r"datetime\.date in it"):
