@@ -35,6 +35,7 @@ def localize(
     camera: str | None = None,
     focal_error: float | None = None,
     distortion: bool = False,
+    ignore_orientation: bool = False,
     views: Path | None = None,
     keypoints: Path | None = None,
     leave_one_out: bool = False,
@@ -62,6 +63,8 @@ def localize(
         focal_error: relative standard deviation of the focal length of the camera, such as 0.1; it is then found with
             the pose. No effect on photos whose camera is unknown.
         distortion: fit a radial coefficient with an unknown focal length even where it is not significantly better.
+        ignore_orientation: do not use the orientation in the EXIF data of a photo. By default the views of the map are
+            first tried turned by the quarter turns that make them upright where the photo is.
         views: text file of lines "photo view", the views of the map to try; the whole map by default.
         keypoints: hloc's HDF5 file of features or COLMAP's database; SIFT is detected by default.
         leave_one_out: the photos are views of the map; remove each from the map before it is localized.
@@ -106,6 +109,7 @@ def localize(
             camera=lens,
             focal_error=focal_error,
             distortion=distortion or None,
+            ignore_orientation=ignore_orientation or None,
             views=tried,
             keypoints=keypoints,
             leave_one_out=leave_one_out,

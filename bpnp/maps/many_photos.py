@@ -64,7 +64,7 @@ def photo_task(
 
     camera, keypoints, solver: as for `SceneMap.localize_photo`. views: those to try by the name of the photo, None for
     the whole map. leave_one_out: the photo is a view of the map and is taken out of it. search: focal_error,
-    distortion, seed and time_limit.
+    distortion, ignore_orientation, seed and time_limit.
     Raises ValueError for what is wrong with the photo, its camera, keypoints or views.
     """
     photo_content, source = content_of(photo), "--camera"
@@ -91,7 +91,8 @@ def photo_task(
         "leave_one_out": leave_one_out,
     }
     arguments = {"camera": lens, "keypoints": keypoints, "name": name, "solver": solver}
-    return PhotoTask(name, photo.absolute(), arguments | shared, made_with | shared)
+    ignore = {"ignore_orientation": bool(search.get("ignore_orientation"))}
+    return PhotoTask(name, photo.absolute(), arguments | shared | ignore, made_with | shared)
 
 
 def attempt(scene: SceneMap, task: PhotoTask) -> Solution | str:

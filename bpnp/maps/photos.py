@@ -19,6 +19,9 @@ SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", 
 IFD_EXIF = 0x8769
 FOCAL_LENGTH, FOCAL_LENGTH_35MM = 0x920A, 0xA405
 RESOLUTION_X, RESOLUTION_UNIT = 0xA20E, 0xA210
+ORIENTATION = 0x0112
+# Direction up in the camera (x right, y down) of a photo with this orientation; the others are mirrored.
+UP_OF_ORIENTATION = {1: (0.0, -1.0, 0.0), 3: (0.0, 1.0, 0.0), 6: (-1.0, 0.0, 0.0), 8: (1.0, 0.0, 0.0)}
 PIXELS_X, PIXELS_Y = 0xA002, 0xA003
 DIAGONAL_35MM = 43.2666  # of a frame of 36 x 24 mm; equivalent focal lengths are by the diagonal (CIPA DCG-001)
 MILLIMETRES = {2: 25.4, 3: 10.0}  # of the resolution's unit, by its EXIF number: inch, centimetre
@@ -90,13 +93,22 @@ def focal_from_exif(photo: Path) -> float | None:
     return millimetres * resolution / unit * max(size) / max(taken)
 
 
+def up_from_exif(photo: Path) -> tuple[float, float, float] | None:
+    """Return the direction up in the camera of a photo as it is stored, to a quarter turn, from EXIF's orientation.
+
+    None if there is none, or a mirrored one. Raises ValueError for a photo that cannot be read.
+    """
+    return UP_OF_ORIENTATION.get(_opened(photo)[1].get(ORIENTATION, 0))
+
+
 def _opened(photo: Path) -> tuple[Size, dict[int, Any]]:
-    """Size of a photo, and its EXIF tags."""
+    """Size of a photo, and its EXIF tags, with that of its orientation."""
     from PIL import Image
 
     try:
         with Image.open(photo) as image:
-            return image.size, image.getexif().get_ifd(IFD_EXIF)
+            exif = image.getexif()
+            return image.size, {ORIENTATION: exif.get(ORIENTATION), **exif.get_ifd(IFD_EXIF)}
     except OSError as error:
         raise ValueError(f"expected a photo that can be read, got {photo}: {error}; try a JPEG or PNG file") from error
 

@@ -31,8 +31,9 @@ from bpnp.maps.localize import (
     rank,
     strongest_of,
 )
-from bpnp.maps.photos import focal_from_exif, photo_keypoints, photo_size
+from bpnp.maps.photos import focal_from_exif, photo_keypoints, photo_size, up_from_exif
 from bpnp.maps.twins import without_twins
+from bpnp.maps.upright import quarter_turns, turned_view
 from bpnp.maps.verify_view import verify_pose
 from bpnp.maps.views import (
     RUNG,
@@ -52,6 +53,7 @@ from bpnp.solving.arguments import (
     check_inside,
     checked_prior,
     checked_seed,
+    numbers,
     pixels_from,
     positive,
     source_from,
@@ -233,6 +235,7 @@ class SceneMap:
         views: Iterable[str] | None = None,
         scores: Any = None,
         prior: Any = None,
+        up_camera: Any = None,
         solver: "str | Path | torch.nn.Module" = "auto",
         seed: int = 0,
         time_limit: float | int | None = None,
@@ -252,6 +255,9 @@ class SceneMap:
         scores: (m,) strength of the keypoints; the strongest are used first.
         prior: what is known of the photo's pose, as for `bpnp.solve`; None to expect it near that of the view that is
             tried.
+        up_camera: direction up (3,) in the camera of the photo, known to a quarter turn, such as from the orientation
+            of EXIF data. Views that are turned against it by a quarter turn or more are tried as if they were not. If
+            no pose is confident then, they are tried as they are. No effect with a prior.
         solver: as for `bpnp.solve`; a network that expects the points in the camera of a view gets them in that of the
             view that is tried, or of the prior.
         seed: of the search.
@@ -267,6 +273,11 @@ class SceneMap:
         with the ids `solution.point_ids` are the points that were tried.
         Raises ValueError for unknown views and for input that `bpnp.solve` refuses.
         """
+        views = None if views is None else list(views)
+        if up_camera is not None and prior is None and (turned := self._turned(up_camera)) is not self:
+            options: dict[str, Any] = {"image_size": image_size, "focal_error": focal_error, "distortion": distortion}
+            options |= {"views": views, "scores": scores, "solver": solver, "seed": seed}
+            return self._localize_turned(turned, keypoints, camera, positive("time_limit", time_limit), options)
         start, best = Clock.now(), list[tuple[Place, Solution]]()
         pixels = pixels_from(keypoints, image_size or camera)
         lens = self._lens(camera, image_size, focal_error, distortion)
@@ -334,6 +345,40 @@ class SceneMap:
         solution = best[0][1] if strongest is None else among_all(best[0][1], strongest, pixels)
         return replace(solution, seconds=Clock.now() - start)
 
+    def _turned(self, up_camera: Any) -> "SceneMap":
+        """The map with the camera of each view turned by quarter turns until its up is that of a photo (3,); the map
+        itself if none has to be turned."""
+        up = numbers("up_camera", up_camera)
+        if up.shape != (3,) or not np.isfinite(up).all() or not up.any():
+            raise ValueError(f"`up_camera` is {up.tolist()}; three numbers that are not all zero are needed")
+        turns = quarter_turns(self.views, up)
+        if not turns.any():
+            return self
+        key = turns.tobytes()
+        if key not in self._turned_maps:
+            views = tuple(map(turned_view, self.views, turns.tolist()))
+            self._turned_maps[key] = turned = replace(self, views=views)
+            vars(turned).update(cones=self.cones)  # of the centres of the views, which stay
+        return self._turned_maps[key]
+
+    @cached_property
+    def _turned_maps(self) -> dict[bytes, "SceneMap"]:
+        return {}
+
+    def _localize_turned(
+        self, turned: "SceneMap", keypoints: Any, camera: Any, time_limit: float | None, options: dict[str, Any]
+    ) -> Solution:
+        """The pose of a photo in a map with turned views or, if that is not confident, the better one of it and that in
+        this map. Half of the time limit is for the first."""
+        start = Clock.now()
+        half = None if time_limit is None else time_limit / 2
+        upright = turned.localize(keypoints, camera, time_limit=half, **options)
+        if upright.verdict == "confident":
+            return upright
+        left = None if time_limit is None else max(time_limit - (Clock.now() - start), 1e-3)
+        best = max(upright, self.localize(keypoints, camera, time_limit=left, **options), key=rank)
+        return replace(best, seconds=Clock.now() - start)
+
     def verify_view(
         self, name: str, keypoints: Any, *, seed: int = 0, time_limit: float | int | None = 10.0
     ) -> Solution:
@@ -385,6 +430,7 @@ class SceneMap:
         *,
         keypoints: str | Path | None = None,
         name: str | None = None,
+        ignore_orientation: bool = False,
         **options: Any,
     ) -> Solution:
         """The pose of a photo from its file, as `bpnp localize` finds it.
@@ -394,6 +440,8 @@ class SceneMap:
             size; "unknown" for an unknown focal length whatever EXIF says.
         keypoints: HDF5 file of hloc or COLMAP's database, which has those of the photo under its `name`, by default
             that of the file; None to detect SIFT keypoints.
+        ignore_orientation: whether the orientation in the EXIF data is not used. It is a hint: the side that is up is
+            tried first (`up_camera` of `localize`). The photo is not turned, as in COLMAP.
         options: focal_error, distortion, views, prior, solver, seed and time_limit, as for `localize`; the first one
             has no effect on a photo whose camera is unknown.
         Raises ValueError for a photo that cannot be read, or of another size than its camera or keypoints, and as
@@ -410,6 +458,8 @@ class SceneMap:
             )
         points = photo_keypoints(path, keypoints, path.name if name is None else name)
         options = {option: value for option, value in options.items() if value is not None}
+        if not ignore_orientation:
+            options.setdefault("up_camera", up_from_exif(path))
         if lens is None:
             options.pop("focal_error", None)
             return self.localize(points.pixels, image_size=size, scores=points.scores, **options)
