@@ -5,7 +5,7 @@ import io
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from bpnp.report.terminal import INKS, VERDICTS, number
 
 SECONDS = 10.0  # an image
 UNTESTED = "untested"
+MATCHED_ONLY = "Significant on the matched keypoints alone, log10 NFA {0:.1f}, but not on all {2} keypoints, {1:.1f}"
 WORST_FIRST = ("failed", "ambiguous", UNTESTED, "confident")
 DRAWN = 3000  # points of the map on the page
 SIDE = 1000.0  # of the drawing
@@ -71,6 +72,10 @@ def verify_map(
 ) -> list[VerifiedView]:
     """Verify the pose of each image of a COLMAP model without the image's own observations.
 
+    A pose is judged on all keypoints of the image. Where it is not significant on these, but on the keypoints that the
+    model matched to some point, it is "ambiguous": thousands of other keypoints may hide a right pose, and the matched
+    ones alone do not exclude an equal building.
+
     Args:
         folder: Of the model; the keypoints of its images are read.
         scene: The map of the same model.
@@ -84,11 +89,19 @@ def verify_map(
     Raises:
         ColmapError: A ValueError, if the model cannot be read.
     """
-    keypoints = {image.name: image.keypoints for image in read_records(folder).images}
+    images = {image.name: image for image in read_records(folder).images}
     verified = []
     for view in scene.views:
-        pixels = np.unique(keypoints[view.name], axis=0)
-        verified.append(_verified(scene, view.name, pixels[np.isfinite(pixels).all(-1)], seed, time_limit))
+        image = images[view.name]
+        usable = np.isfinite(image.keypoints).all(-1)
+        one = _verified(scene, view.name, np.unique(image.keypoints[usable], axis=0), seed, time_limit)
+        if one.verdict == "failed" and one.log10_false_alarms > 0:
+            matched = np.unique(image.keypoints[usable & (image.point_ids >= 0)], axis=0)
+            again = _verified(scene, view.name, matched, seed, time_limit)
+            if again.verdict != "failed":
+                reason = MATCHED_ONLY.format(again.log10_false_alarms, one.log10_false_alarms, len(image.keypoints))
+                one = replace(again, verdict="ambiguous", reason=reason)
+        verified.append(one)
         done()
     return sorted(verified, key=lambda one: (WORST_FIRST.index(one.verdict), -one.log10_false_alarms, one.name))
 

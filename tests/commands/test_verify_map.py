@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -88,6 +89,28 @@ def test_an_image_is_judged_without_the_points_that_it_made(tmp_path: Path) -> N
     assert verified[0].name == "turned.jpg"
     assert (verified[0].verdict, [one.verdict for one in verified[1:]]) == ("failed", ["confident"] * 5)
     assert len(scene.points3d) == 180
+
+
+def test_thousands_of_other_keypoints_do_not_refute_a_pose(tmp_path: Path) -> None:
+    """One image at its place and the wrong one get 8,000 keypoints without a point: one in six pixels to each side."""
+    draw_map(tmp_path / "drawn")
+    pycolmap.Reconstruction(tmp_path / "drawn").write_text(tmp_path / "drawn")
+    lines = (tmp_path / "drawn" / "images.txt").read_text().splitlines()
+    rng = np.random.default_rng(3)
+    for k, line in enumerate(lines):
+        if line.endswith(("00.jpg", WRONG_IMAGE)):
+            clutter = rng.uniform((0, 0), (640, 480), (8000, 2))
+            lines[k + 1] += "".join(f" {x:.2f} {y:.2f} -1" for x, y in clutter)
+    (tmp_path / "map").mkdir()
+    (tmp_path / "map" / "images.txt").write_text("\n".join(lines) + "\n")
+    for name in ("cameras", "points3D"):
+        shutil.copy(tmp_path / "drawn" / f"{name}.txt", tmp_path / "map")
+    verified = {one.name: one for one in verify_map(tmp_path / "map", SceneMap.from_colmap(tmp_path / "map"))}
+    assert verified["00.jpg"].verdict == "ambiguous"  # no longer significant, and yet not refuted
+    assert "Significant on the matched keypoints alone" in verified["00.jpg"].reason
+    assert "not on all 8200 keypoints" in verified["00.jpg"].reason
+    assert verified[WRONG_IMAGE].verdict in ("ambiguous", "failed")
+    assert {name for name, one in verified.items() if one.doubtful} == {"00.jpg", WRONG_IMAGE}
 
 
 def test_images_whose_points_hardly_another_one_sees_are_untested(tmp_path: Path) -> None:
