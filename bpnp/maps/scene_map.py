@@ -275,9 +275,9 @@ class SceneMap:
         """
         views = None if views is None else list(views)
         if up_camera is not None and prior is None and (turned := self._turned(up_camera)) is not self:
-            options: dict[str, Any] = {"image_size": image_size, "focal_error": focal_error, "distortion": distortion}
-            options |= {"views": views, "scores": scores, "solver": solver, "seed": seed}
-            return self._localize_turned(turned, keypoints, camera, positive("time_limit", time_limit), options)
+            known: dict[str, Any] = {"image_size": image_size, "focal_error": focal_error, "distortion": distortion}
+            known |= {"views": views, "scores": scores, "solver": solver, "seed": seed}
+            return self._localize_turned(turned, keypoints, camera, positive("time_limit", time_limit), known)
         start, best = Clock.now(), list[tuple[Place, Solution]]()
         pixels = pixels_from(keypoints, image_size or camera)
         lens = self._lens(camera, image_size, focal_error, distortion)
