@@ -230,22 +230,21 @@ class Problem:
         reason = why_degenerate(self.bearings, self.points3d, fewest)
         return f"of the lights that no other problem has, {reason}" if reason and self.taken2d else reason
 
-    def project(self, rotation: Array, translation: Array, points: Array) -> Array:
-        """Return where points (p, 3) in unit size are seen, in the coordinates of `image_points`; NaN if nowhere."""
-        camera = points @ rotation.T + translation
+    def project(self, in_camera: Array) -> Array:
+        """Return where points (p, 3) in the camera's frame are seen, as `image_points`; NaN if nowhere."""
         if self.camera is not None:
-            return self.camera.project(camera)
+            return self.camera.project(in_camera)
         if self.points2d is not None:
-            return in_front(camera)[:, :2]
-        length = np.linalg.norm(camera, axis=-1, keepdims=True)
-        return np.divide(camera, length, out=np.full_like(camera, np.nan), where=length > 0)
+            return in_front(in_camera)[:, :2]
+        length = np.linalg.norm(in_camera, axis=-1, keepdims=True)
+        return np.divide(in_camera, length, out=np.full_like(in_camera, np.nan), where=length > 0)
 
     def project_scene(self, rotation: Array, translation: Array) -> Array:
         """Return where the scene points are seen (n, d); NaN for those that are not, or face away."""
-        seen = self.project(rotation, translation, self.points3d)
+        in_camera = self.points3d @ rotation.T + translation
+        seen = self.project(in_camera)
         if self.normals3d is not None:
-            camera = self.points3d @ rotation.T + translation
-            seen[~faces(self.normals3d, self.cosines3d, camera, rotation)] = np.nan
+            seen[~faces(self.normals3d, self.cosines3d, in_camera, rotation)] = np.nan
         return seen
 
     def may_match(self, i: Labels, j: Labels) -> NDArray[np.bool_]:

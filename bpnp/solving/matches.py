@@ -4,7 +4,6 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +25,7 @@ DENSE = 4096  # possible matches up to which all of them are compared
 NEIGHBOURS = 8  # of a point that can be its match; more only where the radius is far too large
 SCALES = 3.0  # of the residuals: the threshold of an inlier, if none is given
 FIT_ROUNDS = 5
+DIFFERENCE = 6e-6  # of a step of the pose, the cube root of the precision: of central differences
 SIGNIFICANT = 22.5  # chi-squared with 6 degrees of freedom, one in a thousand
 
 
@@ -116,16 +116,17 @@ def _fitted(problem: Problem, rotation: Array, translation: Array, threshold: fl
     too coarse for the data. At an optimum of the same precision n log(S / S_min), S the sum of n squared residuals, is
     distributed as chi-squared with 6 degrees of freedom.
     """
+    image = problem.image_points
     for _ in range(FIT_ROUNDS):
-        i, j = mutual_nearest(
-            problem.image_points, problem.project_scene(rotation, translation), threshold, problem.may_match
-        ).T
+        seen = problem.project_scene(rotation, translation)
+        i, j = mutual_nearest(image, seen, threshold, problem.may_match).T
         if len(i) < MIN_POINTS:
             break
-        target, project = problem.image_points[i], partial(problem.project, points=problem.points3d[j])
-        trial = fit_pose(project, target, rotation, translation, scale=threshold)
-        before, after = (float(((project(*pose) - target) ** 2).sum()) for pose in ((rotation, translation), trial))
-        if not before > after * math.exp(SIGNIFICANT / target.size):
+        target, points = image[i], problem.points3d[j]
+        trial = fit_pose(problem.project, points, target, rotation, translation, scale=threshold)
+        after = problem.project(points @ trial[0].T + trial[1])
+        squares = [float(((each - target) ** 2).sum()) for each in (seen[j], after)]
+        if not squares[0] > squares[1] * math.exp(SIGNIFICANT / target.size):
             break
         rotation, translation = trial
     return rotation, translation
@@ -177,23 +178,59 @@ def mutual_nearest(image: Array, projected: Array, radius: float, allowed: Allow
 
 
 def fit_pose(
-    project: Callable[[Array, Array], Array], target: Array, rotation: Array, translation: Array, *, scale: float
+    project: Callable[[Array], Array],
+    points: Array,
+    target: Array,
+    rotation: Array,
+    translation: Array,
+    *,
+    scale: float,
 ) -> tuple[Array, Array]:
-    """The pose near (rotation, translation) of least squared distance between `target` (k, d) and project(R, t) (k, d).
+    """Fit a pose to matches by least squares, with Levenberg-Marquardt steps from a pose nearby.
 
-    By Levenberg-Marquardt with numeric derivatives in (w, s), R = exp([w]x) rotation, t = translation + size s, so
-    that it serves every camera. scale: of the residuals; a point that leaves the view counts as far off.
+    The derivatives by (w, s), R = exp([w]x) rotation, t = translation + size s, are central differences, so that any
+    camera can be used.
+
+    Args:
+        project: Returns the image points (k, d) of points (k, 3) in the camera's frame.
+        points: (k, 3) scene points.
+        target: (k, d) their image points.
+        rotation: (3, 3) to start from.
+        translation: (3,) to start from.
+        scale: Scale of the residuals; a point that leaves the view has a thousand times as much.
+
+    Returns:
+        Rotation (3, 3) and translation (3,).
     """
     size = max(float(np.linalg.norm(translation)), 1e-12)
+    differences = DIFFERENCE * np.concatenate([np.eye(6), -np.eye(6)])
 
-    def pose(step: Array) -> tuple[Array, Array]:
-        return Rotation.from_rotvec(step[:3]).as_matrix() @ rotation, translation + size * step[3:]
+    def poses(steps: Array) -> tuple[Array, Array]:
+        return Rotation.from_rotvec(steps[:, :3]).as_matrix() @ rotation, translation + size * steps[:, 3:]
 
-    def residuals(step: Array) -> Array:
-        return np.nan_to_num(project(*pose(step)) - target, nan=1e3 * scale).ravel() / scale
+    def residuals(steps: Array) -> Array:
+        """Return the residuals (s, k d) of steps (s, 6), which are all projected at once."""
+        turns, shifts = poses(steps)
+        seen = project((points @ turns.transpose(0, 2, 1) + shifts[:, None]).reshape(-1, 3))
+        off = seen.reshape(len(steps), *target.shape) - target
+        return np.nan_to_num(off, nan=1e3 * scale).reshape(len(steps), -1) / scale
 
-    found = least_squares(residuals, np.zeros(6), method="lm", xtol=1e-12, ftol=1e-12, gtol=1e-12, max_nfev=200)
-    return pose(found.x)
+    def jacobian(step: Array) -> Array:
+        above, below = np.split(residuals(step + differences), 2)
+        return np.asarray((above - below).T / (2 * DIFFERENCE))
+
+    found = least_squares(
+        lambda step: residuals(step[None])[0],
+        np.zeros(6),
+        jac=jacobian,
+        method="lm",
+        xtol=1e-12,
+        ftol=1e-12,
+        gtol=1e-12,
+        max_nfev=200,
+    )
+    turns, shifts = poses(found.x[None])
+    return turns[0], shifts[0]
 
 
 def _near(image: Array, projected: Array, radius: float, allowed: Allowed | None) -> tuple[Labels, Array]:
