@@ -17,6 +17,7 @@ import symmetric
 from record import Problem, parser
 from scipy.spatial.transform import Rotation
 
+from bpnp.poses import Tolerance
 from bpnp.search.evidence.repetitions import competing_poses, registered
 from bpnp.search.pool import Pool
 from bpnp.search.scene import Scene
@@ -67,7 +68,7 @@ def leads_back(kind: symmetric.Kind, problem: Problem) -> bool:
     motions = registered(points, turned, shift, symmetric.NOISE, DEFAULT.evidence)
     rotations, translations = competing_poses(points, turned, shift, motions, DEFAULT.evidence)
     poses = np.concatenate([rotation[None], rotations]), np.vstack([translation, translations])
-    return bool(points.same_pose(*poses, RIGHT_DEG, DEFAULT.evidence.other_shift)[1:].any())
+    return bool(points.same_pose(*poses, Tolerance(RIGHT_DEG))[1:].any())
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
 """Comparison of poses that are NumPy arrays."""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,55 @@ def turned_by(one: Array, other: Array) -> float:
     return math.acos(min(max(cosine, -1.0), 1.0))
 
 
+class Tolerance(NamedTuple):
+    """How far apart two poses may be to count as the same one.
+
+    Attributes:
+        degrees: Angle between the rotations.
+        shift: How far the middle of the scene moves in the camera's frame, a fraction of its distance.
+    """
+
+    degrees: float = 2.0
+    shift: float = 0.05
+
+    def times(self, factor: float | int) -> "Tolerance":
+        """Return a tolerance that is larger by a factor."""
+        return Tolerance(factor * self.degrees, factor * self.shift)
+
+
+SAME = Tolerance()
+
+
 def same_pose(
+    rotation: Array, middle: Array, i: int | NDArray[np.int64] = 0, tolerance: Tolerance = SAME
+) -> NDArray[np.bool_]:
+    """Find the poses that are the same as pose i.
+
+    Args:
+        rotation: Rotations (c, 3, 3).
+        middle: (c, 3) the middle of the scene in the camera's frame; (c, k, 3) in the frames of several cameras.
+        i: Index of the reference pose, or several indices (k,).
+        tolerance: Largest differences.
+
+    Returns:
+        Mask (c,), or (k, c) for several indices.
+
+    Examples:
+        >>> middle = np.array([[0, 0, 10], [0.4, 0, 10], [0, 0, 10.6]])
+        >>> same_pose(np.stack([np.eye(3)] * 3), middle)
+        array([ True,  True, False])
+    """
+    return close_poses(rotation, seen_from(middle), i, *tolerance)
+
+
+def seen_from(middle: Array) -> Array:
+    """Return the directions and log distances (c, 4 k) of points (c, 3) or (c, k, 3) in cameras' frames."""
+    distance = np.maximum(np.linalg.norm(middle, axis=-1, keepdims=True), 1e-300)
+    seen = np.concatenate([middle / distance, np.log(distance)], -1)
+    return np.asarray(seen.reshape(len(seen), int(np.prod(seen.shape[1:]))))
+
+
+def close_poses(
     rotation: Array, translation: Array, i: int | NDArray[np.int64], degrees: float, shift: float
 ) -> NDArray[np.bool_]:
     """Find the poses that are close to pose i.
@@ -50,8 +98,8 @@ def distinct(
         translation: Translations (c, 3).
         score: Score (c,), larger is better. Poses with NaN or -inf are left out.
         count: Largest number of poses.
-        degrees: Angle limit, as in `same_pose`, degrees.
-        shift: Distance limit, as in `same_pose`.
+        degrees: Angle limit, as in `close_poses`, degrees.
+        shift: Distance limit, as in `close_poses`.
 
     Returns:
         Indices of at most `count` poses, best first.
@@ -61,7 +109,7 @@ def distinct(
     order = np.argsort(-np.where(free, score, -np.inf), kind="stable")
     for first in range(0, len(order), AT_ONCE):
         several = order[first : first + AT_ONCE]
-        for i, same in zip(several.tolist(), same_pose(rotation, translation, several, degrees, shift), strict=True):
+        for i, same in zip(several.tolist(), close_poses(rotation, translation, several, degrees, shift), strict=True):
             if len(kept) == count:
                 return np.array(kept, dtype=np.int64)
             if free[i]:

@@ -214,7 +214,7 @@ def on_all_points(solution: Solution, photo: Photo, lens: Camera | UnknownCamera
     result = against_rivals(alone, problem, lambda: scene, rule, exhaustive=True)
     rotations, shifts = np.stack([rotation, result.best[0]]), np.stack([shift, result.best[1]])
     behind = result.log10_false_alarms - solution.log10_false_alarms
-    if sure and not problem.same_pose(rotations, shifts, rule.other_deg, rule.other_shift)[1]:
+    if sure and not problem.same_pose(rotations, shifts, rule.same)[1]:
         return solution if behind >= rule.lead else _doubted(solution, fits_as_well(rotation, result.best[0], behind))
     if behind < 0 or (not sure and result.verdict == "confident"):
         found = finished(problem, result, solution.seconds, None)

@@ -72,9 +72,7 @@ def best_rival(photo: Photo, solution: Solution, met: Sequence[Solution]) -> tup
 
     def different(rotations: Array, translations: Array) -> NDArray[np.bool_]:
         rotations, translations = np.concatenate([best[0][None], rotations]), np.r_[best[1][None], translations]
-        middle = rotations @ matched + translations
-        shift = rule.other_shift * float(np.linalg.norm(middle[0]))
-        return np.asarray(~same_pose(rotations, middle, 0, rule.other_deg, shift)[1:])
+        return np.asarray(~same_pose(rotations, rotations @ matched + translations, 0, rule.same)[1:])
 
     rotations, translations = (np.array([pose[k] for pose in poses]).reshape(-1, *x.shape) for k, x in enumerate(best))
     apart = different(rotations, translations)

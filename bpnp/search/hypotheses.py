@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.poses import distinct, same_pose
+from bpnp.poses import close_poses, distinct
 from bpnp.search.scene import Scene
 
 SIGNIFICANT = 1e3  # nats a bearing, more than any log-likelihood
@@ -126,7 +126,7 @@ def select_distinct(poses: Hypotheses, scene: Scene, count: int, apart_deg: floa
     kept = distinct(*compared, poses.sort_key, count, *limits)
     if not len(kept):
         return poses[kept]
-    same = same_pose(*compared, kept, *limits)
+    same = close_poses(*compared, kept, *limits)
     first = same & (np.cumsum(same, 0) == 1)  # a pose near two counts for the better one
     return replace(poses[kept], basin_count=first @ poses.basin_count)
 

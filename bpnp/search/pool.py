@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.poses import same_pose
+from bpnp.poses import close_poses
 from bpnp.search.annealing import finish
 from bpnp.search.evidence.false_alarms import log10_tests
 from bpnp.search.evidence.rivals import against_rivals
@@ -92,13 +92,13 @@ class Pool:
         rule, looked = self.scene.settings.evidence, to_user_frame(self.surrounded, self.scene)
         rotation = np.concatenate([leaders.rotation[:1], looked.rotation])
         translation = np.concatenate([leaders.translation[:1], looked.translation])
-        return int(self.problem.same_pose(rotation, translation, rule.other_deg, rule.other_shift).sum()) - 1
+        return int(self.problem.same_pose(rotation, translation, rule.same).sum()) - 1
 
     def is_searched(self, pose: Hypotheses) -> bool:
         """Whether the surroundings of a pose (1,), or of one much like it, were searched before one exceeded chance."""
         together, settings = Hypotheses.concatenate([pose, *self.searched]), self.scene.settings
         poses = together.rotation, together.translation * self.scene.shift_weight
-        return bool(same_pose(*poses, 0, settings.same_deg, settings.same_shift)[1:].any())
+        return bool(close_poses(*poses, 0, settings.same_deg, settings.same_shift)[1:].any())
 
     def _missed(self) -> float:
         leaders = self.leaders()

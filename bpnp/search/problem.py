@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.cameras import Camera, in_front
-from bpnp.poses import MIN_POINTS, same_pose, turned_by
+from bpnp.poses import MIN_POINTS, SAME, Tolerance, same_pose, turned_by
 from bpnp.search.image_statistics import ImageStatistics
 from bpnp.search.propose.symmetries import Motions
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
@@ -303,11 +303,9 @@ class Problem:
         middle = self.size * self.middle
         return middle if self.origin is None else middle + self.origin
 
-    def same_pose(self, rotation: Array, translation: Array, degrees: float, share: float) -> NDArray[np.bool_]:
-        """Return which poses (c, 3, 3), (c, 3) are the first one: turned by `degrees` at most, and the middle of the
-        scene moved by this fraction of its distance."""
-        middle = rotation @ self.middle + translation
-        return same_pose(rotation, middle, 0, degrees, share * float(np.linalg.norm(middle[0])))
+    def same_pose(self, rotation: Array, translation: Array, tolerance: Tolerance = SAME) -> NDArray[np.bool_]:
+        """Return which poses (c, 3, 3), (c, 3) are the same as the first one."""
+        return same_pose(rotation, rotation @ self.middle + translation, 0, tolerance)
 
     @property
     def knows_rotation(self) -> bool:

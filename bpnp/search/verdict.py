@@ -132,7 +132,7 @@ def motions_of(candidates: Hypotheses, problem: Problem, rule: Evidence) -> Moti
     pose = candidates.rotation[:1], candidates.translation[:1]
     for rotation, translation, motions in problem.registered:
         poses = np.concatenate([pose[0], rotation[None]]), np.vstack([pose[1], translation])
-        if problem.same_pose(*poses, rule.other_deg, rule.other_shift)[1]:
+        if problem.same_pose(*poses, rule.same)[1]:
             return motions
     scale = max(float(candidates.scale[0]), float(problem.image.scales[0]))
     motions = registered(problem, pose[0][0], pose[1][0], scale, rule)
@@ -163,7 +163,7 @@ def starts_met(candidates: Hypotheses, problem: Problem, rule: Evidence, *, symm
     counted = np.zeros(len(candidates), bool)
     for rotation, translation in zip(*first, strict=True):
         poses = np.concatenate([rotation[None], candidates.rotation]), np.vstack([translation, candidates.translation])
-        counted |= problem.same_pose(*poses, rule.other_deg, rule.other_shift)[1:]
+        counted |= problem.same_pose(*poses, rule.same)[1:]
     return int(candidates.basin_count[counted].sum())
 
 

@@ -287,11 +287,10 @@ class _Ladder:
                 behind = other.log10_false_alarms - best.log10_false_alarms
                 rotations = np.stack([best.rotation, other.rotation])
                 moved = rotations @ middle + np.stack([best.translation, other.translation])
-                shift = rule.other_shift * float(np.linalg.norm(moved[0]))
                 zoom = end.focal_length / best.focal_length
                 if (
                     behind < rule.lead
-                    and not same_pose(rotations, moved, 0, rule.other_deg, shift)[1]
+                    and not same_pose(rotations, moved, 0, rule.same)[1]
                     and not is_claimed(best, other.rotation, zoom)
                 ):
                     away = math.degrees(turned_by(best.rotation, other.rotation))
@@ -306,7 +305,7 @@ def is_claimed(solution: Solution, rotation: Array, zoom: float) -> bool:
     Not one that is turned by more than `Contested.far` times what makes a different pose, whatever the bound.
     """
     turn, rule = Rotation.from_matrix(rotation @ solution.rotation.T).as_rotvec(), SEARCH.evidence
-    if math.degrees(float(np.linalg.norm(turn))) > rule.contested.far * rule.other_deg:
+    if math.degrees(float(np.linalg.norm(turn))) > rule.contested.far * rule.same.degrees:
         return False
     chosen, free = [0, 1, 2, POSE], 2 * len(solution.matches) - (POSE + 1)
     return is_within(np.r_[turn, math.log(zoom)], solution.covariance[np.ix_(chosen, chosen)], free)

@@ -271,5 +271,5 @@ def _same(pose: Any, other: Any) -> bool:
         depth2 += other[3, k] ** 2
         for c in range(3):
             trace += pose[k, c] * other[k, c]
-    near = shift2 < (RULES.same_shift + RULES.same_depth * math.sqrt(depth2)) ** 2
+    near = shift2 < RULES.same_shift**2 * depth2
     return near and trace > RULES.same_trace

@@ -76,7 +76,7 @@ class Enumeration:
         (prior, heading, log_share), fixing = prior_arrays(problem, scene, image, settings), problem.pairs_that_fix
         self.scene, self.image, self.settings = scene, image, settings
         self.fixing, self.solved, self._pace = fixing, 0, SLOWEST
-        self.contested: list[Array] = []  # rotations (3, 3) of poses whose competitors were proposed
+        self.contested: list[Hypotheses] = []  # poses (1,) whose competitors were proposed
         m, n, kept = len(image.arrays.rays), len(scene.arrays.points), settings.kept
         self.tables = EnumerationTables(scene.arrays, image.arrays, prior, heading, fixing, image.density)
         self.kept = Kept(
@@ -201,8 +201,8 @@ def enumerate_poses(
             return None
         poses = _poses(run)
         if competitors is not None:
-            poses = _with_competitors(run, poses, competitors)
-        if margin(poses, settings) >= safe * (1 - run.solved / settings.patience) and (
+            poses = _with_competitors(run, problem, poses, competitors)
+        if margin(poses, problem) >= safe * (1 - run.solved / settings.patience) and (
             is_safe is None or is_safe(poses)
         ):
             return Enumerated(poses, "safe")
@@ -232,13 +232,13 @@ def enumerate_poses(
     return Enumerated(_poses(run), "exhausted" if complete else "most")
 
 
-def _with_competitors(run: Enumeration, poses: Hypotheses, competitors: Competitors) -> Hypotheses:
+def _with_competitors(run: Enumeration, problem: Problem, poses: Hypotheses, competitors: Competitors) -> Hypotheses:
     """Propose the competitors of the best pose, and of the better pose that one of them leads to; each pose once."""
     while True:
-        best = poses.rotation[0]
-        if any(np.trace(known.T @ best) > RULES.same_trace for known in run.contested):
+        known = Hypotheses.concatenate([poses[:1], *run.contested])
+        if problem.same_pose(known.rotation, known.translation)[1:].any():
             return poses
-        run.contested.append(best)
+        run.contested.append(poses[:1])
         for pose in zip(*competitors(poses), strict=True):
             run.propose(*pose, run.reach)
         poses = _poses(run)
@@ -280,12 +280,11 @@ def _poses(run: Enumeration) -> Hypotheses:
     )
 
 
-def margin(poses: Hypotheses, settings: EnumerationSettings = DEFAULT) -> float:
+def margin(poses: Hypotheses, problem: Problem) -> float:
     """Return the nats by which the best pose exceeds both chance after all tests, and every different pose."""
     if poses.evidence is None or not len(poses):
         return -math.inf
-    traces = np.einsum("cij,ij->c", poses.rotation, poses.rotation[0])
-    other = poses.evidence[traces < 1 + 2 * math.cos(math.radians(settings.other_deg))]
+    other = poses.evidence[~problem.same_pose(poses.rotation, poses.translation)]
     lead = float(poses.evidence[0] - other.max()) if len(other) else math.inf
     return min(float(poses.evidence[0]), lead)
 
@@ -343,7 +342,7 @@ def search_by_enumeration(problem: Problem, deadline: Deadline, settings: Search
             found, others = enumerated(replace(problem, prior=None), DEFAULT)
             candidates = with_false_alarms(Hypotheses.concatenate([candidates, others]), problem)
             candidates = candidates[np.argsort(candidates.log10_false_alarms, kind="stable")[: settings.kept]]
-    elif certain is None and tracked and (near or margin(found.poses) < 0):
+    elif certain is None and tracked and (near or margin(found.poses, problem) < 0):
         found, others = enumerated(replace(problem, prior=None), DEFAULT)
         candidates = Hypotheses.concatenate([candidates, others])
         candidates = candidates[np.argsort(-candidates.log_likelihood, kind="stable")[: settings.kept]]

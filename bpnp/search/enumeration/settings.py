@@ -4,6 +4,8 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from bpnp.poses import SAME
+
 
 class Stage(NamedTuple):
     """A block of hypotheses: the `near2d` nearest of an image point with the `near3d` nearest of a scene point.
@@ -28,8 +30,8 @@ class Rules(NamedTuple):
     takes away from a hypothesis. behind: matches that a hypothesis may have less than any other had, to be refined.
     skipped: matches of the best pose from which its own triples are not solved again, counted: its basin count then.
     tighter, final: factor of the radius from one step of a refinement to the next, and steps at the last one.
-    same_trace, same_shift, same_depth: poses are the same if the trace of the turn between them is larger and the shift
-    smaller than the sum of these shares of the scene's extent and of its distance.
+    same_trace, same_shift: poses are the same (`Tolerance`) if the trace of the turn between them is larger and the
+    shift smaller than this fraction of the scene's distance.
     """
 
     cells: int = 48
@@ -43,9 +45,8 @@ class Rules(NamedTuple):
     counted: int = 12
     tighter: float = 0.55
     final: int = 3
-    same_trace: float = 1 + 2 * math.cos(math.radians(2.0))
-    same_shift: float = 0.1
-    same_depth: float = 0.05
+    same_trace: float = 1 + 2 * math.cos(math.radians(SAME.degrees))
+    same_shift: float = SAME.shift
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class EnumerationSettings:
     where a prior lets two matches fix a pose.
 
     stages: what is tried, one after the other; those of two matches only where a prior lets two fix a pose.
-    kept: distinct poses. other_deg: poses farther apart answer differently. safe: nats beyond chance and ahead of
+    kept: distinct poses. safe: nats beyond chance and ahead of
     any other pose at which the search ends at once; after `patience` hypotheses none are asked for, and after twice
     as many it ends with any pose that exceeds chance. look, chunk: hypotheses between looks at the best pose, when
     it exceeds chance and before. most: hypotheses in all. widest: radii within which points are matched to a
@@ -76,7 +77,6 @@ class EnumerationSettings:
         *(Stage(3, *near, reach) for near in ((5, 9), (8, 13), (24, 32), (63, 63)) for reach in (0.5, 2.0)),
     )
     kept: int = 16
-    other_deg: float = 10.0
     safe: float = math.log(1e6)
     patience: int = 25_000
     look: int = 3_000

@@ -42,10 +42,9 @@ class Alternative(NamedTuple):
 def other_pose(candidates: Hypotheses, problem: Problem, rule: Evidence) -> Alternative | None:
     """The different pose with the fewest false alarms; None if there is none.
 
-    Different: turned by more than `other_deg`, or the middle of the scene moved by more than `other_shift` of its
-    distance.
+    Different: farther apart than `Evidence.same`.
     """
-    same = problem.same_pose(candidates.rotation, candidates.translation, rule.other_deg, rule.other_shift)
+    same = problem.same_pose(candidates.rotation, candidates.translation, rule.same)
     others = np.flatnonzero(~same)
     if not len(others):
         return None
@@ -74,14 +73,14 @@ def misfit(linear: Linearised | None, count: float, rule: Evidence) -> Alternati
     and with them the pose would be a different one; None otherwise.
 
     count: of the matches. Where the focal length cannot be told, the camera is believed as it was given; where another
-    one is significantly better and moves the middle of the scene by more than `rule.other_shift`, the pose is in doubt.
+    one is significantly better and moves the middle of the scene by more than `rule.same.shift`, the pose is in doubt.
     """
     return of_misfit(systematic_misfit(linear, count, rule), rule)
 
 
 def of_misfit(off: Misfit, rule: Evidence) -> Alternative | None:
     """The alternative that is so far off; None where it is the same pose."""
-    limits = (rule.zoomed.bend_deg, rule.zoomed.bend_shift) if off.radial else (rule.other_deg, rule.other_shift)
+    limits = (rule.zoomed.bend_deg, rule.zoomed.bend_shift) if off.radial else (rule.same.degrees, rule.same.shift)
     if math.degrees(off.turn) <= limits[0] and off.shift <= limits[1]:
         return None
     other = f"{off.zoom:.2f} times the focal length" if off.zoom != 1 else "other proportions of the scene"
@@ -118,7 +117,7 @@ def contesting(seen: Seen, rule: Evidence) -> Alternative | None:
         return None
     candidates, problem = seen[0]
     poses, chosen = (candidates.rotation, candidates.translation), sum(len(each.image.chosen) for _, each in seen)
-    others = np.flatnonzero(~problem.same_pose(*poses, limits.far * rule.other_deg, limits.far * rule.other_shift))
+    others = np.flatnonzero(~problem.same_pose(*poses, rule.same.times(limits.far)))
     # A lead that would be no chance if all gaps were as large as they can be needs no second look.
     decisive = limits.most * math.sqrt(least * chosen) / math.log(10)
     others = others[candidates.log10_false_alarms[others] - candidates.log10_false_alarms[0] < decisive]

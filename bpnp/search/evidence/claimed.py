@@ -147,7 +147,7 @@ def _is_same(problem: Problem, claim: Hypotheses, pose: Hypotheses, rule: Eviden
     """Return whether a pose (1,) is the given one, or within what its points leave open of it."""
     rotations = np.concatenate([claim.rotation, pose.rotation])
     translations = np.concatenate([claim.translation, pose.translation])
-    if problem.same_pose(rotations, translations, rule.other_deg, rule.other_shift)[1]:
+    if problem.same_pose(rotations, translations, rule.same)[1]:
         return True
     turn = claim.rotation[0] @ pose.rotation[0].T
     if pose.log10_false_alarms[0] > rule.false_alarms or np.trace(turn) <= 1:  # over 90 degrees away

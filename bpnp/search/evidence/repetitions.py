@@ -96,7 +96,7 @@ def competing_poses(problem: Problem, rotation: Array, translation: Array, motio
         for parts, one in zip(every, mirrored, strict=True):
             parts.append(one[None])
     rotations, translations = (np.concatenate(parts) for parts in every)
-    other = np.flatnonzero(~problem.same_pose(rotations, translations, rule.other_deg, rule.other_shift))
+    other = np.flatnonzero(~problem.same_pose(rotations, translations, rule.same))
     return rotations[other], translations[other]
 
 
@@ -113,7 +113,7 @@ def repeated_poses(
         least: smallest fraction of the matched points that a motion maps.
 
     Returns:
-        Those poses that a verdict takes for different from the given one (`Evidence.other_deg`), at most
+        Those poses that a verdict takes for different from the given one (`Evidence.same`), at most
         `Repetitions.kept`, as they are, with the fewest false alarms first; of a flat scene also its mirror image.
 
     Examples:

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from bpnp.poses import SAME, Tolerance
+
 
 @dataclass(frozen=True)
 class ImagePoints:
@@ -96,8 +98,8 @@ class Evidence:
 
     false_alarms: of the number of false alarms, at most. It is a bound; on unrelated points an exhaustive search stayed
     above 1 in 999 of 1000 cases, and never came below 0.1.
-    lead: by which every alternative must be less likely: once in a thousand a wrong one is by chance. other_deg,
-        other_shift: poses with rotations farther apart, or translations by this share of their length, are different.
+    lead: by which every alternative must be less likely: once in a thousand a wrong one is by chance. same: poses
+        that are farther apart are different.
     missed: of the probability that a better optimum was not met, at most (`bpnp.search.evidence.alternatives`).
     independent: matches that have to be coincidences for it, as many as fix a pose. another: probability that there is
         a better optimum though several starts ended at a pose that exceeds chance. uncompared: probability that a
@@ -108,7 +110,7 @@ class Evidence:
         tenth wrong is believed half as often again.
     contested, repetitions, zoomed: constants of these alternatives.
     focal: fraction by which a focal length that is fitted may be off, once in a thousand; with it the distance is off,
-        and by `other_shift` the pose is a different one. focal_few: the same of an object, a scene of at
+        and by `same.shift` the pose is a different one. focal_few: the same of an object, a scene of at
         most `Repetitions.whole` points that is no map, such as LEDs: its rotation is right long before its distance.
         The reason says how far the focal length may be off; beyond a factor of two it is open. scale: the same of the
         scale of a rig's scene.
@@ -116,8 +118,7 @@ class Evidence:
 
     false_alarms: float = -2.0
     lead: float = 3.0
-    other_deg: float = 2.0
-    other_shift: float = 0.05
+    same: Tolerance = SAME
     missed: float = -3.0
     independent: int = 3
     another: float = 0.01

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bpnp.poses import SAME, distinct, seen_from
 from bpnp.search.evidence.partners import across, explained
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem
@@ -24,9 +25,9 @@ SCORED = 500  # matches on which the poses of triples are compared
 REFINED = 6  # poses that are refined
 STEPS, ROUNDS = 10, 3  # of Levenberg and Marquardt; with new weights
 WRONG = 0.1  # fraction of known matches that are expected to be wrong
+CONVERGED = 0.05  # times the tolerance of equal poses, within which refined poses are one optimum
 DAMPING = 1e-3  # first factor of Levenberg and Marquardt
 SETTLED, EXACT = 1e-6, 1e-24  # relative and absolute change of a sum of squares, of radians, that ends the steps
-SAME_DEG, SAME_SHIFT = 0.1, 2e-3  # of refined poses that are one optimum, the shift in distances
 
 
 def known_matches(problem: Problem) -> tuple[Labels, Labels] | None:
@@ -95,7 +96,7 @@ def poses_of_matches(problem: Problem, i: Labels, j: Labels, seed: int = 0) -> H
         if len(group):
             left = _squared(rays, points, group)
             ends.append(group[np.argsort(np.median(left, 1) if group is fitted else left.sum(1), kind="stable")])
-    poses = _distinct(np.concatenate(ends)) if ends else poses[:0]
+    poses = np.concatenate(ends) if ends else poses[:0]
     rotation = poses[:, :3]
     translation = size * poses[:, 3] - rotation @ middle
     return _scored(problem, i, j, rotation, translation, scales)
@@ -172,20 +173,9 @@ def _refined(rays: Array, points: Array, poses: Array, weights: Array, steps: in
     return poses
 
 
-def _distinct(poses: Array) -> Array:
-    """Return the first of poses (h, 4, 3) that are the same optimum."""
-    kept: list[int] = []
-    for k in range(len(poses)):
-        turn = np.einsum("hij,ij->h", poses[kept, :3], poses[k, :3])
-        shift = np.linalg.norm(poses[kept, 3] - poses[k, 3], axis=-1)
-        same = (turn > 1 + 2 * math.cos(math.radians(SAME_DEG))) & (shift < SAME_SHIFT * np.linalg.norm(poses[k, 3]))
-        if not same.any():
-            kept.append(k)
-    return poses[kept]
-
-
 def _scored(problem: Problem, i: Labels, j: Labels, rotation: Array, translation: Array, scales: Array) -> Hypotheses:
-    """Return poses (h, 3, 3), (h, 3) with the scale of their residuals, and score and matches at it."""
+    """Return the distinct ones of poses (h, 3, 3), (h, 3) with the scale of their residuals, and likelihood and number
+    of matches at it."""
     poses = np.concatenate([rotation, translation[:, None]], 1)
     squared, density = _squared(problem.bearings[i], problem.points3d[j], poses), 1 / problem.image.solid_angle
     own = scales[_agreement(squared, scales, density)[1]]
@@ -194,4 +184,6 @@ def _scored(problem: Problem, i: Labels, j: Labels, rotation: Array, translation
     scale = np.clip(np.sqrt((weight * squared).sum(1) / free), scales[0], scales[-1])
     found = [explained(problem, *each) for each in zip(rotation, translation, scale, strict=True)]
     score, count = (np.array([one[k] for one in found]) for k in (0, 1))
-    return Hypotheses.from_poses(rotation, translation, log_likelihood=score, match_count=count, scale=scale)
+    hypotheses = Hypotheses.from_poses(rotation, translation, log_likelihood=score, match_count=count, scale=scale)
+    seen, order = seen_from(rotation @ problem.middle + translation), -np.arange(float(len(score)))
+    return hypotheses[distinct(rotation, seen, order, len(score), *SAME.times(CONVERGED))]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.loops.parallel import NEVER, Clock, Deadline, one_blas_thread
-from bpnp.poses import distinct
+from bpnp.poses import distinct, seen_from
 from bpnp.search.enumeration.search import enumerate_poses, is_enumerable
 from bpnp.search.enumeration.settings import DEFAULT as ENUMERATION
 from bpnp.search.evidence.repetitions import repeated_poses
@@ -33,7 +33,6 @@ PROPOSING = replace(ENUMERATION, kept=4000)  # poses of few points that a camera
 REFINED = 16  # poses of all cameras
 A_TURN = 2  # poses that a turn of a camera finds and that are refined
 COMPARED = 64  # proposals of which it is asked how much evidence they have
-SAME = (1.0, 0.02)  # degrees and distances of the scene within which a pose is not refined twice
 BEFORE = 1e9  # nats, more than any pose explains: of those that were refined before
 AGREE_DEG, AGREE, PAIRS = 6.0, 0.2, 50_000  # of poses of two cameras that tell a scale: turn, shift in distances, most
 LEAST_APART = 0.01  # of two cameras, in distances of the scene: a scale with which they are nearer cannot be told
@@ -138,14 +137,12 @@ class Together:
             )
 
     def _distinct(self, poses: Hypotheses, score: Array, count: int) -> NDArray[np.int64]:
-        """The places of the best poses, of which no two show the middle of the scene to all cameras alike."""
-        places = []
+        """Return the indices of the best poses, of which no two are the same to all cameras."""
+        seen = []
         for k, problem in enumerate(self.rig.problems):
             turns, shifts = self.rig.pose_of(k, poses.rotation, poses.translation)
-            middle = turns @ problem.middle + shifts
-            distance = np.maximum(np.linalg.norm(middle, axis=-1, keepdims=True), 1e-300)
-            places += [middle / distance, np.log(distance)]
-        return distinct(poses.rotation, np.concatenate(places, -1), score, count, *SAME)
+            seen.append(turns @ problem.middle + shifts)
+        return distinct(poses.rotation, seen_from(np.stack(seen, 1)), score, count, *self.rule.same)
 
     def _looks(self) -> int:
         """How often its surroundings were searched in vain."""
@@ -157,7 +154,7 @@ class Together:
         """Which poses of a camera are the best one."""
         turn, shift = self.rig.pose_of(k, self.best.rotation[:1], self.best.translation[:1])
         both = np.concatenate([turn, poses.rotation]), np.concatenate([shift, poses.translation])
-        return self.rig.problems[k].same_pose(*both, self.rule.other_deg, self.rule.other_shift)[1:]
+        return self.rig.problems[k].same_pose(*both, self.rule.same)[1:]
 
     def may_be_certain(self) -> bool:
         """Whether chance is excluded, and that a better pose was missed."""
