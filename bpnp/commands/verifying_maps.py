@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from rich.text import Text
 
 from bpnp.files import write_text
-from bpnp.report.terminal import VERDICTS, WIDTH, SplitTable, console, progress, say, shorten
+from bpnp.report.terminal import VERDICTS, WIDTH, SplitTable, console, count_items, say, shorten
 
 if TYPE_CHECKING:
     from bpnp.maps.verified_map import VerifiedView
@@ -52,9 +52,8 @@ def verify_images(
 
     limit = positive("time_limit", SECONDS if time_limit is None else time_limit)
     scene = SceneMap.from_colmap(map)
-    with progress(quiet=quiet) as shown:
-        bar = shown.add_task("verifying", total=len(scene.views))
-        verified = verify_map(map, scene, seed=seed, time_limit=limit, done=lambda: shown.advance(bar))
+    with count_items("verifying", len(scene.views), quiet=quiet) as done:
+        verified = verify_map(map, scene, seed=seed, time_limit=limit, done=done)
     out = console(json=json, quiet=quiet)
     if json:
         say(as_json(verified, map))

@@ -9,6 +9,7 @@ import json
 import os
 import shutil
 import sys
+import time
 import warnings
 import zlib
 from collections import defaultdict
@@ -29,6 +30,7 @@ from bpnp.files import cache_folder, delay_interrupts, fingerprint, lock_folder,
 
 MANIFEST = "manifest.json"
 FORMAT = 4  # raised whenever the meaning of a column changes
+QUIET_SECONDS = 10.0  # between lines on the progress where there is no terminal
 BULK = np.dtype("<f4")
 Row = tuple[str, Mapping[str, NDArray[Any]], Mapping[str, Any]]  # name, points by bulk column, other entries by column
 Made = tuple[list[Row], dict[str, str]]  # rows, and the reason for each item left out, by its name
@@ -329,8 +331,12 @@ def _make(recipe: Recipe, output: Path, processes: int) -> None:
     made, console = _make_store(recipe, processes), Console(stderr=True, force_jupyter=False)
     with new_store(output, recipe.kind, recipe.widths) as writer:
         writer.parameters |= recipe.parameters
-        shown: Any = {"console": console, "transient": True, "disable": not sys.stderr.isatty()}
-        for rows, skipped in track(made, f"reading {recipe.source}", len(recipe), **shown):
+        bar, printed = sys.stderr.isatty(), time.monotonic()
+        shown: Any = {"console": console, "transient": True, "disable": not bar}
+        for done, (rows, skipped) in enumerate(track(made, f"reading {recipe.source}", len(recipe), **shown), 1):
+            if not bar and time.monotonic() > printed + QUIET_SECONDS:
+                printed = time.monotonic()
+                print(f"reading {recipe.source}: {done} of {len(recipe)}", file=sys.stderr, flush=True)  # noqa: T201
             writer.skipped |= skipped
             for row in rows:
                 writer.add(*row)

@@ -68,7 +68,7 @@ def verify_map(
     *,
     seed: int = 0,
     time_limit: float | None = SECONDS,
-    done: Callable[[], None] = lambda: None,
+    done: Callable[[str], None] = lambda words: None,
 ) -> list[VerifiedView]:
     """Verify the pose of each image of a COLMAP model without the image's own observations.
 
@@ -81,7 +81,7 @@ def verify_map(
         scene: The map of the same model.
         seed: As for `SceneMap.verify_view`.
         time_limit: Seconds an image, as for `SceneMap.verify_view`.
-        done: Called after each image.
+        done: Called with a few words on each image.
 
     Returns:
         A record for each view of the map: failed, ambiguous, untested, confident; the largest NFA first.
@@ -102,7 +102,7 @@ def verify_map(
                 reason = MATCHED_ONLY.format(again.log10_false_alarms, one.log10_false_alarms, len(image.keypoints))
                 one = replace(again, verdict="ambiguous", reason=reason)
         verified.append(one)
-        done()
+        done(f"{view.name}: {one.verdict}")
     return sorted(verified, key=lambda one: (WORST_FIRST.index(one.verdict), -one.log10_false_alarms, one.name))
 
 

@@ -68,7 +68,7 @@ def solve(
         torch; also OpenCV's (m, 1, 2) arrays, rows of four or more numbers that begin with x and y, and lists of
         cv2.KeyPoint, which get their half pixel but with OpenCV's (K, distortion): elsewhere (0.5, 0.5) is the centre
         of the first pixel, as in COLMAP.
-    points3d: (n, 3) points of the scene, in any unit.
+    points3d: (n, 3) points of the scene, in any unit; also a cloud or mesh of trimesh or Open3D.
     camera: 3x3 matrix K; OpenCV's (K, distortion); (COLMAP model, parameters) or (model, width, height, parameters); or
         a pycolmap.Camera.
         Distortion is undone; pixels for which that cannot be done are left out and counted in `stats.dropped2d`.
