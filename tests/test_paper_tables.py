@@ -1,11 +1,16 @@
 """The benchmarks of the paper's tables: what was stopped goes on, figures are those of the rows, pages are filled."""
 
+import json
 from pathlib import Path
+from types import ModuleType
 
+import finetune
 import numpy as np
 import paper_tables
 import pytest
+import results
 import table1
+import table2
 import torch
 from paper_tables import Training, effect, figures, filled, network, printed_rows, row_text, solve_problems
 from paper_weights import EPOCH, STAGES, trainings
@@ -170,3 +175,25 @@ def test_the_picture_has_a_curve_a_row_and_the_papers_quartiles() -> None:
     assert rotation.lines[0].get_ydata().tolist() == [25, 50, 75, 100]
     assert rotation.lines[1].get_xdata().tolist() == [5.49, 11.7, 20.0]
     assert translation.lines[1].get_xdata().tolist() == [0.04, 0.09, 0.20]
+
+
+@pytest.mark.parametrize("benchmark", [table1, table2, finetune], ids=lambda module: module.__name__)
+def test_the_pages_hold_the_tables_of_their_records(
+    benchmark: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As they are, and no longer once a record has another figure."""
+    monkeypatch.setattr("sys.argv", ["benchmark", "--check"])
+    benchmark.main()
+    changed = benchmark.FILE.read_text().replace('"problems": ', '"problems": 9')
+    (tmp_path / "record.json").write_text(changed)
+    monkeypatch.setattr("sys.argv", ["benchmark", "--check", "--output", str(tmp_path / "record.json")])
+    if '"problems": ' in changed:
+        with pytest.raises(SystemExit, match="are not those of the record"):
+            benchmark.main()
+
+
+def test_the_guides_hold_the_tables_of_the_results() -> None:
+    kept = json.loads(results.FILE.read_text())["full"]
+    for document in results.DOCUMENTS:
+        text = document.read_text(encoding="utf-8")
+        assert results.filled(text, kept) == text, document.name
