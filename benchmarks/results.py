@@ -36,7 +36,7 @@ from bpnp.models import TrainedNet
 FILE = ROOT / "benchmarks" / "results.json"
 SEEDS = {"quick": 9, "full": 506}  # defaults
 DOCUMENTS = (ROOT / "README.md", *(ROOT / "docs" / f"{name}.md" for name in ("results", "solve", "stars")))
-COLUMNS = ("data", "problems", "rotation, deg (quartiles)", "right", "confident", "and wrong", "CPU s")
+COLUMNS = ("data", "problems", "rotation, deg (quartiles)", "success", "confident", "confident but wrong", "CPU s")
 # What may differ between two runs of a row, on another machine and with other libraries: problems that are right or
 # confident, and the ratio of the median errors where one exceeds FLOOR_DEG.
 PROBLEMS, MEDIAN, FLOOR_DEG = 1, 1.5, 0.05
@@ -102,9 +102,9 @@ ROWS = (
         Row("search", f"photos, {name}", partial(shapes.problems, "photos", ratio), (100, 5), 1.0, data="colmap")
         for name, ratio in (("the points that they see", 0), ("0.5 outliers a match", 0.5))
     ),
-    Row("maps", "left out of its map, which view is told", partial(photos, "best view", 1.0), (48, 5), 1.0,
+    Row("maps", "left out of its map, view given", partial(photos, "best view", 1.0), (48, 5), 1.0,
         data="colmap"),
-    Row("maps", "left out of its map, nothing is told", partial(photos, "map", 1.0), (58, 5), 1.0, data="colmap",
+    Row("maps", "left out of its map, no view given", partial(photos, "map", 1.0), (58, 5), 1.0, data="colmap",
         in_readme=True),
     *(
         Row("maps", f"points of one view, no prior, {outliers:.0%} outliers a side",
@@ -163,7 +163,7 @@ def rows(options: argparse.Namespace, seeds: Mapping[str, int]) -> Iterator[reco
 
 
 def differences(new: dict[str, Any], old: dict[str, Any]) -> list[str]:
-    """What lies outside the tolerance."""
+    """List the figures of a row that lie outside the tolerance."""
     if new["problems"] != old["problems"] or new["seed"] != old["seed"]:
         return [f"{new['problems']} problems of seed {new['seed']}, not {old['problems']} of {old['seed']}"]
     found, share = [], PROBLEMS / new["problems"] + 1e-3
@@ -188,7 +188,7 @@ def table(name: str, results: dict[str, Any]) -> str | None:
         result = results[key(row)]
         quartiles = " / ".join(f"{q:.2g}" if q < 10 else f"{q:.0f}" for q in result["rotation_q_deg"])
         where = f"{row.right_deg:g} deg" + (f", {row.right_shift:g}" if row.right_shift < 1e9 else "")
-        right = f"{result['right']:.1%} ({where})" if row.right_deg else "none can be"
+        right = f"{result['right']:.1%} ({where})" if row.right_deg else "n/a"
         sure = "" if result["confident"] is None else f"{result['confident']:.1%}"
         wrong = "" if result["confident"] is None else str(result["confident_and_wrong"])
         of = NAMED.get(row.table, "") if name == "readme" else ""
@@ -198,7 +198,7 @@ def table(name: str, results: dict[str, Any]) -> str | None:
 
 
 def filled(text: str, results: dict[str, Any]) -> str:
-    """A document with the tables between its markers; one of which a row is not measured stays."""
+    """Return a document with the tables between its markers; a table with a row that is not measured stays."""
 
     def replaced(match: re.Match[str]) -> str:
         new = table(match[1], results)
