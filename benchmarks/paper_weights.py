@@ -46,8 +46,8 @@ class Stage:
 
 
 STAGES = (
-    Stage("paper-lc", points=1000, batch=8, steps=100, learning_rate=1e-4),
-    Stage("paper-lclp", points=1000, batch=8, steps=200, learning_rate=1e-4, pose_loss=True),
+    Stage("paper-lc", points=1000, batch=8, steps=50, learning_rate=3e-5),
+    Stage("paper-lclp", points=1000, batch=8, steps=150, learning_rate=5e-5, pose_loss=True),
 )
 
 
