@@ -19,7 +19,7 @@ from bpnp.search.evidence import reasons
 from bpnp.search.evidence.alternatives import Alternative, fits_as_well
 from bpnp.search.evidence.rivals import against_rivals, other_camera
 from bpnp.search.evidence.settings import Evidence
-from bpnp.search.hypotheses import Hypotheses, to_user_frame
+from bpnp.search.hypotheses import Hypotheses, to_problem_frame
 from bpnp.search.problem import Problem, UnknownFocal, faces
 from bpnp.search.raster_search import search_beside
 from bpnp.search.scene import Scene
@@ -209,7 +209,7 @@ def on_all_points(solution: Solution, photo: Photo, lens: Camera | UnknownCamera
         ends = Hypotheses.concatenate([ends, polished(scene, turns, shifts, max(scale, problem.image.scales[0]))])
     for _ in range(looks):
         beside = finish(scene, search_beside(scene, start, DEFAULT.beside), DEFAULT.finished)
-        ends = Hypotheses.concatenate([ends, to_user_frame(beside, scene)])
+        ends = Hypotheses.concatenate([ends, to_problem_frame(beside, scene)])
     alone = judged(ends, problem, batches=1, exhaustive=True, rule=rule)
     result = against_rivals(alone, problem, lambda: scene, rule, exhaustive=True)
     rotations, shifts = np.stack([rotation, result.best[0]]), np.stack([shift, result.best[1]])

@@ -19,7 +19,7 @@ from bpnp.poses import same_pose, turned_by
 from bpnp.search.annealing import finish, polished
 from bpnp.search.evidence.reasons import number
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
-from bpnp.search.hypotheses import Hypotheses, to_user_frame
+from bpnp.search.hypotheses import Hypotheses, to_problem_frame
 from bpnp.search.kernels.raster import Raster
 from bpnp.search.problem import Problem
 from bpnp.search.raster_search import search_beside, search_near
@@ -126,8 +126,8 @@ def _looks(photo: Photo, solution: Solution, problem: Problem) -> Iterator[tuple
 
 
 def _likeliest(poses: Hypotheses, scene: Scene, problem: Problem) -> Hypotheses:
-    """(1,) of the poses that with the fewest false alarms, in the user's frame."""
-    return weighed(to_user_frame(poses, scene), problem)[:1]
+    """(1,) of the poses that with the fewest false alarms, in the frame of the problem."""
+    return weighed(to_problem_frame(poses, scene), problem)[:1]
 
 
 def without_twins(

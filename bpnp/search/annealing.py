@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bpnp.loops.parallel import in_time, thread_count
-from bpnp.search.hypotheses import Hypotheses, select_distinct, to_user_frame
+from bpnp.search.hypotheses import Hypotheses, select_distinct, to_problem_frame
 from bpnp.search.kernels.dense import dense_scratch, descend
 from bpnp.search.kernels.sparse import descend_sparse, sparse_scratch
 from bpnp.search.scene import Scene, Sides
@@ -132,9 +132,18 @@ def finish(scene: Scene, poses: Hypotheses, annealed: int | None = None) -> Hypo
 def polished(
     scene: Scene, rotations: NDArray[np.float64], translations: NDArray[np.float64], scale: float
 ) -> Hypotheses:
-    """Poses (c, 3, 3), (c, 3) of the user with residuals of `scale`, radians, annealed to the end on all points, in the
-    user's frame; as they were after the deadline."""
+    """Anneal poses of a problem to the end on all points; after the deadline they stay as they are.
+
+    Args:
+        scene: Points, settings and deadline.
+        rotations: (c, 3, 3).
+        translations: (c, 3).
+        scale: Standard deviation of their residuals, radians.
+
+    Returns:
+        Distinct hypotheses in the frame of the problem.
+    """
     starts = Hypotheses.from_poses(*scene.enter(rotations, translations))
     starts = replace(starts, scale=np.full(len(starts), scale, np.float32))
     ends = finish(scene, starts)  # none after the deadline
-    return to_user_frame(ends if len(ends) else starts, scene)
+    return to_problem_frame(ends if len(ends) else starts, scene)

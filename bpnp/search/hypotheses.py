@@ -21,7 +21,7 @@ class Hypotheses:
     A stage fills the columns that it computes; the others hold what `from_poses` gives them.
 
     Attributes:
-        rotation: (c, 3, 3). Float32 in the frame of a `Scene`, float64 in that of the user.
+        rotation: (c, 3, 3). Float32 in the frame of a `Scene`, float64 in that of a `Problem`.
         translation: (c, 3), in the same frame; (c, 4) homogeneous for a rig.
         log_likelihood: (c,) mean over the bearings, nats; -inf for a pose that was not scored.
         match_count: (c,) expected number of matches.
@@ -136,8 +136,8 @@ def merge_hypotheses(parts: Sequence[Hypotheses], scene: Scene) -> Hypotheses:
     return select_distinct(Hypotheses.concatenate(parts), scene, scene.settings.kept)
 
 
-def to_user_frame(poses: Hypotheses, scene: Scene) -> Hypotheses:
-    """Return hypotheses of a scene in the coordinates and unit of the user, in float64."""
+def to_problem_frame(poses: Hypotheses, scene: Scene) -> Hypotheses:
+    """Return hypotheses of a `Scene` in the frame of its problem, in float64."""
     rotation, translation = scene.leave(poses.rotation, poses.translation)
     return replace(
         poses,
@@ -150,6 +150,6 @@ def to_user_frame(poses: Hypotheses, scene: Scene) -> Hypotheses:
 
 
 def to_scene_frame(poses: Hypotheses, scene: Scene) -> Hypotheses:
-    """Return hypotheses of the user in the frame of a scene."""
+    """Return hypotheses of a problem in the frame of a `Scene`."""
     rotation, translation = scene.enter(poses.rotation, poses.translation)
     return replace(poses, rotation=rotation, translation=translation)

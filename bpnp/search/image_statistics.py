@@ -5,11 +5,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.evidence.settings import ImagePoints
+from bpnp.search.evidence.settings import ImageSettings
 from bpnp.search.kernels.neighbours import sums_near
 
 Array = NDArray[np.float64]
-IMAGE = ImagePoints()
+IMAGE = ImageSettings()
 
 
 class ImageStatistics:
@@ -24,7 +24,7 @@ class ImageStatistics:
     weights: (k, S, S) of the evidence, see `_weights`.
     """
 
-    def __init__(self, bearings: Array, floor: float | None, rule: ImagePoints = IMAGE) -> None:
+    def __init__(self, bearings: Array, floor: float | None, rule: ImageSettings = IMAGE) -> None:
         m = len(bearings)
         self.centre = bearings.mean(0)
         centred = bearings - self.centre
@@ -54,7 +54,7 @@ def _weights(together: NDArray[np.int64], expected: Array, crowded_sigmas: float
     even spread explains: over their expected number. So the place of a clump of points is one observation, and where
     each of them lies within it one each.
 
-    together: (k, S) image points within `ImagePoints.together` scales of each. expected: (S,) of them, spread evenly
+    together: (k, S) image points within `ImageSettings.together` scales of each. expected: (S,) of them, spread evenly
     over the view. crowded_sigmas: standard deviations above it from which they are a clump.
     """
     clump = together > expected + crowded_sigmas * np.sqrt(expected)

@@ -10,7 +10,7 @@ from bpnp.poses import close_poses
 from bpnp.search.annealing import finish
 from bpnp.search.evidence.false_alarms import log10_tests
 from bpnp.search.evidence.rivals import against_rivals
-from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_scene_frame, to_user_frame
+from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.problem import Problem
 from bpnp.search.scene import Scene
 from bpnp.search.verdict import SearchResult, judged, missed, weighed, with_false_alarms
@@ -64,7 +64,7 @@ class Pool:
         if count is None:
             count = self.scene.settings.finished if self.problem.prior is None else self.scene.settings.kept
         places = np.flatnonzero(self._promising(candidates[:count]))
-        first = with_false_alarms(to_user_frame(candidates[places], self.scene), self.problem)
+        first = with_false_alarms(to_problem_frame(candidates[places], self.scene), self.problem)
         alarms, rough = candidates.log10_false_alarms.copy(), candidates.log10_rough.copy()
         alarms[places], rough[places] = first.log10_false_alarms, first.log10_rough
         return replace(candidates, log10_false_alarms=alarms, log10_rough=rough)
@@ -78,7 +78,7 @@ class Pool:
     def leaders(self) -> Hypotheses:
         """The candidates that have their false alarms, as a verdict needs them."""
         known = self.candidates[~np.isnan(self.candidates.log10_false_alarms)]
-        return weighed(to_user_frame(known, self.scene), self.problem, self.scene.settings.evidence)
+        return weighed(to_problem_frame(known, self.scene), self.problem, self.scene.settings.evidence)
 
     @property
     def alarms(self) -> float:
@@ -86,10 +86,10 @@ class Pool:
         return float(np.nanmin(self.candidates.log10_false_alarms, initial=np.inf))
 
     def looks(self, leaders: Hypotheses) -> int:
-        """How often the surroundings of the first one, in the user's frame, were searched in vain."""
+        """How often the surroundings of the first one, in the frame of the problem, were searched in vain."""
         if not len(leaders) or not len(self.surrounded):
             return 0
-        rule, looked = self.scene.settings.evidence, to_user_frame(self.surrounded, self.scene)
+        rule, looked = self.scene.settings.evidence, to_problem_frame(self.surrounded, self.scene)
         rotation = np.concatenate([leaders.rotation[:1], looked.rotation])
         translation = np.concatenate([leaders.translation[:1], looked.translation])
         return int(self.problem.same_pose(rotation, translation, rule.same).sum()) - 1
@@ -112,7 +112,7 @@ class Pool:
         if len(ends) and problem.prior is not None:  # of a pose before and after, that which chance explains less
             ends = self._weighed(ends)
             ends = merge_hypotheses([ends, self.candidates.as_dependent()], scene)
-        leaders = weighed(to_user_frame(ends, scene), problem, rule)
+        leaders = weighed(to_problem_frame(ends, scene), problem, rule)
         looks = self.looks(leaders)
         result = judged(leaders, problem, batches=self.turns, looks=looks, rule=rule)
         if self.enumerated.log10_false_alarms < result.log10_false_alarms:

@@ -115,7 +115,7 @@ def drawn_around(scene: Scene, prior: PosePrior, count: int) -> Hypotheses:
 
 
 def admitted(scene: Scene, poses: Hypotheses, prior: Prior | None) -> Hypotheses:
-    """The poses that a `PosePrior` of the user admits, within `settings.admitted` standard deviations; all without."""
+    """Return the poses within `settings.admitted` standard deviations of a `PosePrior` of the problem; all without."""
     if not isinstance(prior, PosePrior):
         return poses
     mean = scene.enter_prior(prior)

@@ -122,7 +122,7 @@ def _with_surroundings(pool: Pool, found: Hypotheses) -> Iterator[Hypotheses]:
 
 
 def proposed(pool: Pool, proposals: Proposals) -> Hypotheses:
-    """Distinct poses from those proposed, in the user's coordinates, that a prior of the user admits.
+    """Distinct poses from those proposed, in the frame of the problem, that its prior admits.
 
     Their basin counts are 0, since proposals depend on each other.
     """

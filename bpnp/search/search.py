@@ -14,7 +14,7 @@ from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
 from bpnp.search.annealing import anneal_on_clusters, anneal_on_points, finish, run_batch
 from bpnp.search.enumeration.search import exceeds_enumeration, is_enumerable, search_by_enumeration
 from bpnp.search.evidence.rivals import against_rivals
-from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_user_frame
+from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame
 from bpnp.search.infinity.kernels import Image
 from bpnp.search.infinity.search import search_rotation
 from bpnp.search.kernels.sides import FORWARD
@@ -199,7 +199,7 @@ def refine_poses(problem: Problem, rotation: NDArray[np.float64], translation: N
     direct = anneal_on_points(scene, starts, first_scale)
     poses = finish(scene, merge_hypotheses([clustered, direct], scene))
     annealed = crowd + len(around) - len(starts)
-    return judged(to_user_frame(poses, scene), problem, batches=annealed, rule=settings.evidence)
+    return judged(to_problem_frame(poses, scene), problem, batches=annealed, rule=settings.evidence)
 
 
 @one_blas_thread
@@ -220,11 +220,11 @@ def score_poses(
     distance, _ = cKDTree(scene.offsets + FORWARD).query(camera / length)
     scale = np.asarray(np.maximum(np.median(distance, -1), scene.smallest_scale), np.float32)
     poses = finish(scene, replace(starts, scale=scale))
-    return judged(to_user_frame(poses, scene), problem, batches=len(starts))
+    return judged(to_problem_frame(poses, scene), problem, batches=len(starts))
 
 
 def _entered(scene: Scene, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Hypotheses:
-    """Those of the user's poses in the frame of a scene that are not missing."""
+    """Return the poses of a problem that are not missing, in the frame of a scene."""
     known = np.isfinite(rotation).all((-2, -1)) & np.isfinite(translation).all(-1)
     return Hypotheses.from_poses(*scene.enter(rotation[known], translation[known]))
 

@@ -34,7 +34,7 @@ REFINED = math.inf  # local searches that the exact refinement of an enumeration
 class SearchResult:
     """What is known of the pose of one problem.
 
-    candidates: distinct poses in the user's coordinates, float64, best first. batches: turns of the search.
+    candidates: distinct poses in the frame of the problem, float64, best first. batches: turns of the search.
     verdict: see the head of this file. reason: of the verdict, in words. settled: whether more search would not change
     it: that a better optimum exists is excluded, whatever its matches say of each other.
     """
@@ -64,7 +64,7 @@ class SearchResult:
 
 
 def with_false_alarms(candidates: Hypotheses, problem: Problem) -> Hypotheses:
-    """The candidates, in the user's coordinates, with their false alarms; those that have them already keep them."""
+    """The candidates, in the frame of the problem, with their false alarms; those that have them already keep them."""
     alarms, rough = candidates.log10_false_alarms.copy(), candidates.log10_rough.copy()
     new = np.isnan(alarms)
     if not new.any():
@@ -75,7 +75,7 @@ def with_false_alarms(candidates: Hypotheses, problem: Problem) -> Hypotheses:
 
 
 def weighed(candidates: Hypotheses, problem: Problem, rule: Evidence = DEFAULT.evidence) -> Hypotheses:
-    """The candidates, in the user's coordinates, with their false alarms; the best first, the others as they were.
+    """The candidates, in the frame of the problem, with their false alarms; the best first, the others as they were.
 
     Best is the first one whose false alarms exceed the fewest by less than the lead that a verdict asks for: among
     poses that chance cannot tell apart, the order of the search, which is that of the likelihood, decides.
@@ -100,7 +100,7 @@ def missed(
     """Return log10 of the probability that weighed candidates lack a better optimum.
 
     Args:
-        candidates: poses in the user's coordinates, best first.
+        candidates: poses in the frame of the problem, best first.
         problem: the points of the problem.
         looks: number of local searches around the first candidate that found nothing better; `REFINED` of an
             enumeration, which leaves no better pose beside one.
@@ -150,7 +150,7 @@ def starts_met(candidates: Hypotheses, problem: Problem, rule: Evidence, *, symm
     """Return the basin count of the first candidate and of others that are no different pose.
 
     Args:
-        candidates: poses in the user's coordinates, best first.
+        candidates: poses in the frame of the problem, best first.
         problem: the points of the problem.
         rule: constants of the verdict.
         symmetric: count the poses too that the motions of the scene confuse with the first one. These are compared with
@@ -177,7 +177,7 @@ def judged(
     rule: Evidence = DEFAULT.evidence,
     rig: Seen = (),
 ) -> SearchResult:
-    """The verdict on candidates in the user's coordinates, best first.
+    """The verdict on candidates in the frame of the problem, best first.
 
     looks: how often the surroundings of the best one were searched in vain. exhaustive: whether every pose that fits
     some points was looked at, so that none is unseen. rig: the candidates, best first, and the points of all cameras of

@@ -305,7 +305,7 @@ def exceeds_enumeration(problem: Problem) -> bool:
 
 
 def search_by_enumeration(problem: Problem, deadline: Deadline, settings: SearchSettings) -> tuple[Hypotheses, bool]:
-    """The poses of few points in the user's coordinates, best first; and whether every hypothesis was tried.
+    """The poses of few points, best first; and whether every hypothesis was tried.
 
     Where the whole pose is known closely, as when a device is tracked, it is tried, and if it does not hold the search
     goes everywhere; where it is known roughly, the search goes everywhere if no pose near it exceeds chance. Where

@@ -24,7 +24,7 @@ from bpnp.search.evidence.repetitions import competing_poses, registered
 from bpnp.search.evidence.rivals import against_rivals
 from bpnp.search.evidence.settings import Evidence
 from bpnp.search.evidence.uncertainty import linearised, local_covariance
-from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_scene_frame, to_user_frame
+from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.problem import SIGMAS, Problem
 from bpnp.search.raster_search import around_each
 from bpnp.search.scene import Scene
@@ -109,7 +109,7 @@ def _proposed(claim: Hypotheses, scene: Scene) -> Hypotheses:
     around = Hypotheses.concatenate([start, around_each(scene, start), _mirrored(scene, start)])
     parts = [anneal_on_points(scene, start, wide), anneal_on_points(scene, around, wide), finish(scene, start)]
     poses = finish(scene, merge_hypotheses(parts, scene), scene.settings.finished)
-    return to_user_frame(poses, scene)
+    return to_problem_frame(poses, scene)
 
 
 def _weighed_anew(candidates: Hypotheses, problem: Problem) -> Hypotheses:

@@ -16,7 +16,7 @@ from bpnp.search.evidence.false_alarms import alarms_of
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
 from bpnp.search.evidence.settings import Evidence, OtherFocal
 from bpnp.search.evidence.uncertainty import bends_significantly, linearised, misfit_of
-from bpnp.search.hypotheses import Hypotheses, to_user_frame
+from bpnp.search.hypotheses import Hypotheses, to_problem_frame
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.propose.lens import LensFit, fit_lens, undistort
 from bpnp.search.raster_search import search_beside
@@ -120,7 +120,7 @@ def beside(found: AtZoom, zoom: float, scene: Scene) -> AtZoom:
     there = Scene(problem, 0, scene.settings, scene.deadline)
     shift = found.middle * (1, 1, zoom) - found.rotation @ problem.middle
     start = Hypotheses.from_poses(*there.enter(found.rotation[None], shift[None]))
-    poses = to_user_frame(search_beside(there, start, scene.settings.zoomed)[:1], there)
+    poses = to_problem_frame(search_beside(there, start, scene.settings.zoomed)[:1], there)
     if not len(poses):
         return found
     rotation, likelihood = poses.rotation[0], float(poses.log_likelihood[0]) + math.log(problem.image.solid_angle)

@@ -6,8 +6,8 @@ from bpnp.poses import SAME, Tolerance
 
 
 @dataclass(frozen=True)
-class ImagePoints:
-    """What is evidence of image points (`bpnp.search.problem`).
+class ImageSettings:
+    """What is evidence of image points (`bpnp.search.image_statistics`).
 
     scale_step: from one scale of the residuals to the next. coarsest: scale in spacings sqrt(A / m) of the points;
     beyond, only the outline fits. floor: smallest scale in spreads of the bearings, some hundredths of a pixel of an

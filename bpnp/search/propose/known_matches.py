@@ -51,7 +51,7 @@ def known_matches(problem: Problem) -> tuple[Labels, Labels] | None:
 
 
 def poses_of_matches(problem: Problem, i: Labels, j: Labels, seed: int = 0) -> Hypotheses:
-    """Return distinct poses that matches fit best, in the user's coordinates.
+    """Return distinct poses that matches fit best.
 
     Args:
         problem: Points of the problem.

@@ -19,7 +19,7 @@ from bpnp.search.enumeration.search import enumerate_poses, is_enumerable
 from bpnp.search.enumeration.settings import DEFAULT as ENUMERATION
 from bpnp.search.evidence.repetitions import repeated_poses
 from bpnp.search.evidence.uncertainty import share_bound
-from bpnp.search.hypotheses import Hypotheses, to_scene_frame, to_user_frame
+from bpnp.search.hypotheses import Hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.pool import Pool
 from bpnp.search.raster_search import search_beside
 from bpnp.search.rig.cameras import WIDE, Array, Pose, Rig
@@ -77,8 +77,8 @@ def search_rig(rig: Rig, *, clutter: float | None = None, seed: int = 0, deadlin
 class Together:
     """What the cameras of a rig have proposed, and the best of it refined on all.
 
-    met: of each camera all poses, in the user's coordinates. pools: of those that search. starts: poses of the rig that
-    were refined, with their evidence. looked: those around which was searched. best: distinct poses, best first.
+    met: of each camera all poses, in the frame of its problem. pools: of those that search. starts: poses of the rig
+    that were refined, with their evidence. looked: those around which was searched. best: distinct poses, best first.
     exhaustive: whether every pose was looked at.
     """
 
@@ -96,7 +96,7 @@ class Together:
     def take(self, new: Mapping[int, Hypotheses], most: int) -> None:
         """Refine at most so many of the poses that cameras propose, in the frames of their scenes if they have one,
         those that all agree with best."""
-        new = {k: to_user_frame(p, self.pools[k].scene) if k in self.pools else p for k, p in new.items()}
+        new = {k: to_problem_frame(p, self.pools[k].scene) if k in self.pools else p for k, p in new.items()}
         rotation, translation = _proposals(self.rig, new, self.met)
         for k, poses in new.items():
             self.met[k] = Hypotheses.concatenate([self.met[k], poses])
@@ -147,7 +147,7 @@ class Together:
     def _looks(self) -> int:
         """How often its surroundings were searched in vain."""
         return sum(
-            int(self._as_best(k, to_user_frame(pool.surrounded, pool.scene)).sum()) for k, pool in self.pools.items()
+            int(self._as_best(k, to_problem_frame(pool.surrounded, pool.scene)).sum()) for k, pool in self.pools.items()
         )
 
     def _as_best(self, k: int, poses: Hypotheses) -> NDArray[np.bool_]:
