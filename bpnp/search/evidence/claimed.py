@@ -25,7 +25,8 @@ from bpnp.search.evidence.rivals import against_rivals
 from bpnp.search.evidence.settings import Evidence
 from bpnp.search.evidence.uncertainty import linearised, local_covariance
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
-from bpnp.search.problem import SIGMAS, Problem
+from bpnp.search.problem import SIGMAS, Problem, in_bulk
+from bpnp.search.propose.symmetries import mirror_pose
 from bpnp.search.raster_search import around_each
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT
@@ -66,7 +67,7 @@ def judge_claim(
     one = replace(problem, log10_tried=0.0)
     claim = _unrefined(one, rotation, translation)
     scene, few = Scene(one, seed, DEFAULT, deadline), is_enumerable(problem)
-    others = _proposed(claim, scene)
+    others = _proposed(problem, claim, scene)
     if few:  # as in an enumeration, whose candidates have been refined
         motions = registered(one, rotation, translation, float(claim.scale[0]), rule)
         copies = competing_poses(one, rotation, translation, motions, rule)
@@ -101,12 +102,17 @@ def judge_claim(
     return replace(result, batches=int(refined)), optimum  # no last fit to the matches
 
 
-def _proposed(claim: Hypotheses, scene: Scene) -> Hypotheses:
+def _proposed(problem: Problem, claim: Hypotheses, scene: Scene) -> Hypotheses:
     """Return the distinct poses that annealing reaches from a pose (1,), from copies of it near it, and from
     its mirror image before a flat scene."""
     start = to_scene_frame(claim, scene)
     wide = scene.settings.middle[-1].last_scale * scene.spread
-    around = Hypotheses.concatenate([start, around_each(scene, start), _mirrored(scene, start)])
+    bulk = problem.points3d[in_bulk(problem.points3d)]
+    mirrored = mirror_pose(bulk, claim.rotation[0], claim.translation[0])
+    starts = [start, around_each(scene, start)]
+    if mirrored is not None:
+        starts.append(to_scene_frame(Hypotheses.from_poses(mirrored[0][None], mirrored[1][None]), scene))
+    around = Hypotheses.concatenate(starts)
     parts = [anneal_on_points(scene, start, wide), anneal_on_points(scene, around, wide), finish(scene, start)]
     poses = finish(scene, merge_hypotheses(parts, scene), scene.settings.finished)
     return to_problem_frame(poses, scene)
@@ -115,18 +121,6 @@ def _proposed(claim: Hypotheses, scene: Scene) -> Hypotheses:
 def _weighed_anew(candidates: Hypotheses, problem: Problem) -> Hypotheses:
     """With the false alarms of as many tests as the problem has."""
     return with_false_alarms(candidates.unweighed(), problem)
-
-
-def _mirrored(scene: Scene, pose: Hypotheses) -> Hypotheses:
-    """The pose (1,) that sees a flat scene nearly the same, its normal on the other side of the line of sight (the
-    ambiguity of a plane seen from afar, Oberkampf, DeMenthon, Davis, CVIU 1996)."""
-    middle = scene.bulk3d.mean(0)
-    normal = np.linalg.svd(scene.bulk3d - middle, full_matrices=False)[2][2]
-    seen = pose.rotation[0] @ middle + pose.translation[0]
-    sight = seen / np.linalg.norm(seen)
-    across, flipped = (np.eye(3) - 2 * np.outer(axis, axis) for axis in (sight, normal))
-    rotation = (across @ pose.rotation[0] @ flipped).astype(np.float32)
-    return Hypotheses.from_poses(rotation[None], (seen - rotation @ middle)[None].astype(np.float32))
 
 
 def _unrefined(problem: Problem, rotation: Array, translation: Array) -> Hypotheses:
