@@ -154,10 +154,11 @@ def test_another_focal_length_is_climbed_to(factor: float) -> None:
     exact = directions(points + shift) + 4e-3 * rng.standard_normal((1500, 3))
     problem = Problem(directions(exact / (factor, factor, 1)), points)
     turned = Rotation.from_euler("x", 3, degrees=True).as_matrix()
-    met = AtZoom(1.0, problem, turned, shift * (1, 1, factor), 4e-3)
+    away = shift * (1, 1, factor) - turned @ problem.middle
+    met = AtZoom(1.0, problem, Hypotheses.from_poses(turned[None], away[None], scale=np.array([4e-3])))
     climbed = likeliest_zoom(met, Scene(problem, 0, DEFAULT), DEFAULT.evidence.zoomed)
     assert climbed.zoom == pytest.approx(1 / factor, rel=0.09 if factor == 1 else 0.045)  # half a step; never none
-    assert np.degrees(Rotation.from_matrix(climbed.rotation).magnitude()) < 0.5
+    assert np.degrees(Rotation.from_matrix(climbed.pose.rotation[0]).magnitude()) < 0.5
     seen = verdict_on(problem, np.eye(3)[None], met.middle[None], 4e-3, 0.6)
     scenes = [Scene(problem, 0, DEFAULT, end) for end in (NEVER, Deadline(0.0))]
     other, untried = (other_camera(seen, problem, lambda one=one: one, DEFAULT.evidence) for one in scenes)

@@ -69,15 +69,15 @@ def other_camera(
     starts = (None, 0.0) if bends_significantly(linear, count, rule) else (None,)
 
     def better(found: AtZoom) -> Alternative | None:
-        least = max(found.scale, found.problem.image.scales[0])
-        fits = (fit_lens(found.problem, found.rotation, found.middle, least, start) for start in starts)
+        least = max(float(found.pose.scale[0]), found.problem.image.scales[0])
+        fits = (fit_lens(found.problem, found.pose.rotation[0], found.middle, least, start) for start in starts)
         others = [fit._replace(zoom=found.zoom * fit.zoom) for fit in fits if fit is not None]
         alarms = [_alarms(problem, other, rule) for other in others]
         if min(alarms, default=math.inf) >= result.log10_false_alarms + math.log10(rule.focal_chance):
             return None
         return of_misfit(misfit_of(rotation, middle, others[int(np.argmin(alarms))]), rule)
 
-    known = AtZoom(1.0, problem, rotation, middle, scale)
+    known = AtZoom(1.0, problem, result.candidates[:1])
     other = better(known)
     if other is not None or rule.independent * result.log10_false_alarms / count <= rule.missed:
         return other
@@ -89,20 +89,32 @@ def other_camera(
 
 
 class AtZoom(NamedTuple):
-    """A pose at `zoom` times the focal length, the points there, and its likelihood: of the bearings, nats each,
-    against an even density over the view. middle: (3,) of the scene, seen from the camera."""
+    """A hypothesis at another focal length.
+
+    Attributes:
+        zoom: Focal length over the given one.
+        problem: The points as seen with it.
+        pose: One hypothesis.
+    """
 
     zoom: float
     problem: Problem
-    rotation: Array
-    middle: Array
-    scale: float
-    likelihood: float = -math.inf
+    pose: Hypotheses
+
+    @property
+    def middle(self) -> Array:
+        """(3,) middle of the scene in the camera's frame."""
+        return np.asarray(self.pose.rotation[0] @ self.problem.middle + self.pose.translation[0])
+
+    @property
+    def likelihood(self) -> float:
+        """Mean log-likelihood of the bearings, nats, against an even density over the view."""
+        return float(self.pose.log_likelihood[0]) + math.log(self.problem.image.solid_angle)
 
 
 def likeliest_zoom(start: AtZoom, scene: Scene, rule: OtherFocal) -> AtZoom:
-    """The likeliest pose at other focal lengths: of a step to either side the likelier one, and farther on that side
-    while it grows likelier. scene: whose settings and deadline hold."""
+    """Return the likeliest pose at other focal lengths: the likelier one of a step to either side, and farther on that
+    side while the likelihood grows. The settings and the deadline are those of `scene`."""
     steps = [(step, beside(start, step, scene)) for step in (1 / rule.step, rule.step)]
     step, best = max(steps, key=lambda one: one[1].likelihood)
     while 1 / rule.widest < best.zoom * step < rule.widest:
@@ -114,18 +126,14 @@ def likeliest_zoom(start: AtZoom, scene: Scene, rule: OtherFocal) -> AtZoom:
 
 
 def beside(found: AtZoom, zoom: float, scene: Scene) -> AtZoom:
-    """The likeliest pose at `zoom` times the focal length of one, beside that which sees the scene as large; the pose
-    itself after the deadline."""
+    """Return the likeliest pose at `zoom` times the focal length of one, near that which sees the scene as large; the
+    given one after the deadline."""
     problem = at_focal_length(found.problem, zoom)
     there = Scene(problem, 0, scene.settings, scene.deadline)
-    shift = found.middle * (1, 1, zoom) - found.rotation @ problem.middle
-    start = Hypotheses.from_poses(*there.enter(found.rotation[None], shift[None]))
+    shift = found.middle * (1, 1, zoom) - found.pose.rotation[0] @ problem.middle
+    start = Hypotheses.from_poses(*there.enter(found.pose.rotation, shift[None]))
     poses = to_problem_frame(search_beside(there, start, scene.settings.zoomed)[:1], there)
-    if not len(poses):
-        return found
-    rotation, likelihood = poses.rotation[0], float(poses.log_likelihood[0]) + math.log(problem.image.solid_angle)
-    middle = rotation @ problem.middle + poses.translation[0]
-    return AtZoom(zoom * found.zoom, problem, rotation, middle, float(poses.scale[0]), likelihood)
+    return AtZoom(zoom * found.zoom, problem, poses) if len(poses) else found
 
 
 def _alarms(problem: Problem, other: LensFit, rule: Evidence) -> float:
