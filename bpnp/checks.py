@@ -19,7 +19,7 @@ def check_shapes(function: _F) -> _F:
 
     An annotation such as `Float[Tensor, "b m 2"]` requires three non-empty axes, the last of size 2, and floating-point
     numbers. An axis name stands for one size in all arguments. Not checked are other annotations, those with a variable
-    number of axes, and arguments that are None by default.
+    number of axes, and None where it is the default.
 
     Raises:
         ValueError: From the decorated function, for an argument that does not fit, or within a transform of

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from bpnp.cameras import Camera
     from bpnp.report.figures import Lines
     from bpnp.report.points import ProblemPoints
-    from bpnp.report.tables import Row
+    from bpnp.report.tables import MethodRow
     from bpnp.training.comparison import MethodTest
 
 LINES: Mapping[str, "Lines | None"] = {"true": "match3d", "assigned": "assigned3d", "none": None}
@@ -254,11 +254,11 @@ def table(
         say(f"wrote {save_figure(outlier_curves(frame), output / 'outliers.png')}", to=out)
 
 
-def _rows(label: str, ratio: float | None, tests: "list[MethodTest]") -> "list[Row]":
+def _rows(label: str, ratio: float | None, tests: "list[MethodTest]") -> "list[MethodRow]":
     """Return a row per estimate of a method; for several seeds, their mean and standard deviation."""
     from pandas import DataFrame
 
-    from bpnp.report.tables import Row
+    from bpnp.report.tables import MethodRow
 
     results = [result for test in tests if (result := test.results()) is not None]
     count = {"problems": sum(result.problems for result in results)}
@@ -267,8 +267,8 @@ def _rows(label: str, ratio: float | None, tests: "list[MethodTest]") -> "list[R
         name = f"{label} {estimate}" if len(results[0].estimates) > 1 else label
         frame = DataFrame([result.estimates[estimate] for result in results])
         mean: dict[str, Any] = frame.mean(skipna=False).to_dict()
-        rows.append(Row(name, mean | count, rho=ratio, problems=("rho", ratio)))
+        rows.append(MethodRow(name, mean | count, rho=ratio, problems=("rho", ratio)))
         if len(results) > 1:
             deviation = frame.std(skipna=False).to_dict()
-            rows.append(Row(f"{name}, standard deviation of {len(results)} seeds", deviation | count, rho=ratio))
+            rows.append(MethodRow(f"{name}, standard deviation of {len(results)} seeds", deviation | count, rho=ratio))
     return rows

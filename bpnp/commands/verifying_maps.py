@@ -1,4 +1,4 @@
-"""`bpnp verify MAP`: which images of a COLMAP model have a doubtful pose."""
+"""`bpnp verify MAP`: verify the pose of each image of a COLMAP model."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,12 +14,12 @@ if TYPE_CHECKING:
 
 COLUMNS = ("verdict", "points", "matches", "error\npx", "log10\nNFA", "change\ndeg")
 CAPTION = (
-    "points: in view, and seen by two other images. matches: keypoints that they explain; error: their mean. "
-    "log10 NFA: the smaller, the surer. change: from the pose to the optimum of these points."
+    "points: points in view that two other images observe. matches: keypoints near one of them. error: mean error of "
+    "the matches. log10 NFA: log10 of the number of false alarms. change: from the pose to the optimum of these points."
 )
 SUFFIXES = (".json", ".csv")
-NAME_WIDTH = WIDTH // 3  # of an image
-REASONS = 20  # doubtful images whose reason is printed
+NAME_WIDTH = WIDTH // 3  # width of an image's name, columns
+REASONS = 20  # largest number of images that are not confident whose reason is printed
 
 
 def verify_images(

@@ -19,8 +19,8 @@ from bpnp.poses import MIN_POINTS
 from bpnp.types import Batch
 
 Side = Literal["both", "2d", "3d"]
-DrawnSide = Literal["both", "2d", "3d", "random"]
-Drawn = float | tuple[float, float]  # a number, or (low, high) for one drawn uniformly for each problem
+SideOrRandom = Literal["both", "2d", "3d", "random"]
+NumberOrRange = float | tuple[float, float]  # a number, or (low, high) for one drawn uniformly for each problem
 SIDES = ("2d", "both", "3d")  # the order in which `_on_sides` numbers them
 
 
@@ -38,10 +38,10 @@ class Outliers:
         occluded_side: Side of the lost points, 2d, 3d, both for half of the matches on each side, or random.
     """
 
-    ratio: Drawn = 0.0
-    side: DrawnSide = "both"
-    occlusion: Drawn = 0.0
-    occluded_side: DrawnSide = "2d"
+    ratio: NumberOrRange = 0.0
+    side: SideOrRandom = "both"
+    occlusion: NumberOrRange = 0.0
+    occluded_side: SideOrRandom = "2d"
 
     def __post_init__(self) -> None:
         check_within(0, math.inf, ratio=self.ratio)
@@ -167,7 +167,7 @@ def check_clutter(clutter: float) -> None:
         raise ValueError(f"expected `clutter` of 0 or more, got {clutter}; 0.5 adds half as many points")
 
 
-def bounds(value: Drawn) -> tuple[float, float]:
+def bounds(value: NumberOrRange) -> tuple[float, float]:
     """Return (low, high) of a number or of the limits of a drawn number."""
     low, high = value if isinstance(value, (tuple, list)) else (value, value)
     return low, high
@@ -204,12 +204,12 @@ def _amounts(
     )
 
 
-def _draw_amount(value: Drawn, uniform: Tensor) -> Tensor:
+def _draw_amount(value: NumberOrRange, uniform: Tensor) -> Tensor:
     low, high = bounds(value)
     return low + (high - low) * uniform
 
 
-def _on_sides(side: DrawnSide, uniform: Tensor) -> tuple[Bool[Tensor, "b 1"], Bool[Tensor, "b 1"]]:
+def _on_sides(side: SideOrRandom, uniform: Tensor) -> tuple[Bool[Tensor, "b 1"], Bool[Tensor, "b 1"]]:
     """Return masks of the 2D side and of the 3D side; for "random", 2d, both and 3d are equally likely."""
     number = (3 * uniform).long() if side == "random" else torch.full_like(uniform, SIDES.index(side)).long()
     return number < 2, number > 0

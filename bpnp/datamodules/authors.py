@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from bpnp.datamodules.loader import hold_out
 from bpnp.datamodules.problem import Problem
-from bpnp.datamodules.store import Made, Recipe, Row, Store, is_store, open_or_prepare, open_store
+from bpnp.datamodules.store import JobResult, Recipe, Store, StoreRow, is_store, open_or_prepare, open_store
 from bpnp.datamodules.stored import PROBLEMS, WIDTHS, StoredDataModule, problem_row, scene_rows
 from bpnp.files import file_states, fingerprint
 from bpnp.poses import MIN_POINTS
@@ -133,7 +133,7 @@ def _find_parts(root: Path, dataset: str | None) -> tuple[str, list[tuple[str, l
     return chosen, parts
 
 
-def _convert(scene: str, files: Sequence[Path], focal: float) -> Made:
+def _convert(scene: str, files: Sequence[Path], focal: float) -> JobResult:
     """Convert every sample of a scene, or record why it cannot be used.
 
     Copies that pad small sets to 1000 points are dropped. W_gt may hold the 2D point of each 3D point or, as for
@@ -150,7 +150,7 @@ def _convert(scene: str, files: Sequence[Path], focal: float) -> Made:
             raise PickleError(f"{file} has other samples than {files[0].name}, which has {len(keys)}")
     samples = {f"{scene}/{key:06d}": {name: column[key] for name, column in columns.items()} for key in keys}
     by_2d = "W_gt" in columns and _index_by_2d(files[0].parent, list(samples.values())[:PROBED])
-    rows: list[Row] = []
+    rows: list[StoreRow] = []
     skipped = {}
     for name, sample in samples.items():
         try:

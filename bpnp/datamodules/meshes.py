@@ -30,7 +30,7 @@ from bpnp.datamodules.keyed_random import (
 from bpnp.datamodules.loader import STAGES, ProblemDataModule, hold_out
 from bpnp.datamodules.problem import Counts
 from bpnp.datamodules.shapes import MeshError, Normalisation, Sampler, Shapes, normalise, procedural_shapes
-from bpnp.datamodules.store import Made, Recipe, Row, Store, StoreError, is_store, open_or_prepare, open_store
+from bpnp.datamodules.store import JobResult, Recipe, Store, StoreError, StoreRow, is_store, open_or_prepare, open_store
 from bpnp.geometry import project, transform
 from bpnp.poses import MIN_POINTS
 from bpnp.types import Batch
@@ -360,8 +360,8 @@ def surfaces_recipe(shapes: Shapes, *, points: int, normalisation: Normalisation
     )
 
 
-def _sample_rows(samplers: Sequence[tuple[str, Sampler]], count: int, mode: Normalisation) -> Made:
-    rows: list[Row] = []
+def _sample_rows(samplers: Sequence[tuple[str, Sampler]], count: int, mode: Normalisation) -> JobResult:
+    rows: list[StoreRow] = []
     skipped = {}
     for name, sampler in samplers:
         try:

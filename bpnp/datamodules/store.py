@@ -32,8 +32,10 @@ MANIFEST = "manifest.json"
 FORMAT = 4  # raised whenever the meaning of a column changes
 QUIET_SECONDS = 10.0  # between lines on the progress where there is no terminal
 BULK = np.dtype("<f4")
-Row = tuple[str, Mapping[str, NDArray[Any]], Mapping[str, Any]]  # name, points by bulk column, other entries by column
-Made = tuple[list[Row], dict[str, str]]  # rows, and the reason for each item left out, by its name
+StoreRow = tuple[
+    str, Mapping[str, NDArray[Any]], Mapping[str, Any]
+]  # name, points by bulk column, other entries by column
+JobResult = tuple[list[StoreRow], dict[str, str]]  # rows, and the reason for each item left out, by its name
 
 
 class StoreError(ValueError):
@@ -233,7 +235,7 @@ def _write_header(file: BinaryIO, dtype: np.dtype[Any], shape: tuple[int, ...]) 
 
 
 @dataclass(frozen=True)
-class Recipe(Dataset[Made]):
+class Recipe(Dataset[JobResult]):
     """Jobs that make a store; `work(*job)` returns rows.
 
     Attributes:
@@ -250,14 +252,14 @@ class Recipe(Dataset[Made]):
     widths: Mapping[str, int]
     parameters: Mapping[str, Any]
     jobs: Sequence[tuple[Any, ...]]
-    work: Callable[..., Made]
+    work: Callable[..., JobResult]
     what: str
     source: str
 
     def __len__(self) -> int:
         return len(self.jobs)
 
-    def __getitem__(self, number: int) -> Made:
+    def __getitem__(self, number: int) -> JobResult:
         return self.work(*self.jobs[number])
 
 
@@ -347,7 +349,7 @@ def _make(recipe: Recipe, output: Path, processes: int) -> None:
             )
 
 
-def _make_store(recipe: Recipe, processes: int) -> Iterator[Made]:
+def _make_store(recipe: Recipe, processes: int) -> Iterator[JobResult]:
     """Run the jobs and yield their results in order; worker processes end with this process, even if it is killed."""
     workers = 0 if processes == 1 else min(processes, len(recipe))
     generator = torch.Generator()  # otherwise the seeds of the workers change the global generator

@@ -16,7 +16,7 @@ from bpnp.checks import check_within
 from bpnp.datamodules.augment import Augmentation, Side
 from bpnp.datamodules.loader import STAGES, ProblemDataModule
 from bpnp.datamodules.problem import Counts, Problem, ProblemSource, stack_problems
-from bpnp.datamodules.store import Row, Store, StoreError, new_store, open_store
+from bpnp.datamodules.store import Store, StoreError, StoreRow, new_store, open_store
 from bpnp.poses import MIN_POINTS
 from bpnp.types import Batch
 
@@ -45,7 +45,7 @@ def write_problems(
         writer.parameters |= parameters or {}
 
 
-def problem_row(scene: str, problem: Problem) -> Row:
+def problem_row(scene: str, problem: Problem) -> StoreRow:
     """Return the row of a store that holds a problem."""
     columns = {name: getattr(problem, name) for name in ("matched", "focal", "rotation", "translation")}
     origin = np.zeros(3) if problem.origin is None else problem.origin

@@ -1,7 +1,7 @@
 """Results as a run of Weights & Biases.
 
-Offline unless WANDB_MODE says otherwise. An offline run is a folder; `wandb sync FOLDER` sends it. `wandb` is imported
-here only, when it is used.
+Runs are offline unless WANDB_MODE says otherwise. An offline run is a folder; `wandb sync FOLDER` uploads it. This is
+the only module that imports `wandb`, and only when it is used.
 """
 
 import os
@@ -15,27 +15,27 @@ from bpnp.report.points import ProblemPoints, read_points, utf8
 from bpnp.report.results import Results, cause_fractions, read_results
 from bpnp.report.training_curves import training_folder
 
-MOST_PICTURES = 12
+MOST_PICTURES = 12  # largest number of pictures of problems
 
 
 def log_results(folder: Path | str, *, name: str, project: str = "bpnp", directory: Path | str | None = None) -> Path:
     """Log a results folder to W&B.
 
-    Scalars "test/<estimate>/rotation_q1_deg" and so on; tables "quartiles", "causes" and "problems"; recall curves as
-    plotly charts and as a picture; pictures of the worst problems. Where the folder lies in that of a training, the
-    configuration of the training is that of the W&B run, and both are of one group.
+    The run has scalars "test/<estimate>/rotation_q1_deg" and so on; tables "quartiles", "causes" and "problems"; recall
+    curves as plotly charts and as a picture; and pictures of the worst problems. If the folder is in that of a
+    training, the run has the configuration of the training, and both are in one group.
 
     Args:
-        folder: what `bpnp test` wrote.
-        name: of the W&B run.
-        project: of the W&B run.
-        directory: where the W&B run is written, in `wandb`; the folder that the results lie in by default.
+        folder: Folder that `bpnp test` wrote.
+        name: Name of the W&B run.
+        project: W&B project.
+        directory: Parent of the folder `wandb` for the run. Default: the parent of `folder`.
 
     Returns:
         The folder of the W&B run.
 
     Raises:
-        ValueError: the folder cannot be read.
+        ValueError: The folder cannot be read.
     """
     import wandb
 
@@ -58,7 +58,7 @@ def log_results(folder: Path | str, *, name: str, project: str = "bpnp", directo
         group=group,
         config=config,
         mode=mode,
-        reinit="create_new",  # a run that is open goes on
+        reinit="create_new",  # an open run continues
         settings=wandb.Settings(silent=True, console="off", disable_git=True, save_code=False),
     )
     try:

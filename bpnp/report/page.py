@@ -225,15 +225,15 @@ def page_numbers(runs: Mapping[str, Results]) -> dict[str, Any]:
     """Return the numbers of all problems: a series for each run and estimate. Equal columns are stored once."""
     columns: dict[tuple[Any, ...], int] = {}
 
-    def place(values: Iterable[Any]) -> int:
+    def add_column(values: Iterable[Any]) -> int:
         return columns.setdefault(tuple(values), len(columns))
 
     series = []
     for line in lines_of(runs):
         rows = runs[line.run].of(line.estimate)
         names = {"run": line.run, "estimate": line.estimate, "name": line.label, "colour": f"c{line.colour}"}
-        ids, numbers = place(utf8(row.id) or "(no name)" for row in rows), _columns(rows)
-        series.append(names | {"ids": ids, "numbers": {key: place(values) for key, values in numbers.items()}})
+        ids, numbers = add_column(utf8(row.id) or "(no name)" for row in rows), _columns(rows)
+        series.append(names | {"ids": ids, "numbers": {key: add_column(values) for key, values in numbers.items()}})
     return {"series": series, "columns": list(columns)}
 
 

@@ -136,7 +136,7 @@ class Column:
 
 
 @dataclass(frozen=True)
-class Row:
+class MethodRow:
     """Row of a table: an estimate of a run, or a method.
 
     Attributes:
@@ -202,11 +202,12 @@ PRINTED: Mapping[Paper, tuple[str, Column, str]] = {
 }  # fmt: skip
 
 
-def run_rows(runs: Mapping[str, Results], paper: Paper | None = None) -> list[Row]:
+def run_rows(runs: Mapping[str, Results], paper: Paper | None = None) -> list[MethodRow]:
     """Return a row per run and estimate, then the published rows."""
     tested = {name: tested_problems(results) for name, results in runs.items()}
     rows = [
-        Row(line.label, runs[line.run].estimates[line.estimate], problems=tested[line.run]) for line in lines_of(runs)
+        MethodRow(line.label, runs[line.run].estimates[line.estimate], problems=tested[line.run])
+        for line in lines_of(runs)
     ]
     return rows + paper_rows(paper)
 
@@ -220,7 +221,7 @@ def tested_problems(results: Results) -> Hashable:
     return json.dumps(data, sort_keys=True), frozenset((row.index, row.id, row.m, row.n) for row in results.rows)
 
 
-def paper_rows(paper: Paper | None) -> list[Row]:
+def paper_rows(paper: Paper | None) -> list[MethodRow]:
     """Return the published rows of a data set; none for None."""
     if paper is None:
         return []
@@ -228,7 +229,8 @@ def paper_rows(paper: Paper | None) -> list[Row]:
     keys = [column.key for column in (*QUARTILES, SECONDS, recall)]
     lines = (line.split("|") for line in text.strip().splitlines())
     return [
-        Row(label.strip(), dict(zip(keys, numbers.split(), strict=False)), f"paper, {name}") for label, numbers in lines
+        MethodRow(label.strip(), dict(zip(keys, numbers.split(), strict=False)), f"paper, {name}")
+        for label, numbers in lines
     ]
 
 
@@ -249,7 +251,7 @@ def cell(column: Column, values: Values) -> str:
     return f"{100 * value:.1f}" if column.percent else number(value)
 
 
-def best_texts(columns: Sequence[Column], rows: Sequence[Row]) -> dict[tuple[Hashable, str], str]:
+def best_texts(columns: Sequence[Column], rows: Sequence[MethodRow]) -> dict[tuple[Hashable, str], str]:
     """Return the best number of each column among rows of the same problems, as text.
 
     Comparing texts marks all cells that read the same.
@@ -281,7 +283,7 @@ def results_table(runs: Mapping[str, Results], *, paper: Paper | None = None) ->
     return table_of_rows(f"Pose errors, {sizes} problems", RESULT_COLUMNS, run_rows(runs, paper), CAPTION)
 
 
-def table_of_rows(title: str, columns: Sequence[Column], rows: Sequence[Row], caption: str) -> SplitTable:
+def table_of_rows(title: str, columns: Sequence[Column], rows: Sequence[MethodRow], caption: str) -> SplitTable:
     """Return a table for the terminal: our rows with the best numbers bold, below them those of the paper."""
     best = best_texts(columns, rows)
     groups: tuple[list[tuple[Text, list[Text]]], ...] = ([], [])
@@ -293,11 +295,11 @@ def table_of_rows(title: str, columns: Sequence[Column], rows: Sequence[Row], ca
     return SplitTable(title, [column.header for column in columns], groups, caption)
 
 
-def table_frame(rows: Sequence[Row]) -> "DataFrame":
+def table_frame(rows: Sequence[MethodRow]) -> "DataFrame":
     """Return all numbers as a DataFrame, fractions from 0 to 1, the paper's as published; `source` separates them."""
     from pandas import DataFrame
 
-    def value_of(column: Column, row: Row) -> float | int | str | None:
+    def value_of(column: Column, row: MethodRow) -> float | int | str | None:
         value = row.values.get(column.key)
         return float(value) / 100 if column.percent and isinstance(value, str) else value  # published in percent
 
@@ -305,7 +307,7 @@ def table_frame(rows: Sequence[Row]) -> "DataFrame":
     return DataFrame(records, columns=["method", "source", "rho", *(c.key for c in FILE_COLUMNS)], dtype=object)
 
 
-def as_latex(rows: Sequence[Row]) -> str:
+def as_latex(rows: Sequence[MethodRow]) -> str:
     """Return a booktabs table with the paper's columns: quartiles, seconds, and both recalls."""
     from pandas import DataFrame, MultiIndex
 
@@ -316,7 +318,7 @@ def as_latex(rows: Sequence[Row]) -> str:
     return style.to_latex(hrules=True, column_format=align, multicol_align="c", caption=" ".join(note(rows)) or None)
 
 
-def note(rows: Sequence[Row]) -> list[str]:
+def note(rows: Sequence[MethodRow]) -> list[str]:
     """Return a line for each source other than this run."""
     sources = dict.fromkeys(row.source for row in rows if row.source != HERE)
     return [f"{source}: another data set than ours." for source in sources]

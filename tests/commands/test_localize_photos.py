@@ -90,7 +90,7 @@ def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, 
     # What no photo can be localised with is said once, before the first photo.
     for given, message in (
         (("--camera", "PINHOLE,1"), "a PINHOLE camera has 4 parameters, not [1.0]"),
-        (("--keypoints", "nothing.h5"), "of keypoints, got nothing.h5, which is no file"),
+        (("--keypoints", "nothing.h5"), "--keypoints nothing.h5 does not exist; give"),
         (("--solver", "nothing"), "or packaged weights"),
         (("--model", str(model)), "nrecognized arguments: --model"),
         (("--time_limit", "-1"), "expected a positive `time_limit`, got -1.0"),

@@ -15,7 +15,7 @@ from bpnp.cli import main
 from bpnp.files import lock_folder
 from bpnp.models.baselines import RandomRansac
 from bpnp.report import read_points, read_results
-from bpnp.report.tables import Row, as_latex, paper_rows
+from bpnp.report.tables import MethodRow, as_latex, paper_rows
 from bpnp.training.comparison import parse_methods
 from bpnp.training.task import BlindPnPTask
 from bpnp.types import Batch, Prediction
@@ -232,7 +232,7 @@ def test_a_checkpoint_becomes_rows_per_estimate(tmp_path: Path) -> None:
 
 
 def test_names_in_latex_are_text() -> None:
-    assert r"L\_c \& 50\% | R" in as_latex([Row("L_c & 50% | R", {"problems": 3})])
+    assert r"L\_c \& 50\% | R" in as_latex([MethodRow("L_c & 50% | R", {"problems": 3})])
 
 
 @pytest.mark.parametrize(

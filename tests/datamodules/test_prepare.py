@@ -22,7 +22,7 @@ from bpnp.datamodules.clouds import open_shapes
 from bpnp.datamodules.colmap.module import colmap_recipe
 from bpnp.datamodules.meshes import POINTS, SURFACES, surfaces_recipe
 from bpnp.datamodules.shapes import normalise, read_mesh, sample_surface
-from bpnp.datamodules.store import Made, Recipe, Store, StoreError, is_store, open_store, prepare
+from bpnp.datamodules.store import JobResult, Recipe, Store, StoreError, is_store, open_store, prepare
 
 pytestmark = pytest.mark.slow
 
@@ -226,7 +226,7 @@ def test_a_worker_that_is_killed_is_one_error(meshes: Path, tmp_path: Path) -> N
     assert not (tmp_path / "store").exists()
 
 
-def end_worker(parent: int) -> Made:
+def end_worker(parent: int) -> JobResult:
     assert os.getpid() != parent
     os.kill(os.getpid(), signal.SIGKILL)
     return [], {}

@@ -15,7 +15,7 @@ from bpnp.datamodules.augment import check_clutter
 from bpnp.datamodules.colmap.model_files import FILES, ColmapError, find_scenes
 from bpnp.datamodules.colmap.reconstruction import ImagePoints, Reconstruction, read_reconstruction
 from bpnp.datamodules.problem import Counts, Problem, ProblemSource, stack_problems
-from bpnp.datamodules.store import Made, Recipe, StoreError, is_store
+from bpnp.datamodules.store import JobResult, Recipe, StoreError, is_store
 from bpnp.datamodules.stored import PROBLEMS, WIDTHS, StoredDataModule, has_enough_matches, problem_row
 from bpnp.files import file_states, fingerprint
 from bpnp.types import Batch
@@ -188,7 +188,7 @@ def colmap_recipe(source: Path, *, min_points: int, clutter: float) -> Recipe:
     )
 
 
-def model_rows(scene: str, name: str, folder: Path, min_points: int, clutter: float) -> Made:
+def model_rows(scene: str, name: str, folder: Path, min_points: int, clutter: float) -> JobResult:
     """Return the problems of one COLMAP model, none if it cannot be used.
 
     Unused parts are listed in the result instead of logged, because there may be hundreds of models.

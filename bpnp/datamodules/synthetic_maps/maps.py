@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bpnp.checks import check_positive, check_within
-from bpnp.datamodules.augment import Augmentation, Drawn, bounds
+from bpnp.datamodules.augment import Augmentation, NumberOrRange, bounds
 from bpnp.datamodules.loader import PARTS, ProblemDataModule
 from bpnp.datamodules.problem import Counts, Problem, stack_problems
 from bpnp.datamodules.synthetic_maps.kinds import facades, statue, street
@@ -57,14 +57,14 @@ class MapOptions:
 
     num_points: int = 256
     min_points: int = 16
-    outliers: Drawn = (0.25, 1.0)
+    outliers: NumberOrRange = (0.25, 1.0)
     views: tuple[int, int] = (1, 3)
     kinds: Mapping[str, float] = field(default_factory=WEIGHTS.copy)
     frame: Frame = "upright"
     tilt_deg: float = 0.0
     scale_range: tuple[float, float] = (0.1, 10.0)
-    field_of_view: Drawn = (24.0, 115.0)
-    noise_px: Drawn = (0.1, 1.5)
+    field_of_view: NumberOrRange = (24.0, 115.0)
+    noise_px: NumberOrRange = (0.1, 1.5)
 
     def __post_init__(self) -> None:
         check_within(MIN_POINTS, self.num_points, min_points=self.min_points)
@@ -223,12 +223,12 @@ def _amounts(
     return int(matches * factor), int(extra2d * factor), int(extra3d * factor)
 
 
-def _uniform(value: Drawn, rng: np.random.Generator) -> float:
+def _uniform(value: NumberOrRange, rng: np.random.Generator) -> float:
     low, high = bounds(value)
     return float(rng.uniform(low, high)) if low < high else low
 
 
-def _log_uniform(value: Drawn, rng: np.random.Generator) -> float:
+def _log_uniform(value: NumberOrRange, rng: np.random.Generator) -> float:
     low, high = bounds(value)
     return float(low * (high / low) ** rng.random()) if 0 < low < high else _uniform(value, rng)
 
@@ -301,14 +301,14 @@ class SyntheticMapDataModule(ProblemDataModule):
         test_problems: int = 200,
         num_points: int = 256,
         min_points: int = 16,
-        outliers: Drawn = (0.25, 1.0),
+        outliers: NumberOrRange = (0.25, 1.0),
         views: tuple[int, int] = (1, 3),
         kinds: Mapping[str, float] | None = None,
         frame: Literal["any", "upright", "view"] = "any",
         tilt_deg: float = 0.0,
         scale_range: tuple[float, float] = (0.1, 10.0),
-        field_of_view: Drawn = (24.0, 115.0),
-        noise_px: Drawn = (0.1, 1.5),
+        field_of_view: NumberOrRange = (24.0, 115.0),
+        noise_px: NumberOrRange = (0.1, 1.5),
         **loading: Any,
     ) -> None:
         super().__init__(**loading)
