@@ -95,7 +95,7 @@ def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, 
         (("--model", str(model)), "nrecognized arguments: --model"),
         (("--time_limit", "-1"), "expected a positive `time_limit`, got -1.0"),
         (("--views", "nothing.txt"), "expected a text file of lines `photo view`"),
-        (("--output", str(tmp_path / "plain.jpg")), "expected a folder to write to, got"),
+        (("--output", str(tmp_path / "plain.jpg")), ": it is a file, or lies in one"),
     ):
         error = fails(*plain, *out, *given)
         assert message in error
