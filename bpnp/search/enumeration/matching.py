@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bpnp.loops.vectors import rotated, turn
-from bpnp.search.enumeration.points import Array, Heading, ImagePoints, Places, PriorArrays, ScenePoints
+from bpnp.search.enumeration.points import Array, Heading, ImageArrays, Places, PriorArrays, SceneArrays
 from bpnp.search.enumeration.settings import RULES
 from bpnp.search.kernels.dense import solve_normal_equations
 from bpnp.search.propose.minimal_solvers import part
@@ -20,8 +20,8 @@ class EnumerationTables(NamedTuple):
     """What the compiled loops read. heading: where two matches fix a pose. fixing: matches that fix a pose, which its
     freedom takes up. density: chance that one scene point lies within one radius of an image point that is anywhere."""
 
-    scene: ScenePoints
-    image: ImagePoints
+    scene: SceneArrays
+    image: ImageArrays
     prior: PriorArrays
     heading: Heading
     fixing: int

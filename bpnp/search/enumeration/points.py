@@ -23,7 +23,7 @@ SLACK = math.cos(math.radians(95.0))  # the lines of sight to three points are n
 EDGE_ON = 0.15  # sine of an angle to the triangle's plane, below which either orientation is possible
 
 
-class ScenePoints(NamedTuple):
+class SceneArrays(NamedTuple):
     """points: (n, 3) in unit size. normals: (n, 3), (0, 3) if every point can be seen.
     labels: (n,), -1 fits any."""
 
@@ -35,7 +35,7 @@ class ScenePoints(NamedTuple):
 class Grid(NamedTuple):
     """Image points in the cells of a grid, each in all that lie within reach of it.
 
-    flat: (m, 2) coordinates, gain: (m,), of `ImagePoints`. labels: (m,), -1 fits any. low_u, low_v: the lower corner.
+    flat: (m, 2) coordinates, gain: (m,), of `ImageArrays`. labels: (m,), -1 fits any. low_u, low_v: the lower corner.
     per_cell: cells a unit. starts: where the items of a cell begin (cells^2 + 1,), those along the second coordinate
     next to each other. items: image points.
     """
@@ -50,7 +50,7 @@ class Grid(NamedTuple):
     items: Places
 
 
-class ImagePoints(NamedTuple):
+class ImageArrays(NamedTuple):
     """Bearings in a frame whose z axis is their mean, and in stereographic coordinates (x, y) / (|p| + z) about it.
 
     A difference s of coordinates is an angle of s (1 + cos theta), theta from the axis: `gain` turns differences near
@@ -99,7 +99,7 @@ class SceneSide:
     def __init__(self, points3d: Array, normals3d: Array | None, labels3d: Places | None) -> None:
         normals = np.empty((0, 3)) if normals3d is None else np.array(normals3d, np.float64, order="C")
         labels = np.full(len(points3d), -1) if labels3d is None else np.array(labels3d, np.int64)
-        self.arrays = ScenePoints(np.array(points3d, np.float64, order="C"), normals, labels)
+        self.arrays = SceneArrays(np.array(points3d, np.float64, order="C"), normals, labels)
         self.nearest = nearest_of(self.arrays.points, normals)
         self.tables: dict[tuple[int, int], Triangles] = {}
 
@@ -127,7 +127,7 @@ class ImageSide:
         per_radian = 1 / float(radius)
         flat, gain = rays[:, :2] / np.maximum(1 + rays[:, 2:], 1e-9), (1 + rays[:, 2]) * per_radian
         labels = np.full(len(rays), -1) if labels2d is None else np.array(labels2d, np.int64)
-        self.arrays = ImagePoints(np.ascontiguousarray(rays), per_radian, grid_of(flat, gain, labels, reach))
+        self.arrays = ImageArrays(np.ascontiguousarray(rays), per_radian, grid_of(flat, gain, labels, reach))
         self.density = float(math.pi * (1 / gain**2).mean() / _area(flat, float(1 / gain.mean())))
 
     @functools.cached_property

@@ -65,8 +65,7 @@ def poses_of_matches(problem: Problem, i: Labels, j: Labels, seed: int = 0) -> H
     """
     rays, points = problem.bearings[i], problem.points3d[j]
     middle = points.mean(0)
-    size = max(float(np.sqrt(((points - middle) ** 2).sum(-1).mean())), 1e-300)
-    points = (points - middle) / size
+    points = points - middle  # about which a turn and a shift are nearly independent
     rng = np.random.default_rng(seed)
     triples = _triples(len(i), rng)
     poses = p3p_poses(rays[triples], points[triples]).reshape(-1, 4, 3)
@@ -98,7 +97,7 @@ def poses_of_matches(problem: Problem, i: Labels, j: Labels, seed: int = 0) -> H
             ends.append(group[np.argsort(np.median(left, 1) if group is fitted else left.sum(1), kind="stable")])
     poses = np.concatenate(ends) if ends else poses[:0]
     rotation = poses[:, :3]
-    translation = size * poses[:, 3] - rotation @ middle
+    translation = poses[:, 3] - rotation @ middle
     return _scored(problem, i, j, rotation, translation, scales)
 
 
