@@ -15,8 +15,8 @@ from bpnp.layers.plan import SHORT_SUM, Plan
 from bpnp.loops.compilation import FAST, compiler
 from bpnp.loops.parallel import in_threads
 
-compiled = compiler(fastmath=FAST, _nrt=False)
-part = compiler(fastmath=FAST, _nrt=False, no_cpython_wrapper=True)  # for functions called by compiled code only
+compiled = compiler(fastmath=FAST)
+part = compiler(fastmath=FAST, part=True, forceinline=True)  # for functions called by compiled code only
 SHORT_COLUMN = 256  # rows summed in the precision of the data before the sum is added in float64
 
 

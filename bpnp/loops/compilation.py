@@ -1,173 +1,164 @@
-"""How loops on the CPU are compiled, and where the result is kept.
-
-The second half takes shortcuts through private parts of numba that halve the time to compile, hence the bound of its
-version.
-"""
+"""Compilation of loops with numba, and the folder that keeps the machine code."""
 
 import gc
+import hashlib
 import inspect
 import logging
-import os
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import cache, update_wrapper
+from pathlib import Path
 from typing import Any
 
 import numba
-from numba import _dynfunc  # type: ignore[attr-defined]
-from numba.core import event
-from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler
-from numba.core.dispatcher import Dispatcher
-from numba.core.typed_passes import InlineOverloads, IRLegalization, NopythonRewrites
-from numba.core.types import BaseFunction
-from numba.core.untyped_passes import InlineClosureLikes
 
+from bpnp.files import cache_folder, lock_folder
 from bpnp.loops.parallel import Clock
 
 # Of `fastmath`: sums in any order, but NaN and infinity keep their meaning, for they mark a lost pose or sample.
 FAST = {"reassoc", "contract", "arcp", "nsz"}
-_FILES: dict[Any, set[str]] = {}  # of each compiled function: its own, and those of the functions that these call
+_SETTINGS: Any = numba.config  # NUMBA_CACHE_DIR and others, as attributes
 
 
-def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """A decorator: compile at the first call, keep the result on disk, and hold no lock while it runs.
+def compiler(*, part: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Return a decorator that compiles a function with `numba.njit`.
 
-    It is kept beside the source or, where that cannot be written to, in the user's cache folder (`NUMBA_CACHE_DIR`
-    names another one); where neither can, each process compiles again. So it is after a change of the function's file,
-    or of this one, or of another with functions that its file calls or records of constants that it reads, which numba
-    does not look at. A function is compiled without the wrappers that a type checker puts around it on import.
-    options: of `numba.njit`. A division by zero is infinite, as in C. No wrapper for function pointers is made: that
-    would be a tenth of the time. Counting references is a fifth, which `_nrt=False` leaves out of a function that
-    allocates nothing. One that only compiled ones call has no wrapper for Python (`no_cpython_wrapper`; a call from
-    there ends the process), and is optimised and kept with its callers alone, which saves another quarter.
+    Divisions by zero are infinite, as in C, and the GIL is released. A type checker's wrapper around the function is
+    left out.
+
+    Args:
+        part: Make a function that only compiled functions call, and that is kept with them.
+        options: Options of `numba.njit`.
+
+    Returns:
+        A decorator that returns a `Loop`, or for a part numba's function.
     """
-    part = "no_cpython_wrapper" in options
-    options |= {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-    options["pipeline_class"] = _LoopCompiler
-
-    def compiled(function: Callable[..., Any]) -> Any:
-        function = inspect.unwrap(function)
-        known = function.__globals__.values()
-        files = {__file__, inspect.getfile(function)}.union(*(_FILES[x] for x in known if isinstance(x, Dispatcher)))
-        files |= {inspect.getfile(type(x)) for x in known if isinstance(x, tuple) and hasattr(x, "_fields")}
-        try:
-            dispatcher: Any = numba.njit(function, cache=not part, **options)
-            if not part:
-                stats = [os.stat(file) for file in sorted(files)]
-                _stamp(dispatcher, [(stat.st_mtime, stat.st_size) for stat in stats])
-        except RuntimeError:  # numba finds no folder for its cache
-            dispatcher = numba.njit(function, **options)
-        _FILES[dispatcher] = files
-        return dispatcher
-
-    return compiled
+    options |= {"nogil": True, "error_model": "numpy"}
+    if part:
+        return lambda function: numba.njit(inspect.unwrap(function), **options)
+    return lambda function: Loop(inspect.unwrap(function), options)
 
 
-class _Compilation(event.Listener):
-    """Logs one line when the first of this package's functions is compiled, for it takes seconds.
+class Loop:
+    """A function that numba compiles at its first call, once an installation.
 
-    Meanwhile Python's collector of cycles rests, which would find nothing, operators are looked up once, and the clock
-    of deadlines stands still. numba compiles one function at a time, whatever the thread, and those that it calls
-    within.
+    The machine code is kept in ``loops`` in `cache_folder`, or in NUMBA_CACHE_DIR. Each version of the source has a
+    folder of its own there: of the function's file, of the files of the parts that it calls, and of those of the named
+    tuples that it takes. numba itself would only look at the first. One process compiles; others that need the same
+    loop wait for it. Where the folder cannot be written to, each process compiles.
     """
 
-    made, depth, collected, begun = False, 0, False, 0.0
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        self.function, self.options = function, options
+        self.compiled: Any = None
+        update_wrapper(self, function)
 
-    def on_start(self, event: event.Event) -> None:
-        if not _is_ours(event):
-            return
-        if not self.made:
-            self.made = True
-            logging.getLogger(__name__).warning("compiling bpnp's loops, which takes some seconds once an installation")
-        if not self.depth:
-            self.begun = time.monotonic()
-            self.collected = gc.isenabled()
-            gc.disable()
-            _resolve_once(True)
-        self.depth += 1
+    def __call__(self, *arguments: Any) -> Any:
+        if self.compiled is None:
+            self._compile(arguments)
+        return self.compiled(*arguments)
 
-    def on_end(self, event: event.Event) -> None:
-        if _is_ours(event):
-            self.depth -= 1
-            if not self.depth:
-                Clock.compiling += time.monotonic() - self.begun
-                _resolve_once(False)
-                if self.collected:
-                    gc.enable()
-
-
-def _is_ours(event: event.Event) -> bool:
-    return event.data["dispatcher"].py_func.__module__.startswith("bpnp.")
-
-
-class _PartCode(JITCodeLibrary):
-    """The code of a function that is linked into those that call it, as numba translated it."""
-
-    def _optimize_final_module(self) -> None:
-        """Leave it to the callers."""
-
-    def _finalize_final_module(self) -> None:
-        self._finalized = True
+    def _compile(self, arguments: tuple[Any, ...]) -> None:
+        """Compile the function for the types of the arguments, or load what was compiled before."""
+        with _ONE_AT_A_TIME, ExitStack() as stack:
+            if self.compiled is not None:  # by another thread
+                return
+            stack.enter_context(_clock_stopped())
+            folder = _folder_of(self.function, arguments)
+            try:
+                stack.enter_context(lock_folder(folder, wait=True))
+                compiled = _njit_into(folder, self.function, self.options)
+            except (OSError, ValueError, RuntimeError):  # not a folder, read-only, or too full for numba
+                compiled = numba.njit(self.function, **self.options)
+            if not any(folder.glob("*/*.nbc")):
+                _announce(folder.parent)
+                stack.enter_context(_collection_paused())
+            compiled.compile(tuple(map(numba.typeof, arguments)))
+            self.compiled = compiled
 
 
-class _LoopCompiler(Compiler):
-    """Compiles a loop, or a part of one, which gets no machine code of its own."""
-
-    def __init__(self, typing: Any, target: Any, code: Any, args: Any, result: Any, flags: Any, *rest: Any) -> None:
-        if flags.no_cpython_wrapper:
-            code = _PartCode(target.codegen(), "part")
-            code.enable_object_caching()
-        super().__init__(typing, target, code, args, result, flags, *rest)
-        if flags.no_cpython_wrapper:
-            self.state.targetctx.get_executable = _without_machine_code
-
-    def define_pipelines(self) -> Any:
-        """Without the passes for closures, inlined functions and expressions of arrays, which the loops lack, and for
-        the end of each variable's life, which matters where references are counted."""
-        (pipeline,) = super().define_pipelines()
-        unused: set[Any] = {InlineClosureLikes, InlineOverloads, NopythonRewrites}
-        if not self.state.flags.nrt:
-            unused.add(IRLegalization)
-        pipeline.passes = [entry for entry in pipeline.passes if entry[0] not in unused]
-        pipeline.finalize()
-        return [pipeline]
+_ONE_AT_A_TIME = threading.RLock()
 
 
-def _without_machine_code(library: Any, description: Any, environment: Any) -> Any:
-    """What stands for the function among numba's; `Compiler` gives each compilation a copy of the target."""
-    return _dynfunc.make_function(description.lookup_module(), description.qualname, "", 0, environment, (library,))
+def _njit_into(folder: Path, function: Callable[..., Any], options: dict[str, Any]) -> Any:
+    """Return a function that numba keeps in a folder. numba reads the setting while it makes the function."""
+    before = _SETTINGS.CACHE_DIR
+    _SETTINGS.CACHE_DIR = str(folder)
+    try:
+        return numba.njit(function, cache=True, **options)
+    finally:
+        _SETTINGS.CACHE_DIR = before
 
 
-_FUNCTION: Any = BaseFunction  # of numba, or an operator
-_resolve = _FUNCTION.get_call_type
-_RESOLVED: dict[Any, Any] = {}
+def _folder_of(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Path:
+    """Return the folder for this version of a function's source."""
+    types = {type(value) for value in _flattened(arguments) if hasattr(value, "_fields")}
+    files = sorted({__file__, *_files_of(function), *map(inspect.getfile, types)})
+    content = hashlib.blake2b(numba.__version__.encode(), digest_size=8)
+    for file in files:
+        content.update(_digest(file))
+    root = Path(_SETTINGS.CACHE_DIR) if _SETTINGS.CACHE_DIR else cache_folder() / "loops"
+    return root / f"{function.__module__}.{function.__name__}-{content.hexdigest()}"
 
 
-def _resolve_once(once: bool) -> None:
-    """Whether numba looks up what an operator does with some types once, not at each use, which takes a sixth."""
-    _FUNCTION.get_call_type = _resolved_once if once else _resolve
+def _flattened(values: tuple[Any, ...]) -> Iterator[Any]:
+    """Yield tuples within tuples, the outer ones first."""
+    for value in values:
+        if isinstance(value, tuple):
+            yield value
+            yield from _flattened(value)
 
 
-def _resolved_once(function: Any, context: Any, args: Any, kws: Any) -> Any:
-    """As `get_call_type` of a function of numba's, whose answer for each kind of arguments is kept."""
-    key = function, context, tuple(args), tuple(kws.items())
-    if key not in _RESOLVED:
-        _RESOLVED[key] = _resolve(function, context, args, kws)
-    return _RESOLVED[key]
+@cache
+def _files_of(function: Callable[..., Any]) -> frozenset[str]:
+    """Return the files of a function, of the parts and named tuples in its module, and so on for the parts."""
+    files, modules, waiting = set[str](), set[str](), [function]
+    while waiting:
+        part = waiting.pop()
+        files.add(inspect.getfile(part))
+        if part.__module__ in modules:
+            continue
+        modules.add(part.__module__)
+        for value in part.__globals__.values():
+            if hasattr(value, "py_func"):  # numba's
+                waiting.append(value.py_func)
+            elif isinstance(value, tuple) and hasattr(value, "_fields"):
+                files.add(inspect.getfile(type(value)))
+    return frozenset(files)
 
 
-def _stamp(dispatcher: Any, source: Any) -> None:
-    """Compile again where `source` is not as it was, or the types that a kept loop takes are gone or elsewhere."""
-    kept = dispatcher._cache._cache_file
-    kept._source_stamp, load = source, kept._load_index
-
-    def loaded() -> Any:
-        try:
-            return load()
-        except (ImportError, AttributeError):
-            return {}
-
-    kept._load_index = loaded
+@cache
+def _digest(file: str) -> bytes:
+    return hashlib.blake2b(Path(file).read_bytes(), digest_size=8).digest()
 
 
-event.register("numba:compile", _Compilation())
+@contextmanager
+def _clock_stopped() -> Iterator[None]:
+    """Leave the time out of time limits."""
+    begun = time.monotonic()
+    try:
+        yield
+    finally:
+        Clock.compiling += time.monotonic() - begun
+
+
+@contextmanager
+def _collection_paused() -> Iterator[None]:
+    """Pause Python's collector of cycles, which would find nothing and take a tenth of the time."""
+    collected = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collected:
+            gc.enable()
+
+
+@cache
+def _announce(root: Path) -> None:
+    """Log once a process that something is compiled, for it takes seconds."""
+    logging.getLogger(__name__).warning(
+        "compiling bpnp's loops, which takes some seconds once an installation; they are kept in %s", root
+    )

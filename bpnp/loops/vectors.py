@@ -8,8 +8,10 @@ import numpy as np
 from bpnp.loops.compilation import FAST, compiler
 
 F = np.float32
-compiled = compiler(fastmath=FAST | {"afn"}, _nrt=False)
-part = compiler(fastmath=FAST | {"afn"}, _nrt=False, no_cpython_wrapper=True)  # called by compiled ones
+compiled = compiler(fastmath=FAST | {"afn"})
+# Called by compiled functions. Inlined, for else the loops in which they are called are not vectorised and take twice
+# the time.
+part = compiler(fastmath=FAST | {"afn"}, part=True, forceinline=True)
 LARGEST_TURN = 0.5  # radians in one step
 
 

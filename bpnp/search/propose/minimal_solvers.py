@@ -14,8 +14,8 @@ from bpnp.loops.compilation import compiler
 from bpnp.loops.parallel import in_threads
 from bpnp.loops.vectors import cross, rotated
 
-compiled = compiler(_nrt=False)
-part = compiler(_nrt=False, no_cpython_wrapper=True)  # called by compiled functions alone
+compiled = compiler()
+part = compiler(part=True, forceinline=True)  # called by compiled functions alone; see `bpnp.loops.vectors.part`
 FLAT = 1e-12  # squared height of a triangle over its squared longest side
 TOLERANCE = 1e-6  # of the squared sides, in units of the longest
 ROUNDING = 1e-12  # of a discriminant: what is smaller than this counts as zero
