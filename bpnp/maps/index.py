@@ -1,7 +1,9 @@
-"""The index of a large map: what opening a COLMAP model computes, in one file beside it."""
+"""The index of a large map in the cache folder: what opening a COLMAP model computes, in one file."""
 
 import json
 import zipfile
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,10 +12,9 @@ from numpy.typing import NDArray
 
 from bpnp.cameras import camera_from, camera_to_json
 from bpnp.datamodules.colmap.model_files import FILES
-from bpnp.files import file_states, fingerprint, write_atomically
+from bpnp.files import cache_folder, file_states, fingerprint, lock_folder, write_atomically
 from bpnp.maps.views import MARGIN_DEG, RANK, Array, Cones, Pictures, View
 
-FILE = "bpnp_index.npz"
 LARGE = 200_000  # points of a map from which on it has an index: smaller ones are opened in two seconds without
 FORMAT = 1
 
@@ -36,8 +37,35 @@ def _stamp(folder: Path) -> str:
     return fingerprint([FORMAT, MARGIN_DEG, repr(RANK), model])
 
 
-def write_index(folder: Path, index: Index) -> None:
-    """Write the index of the model in a folder whole; nothing where the folder cannot be written."""
+def index_file(folder: Path) -> Path:
+    """Return the file for the index of the model in a folder, in ``maps`` in `cache_folder`."""
+    return cache_folder() / "maps" / fingerprint(str(folder.resolve())) / "index.npz"
+
+
+def make_index(folder: Path, compute: Callable[[], Index]) -> Index:
+    """Return the index of the model in a folder, and keep it.
+
+    One process computes; others that open the same model wait for it. Where the cache folder cannot be written to,
+    nothing is kept.
+
+    Args:
+        folder: COLMAP model.
+        compute: Makes the index from the model.
+    """
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(lock_folder(index_file(folder).parent, wait=True))
+        except (OSError, ValueError):
+            return compute()
+        index = read_index(folder)
+        if index is None:
+            index = compute()
+            _write_index(folder, index)
+        return index
+
+
+def _write_index(folder: Path, index: Index) -> None:
+    """Write the index of the model in a folder whole; nothing where the disk is full."""
     views = index.views
     cameras = list({id(view.camera): view.camera for view in views}.values())
     number = {id(camera): k for k, camera in enumerate(cameras)}
@@ -54,7 +82,7 @@ def write_index(folder: Path, index: Index) -> None:
         "counts": np.array([len(view.points) for view in views]),
     }
     try:
-        with write_atomically(folder / FILE) as temporary, temporary.open("wb") as file:
+        with write_atomically(index_file(folder)) as temporary, temporary.open("wb") as file:
             np.savez(
                 file,
                 **arrays,  # type: ignore[arg-type]
@@ -66,7 +94,7 @@ def write_index(folder: Path, index: Index) -> None:
 def read_index(folder: Path) -> Index | None:
     """The index of the model in a folder; None if it has none, or one of other files or other constants."""
     try:
-        with (folder / FILE).open("rb") as opened, np.load(opened) as file:
+        with index_file(folder).open("rb") as opened, np.load(opened) as file:
             if file["stamp"].tobytes().decode() != _stamp(folder):
                 return None
             arrays = dict(file)

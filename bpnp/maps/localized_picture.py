@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bpnp.cameras import camera_from
-from bpnp.report.figures import size_in_camera
+from bpnp.report.images import size_in_camera
 from bpnp.report.terminal import LIGHT, QUIET, VERDICTS, number
 from bpnp.search.evidence.uncertainty import centre_covariance
 from bpnp.solving.solution import Solution, solution_points

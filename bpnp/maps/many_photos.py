@@ -21,7 +21,7 @@ from bpnp.files import delay_interrupts, fingerprint, write_text
 from bpnp.maps.localized_picture import localized_picture
 from bpnp.maps.photos import photo_keypoints
 from bpnp.maps.scene_map import UNKNOWN, SceneMap
-from bpnp.report.figures import read_photo, save_figure
+from bpnp.report.images import read_photo, save_figure
 from bpnp.solving.solution import Solution
 
 CHANGES = {"photo": "another photo", "map": "another map", "views": "other views", "keypoints": "other keypoints"}

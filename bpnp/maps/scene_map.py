@@ -102,7 +102,7 @@ class SceneMap:
 
         Not used, and logged as a warning: images with a broken pose, and points that are not finite. A view without
         points stays in the map. Keypoints are not kept: 10^6 points and 10^4 views of 1,000 points take 80 MB. The
-        first time that a large map is opened, an index is written beside the model (`bpnp.maps.index`).
+        first time that a large map is opened, an index is written to the cache folder (`bpnp.maps.index`).
         Raises ColmapError, a ValueError, for a model that cannot be read or has no view that sees a point.
         """
         if callable(getattr(path, "write_binary", None)):
@@ -111,9 +111,7 @@ class SceneMap:
                 return cls.from_colmap(folder)
         known = index.read_index(Path(path))
         if known is not None:
-            scene = cls(*known[:4])
-            vars(scene).update(pictures=known.pictures, cones=known.cones)
-            return scene
+            return cls._from_index(known)
         model = read_reconstruction(path, keypoints=False)
         views = tuple(
             View(image.name, image.camera, image.rotation, image.translation, image.observed.astype(np.int32))
@@ -125,9 +123,17 @@ class SceneMap:
                 f"{len(model.point_ids)} points; try a model with registered images"
             )
         scene = cls(model.points3d, model.point_ids, np.zeros(len(model.point_ids), np.int32), views).seen_by(1)
-        if len(scene.points3d) >= index.LARGE:
-            parts = scene.points3d, scene.point_ids, scene.track_lengths, scene.views
-            index.write_index(Path(path), index.Index(*parts, scene.pictures, scene.cones))
+        if len(scene.points3d) < index.LARGE:
+            return scene
+        parts = scene.points3d, scene.point_ids, scene.track_lengths, scene.views
+        return cls._from_index(
+            index.make_index(Path(path), lambda: index.Index(*parts, scene.pictures, scene.cones)),
+        )
+
+    @classmethod
+    def _from_index(cls, known: index.Index) -> "SceneMap":
+        scene = cls(*known[:4])
+        vars(scene).update(pictures=known.pictures, cones=known.cones)
         return scene
 
     def __repr__(self) -> str:

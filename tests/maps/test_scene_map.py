@@ -1,5 +1,9 @@
 """Maps are read with the points, tracks and views that the model has, whichever its form."""
 
+import shutil
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -39,14 +43,18 @@ def test_the_planted_map_comes_back(tmp_path: Path, text: bool) -> None:
 
 
 def test_a_large_map_is_indexed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    truth = plant_model(tmp_path, images=4, points=60, seen=25)
-    SceneMap.from_colmap(tmp_path)
-    assert not (tmp_path / index.FILE).exists()
+    monkeypatch.setenv("BPNP_CACHE", str(tmp_path / "cache"))
+    folder = tmp_path / "model"
+    truth = plant_model(folder, images=4, points=60, seen=25)
+    files = sorted(folder.iterdir())
+    SceneMap.from_colmap(folder)
+    assert not (tmp_path / "cache").exists()
     monkeypatch.setattr(index, "LARGE", 10)
-    first = SceneMap.from_colmap(tmp_path)
+    first = SceneMap.from_colmap(folder)
+    assert sorted(folder.iterdir()) == files
     with monkeypatch.context() as without_model:
         without_model.setattr(scene_map, "read_reconstruction", None)
-        again = SceneMap.from_colmap(tmp_path)
+        again = SceneMap.from_colmap(folder)
     for name in ("points3d", "point_ids", "track_lengths"):
         np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
     for one, other in ((again.pictures, first.pictures), (again.cones, first.cones)):
@@ -57,14 +65,38 @@ def test_a_large_map_is_indexed_once(tmp_path: Path, monkeypatch: pytest.MonkeyP
         np.testing.assert_allclose(view.rotation, truth.rotations[k], atol=1e-12)
         np.testing.assert_allclose(view.translation, truth.translations[k])
         assert (view.name, view.camera.focal) == (as_read.name, as_read.camera.focal)
-    plant_model(tmp_path, images=3, points=50, seen=20)  # another model in its place
-    assert len(SceneMap.from_colmap(tmp_path).views) == 3
-    (tmp_path / index.FILE).write_bytes((tmp_path / index.FILE).read_bytes()[:500])
-    assert len(SceneMap.from_colmap(tmp_path).views) == 3
-    (tmp_path / index.FILE).unlink()
-    (tmp_path / index.FILE).mkdir()  # where nothing can be written
-    (tmp_path / index.FILE / "file").touch()
-    assert len(SceneMap.from_colmap(tmp_path).views) == 3
+    plant_model(folder, images=3, points=50, seen=20)  # another model in its place
+    assert len(SceneMap.from_colmap(folder).views) == 3
+    (kept,) = (tmp_path / "cache").rglob("*.npz")
+    kept.write_bytes(kept.read_bytes()[:500])
+    assert len(SceneMap.from_colmap(folder).views) == 3
+    shutil.rmtree(tmp_path / "cache")
+    (tmp_path / "cache").touch()  # where nothing can be written
+    assert len(SceneMap.from_colmap(folder).views) == 3
+
+
+def test_of_processes_that_open_a_large_map_together_one_computes_its_index(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The other waits, and reads what the first one wrote."""
+    monkeypatch.setenv("BPNP_CACHE", str(tmp_path / "cache"))
+    plant_model(tmp_path / "model", images=4, points=60, seen=25)
+    scene = SceneMap.from_colmap(tmp_path / "model")
+    parts = scene.points3d, scene.point_ids, scene.track_lengths, scene.views, scene.pictures, scene.cones
+    begun, computed = threading.Event(), list[int]()
+
+    def compute(number: int) -> index.Index:
+        begun.set()
+        time.sleep(0.3)
+        computed.append(number)
+        return index.Index(*parts)
+
+    with ThreadPoolExecutor() as pool:  # a lock of a file holds threads apart as it does processes
+        first = pool.submit(index.make_index, tmp_path / "model", lambda: compute(1))
+        begun.wait()
+        second = pool.submit(index.make_index, tmp_path / "model", lambda: compute(2))
+        np.testing.assert_array_equal(second.result().points3d, first.result().points3d)
+    assert computed == [1]
 
 
 def test_without_a_view_its_own_points_are_gone(planted: tuple[Path, Planted]) -> None:
