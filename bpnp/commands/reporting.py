@@ -41,7 +41,8 @@ def report(
         recall: write the recall curves as .png, .jpg, .svg or .pdf.
         curves: write losses and validation of the first run's training as .png, .jpg, .svg or .pdf.
     """
-    from bpnp.report.figures import recall_curve, save_figure
+    from bpnp.report.figures import recall_curve
+    from bpnp.report.images import save_figure
     from bpnp.report.intervals import interval_table
     from bpnp.report.page import write_page
     from bpnp.report.tables import named_runs, read_runs, results_table
@@ -86,7 +87,8 @@ def view(
         photo: photo of the problem; needs --camera.
         camera: camera of the photo: a 3x3 matrix in a file, MODEL,PARAMETERS, or a COLMAP model that has the photo.
     """
-    from bpnp.report.figures import plot_photo, plot_problem, read_photo, save_figure
+    from bpnp.report.figures import plot_photo, plot_problem
+    from bpnp.report.images import read_photo, save_figure
     from bpnp.report.tables import named_runs
 
     names = problems or []
@@ -210,7 +212,8 @@ def table(
         paper: published rows to add.
     """
     from bpnp.datamodules import Outliers
-    from bpnp.report.figures import outlier_curves, save_figure
+    from bpnp.report.figures import outlier_curves
+    from bpnp.report.images import save_figure
     from bpnp.report.tables import CAPTION, FILE_COLUMNS, as_latex, note, paper_rows, table_frame, table_of_rows
     from bpnp.training.comparison import MethodTest, parse_methods, read_data
 

@@ -87,10 +87,7 @@ def solve(
         seed: random seed of the search.
         device: torch device such as cuda; cpu by default.
     """
-    from bpnp.cameras import camera_from
     from bpnp.commands.point_files import read_camera, read_prior
-    from bpnp.search.starts import GravityPrior
-    from bpnp.solving.solve import solve as find_pose
 
     if (up_camera is None) != (up_scene is None):
         raise ValueError("give --up_camera and --up_scene together")
@@ -101,29 +98,31 @@ def solve(
     if photo is not None and (picture is None or camera is None):
         raise ValueError("--photo needs --picture and --camera")
     if picture is not None:
-        from bpnp.report.figures import (  # imports matplotlib
-            SUFFIXES,
-            read_photo,
-            save_figure,
-            size_in_camera,
-        )
-        from bpnp.solving.solution import solution_picture
+        from bpnp.report.images import SUFFIXES, read_photo, save_figure, size_in_camera
 
         if picture.suffix.lower() not in SUFFIXES:
             raise ValueError(f"--picture {picture.name!r} has to end in {', '.join(SUFFIXES)}")
-    pose_prior: Any = None if prior is None else read_prior(prior, prior_degrees, prior_distance)
-    if up_camera is not None and up_scene is not None:
-        pose_prior = GravityPrior(up_camera, up_scene, up_degrees)
     image_points, scene_points, annotations = _read_sides(points2d, points3d, surface, seed)
     lens = None if camera is None else read_camera(camera, image)
     size = None if image_size is None else _size(image_size)
     background = None if photo is None or picture is None else read_photo(photo)
     if background is not None:
+        from bpnp.cameras import camera_from
+
         size_in_camera(background, camera_from(lens))
     inputs = [points2d, points3d, prior, photo, *(Path(text) for text in (camera, solver) if text is not None)]
     _check_outputs([output, picture], inputs)
     if colmap is not None:
         require_new_folder(colmap)
+    pose_prior: Any = None if prior is None else read_prior(prior, prior_degrees, prior_distance)
+
+    # All files have been read: only now import the search.
+    from bpnp.solving.solve import solve as find_pose
+
+    if up_camera is not None and up_scene is not None:
+        from bpnp.search.starts import GravityPrior
+
+        pose_prior = GravityPrior(up_camera, up_scene, up_degrees)
     with progress(items=False, quiet=quiet) as shown:
         task = shown.add_task("searching the pose", total=None)
         solution = find_pose(
@@ -146,6 +145,8 @@ def solve(
         )
     messages = _print_solution(solution, annotations, json=json, quiet=quiet, output=output)
     if picture is not None:
+        from bpnp.solving.solution import solution_picture
+
         figure = solution_picture(solution, title=points2d.stem, photo=background)
         say(f"wrote {save_figure(figure, picture)}", to=messages)
     if colmap is not None:
@@ -217,7 +218,6 @@ def verify(
     if page is not None:
         raise ValueError("--page needs the folder of a COLMAP model alone: bpnp verify MAP --page FILE.html")
     from bpnp.commands.point_files import read_camera, read_pairs, read_pose
-    from bpnp.solving.verify import verify as judge_pose
 
     given_pose: tuple[Any, Any]
     if pose is None and rotation is not None and translation is not None:
@@ -229,6 +229,12 @@ def verify(
     inputs = [points2d, points3d, pose, matches, None if camera is None else Path(camera)]
     _check_outputs([output], inputs)
     image_points, scene_points, annotations = _read_sides(points2d, points3d, surface, seed)
+    lens = None if camera is None else read_camera(camera, image)
+    pairs = None if matches is None else read_pairs(matches)
+
+    # All files have been read: only now import the search.
+    from bpnp.solving.verify import verify as judge_pose
+
     with progress(items=False, quiet=quiet) as shown:
         shown.add_task("verifying the pose", total=None)
         solution = judge_pose(
@@ -236,9 +242,9 @@ def verify(
             scene_points,
             given_pose[0],
             given_pose[1],
-            None if camera is None else read_camera(camera, image),
+            lens,
             **annotations,
-            matches=None if matches is None else read_pairs(matches),
+            matches=pairs,
             refine=not as_it_is,
             inlier_threshold=inlier_threshold,
             seed=seed,

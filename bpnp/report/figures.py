@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from bpnp.cameras import Camera, image_size, in_front, same_aspect_ratio
-from bpnp.files import delay_interrupts, write_atomically
+from bpnp.cameras import in_front
 from bpnp.report.charts import RECALLS, Error, recall_of
+from bpnp.report.images import size_in_camera
 from bpnp.report.points import Array, ProblemPoints, utf8
 from bpnp.report.results import Results
 from bpnp.report.tables import lines_of, paper_quartiles, read_runs
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".svg", ".pdf")
 POINTS = 981  # points of a curve
 NUMBERED = 40  # largest number of 3D points whose indices are drawn
 MARGIN = 0.15  # margin around the image points, relative to their extent
@@ -315,25 +314,6 @@ def plot_matches(
     return figure
 
 
-def save_figure(figure: "Figure", path: Path | str, *, dpi: int = 110) -> Path:
-    """Write a figure atomically and return its path.
-
-    Args:
-        figure: Matplotlib figure.
-        path: File name that ends in .png, .jpg, .svg or .pdf.
-        dpi: Resolution of .png and .jpg.
-
-    Raises:
-        ValueError: The name has another suffix.
-    """
-    path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"the file name {path.name!r} has to end in {', '.join(SUFFIXES)}")
-    with write_atomically(path) as temporary, delay_interrupts():  # matplotlib reports Ctrl-C as an input error
-        figure.savefig(temporary, format=path.suffix[1:].lower(), dpi=dpi)
-    return path
-
-
 def _estimate(problem: ProblemPoints, estimate: str | None) -> tuple[str, tuple[Array, Array]]:
     """Return the name and the pose of an estimate, by default the first; the pose is NaN if there is none."""
     if estimate is not None and estimate not in problem.estimates:
@@ -399,46 +379,3 @@ def _upright(points: Array, frame: tuple[Array, Array]) -> Array:
     rotation, translation = frame
     x, y, z = (points @ rotation.T + translation).T
     return np.stack([x, z, -y], -1)
-
-
-def read_photo(path: Path | str) -> Array:
-    """Read a picture.
-
-    Args:
-        path: File.
-
-    Returns:
-        Pixels (h, w, 3), uint8.
-
-    Raises:
-        ValueError: The file is no picture.
-    """
-    from PIL import Image
-
-    try:
-        with Image.open(path) as photo:
-            return np.asarray(photo.convert("RGB"))
-    except OSError as error:
-        raise ValueError(f"{path} is no picture: {error}") from error
-
-
-def size_in_camera(photo: Array, camera: Camera | None) -> tuple[int, int]:
-    """Return the width and height of a photo in pixels of its camera, which differ if the photo was resized.
-
-    Args:
-        photo: Photo (h, w, 3).
-        camera: Its camera.
-
-    Raises:
-        ValueError: The photo has another aspect ratio than the camera's images.
-    """
-    height, width = photo.shape[:2]
-    size = None if camera is None else image_size(camera)
-    if size is None:
-        return width, height
-    if not same_aspect_ratio((width, height), size):
-        raise ValueError(
-            f"the photo has {width} x {height} pixels, and its camera {size[0]} x {size[1]}, another aspect ratio; use "
-            "the photo of this camera"
-        )
-    return size

@@ -198,7 +198,7 @@ class Solution:
         coordinates without a camera. photo: a file or (h, w, 3) uint8 under the points, as it was taken; it needs a
         camera. Raises ValueError for a photo without a camera, and if no image point is in front of the camera.
         """
-        from bpnp.report.figures import read_photo
+        from bpnp.report.images import read_photo
 
         picture = read_photo(photo) if isinstance(photo, (Path, str)) else photo
         drawn = self if camera is None else replace(self, camera=camera_from(camera))

@@ -19,7 +19,7 @@ import bpnp
 from bpnp.cameras import camera_from
 from bpnp.cli import main
 from bpnp.examples import load
-from bpnp.report.figures import save_figure
+from bpnp.report.images import save_figure
 from bpnp.solving.inputs import problem_from
 from bpnp.solving.matches import without_pose
 

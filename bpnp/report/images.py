@@ -1,0 +1,78 @@
+"""Photos that are read and figures that are written."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from bpnp.cameras import Camera, image_size, same_aspect_ratio
+from bpnp.files import delay_interrupts, write_atomically
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".svg", ".pdf")
+Array = npt.NDArray[Any]
+
+
+def save_figure(figure: "Figure", path: Path | str, *, dpi: int = 110) -> Path:
+    """Write a figure atomically and return its path.
+
+    Args:
+        figure: Matplotlib figure.
+        path: File name that ends in .png, .jpg, .svg or .pdf.
+        dpi: Resolution of .png and .jpg.
+
+    Raises:
+        ValueError: The name has another suffix.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"the file name {path.name!r} has to end in {', '.join(SUFFIXES)}")
+    with write_atomically(path) as temporary, delay_interrupts():  # matplotlib reports Ctrl-C as an input error
+        figure.savefig(temporary, format=path.suffix[1:].lower(), dpi=dpi)
+    return path
+
+
+def read_photo(path: Path | str) -> Array:
+    """Read a picture.
+
+    Args:
+        path: File.
+
+    Returns:
+        Pixels (h, w, 3), uint8.
+
+    Raises:
+        ValueError: The file is no picture.
+    """
+    from PIL import Image
+
+    try:
+        with Image.open(path) as photo:
+            return np.asarray(photo.convert("RGB"))
+    except OSError as error:
+        raise ValueError(f"{path} is no picture: {error}") from error
+
+
+def size_in_camera(photo: Array, camera: Camera | None) -> tuple[int, int]:
+    """Return the width and height of a photo in pixels of its camera, which differ if the photo was resized.
+
+    Args:
+        photo: Photo (h, w, 3).
+        camera: Its camera.
+
+    Raises:
+        ValueError: The photo has another aspect ratio than the camera's images.
+    """
+    height, width = photo.shape[:2]
+    size = None if camera is None else image_size(camera)
+    if size is None:
+        return width, height
+    if not same_aspect_ratio((width, height), size):
+        raise ValueError(
+            f"the photo has {width} x {height} pixels, and its camera {size[0]} x {size[1]}, another aspect ratio; use "
+            "the photo of this camera"
+        )
+    return size
