@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 POINTS = 981  # points of a curve
 NUMBERED = 40  # largest number of 3D points whose indices are drawn
 MARGIN = 0.15  # margin around the image points, relative to their extent
-WIDTH, CLOSE_UP, CAPTIONS = 10.0, 3.5, 1.3  # width of an image, of its residuals, and height of the captions, inches
+WIDTH, CLOSE_UP, CAPTIONS = 10.0, 3.5, 1.6  # width of an image, of its residuals, and height of the captions, inches
 LIMITS: dict[Error, float] = {"rotation_deg": 20.0, "translation": 1.0, "joint": 20.0, "reprojection_deg": 2.0}
 Lines = Literal["match3d", "assigned3d"]
 
@@ -306,7 +306,7 @@ def plot_matches(
     axes = images[0]
     plot_residuals(close, problem)
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
-    height = float(np.clip(widths[0] * (bottom - top) / (right - left), 3, 10))
+    height = float(np.clip(widths[0] * (bottom - top) / (right - left), 3, 8))
     figure.set_size_inches(sum(widths), height + CAPTIONS)
     figure.suptitle(problem.id.replace("$", r"\$"), fontsize=10, color=colour)
     entries = {label: handle for one in images for handle, label in zip(*one.get_legend_handles_labels(), strict=True)}

@@ -126,7 +126,7 @@ def test_images_whose_points_hardly_another_one_sees_are_untested(tmp_path: Path
     [
         (["nowhere"], "nowhere does not exist; name points2d, points3d and a pose, or the folder of a COLMAP model"),
         (["file.csv"], "file.csv is a file; name points2d, points3d and a pose, or the folder of a COLMAP model"),
-        (["empty"], "expected a COLMAP model (cameras, images and points3D, all .bin or all .txt) in empty"),
+        (["empty"], "empty is no COLMAP model (cameras, images and points3D, all .bin or all .txt)"),
         (["scene"], "scene has no COLMAP model, but scene/0 has; try bpnp verify scene/0"),
         (["scene/0", "--output", "out.txt"], "--output is out.txt; name a file that ends in .json or .csv"),
         (["scene/0", "--page", "scene"], "--page is scene; name a file that ends in .html"),
@@ -149,3 +149,12 @@ def test_a_mistake_is_one_line(
 def test_the_drawn_map_never_replaces_a_folder(houses: tuple[Path, dict[str, tuple[np.ndarray, np.ndarray]]]) -> None:
     with pytest.raises(ValueError, match=r"houses is not empty; name a new folder"):
         draw_map(houses[0])
+
+
+def test_a_pipe_gets_a_line_for_each_image(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plant_model(tmp_path, camera=PINHOLE, images=3, points=140, seen=90, clutter=15)
+    main(["verify", str(tmp_path)])
+    lines = [line for line in capsys.readouterr().err.splitlines() if line[1:3] == "/3"]
+    assert [line.partition(": ")[0] for line in lines] == [f"{k + 1}/3 photo {k}.jpg" for k in range(3)]
+    main(["verify", str(tmp_path), "--quiet"])
+    assert capsys.readouterr() == ("", "")
