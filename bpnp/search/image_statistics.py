@@ -13,15 +13,18 @@ IMAGE = ImageSettings()
 
 
 class ImageStatistics:
-    """Of bearings (m, 3).
+    """Statistics of the bearings of an image.
 
-    centre: their mean (3,). spread: root mean square distance from it. axes: (3, 2) principal axes on the tangent
-    plane, half_widths: (2,) of the rectangle with their standard deviations, solid_angle: its area, steradians, at
-    most 4 pi.
-    scales: (S,) of residuals, radians, from the smallest that is believed to the largest that is no mere outline.
-    chosen: (k,) places of the image points that are looked at. together: (k, S) how many of them lie within
-    `rule.together` scales.
-    weights: (k, S, S) of the evidence, see `_weights`.
+    Attributes:
+        centre: (3,) mean of the bearings.
+        spread: RMS distance of the bearings from it.
+        axes: (3, 2) principal axes on the tangent plane.
+        half_widths: (2,) of the rectangle with the standard deviations of the bearings.
+        solid_angle: Area of this rectangle, steradians, at most 4 pi.
+        scales: (S,) of residuals, radians, from the noise floor to the largest that is no mere outline.
+        chosen: (k,) indices of the image points that are used.
+        together: (k, S) number of them within `rule.together` scales of each.
+        weights: (k, S, S) of the evidence, see `_weights`.
     """
 
     def __init__(self, bearings: Array, floor: float | None, rule: ImageSettings = IMAGE) -> None:

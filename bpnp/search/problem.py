@@ -59,7 +59,7 @@ class UnknownFocal(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Image points and scene points that nobody has matched, and what is known of them and of the pose.
+    """Unmatched image points and scene points, and what is known of them and of the pose.
 
     `Problem.of` makes one from the user's coordinates. Poses are those of the scene in unit size, camera = R p + t;
     `from_user` and `to_user` convert them.
@@ -74,11 +74,11 @@ class Problem:
             With them the enumeration leaves the normals aside.
         scores2d: (m,) probability in (0, 1] that an image point has a match; None for equal ones.
         scores3d: (n,) the same of the scene points.
-        floor: Smallest scale of the residuals that is believed, radians; None for a fraction of the bearings' spread.
+        floor: Smallest scale of the residuals, radians; None for a fraction of the RMS radius of the bearings.
         radius: Largest residual of a match in an enumeration, radians; None for that of its settings.
         clutter: Fraction of the image points without a match; None if it is unknown.
         prior: What is known of the pose, in unit size.
-        log10_tried: Logarithm of the number of poses that were tried; None for as many as triples of matches give.
+        log10_tried: Logarithm of the number of poses that were tried; None for the number that triples of matches give.
         odds2d: (m, c) with `classes3d`: their scalar product is how much likelier a match is by its classes than a
             mean one. The labels are then those of points whose class is certain.
         classes3d: (n, c) probabilities of the classes.
@@ -308,8 +308,8 @@ class Problem:
         return same_pose(rotation, rotation @ self.middle + translation, 0, tolerance)
 
     @property
-    def knows_rotation(self) -> bool:
-        """Whether a prior has the rotation to 5 degrees: a half turn then has 10^3.5 times the false alarms."""
+    def has_known_rotation(self) -> bool:
+        """True if a prior has the rotation to 5 degrees: a half turn then has 10^3.5 times the false alarms."""
         return isinstance(self.prior, PosePrior) and self.prior.rotation_sigma_deg <= TURNED_DEG
 
     @property
@@ -320,9 +320,11 @@ class Problem:
         return RADIUS if self.floor is None else FLOORS * self.floor
 
     @property
-    def knows_vertical(self) -> bool:
-        """Whether gravity is known so well that a tilt within its error moves no image point out of reach of its match;
-        always of three points, which fix no pose without it."""
+    def has_known_vertical(self) -> bool:
+        """True if a tilt within the error of a known gravity moves no image point out of reach of its match.
+
+        Always true of three points, which fix no pose without it.
+        """
         if not isinstance(self.prior, GravityPrior):
             return False
         if min(len(self.bearings), len(self.points3d)) == 3:
@@ -330,22 +332,25 @@ class Problem:
         return math.radians(self.prior.sigma_deg) * self.image.spread <= TILTED * self.match_radius
 
     @property
-    def pairs_that_fix(self) -> int:
+    def fixing_matches(self) -> int:
         """Number of matches that fix a pose: 2 where the vertical, or the rotation to a few degrees, is known, else
         3."""
-        return 2 if self.knows_rotation or self.knows_vertical else 3
+        return 2 if self.has_known_rotation or self.has_known_vertical else 3
 
     @property
     def fitted(self) -> int:
         """Numbers that are fitted to the image points."""
         lens = 0 if self.focal is None else 1 + (self.focal.radial_range > 0)
-        return 2 * self.pairs_that_fix + lens
+        return 2 * self.fixing_matches + lens
 
     def log10_share(self, rotation: Array, translation: Array) -> float:
-        """log10 of the share of all poses that are as near to the prior as this one, or within two standard deviations.
+        """Return log10 of the fraction of all poses that are as near to the prior as this one.
 
-        Of poses that fit matches of these points: their rotations fill SO(3) evenly, the directions to the middle of
-        the scene fill the view, and the logarithms of its distance a factor of 30.
+        The poses are those that fit matches of these points: their rotations fill SO(3) evenly, the directions to the
+        middle of the scene fill the view, and the logarithms of its distance a factor of 30. Poses within two standard
+        deviations of the prior are equally near. Weighed by the inverse of this fraction F, the tests of all poses add
+        up to 1 + log(1 / F_0) times as many as without a prior, F_0 the smallest fraction; the NFA leaves out this
+        factor, 8 for gravity known to 2 degrees.
         """
         if self.prior is None:
             return 0.0
@@ -368,7 +373,7 @@ class Problem:
 
 
 def faces(normals3d: Array, cosines3d: Array | None, camera: Array, rotation: Array) -> NDArray[np.bool_]:
-    """Which points (n, 3) in the camera's frame face it: n . c > cosine, c the unit vector to the camera's centre."""
+    """Return which points (n, 3) in the camera's frame face it: n . c > cosine, c the unit vector to its centre."""
     towards = -((normals3d @ rotation.T) * camera).sum(-1)
     if cosines3d is None:
         return np.asarray(towards > 0)
@@ -378,7 +383,7 @@ def faces(normals3d: Array, cosines3d: Array | None, camera: Array, rotation: Ar
 def label_groups(
     chosen: Labels, labels2d: Labels | None, labels3d: Labels | None, n: int
 ) -> list[tuple[Labels, Labels]]:
-    """Places in `chosen` and in the scene that can be partners, a group for each label in the image."""
+    """Return indices of `chosen` and of scene points that may match, a group for each label in the image."""
     if labels2d is None or labels3d is None:
         return [(np.arange(len(chosen)), np.arange(n))]
     order, any_label = np.argsort(labels3d, kind="stable"), np.flatnonzero(labels3d == -1)
@@ -414,7 +419,13 @@ def units_per_radian(points2d: Array, unit: Unit, camera: Camera | None) -> floa
 
 
 def why_degenerate(bearings: Array, points3d: Array, fewest: int = MIN_POINTS) -> str | None:
-    """Return why no pose can follow from points, of which `fewest` different ones fix one; None if one may."""
+    """Return why points fix no pose; None if they may.
+
+    Args:
+        bearings: (m, 3) unit vectors.
+        points3d: (n, 3) scene points.
+        fewest: Number of different points that fix a pose.
+    """
     for name, points in (("2D", bearings), ("3D", points3d)):
         count, others = 0, points
         while len(others) and count < fewest:

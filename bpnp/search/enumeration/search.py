@@ -73,7 +73,7 @@ class Enumeration:
         scene = scene_side(problem.points3d, problem.normals3d, problem.labels3d)
         self.reach = _reach(problem, radius, settings)
         image = ImageSide(problem.bearings, radius, problem.labels2d, self.reach)
-        (prior, heading, log_share), fixing = prior_arrays(problem, scene, image, settings), problem.pairs_that_fix
+        (prior, heading, log_share), fixing = prior_arrays(problem, scene, image, settings), problem.fixing_matches
         self.scene, self.image, self.settings = scene, image, settings
         self.fixing, self.solved, self._pace = fixing, 0, SLOWEST
         self.contested: list[Hypotheses] = []  # poses (1,) whose competitors were proposed
@@ -296,7 +296,7 @@ def _log_choose(n: int, k: int) -> float:
 def is_enumerable(problem: Problem) -> bool:
     """Whether the points have so few hypotheses that they are enumerated."""
     products = len(problem.bearings) * len(problem.points3d)
-    return products <= (DEFAULT.most_products if problem.pairs_that_fix == 3 else DEFAULT.most_products_known)
+    return products <= (DEFAULT.most_products if problem.fixing_matches == 3 else DEFAULT.most_products_known)
 
 
 def exceeds_enumeration(problem: Problem) -> bool:
@@ -334,7 +334,7 @@ def search_by_enumeration(problem: Problem, deadline: Deadline, settings: Search
         return found, _candidates(found.poses, annotated, settings) if certain is None else certain
 
     tracked = predicted_pose(problem.prior) is not None
-    near = tracked and problem.pairs_that_fix == 2
+    near = tracked and problem.fixing_matches == 2
     found, candidates = enumerated(problem, replace(DEFAULT, stages=()) if near else DEFAULT)
     if certain is None and isinstance(problem.prior, GravityPrior):
         candidates = with_false_alarms(candidates, problem)
