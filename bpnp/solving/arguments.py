@@ -156,12 +156,12 @@ def checked_prior(prior: Any) -> Prior | None:
         rotation, shift = checked_pose("prior.", prior.rotation, prior.translation)
         for name in ("rotation_sigma_deg", "translation_sigma"):
             positive(f"prior.{name}", getattr(prior, name))
-        return prior._replace(rotation=rotation, translation=shift)
+        return PosePrior(rotation, shift, float(prior.rotation_sigma_deg), float(prior.translation_sigma))
     if isinstance(prior, GravityPrior):
         camera, scene = (_finite(f"prior.{name}", getattr(prior, name), (3,)) for name in ("up_camera", "up_scene"))
         if not (camera.any() and scene.any() and prior.sigma_deg > 0):
             raise ValueError(f"expected directions and a positive sigma_deg in `prior`, got {prior}")
-        return GravityPrior(camera, scene, prior.sigma_deg)
+        return GravityPrior(camera, scene, float(prior.sigma_deg))
     from bpnp.models.weights import LEARNED, TrainedNet  # where a network is asked for
 
     if isinstance(prior, (str, Path)):
