@@ -1,6 +1,8 @@
 """Loops shared among threads: every index once, none stuck; and numpy's products on one thread meanwhile."""
 
 import multiprocessing
+import os
+import sys
 from collections.abc import Iterator
 
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 import torch
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from bpnp.loops.parallel import in_threads, one_blas_thread
+from bpnp.loops.parallel import in_threads, one_blas_thread, thread_count
 
 
 @pytest.fixture(params=[1, 2, 5])
@@ -17,6 +19,19 @@ def threads(request: pytest.FixtureRequest) -> Iterator[int]:
     torch.set_num_threads(request.param)
     yield request.param
     torch.set_num_threads(before)
+
+
+def test_threads_are_those_of_torch_else_of_the_environment_else_the_cpus(
+    threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert thread_count() == threads
+    monkeypatch.delitem(sys.modules, "torch")
+    for value, count in (("3", 3), ("4,2", 4)):
+        monkeypatch.setenv("OMP_NUM_THREADS", value)
+        assert thread_count() == count
+    for value in ("0", "many", ""):
+        monkeypatch.setenv("OMP_NUM_THREADS", value)
+        assert thread_count() == len(os.sched_getaffinity(0))
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 100])
