@@ -28,7 +28,7 @@ from bpnp.search.settings import DEFAULT, Draws, Narrowing, RasterSearch, Raster
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import weighed
 from bpnp.solving.matches import count_one_to_one
-from bpnp.solving.solution import Candidate, Solution
+from bpnp.solving.solution import Candidate, Solution, candidates_of
 
 
 @dataclass(frozen=True)
@@ -93,8 +93,10 @@ def _candidate(problem: Problem, solution: Solution, ends: Hypotheses, k: int, b
     rotation, translation = ends.rotation[k], ends.translation[k]
     seen = problem.project_scene(rotation, translation)
     inliers = count_one_to_one(problem.image_points, seen, solution.inlier_threshold)
-    alarms = solution.log10_false_alarms + behind
-    return Candidate(*problem.to_user(rotation, translation), float(ends.log_likelihood[k]), inliers, alarms)
+    turn, shift = problem.to_user(rotation[None], translation[None])
+    alarms = np.array([solution.log10_false_alarms + behind])
+    twin = replace(ends[k : k + 1], rotation=turn, translation=shift, log10_false_alarms=alarms)
+    return candidates_of(twin, [inliers])[0]
 
 
 def _looks(photo: Photo, solution: Solution, problem: Problem) -> Iterator[tuple[Array, Array]]:

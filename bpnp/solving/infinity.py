@@ -25,7 +25,7 @@ from bpnp.solving.arguments import (
 from bpnp.solving.focal_length import UnknownCamera
 from bpnp.solving.inputs import bearings_of, check_seen, unit_of
 from bpnp.solving.matches import SCALES, angles_between, count_one_to_one, one_to_one
-from bpnp.solving.solution import Candidate, Solution, SolutionStats, with_pose
+from bpnp.solving.solution import Solution, SolutionStats, with_pose
 from bpnp.solving.sources import Options
 
 FEWEST = 3  # two fix a rotation and are no evidence
@@ -163,17 +163,9 @@ def _seen_by(
     angles = angles_between(bearings[i], seen[0][j])
     return with_pose(
         solution,
-        [
-            Candidate(*each)
-            for each in zip(
-                found.rotation,
-                found.translation,
-                found.log_likelihood.tolist(),
-                counts,
-                found.log10_false_alarms.tolist(),
-                strict=True,
-            )
-        ],
+        result,
+        found,
+        counts,
         np.stack([usable[i], j], -1),
         angles * per_radian,
         angles,

@@ -18,7 +18,7 @@ from bpnp.search.evidence.uncertainty import linearised, pose_covariance
 from bpnp.search.problem import Problem
 from bpnp.search.verdict import SearchResult
 from bpnp.solving.arguments import Array, Labels
-from bpnp.solving.solution import Candidate, Solution, SolutionStats, with_pose
+from bpnp.solving.solution import Solution, SolutionStats, with_pose
 
 Allowed = Callable[[Labels, Labels], NDArray[np.bool_]]
 DENSE = 4096  # possible matches up to which all of them are compared
@@ -42,19 +42,16 @@ def finished(problem: Problem, result: SearchResult, seconds: float, inlier_thre
     matches = one_to_one(problem.image_points, projected, threshold, problem.may_match)
     image, may_match = problem.image_points, problem.may_match
     counts = [len(matches), *(count_one_to_one(image, seen, threshold, may_match) for seen in others)]
-    candidates = [
-        Candidate(*problem.to_user(rotation, translation), score, count, alarms)
-        for (rotation, translation), score, count, alarms in zip(
-            poses, found.log_likelihood.tolist(), counts, found.log10_false_alarms.tolist(), strict=True
-        )
-    ]
+    rotation, translation = problem.to_user(*map(np.stack, zip(*poses, strict=True)))
     i, j = matches.T
     camera = problem.points3d[j] @ poses[0][0].T + poses[0][1]
     matched = float(found.match_count[0])
     linear = None if result.verdict == "failed" else linearised(problem, *poses[0], result.residual)
     solution = with_pose(
-        replace(without_pose(problem, _note_duplicates(problem, result), None), verdict=result.verdict),
-        candidates,
+        without_pose(problem, _note_duplicates(problem, result), None),
+        result,
+        replace(found, rotation=rotation, translation=translation),
+        counts,
         np.stack([problem.usable[i], j], -1),
         np.linalg.norm(image[i] - projected[j], axis=-1),
         angles_between(problem.bearings[i], camera),
@@ -63,8 +60,7 @@ def finished(problem: Problem, result: SearchResult, seconds: float, inlier_thre
         residual=result.residual,
         covariance=_of_pixels(problem, pose_covariance(problem, linear, matched)),
     )
-    stats = replace(solution.stats, iterations=result.batches)
-    return replace(solution, stats=stats, seconds=seconds + time.perf_counter() - start)
+    return replace(solution, seconds=seconds + time.perf_counter() - start)
 
 
 def _note_duplicates(problem: Problem, result: SearchResult) -> str:

@@ -18,7 +18,7 @@ from bpnp.search.verdict import SearchResult, no_pose
 from bpnp.solving.arguments import Array, about, checked_pose, each_camera, each_set, numbers
 from bpnp.solving.inputs import problem_from
 from bpnp.solving.matches import SCALES, one_to_one, without_pose
-from bpnp.solving.solution import Candidate, Solution, with_pose
+from bpnp.solving.solution import Solution, with_pose
 from bpnp.solving.sources import Options
 
 
@@ -96,18 +96,14 @@ def _finished(rig: Rig, problems: Sequence[Problem], result: SearchResult, inlie
         covariance = _about_origin(
             covariance, first.size, middle, shift, 1 / translation[3], max(2 * matched - rig.unknowns, 1)
         )
-    alarms = found.log10_false_alarms.tolist()
+    _, moved = first.to_user(found.rotation, found.translation[:, :3])
     points2d = np.concatenate([problem.all2d for problem in problems])
     dropped = sum(problem.dropped2d for problem in problems)
-    stats = replace(solution.stats, iterations=result.batches, dropped2d=dropped)
     return with_pose(
-        replace(solution, verdict=result.verdict, points2d=points2d, stats=stats),
-        [
-            Candidate(
-                r, first.to_user(r, t[:3])[1] / t[3], -alarms[k], matched if k == 0 else 0, alarms[k], float(1 / t[3])
-            )
-            for k, (r, t) in enumerate(zip(found.rotation, found.translation, strict=True))
-        ],
+        replace(solution, points2d=points2d, stats=replace(solution.stats, dropped2d=dropped)),
+        result,
+        replace(found, translation=np.column_stack([moved, found.translation[:, 3]])),
+        [matched, *[0] * (len(found) - 1)],
         np.concatenate(matches),
         np.concatenate(errors),
         np.concatenate(angles),

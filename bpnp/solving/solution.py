@@ -18,8 +18,9 @@ from scipy.spatial import cKDTree
 
 from bpnp.cameras import Camera, camera_from, camera_to_json, in_front
 from bpnp.search.evidence.uncertainty import centre_covariance
+from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Unit
-from bpnp.search.verdict import Verdict
+from bpnp.search.verdict import SearchResult, Verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -255,9 +256,33 @@ class Solution:
             raise ValueError(f"expected the JSON of a solution{name}, got {error}") from error
 
 
+def candidates_of(poses: Hypotheses, counts: Sequence[int]) -> tuple[Candidate, ...]:
+    """Return hypotheses as a user gets them.
+
+    Args:
+        poses: In the coordinates of the user; translations (c, 4) are homogeneous, the unit of the scene last.
+        counts: Inliers of each.
+    """
+    unit = poses.translation[:, 3:] if poses.translation.shape[1] == 4 else np.ones((len(poses), 1))
+    return tuple(
+        Candidate(rotation, translation, score, count, alarms, scale)
+        for rotation, translation, score, count, alarms, scale in zip(
+            poses.rotation,
+            poses.translation[:, :3] / unit,
+            poses.log_likelihood.tolist(),
+            counts,
+            poses.log10_false_alarms.tolist(),
+            (1 / unit[:, 0]).tolist(),
+            strict=True,
+        )
+    )
+
+
 def with_pose(
     solution: Solution,
-    candidates: Sequence[Candidate],
+    result: SearchResult,
+    poses: Hypotheses,
+    counts: Sequence[int],
     matches: npt.NDArray[np.int64],
     errors: Array,
     angles: Array,
@@ -267,8 +292,22 @@ def with_pose(
     residual: float,
     covariance: Array | None,
 ) -> Solution:
-    """A solution without a pose with the first of the candidates, of whose matches `errors` are in the unit of the
-    solution and `angles` in radians; at `most` so many matches there could be."""
+    """Return a solution with the pose, the verdict and the candidates of a search.
+
+    Args:
+        solution: Without a pose.
+        result: Verdict of the search.
+        poses: Hypotheses in the coordinates of the user, the best first; see `candidates_of`.
+        counts: Inliers of each.
+        matches: (k, 2) of the first pose.
+        errors: (k,) of the matches, in the unit of the solution.
+        angles: (k,) of the matches, radians.
+        most: Largest possible number of matches.
+        threshold: Largest error of an inlier, in the unit of the solution.
+        residual: Scale of the residuals, radians.
+        covariance: Of the first pose; None keeps that of the solution.
+    """
+    candidates = candidates_of(poses, counts)
     return replace(
         solution,
         rotation=candidates[0].rotation,
@@ -281,9 +320,15 @@ def with_pose(
         reprojection_error=float(errors.mean()) if len(matches) else math.nan,
         reprojection_error_deg=float(np.degrees(angles).mean()) if len(matches) else math.nan,
         covariance=solution.covariance if covariance is None else covariance,
-        candidates=tuple(candidates),
+        candidates=candidates,
+        verdict=result.verdict,
         log10_false_alarms=candidates[0].log10_false_alarms,
-        stats=replace(solution.stats, residual=residual, converged=solution.verdict == "confident"),
+        stats=replace(
+            solution.stats,
+            iterations=result.batches,
+            residual=residual,
+            converged=result.verdict == "confident",
+        ),
     )
 
 
