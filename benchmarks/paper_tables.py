@@ -213,7 +213,7 @@ def measure(
     record: dict[str, Any] = json.loads(options.output.read_text()) if options.output.is_file() else {}
     record = {key: record.get(key, {}) for key in ("rows", "effects", "training")}
     steps = {label: trained_steps(one.checkpoint) for label, one in trained.items()}
-    if any(steps.values()):
+    if any(steps[label] for label in BRANCHES):
         facts = {"learning_rate": options.learning_rate, "switch": options.steps}
         record["training"][f"seed {options.seed}"] = steps | facts
     for name in options.sets:

@@ -124,11 +124,6 @@ ROWS = (
                      "LEDs, 4 cameras, scale unknown")
     ),
     *(
-        Row("rigs", f"photos, {name}", partial(of_benchmark, bench_rigs.rows, f"photos, {name}"), (8, 1),
-            bench_rigs.RIGHT_DEG, data="colmap")
-        for name in ("camera 1", "camera 2", "camera 3", "3 cameras")
-    ),
-    *(
         Row("stars", f"{count:,} stars, {field:.0f} deg",
             partial(of_benchmark, bench_stars.rows, f"{count}, {field:.0f} deg"), (170, 4), bench_stars.RIGHT_DEG)
         for count in bench_stars.CATALOGUES for field in bench_stars.FIELDS
