@@ -5,6 +5,7 @@ Positional parameters become arguments, keyword-only ones options.
 
 import difflib
 import inspect
+import itertools
 import math
 import re
 import typing
@@ -69,7 +70,7 @@ def plain(message: str) -> str:
 def parse_arguments(name: str, command: Callable[..., None], arguments: Sequence[str]) -> dict[str, Any]:
     """Parse the arguments of a command.
 
-    A hyphen in the name of an option is read as an underscore.
+    A hyphen in the name of an option is read as an underscore, and the value `inf` as YAML's `.inf`.
 
     Args:
         name: Name of the command.
@@ -83,6 +84,7 @@ def parse_arguments(name: str, command: Callable[..., None], arguments: Sequence
         ValueError: The command does not take these arguments.
     """
     words = [re.sub(r"^--[\w-]+", lambda name: f"--{name[0][2:].replace('-', '_')}", text) for text in arguments]
+    words = [_infinity(before, text) for before, text in itertools.pairwise(["", *words])]
     extra = {}
     if OVERRIDES in inspect.signature(command).parameters:
         rest, words, extra = iter(words), [], {OVERRIDES: list[str]()}
@@ -98,6 +100,13 @@ def parse_arguments(name: str, command: Callable[..., None], arguments: Sequence
         if key in hints
     }
     return chosen | extra
+
+
+def _infinity(before: str, text: str) -> str:
+    """Return the YAML form of an infinite value, `--option inf` or `--option=inf`, and any other word as it is."""
+    if text == "inf" and before.startswith("--"):
+        return ".inf"
+    return re.sub(r"^(--\w+=)inf$", r"\1.inf", text)
 
 
 def command_parser(name: str, command: Callable[..., None]) -> OneLineParser:

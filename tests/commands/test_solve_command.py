@@ -1,6 +1,7 @@
 """`bpnp solve` on planted problems: files in, JSON, table and picture out; a mistake is one line."""
 
 import json
+import math
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -80,8 +81,10 @@ def test_options_and_columns_reach_the_search_as_they_are_written(tmp_path: Path
         words += f" --distortion --at_infinity --device cpu --prior {rough} --prior-degrees 6 --prior_distance 0.5"
         files = [str(tmp_path / "x.csv"), str(tmp_path / "p.csv")]
         main(["solve", *files, *words.split()])
-        main(["solve", *files, *UP, "--up-degrees", "7"])
-    options, upright = asked
+        main(["solve", *files, *UP, "--up-degrees", "7", "--time-limit", "inf"])
+        main(["solve", *files, *UP, "--up-degrees", "7", "--time_limit=inf"])
+    options, upright, endless = asked
+    assert upright["time_limit"] == endless["time_limit"] == math.inf
     np.testing.assert_array_equal(options["normals3d"], sides[:, 3:6])
     np.testing.assert_array_equal(options["labels3d"], sides[:, 6])
     np.testing.assert_array_equal(options["labels2d"], colours[:, 0])
