@@ -58,7 +58,7 @@ def test_a_text_model_whose_last_line_has_no_break_is_read_if_its_header_has_the
         (
             "cameras.bin",
             struct.pack("<QIiQQ4d", 1, 1, 1, 9, 9, np.nan, 1, 1, 1),
-            "camera 1 of image .*: expected finite",
+            "camera 1 of image .*: the parameters of a PINHOLE camera hold NaN or infinity",
         ),
         (
             "cameras.bin",

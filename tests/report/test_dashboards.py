@@ -10,7 +10,10 @@ from small_data import is_written
 from bpnp.report.charts import recall_chart
 from bpnp.report.dashboards import log_results, scalars
 
-pytestmark = pytest.mark.usefixtures("wandb_session")
+
+@pytest.fixture(autouse=True)
+def _offline(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("WANDB_MODE", raising=False)
 
 
 def test_scalars_are_those_of_the_summary(tmp_path: Path) -> None:

@@ -182,10 +182,10 @@ def test_the_tensorboard_logger_has_the_loss_of_each_step(tmp_path: Path) -> Non
     assert losses[-1] == pytest.approx(float(Observer.trainer.callback_metrics["train/loss"]), rel=1e-6)
 
 
-@pytest.mark.usefixtures("wandb_session")
-def test_the_wandb_logger_has_the_loss_of_the_last_step(tmp_path: Path) -> None:
+def test_the_wandb_logger_has_the_loss_of_the_last_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WANDB_MODE", "offline")  # Lightning's logger sets it too, for the whole process
     logger = ["--trainer.logger=WandbLogger", f"--trainer.logger.save_dir={tmp_path}/wandb"]
-    logger += ["--trainer.logger.project=bpnp", "--trainer.logger.offline=true"]
+    logger += ["--trainer.logger.project=bpnp", "--trainer.logger.mode=offline"]
     fit(tmp_path, *TWO_STEPS, *logger, "--trainer.log_every_n_steps=1")
     run = Observer.trainer.loggers[0].experiment
     assert run.summary["trainer/global_step"] == 1
