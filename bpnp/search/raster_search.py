@@ -1,20 +1,19 @@
-"""Raster search: of many starts, around a rough pose or over all rotations, those go on whose points fall on bearings
-more often than chance lets them.
+"""Density-map search: preselect many initial poses by how well their projected points fall on dense bearings.
 
-Annealing on clusters loses a pose among many outliers even if it begins there: at scales at which 64 clusters stand for
-a thousand points the true pose is no optimum. At a scale of a few hundredths of the view it is one, in a basin so
-narrow that it takes some 10^5 starts to hit within the range of a prior; at a coarser one, where chance does not fill
-the view yet, thousands do. They are affordable because each is only looked up, not annealed: a point that falls at x
-adds
+The initial poses lie around a rough pose or over all rotations. Annealing on clusters loses a pose among many outliers
+even if it begins there. At scales at which 64 clusters stand for a thousand points, the true pose is no optimum. At a
+scale of a few hundredths of the view it is one. Its basin is then so narrow that about 10^5 starts within the range of
+a prior are needed to reach it. At a coarser scale, where chance does not fill the view yet, thousands suffice. They
+are affordable because each is only scored on the map, not annealed: a point that falls at x adds
 
     log(w + (1 - w) d_s(x) / d_b(x)) - its mean near x,
 
-d_s the density of the bearings smoothed by the small scale s, d_b by a larger one, w the share of outliers. So a point
-adds nothing in the mean if it falls where it does by chance, wherever the bearings are dense, and nothing outside.
+d_s the density of the bearings smoothed by the small scale s, d_b by a larger one, w the outlier fraction. A point that
+falls somewhere by chance adds nothing in the mean, even where bearings are dense. Outside the view it adds nothing.
 
-The scale s then shrinks by steps. At each the poses that are left are copied, each copy moved about as far as s, and
-all are looked up again: an annealed particle filter (Deutscher, Blake, Reid, CVPR 2000). At a smaller scale a point
-that falls on a bearing tells more, and the copies find the narrower optimum within the wide one.
+The scale s then shrinks by steps. At each step the remaining poses are copied, each copy is moved by about s, and all
+are scored again: an annealed particle filter (Deutscher, Blake, Reid, CVPR 2000). At a smaller scale a point that falls
+on a bearing is more informative. The copies find the narrower optimum within the wide one.
 """
 
 import math
@@ -32,15 +31,21 @@ from bpnp.search.scene import Scene
 from bpnp.search.settings import RasterSearch, RasterShape
 from bpnp.search.starts import PosePrior, Prior, aim_of, draw_poses
 
-WIDE = 5.0  # standard deviations of a smoothing beyond which its kernel is 0
-WIDEST = 2 * math.tan(math.radians(60))  # half a raster's side: 120 degrees off the axis, where a view is all around
-NARROW = 4.0  # cells of the raster, of the standard deviation of a smoothing that is added up cell by cell
+WIDE = 5.0  # standard deviations beyond which a smoothing kernel is 0
+WIDEST = 2 * math.tan(math.radians(60))  # half side of the largest density map: 120 degrees off the axis
+NARROW = 4.0  # standard deviation, in cells, below which a smoothing is computed cell by cell
 
 
 def search_near(scene: Scene, prior: PosePrior, rule: RasterSearch | None = None) -> Hypotheses:
-    """Poses from starts drawn from a prior with a translation: the likeliest of them by a raster, annealed.
+    """Run density-map searches from initial poses drawn from a prior.
 
-    rule: None for those of the settings, one after the other.
+    Args:
+        scene: Points, settings and deadline.
+        prior: Prior with a translation, in the frame of the scene.
+        rule: Settings of one search; None for all of `settings.near`.
+
+    Returns:
+        Distinct annealed poses of all searches.
     """
     rules = scene.settings.near if rule is None else (rule,)
     starts = (drawn_around(scene, prior, starts_of(scene, prior, one)) for one in rules)
@@ -48,7 +53,16 @@ def search_near(scene: Scene, prior: PosePrior, rule: RasterSearch | None = None
 
 
 def raster_search(scene: Scene, poses: Hypotheses, rule: RasterSearch) -> Hypotheses:
-    """Distinct poses from those starts under which most points fall on bearings by a raster, annealed."""
+    """Preselect initial poses on a density map, narrow the scale, and anneal the best.
+
+    Args:
+        scene: Points, settings and deadline.
+        poses: Initial poses in the frame of the scene.
+        rule: Settings of the search.
+
+    Returns:
+        Distinct annealed poses. Copies of one initial pose count once for the basin counts.
+    """
     for points, kept in zip(rule.screens.points, rule.screens.kept, strict=True):
         poses, _ = looked_up(scene, poses, rule.raster, rule.narrowing.first_scale, points, kept)
     steps, scale = rule.narrowing, rule.narrowing.first_scale
@@ -68,10 +82,17 @@ def raster_search(scene: Scene, poses: Hypotheses, rule: RasterSearch) -> Hypoth
 
 
 def search_everywhere(scene: Scene, number: int, prior: Prior | None) -> Hypotheses:
-    """Distinct poses from as many starts as for a wide prior, but over all rotations, aimed at one place of the view.
+    """Run a density-map search over all rotations, aimed at one position in the view.
 
-    number: of the search, counted from 0, on which the place depends. Near one place the right pose competes with fewer
-    others, and where it is the right one few searches of all rotations miss it.
+    Near one position the correct pose has fewer competitors. If the position is correct, few searches miss the pose.
+
+    Args:
+        scene: Points, settings and deadline.
+        number: Index of the search, from 0, which determines the position.
+        prior: Prior of the rotations, in the frame of the scene; None for all rotations.
+
+    Returns:
+        Distinct annealed poses.
     """
     settings = scene.settings
     rule, aim = settings.everywhere, aim_of(number)
@@ -80,33 +101,42 @@ def search_everywhere(scene: Scene, number: int, prior: Prior | None) -> Hypothe
 
 
 def search_beside(scene: Scene, pose: Hypotheses, rule: RasterSearch) -> Hypotheses:
-    """Distinct poses around one, as far as the rule's widest prior reaches; their basin counts are 0."""
+    """Run a local search around a pose.
+
+    Args:
+        scene: Points, settings and deadline.
+        pose: One pose in the frame of the scene; the widest prior of the rule is centred on it.
+        rule: Settings of the search.
+
+    Returns:
+        Distinct annealed poses with basin counts of 0.
+    """
     prior = PosePrior(pose.rotation[0], pose.translation[0], rule.draws.wide_deg)
     sigma = rule.draws.wide_shift * distance_of(scene, prior)
     return search_near(scene, prior._replace(translation_sigma=sigma), rule).as_dependent()
 
 
 def is_near(scene: Scene, prior: PosePrior) -> bool:
-    """Whether a prior is narrow enough for starts around it to meet the basin of the right pose."""
+    """Return True if a prior has a translation and is narrow enough for its starts to reach the right basin."""
     return (
         prior.translation is not None and _volume(scene, prior, scene.settings.near[0]) <= scene.settings.most_volumes
     )
 
 
 def starts_of(scene: Scene, prior: PosePrior, rule: RasterSearch) -> int:
-    """As many starts as lie as densely around a narrow prior as `Draws.starts` do around a wide one."""
+    """Return the number of starts that covers a narrow prior as densely as `Draws.starts` cover a wide one."""
     share = min(_volume(scene, prior, rule), 1.0)
     return int(np.clip(rule.draws.starts * share, rule.draws.least_starts, rule.draws.starts))
 
 
 def _volume(scene: Scene, prior: PosePrior, rule: RasterSearch) -> float:
-    """Of the poses that a prior allows, in that of the rule's wide one."""
+    """Return the volume of the poses that a prior allows, in multiples of the wide prior of the rule."""
     wide = math.radians(rule.draws.wide_deg), rule.draws.wide_shift * distance_of(scene, prior)
     return (math.radians(prior.rotation_sigma_deg) / wide[0]) ** 3 * (prior.translation_sigma / wide[1]) ** 3
 
 
 def drawn_around(scene: Scene, prior: PosePrior, count: int) -> Hypotheses:
-    """Poses drawn from the prior, the first one its mean."""
+    """Draw `count` poses from the prior; the first is its mean."""
     mean = np.asarray(prior.rotation, np.float32)[None], np.asarray(prior.translation, np.float32)[None]
     vectors = math.radians(prior.rotation_sigma_deg) * scene.rng.standard_normal((count, 3), np.float32)
     shifts = np.float32(prior.translation_sigma) * scene.rng.standard_normal((count, 3), np.float32)
@@ -115,7 +145,13 @@ def drawn_around(scene: Scene, prior: PosePrior, count: int) -> Hypotheses:
 
 
 def admitted(scene: Scene, poses: Hypotheses, prior: Prior | None) -> Hypotheses:
-    """Return the poses within `settings.admitted` standard deviations of a `PosePrior` of the problem; all without."""
+    """Select the poses within `settings.admitted` standard deviations of a prior.
+
+    Args:
+        scene: Points and settings.
+        poses: Poses in the frame of the scene.
+        prior: Prior in the frame of the problem; all poses are returned unless it is a `PosePrior`.
+    """
     if not isinstance(prior, PosePrior):
         return poses
     mean = scene.enter_prior(prior)
@@ -130,7 +166,17 @@ def admitted(scene: Scene, poses: Hypotheses, prior: Prior | None) -> Hypotheses
 
 
 def moved(scene: Scene, poses: Hypotheses, scale: float, copies: int) -> Hypotheses:
-    """Each pose and copies of it whose points fall about `scale`, in spreads of the bearings, beside its own."""
+    """Return the poses and randomly perturbed copies of them.
+
+    Args:
+        scene: Points and random generator.
+        poses: (k,) in the frame of the scene.
+        scale: Angular distance by which the points move, in units of the RMS angular radius of the bearings.
+        copies: Number of poses that replace each one, itself first.
+
+    Returns:
+        (k * copies,) poses with the basin counts of their originals.
+    """
     vectors, shifts = np.float32(scale) * scene.rng.standard_normal((2, copies * len(poses), 3), np.float32)
     depth = np.linalg.norm(poses.rotation @ scene.bulk3d.mean(0) + poses.translation, axis=-1)
     shifts *= np.repeat(depth, copies)[:, None] * np.array([scene.spread, scene.spread, 1], np.float32)
@@ -140,15 +186,26 @@ def moved(scene: Scene, poses: Hypotheses, scale: float, copies: int) -> Hypothe
 
 
 def around_each(scene: Scene, poses: Hypotheses) -> Hypotheses:
-    """Copies of poses that come from elsewhere; basin counts 0, since that copies end alike is no evidence."""
+    """Return poses from other sources with perturbed copies; basin counts are 0, since copies are dependent."""
     return moved(scene, poses, scene.settings.copied_scale, scene.settings.copies).as_dependent()
 
 
 def looked_up(
     scene: Scene, poses: Hypotheses, shape: RasterShape, scale: float, points: int, kept: int
 ) -> tuple[Hypotheses, NDArray[np.int64]]:
-    """The `kept` poses under which so many points fall best on the bearings, of all companions too, best first, and
-    their places."""
+    """Score poses on the density maps of all rig cameras and select the best.
+
+    Args:
+        scene: Points, settings and deadline.
+        poses: Poses in the frame of the scene.
+        shape: Shape of the density map.
+        scale: Smoothing of the bearings, in units of their RMS angular radius.
+        points: Number of 3D points to score.
+        kept: Number of poses to return, at most; fewer are scored after the deadline.
+
+    Returns:
+        The poses, best first, and their indices in `poses`.
+    """
     score = np.zeros(len(poses), np.float32)
     cameras = [(scene, poses.rotation, poses.translation)]
     cameras += [(x.scene, x.turn @ poses.rotation, poses.translation @ x.turn.T + x.shift) for x in scene.companions]
@@ -162,20 +219,27 @@ def looked_up(
 
     done = in_time(look_up, len(poses), scene.deadline, scene.settings.lookups_a_check)
     best = np.arange(done)
-    if len(best) > kept:  # much faster than to sort all of them
+    if len(best) > kept:  # much faster than sorting all of them
         best = best[np.sort(np.argpartition(-score[best], kept)[:kept])]
     best = best[np.argsort(-score[best], kind="stable")]
     return poses[best], best
 
 
 def raster_of(scene: Scene, shape: RasterShape, scale: float) -> Raster:
-    """The raster of a scene's bearings, smoothed by a scale in spreads of them; the scene keeps it."""
+    """Return the density map of the bearings of a scene; the scene stores it.
+
+    Args:
+        scene: Bearings.
+        shape: Shape of the map.
+        scale: Smoothing, in units of the RMS angular radius of the bearings.
+    """
     if (shape, scale) not in scene.rasters:
         scene.rasters[shape, scale] = _drawn_raster(scene, shape, scale)
     return scene.rasters[shape, scale]
 
 
 def _drawn_raster(scene: Scene, shape: RasterShape, scale: float) -> Raster:
+    """Compute the density map that `raster_of` stores."""
     d = scene.offsets.astype(np.float64)
     at = 2 * d[:, :2] / np.maximum(2 + d[:, 2:], 1e-9)
     scale *= scene.spread
@@ -197,16 +261,16 @@ def _drawn_raster(scene: Scene, shape: RasterShape, scale: float) -> Raster:
 
 
 def distance_of(scene: Scene, prior: PosePrior) -> float:
-    """Of the middle of the points from the camera of the prior."""
+    """Return the distance of the centroid of the points from the camera of the prior, at least 1e-6."""
     middle = scene.bulk3d.mean(0)
     return max(float(np.linalg.norm(np.asarray(prior.rotation) @ middle + np.asarray(prior.translation))), 1e-6)
 
 
 def _smoothed(values: NDArray[np.float32], cells: float) -> NDArray[np.float32]:
-    """Values (g, g), 0 around them, after a Gaussian filter with a standard deviation of so many cells.
+    """Apply a Gaussian filter to values (g, g), 0 outside; `cells` is its standard deviation.
 
-    A wide filter in two steps of half the variance, the first one to a coarser grid, as products of matrices: sums at a
-    spacing of 0.6 standard deviations are exact to 3e-6, and cost a tenth.
+    A wide filter has two steps of half the variance, the first one to a coarser grid, as products of matrices. Sums at
+    a spacing of 0.6 standard deviations are exact to 3e-6, and cost a tenth.
     """
     if cells < NARROW:
         return np.asarray(gaussian_filter(values, cells, mode="constant"))

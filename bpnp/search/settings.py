@@ -1,6 +1,6 @@
-"""Every constant that tunes the search, in one argument: what it is, its unit, and why it has this value.
+"""Constants of the search, with unit and reason.
 
-Those of the evidence are in `bpnp.search.evidence.settings`.
+The constants of the evidence are in `bpnp.search.evidence.settings`.
 """
 
 import math
@@ -11,10 +11,12 @@ from bpnp.search.evidence.settings import Evidence
 
 @dataclass(frozen=True)
 class Recipe:
-    """How the starts of a batch are drawn around the weak-perspective pose.
+    """Sampling of initial poses around the weak-perspective pose.
 
-    off_centre: 0 puts the mean of the 3D points on the mean bearing; 1, any 3D point, for cameras that see a part.
-    log_depth: the depth is multiplied by exp(u), u uniform in [-log_depth, log_depth].
+    Attributes:
+        off_centre: 0 puts the centroid of the 3D points on the mean bearing. 1 puts a random 3D point there, for
+            cameras that see a part of the scene. Values between interpolate.
+        log_depth: The depth is multiplied by exp(u), u uniform in [-log_depth, log_depth].
     """
 
     off_centre: float
@@ -23,13 +25,17 @@ class Recipe:
 
 @dataclass(frozen=True)
 class ClusterStage:
-    """Annealing of many poses on weighted clusters of both sides.
+    """Annealing of many poses on weighted clusters of both point sets.
 
-    clusters: of each side, at most; one iteration costs their number squared.
-    first_scale, last_scale: in spreads of the bearings. iterations: from one to the other, a Gauss-Newton step each.
-    kept: poses that go on to the next stage. apart_deg: least angle between their rotations.
-    halvings: iterations after which the likelier half goes on, and twice `kept` at least; after fewer than 6 it lacks
-        right poses in clutter.
+    Attributes:
+        clusters: Number of clusters of each set, at most; the cost of an iteration grows with its square.
+        first_scale: Scale of the first iteration, in units of the RMS angular radius of the bearings.
+        last_scale: Scale of the last iteration, in the same unit.
+        iterations: Number of scales between the two, with one Gauss-Newton step each.
+        kept: Number of poses that the next stage receives.
+        apart_deg: Least angle between the rotations of two kept poses, degrees.
+        halvings: Iterations after which only the likelier half of the poses is kept, and at least twice `kept`. Below 6
+            iterations, this step loses correct poses in clutter.
     """
 
     clusters: int
@@ -46,12 +52,17 @@ Stages = tuple[ClusterStage, ...]
 
 @dataclass(frozen=True)
 class FineStage:
-    """Annealing of a few poses on all 3D points, to the scale at which the likelihood is largest.
+    """Annealing of a few poses on all 3D points, to the scale with the largest likelihood.
 
-    bearings: used before the last stage, which uses all; more cost time and hardly change which pose is best.
-    smallest_scale: radians, a tenth of a pixel at a focal length of 500 pixels; relative_smallest: in spreads of the
-        bearings, for narrow views. The smallest of both and of `Problem.floor` is the end of the annealing.
-    cooling: factor from one scale to the next. patience: scales after the likeliest one before a pose is left.
+    The annealing ends at the least of `smallest_scale`, `relative_smallest` and `Problem.floor`.
+
+    Attributes:
+        bearings: Number of bearings before the last stage, which uses all. More cost time and rarely change the best
+            pose.
+        smallest_scale: Radians; 2e-4 is a tenth of a pixel at a focal length of 500 pixels.
+        relative_smallest: In units of the RMS angular radius of the bearings, for narrow views.
+        cooling: Factor from one scale to the next.
+        patience: Number of scales after the likeliest one before the annealing of a pose stops.
     """
 
     bearings: int = 1000
@@ -63,10 +74,14 @@ class FineStage:
 
 @dataclass(frozen=True)
 class Draws:
-    """How many starts are drawn around a rough pose.
+    """Number of initial poses around a rough pose.
 
-    starts: around one with a standard deviation of `wide_deg` and `wide_shift` (of the distance), or more; these leave
-    few gaps over the width of a basin. A narrower one gets as many as lie as densely, and `least_starts` at least.
+    Attributes:
+        starts: Number for a prior with the standard deviations `wide_deg` and `wide_shift`, or larger ones. These leave
+            few gaps over the width of a basin. A narrower prior gets fewer, at the same density.
+        wide_deg: Standard deviation of the rotation, degrees.
+        wide_shift: Standard deviation of the translation, as a fraction of the distance.
+        least_starts: Least number of initial poses.
     """
 
     starts: int = 2**16
@@ -77,7 +92,12 @@ class Draws:
 
 @dataclass(frozen=True)
 class Screens:
-    """Which starts go on: `kept` of them each time that so many 3D `points` are looked up in the raster."""
+    """Preselection of initial poses on the density map, in steps.
+
+    Attributes:
+        points: Number of 3D points that each step scores.
+        kept: Number of poses that each step keeps.
+    """
 
     points: tuple[int, ...] = (300, 5000)
     kept: tuple[int, ...] = (2**13, 2**10)
@@ -85,12 +105,16 @@ class Screens:
 
 @dataclass(frozen=True)
 class Narrowing:
-    """From the scale of the screening to one at which poses are annealed.
+    """Sequence of scales from the preselection to the annealing.
 
-    first_scale, last_scale: of the smoothed bearings, in spreads of the bearings; from 0.12 on chance fills the view,
-        at 0.03 the gaps between the starts are wider than the basins. steps: from one to the other, with factors above
-        0.7, below which the narrower optimum is lost more often; 0 for the first scale alone.
-    copies: of a pose at each step. points: 3D points that are looked up there.
+    Attributes:
+        first_scale: Smoothing of the bearings at the first step, in units of their RMS angular radius. From 0.12 on,
+            chance fills the view. At 0.03, the gaps between the initial poses are wider than the basins.
+        last_scale: Smoothing at the last step, in the same unit.
+        steps: Number of steps; 0 for the first scale alone. Below a factor of 0.7 from step to step, the narrower
+            optimum is lost more often.
+        copies: Number of copies of each pose at each step.
+        points: Number of 3D points that each step scores.
     """
 
     first_scale: float = 0.06
@@ -102,9 +126,15 @@ class Narrowing:
 
 @dataclass(frozen=True)
 class RasterShape:
-    """A raster of the view. background: scales of the density that is chance. cells: a scale; most_cells: a side.
-    outliers: share of the bearings without a partner, at least. inside: of the largest density of the smoothed
-    bearings; less is outside the view."""
+    """Density map of the view.
+
+    Attributes:
+        background: Standard deviation of the background density, in multiples of the scale.
+        cells: Number of cells per scale.
+        most_cells: Largest number of cells per side.
+        outliers: Outlier fraction of the map; also the least outlier fraction of the annealing that follows.
+        inside: Fraction of the largest background density below which a cell is outside the view.
+    """
 
     background: float = 8.0
     cells: float = 2.0
@@ -115,7 +145,15 @@ class RasterShape:
 
 @dataclass(frozen=True)
 class RasterSearch:
-    """One raster search (`bpnp.search.raster_search`): draw, screen, narrow, and anneal so many poses."""
+    """One density-map search (`bpnp.search.raster_search`): draw, preselect, narrow, anneal.
+
+    Attributes:
+        draws: Number of initial poses.
+        screens: Preselection of the initial poses.
+        narrowing: Scales from the preselection to the annealing.
+        raster: Density map of the view.
+        annealed: Number of poses that are annealed at the end.
+    """
 
     draws: Draws = Draws()
     screens: Screens = Screens()
@@ -126,15 +164,21 @@ class RasterSearch:
 
 @dataclass(frozen=True)
 class Schedule:
-    """In which order starts are drawn, and how many (`bpnp.search.schedule`).
+    """Order and number of the steps of a search (`bpnp.search.schedule`).
 
-    turns: at most. enumerated: of points few enough to be enumerated, where that leaves a doubt; clusters hide nothing
-        of them, so that more turns end where these did. around: from a guess of the pose, before all others. near: with
-        a rough prior before it may be wrong.
-    unaided: batches and raster searches before proposals are asked for. starts_a_search: of a batch, that take as long
-        as a raster search of all rotations. around_each: poses of a source that
-        raster searches are made around, no two turned by less than `apart_deg`, until `in_vain` of them better nothing.
-        looks: in vain around a pose that exceeds chance, at most.
+    Attributes:
+        turns: Number of iterations, at most.
+        enumerated: Number of iterations, at most, for points few enough to be enumerated. Clusters keep every one of so
+            small a set, and further iterations end at the same poses.
+        around: Number of batches around a guess of the pose, before all others.
+        near: Number of steps near a rough prior before the search treats the prior as possibly wrong.
+        unaided: Number of rounds without a significant pose before proposals are requested.
+        starts_a_search: Starts in a batch that take as long as one density-map search over all rotations.
+        around_each: Number of poses of a source that density-map searches are made around, at most.
+        apart_deg: Least angle between the rotations of these poses, degrees.
+        in_vain: Number of consecutive searches without a better pose after which the other poses of the source are
+            skipped.
+        looks: Number of local searches around a significant pose that find nothing better, at most.
     """
 
     turns: int = 400
@@ -151,11 +195,13 @@ class Schedule:
 
 @dataclass(frozen=True)
 class Facing:
-    """From where a point with a normal is seen (`bpnp.search.kernels.sides`).
+    """Visibility of points with normals (`bpnp.search.kernels.sides`).
 
-    softness: cosines from the cone's edge to where a point is seen fully, or hardly; annealed poses are some degrees
-    off, and so are normals. unseen: weight of a point that should not be seen. extent: of the scene, that counts as
-    much in a cluster as a radian between normals.
+    Attributes:
+        softness: Difference of the cosine between the edge of the viewing cone and full or least visibility. Poses
+            during the annealing are some degrees off, and so are normals.
+        unseen: Least weight of a point, for a point outside its viewing cone.
+        extent: Distance, in extents of the scene, that clustering treats like one radian between normals.
     """
 
     softness: float = 0.2
@@ -165,29 +211,50 @@ class Facing:
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """All of it; the stages are described in docs/search.md.
+    """All settings of the search; docs/search.md describes the stages.
 
-    schedule: the order of the sources, and the budget. recipes: of batches, in turn. starts: of a full one; 1200 leave
-        no gap of 25 deg. first_starts: of the first batch; each next one has twice as many until it is full. Easy
-        problems need no more. A small batch hands on the square root of its share of a full one from stage to stage,
-        and least_kept at least.
-    near, beside, zoomed, proposed, everywhere: raster searches around a prior, around a pose that was met, around one
-        that is a step of the focal length away, from proposed poses, and from poses of all rotations.
-    most_volumes: of a prior against the widest that has as many starts as it needs; a map view's has 9. admitted:
-        standard deviations of a prior within which a proposed pose is tried, 94 % of those drawn from it.
-    least_annealed: points of the smaller side; fewer are enumerated only: they have no smooth optimum.
-    outliers: share of the points without a partner that the assignment expects where the caller gives none.
-    end_outliers: shares that the best poses are annealed with in the last stage too, and the likelihood chooses.
-    least_outliers: of the caller's share; without any slack a single outlier would be forced into a match.
-    end_scale: where the last stage begins, in scales of the pose; wide enough to let other points in.
-    finished: candidates that are weighed after each batch, and annealed on all bearings in the end. kept: candidates,
-        from turn to turn. refined_directly: starts of `refine_poses` that need no clusters.
-    copied, copies, copied_scale: of the first so many poses that come from elsewhere, so many copies are annealed too,
-        whose points fall so many spreads of the bearings beside its own: about what separates optima of one basin.
-    same_deg, same_shift: poses closer than both, in degrees and extents of the scene, are one.
-    sampled, lloyd_iterations: points a cluster from which cluster centres are computed, and iterations.
-    starts_a_check, lookups_a_check: starts that are annealed on clusters, and looked up in a raster, between two looks
-        at the clock, if time is limited.
+    Attributes:
+        schedule: Order of the sources of poses, and the budget.
+        starts: Number of starts of a full batch; 1200 leave no gap of 25 degrees.
+        first_starts: Number of starts of the first batch, enough for easy problems. Each next batch has twice as many
+            until it is full.
+        least_kept: Least number of poses that a stage keeps. A small batch keeps the square root of its fraction of a
+            full one.
+        recipes: Sampling of the batches, in turn.
+        coarse: First stages on clusters.
+        middle: Stages on finer clusters.
+        fine: Annealing on all points.
+        near: Density-map searches around a prior.
+        beside: Density-map search around a pose that the search has found.
+        zoomed: Density-map search around a pose at the next step of the focal length.
+        proposed: Density-map search from proposed poses.
+        everywhere: Density-map search over all rotations.
+        facing: Visibility of points with normals.
+        evidence: Constants of the verdict.
+        most_volumes: Largest volume of a prior that counts as near, in multiples of the widest one with a full number
+            of starts; the prior of a map view has 9.
+        admitted: Standard deviations of a prior within which proposed poses are used; 94 % of the poses drawn from it.
+        least_annealed: Least number of points of the smaller set for annealing. Fewer points have no smooth optimum and
+            are only enumerated.
+        outliers: Outlier fraction of the annealing if the caller gives none.
+        end_outliers: Other outlier fractions with which the last stage anneals the best poses; the likelihood chooses.
+        least_outliers: Lower bound of the caller's outlier fraction. Without it, a single outlier would be forced into
+            a match.
+        finished: Number of candidates whose NFA each batch computes and that are annealed on all bearings at the end.
+        refined_directly: Number of initial poses of `refine_poses`, at most, that need no clusters.
+        copied: Number of poses from other sources, the best first, that are also copied.
+        copies: Number of copies of each of them.
+        copied_scale: Angular distance of the points of a copy from those of its pose, in units of the RMS angular
+            radius of the bearings. Optima of one basin are about as far apart.
+        end_scale: Scale at which the last stage begins, in multiples of the scale of the pose, so that other points can
+            enter.
+        kept: Number of candidates that a search keeps from one iteration to the next.
+        same_deg: Angle below which two poses can be the same, degrees.
+        same_shift: Shift below which they can be, in extents of the scene; both conditions are necessary.
+        sampled: Number of points per cluster from which the cluster centres are computed.
+        lloyd_iterations: Number of iterations of the clustering.
+        starts_a_check: Number of starts annealed on clusters between two checks of the deadline.
+        lookups_a_check: Number of poses scored on the density map between two checks of the deadline.
     """
 
     schedule: Schedule = Schedule()
@@ -203,7 +270,7 @@ class SearchSettings:
     fine: FineStage = FineStage()
     near: tuple[RasterSearch, ...] = tuple(
         RasterSearch(screens=Screens((100, 1000)), narrowing=Narrowing(first, points=600), annealed=12)
-        for first in (0.06, 0.03)  # the finer one where keypoints are dense and few points are seen
+        for first in (0.06, 0.03)  # the finer one for dense keypoints of which few are visible
     )
     beside: RasterSearch = RasterSearch(
         Draws(2**13, 10.0, 0.1, 2**13),
@@ -254,24 +321,30 @@ class SearchSettings:
             raise ValueError(f"expected shares of outliers in (0, 1), got {self.outliers} and {self.end_outliers}")
 
     def limited(self, turns: int) -> "SearchSettings":
-        """These settings with so many turns at most."""
+        """Return a copy of these settings with at most this number of iterations."""
         return replace(self, schedule=replace(self.schedule, turns=turns))
 
     def expecting(self, clutter: float) -> "SearchSettings":
-        """These settings where the share of the points without a partner is known. Raises ValueError outside [0, 1).
+        """Return a copy of these settings for a given outlier fraction.
 
-        It is expected in all stages and the only one tried at the end.
+        All stages use this fraction, and the last stage tries no other.
+
+        Args:
+            clutter: Fraction of the points without a correspondence, in [0, 1).
+
+        Raises:
+            ValueError: If `clutter` is outside [0, 1).
         """
         if not 0 <= clutter < 1:
             raise ValueError(f"expected `clutter` in [0, 1), a share of the points, got {clutter}")
         return replace(self, outliers=max(clutter, self.least_outliers), end_outliers=())
 
     def batch(self, number: int) -> int:
-        """Starts of a batch, counted from 0."""
+        """Return the number of starts of a batch; `number` counts batches from 0."""
         return min(self.starts, self.first_starts * 2 ** min(number, 60))
 
     def kept_by(self, stage: ClusterStage, starts: int) -> int:
-        """How many poses of a batch of so many starts a stage hands on."""
+        """Return the number of poses that a stage keeps from a batch with this number of starts."""
         return min(stage.kept, max(self.least_kept, math.ceil(math.sqrt(starts / self.starts) * stage.kept)))
 
 

@@ -1,10 +1,14 @@
-"""What a search says about its best pose: all of it is here.
+"""Verdict on the best pose of a search.
 
-The currency is the number of false alarms (`bpnp.search.evidence.false_alarms`): how many poses would fit as well if
-the image had nothing to do with the scene. "confident": chance is excluded (`Evidence.false_alarms`), every alternative
-that was met is less likely by `Evidence.lead` decades, and so is that a better optimum was not met
-(`bpnp.search.evidence.alternatives`). "ambiguous": better than chance, but one of the three is not excluded. "failed":
-no pose, or none better than chance.
+The criterion is the number of false alarms (NFA, `bpnp.search.evidence.false_alarms`): the expected number of poses
+that fit as well if image and scene are unrelated.
+
+- "confident": The NFA is below `Evidence.false_alarms`. The margin to every competing pose is at least `Evidence.lead`
+  decades. The probability that the search missed a better optimum (`bpnp.search.evidence.alternatives`) is below
+  `Evidence.missed`.
+- "ambiguous": The best pose is significant, but one of the three conditions does not hold, or the points do not fix
+  the rotation or the focal length.
+- "failed": No pose was found, or none is significant.
 """
 
 import math
@@ -26,17 +30,21 @@ from bpnp.search.propose.symmetries import Motions
 from bpnp.search.settings import DEFAULT
 
 Verdict = Literal["confident", "ambiguous", "failed"]
-HALF_TURN = 180.0  # degrees; a bound that is larger says nothing of a rotation
-REFINED = math.inf  # local searches that the exact refinement of an enumeration is worth
+HALF_TURN = 180.0  # degrees; a larger bound does not constrain a rotation
+REFINED = math.inf  # number of local searches that the exact refinement of an enumeration replaces
 
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """What is known of the pose of one problem.
+    """Result of the search for the pose of one problem.
 
-    candidates: distinct poses in the frame of the problem, float64, best first. batches: turns of the search.
-    verdict: see the head of this file. reason: of the verdict, in words. settled: whether more search would not change
-    it: that a better optimum exists is excluded, whatever its matches say of each other.
+    Attributes:
+        candidates: Distinct poses in the frame of the problem, float64, best first.
+        verdict: Confident, ambiguous or failed, as defined at the head of this file.
+        reason: Reason of the verdict, a plain sentence.
+        batches: Number of iterations of the search.
+        settled: True if more search would not change the verdict. A better optimum is then excluded without the
+            evidence of the matches.
     """
 
     candidates: Hypotheses
@@ -47,24 +55,32 @@ class SearchResult:
 
     @property
     def best(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Rotation (3, 3) and translation (3,) of the best pose, NaN if there is none."""
+        """Rotation (3, 3) and translation (3,) of the best pose; NaN if there is none."""
         if not len(self.candidates):
             return np.full((3, 3), math.nan), np.full(3, math.nan)
         return self.candidates.rotation[0], self.candidates.translation[0]
 
     @property
     def residual(self) -> float:
-        """Scale of the best pose's residuals, radians; infinite if there is none."""
+        """Scale of the residuals of the best pose, radians; infinite if there is none."""
         return float(self.candidates.scale[0]) if len(self.candidates) else math.inf
 
     @property
     def log10_false_alarms(self) -> float:
-        """Of the best pose; infinite if there is none."""
+        """log10 NFA of the best pose; infinite if there is none."""
         return float(self.candidates.log10_false_alarms[0]) if len(self.candidates) else math.inf
 
 
 def with_false_alarms(candidates: Hypotheses, problem: Problem) -> Hypotheses:
-    """The candidates, in the frame of the problem, with their false alarms; those that have them already keep them."""
+    """Compute the NFA of the candidates that lack it.
+
+    Args:
+        candidates: Poses in the frame of the problem.
+        problem: Points of the problem.
+
+    Returns:
+        Candidates in the same order.
+    """
     alarms, rough = candidates.log10_false_alarms.copy(), candidates.log10_rough.copy()
     new = np.isnan(alarms)
     if not new.any():
@@ -75,10 +91,18 @@ def with_false_alarms(candidates: Hypotheses, problem: Problem) -> Hypotheses:
 
 
 def weighed(candidates: Hypotheses, problem: Problem, rule: Evidence = DEFAULT.evidence) -> Hypotheses:
-    """The candidates, in the frame of the problem, with their false alarms; the best first, the others as they were.
+    """Compute the NFA of the candidates and move the best one to the front.
 
-    Best is the first one whose false alarms exceed the fewest by less than the lead that a verdict asks for: among
-    poses that chance cannot tell apart, the order of the search, which is that of the likelihood, decides.
+    The best is the first one in the order of the search whose log10 NFA is within `Evidence.lead` of the smallest. The
+    order of the search is that of the likelihood. It decides among poses that the NFA cannot separate.
+
+    Args:
+        candidates: Poses in the frame of the problem, best first.
+        problem: Points of the problem.
+        rule: Constants of the verdict.
+
+    Returns:
+        Candidates with their NFA; the others keep their order.
     """
     if not len(candidates):
         return candidates
@@ -90,26 +114,26 @@ def weighed(candidates: Hypotheses, problem: Problem, rule: Evidence = DEFAULT.e
 
 
 def match_count(candidates: Hypotheses, problem: Problem) -> float:
-    """Expected number of matches of the best pose."""
+    """Return the expected number of matches of the best pose."""
     return float(candidates.match_count[0])
 
 
 def missed(
     candidates: Hypotheses, problem: Problem, looks: float | int, rule: Evidence, *, independent: bool = True
 ) -> float:
-    """Return log10 of the probability that weighed candidates lack a better optimum.
+    """Return log10 of the probability that the search missed a better optimum.
 
     Args:
-        candidates: poses in the frame of the problem, best first.
-        problem: the points of the problem.
-        looks: number of local searches around the first candidate that found nothing better; `REFINED` of an
-            enumeration, which leaves no better pose beside one.
-        rule: constants of the verdict.
+        candidates: Poses in the frame of the problem with their NFA, best first.
+        problem: Points of the problem.
+        looks: Number of local searches around the first candidate that found nothing better. `REFINED` for an
+            enumeration, whose exact refinement leaves no better pose nearby.
+        rule: Constants of the verdict.
         independent: False to leave out the evidence of the matches.
 
     Returns:
-        The logarithm; 0 where the first candidate is not significant. Where a motion maps the matched points onto
-        others, the matches of a wrong pose are no independent coincidences, and only basin counts reduce it.
+        The logarithm; 0 if the first candidate is not significant. If a motion maps the matched points onto others,
+        matches of a wrong pose are not independent coincidences. Only basin counts reduce the value then.
     """
     alarms = float(candidates.log10_false_alarms[0]) if len(candidates) else math.inf
     if alarms > 0:
@@ -127,7 +151,7 @@ def missed(
 def motions_of(candidates: Hypotheses, problem: Problem, rule: Evidence) -> Motions:
     """Return the motions that map the matched points of the first candidate onto other scene points.
 
-    They are computed once for a pose and those that are no different pose.
+    The result is stored in `Problem.registered` and reused for equal poses.
     """
     pose = candidates.rotation[:1], candidates.translation[:1]
     for rotation, translation, motions in problem.registered:
@@ -141,20 +165,22 @@ def motions_of(candidates: Hypotheses, problem: Problem, rule: Evidence) -> Moti
 
 
 def is_symmetric(candidates: Hypotheses, problem: Problem, rule: Evidence) -> bool:
-    """Return whether a motion maps so many of the matched points of the first candidate onto other scene points that
-    it could by itself explain a better pose."""
+    """Return True if a motion maps a large part of the matched points onto other scene points.
+
+    The motion could by itself explain a better pose. The fraction is compared with `Evidence.repetitions`.
+    """
     return float(motions_of(candidates, problem, rule).fraction.max(initial=0)) >= rule.repetitions.symmetric
 
 
 def starts_met(candidates: Hypotheses, problem: Problem, rule: Evidence, *, symmetric: bool = False) -> int:
-    """Return the basin count of the first candidate and of others that are no different pose.
+    """Return the basin count of the first candidate and of all poses equal to it.
 
     Args:
-        candidates: poses in the frame of the problem, best first.
-        problem: the points of the problem.
-        rule: constants of the verdict.
-        symmetric: count the poses too that the motions of the scene confuse with the first one. These are compared with
-            it one by one; a better pose elsewhere has as many copies.
+        candidates: Poses in the frame of the problem, best first.
+        problem: Points of the problem.
+        rule: Constants of the verdict.
+        symmetric: Also count the poses that the motions of the scene confuse with the first one. Each is compared with
+            it separately; a better pose elsewhere has the same number of copies.
     """
     first = candidates.rotation[:1], candidates.translation[:1]
     if symmetric:
@@ -177,11 +203,19 @@ def judged(
     rule: Evidence = DEFAULT.evidence,
     rig: Seen = (),
 ) -> SearchResult:
-    """The verdict on candidates in the frame of the problem, best first.
+    """Compute the verdict on the candidates.
 
-    looks: how often the surroundings of the best one were searched in vain. exhaustive: whether every pose that fits
-    some points was looked at, so that none is unseen. rig: the candidates, best first, and the points of all cameras of
-    a rig, of which `problem` has one.
+    Args:
+        candidates: Poses in the frame of the problem, best first.
+        problem: Points of the problem.
+        batches: Number of iterations of the search.
+        looks: Number of local searches around the best pose that found nothing better.
+        exhaustive: True if every pose that fits some points was examined; the miss probability is then 0.
+        rule: Constants of the verdict.
+        rig: Candidates, best first, and points of every camera of a rig; empty for a single camera.
+
+    Returns:
+        Candidates, best first, with the verdict and its reason.
     """
     if not len(candidates):
         return no_pose("no pose was found", batches, settled=exhaustive)
@@ -192,7 +226,7 @@ def judged(
         reason = reasons.against("no pose fits better than chance", alarms)
         return SearchResult(candidates, "failed", reason, batches, settled)
     unseen = -math.inf if exhaustive else missed(candidates, problem, looks, rule)
-    # What costs more is asked only where the verdict depends on it.
+    # Costly tests run only if the verdict depends on them.
     seen = rig or [(candidates, problem)]
     against = [*(other_pose(*each, rule) for each in seen), rougher(candidates)]
     certain = alarms <= rule.false_alarms and unseen <= rule.missed
@@ -225,12 +259,18 @@ def judged(
 
 
 def is_object(problem: Problem, rule: Evidence) -> bool:
-    """Return whether the scene points are those of an object, few and not of a map, whose points have viewing cones."""
+    """Return True if the scene points are those of an object.
+
+    An object has few points, and they have no viewing cones, unlike those of a map.
+    """
     return problem.cosines3d is None and len(problem.points3d) <= rule.repetitions.whole
 
 
 def is_certain(candidates: Hypotheses, problem: Problem, rule: Evidence = DEFAULT.evidence) -> bool:
-    """Whether weighed candidates of an enumeration leave no doubt about the first one, as far as is cheaply told."""
+    """Return True if the first candidate of an enumeration passes the cheap tests of the verdict.
+
+    The tests are the NFA, the margin to the best different pose, rough residuals and the miss probability.
+    """
     if not len(candidates) or float(candidates.log10_false_alarms[0]) > rule.false_alarms:
         return False
     other = other_pose(candidates, problem, rule)
@@ -240,5 +280,5 @@ def is_certain(candidates: Hypotheses, problem: Problem, rule: Evidence = DEFAUL
 
 
 def no_pose(reason: str, batches: int = 0, *, settled: bool = False) -> SearchResult:
-    """Of points that fix no pose, or for which none was found."""
+    """Return a failed result without candidates, for points that fix no pose or a search that found none."""
     return SearchResult(Hypotheses.empty(), "failed", reason, batches, settled)
