@@ -1,1 +1,1 @@
-"""Poses from two point sets alone: numpy and numba, nothing to train."""
+"""Search for poses from two point sets alone, with numpy and numba, without training."""

@@ -1,4 +1,4 @@
-"""The stages of the search: starts annealed on coarse clusters, the best on finer ones, few on all points."""
+"""Stages of the search: anneal starts on coarse clusters, the best on finer ones, and few on all points."""
 
 import math
 from dataclasses import replace
@@ -17,8 +17,16 @@ from bpnp.search.starts import Array, Prior, draw_poses
 
 
 def multistart(scene: Scene, number: int, prior: Prior | None) -> Hypotheses:
-    """Distinct poses of one batch of starts over all rotations, or those that a prior allows. number: of the batch,
-    counted from 0."""
+    """Run one batch of starts over all rotations, or over those that a prior allows.
+
+    Args:
+        scene: Points, settings and deadline.
+        number: Index of the batch, from 0.
+        prior: Prior in the frame of the scene; None for all rotations.
+
+    Returns:
+        Distinct poses with their basin counts.
+    """
     settings = scene.settings
     recipe = settings.recipes[number % len(settings.recipes)]
     drawn = draw_poses(scene.spread, scene.bulk3d, settings.batch(number), recipe, prior, scene.rng)
@@ -26,20 +34,30 @@ def multistart(scene: Scene, number: int, prior: Prior | None) -> Hypotheses:
 
 
 def run_batch(scene: Scene, starts: Hypotheses) -> Hypotheses:
-    """One batch of starts, from clusters to all points."""
+    """Anneal one batch of starts, from clusters to all points."""
     stages = *scene.settings.coarse, *scene.settings.middle
     poses = anneal_on_clusters(scene, starts, stages, len(starts))
     return anneal_on_points(scene, poses, stages[-1].last_scale * scene.spread)
 
 
 def anneal_on_clusters(scene: Scene, poses: Hypotheses, stages: Stages, starts: int) -> Hypotheses:
-    """Poses of a batch of so many starts after stages on clusters, best first, of different rotations."""
+    """Anneal poses on clusters, stage by stage.
+
+    Args:
+        scene: Points, settings and deadline.
+        poses: Initial poses.
+        stages: Stages, coarse to fine.
+        starts: Number of starts of the batch, which determines how many poses each stage keeps.
+
+    Returns:
+        Poses with different rotations, best first.
+    """
     outlier = scene.outlier_density(scene.settings.outliers)
     for stage, clusters in zip(stages, scene.clusters([stage.clusters for stage in stages]), strict=True):
         kept = scene.settings.kept_by(stage, starts)
         scales = (scene.spread * np.geomspace(stage.first_scale, stage.last_scale, stage.iterations)).astype(np.float32)
         for k, part in enumerate(np.split(scales, stage.halvings)):
-            if k:  # best first, since only the first ones go on after the deadline
+            if k:  # best first, since only the first ones are annealed after the deadline
                 poses = poses[np.argsort(-poses.log_likelihood, kind="stable")[: max(len(poses) // 2, 2 * kept)]]
             poses = _annealed(scene, poses, clusters, part, outlier)
         poses = select_distinct(poses, scene, kept, stage.apart_deg)
@@ -47,7 +65,7 @@ def anneal_on_clusters(scene: Scene, poses: Hypotheses, stages: Stages, starts: 
 
 
 def _annealed(scene: Scene, starts: Hypotheses, sides: Sides, scales: Array, outlier: np.float32) -> Hypotheses:
-    """The poses for which there was time, after a step at each of the scales (k,), radians."""
+    """Take one step at each scale (k,), radians; return the poses that were annealed before the deadline."""
     rotation, translation, score = starts.rotation.copy(), starts.translation.copy(), starts.log_likelihood.copy()
 
     def anneal(i: int, j: int) -> None:
@@ -61,9 +79,17 @@ def _annealed(scene: Scene, starts: Hypotheses, sides: Sides, scales: Array, out
 def anneal_on_points(
     scene: Scene, starts: Hypotheses, first_scale: float, *, outliers: float | None = None, every: bool = False
 ) -> Hypotheses:
-    """Distinct poses that `starts` reach on all 3D points and as many bearings as the fine stage uses, or `every` one.
+    """Anneal poses on all 3D points.
 
-    first_scale: radians. outliers: share to expect, None for that of the settings.
+    Args:
+        scene: Points, settings and deadline.
+        starts: Initial poses.
+        first_scale: Scale of the first step, radians.
+        outliers: Expected outlier fraction; None for that of the settings.
+        every: True to use all bearings; False for the number of the fine stage.
+
+    Returns:
+        Distinct poses, without an NFA.
     """
     fine, bearings = scene.settings.fine, None if every else scene.settings.fine.bearings
     outliers = scene.settings.outliers if outliers is None else outliers
@@ -80,10 +106,10 @@ def anneal_on_points(
             scratch = sparse_scratch(tiles, len(points.b), pairs)
             poses = rotation[i:j], translation[i:j]
             i += descend_sparse(tiles, points, *poses, scales, outlier, fine.patience, result[i:j], scratch)
-            pairs = 2 * len(scratch.near.point)  # where more points lie together than there was place for
+            pairs = 2 * len(scratch.near.point)  # the buffer was too small for the number of close points
 
     done = in_time(anneal, len(starts), scene.deadline, thread_count())
-    score = result[:, 0] + np.float32(math.log(1 - outliers))  # the mixture's factor, for shares to be compared
+    score = result[:, 0] + np.float32(math.log(1 - outliers))  # mixture factor: makes outlier fractions comparable
     ends = replace(
         starts.unweighed(),
         rotation=rotation,
@@ -98,10 +124,20 @@ def anneal_on_points(
 def turned_about_middle(
     scene: Scene, rotation: Array, translation: Array, vectors: Array, shifts: Array, *, basin_count: int = 0
 ) -> Hypotheses:
-    """Copies of poses (k, 3, 3), (k, 3), s in all, turned by rotation vectors (s, 3) about the middle of the points and
-    shifted by (s, 3).
+    """Return perturbed copies of poses, rotated about the centroid of the points.
 
-    There an error of the rotation moves the camera, not what it looks at.
+    With this centre, an error of the rotation moves the camera and leaves the points in view.
+
+    Args:
+        scene: Points.
+        rotation: (k, 3, 3) poses.
+        translation: (k, 3) poses.
+        vectors: (s, 3) rotation vectors, s a multiple of k.
+        shifts: (s, 3) translations.
+        basin_count: Basin count of all copies.
+
+    Returns:
+        (s,) hypotheses; the copies of a pose are adjacent.
     """
     middle, copies = scene.bulk3d.mean(0), len(vectors) // max(len(rotation), 1)
     turns = Rotation.from_rotvec(vectors).as_matrix().astype(np.float32)
@@ -112,9 +148,17 @@ def turned_about_middle(
 
 
 def finish(scene: Scene, poses: Hypotheses, annealed: int | None = None) -> Hypotheses:
-    """The poses, of which the first `annealed` (None for all) are annealed once more on every bearing.
+    """Anneal the best poses again on every bearing.
 
-    The best two of these with each of `settings.end_outliers` too.
+    The best two are also annealed with each of `settings.end_outliers`.
+
+    Args:
+        scene: Points, settings and deadline.
+        poses: Distinct poses in the frame of the scene, best first.
+        annealed: Number of poses to anneal; None for all.
+
+    Returns:
+        Distinct poses, best first. Poses that are not annealed are kept.
     """
     settings, count = scene.settings, len(poses) if annealed is None else min(annealed, len(poses))
     runs = [(i, settings.outliers) for i in range(count)]
@@ -132,7 +176,7 @@ def finish(scene: Scene, poses: Hypotheses, annealed: int | None = None) -> Hypo
 def polished(
     scene: Scene, rotations: NDArray[np.float64], translations: NDArray[np.float64], scale: float
 ) -> Hypotheses:
-    """Anneal poses of a problem to the end on all points; after the deadline they stay as they are.
+    """Anneal poses of a problem to the end on all points; after the deadline they are returned unchanged.
 
     Args:
         scene: Points, settings and deadline.

@@ -1,4 +1,4 @@
-"""Pose hypotheses of one problem: the one record of them, in columns, and how equal ones are merged."""
+"""Pose hypotheses of one problem, one record with a column per quantity, and how equal ones are merged."""
 
 import math
 from collections.abc import Sequence
@@ -11,28 +11,29 @@ from numpy.typing import NDArray
 from bpnp.poses import close_poses, distinct
 from bpnp.search.scene import Scene
 
-SIGNIFICANT = 1e3  # nats a bearing, more than any log-likelihood
+SIGNIFICANT = 1e3  # nats per bearing, more than any log-likelihood
 
 
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
-    """Poses of one problem, camera = R p + t, one a row, and how well they explain its points.
+    """Poses of one problem, camera = R p + t, one per row, with the measures of how well they explain its points.
 
-    A stage fills the columns that it computes; the others hold what `from_poses` gives them.
+    A stage fills the columns that it computes; the others have the values of `from_poses`.
 
     Attributes:
         rotation: (c, 3, 3). Float32 in the frame of a `Scene`, float64 in that of a `Problem`.
         translation: (c, 3), in the same frame; (c, 4) homogeneous for a rig.
         log_likelihood: (c,) mean over the bearings, nats; -inf for a pose that was not scored.
         match_count: (c,) expected number of matches.
-        scale: (c,) standard deviation of the residuals per axis, radians, to which the columns before refer.
-        basin_count: (c,) number of independent starts that ended at this pose.
-        log10_false_alarms: (c,) at the scales of the residuals (`bpnp.search.evidence.false_alarms`); NaN before it is
+        scale: (c,) standard deviation of the residuals per axis, radians, at which the two previous columns are
             computed.
-        log10_rough: (c,) the same at scales far beyond those of the residuals.
+        basin_count: (c,) number of independent starts that ended at this pose.
+        log10_false_alarms: (c,) log10 NFA at the scale of the residuals (`bpnp.search.evidence.false_alarms`); NaN
+            before it is computed.
+        log10_rough: (c,) log10 NFA at scales far beyond those of the residuals; NaN likewise.
         evidence: (c,) of a proposer, nats by which the matches exceed chance; None where it computes none.
         matches: (c, m) index of the scene point of each image point, -1 for none; None where no matches are fixed.
-        residual: (c, m) angle of each match, radians, infinite where there is none; None likewise.
+        residual: (c, m) angle of each match, radians, infinite for none; None likewise.
         point_evidence: (c, m) nats by which a pose explains each image point better than chance does; None likewise.
     """
 
@@ -68,12 +69,12 @@ class Hypotheses:
 
     @classmethod
     def empty(cls, numbers: int = 3, dtype: type[np.floating[Any]] = np.float64) -> "Hypotheses":
-        """Return no hypotheses, whose translations have this many numbers."""
+        """Return a record without hypotheses; translations have `numbers` coordinates."""
         return cls.from_poses(np.empty((0, 3, 3), dtype), np.empty((0, numbers), dtype))
 
     @property
     def sort_key(self) -> NDArray[np.float64]:
-        """(c,) largest for the best: the number of false alarms of significant poses, else the log-likelihood."""
+        """(c,) sort key, largest for the best: the NFA of significant poses, else the log-likelihood."""
         is_significant = self.log10_false_alarms < 0  # not NaN
         return np.where(is_significant, SIGNIFICANT - self.log10_false_alarms, self.log_likelihood)
 
@@ -82,7 +83,7 @@ class Hypotheses:
         return replace(self, basin_count=np.zeros_like(self.basin_count))
 
     def unweighed(self) -> "Hypotheses":
-        """Return a copy whose false alarms are to be computed again."""
+        """Return a copy without NFA, so that it is computed again."""
         unknown = np.full(len(self), math.nan)
         return replace(self, log10_false_alarms=unknown, log10_rough=unknown)
 
@@ -109,16 +110,17 @@ class Hypotheses:
 
 
 def select_distinct(poses: Hypotheses, scene: Scene, count: int, apart_deg: float | None = None) -> Hypotheses:
-    """Return the best hypotheses of a scene of which no two are the same pose, best first.
+    """Return the best hypotheses of a scene, best first, no two of them equal.
 
     Args:
-        poses: In the frame of the scene.
-        scene: Whose settings say which poses are the same.
+        poses: Hypotheses in the frame of the scene.
+        scene: Scene whose settings define equal poses.
         count: Number of hypotheses, at most.
-        apart_deg: Least angle between their rotations, instead.
+        apart_deg: Least angle between their rotations, degrees; replaces the limits of the settings. None for these
+            limits.
 
     Returns:
-        Hypotheses with the basin counts of all those that are the same pose.
+        Hypotheses with the basin counts of all poses equal to them.
     """
     settings = scene.settings
     limits = (settings.same_deg, settings.same_shift) if apart_deg is None else (apart_deg, math.inf)
@@ -137,7 +139,7 @@ def merge_hypotheses(parts: Sequence[Hypotheses], scene: Scene) -> Hypotheses:
 
 
 def to_problem_frame(poses: Hypotheses, scene: Scene) -> Hypotheses:
-    """Return hypotheses of a `Scene` in the frame of its problem, in float64."""
+    """Return hypotheses in the frame of the problem of their `Scene`, in float64."""
     rotation, translation = scene.leave(poses.rotation, poses.translation)
     return replace(
         poses,
@@ -150,6 +152,6 @@ def to_problem_frame(poses: Hypotheses, scene: Scene) -> Hypotheses:
 
 
 def to_scene_frame(poses: Hypotheses, scene: Scene) -> Hypotheses:
-    """Return hypotheses of a problem in the frame of a `Scene`."""
+    """Return hypotheses of a problem in the frame of a `Scene`, in float32."""
     rotation, translation = scene.enter(poses.rotation, poses.translation)
     return replace(poses, rotation=rotation, translation=translation)

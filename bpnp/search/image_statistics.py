@@ -1,4 +1,4 @@
-"""Statistics of image points: their extent, the scales of their residuals, and which of them lie together."""
+"""Statistics of image points: extent, scales of the residuals, and local density."""
 
 import math
 
@@ -19,12 +19,13 @@ class ImageStatistics:
         centre: (3,) mean of the bearings.
         spread: RMS distance of the bearings from it.
         axes: (3, 2) principal axes on the tangent plane.
-        half_widths: (2,) of the rectangle with the standard deviations of the bearings.
+        half_widths: (2,) half widths of the rectangle with the standard deviations of the bearings.
         solid_angle: Area of this rectangle, steradians, at most 4 pi.
-        scales: (S,) of residuals, radians, from the noise floor to the largest that is no mere outline.
-        chosen: (k,) indices of the image points that are used.
-        together: (k, S) number of them within `rule.together` scales of each.
-        weights: (k, S, S) of the evidence, see `_weights`.
+        scales: (S,) scales of residuals, radians, from the noise floor to a fraction of the mean distance of the
+            points.
+        chosen: (k,) indices of the image points that are used, at most `rule.most`.
+        together: (k, S) number of used points within `rule.together` scales of each.
+        weights: (k, S, S) weights of the evidence, see `_weights`.
     """
 
     def __init__(self, bearings: Array, floor: float | None, rule: ImageSettings = IMAGE) -> None:
@@ -50,15 +51,20 @@ class ImageStatistics:
 
 
 def _weights(together: NDArray[np.int64], expected: Array, crowded_sigmas: float) -> Array:
-    """(k, S, S): weight of log x_i at the scale s_q in the evidence of image point i at the scale s_r.
+    """Return weights of log x_i at the scale s_q in the evidence of image point i at the scale s_r.
 
-    log x_i at s_r is a sum of steps, from the largest scale to s_r. A step from 2 s to s counts with 1 / c_i(s), and
-    with 1 / c_i(s_r) if that is less, where c_i(s) is the number of image points within 2 s of i, if it is more than an
-    even spread explains: over their expected number. So the place of a clump of points is one observation, and where
-    each of them lies within it one each.
+    log x_i at s_r is a sum of steps, from the largest scale to s_r. A step from 2 s to s counts with the lesser of
+    1 / n_i(s_r) and 1 / c_i(s). n_i(s) is the number of image points within 2 s of i. c_i(s) is n_i(s) over the number
+    for an even spread if the points are a clump, else 1. The position of a clump is then one observation, and the
+    position of each of its points within it is one more.
 
-    together: (k, S) image points within `ImageSettings.together` scales of each. expected: (S,) of them, spread evenly
-    over the view. crowded_sigmas: standard deviations above it from which they are a clump.
+    Args:
+        together: (k, S) number n_i of image points within `ImageSettings.together` scales of each.
+        expected: (S,) number for points spread evenly over the view.
+        crowded_sigmas: Standard deviations above `expected` from which points are a clump.
+
+    Returns:
+        (k, S, S) weights, in the order i, r, q.
     """
     clump = together > expected + crowded_sigmas * np.sqrt(expected)
     crowded = np.where(clump, together / expected, 1.0)

@@ -1,4 +1,4 @@
-"""The poses that a search has found so far, and the verdict on them."""
+"""Poses that a search has found so far, and the verdict on them."""
 
 import math
 from dataclasses import replace
@@ -17,11 +17,17 @@ from bpnp.search.verdict import SearchResult, judged, missed, weighed, with_fals
 
 
 class Pool:
-    """Distinct poses of a scene, best first, from all turns of a search.
+    """Distinct poses of a scene, best first, from all iterations of a search.
 
-    enumerated: the result of the enumeration of few points, whose poses are the first. candidates: at most
-    `settings.kept`. turns: so far. missed: log10 of the probability that a better optimum was not met.
-    surrounded, searched: poses around which was searched in vain, of those that exceed chance, and of others.
+    Attributes:
+        scene: Points in the frame of the search.
+        problem: Points in the frame of the problem.
+        enumerated: Result of the enumeration of few points, whose poses are the first candidates.
+        candidates: Best poses in the frame of the scene, at most `settings.kept`.
+        turns: Number of iterations so far.
+        missed: log10 of the probability that the search missed a better optimum.
+        surrounded: Significant poses whose local search found nothing better.
+        searched: Other poses whose surroundings were searched.
     """
 
     def __init__(self, scene: Scene, problem: Problem, enumerated: SearchResult) -> None:
@@ -40,9 +46,9 @@ class Pool:
         self.missed = 0.0
 
     def merge(self, found: Hypotheses) -> None:
-        """Take up the poses of a turn.
+        """Add the poses of an iteration.
 
-        They are weighed first: a pose that exceeds chance may lie beside one that does not and is likelier.
+        Their NFA is computed first: a significant pose may be close to a likelier one that is not significant.
         """
         rule, before = self.scene.settings.evidence, self.alarms
         self.candidates = self._weighed(merge_hypotheses([self.candidates, self._weighed(found)], self.scene), 1)
@@ -50,17 +56,23 @@ class Pool:
             self.surrounded = Hypotheses.concatenate([self.surrounded, self._around])
         self._around = None
         self.missed = self._missed()
-        if self.missed > rule.missed:  # else the others are weighed for the verdict
+        if self.missed > rule.missed:  # otherwise `result` computes the NFA of the others
             self.candidates = self._weighed(self.candidates)
             self.candidates = self.candidates[np.argsort(-self.candidates.sort_key, kind="stable")]
             self.missed = self._missed()
 
     def look_around(self, pose: Hypotheses) -> None:
-        """The next turn searches the surroundings of a pose (1,): in vain, if none is much less likely by chance."""
+        """Record that the next iteration searches around a pose (1,).
+
+        The search counts as unsuccessful if the best NFA does not fall by `Evidence.lead` decades.
+        """
         self._around = pose
 
     def _weighed(self, candidates: Hypotheses, count: int | None = None) -> Hypotheses:
-        """The candidates, of which the first `count`, by default as many as a verdict needs, have false alarms."""
+        """Compute the NFA of the promising poses among the first `count` candidates.
+
+        None for `count` means as many as a verdict needs.
+        """
         if count is None:
             count = self.scene.settings.finished if self.problem.prior is None else self.scene.settings.kept
         places = np.flatnonzero(self._promising(candidates[:count]))
@@ -70,23 +82,30 @@ class Pool:
         return replace(candidates, log10_false_alarms=alarms, log10_rough=rough)
 
     def _promising(self, candidates: Hypotheses) -> NDArray[np.bool_]:
-        """Which poses may exceed chance: those that explain the bearings better than scene points would that are spread
-        evenly over the view, or worse by less than three times the number of tests, in decades."""
+        """Return a mask of the poses that may be significant.
+
+        Their likelihood is at most 3 T decades below that of scene points spread evenly over the view. T is log10 of
+        the number of tests.
+        """
         nats = candidates.log_likelihood - math.log(2 * math.pi / self.scene.solid_angle)
         return np.asarray(nats * len(self.problem.bearings) > -3 * math.log(10) * self._tests)
 
     def leaders(self) -> Hypotheses:
-        """The candidates that have their false alarms, as a verdict needs them."""
+        """Return the candidates with an NFA, in the frame of the problem, the best one first."""
         known = self.candidates[~np.isnan(self.candidates.log10_false_alarms)]
         return weighed(to_problem_frame(known, self.scene), self.problem, self.scene.settings.evidence)
 
     @property
     def alarms(self) -> float:
-        """log10 of the fewest false alarms of a pose."""
+        """log10 of the smallest NFA of the candidates; infinite if none has one."""
         return float(np.nanmin(self.candidates.log10_false_alarms, initial=np.inf))
 
     def looks(self, leaders: Hypotheses) -> int:
-        """How often the surroundings of the first one, in the frame of the problem, were searched in vain."""
+        """Return the number of local searches around the first of these poses that found nothing better.
+
+        Args:
+            leaders: Poses in the frame of the problem, best first.
+        """
         if not len(leaders) or not len(self.surrounded):
             return 0
         rule, looked = self.scene.settings.evidence, to_problem_frame(self.surrounded, self.scene)
@@ -95,21 +114,26 @@ class Pool:
         return int(self.problem.same_pose(rotation, translation, rule.same).sum()) - 1
 
     def is_searched(self, pose: Hypotheses) -> bool:
-        """Whether the surroundings of a pose (1,), or of one much like it, were searched before one exceeded chance."""
+        """Return True if the surroundings of a pose (1,), or of one equal to it, were searched before."""
         together, settings = Hypotheses.concatenate([pose, *self.searched]), self.scene.settings
         poses = together.rotation, together.translation * self.scene.shift_weight
         return bool(close_poses(*poses, 0, settings.same_deg, settings.same_shift)[1:].any())
 
     def _missed(self) -> float:
+        """Compute `missed` from the current candidates."""
         leaders = self.leaders()
         return missed(leaders, self.problem, self.looks(leaders), self.scene.settings.evidence)
 
     def result(self, annealed: int | None = None) -> SearchResult:
-        """The verdict on the best candidates, the first `annealed` of which are annealed to the end on all points."""
+        """Compute the verdict on the best candidates.
+
+        Args:
+            annealed: Number of candidates, best first, to anneal on all points; None for `settings.finished`.
+        """
         scene, problem, rule = self.scene, self.problem, self.scene.settings.evidence
         annealed = scene.settings.finished if annealed is None else annealed
         ends = finish(scene, self.candidates, annealed) if len(self.candidates) else self.candidates
-        if len(ends) and problem.prior is not None:  # of a pose before and after, that which chance explains less
+        if len(ends) and problem.prior is not None:  # keep the version of each pose with the smaller NFA
             ends = self._weighed(ends)
             ends = merge_hypotheses([ends, self.candidates.as_dependent()], scene)
         leaders = weighed(to_problem_frame(ends, scene), problem, rule)

@@ -1,7 +1,7 @@
-"""The one record of the points of a problem: image points and scene points, with what is known of them and of the pose.
+"""Record of the points of a problem: image points and scene points, with their annotations and the priors of the pose.
 
-The scene is divided by its size once, where a `Problem` is made. Nothing after it depends on the unit or on the origin
-of the scene; `to_user` takes a pose back to the user's coordinates.
+The scene is divided by its size once, where a `Problem` is made. No later step depends on the unit or on the origin of
+the scene; `to_user` converts a pose to the user's coordinates.
 """
 
 import math
@@ -21,30 +21,30 @@ from bpnp.search.starts import GravityPrior, PosePrior, Prior
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
 Unit = Literal["px", "normalised", "rad"]
-BULK = 20.0  # median distances from the median; scene points farther off decide neither the origin nor the unit
-TURNED_DEG = 5.0  # standard deviation up to which a known rotation lets two matches fix a pose
-RADIUS = 3e-3  # radians, of a match, where the size of a pixel is not known
-FLOORS = 30.0  # radius of a match in smallest believable scales: 3 pixels, where that is a tenth of one
-TILTED = 2.0  # radii by which a tilt may move image points for two matches to fix a pose: those of the last stage
-SIGMAS = 2.0  # of a prior: poses farther off could not have been tried
-LOG_DEPTHS = math.log(30.0)  # the farthest over the nearest distance at which a scene could stand
-PAIRS_A_POINT = 32  # pairs of one label, for each point, up to which each pair is computed
-LIKELY = 0.1  # by their classes, over a mean match, at least, of two points that are matched
-FLAT = 1e-6  # of the points' longest extent; what float32 leaves of the other extents of a line
+BULK = 20.0  # median distances from the median; farther scene points do not affect the origin and the unit
+TURNED_DEG = 5.0  # largest standard deviation, degrees, of a rotation prior with which two matches fix a pose
+RADIUS = 3e-3  # radius of a match, radians, if the pixel size is unknown
+FLOORS = 30.0  # radius of a match in noise floors: 3 pixels if the floor is a tenth of a pixel
+TILTED = 2.0  # largest motion of image points by the tilt, in match radii, with which two matches fix a pose
+SIGMAS = 2.0  # standard deviations of a prior within which all poses count as equally near
+LOG_DEPTHS = math.log(30.0)  # logarithm of the farthest over the nearest possible distance of a scene
+PAIRS_A_POINT = 32  # largest number of pairs per point for which every pair is computed
+LIKELY = 0.1  # least likelihood of a possible match by its classes, relative to a mean match
+FLAT = 1e-6  # largest second extent of a line as a fraction of the first, in float32
 OF_IMAGE = "bearings", "labels2d", "scores2d", "odds2d", "points2d"  # fields with one row per image point
 OF_SCENE = "points3d", "normals3d", "labels3d", "cosines3d", "scores3d", "classes3d"  # one row per scene point
 
 
 class UnknownFocal(NamedTuple):
-    """What is known of a lens whose focal length is fitted with the pose.
+    """Prior of a camera model whose focal length is fitted with the pose.
 
     Attributes:
-        log_range: Logarithm of the largest over the smallest focal length that was possible.
-        sigma: Standard deviation of the logarithm of the focal length; infinite if nothing is known of it.
+        log_range: Logarithm of the largest over the smallest possible focal length.
+        sigma: Standard deviation of the logarithm of the focal length; infinite without a prior.
         offset: Logarithm of the focal length of these bearings over the expected one.
-        radial: Radial coefficient k of the lens with which the bearings were undistorted.
-        radial_sigma: Standard deviation of k; 0 if the distortion is known, infinite if k is fitted.
-        radial_range: Range of k that was possible; 0 if k is not fitted.
+        radial: Radial coefficient k of the camera model with which the bearings were undistorted.
+        radial_sigma: Standard deviation of k; 0 if the distortion is given, infinite if k is fitted.
+        radial_range: Range of possible k; 0 if k is not fitted.
         centre_sigma: Standard deviation of the principal point, in focal lengths. It is not fitted.
     """
 
@@ -59,7 +59,7 @@ class UnknownFocal(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Unmatched image points and scene points, and what is known of them and of the pose.
+    """Unmatched image points and scene points, with their annotations and the priors of the pose.
 
     `Problem.of` makes one from the user's coordinates. Poses are those of the scene in unit size, camera = R p + t;
     `from_user` and `to_user` convert them.
@@ -68,21 +68,21 @@ class Problem:
         bearings: (m, 3) unit vectors of the image points, in the camera's frame.
         points3d: (n, 3) scene points, (x - origin) / size of the user's points x.
         normals3d: (n, 3) outward unit normals; a point that faces away from the camera is not seen.
-        labels2d: (m,) only points of one label match, -1 fits any.
-        labels3d: (n,) the same of the scene points.
+        labels2d: (m,) labels of the image points; only points with equal labels match, -1 fits any.
+        labels3d: (n,) labels of the scene points.
         cosines3d: (n,) least cosine between a normal and the direction to a camera that sees the point; None for 0.
-            With them the enumeration leaves the normals aside.
+            With them the enumeration ignores the normals.
         scores2d: (m,) probability in (0, 1] that an image point has a match; None for equal ones.
-        scores3d: (n,) the same of the scene points.
+        scores3d: (n,) probability in (0, 1] that a scene point has a match; None for equal ones.
         floor: Smallest scale of the residuals, radians; None for a fraction of the RMS radius of the bearings.
         radius: Largest residual of a match in an enumeration, radians; None for that of its settings.
         clutter: Fraction of the image points without a match; None if it is unknown.
-        prior: What is known of the pose, in unit size.
+        prior: Prior of the pose, in unit size.
         log10_tried: Logarithm of the number of poses that were tried; None for the number that triples of matches give.
         odds2d: (m, c) with `classes3d`: their scalar product is how much likelier a match is by its classes than a
             mean one. The labels are then those of points whose class is certain.
         classes3d: (n, c) probabilities of the classes.
-        focal: What is known of the lens with which the bearings were made; None if it is given.
+        focal: Prior of the focal length with which the bearings were computed; None if it is given.
         log10_views: Logarithm of the number of sets of scene points, such as the views of a map, that are tried with
             these bearings.
         origin: (3,) of the user's coordinates that is the origin here.
@@ -142,7 +142,7 @@ class Problem:
         Args:
             bearings: (m, 3) unit vectors.
             points3d: (n, 3) scene points, in any unit.
-            prior: What is known of the pose, in the user's coordinates.
+            prior: Prior of the pose, in the user's coordinates.
             **known: The other attributes.
         """
         bulk = points3d[in_bulk(points3d)]
@@ -177,14 +177,19 @@ class Problem:
         )
 
     def choose(self, image: Labels | slice = slice(None), scene: Labels | slice = slice(None)) -> "Problem":
-        """Return the same problem with these image points and scene points alone."""
+        """Return the problem restricted to these image points and scene points.
+
+        Args:
+            image: Indices or slice of the image points; all by default.
+            scene: Indices or slice of the scene points; all by default.
+        """
         rows = dict.fromkeys(OF_IMAGE, image) | dict.fromkeys(OF_SCENE, scene)
         known = {name: values[rows[name]] for name in rows if (values := getattr(self, name)) is not None}
         given3d = None if self.given3d is None else self.given3d[scene]
         return replace(self, indices2d=self.usable[image], given3d=given3d, given2d=self.all2d, **known)
 
     def without(self, taken: Labels) -> "Problem":
-        """Return the same problem without the image points that have these indices among the user's."""
+        """Return the problem without the image points that have these indices among the user's."""
         stay = np.flatnonzero(~np.isin(self.usable, taken))
         return replace(self.choose(stay), taken2d=len(self.bearings) - len(stay))
 
@@ -225,13 +230,13 @@ class Problem:
 
     @cached_property
     def degenerate(self) -> str | None:
-        """Why no pose can follow from these points; None if one may."""
+        """Reason why these points fix no pose; None if they may."""
         fewest = MIN_POINTS - isinstance(self.prior, GravityPrior)
         reason = why_degenerate(self.bearings, self.points3d, fewest)
         return f"of the lights that no other problem has, {reason}" if reason and self.taken2d else reason
 
     def project(self, in_camera: Array) -> Array:
-        """Return where points (p, 3) in the camera's frame are seen, as `image_points`; NaN if nowhere."""
+        """Project points (p, 3) in the camera's frame to `image_points`; NaN for points without an image."""
         if self.camera is not None:
             return self.camera.project(in_camera)
         if self.points2d is not None:
@@ -240,7 +245,7 @@ class Problem:
         return np.divide(in_camera, length, out=np.full_like(in_camera, np.nan), where=length > 0)
 
     def project_scene(self, rotation: Array, translation: Array) -> Array:
-        """Return where the scene points are seen (n, d); NaN for those that are not, or face away."""
+        """Project the scene points, (n, d); NaN for those without an image or that face away."""
         in_camera = self.points3d @ rotation.T + translation
         seen = self.project(in_camera)
         if self.normals3d is not None:
@@ -248,7 +253,7 @@ class Problem:
         return seen
 
     def may_match(self, i: Labels, j: Labels) -> NDArray[np.bool_]:
-        """Return whether image points i (k,) and scene points j (k,) can be matched by their labels or classes."""
+        """Return a mask (k,) of pairs i, j (k,) of image and scene points that their labels or classes admit."""
         if self.odds2d is not None and self.classes3d is not None:
             return np.asarray((self.odds2d[i] * self.classes3d[j]).sum(-1) > LIKELY)
         if self.labels2d is None or self.labels3d is None:
@@ -258,7 +263,7 @@ class Problem:
 
     @property
     def cones3d(self) -> Array | None:
-        """(n, 4) normals and `cosines3d`; None if nothing is known of them."""
+        """(n, 4) normals and `cosines3d`; None without normals."""
         if self.normals3d is None:
             return None
         cosines = np.zeros(len(self.normals3d)) if self.cosines3d is None else self.cosines3d
@@ -271,11 +276,11 @@ class Problem:
 
     @cached_property
     def labelled_pairs(self) -> tuple[Labels, Labels] | None:
-        """Every pair of points whose labels agree.
+        """Every pair of points whose labels are equal or include -1.
 
         Returns:
-            Indices (k,) among `image.chosen` and (k,) of scene points. None where the labels leave so many pairs that
-            sums over neighbours are faster, or where class probabilities or no labels are given.
+            Indices (k,) among `image.chosen` and (k,) of scene points. None with too many pairs, for which sums over
+            neighbours are faster, and with class probabilities or without labels.
         """
         if self.labels2d is None or self.labels3d is None or self.odds2d is not None:
             return None
@@ -289,7 +294,7 @@ class Problem:
 
     @cached_property
     def registered(self) -> list[tuple[Array, Array, Motions]]:
-        """Poses (3, 3), (3,) and the motions of the scene that were found from their matched points."""
+        """Poses (3, 3), (3,) with the motions of the scene that were computed from their matched points."""
         return []
 
     @cached_property
@@ -304,7 +309,7 @@ class Problem:
         return middle if self.origin is None else middle + self.origin
 
     def same_pose(self, rotation: Array, translation: Array, tolerance: Tolerance = SAME) -> NDArray[np.bool_]:
-        """Return which poses (c, 3, 3), (c, 3) are the same as the first one."""
+        """Return a mask of the poses (c, 3, 3), (c, 3) that are equal to the first one."""
         return same_pose(rotation, rotation @ self.middle + translation, 0, tolerance)
 
     @property
@@ -314,16 +319,16 @@ class Problem:
 
     @property
     def match_radius(self) -> float:
-        """Largest residual of a match in an enumeration, radians: `radius`, or 3 pixels where a pixel is known."""
+        """Largest residual of a match in an enumeration, radians: `radius`, or 3 pixels if the pixel size is known."""
         if self.radius is not None:
             return self.radius
         return RADIUS if self.floor is None else FLOORS * self.floor
 
     @property
     def has_known_vertical(self) -> bool:
-        """True if a tilt within the error of a known gravity moves no image point out of reach of its match.
+        """True if a tilt within the error of the gravity prior moves no image point out of reach of its match.
 
-        Always true of three points, which fix no pose without it.
+        Always true for three points, which fix no pose without it.
         """
         if not isinstance(self.prior, GravityPrior):
             return False
@@ -333,13 +338,12 @@ class Problem:
 
     @property
     def fixing_matches(self) -> int:
-        """Number of matches that fix a pose: 2 where the vertical, or the rotation to a few degrees, is known, else
-        3."""
+        """Number of matches that fix a pose: 2 with a close prior of the vertical or of the rotation, else 3."""
         return 2 if self.has_known_rotation or self.has_known_vertical else 3
 
     @property
     def fitted(self) -> int:
-        """Numbers that are fitted to the image points."""
+        """Number of parameters that are fitted to the image points."""
         lens = 0 if self.focal is None else 1 + (self.focal.radial_range > 0)
         return 2 * self.fixing_matches + lens
 
@@ -347,10 +351,10 @@ class Problem:
         """Return log10 of the fraction of all poses that are as near to the prior as this one.
 
         The poses are those that fit matches of these points: their rotations fill SO(3) evenly, the directions to the
-        middle of the scene fill the view, and the logarithms of its distance a factor of 30. Poses within two standard
-        deviations of the prior are equally near. Weighed by the inverse of this fraction F, the tests of all poses add
-        up to 1 + log(1 / F_0) times as many as without a prior, F_0 the smallest fraction; the NFA leaves out this
-        factor, 8 for gravity known to 2 degrees.
+        median scene point fill the view, and the logarithms of its distance a factor of 30. Poses within two standard
+        deviations of the prior are equally near. F is this fraction and F_0 the smallest one.
+        Weighted by 1 / F, the tests of all poses add up to 1 + log(1 / F_0) times as many as without a prior. The NFA
+        omits this factor, 8 for a vertical with a standard deviation of 2 degrees.
         """
         if self.prior is None:
             return 0.0
@@ -373,7 +377,14 @@ class Problem:
 
 
 def faces(normals3d: Array, cosines3d: Array | None, camera: Array, rotation: Array) -> NDArray[np.bool_]:
-    """Return which points (n, 3) in the camera's frame face it: n . c > cosine, c the unit vector to its centre."""
+    """Return a mask (n,) of points that face the camera: n . c > cosine, c the unit vector to its centre.
+
+    Args:
+        normals3d: (n, 3) unit normals in the scene.
+        cosines3d: (n,) least cosines; None for 0.
+        camera: (n, 3) points in the camera's frame.
+        rotation: (3, 3) from the scene to the camera.
+    """
     towards = -((normals3d @ rotation.T) * camera).sum(-1)
     if cosines3d is None:
         return np.asarray(towards > 0)
@@ -383,7 +394,17 @@ def faces(normals3d: Array, cosines3d: Array | None, camera: Array, rotation: Ar
 def label_groups(
     chosen: Labels, labels2d: Labels | None, labels3d: Labels | None, n: int
 ) -> list[tuple[Labels, Labels]]:
-    """Return indices of `chosen` and of scene points that may match, a group for each label in the image."""
+    """Group the points that may match by label.
+
+    Args:
+        chosen: (k,) indices of image points.
+        labels2d: (m,) labels of all image points, -1 for any; None for no labels.
+        labels3d: (n,) labels of the scene points, -1 for any; None for no labels.
+        n: Number of scene points.
+
+    Returns:
+        For each label in the image, indices into `chosen` and indices of scene points.
+    """
     if labels2d is None or labels3d is None:
         return [(np.arange(len(chosen)), np.arange(n))]
     order, any_label = np.argsort(labels3d, kind="stable"), np.flatnonzero(labels3d == -1)
@@ -399,7 +420,7 @@ def label_groups(
 
 
 def in_bulk(points3d: Array) -> NDArray[np.bool_]:
-    """Return which points (n, 3) are within `BULK` median distances of the median."""
+    """Return a mask of the points (n, 3) that are within `BULK` median distances of the median."""
     distance = np.linalg.norm(points3d - np.median(points3d, 0), axis=-1)
     return np.asarray(distance <= BULK * float(np.median(distance)))
 
@@ -409,8 +430,8 @@ def units_per_radian(points2d: Array, unit: Unit, camera: Camera | None) -> floa
 
     Args:
         points2d: (m, 2) normalised image points.
-        unit: In which residuals are measured.
-        camera: Camera of the pixels.
+        unit: Unit in which residuals are measured.
+        camera: Camera of the pixels; None for normalised points.
     """
     if unit == "rad":
         return 1.0
@@ -419,7 +440,7 @@ def units_per_radian(points2d: Array, unit: Unit, camera: Camera | None) -> floa
 
 
 def why_degenerate(bearings: Array, points3d: Array, fewest: int = MIN_POINTS) -> str | None:
-    """Return why points fix no pose; None if they may.
+    """Return the reason why points fix no pose; None if they may.
 
     Args:
         bearings: (m, 3) unit vectors.

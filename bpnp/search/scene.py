@@ -1,4 +1,4 @@
-"""A problem as the annealing reads it: in float32, in random order, and summed up in weighted clusters."""
+"""Problem in the form that the annealing reads: float32, random order, weighted clusters."""
 
 import math
 from collections.abc import Sequence
@@ -26,12 +26,18 @@ from bpnp.search.settings import RasterShape, SearchSettings
 from bpnp.search.starts import Array, GravityPrior, Prior, turned_to
 
 Sides = tuple[WeightedBearings, WeightedPoints]
-SHIFT_ALONG = 5.0  # spreads: what a shift along the view counts against one across it, at most 1
+SHIFT_ALONG = 5.0  # weight of a shift along the view over one across it, per RMS angular radius; at most 1
 ON_A_LINE = 1e-6  # second singular value over the first, below which points lie on a line
 
 
 class Companion(NamedTuple):
-    """Another camera that sees the same points, fixed to that of a scene: x' = turn x + shift, in the units of both."""
+    """Other rig camera that sees the same points, rigidly attached to the camera of a scene.
+
+    Attributes:
+        scene: Its scene.
+        turn: (3, 3) rotation; x' = turn x + shift maps the frame of the first camera to that of this one.
+        shift: (3,) translation, in the unit of both scenes.
+    """
 
     scene: "Scene"
     turn: Array
@@ -39,15 +45,26 @@ class Companion(NamedTuple):
 
 
 class Scene:
-    """A problem in float32 and in random order, the camera turned to the mean bearing.
+    """Problem in float32 and in random order, with the camera turned to the mean bearing.
 
-    offsets: (m, 3) of the unit bearings from (0, 0, 1), their mean direction after `frame` (3, 3) has turned the
-    camera: float32 keeps the digits of a narrow view in them. points3d: (n, 3). bulk3d: those of them that decide
-    origin and unit of the problem.
-    spread: of the bearings, radians for a narrow view. shift_weight: (3,) of the axes in which translations are
-    compared: along the view a narrow image hardly shows a shift. solid_angle: that they fill, steradians.
-    image, seen: both sides with what is known of single points. smallest_scale: of the residuals, radians. rng: of all
-    that is random. settings, deadline: of the search. rasters: of the bearings, those that were asked for.
+    Attributes:
+        offsets: (m, 3) unit bearings minus (0, 0, 1), their mean direction after `frame` has turned the camera. In this
+            form float32 keeps the digits of a narrow view.
+        frame: (3, 3) rotation from the camera of the problem to that of the scene.
+        points3d: (n, 3) scene points.
+        bulk3d: (b, 3) scene points that determine the origin and the unit of the problem.
+        spread: RMS distance of the bearings from their mean; radians for a narrow view.
+        shift_weight: (3,) weights of the axes in comparisons of translations. A narrow image hardly shows a shift along
+            the view.
+        solid_angle: Solid angle that the bearings fill, steradians.
+        image: Image points with their annotations.
+        seen: Scene points with their annotations.
+        smallest_scale: Smallest scale of the residuals, radians.
+        rng: Generator of all random numbers.
+        settings: Settings of the search.
+        deadline: Deadline of the search.
+        companions: Other rig cameras with the same points.
+        rasters: Density maps of the bearings that were computed so far.
     """
 
     def __init__(self, problem: Problem, seed: int, settings: SearchSettings, deadline: Deadline = NEVER) -> None:
@@ -74,16 +91,25 @@ class Scene:
         self.smallest_scale = min(fine.smallest_scale, fine.relative_smallest * self.spread, floor)
 
     def outlier_density(self, share: float) -> np.float32:
-        """o / s^2, o = 2 pi s^2 w / ((1 - w) A): the density of outliers against that of a kernel (Myronenko, Song)."""
+        """Return the density of outliers over that of a kernel (Myronenko, Song).
+
+        The density is o / s^2, o = 2 pi s^2 w / ((1 - w) A), w the outlier fraction `share`, A the solid angle.
+        """
         return np.float32(2 * math.pi * share / ((1 - share) * self.solid_angle))
 
     def join(self, other: "Scene", turn: NDArray[np.float64], shift: NDArray[np.float64]) -> None:
-        """Add a companion with the same points: in the coordinates of the problem x' = turn x + shift."""
+        """Add a rig camera with the same points.
+
+        Args:
+            other: Scene of the camera.
+            turn: (3, 3) rotation of x' = turn x + shift, in the coordinates of the problem.
+            shift: (3,) translation.
+        """
         turned, moved = other.frame @ turn @ self.frame.T, other.frame @ shift
         self.companions.append(Companion(other, turned.astype(np.float32), moved.astype(np.float32)))
 
     def enter_prior(self, prior: Prior) -> Prior:
-        """The prior in this frame."""
+        """Return the prior of a problem in the frame of the scene."""
         if isinstance(prior, GravityPrior):
             return prior._replace(up_camera=self.frame @ np.asarray(prior.up_camera))
         rotation = np.asarray(prior.rotation, np.float64)
@@ -93,17 +119,26 @@ class Scene:
         return prior._replace(rotation=turned, translation=moved)
 
     def enter(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> tuple[Array, Array]:
-        """Return poses of the problem in this frame."""
+        """Return poses (k, 3, 3), (k, 3) of the problem in the frame of the scene, float32."""
         return (self.frame @ rotation).astype(np.float32), (translation @ self.frame.T).astype(np.float32)
 
     def leave(self, rotation: Array, translation: Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return poses of this frame as poses of the problem, in float64, their rotations orthogonal to that."""
+        """Return poses of the scene in the frame of the problem, in float64.
+
+        The rotations are orthogonal to float64 precision.
+        """
         turn = self.frame.T @ Rotation.from_matrix(rotation.astype(np.float64)).as_matrix()
         return turn, translation.astype(np.float64) @ self.frame
 
     def clusters(self, counts: Sequence[int]) -> list[Sides]:
-        """Both sides in about so many clusters each, in the order of their labels: those of a count are clusters of
-        those of the next larger one."""
+        """Cluster both point sets.
+
+        Args:
+            counts: Approximate numbers of clusters.
+
+        Returns:
+            Clusters of both sides for each count, ordered by label. Smaller sets are clusters of the next larger one.
+        """
         sides, image, seen = {}, self.image, self.seen
         for count in sorted(set(counts), reverse=True):
             image = image.clustered(count, self.settings, self.rng)
@@ -115,17 +150,17 @@ class Scene:
         return [sides[count] for count in counts]
 
     def sides(self, bearings: int | None = None, points: int | None = None) -> Sides:
-        """All points of both sides, or so many of them."""
+        """Return bearings and points in random order; the first `bearings` and `points` of them, None for all."""
         return kernel_sides(self.image.at(slice(bearings)), self.seen.at(slice(points)), self.settings.facing)
 
     def seen_points(self, count: int) -> WeightedPoints:
-        """So many of the points, as they are looked up; kept."""
+        """Return the first `count` points as the density map scores them, from a cache."""
         if count not in self._points:
             self._points[count] = self.sides(points=count)[1]
         return self._points[count]
 
     def tiles(self, bearings: int | None = None) -> tuple[Tiles, WeightedPoints]:
-        """All points, and all bearings or so many of them in tiles; both are kept."""
+        """Return all points, and the first `bearings` bearings (None for all) in tiles, from a cache."""
         count = len(self.offsets) if bearings is None else min(bearings, len(self.offsets))
         if count not in self._tiles:
             image, points = self.sides(count)
@@ -134,7 +169,7 @@ class Scene:
 
 
 def degenerate(points: NDArray[np.float64]) -> bool:
-    """Whether there are fewer than 4 points, or all of them lie in one place or on one line."""
+    """Return True for fewer than 4 points, or for points that all coincide or lie on one line."""
     if len(points) < MIN_POINTS:
         return True
     values = np.linalg.svd(points - points.mean(0), compute_uv=False)

@@ -1,14 +1,14 @@
-"""In which order a search draws its poses, until it is certain or its budget is spent.
+"""Order in which a search draws initial poses, until a pose is confident or the budget is spent.
 
-| the best pose so far            | turn after turn                                                            |
+| best pose so far                | iterations                                                                 |
 |---------------------------------|----------------------------------------------------------------------------|
-| near a rough prior              | raster search, a batch of starts from anywhere                             |
-| does not exceed chance          | in turns: a batch of starts from anywhere, and raster searches of all      |
-|                                 | rotations for as much time; once a network's proposals; after each, raster |
-|                                 | searches around its likeliest poses                                        |
-| exceeds chance, and is not sure | batches and searches of all rotations, and raster searches around it       |
+| near a rough prior              | density-map search, then a batch of starts over all rotations              |
+| not significant                 | a batch of starts over all rotations, and density-map searches over all    |
+|                                 | rotations of equal duration; once the proposals of a network; after each,  |
+|                                 | local searches around its likeliest poses                                  |
+| significant, not yet confident  | batches and searches over all rotations, and local searches around it      |
 
-Every turn draws starts, screens them, anneals the best, and gives distinct poses, which the pool merges.
+Each iteration draws starts, preselects them, anneals the best, and yields distinct poses, which the pool merges.
 """
 
 from collections.abc import Callable, Iterator
@@ -36,7 +36,15 @@ Proposals = Callable[[], tuple[NDArray[np.float64], NDArray[np.float64]]]  # rot
 
 
 def turns(pool: Pool, around: Prior | None, proposals: Proposals | None) -> Iterator[Hypotheses]:
-    """The poses of one turn after the other; the pool has merged those of a turn before the next one begins."""
+    """Yield the poses of one iteration after the other.
+
+    The caller merges the poses of an iteration into the pool before it requests the next.
+
+    Args:
+        pool: Poses found so far.
+        around: Guess of the pose in the frame of the problem, used before all other sources; None for none.
+        proposals: Function that returns poses to start from; None for none.
+    """
     scene, settings = pool.scene, pool.scene.settings
     guess, known = (None if prior is None else scene.enter_prior(prior) for prior in (around, pool.problem.prior))
     if guess is not None:
@@ -47,13 +55,14 @@ def turns(pool: Pool, around: Prior | None, proposals: Proposals | None) -> Iter
         yield from islice(near, settings.schedule.near)
         while pool.alarms < 0:
             yield from _sure(pool, near)
-        # The prior may be wrong: what was found near it would only be in the way.
+        # The prior may be wrong: poses found near it would only displace others.
         pool.forget()
         known = None
     yield from _anywhere(pool, known, proposals)
 
 
 def _near(pool: Pool, known: PosePrior, proposals: Proposals | None) -> Iterator[Hypotheses]:
+    """Yield poses near a prior, alternating with batches over all rotations, and proposals once."""
     scene = pool.scene
     for number in count():
         yield search_near(scene, known)
@@ -63,6 +72,7 @@ def _near(pool: Pool, known: PosePrior, proposals: Proposals | None) -> Iterator
 
 
 def _anywhere(pool: Pool, known: Prior | None, proposals: Proposals | None) -> Iterator[Hypotheses]:
+    """Yield poses from all rotations or a wide prior, with local searches and proposals, without end."""
     drawn = _drawn(pool, known)
     yield next(drawn)
     for number in count():
@@ -76,7 +86,10 @@ def _anywhere(pool: Pool, known: Prior | None, proposals: Proposals | None) -> I
 
 
 def _sure(pool: Pool, drawn: Iterator[Hypotheses]) -> Iterator[Hypotheses]:
-    """What excludes the likelier case: a raster search around the best pose, or more starts from anywhere."""
+    """Run the step that reduces the larger miss probability.
+
+    The step is a local search around the best pose, or the next source of starts.
+    """
     leaders, settings = pool.leaders(), pool.scene.settings
     looks, rule = pool.looks(leaders), settings.evidence
     symmetric = bool(pool.problem.registered) and is_symmetric(leaders, pool.problem, rule)
@@ -89,15 +102,17 @@ def _sure(pool: Pool, drawn: Iterator[Hypotheses]) -> Iterator[Hypotheses]:
 
 
 def _look(pool: Pool) -> Hypotheses:
-    """A raster search around the best pose."""
+    """Run a local search around the best pose."""
     leader = to_scene_frame(pool.leaders()[:1], pool.scene)
     pool.look_around(leader)
     return search_beside(pool.scene, leader, pool.scene.settings.beside)
 
 
 def _drawn(pool: Pool, known: Prior | None) -> Iterator[Hypotheses]:
-    """Poses from anywhere: of batches of starts, and of raster searches of all rotations in about as much time; every
-    third batch does not know the prior, which may be wrong."""
+    """Yield poses of batches of starts and of density-map searches over all rotations that take as long.
+
+    Every third batch ignores the prior, which may be wrong.
+    """
     scene, searches = pool.scene, count()
     for number in count():
         yield multistart(scene, number, None if number % 3 == 2 else known)
@@ -106,8 +121,11 @@ def _drawn(pool: Pool, known: Prior | None) -> Iterator[Hypotheses]:
 
 
 def _with_surroundings(pool: Pool, found: Hypotheses) -> Iterator[Hypotheses]:
-    """Poses, and raster searches around each of the best of different rotations, none twice, until several are in vain
-    or a pose exceeds chance."""
+    """Yield poses, then local searches around the best of different rotations.
+
+    Poses whose surroundings were searched before are skipped. The searches end after several without a better pose, or
+    with a significant pose.
+    """
     yield found
     settings, since = pool.scene.settings, 0
     poses = select_distinct(found, pool.scene, settings.schedule.around_each, settings.schedule.apart_deg)
@@ -122,16 +140,21 @@ def _with_surroundings(pool: Pool, found: Hypotheses) -> Iterator[Hypotheses]:
 
 
 def proposed(pool: Pool, proposals: Proposals) -> Hypotheses:
-    """Distinct poses from those proposed, in the frame of the problem, that its prior admits.
+    """Run a density-map search from proposed poses that the prior of the problem admits.
 
-    Their basin counts are 0, since proposals depend on each other.
+    Args:
+        pool: Poses found so far.
+        proposals: Function that returns poses in the frame of the problem.
+
+    Returns:
+        Distinct poses in the frame of the scene. Their basin counts are 0, since proposals are dependent.
     """
     poses = admitted(pool.scene, Hypotheses.from_poses(*pool.scene.enter(*proposals())), pool.problem.prior)
     return raster_search(pool.scene, poses, pool.scene.settings.proposed)
 
 
 def only_proposed(pool: Pool, proposals: Proposals) -> Iterator[Hypotheses]:
-    """Proposed poses and nothing else, but what is around them."""
+    """Yield proposed poses and local searches around them, and no other starts."""
     yield from _with_surroundings(pool, proposed(pool, proposals))
     while pool.alarms < 0 and pool.looks(pool.leaders()) < pool.scene.settings.schedule.looks:
         yield _look(pool)

@@ -1,5 +1,8 @@
-"""Poses from two unmatched point sets, without training: searched everywhere, turn after turn until one is certain, or
-from proposed poses; refined from given ones; and every loop of it compiled beforehand."""
+"""Search for poses from two unmatched point sets, without training.
+
+The functions search over all poses, search from proposed poses only, refine or score given poses, and compile the loops
+in advance.
+"""
 
 import time
 from collections.abc import Callable, Iterator
@@ -31,7 +34,7 @@ from bpnp.search.starts import Prior
 from bpnp.search.verdict import REFINED, SearchResult, judged, no_pose
 
 Progress = Callable[[int, float], None]  # batches so far, seconds
-WARMING = 8  # points of the problem that compiles the loops
+WARMING = 8  # number of points of the problem that compiles the loops
 
 
 @one_blas_thread
@@ -46,25 +49,35 @@ def search_poses(
     settings: SearchSettings = DEFAULT,
     progress: Progress | None = None,
 ) -> SearchResult:
-    """Every distinct pose (R, t) found that explains the bearings f_i by the points p_j, in no known order.
+    """Search for distinct poses (R, t) that explain the bearings f_i by the points p_j, in no known order.
 
     Maximises the likelihood of the bearings under the mixture
     p(f_i) = (1 - w)/n sum_j exp((f_i . g(R p_j + t) - 1)/s^2) / 2 pi s^2 + w/A, g(y) = y/|y|, over pose and scale s,
     A the solid angle of the view, by annealing s from starts over all rotations, or around `problem.prior`.
 
-    Few points (`bpnp.search.enumeration`) are enumerated first, and annealed only if that leaves a doubt.
+    Few points (`bpnp.search.enumeration`) are enumerated first, and annealed only if the result is not conclusive.
 
-    around: a guess from the same points, such as a network's pose: the first `Schedule.around` batches start there, and
-        that they end alike is no evidence. proposals: gives poses to start from, such as those that a network finds
-        likely, and no evidence either; asked where the search ends in doubt, without a prior of many points alone, and
-        where no pose exceeds chance. seed: of all that is random.
-    clutter: share of the points without a partner to expect, from 0 to below 1 (`SearchSettings.expecting`); None for
-        that of the settings, and several at the end.
-    deadline: after it no batch of starts begins, and one that has begun goes on with the poses it has; the result then
-        depends on the machine. progress: called after each batch, and with 0 after the enumeration of few points.
+    Args:
+        problem: Points with priors of the points and of the pose.
+        around: Guess of the pose from the same points, such as that of a network. The first `Schedule.around` batches
+            start there; their basin counts are 0, since they are dependent. None for no guess.
+        proposals: Function that returns poses to start from, such as the likeliest ones of a network; basin counts are
+            0. It is called only with too many points to enumerate, while the NFA of the best pose is not small enough.
+        clutter: Expected fraction of the points without a correspondence, from 0 to below 1
+            (`SearchSettings.expecting`). None for the fraction of the settings, and several at the end.
+        seed: Seed of all random numbers.
+        deadline: Time after which no batch begins. A running batch continues with the poses that it has. The result
+            then depends on the machine.
+        settings: Constants of the search.
+        progress: Callback with the number of batches and the seconds, after each batch. It gets 0 after the enumeration
+            of few points. None for no callback.
 
-    With fewer than 4 points of a side, or all bearings or all points on one line or in one place, there are no
-    candidates. Raises ValueError for `clutter` out of range.
+    Returns:
+        Distinct poses with the verdict. There are no candidates with fewer than 4 points of a side, or if all bearings
+        or all points coincide or lie on one line.
+
+    Raises:
+        ValueError: If `clutter` is out of range.
     """
     if clutter is not None:
         settings, problem = settings.expecting(clutter), replace(problem, clutter=clutter)
@@ -91,10 +104,10 @@ def search_poses(
         enumerated = against_rivals(
             enumerated, problem, entered, rule, looks=REFINED, exhaustive=exhaustive, contested=True
         )
-        if matches is not None and enumerated.log10_false_alarms > 0:  # their residuals may exceed its radius
+        if matches is not None and enumerated.log10_false_alarms > 0:  # residuals may exceed its match radius
             return _of_known_matches(problem, *matches, entered, seed, settings)
         tell(0)
-        # More search helps only where no pose exceeds chance yet, and there are enough points to anneal.
+        # More search helps only if no pose is significant yet, and there are enough points to anneal.
         small = min(len(problem.bearings), len(problem.points3d)) < settings.least_annealed
         settled = exhaustive or enumerated.log10_false_alarms <= 0
         if enumerated.verdict == "confident" or small or (settled and not many):
@@ -117,14 +130,14 @@ def _of_known_matches(
     seed: int,
     settings: SearchSettings,
 ) -> SearchResult:
-    """Judge the poses that known matches, indices (k,) of image points and of scene points, fit best."""
+    """Compute the verdict on the poses that known matches, indices (k,) of image and of scene points, fit best."""
     found, rule = poses_of_matches(problem, i, j, seed), settings.evidence
     result = judged(found, problem, batches=0, exhaustive=True, rule=rule)
     return against_rivals(result, problem, entered, rule, exhaustive=True)
 
 
 def lacks_partners(scene: Scene) -> bool:
-    """Whether the points with a label of the other side are too few, or all on one line."""
+    """Return True if the points whose label occurs on the other side are too few or all on one line."""
     lacking = (side for side in (scene.image, scene.seen) if not side.weights.all())
     return any(degenerate(side.points[side.weights > 0].astype(np.float64)) for side in lacking)
 
@@ -132,7 +145,7 @@ def lacks_partners(scene: Scene) -> bool:
 def _until_certain(
     pool: Pool, turns: Iterator[Hypotheses], tell: Callable[[int], None] = lambda turns: None
 ) -> SearchResult:
-    """Turn after turn until the verdict is settled or the budget is spent."""
+    """Run iterations until the verdict is settled or the budget is spent."""
     settings, finished = pool.scene.settings, 0.0
     thinned = len(pool.problem.bearings) > settings.fine.bearings
     while pool.turns < settings.schedule.turns and not pool.scene.deadline.passed():
@@ -142,7 +155,7 @@ def _until_certain(
         pool.turns += 1
         pool.merge(found)
         tell(pool.turns)
-        bettered = thinned and pool.alarms < finished - settings.evidence.lead  # on all points more of them match
+        bettered = thinned and pool.alarms < finished - settings.evidence.lead  # more points match if all are used
         if bettered or pool.missed <= settings.evidence.missed:
             finished, result = min(finished, pool.alarms), pool.result(1)
             if result.verdict == "confident" or result.settled:
@@ -160,9 +173,20 @@ def search_proposed(
     deadline: Deadline = NEVER,
     settings: SearchSettings = DEFAULT,
 ) -> SearchResult:
-    """The pose of many points that starts at proposed poses alone, such as those that a network finds likely, lead to.
+    """Search with many points from proposed poses alone, such as the likeliest ones of a network.
 
-    What `search_poses` does with proposals, without its own starts; the arguments are the same ones.
+    The method is that of `search_poses` with proposals, without its own starts.
+
+    Args:
+        problem: Points with priors of the points and of the pose.
+        proposals: Function that returns poses to start from.
+        clutter: Expected fraction of the points without a correspondence; None for that of the settings.
+        seed: Seed of all random numbers.
+        deadline: Time after which no new search begins.
+        settings: Constants of the search.
+
+    Returns:
+        Distinct poses with the verdict.
     """
     if degenerate(problem.bearings) or degenerate(problem.points3d):
         return no_pose("no pose fits: too few points, or all on one line")
@@ -174,15 +198,20 @@ def search_proposed(
 
 @one_blas_thread
 def refine_poses(problem: Problem, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> SearchResult:
-    """The likeliest poses that annealing reaches from given ones and from poses around them.
+    """Refine given poses by annealing, with perturbed copies of the first few.
 
-    The objective is that of `search_poses`. A start may be some 10 degrees off, and more where there are many: those
-    beyond `refined_directly` are first annealed on clusters, as the search does, and the likeliest go on.
+    The objective is that of `search_poses`. An initial pose may be about 10 degrees off, and more if there are many. If
+    there are more than `refined_directly`, all are first annealed on clusters, as in the search, and the likeliest go
+    on.
 
-    rotation (s, 3, 3), translation (s, 3): the starts; those with NaN are missing.
+    Args:
+        problem: Points with priors of the points and of the pose.
+        rotation: (s, 3, 3) initial rotations; NaN for a missing one.
+        translation: (s, 3) initial translations.
 
-    `batches` of the result is the number of starts that were annealed. Without a start, or with points that fix no
-    pose, there are no candidates.
+    Returns:
+        Distinct poses with the verdict. `batches` is the number of initial poses that were annealed. There are no
+        candidates without an initial pose, or with points that fix no pose.
     """
     settings, scene = DEFAULT, Scene(problem, 0, DEFAULT)
     starts = _entered(scene, rotation, translation)
@@ -195,7 +224,7 @@ def refine_poses(problem: Problem, rotation: NDArray[np.float64], translation: N
     first_scale = settings.middle[-1].last_scale * scene.spread
     clustered = anneal_on_clusters(scene, around, settings.middle, settings.starts)
     clustered = anneal_on_points(scene, clustered, first_scale)
-    # A start that is right already needs no clusters, which would only shake it.
+    # A correct initial pose needs no clusters, which would only perturb it.
     direct = anneal_on_points(scene, starts, first_scale)
     poses = finish(scene, merge_hypotheses([clustered, direct], scene))
     annealed = crowd + len(around) - len(starts)
@@ -206,10 +235,16 @@ def refine_poses(problem: Problem, rotation: NDArray[np.float64], translation: N
 def score_poses(
     problem: Problem, rotation: NDArray[np.float64], translation: NDArray[np.float64], deadline: Deadline
 ) -> SearchResult:
-    """Poses (c, 3, 3), (c, 3) annealed a little and scored as those of a search; NaN for a missing one.
+    """Anneal poses a little and score them like those of a search.
 
-    Their residuals are taken to be the median distance of a point to the nearest bearing. Their basin counts are 0,
-    since no other starts were tried: only overwhelming evidence makes the best of them certain.
+    The residuals are assumed to have the median distance of a point to the nearest bearing. Basin counts are 0, since
+    no other starts were tried: only overwhelming evidence makes the best pose confident.
+
+    Args:
+        problem: Points with priors of the points and of the pose.
+        rotation: (c, 3, 3) rotations; NaN for a missing one.
+        translation: (c, 3) translations.
+        deadline: Time after which the remaining poses are not annealed.
     """
     scene = Scene(problem, 0, DEFAULT, deadline)
     starts = _entered(scene, rotation, translation)
@@ -224,16 +259,16 @@ def score_poses(
 
 
 def _entered(scene: Scene, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Hypotheses:
-    """Return the poses of a problem that are not missing, in the frame of a scene."""
+    """Return the poses of a problem that are not NaN, in the frame of a scene."""
     known = np.isfinite(rotation).all((-2, -1)) & np.isfinite(translation).all(-1)
     return Hypotheses.from_poses(*scene.enter(rotation[known], translation[known]))
 
 
 @one_blas_thread
 def warm_up() -> None:
-    """Compile the loops of the search, for some seconds; at once where they were compiled before.
+    """Compile the loops of the search; this takes some seconds, or none if they were compiled before.
 
-    A tracker calls it before its first frame: what is kept on disk still has to be read, at the first call of each.
+    A tracker calls it before its first frame, since loops cached on disk are still loaded at their first call.
     """
     points = np.random.default_rng(0).uniform(-1, 1, (WARMING, 3))
     rays = points + (0, 0, 6)

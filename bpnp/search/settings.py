@@ -270,7 +270,7 @@ class SearchSettings:
     fine: FineStage = FineStage()
     near: tuple[RasterSearch, ...] = tuple(
         RasterSearch(screens=Screens((100, 1000)), narrowing=Narrowing(first, points=600), annealed=12)
-        for first in (0.06, 0.03)  # the finer one for dense keypoints of which few are visible
+        for first in (0.06, 0.03)  # the finer one for dense keypoints and few visible points
     )
     beside: RasterSearch = RasterSearch(
         Draws(2**13, 10.0, 0.1, 2**13),

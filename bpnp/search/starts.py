@@ -1,4 +1,4 @@
-"""Where a search starts: poses spread over all rotations, or around what is known of the camera."""
+"""Initial poses of a search: spread over all rotations, or drawn from a prior."""
 
 import math
 from typing import NamedTuple
@@ -10,15 +10,18 @@ from scipy.spatial.transform import Rotation
 from bpnp.search.settings import Recipe
 
 Array = NDArray[np.float32]
-ALL_AROUND = 0.95  # spread of bearings above which they fill some 220 degrees or more
-AIM_STEP = 0.16  # spreads of the bearings; a spiral of places with radii of so much times sqrt(k) leaves no gaps
+ALL_AROUND = 0.95  # RMS angular radius above which bearings fill about 220 degrees or more
+AIM_STEP = 0.16  # RMS angular radii; a spiral of positions with radii AIM_STEP * sqrt(k) leaves no gaps
 
 
 class PosePrior(NamedTuple):
-    """A rough pose, camera = R p + t, and one standard deviation of its errors.
+    """Rough pose, camera = R p + t, with one standard deviation of its errors.
 
-    rotation: (3, 3). translation: (3,) in scene units, or None where only the rotation is known.
-    rotation_sigma_deg: degrees about each axis. translation_sigma: scene units along each axis.
+    Attributes:
+        rotation: (3, 3).
+        translation: (3,) in scene units; None if only the rotation is given.
+        rotation_sigma_deg: Standard deviation about each axis, degrees.
+        translation_sigma: Standard deviation along each axis, scene units; infinite by default.
 
     >>> PosePrior(np.eye(3), np.array([0, 0, 6]), rotation_sigma_deg=5.0, translation_sigma=0.5).rotation_sigma_deg
     5.0
@@ -31,7 +34,12 @@ class PosePrior(NamedTuple):
 
 
 class GravityPrior(NamedTuple):
-    """The direction up, (3,) in camera and in scene coordinates, of any length; sigma_deg: its standard deviation.
+    """Direction of the vertical, with its standard deviation.
+
+    Attributes:
+        up_camera: (3,) direction in camera coordinates, of any length.
+        up_scene: (3,) direction in scene coordinates, of any length.
+        sigma_deg: Standard deviation of the angle between them, degrees; 2 by default.
 
     >>> GravityPrior(up_camera=np.array([0, -1, 0]), up_scene=np.array([0, 0, 1])).sigma_deg
     2.0
@@ -46,7 +54,10 @@ Prior = PosePrior | GravityPrior
 
 
 def super_fibonacci(count: int) -> NDArray[np.float64]:
-    """Rotations (count, 3, 3) spread evenly over SO(3): super-Fibonacci spirals (Alexa, CVPR 2022, Algorithm 1)."""
+    """Return rotations (count, 3, 3) spread evenly over SO(3).
+
+    Source: super-Fibonacci spirals (Alexa, CVPR 2022, Algorithm 1).
+    """
     s = np.arange(count) + 0.5
     inner, outer = np.sqrt(s / count), np.sqrt(1 - s / count)
     alpha, beta = 2 * math.pi * s / math.sqrt(2), 2 * math.pi * s / 1.533751168755204288118041
@@ -55,7 +66,16 @@ def super_fibonacci(count: int) -> NDArray[np.float64]:
 
 
 def draw_rotations(count: int, prior: Prior | None, rng: np.random.Generator) -> NDArray[np.float64]:
-    """An even set over SO(3), turned at random, or rotations drawn from the prior (the first one its mean)."""
+    """Draw rotations from a prior, or spread them evenly over SO(3) from a random rotation.
+
+    Args:
+        count: Number of rotations.
+        prior: Prior; the first rotation is its mean. None for all of SO(3).
+        rng: Generator.
+
+    Returns:
+        (count, 3, 3) rotations.
+    """
     if prior is None:
         return super_fibonacci(count) @ Rotation.from_quat(rng.standard_normal(4)).as_matrix()
     if isinstance(prior, PosePrior):
@@ -81,11 +101,23 @@ def draw_poses(
     rng: np.random.Generator,
     aim: NDArray[np.float64] | None = None,
 ) -> tuple[Array, Array]:
-    """Rotations (count, 3, 3) and translations (count, 3) to start from, for a camera that looks along (0, 0, 1).
+    """Draw initial poses for a camera that looks along (0, 0, 1).
 
-    The weak-perspective translation puts a point of the scene on this axis, at the distance at which the points' extent
-    across it is seen under the angle `spread`, that of the bearings; or, with `aim` (2,), within `AIM_STEP` of this
-    place beside it, in spreads.
+    The weak-perspective translation puts a scene point on this axis. At its depth, the extent of the points across the
+    axis is seen under the angle `spread`.
+
+    Args:
+        spread: RMS angular radius of the bearings.
+        points3d: (n, 3) scene points.
+        count: Number of poses.
+        recipe: Sampling of the point and of the depth.
+        prior: Prior of the rotation; None for all rotations.
+        rng: Generator.
+        aim: (2,) position in the view, in units of `spread`; the scene point is seen within `AIM_STEP` of it. None for
+            the axis.
+
+    Returns:
+        Rotations (count, 3, 3) and translations (count, 3), float32.
     """
     rotation = draw_rotations(count, prior, rng)
     middle = points3d.mean(0)
@@ -108,8 +140,13 @@ def draw_poses(
 
 
 def aim_of(number: int) -> NDArray[np.float64]:
-    """Where in the view, (2,) in spreads from its middle, a search aims: every other one at the middle, the others on a
-    spiral that covers the view evenly, begun anew after 4, 16, 64, 64 ... places.
+    """Return the position (2,) in the view at which a search aims, in RMS angular radii from its centre.
+
+    Even searches aim at the centre. Odd ones follow a spiral that covers the view evenly and restarts after 4, 16, 64,
+    64, ... positions.
+
+    Args:
+        number: Index of the search, from 0.
 
     >>> aim_of(0), aim_of(1)
     (array([0., 0.]), array([0.16, 0.  ]))
@@ -122,7 +159,7 @@ def aim_of(number: int) -> NDArray[np.float64]:
 
 
 def turned_to(axis: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A rotation (3, 3) that turns `axis` to (0, 0, 1); none if there is no axis, for bearings all around."""
+    """Return a rotation (3, 3) that maps `axis` to (0, 0, 1); the identity if `axis` is almost 0."""
     length = float(np.linalg.norm(axis))
     if length < 1e-6:
         return np.eye(3)

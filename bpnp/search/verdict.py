@@ -3,11 +3,11 @@
 The criterion is the number of false alarms (NFA, `bpnp.search.evidence.false_alarms`): the expected number of poses
 that fit as well if image and scene are unrelated.
 
-- "confident": The NFA is below `Evidence.false_alarms`. The margin to every competing pose is at least `Evidence.lead`
-  decades. The probability that the search missed a better optimum (`bpnp.search.evidence.alternatives`) is below
-  `Evidence.missed`.
-- "ambiguous": The best pose is significant, but one of the three conditions does not hold, or the points do not fix
-  the rotation or the focal length.
+- "confident": log10 NFA is at most `Evidence.false_alarms`. The margin to every competing pose is at least
+  `Evidence.lead` decades. log10 of the probability that the search missed a better optimum is at most
+  `Evidence.missed` (`bpnp.search.evidence.alternatives`).
+- "ambiguous": The best pose is significant, but one of the three conditions does not hold. Points that do not fix the
+  rotation or the focal length give this verdict too.
 - "failed": No pose was found, or none is significant.
 """
 
@@ -143,7 +143,7 @@ def missed(
     if value > rule.missed or not is_symmetric(candidates, problem, rule):
         return value
     basin_count, share = starts_met(candidates, problem, rule, symmetric=True), 0.0
-    if problem.prior is not None:  # a better pose elsewhere is as unlikely as the prior makes it
+    if problem.prior is not None:  # the prior reduces the probability of a better pose elsewhere
         share = problem.log10_share(candidates.rotation[0], candidates.translation[0])
     return min(log10_missed(basin_count, 0.0, looks, rule, symmetric=True) + share, 0.0)
 
