@@ -1,4 +1,4 @@
-"""Hypotheses, each a minimal problem: solved, checked on the points beside it, refined on its matches, kept, varied."""
+"""Hypotheses: solve a minimal problem, preverify it on nearby points, refine it on its matches, and keep the pose."""
 
 import math
 from typing import Any, NamedTuple
@@ -11,11 +11,20 @@ from bpnp.search.propose.minimal_solvers import Triangles, chords_between, compi
 
 
 class Block(NamedTuple):
-    """Image sets (t, 3) against triangles of the scene, each in every order; where two matches fix a pose, the last
-    place of either is the one before it again. Image sets below `old_image` meet triangles from `old_scene` on alone.
+    """Image sets paired with scene triangles, each in every order.
 
-    size: matches that fix a pose, 3 or 2. orders: (6, 3) or (2, 3) of a set. witnesses: (n, w) near points, of which
-    `need` must be matched within `reach` radii for a pose to be looked at further.
+    Sets below `old_image` are paired only with triangles from `old_scene` on: the other pairs were tried before.
+
+    Attributes:
+        size: Matches that fix a pose, 3 or 2.
+        sets: (t, 3) image points; with size 2 the last index repeats the second.
+        orders: (6, 3) or (2, 3) orders of a set.
+        triangles: Triangles of the scene; with size 2 the last point repeats the second.
+        old_image: Number of sets of an earlier block.
+        old_scene: Number of triangles of an earlier block.
+        witnesses: (n, w) preverification points near each scene point.
+        need: Preverification points that must be matched.
+        reach: Radius of their matches, in match radii.
     """
 
     size: int
@@ -33,7 +42,10 @@ class Block(NamedTuple):
 def explore(
     row: int, first: int, budget: int, stop: float, reach: float, block: Any, problem: Any, kept: Any, work: Any
 ) -> Any:
-    """`sweep` with a budget, and without one `settle` the first pose in `work`: what both call is compiled once."""
+    """Call `sweep`, or `settle` the first pose in `work` if the budget is 0.
+
+    One entry point for both, so that their common code is compiled once.
+    """
     if budget > 0:
         return sweep(row, first, budget, stop, block, problem, kept, work)
     kept.at[0] = -1
@@ -43,10 +55,22 @@ def explore(
 
 @part
 def sweep(row: int, first: int, budget: int, stop: float, block: Any, problem: Any, kept: Any, work: Any) -> Any:
-    """Solve up to `budget` hypotheses from row `row` on, one of an image set in one order, there from triangle `first`.
+    """Solve up to `budget` hypotheses, and keep the refined poses.
 
-    Ends after an image set too when the best pose's evidence is `stop` nats. Returns the next row, the next triangle of
-    it, and the number of hypotheses that were solved.
+    A row is an image set in one order. The sweep also ends after an image set once the best evidence reaches `stop`.
+
+    Args:
+        row: First row.
+        first: First triangle of this row.
+        budget: Largest number of hypotheses.
+        stop: Evidence that ends the sweep, nats.
+        block: A `Block`.
+        problem: `EnumerationTables`.
+        kept: A `Kept`, updated.
+        work: A `Work`, overwritten.
+
+    Returns:
+        The next row, its next triangle, and the number of hypotheses solved.
     """
     triangles, orders, rays, best, poses = block.triangles, block.orders, problem.image.rays, kept.best, work.poses
     labels2d, labels3d, normals = problem.image.grid.labels, problem.scene.labels, problem.scene.normals
@@ -99,13 +123,13 @@ def sweep(row: int, first: int, budget: int, stop: float, block: Any, problem: A
 
 @part
 def _determinant(f: Any, g: Any, h: Any) -> float:
-    """Positive where three rays turn right-handed."""
+    """Return the triple product of three rays, positive if they are right-handed."""
     return f[0] * (g[1] * h[2] - g[2] * h[1]) + f[1] * (g[2] * h[0] - g[0] * h[2]) + f[2] * (g[0] * h[1] - g[1] * h[0])
 
 
 @part
 def facing(pose: Any, normals: Any, a: int, rays: Any, i: int) -> bool:
-    """Whether point a faces the camera that sees it along ray i."""
+    """Return whether point a faces the camera along ray i; always True without normals."""
     if not len(normals):
         return True
     x, y, z = rotated(pose, normals[a, 0], normals[a, 1], normals[a, 2])
@@ -114,8 +138,17 @@ def facing(pose: Any, normals: Any, a: int, rays: Any, i: int) -> bool:
 
 @part
 def witnessed(pose: Any, points: Any, seen: Any, block: Any, problem: Any) -> bool:
-    """Whether enough of the points near the first of a hypothesis, other than its own, are seen near image points other
-    than its own."""
+    """Return whether enough preverification points near the first point are seen near image points.
+
+    The points of the hypothesis and its own image points do not count.
+
+    Args:
+        pose: (4, 3).
+        points: Three indices of scene points.
+        seen: Three indices of image points.
+        block: A `Block`.
+        problem: `EnumerationTables`.
+    """
     witnesses, need, reach, scene, grid = block.witnesses, block.need, block.reach, problem.scene, problem.image.grid
     hits, left = 0, witnesses.shape[1]
     for w in range(witnesses.shape[1]):
@@ -137,12 +170,20 @@ def witnessed(pose: Any, points: Any, seen: Any, block: Any, problem: Any) -> bo
 
 
 class Kept(NamedTuple):
-    """Distinct poses (c, 4, 3), their evidence (c,), numbers of matches (c,), matches (c, m) and squared distances
-    (c, m).
+    """Distinct poses of the enumeration, with their matches.
 
-    best: (1,) the index of the best. most: (1,) matches that any hypothesis of the stage had. basin_count: (c,) the
-    number of image sets of which a hypothesis ended at the pose. last: (c,) the image set that was counted last, at:
-    (1,) the one that is tried, -1 for a pose that does not come from one."""
+    Attributes:
+        poses: (c, 4, 3).
+        evidence: (c,) nats; -inf for an empty slot.
+        counts: (c,) numbers of matches.
+        point: (c, m) scene point of each image point, or -1.
+        distance2: (c, m) squared distances, in radii.
+        best: (1,) index of the best pose.
+        most: (1,) largest number of matches of a hypothesis in this stage, less those that it lacks.
+        basin_count: (c,) number of image sets with a hypothesis that ended at the pose.
+        last: (c,) image set that was counted last.
+        at: (1,) current image set; -1 for a pose from elsewhere.
+    """
 
     poses: Array
     evidence: Array
@@ -157,7 +198,7 @@ class Kept(NamedTuple):
 
 
 class Work(NamedTuple):
-    """What the loops overwrite: poses (4, 4, 3) of a hypothesis, matches of the pose at hand, equations (8, 6)."""
+    """Buffers of the loops: poses (4, 4, 3) of a hypothesis, matches of the current pose, equations (8, 6)."""
 
     poses: Array
     matches: Matches
@@ -166,14 +207,14 @@ class Work(NamedTuple):
 
 @part
 def copy(values: Any, to: Any) -> None:
-    """Element by element: numba compiles an assignment of arrays for more than a second."""
+    """Copy element by element: numba compiles an assignment of arrays for more than a second."""
     for k in range(len(values)):
         to[k] = values[k]
 
 
 @part
 def consider(pose: Any, reach: float, problem: Any, kept: Any, work: Any) -> None:
-    """Refine a pose that matches about as many points as any hypothesis did at this reach."""
+    """Refine a pose with about as many matches as the best hypothesis of the stage."""
     count, _, expected = match(pose, reach, problem.scene, problem.image.grid, work.matches)
     value = count - RULES.lacking * (expected - count if expected > count else 0)
     kept.most[0] = max(kept.most[0], value)
@@ -183,8 +224,18 @@ def consider(pose: Any, reach: float, problem: Any, kept: Any, work: Any) -> Non
 
 @part
 def settle(pose: Any, reach: float, problem: Any, kept: Any, work: Any) -> None:
-    """Refine a pose, in place, on matches within a radius that shrinks from `reach` to 1, and keep it; then within the
-    radius that exceeds chance most, and keep that too. reach: 0 if it is refined already."""
+    """Refine a pose in place and keep it, at radius 1 and then at its most significant radius.
+
+    The matches are those within a radius that shrinks from `reach` to 1. If the evidence is largest at a smaller
+    radius, the pose is refined there too, and also kept.
+
+    Args:
+        pose: (4, 3), overwritten.
+        reach: First radius, in match radii; 0 if the pose is refined already.
+        problem: `EnumerationTables`.
+        kept: A `Kept`, updated.
+        work: A `Work`, overwritten.
+    """
     last = 1.0
     for _ in range(2):
         if reach > 0 and not tightened(pose, reach, last, problem, work.matches, work.system):
@@ -201,7 +252,13 @@ def settle(pose: Any, reach: float, problem: Any, kept: Any, work: Any) -> None:
 
 @part
 def tightened(pose: Any, reach: float, last: float, problem: Any, matches: Any, system: Any) -> bool:
-    """Gauss-Newton steps, in place, on matches within a radius that shrinks from `reach` to `last`, and two at it."""
+    """Refine a pose in place by Gauss-Newton steps on matches within a shrinking radius.
+
+    The radius shrinks from `reach` to `last`, in match radii; `RULES.final` steps follow there.
+
+    Returns:
+        False for too few matches, a singular step, or a pose that the prior excludes.
+    """
     left, known = RULES.final, len(problem.prior.in_scene)
     while left > 0:
         count, _, _ = match(pose, reach, problem.scene, problem.image.grid, matches)
@@ -216,7 +273,7 @@ def tightened(pose: Any, reach: float, last: float, problem: Any, matches: Any, 
 
 @part
 def allowed(pose: Any, prior: Any) -> bool:
-    """Whether the pose agrees with what is known of its translation and of directions."""
+    """Return whether a pose agrees with the prior translation and directions."""
     in_scene, in_camera, shift2 = prior.in_scene, prior.in_camera, 0.0
     for k in range(3):
         shift2 += (pose[3, k] - prior.translation[k]) ** 2
@@ -232,7 +289,7 @@ def allowed(pose: Any, prior: Any) -> bool:
 
 @part
 def keep(pose: Any, value: float, count: int, matches: Any, kept: Any) -> None:
-    """Put a pose among the kept ones: in the place of the same pose, of an empty one, or of the worst."""
+    """Store a pose in the slot of the same pose, of an empty one, or of the worst; count its basin."""
     values, best, place, is_new = kept.evidence, kept.best, -1, False
     for c in range(len(values)):
         if values[c] > -math.inf and _same(pose, kept.poses[c]):
@@ -265,7 +322,8 @@ def keep(pose: Any, value: float, count: int, matches: Any, kept: Any) -> None:
 
 @part
 def _same(pose: Any, other: Any) -> bool:
-    shift2 = depth2 = trace = 0.0  # trace of the turn between them: 1 + 2 cos
+    """Return whether two poses (4, 3) are the same within the tolerances of `Rules`."""
+    shift2 = depth2 = trace = 0.0  # trace of the rotation between them: 1 + 2 cos
     for k in range(3):
         shift2 += (pose[3, k] - other[3, k]) ** 2
         depth2 += other[3, k] ** 2

@@ -1,7 +1,7 @@
 """One-to-one matches of few points under a pose, their evidence, and a step of the pose on them: all compiled.
 
-Poses are (4, 3): R, and t below it. A function takes the records it reads and no others: each field is an argument of
-the compiled code, and costs time to compile.
+Poses are (4, 3): R, and t below it. Functions take only the records that they read: each field is an argument of the
+compiled code and costs time to compile.
 """
 
 import math
@@ -17,8 +17,16 @@ from bpnp.search.propose.minimal_solvers import part
 
 
 class EnumerationTables(NamedTuple):
-    """What the compiled loops read. heading: where two matches fix a pose. fixing: matches that fix a pose, which its
-    freedom takes up. density: chance that one scene point lies within one radius of an image point that is anywhere."""
+    """Inputs of the compiled loops.
+
+    Attributes:
+        scene: Scene points.
+        image: Image points.
+        prior: Prior directions and translation.
+        heading: Input of P2P, where two matches fix a pose.
+        fixing: Number of matches that fix a pose; they are no evidence for it.
+        density: Probability that a scene point, seen anywhere, is within one radius of a given image point.
+    """
 
     scene: SceneArrays
     image: ImageArrays
@@ -29,7 +37,12 @@ class EnumerationTables(NamedTuple):
 
 
 class Matches(NamedTuple):
-    """point: (m,) each image point's scene point or -1. distance2: (m,) squared, in radii."""
+    """One-to-one matches of the image points.
+
+    Attributes:
+        point: (m,) scene point of each image point, or -1.
+        distance2: (m,) squared residuals, in match radii.
+    """
 
     point: Places
     distance2: Array
@@ -37,7 +50,11 @@ class Matches(NamedTuple):
 
 @part
 def sight(pose: Any, scene: Any, j: int) -> tuple[float, float, float]:
-    """Where point j is seen on the plane, and the cosine of its normal to the line of sight (1 without normals)."""
+    """Project point j to stereographic coordinates.
+
+    Returns:
+        Both coordinates, and the cosine between the normal and the line of sight; 1 without normals.
+    """
     points, normals = scene.points, scene.normals
     x, y, z = rotated(pose, points[j, 0], points[j, 1], points[j, 2])
     cx, cy, cz = x + pose[3, 0], y + pose[3, 1], z + pose[3, 2]
@@ -52,19 +69,23 @@ def sight(pose: Any, scene: Any, j: int) -> tuple[float, float, float]:
 
 @part
 def fits(label: int, other: int) -> bool:
+    """Return whether two labels are compatible; -1 fits any."""
     return label < 0 or other < 0 or label == other
 
 
 @part
 def cell_of(u: float, v: float, grid: Any) -> Any:
-    """The cell of the grid with (u, v), -1 outside."""
+    """Return the cell of the grid that contains (u, v), or -1 outside."""
     a, b = (u - grid.low_u) * grid.per_cell, (v - grid.low_v) * grid.per_cell
     return np.int64(a) * RULES.cells + np.int64(b) if a >= 0 and b >= 0 and a < RULES.cells and b < RULES.cells else -1
 
 
 @part
 def nearest(u: float, v: float, cell: int, label: int, reach2: float, grid: Any) -> tuple[int, float]:
-    """The image point nearest to (u, v) whose label fits, -1 for none within the root of reach2, and squared radii."""
+    """Return the nearest image point with a fitting label, and its squared distance in radii.
+
+    The index is -1 if there is none within the square root of `reach2`.
+    """
     flat, gain, place = grid.flat, grid.gain, -1
     if cell >= 0:
         for item in range(grid.starts[cell], grid.starts[cell + 1]):
@@ -78,9 +99,20 @@ def nearest(u: float, v: float, cell: int, label: int, reach2: float, grid: Any)
 
 @part
 def match(pose: Any, reach: float, scene: Any, grid: Any, matches: Any) -> tuple[int, int, int]:
-    """Fill `matches` with each image point's nearest scene point among those that have it as their nearest, within
-    `reach` radii. Returns how many there are, the points that can be seen among the image points, and those expected
-    to be seen."""
+    """Match image and scene points one-to-one within a radius.
+
+    A scene point proposes its nearest image point, and an image point accepts the nearest proposal.
+
+    Args:
+        pose: (4, 3).
+        reach: Radius, in match radii.
+        scene: `SceneArrays`.
+        grid: Grid of the image points.
+        matches: A `Matches`, overwritten.
+
+    Returns:
+        The numbers of matches, of scene points that fall in the grid, and of scene points expected to be seen.
+    """
     for i in range(len(matches.point)):
         matches.point[i], matches.distance2[i] = -1, reach * reach
     visible = expected = count = 0
@@ -100,8 +132,22 @@ def match(pose: Any, reach: float, scene: Any, grid: Any, matches: Any) -> tuple
 
 @part
 def evidence(count: int, visible: int, expected: int, matches: Any, fixing: int, density: float) -> tuple[float, float]:
-    """Nats by which the matches exceed chance, less those of expected points that are missing; and the radius, of the
-    ladder, at which they do: -log of C(m - f, k - f) p^(k - f), p the chance of one match, f those that fix a pose."""
+    """Return the largest evidence of the matches at the radii 1, 1/2, 1/4 ..., and its radius.
+
+    The evidence is -log of C(m - f, k - f) p^(k - f), with p the probability of a chance match and f = `fixing`. Each
+    expected but missing point reduces it.
+
+    Args:
+        count: Number of matches.
+        visible: Number of scene points that fall in the grid.
+        expected: Number of scene points expected to be seen.
+        matches: Matches within one radius.
+        fixing: Number of matches that fix a pose.
+        density: As in `EnumerationTables`.
+
+    Returns:
+        Evidence in nats, and the radius in match radii.
+    """
     best, radius, radius2 = -math.inf, 1.0, 1.0
     for _ in range(RULES.ladder):
         k = 0
@@ -117,13 +163,26 @@ def evidence(count: int, visible: int, expected: int, matches: Any, fixing: int,
 
 @part
 def _log_choose(n: int, k: int) -> float:
+    """Return log C(n, k), or 0 where it is not defined."""
     return math.lgamma(n + 1.0) - math.lgamma(k + 1.0) - math.lgamma(n - k + 1.0) if 0 <= k <= n else 0.0
 
 
 @part
 def step(pose: Any, matched: Any, problem: Any, system: Any) -> bool:
-    """One Gauss-Newton step, in place, on sum_i w_i^2 |f_i - g(R p + t)|^2 over the matches (m,) and what is known of
-    directions; False if it has none. g(y) = y/|y|, w_i one over a radius. The step is y -> y + w x Rp + s."""
+    """Take one Gauss-Newton step of a pose, in place, on its matches and the prior directions.
+
+    The cost is sum_i w_i^2 |f_i - g(R p + t)|^2 with g(y) = y/|y| and w_i one over a radius. The step (w, s) moves
+    y = R p + t by w x Rp + s.
+
+    Args:
+        pose: (4, 3), overwritten.
+        matched: (m,) scene point of each image point, or -1.
+        problem: `EnumerationTables`.
+        system: (8, 6), overwritten.
+
+    Returns:
+        False if the equations have no solution.
+    """
     rays, per_radian, points = problem.image.rays, problem.image.per_radian, problem.scene.points
     in_scene, in_camera, weight = problem.prior.in_scene, problem.prior.in_camera, problem.prior.weight
     for a in range(7):

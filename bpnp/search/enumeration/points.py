@@ -1,5 +1,4 @@
-"""What the compiled loops read of one problem: scene points with tables of their triangles, image points in a grid, and
-what a prior says in their frames."""
+"""Inputs of the compiled loops: scene points with their triangles, image points in a grid, and the prior."""
 
 import functools
 import math
@@ -16,16 +15,21 @@ from bpnp.search.starts import GravityPrior, PosePrior, Prior, turned_to
 
 Array = NDArray[np.float64]
 Places = NDArray[np.int64]
-DENSE = 64  # points up to which all are ranked; beyond, only the nearest of each
+DENSE = 64  # points up to which all neighbours are ranked; beyond, only the nearest of each
 OPPOSITE = -0.8  # cosine of two normals that no camera faces at once
-SCENES = 8  # whose tables are remembered
+SCENES = 8  # scenes whose tables stay in the cache
 SLACK = math.cos(math.radians(95.0))  # the lines of sight to three points are not quite parallel
 EDGE_ON = 0.15  # sine of an angle to the triangle's plane, below which either orientation is possible
 
 
 class SceneArrays(NamedTuple):
-    """points: (n, 3) in unit size. normals: (n, 3), (0, 3) if every point can be seen.
-    labels: (n,), -1 fits any."""
+    """Scene points as arrays.
+
+    Attributes:
+        points: (n, 3) in unit size.
+        normals: (n, 3); (0, 3) if every point can be seen.
+        labels: (n,); -1 fits any label.
+    """
 
     points: Array
     normals: Array
@@ -33,11 +37,17 @@ class SceneArrays(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """Image points in the cells of a grid, each in all that lie within reach of it.
+    """Image points in the cells of a grid, each in all cells within its reach.
 
-    flat: (m, 2) coordinates, gain: (m,), of `ImageArrays`. labels: (m,), -1 fits any. low_u, low_v: the lower corner.
-    per_cell: cells a unit. starts: where the items of a cell begin (cells^2 + 1,), those along the second coordinate
-    next to each other. items: image points.
+    Attributes:
+        flat: (m, 2) stereographic coordinates.
+        gain: (m,) radii a unit of the coordinates (`ImageArrays`).
+        labels: (m,); -1 fits any label.
+        low_u: First coordinate of the lower corner.
+        low_v: Second coordinate of the lower corner.
+        per_cell: Cells a unit of the coordinates.
+        starts: (cells^2 + 1,) index in `items` of the first item of each cell; the second coordinate varies fastest.
+        items: Indices of image points.
     """
 
     flat: Array
@@ -53,9 +63,13 @@ class Grid(NamedTuple):
 class ImageArrays(NamedTuple):
     """Bearings in a frame whose z axis is their mean, and in stereographic coordinates (x, y) / (|p| + z) about it.
 
-    A difference s of coordinates is an angle of s (1 + cos theta), theta from the axis: `gain` turns differences near
-    an image point into units of its radius.
-    rays: (m, 3) unit vectors. per_radian: radii a radian.
+    A difference s of coordinates is an angle of s (1 + cos theta), theta from the axis. `Grid.gain` converts
+    differences near an image point to match radii.
+
+    Attributes:
+        rays: (m, 3) unit vectors.
+        per_radian: Match radii a radian.
+        grid: Grid of the coordinates.
     """
 
     rays: Array
@@ -64,10 +78,15 @@ class ImageArrays(NamedTuple):
 
 
 class PriorArrays(NamedTuple):
-    """What is known of the pose, in the frames of the points.
+    """Prior of the pose, in the frames of the points.
 
-    in_scene, in_camera: (k, 3) directions a and b = R a. weight: of R a - b. farthest2: its largest square.
-    translation: (3,). farthest_shift2: largest squared distance from it.
+    Attributes:
+        in_scene: (k, 3) directions a.
+        in_camera: (k, 3) directions b = R a.
+        weight: Weight of R a - b, in match radii.
+        farthest2: Largest square of R a - b.
+        translation: (3,).
+        farthest_shift2: Largest squared distance from it; infinite without a prior translation.
     """
 
     in_scene: Array
@@ -79,9 +98,14 @@ class PriorArrays(NamedTuple):
 
 
 class Heading(NamedTuple):
-    """What P2P reads of a prior. rays, points: (m, 3) and (n, 3) in frames whose z axis is the known direction, empty
-    if there is none. turns: (3, 3, 3), R is the first one, and the others times the cosine and sine of the angle about
-    this direction; where the rotation is known, at no angle. sine2: squared, of the largest turn from it, or 1.
+    """Points and rotations for P2P, in frames whose z axis is the prior direction.
+
+    Attributes:
+        rays: (m, 3); empty without a prior.
+        points: (n, 3); empty without a prior.
+        turns: (3, 3, 3) terms of R: the first plus the others times cosine and sine of the angle about the direction.
+            With a prior rotation this angle is 0.
+        sine2: Squared sine of the largest rotation from the prior rotation, or 1.
     """
 
     rays: Array
@@ -91,9 +115,12 @@ class Heading(NamedTuple):
 
 
 class SceneSide:
-    """The scene of one problem, or of many: a device is seen in frame after frame.
+    """Scene of one problem, or of many, as when a device is tracked.
 
-    nearest: (n, k) each point's nearest. tables: of (size, near), the triangles that are there already.
+    Attributes:
+        arrays: Points, normals and labels.
+        nearest: (n, k) nearest points of each point.
+        tables: Triangles by (size, near) that were built so far.
     """
 
     def __init__(self, points3d: Array, normals3d: Array | None, labels3d: Places | None) -> None:
@@ -104,7 +131,14 @@ class SceneSide:
         self.tables: dict[tuple[int, int], Triangles] = {}
 
     def triangles(self, size: int, near: int) -> Triangles:
-        """Of a point and two, or one (`pairs`), of its `near` nearest; those of fewer are the first rows."""
+        """Return the triangles of a point and two of its `near` nearest, or the `pairs` with one of them.
+
+        Those of a smaller neighbourhood are the first rows.
+
+        Args:
+            size: Points of a set, 3 or 2.
+            near: Number of neighbours.
+        """
         near = min(near, self.nearest.shape[1])
         if (size, near) not in self.tables:
             sets = sets_within(self.nearest, near, size)
@@ -115,10 +149,14 @@ class SceneSide:
 
 
 class ImageSide:
-    """The image of one problem.
+    """Image of one problem.
 
-    turn: R, f in the frame of the arrays = R f. density: the chance that one scene point falls within one radius of a
-    given image point, if it may be anywhere among them. nearest: (m, k) each point's nearest.
+    Attributes:
+        turn: R, which maps a bearing f to R f in the frame of the arrays.
+        arrays: Bearings and their grid.
+        density: Probability that a scene point, seen anywhere among the image points, is within one radius of a given
+            one.
+        nearest: (m, k) nearest points of each point.
     """
 
     def __init__(self, bearings: Array, radius: float, labels2d: Places | None, reach: float) -> None:
@@ -136,7 +174,7 @@ class ImageSide:
 
 
 def scene_side(points3d: Array, normals3d: Array | None, labels3d: Places | None) -> SceneSide:
-    """The scene; the last few are remembered."""
+    """Return the scene, from a cache of the last few."""
     return _remembered(
         *(None if x is None else np.ascontiguousarray(x).tobytes() for x in (points3d, normals3d, labels3d))
     )
@@ -152,9 +190,13 @@ def _remembered(points3d: bytes, normals3d: bytes | None, labels3d: bytes | None
 
 
 def nearest_of(points: Array, normals: Array) -> Places:
-    """Each point's nearest (n, k), itself not among them. normals: (n, 3) or (0, 3).
+    """Return the nearest points (n, k) of each point, without the point itself.
 
     Points whose normals no camera can face at once come last.
+
+    Args:
+        points: (n, 3).
+        normals: (n, 3), or (0, 3) for none.
     """
     n = len(points)
     if n > DENSE:
@@ -171,7 +213,7 @@ def nearest_of(points: Array, normals: Array) -> Places:
 
 
 def sets_within(nearest: Places, near: int, size: int) -> Places:
-    """Sets (t, size) of a point and one or two of its `near` nearest, each set once, nearest in rank first.
+    """Return sets (t, size) of a point and one or two of its `near` nearest, each set once, nearest in rank first.
 
     >>> sets_within(np.array([[1, 2], [0, 2], [1, 0]]), 2, 2).tolist()
     [[0, 1], [2, 1], [0, 2]]
@@ -185,7 +227,13 @@ def sets_within(nearest: Places, near: int, size: int) -> Places:
 
 
 def visible_triangles(points: Array, normals: Array, triples: Places) -> Triangles:
-    """The triangles of scene triples (t, 3) that a camera can see. normals: (n, 3) or (0, 3)."""
+    """Return the triangles of scene triples that a camera can see.
+
+    Args:
+        points: (n, 3).
+        normals: (n, 3), or (0, 3) for none.
+        triples: (t, 3) indices.
+    """
     triangles = triangles_of(points, triples)
     orientation = triangles.orientation
     if len(normals):
@@ -197,7 +245,7 @@ def visible_triangles(points: Array, normals: Array, triples: Places) -> Triangl
 
 
 def pairs(sets: Places) -> Triangles:
-    """Two points (t, 2) instead of a triangle: the second one stands for the third too."""
+    """Return pairs (t, 2) in the record of triangles: the second point is repeated as the third."""
     everything = np.full(len(sets), 3)
     return Triangles(
         np.ascontiguousarray(sets[:, [0, 1, 1]]), np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3)), everything
@@ -205,7 +253,7 @@ def pairs(sets: Places) -> Triangles:
 
 
 def sphere(count: int) -> Array:
-    """Unit vectors (count, 3) spread evenly: the golden spiral."""
+    """Return unit vectors (count, 3) spread evenly over the sphere (golden spiral)."""
     z = 1 - (2 * np.arange(count) + 1) / count
     angle = math.pi * (3 - math.sqrt(5)) * np.arange(count)
     radius = np.sqrt(1 - z * z)
@@ -216,7 +264,7 @@ DIRECTIONS = sphere(192)
 
 
 def grid_of(flat: Array, gain: Array, labels: Places, reach: float) -> Grid:
-    """The grid of image points (m, 2), each in the cells within `reach` radii."""
+    """Build the grid of image points (m, 2), each in all cells within `reach` radii."""
     cells, around = RULES.cells, reach / gain[:, None]
     low, high = (flat - around).min(0), (flat + around).max(0)
     per_cell = cells / (float((high - low).max()) * (1 + 1e-9) + 1e-12)
@@ -235,14 +283,14 @@ def grid_of(flat: Array, gain: Array, labels: Places, reach: float) -> Grid:
 
 
 def _area(flat: Array, radius: float) -> float:
-    """Area of the rectangle along the principal axes of the points that holds them, no side below two radii."""
+    """Return the area of the bounding rectangle along the principal axes, each side at least two radii."""
     centred = flat - flat.mean(0)
     axes = np.linalg.eigh(centred.T @ centred)[1]
     return float((np.ptp(centred @ axes, axis=0) + 2 * radius).prod())
 
 
 def predicted_pose(prior: Prior | None) -> tuple[Array, Array] | None:
-    """Rotation and translation, if the prior tells both."""
+    """Return rotation and translation of a prior with both, else None."""
     if not isinstance(prior, PosePrior) or prior.translation is None or not math.isfinite(prior.translation_sigma):
         return None
     return np.asarray(prior.rotation, np.float64), np.asarray(prior.translation, np.float64)
@@ -251,10 +299,19 @@ def predicted_pose(prior: Prior | None) -> tuple[Array, Array] | None:
 def prior_arrays(
     problem: Problem, scene: SceneSide, image: ImageSide, settings: EnumerationSettings
 ) -> tuple[PriorArrays, Heading, float]:
-    """The prior in the frames of both sides, as the loops read it, and the log of the share of poses that it allows.
+    """Convert the prior to the frames of the loops.
 
-    Where two matches fix a pose, a direction is taken as known: the vertical, or that of the view, about which the
-    image shows a turn best.
+    Where two matches fix a pose, one direction is taken as exact. It is the vertical, or the direction of the view: the
+    image measures a rotation about this one best.
+
+    Args:
+        problem: Points and prior.
+        scene: Scene of the problem.
+        image: Image of the problem.
+        settings: Constants.
+
+    Returns:
+        The prior as arrays, the input of P2P, and the logarithm of the fraction of rotations that the prior allows.
     """
     prior, none = problem.prior, np.empty((0, 3))
     translation, farthest_shift2, log_share, sine2 = np.zeros(3), math.inf, 0.0, 1.0

@@ -1,8 +1,8 @@
 """Poses of few points (4 to some hundred a side) by exact enumeration: every small group of points is tried.
 
-Triples of an image point and its nearest are paired with triples of a scene point and its nearest, nearest first, and
-each pair is solved (P3P), rejected by the points beside it, or refined on all points, one-to-one. The neighbourhoods
-grow until the verdict is safe, every triple was tried, or the time is up.
+Triples of an image point and its neighbours are paired with triples of a scene point and its neighbours, nearest
+first. Each pair is solved (P3P) and preverified on nearby points. Those that pass are refined on all points,
+one-to-one. The neighbourhoods grow until the verdict is safe, every triple was tried, or the time is up.
 """
 
 import math
@@ -38,9 +38,9 @@ ORDERS = {
     3: np.array([[0, 1, 2], [1, 2, 0], [2, 0, 1], [0, 2, 1], [1, 0, 2], [2, 1, 0]]),
 }
 
-SLOWEST = 2e-6  # seconds a hypothesis, before it is known
+SLOWEST = 2e-6  # seconds a hypothesis, before it is measured
 BUILT, BUILT_FACING = 5e-7, 5e-6  # seconds a set of points when a stage begins, and one with normals
-SHORTEST = 5e-5  # seconds, in which no hypothesis is begun
+SHORTEST = 5e-5  # seconds before the deadline, in which no hypothesis is begun
 Ended = Literal["exhausted", "safe", "interrupted", "most"]
 
 
@@ -48,11 +48,11 @@ class Enumerated(NamedTuple):
     """Result of an enumeration.
 
     Attributes:
-        poses: Distinct hypotheses, likeliest first, with matches and residuals; `evidence` in nats beyond chance, less
-            the logarithm of the number of tests; `basin_count` is the number of image sets of which a minimal problem
-            ended at the pose.
-        ended: "exhausted" where every minimal problem was tried, "safe" where `is_safe` returned True, "interrupted" by
-            the deadline, "most" after as many as are allowed.
+        poses: Distinct hypotheses, likeliest first, with matches and residuals. `evidence` is in nats, less the
+            logarithm of the number of tests. `basin_count` is the number of image sets with a hypothesis that ended at
+            the pose.
+        ended: "exhausted" after every minimal problem, "safe" if `is_safe` returned True, "interrupted" by the
+            deadline, "most" after the largest number of hypotheses.
     """
 
     poses: Hypotheses
@@ -63,10 +63,20 @@ Competitors = Callable[[Hypotheses], tuple[Array, Array]]
 
 
 class Enumeration:
-    """Of one problem. fixing: matches that fix a pose. reach: largest radius at which matches are looked up.
+    """Enumeration of one problem.
 
-    tests: log of the number of minimal problems that these points hold, times the radii that are looked at. solved: how
-    many were solved.
+    Attributes:
+        scene: Scene of the problem.
+        image: Image of the problem.
+        settings: Constants.
+        reach: Largest radius of a match, in match radii.
+        fixing: Number of matches that fix a pose.
+        solved: Number of minimal problems solved so far.
+        contested: Poses (1,) whose competing poses were proposed.
+        tests: Logarithm of the number of minimal problems of these points times the number of radii tested.
+        tables: Inputs of the compiled loops.
+        kept: Poses found so far.
+        work: Buffers of the compiled loops.
     """
 
     def __init__(self, problem: Problem, radius: float, settings: EnumerationSettings) -> None:
@@ -108,7 +118,7 @@ class Enumeration:
         return float(self.kept.evidence.max())
 
     def seconds_to_begin(self, stage: Stage) -> float:
-        """About how long the sets of a stage take to build."""
+        """Estimate the seconds needed to build the sets of a stage."""
         image, scene = (
             len(side) * min(near, side.shape[1]) ** (stage.matches - 1) / 2
             for side, near in ((self.image.nearest, stage.near2d), (self.scene.nearest, stage.near3d))
@@ -118,13 +128,13 @@ class Enumeration:
         return BUILT * image + (BUILT_FACING if len(self.scene.arrays.normals) else BUILT) * scene
 
     def begin(self, stage: Stage) -> None:
-        """Go on with the hypotheses of a stage; those that were solved before are not solved again."""
+        """Continue with the hypotheses of a stage, without those solved before."""
         m, n = len(self.image.arrays.rays), len(self.scene.arrays.points)
         sets = sets_within(self.image.nearest, stage.near2d, stage.matches)
         triangles = self.scene.triangles(stage.matches, stage.near3d)
         before = self._done.get((stage.matches, stage.reach), (0, 0))
         self._done[stage.matches, stage.reach] = len(sets), len(triangles.triples)
-        # How many witnesses make a hypothesis worth a look depends on what chance gives it.
+        # The required number of preverification points depends on the expected number of chance matches.
         chance = self._witnesses.shape[1] * m * self.image.density * stage.reach**2
         one, two = self.settings.witness_chances
         need = (1 if chance < one else 2 if chance < two else 3) + (stage.matches == 2)
@@ -136,12 +146,17 @@ class Enumeration:
 
     @property
     def ended(self) -> bool:
-        """Whether all hypotheses of the stage were tried."""
+        """True once all hypotheses of the stage were tried."""
         return self._row >= len(self._block.sets) * len(self._block.orders)
 
     def sweep(self, most: int, deadline: float) -> None:
-        """Solve `most` hypotheses, or fewer if the best pose becomes better, or half of the time to the deadline is
-        over."""
+        """Solve hypotheses of the stage.
+
+        Args:
+            most: Number of hypotheses. Fewer are solved if a better significant pose is found, or half of the time is
+                over.
+            deadline: When to stop (`Clock.now`).
+        """
         start, stop = Clock.now(), max(self.best + 1e-9, self.tests)
         most = int(min(most, max(0.5 * (deadline - start) / self._pace, 1)))
         self._row, self._triangle, solved = self._explored(self._row, self._triangle, most, stop, 1.0)
@@ -155,7 +170,7 @@ class Enumeration:
         self.refine(np.vstack([turn @ rotation, turn @ translation]), reach)
 
     def refine(self, pose: Array, reach: float) -> None:
-        """Refine a pose (4, 3) of these frames from matches within `reach` radii, and keep it."""
+        """Refine a pose (4, 3), in the frame of the arrays, from matches within `reach` radii, and keep it."""
         self.work.poses[0] = pose
         self._explored(0, 0, 0, 0.0, reach)
 
@@ -174,16 +189,18 @@ def enumerate_poses(
 ) -> Enumerated:
     """Enumerate poses under which image points see scene points, one-to-one within a radius.
 
-    Where gravity is known, or the rotation to a few degrees, two matches fix a pose; where a whole pose is known, it is
-    tried first.
+    With prior gravity, or a rotation within a few degrees, two matches fix a pose. A predicted pose is tried first.
 
     Args:
         problem: Points.
-        radius: Largest residual of a match, radians; None for that of the points.
+        radius: Largest residual of a match, radians; None for the match radius of the problem.
         deadline: When to stop (`Clock.now`).
-        is_safe: Called once the best pose exceeds chance and every other pose; True stops. None stops always.
-        competitors: Returns poses to try beside the best one.
+        is_safe: Called once the best pose is significant and leads every other pose; True stops. None always stops.
+        competitors: Returns competing poses of the best one, which are tried too; None for none.
         settings: Constants.
+
+    Returns:
+        The poses, and why the enumeration ended.
 
     >>> import numpy as np
     >>> rng = np.random.default_rng(0)
@@ -233,7 +250,7 @@ def enumerate_poses(
 
 
 def _with_competitors(run: Enumeration, problem: Problem, poses: Hypotheses, competitors: Competitors) -> Hypotheses:
-    """Propose the competitors of the best pose, and of the better pose that one of them leads to; each pose once."""
+    """Refine the competing poses of the best pose, and of each better pose that results; each pose once."""
     while True:
         known = Hypotheses.concatenate([poses[:1], *run.contested])
         if problem.same_pose(known.rotation, known.translation)[1:].any():
@@ -245,7 +262,10 @@ def _with_competitors(run: Enumeration, problem: Problem, poses: Hypotheses, com
 
 
 def _reach(problem: Problem, radius: float, settings: EnumerationSettings) -> float:
-    """Radii within which points are looked up: as far as a predicted pose may be off, `settings.widest` at most."""
+    """Return the largest radius of a match, in match radii.
+
+    It covers the uncertainty of a predicted pose, up to `settings.widest`.
+    """
     needed = max([1.0, *(stage.reach for stage in settings.stages)])
     if (predicted := predicted_pose(problem.prior)) is not None and isinstance(problem.prior, PosePrior):
         distance = max(float(np.linalg.norm(predicted[1])), 1e-12)
@@ -267,7 +287,7 @@ def _poses(run: Enumeration) -> Hypotheses:
     matches, radii = kept.point[order], np.sqrt(kept.distance2[order])
     matched, angle = matches >= 0, radii / run.image.arrays.per_radian
     count = matched.sum(-1)
-    free = np.maximum(2 * count - 2 * run.fixing, 1)  # numbers that were measured, less those fitted
+    free = np.maximum(2 * count - 2 * run.fixing, 1)  # degrees of freedom
     return Hypotheses.from_poses(
         rotation,
         translation,
@@ -290,27 +310,38 @@ def margin(poses: Hypotheses, problem: Problem) -> float:
 
 
 def _log_choose(n: int, k: int) -> float:
+    """Return log C(n, k), or 0 for n < k."""
     return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1) if n >= k else 0.0
 
 
 def is_enumerable(problem: Problem) -> bool:
-    """Whether the points have so few hypotheses that they are enumerated."""
+    """Return whether the points are few enough to be enumerated."""
     products = len(problem.bearings) * len(problem.points3d)
     return products <= (DEFAULT.most_products if problem.fixing_matches == 3 else DEFAULT.most_products_known)
 
 
 def exceeds_enumeration(problem: Problem) -> bool:
-    """Whether there are more points than are enumerated without a prior; with one the enumeration may miss a pose."""
+    """Return whether the points are too many to be enumerated without a prior.
+
+    With a prior they may be enumerated, but the enumeration may miss a pose.
+    """
     return not is_enumerable(replace(problem, prior=None))
 
 
 def search_by_enumeration(problem: Problem, deadline: Deadline, settings: SearchSettings) -> tuple[Hypotheses, bool]:
-    """The poses of few points, best first; and whether every hypothesis was tried.
+    """Search for the poses of few points by enumeration.
 
-    Where the whole pose is known closely, as when a device is tracked, it is tried, and if it does not hold the search
-    goes everywhere; where it is known roughly, the search goes everywhere if no pose near it exceeds chance. Where
-    no pose with the given gravity is significant, the search goes on without it: a hypothesis of two matches has the
-    error of the prior.
+    A closely predicted pose, as in tracking, is tried first; the whole space is searched if it fails. With a rough
+    prediction the whole space is searched if no pose near it is significant. If no pose with the prior gravity is
+    significant, the search is repeated without it: a hypothesis of two matches has the error of the prior.
+
+    Args:
+        problem: Points.
+        deadline: When to stop.
+        settings: Constants.
+
+    Returns:
+        The poses, best first, and whether every hypothesis was tried.
     """
     certain: Hypotheses | None = None
     annotated = problem
@@ -350,8 +381,7 @@ def search_by_enumeration(problem: Problem, deadline: Deadline, settings: Search
 
 
 def _candidates(poses: Hypotheses, problem: Problem, settings: SearchSettings) -> Hypotheses:
-    """Return the poses that are not far less likely than the best one, with scale and likelihood as the annealing
-    defines them."""
+    """Return the poses not far less likely than the best, with the scale and likelihood of the annealing."""
     if poses.evidence is None or not len(poses):
         return poses
     poses = poses[poses.evidence >= poses.evidence.max() - DEFAULT.near_nats][: settings.kept]

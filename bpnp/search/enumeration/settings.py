@@ -1,4 +1,4 @@
-"""Every constant that tunes the enumeration, in one argument: what it is, its unit, and why it has this value."""
+"""Constants of the enumeration: meaning, unit and the reason for each value."""
 
 import math
 from dataclasses import dataclass
@@ -8,10 +8,13 @@ from bpnp.poses import SAME
 
 
 class Stage(NamedTuple):
-    """A block of hypotheses: the `near2d` nearest of an image point with the `near3d` nearest of a scene point.
+    """Block of hypotheses: the `near2d` nearest of an image point with the `near3d` nearest of a scene point.
 
-    matches: of a hypothesis, 3, or 2 where a prior lets them fix a pose. reach: radii within which a point counts for
-    such a pose, before it is refined.
+    Attributes:
+        matches: Matches of a hypothesis: 3, or 2 where a prior lets two matches fix a pose.
+        near2d: Neighbours of an image point.
+        near3d: Neighbours of a scene point.
+        reach: Largest residual of a match before the pose is refined, in match radii.
     """
 
     matches: int
@@ -21,17 +24,22 @@ class Stage(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """Constants of the compiled loops, which are compiled with them.
+    """Constants of the compiled loops, compiled with them.
 
-    cells: of the grid of the image points, a side.
-    matched_cosine: of the angle between a normal and the line of sight; beyond, a point has no match.
-    expected_cosine: up to this angle a point is expected to be seen. ladder: radii 1, 1/2, 1/4 ... at which matches are
-    counted. missed: nats that an expected but missing point costs: one in five is missed. lacking: matches that it
-    takes away from a hypothesis. behind: matches that a hypothesis may have less than any other had, to be refined.
-    skipped: matches of the best pose from which its own triples are not solved again, counted: its basin count then.
-    tighter, final: factor of the radius from one step of a refinement to the next, and steps at the last one.
-    same_trace, same_shift: poses are the same (`Tolerance`) if the trace of the turn between them is larger and the
-    shift smaller than this fraction of the scene's distance.
+    Attributes:
+        cells: Cells along a side of the grid of the image points.
+        matched_cosine: Smallest cosine between a normal and the line of sight at which a point can have a match.
+        expected_cosine: Smallest cosine at which a point with a normal is expected to be seen.
+        ladder: Number of radii 1, 1/2, 1/4 ... at which matches are counted.
+        missed: Nats subtracted for each expected but missing point; one in five is missed.
+        lacking: Matches subtracted from a hypothesis for each expected but missing point.
+        behind: Matches that a hypothesis may lack against the best one of its stage and still be refined.
+        skipped: Matches of the best pose from which its own triples are not solved again.
+        counted: Basin count of the best pose that this requires too.
+        tighter: Factor of the radius from one step of a refinement to the next.
+        final: Steps of a refinement at its last radius.
+        same_trace: Smallest trace of the rotation between two poses that are the same (`Tolerance`).
+        same_shift: Largest shift between them, as a fraction of the scene's distance.
     """
 
     cells: int = 48
@@ -53,20 +61,26 @@ class Rules(NamedTuple):
 class EnumerationSettings:
     """Constants of the enumeration.
 
-    most_products: image points times scene points up to which points are few: 60 x 60. most_products_known: the same
-    where a prior lets two matches fix a pose.
-
-    stages: what is tried, one after the other; those of two matches only where a prior lets two fix a pose.
-    kept: distinct poses. safe: nats beyond chance and ahead of
-    any other pose at which the search ends at once; after `patience` hypotheses none are asked for, and after twice
-    as many it ends with any pose that exceeds chance. look, chunk: hypotheses between looks at the best pose, when
-    it exceeds chance and before. most: hypotheses in all. widest: radii within which points are matched to a
-    predicted pose. near_nats: of evidence; a pose that has so much less than the best is no rival.
-
-    seen_witnesses: points that check a hypothesis and are seen, if the image points are spread evenly over the scene;
-    fewest_witnesses, most_witnesses: that check one. witness_chances: of so many matches of them by chance one, or two,
-    are not enough. sigmas: of a prior, beyond which no pose is looked for. prior_weight: radii that one standard
-    deviation of a prior weighs as much as: noise is a tenth to a third of a radius.
+    Attributes:
+        most_products: Largest number of image points times scene points that are enumerated: 60 x 60.
+        most_products_known: The limit where a prior lets two matches fix a pose.
+        stages: Blocks of hypotheses, in their order; those of two matches need a prior that lets two fix a pose.
+        kept: Distinct poses that are kept.
+        safe: Margin in nats, over chance and over any other pose, at which the search ends at once.
+        patience: Hypotheses after which the required margin has fallen linearly to 0. After twice as many the search
+            ends with any significant pose.
+        look: Hypotheses between checks of the best pose once it is significant.
+        chunk: Hypotheses between checks before.
+        most: Largest number of hypotheses.
+        widest: Largest radius within which points are matched to a predicted pose, in match radii.
+        near_nats: Evidence in nats by which a competing pose may be behind the best.
+        seen_witnesses: Preverification points that are seen, if the image points are spread evenly over the scene.
+        fewest_witnesses: Fewest preverification points of a hypothesis.
+        most_witnesses: Most preverification points of a hypothesis.
+        witness_chances: Expected chance matches of these points from which two, and three, matches are required.
+        sigmas: Standard deviations of a prior beyond which no pose is tried.
+        prior_weight: Match radii that weigh as much as one standard deviation of a prior. Noise is a tenth to a third
+            of a radius.
     """
 
     most_products: int = 4000
