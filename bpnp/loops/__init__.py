@@ -1,1 +1,1 @@
-"""Loops on the CPU: how they are compiled, shared among threads, and ended when their time is over."""
+"""Loops on the CPU: compilation, threads and time limits."""

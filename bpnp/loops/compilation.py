@@ -17,7 +17,7 @@ import numba
 from bpnp.files import cache_folder, lock_folder
 from bpnp.loops.parallel import Clock
 
-# Of `fastmath`: sums in any order, but NaN and infinity keep their meaning, for they mark a lost pose or sample.
+# Options of `fastmath`: sums in any order. NaN and infinity keep their meaning: they mark a lost pose or sample.
 FAST = {"reassoc", "contract", "arcp", "nsz"}
 _SETTINGS: Any = numba.config  # NUMBA_CACHE_DIR and others, as attributes
 
@@ -26,10 +26,10 @@ def compiler(*, part: bool = False, **options: Any) -> Callable[[Callable[..., A
     """Return a decorator that compiles a function with `numba.njit`.
 
     Divisions by zero are infinite, as in C, and the GIL is released. A type checker's wrapper around the function is
-    left out.
+    removed.
 
     Args:
-        part: Make a function that only compiled functions call, and that is kept with them.
+        part: True for a function that only compiled functions call, and that is cached with them.
         options: Options of `numba.njit`.
 
     Returns:
@@ -42,12 +42,12 @@ def compiler(*, part: bool = False, **options: Any) -> Callable[[Callable[..., A
 
 
 class Loop:
-    """A function that numba compiles at its first call, once an installation.
+    """Function that numba compiles at its first call, once an installation.
 
-    The machine code is kept in ``loops`` in `cache_folder`, or in NUMBA_CACHE_DIR. Each version of the source has a
-    folder of its own there: of the function's file, of the files of the parts that it calls, and of those of the named
-    tuples that it takes. numba itself would only look at the first. One process compiles; others that need the same
-    loop wait for it. Where the folder cannot be written to, each process compiles.
+    The machine code is kept in ``loops`` in `cache_folder`, or in NUMBA_CACHE_DIR. Each version of the source has its
+    own folder there. The source includes the files of the parts that the function calls and of the named tuples that it
+    takes; numba itself only checks the function's file. One process compiles; others that need the same loop wait for
+    it. If the folder is not writable, each process compiles.
     """
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
@@ -61,7 +61,7 @@ class Loop:
         return self.compiled(*arguments)
 
     def _compile(self, arguments: tuple[Any, ...]) -> None:
-        """Compile the function for the types of the arguments, or load what was compiled before."""
+        """Compile the function for the types of the arguments, or load it from the cache."""
         with _ONE_AT_A_TIME, ExitStack() as stack:
             if self.compiled is not None:  # by another thread
                 return
@@ -83,7 +83,7 @@ _ONE_AT_A_TIME = threading.RLock()
 
 
 def _njit_into(folder: Path, function: Callable[..., Any], options: dict[str, Any]) -> Any:
-    """Return a function that numba keeps in a folder. numba reads the setting while it makes the function."""
+    """Return a function that numba caches in a folder; numba reads the setting while it creates the function."""
     before = _SETTINGS.CACHE_DIR
     _SETTINGS.CACHE_DIR = str(folder)
     try:
@@ -113,7 +113,7 @@ def _flattened(values: tuple[Any, ...]) -> Iterator[Any]:
 
 @cache
 def _files_of(function: Callable[..., Any]) -> frozenset[str]:
-    """Return the files of a function, of the parts and named tuples in its module, and so on for the parts."""
+    """Return the files of a function and, recursively, of the parts and named tuples in its module."""
     files, modules, waiting = set[str](), set[str](), [function]
     while waiting:
         part = waiting.pop()
@@ -131,12 +131,13 @@ def _files_of(function: Callable[..., Any]) -> frozenset[str]:
 
 @cache
 def _digest(file: str) -> bytes:
+    """Return the hash of a file's content."""
     return hashlib.blake2b(Path(file).read_bytes(), digest_size=8).digest()
 
 
 @contextmanager
 def _clock_stopped() -> Iterator[None]:
-    """Leave the time out of time limits."""
+    """Exclude the time within the context from time limits."""
     begun = time.monotonic()
     try:
         yield
@@ -146,7 +147,7 @@ def _clock_stopped() -> Iterator[None]:
 
 @contextmanager
 def _collection_paused() -> Iterator[None]:
-    """Pause Python's collector of cycles, which would find nothing and take a tenth of the time."""
+    """Pause the garbage collector, which would find nothing and take a tenth of the time."""
     collected = gc.isenabled()
     gc.disable()
     try:
@@ -158,7 +159,7 @@ def _collection_paused() -> Iterator[None]:
 
 @cache
 def _announce(root: Path) -> None:
-    """Log once a process that something is compiled, for it takes seconds."""
+    """Log once a process that a loop is compiled: that takes seconds."""
     logging.getLogger(__name__).warning(
         "compiling bpnp's loops, which takes some seconds once an installation; they are kept in %s", root
     )

@@ -1,4 +1,4 @@
-"""Work on the CPU: how it is shared among threads, and ended when its time is over."""
+"""Threads and time limits of work on the CPU."""
 
 import math
 import os
@@ -16,10 +16,10 @@ from threadpoolctl import ThreadpoolController
 
 
 def thread_count() -> int:
-    """Return how many threads the compiled loops use.
+    """Return the number of threads that the compiled loops use.
 
-    torch's own number where torch is loaded (`torch.set_num_threads`); else OMP_NUM_THREADS, else the CPUs that this
-    process may use. Results do not depend on it.
+    It is torch's number if torch is loaded (`torch.set_num_threads`), else OMP_NUM_THREADS, else the number of CPUs
+    that this process may use. Results do not depend on it.
     """
     of_torch = getattr(sys.modules.get("torch"), "get_num_threads", None)
     if of_torch is not None:
@@ -31,11 +31,14 @@ def thread_count() -> int:
 
 
 def in_threads(work: Callable[[int, int], object], count: int) -> None:
-    """Call work(first, last) on consecutive shares of range(count), one a thread, and wait for all of them.
+    """Call work(first, last) on consecutive parts of range(count), one a thread, and wait for all of them.
 
-    Uses `thread_count` threads, and no empty share. Only work that releases the GIL gains, as numba's `nogil` functions
-    do; it writes to its own share of an array. Python's threads and not a pool of numba's: that one does not survive
-    the fork of a data loader's workers.
+    Only work that releases the GIL gains, such as numba's `nogil` functions. Each call writes to its own part of an
+    array. Python's threads are used because numba's pool does not survive the fork of a data loader's workers.
+
+    Args:
+        work: Called with the first index and the index after the last.
+        count: Number of items; at most `thread_count` parts are formed, none of them empty.
     """
     shares = max(1, min(thread_count(), count))
     if shares == 1:
@@ -50,14 +53,14 @@ def in_threads(work: Callable[[int, int], object], count: int) -> None:
 
 @lru_cache(1)
 def _pool(process: int) -> ThreadPoolExecutor:
-    """The threads of a process; a fork inherits none of its parent's, so each has its own."""
+    """Return the threads of a process; a fork does not inherit those of its parent."""
     return ThreadPoolExecutor(os.cpu_count(), f"bpnp-{process}")
 
 
 class _OneBlasThread(ContextDecorator):
-    """numpy's and scipy's products on one thread meanwhile, then on as many as before, whoever of several ends last.
+    """Context that limits BLAS to one thread, and restores the limit when its last concurrent user leaves.
 
-    Those of a search are small: threads that wait for the next one would take several times as long as the search.
+    The products of a search are small: threads waiting for the next one would take several times as long as the search.
     """
 
     lock, users = threading.Lock(), 0
@@ -78,6 +81,7 @@ class _OneBlasThread(ContextDecorator):
 
 @lru_cache(1)
 def _blas() -> ThreadpoolController:
+    """Return the controller of the loaded BLAS libraries."""
     return ThreadpoolController().select(user_api="blas")
 
 
@@ -85,19 +89,29 @@ one_blas_thread = _OneBlasThread()
 
 
 class Clock:
-    """Seconds of `time.monotonic`, without those in which loops were compiled: that happens once an installation, and a
-    limit that a user sets is for what comes after. `bpnp.warm_up` compiles before."""
+    """Clock of `time.monotonic` without the seconds in which loops were compiled.
+
+    Compilation happens once an installation and does not count towards a user's time limit. `bpnp.warm_up` compiles in
+    advance.
+    """
 
     compiling = 0.0
 
     @classmethod
     def now(cls) -> float:
+        """Return the current time, seconds."""
         return time.monotonic() - cls.compiling
 
 
 @dataclass(frozen=True)
 class Deadline:
-    """When to stop, in seconds of `Clock`. A stage that has begun ends what it is at and drops the rest."""
+    """Time to stop.
+
+    A stage that has begun completes its current item and drops the rest.
+
+    Attributes:
+        at: Seconds of `Clock`; infinite for no deadline.
+    """
 
     at: float = math.inf
 
@@ -107,13 +121,21 @@ class Deadline:
         return cls() if seconds is None else cls(Clock.now() + seconds)
 
     def passed(self) -> bool:
+        """Return whether the deadline is over."""
         return Clock.now() >= self.at
 
 
 def in_time(work: Callable[[int, int], None], count: int, deadline: Deadline, at_once: int) -> int:
-    """Run work(first, last) on shares of range(count) in threads; how many were done when the deadline passed.
+    """Run work(first, last) on parts of range(count) in threads until a deadline.
 
-    The first `at_once` are always done.
+    Args:
+        work: Called with the first index and the index after the last.
+        count: Number of items.
+        deadline: When to stop.
+        at_once: Items between checks of the deadline; the first `at_once` are always done.
+
+    Returns:
+        The number of items done.
     """
     step = count if math.isinf(deadline.at) else at_once
     done = 0

@@ -1,4 +1,4 @@
-"""Vectors and rotations in the compiled loops, component by component, and how these loops are compiled."""
+"""Vectors and rotations in the compiled loops, component by component, and the decorators that compile the loops."""
 
 import math
 from typing import Any
@@ -9,15 +9,15 @@ from bpnp.loops.compilation import FAST, compiler
 
 F = np.float32
 compiled = compiler(fastmath=FAST | {"afn"})
-# Called by compiled functions. Inlined, for else the loops in which they are called are not vectorised and take twice
-# the time.
+# For functions that only compiled functions call. They are inlined: the calling loops would not vectorise otherwise,
+# and take twice the time.
 part = compiler(fastmath=FAST | {"afn"}, part=True, forceinline=True)
 LARGEST_TURN = 0.5  # radians in one step
 
 
 @part
 def sum_of(values: Any) -> Any:
-    """The sum of float32 values (k,): numba takes longer to compile its own."""
+    """Return the sum of float32 values (k,); numba's own sum takes longer to compile."""
     total = F(0)
     for i in range(len(values)):
         total += values[i]
@@ -26,7 +26,7 @@ def sum_of(values: Any) -> Any:
 
 @part
 def copy_pose(rotation: Any, translation: Any, to_rotation: Any, to_translation: Any) -> None:
-    """Element by element: numba compiles an assignment of arrays for 3 s, most of it the message of a wrong shape."""
+    """Copy a pose element by element: numba compiles an assignment of arrays for 3 s, mostly for an error message."""
     for r in range(3):
         for c in range(3):
             to_rotation[r, c] = rotation[r, c]
@@ -35,13 +35,13 @@ def copy_pose(rotation: Any, translation: Any, to_rotation: Any, to_translation:
 
 @part
 def cross(x: Any, y: Any, z: Any, a: Any, b: Any, c: Any) -> Any:
-    """(x, y, z) x (a, b, c)."""
+    """Return the cross product (x, y, z) x (a, b, c)."""
     return y * c - z * b, z * a - x * c, x * b - y * a
 
 
 @part
 def rotated(rotation: Any, x: Any, y: Any, z: Any) -> Any:
-    """R (x, y, z)."""
+    """Return R (x, y, z)."""
     return (
         rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,
         rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z,
@@ -51,7 +51,7 @@ def rotated(rotation: Any, x: Any, y: Any, z: Any) -> Any:
 
 @part
 def direction(x: Any, y: Any, z: Any) -> Any:
-    """The unit vector of (x, y, z) as the offset from (0, 0, 1), and 1 / |(x, y, z)|."""
+    """Return the unit vector of (x, y, z) as the offset from (0, 0, 1), and 1 / |(x, y, z)|."""
     inverse = F(1) / math.sqrt(x * x + y * y + z * z + F(1e-12))
     x, y, z = x * inverse, y * inverse, z * inverse
     return x, y, -(x * x + y * y) / (F(1) + z) if z > F(0) else z - F(1), inverse
@@ -59,7 +59,7 @@ def direction(x: Any, y: Any, z: Any) -> Any:
 
 @part
 def turn(rotation: Any, vector: Any) -> None:
-    """R <- exp([w]x) R in place, w the first three of `vector`, at most LARGEST_TURN; through a unit quaternion."""
+    """Apply R <- exp([w]x) R in place through a unit quaternion; w = vector[:3], clipped to length LARGEST_TURN."""
     x, y, z = vector[0], vector[1], vector[2]
     angle: Any = math.sqrt(x * x + y * y + z * z)
     shrink = F(LARGEST_TURN) / angle if angle > F(LARGEST_TURN) else F(1)

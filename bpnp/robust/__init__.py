@@ -1,1 +1,1 @@
-"""Poses from candidate matches of points: P3P, RANSAC of this and of other libraries, proposals from an assignment."""
+"""Poses from candidate matches: P3P, RANSAC of this and of other libraries, and proposals from an assignment."""

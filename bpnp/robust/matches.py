@@ -1,7 +1,7 @@
 """Sampling and scoring of candidate matches for a whole batch at once.
 
-The random numbers are a hash of a seed and a counter, the same on every device and for every sample of a batch, so that
-a pose depends neither on the other samples nor on padding.
+The random numbers are a hash of a seed and a counter, the same on every device and for every sample of a batch. A pose
+therefore depends neither on the other samples nor on padding.
 """
 
 from typing import NamedTuple
@@ -16,9 +16,12 @@ CHUNK = 2**18  # residuals scored at a time: 1 MiB in float32, which stays in th
 
 
 def distinct_triples(pool: Float[Tensor, "b d"], seed: int, *, skip: int = 0) -> Int[Tensor, "b d 3"]:
-    """Three different indices below the pool size of each draw, uniform and in random order.
+    """Draw triples of different indices, uniform and in random order.
 
-    skip: draws of earlier calls with this seed; their random numbers are not used again.
+    Args:
+        pool: (b, d) pool size of each draw; indices are below it.
+        seed: Seed of the draws.
+        skip: Draws of earlier calls with this seed, whose random numbers are not used again.
     """
     draws = pool.shape[1]
     uniform = hashed_uniform(3 * draws, seed, pool.device, skip=3 * skip).view(3, draws)
@@ -31,7 +34,13 @@ def distinct_triples(pool: Float[Tensor, "b d"], seed: int, *, skip: int = 0) ->
 
 
 def weighted_draws(weights: Float[Tensor, "b k"], count: int, seed: int) -> Int[Tensor, "b c"]:
-    """Indices drawn with replacement in proportion to the weights, which are not negative and not all zero."""
+    """Draw indices with replacement in proportion to the weights.
+
+    Args:
+        weights: (b, k), not negative and not all zero.
+        count: Number of draws.
+        seed: Seed of the draws.
+    """
     total = weights.double().cumsum(-1)
     uniform = hashed_uniform(count, seed, weights.device)
     # The first sum above the number drawn: never an index of weight zero.
@@ -39,7 +48,16 @@ def weighted_draws(weights: Float[Tensor, "b k"], count: int, seed: int) -> Int[
 
 
 def hashed_uniform(size: int, seed: int, device: torch.device, *, skip: int = 0) -> Float[Tensor, " k"]:
-    """float64 in (0, 1): a 32-bit integer hash (two multiplications and shifts) of the counter and the seed."""
+    """Return float64 numbers in (0, 1) by a 32-bit integer hash of counter and seed.
+
+    The hash takes two multiplications and shifts a round.
+
+    Args:
+        size: Number of values.
+        seed: Seed of the hash.
+        device: Device of the result.
+        skip: First value of the counter.
+    """
     state = torch.arange(skip, skip + size, device=device)
     for salt in (0, (seed * 0x9E3779B1 + 1) & 0xFFFFFFFF):
         state = (state + salt) & 0xFFFFFFFF
@@ -50,7 +68,13 @@ def hashed_uniform(size: int, seed: int, device: torch.device, *, skip: int = 0)
 
 
 class Matches(NamedTuple):
-    """Candidate matches of a 2D and a 3D point; `real` is False for padding, whose points are zero."""
+    """Candidate matches of a 2D and a 3D point.
+
+    Attributes:
+        points2d: (b, k, 2) normalised image coordinates.
+        points3d: (b, k, 3) scene points.
+        real: (b, k), False for padding, whose points are zero.
+    """
 
     points2d: Float[Tensor, "b k 2"]
     points3d: Float[Tensor, "b k 3"]
@@ -58,7 +82,14 @@ class Matches(NamedTuple):
 
 
 class Residuals(NamedTuple):
-    """Of c poses on k matches. inlier: real, in front of the camera, and with an error below the threshold."""
+    """Residuals of c poses on k matches.
+
+    Attributes:
+        squared: (b, c, k) squared reprojection errors.
+        inlier: (b, c, k) True for a real match in front of the camera with an error below the threshold.
+        residual: (b, c, k, 2) reprojection errors.
+        camera: (b, c, k, 3) points in the camera frame.
+    """
 
     squared: Float[Tensor, "b c k"]
     inlier: Bool[Tensor, "b c k"]
@@ -67,9 +98,12 @@ class Residuals(NamedTuple):
 
 
 def normalised(matches: Matches) -> tuple[Matches, Float[Tensor, "b 3"], Float[Tensor, "b 1"]]:
-    """The matches in float64 with 3D points q, centred and of unit variance; centre and scale in p = scale q + centre.
+    """Convert matches to float64 with centred scene points of unit variance.
 
     A scene far from its origin then loses no digits in the minimal solver. Points with NaN or infinity are not real.
+
+    Returns:
+        Matches with 3D points q, and centre (b, 3) and scale (b, 1) of p = scale q + centre.
     """
     usable = matches.real & matches.points2d.isfinite().all(-1) & matches.points3d.isfinite().all(-1)
     real = usable.unsqueeze(-1)
@@ -84,7 +118,16 @@ def normalised(matches: Matches) -> tuple[Matches, Float[Tensor, "b 3"], Float[T
 def in_scene(
     poses: Float[Tensor, "b c 3 4"], centre: Float[Tensor, "b 3"], scale: Float[Tensor, "b 1"]
 ) -> tuple[Float[Tensor, "b c 3 3"], Float[Tensor, "b c 3"]]:
-    """Rotation and translation, in the scene's own coordinates, of poses that were found on normalised matches."""
+    """Convert poses of normalised matches to the scene's own coordinates.
+
+    Args:
+        poses: (b, c, 3, 4) poses [R | t].
+        centre: (b, 3) of `normalised`.
+        scale: (b, 1) of `normalised`.
+
+    Returns:
+        Rotation and translation.
+    """
     rotation = poses[..., :3]
     return rotation, scale.unsqueeze(1) * poses[..., 3] - (rotation @ centre[:, None, :, None]).squeeze(-1)
 
@@ -92,9 +135,9 @@ def in_scene(
 def truncated_scores(
     poses: Float[Tensor, "b c 3 4"], matches: Matches, threshold2: float | Float[Tensor, "b 1 1"]
 ) -> Float[Tensor, "b c"]:
-    """sum_i min(r_i^2, threshold2) over the real matches, r_i the reprojection error, infinite behind the camera.
+    """Compute sum_i min(r_i^2, threshold2) over the real matches in float32.
 
-    Computed in float32. NaN for a pose that is NaN.
+    r_i is the reprojection error, infinite behind the camera. The score of a NaN pose is NaN.
     """
     x, y = matches.points2d.float().unsqueeze(1).unbind(-1)
     scene = torch.cat([matches.points3d.float(), torch.ones_like(x).mT], -1).mT
@@ -113,7 +156,7 @@ def truncated_scores(
 
 
 def residuals(poses: Float[Tensor, "b c 3 4"], matches: Matches, threshold2: float) -> Residuals:
-    """Reprojection error of every match under every pose, in the type of the points."""
+    """Compute the reprojection error of every match under every pose, in the type of the points."""
     points3d = matches.points3d.unsqueeze(1).expand(-1, poses.shape[1], -1, -1)
     camera = transform(poses[..., :3], poses[..., 3], points3d)
     residual = camera[..., :2] / camera[..., 2:] - matches.points2d.unsqueeze(1)

@@ -1,4 +1,4 @@
-"""P3P on tensors: the poses of samples of three matches."""
+"""P3P on tensors: poses of samples of three matches."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,13 @@ from bpnp.search.propose.minimal_solvers import p3p_poses
 
 
 class P3P(NamedTuple):
-    """Up to four poses a sample, camera = R p + t; slots without a solution hold NaN and `valid` False."""
+    """Up to four poses a sample, camera = R p + t.
+
+    Attributes:
+        rotation: (*b, 4, 3, 3); NaN in an empty slot.
+        translation: (*b, 4, 3); NaN in an empty slot.
+        valid: (*b, 4), False for an empty slot.
+    """
 
     rotation: Float[Tensor, "*b 4 3 3"]
     translation: Float[Tensor, "*b 4 3"]
@@ -41,9 +47,10 @@ def p3p(bearings: Float[Tensor, "*b 3 3"], points3d: Float[Tensor, "*b 3 3"]) ->
 
 
 def poses_of_triples(rays: Float[Tensor, "b h 3 3"], points3d: Float[Tensor, "b h 3 3"]) -> Float[Tensor, "b s 3 4"]:
-    """Poses [R | t] of all triples of a sample in s = 2 h + 2 slots, those without a pose NaN and last.
+    """Solve all triples (h) of each sample, and pack the poses [R | t] into s = 2 h + 2 slots.
 
-    A triple has fewer than two solutions on average. Solutions beyond the s-th are dropped.
+    Slots without a pose are NaN and last. A triple has fewer than two solutions on average; those beyond the s-th are
+    dropped.
     """
     solution = p3p(rays, points3d)
     poses = torch.cat([solution.rotation, solution.translation.unsqueeze(-1)], -1).flatten(1, 2)
@@ -52,6 +59,6 @@ def poses_of_triples(rays: Float[Tensor, "b h 3 3"], points3d: Float[Tensor, "b 
 
 
 def take(values: Tensor, index: Int[Tensor, "b k"]) -> Tensor:
-    """values[b, index[b, i], ...] for every sample b."""
+    """Return values[b, index[b, i], ...] for every sample b."""
     trailing = values.shape[2:]
     return values.gather(1, index.view(*index.shape, *(1 for _ in trailing)).expand(*index.shape, *trailing))

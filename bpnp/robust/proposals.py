@@ -1,6 +1,6 @@
 """Poses proposed by a soft assignment: P3P on triples of matches drawn in proportion to their probability.
 
-Where an assignment has few true matches among its most probable ones, some are near the true pose all the same.
+Some of these poses are near the true one even if few of the most probable matches are true.
 """
 
 import math
@@ -16,8 +16,8 @@ from bpnp.robust.matches import Matches, in_scene, normalised, truncated_scores,
 from bpnp.robust.minimal_solvers import poses_of_triples, take
 
 TRIPLES = 1024  # solved for each sample
-DRAWN_EACH = 4  # triples drawn for each that is solved: those of the widest triangles
-SCORED = 512  # matches drawn to score the poses on
+DRAWN_EACH = 4  # triples drawn for each that is solved; the widest triangles are solved
+SCORED = 512  # matches drawn to score the poses
 APART_DEG = 15.0  # smallest angle between two proposals
 THRESHOLD = 0.2  # of a residual, in root mean square distances of the image points from their mean
 
@@ -33,18 +33,25 @@ def pose_hypotheses(
     *,
     count: int,
 ) -> tuple[Float[Tensor, "b s 3 3"], Float[Tensor, "b s 3"]]:
-    """The s = `count` best poses, any two of them 15 degrees apart, of triples of matches drawn in proportion to P.
+    """Propose the best poses of triples of matches drawn in proportion to P, any two of them 15 degrees apart.
 
-    Of the triples drawn those with the largest products of their triangles' areas on both sides are solved (`p3p`): a
-    small triangle magnifies the errors of its matches. A pose scores sum_k min(r_k^2, t^2) over other matches k drawn
-    from P, r_k the reprojection error, infinite behind the camera, and t = `THRESHOLD`: an estimate of the expectation
-    under P.
+    Triples with the largest products of their triangles' areas on both sides are solved (`p3p`): a small triangle
+    magnifies the errors of its matches. A pose scores sum_k min(r_k^2, t^2) over other matches k drawn from P. r_k is
+    the reprojection error, infinite behind the camera, and t = `THRESHOLD`. This estimates the expectation under P.
 
-    assignment: P, non-negative, of any sum. points2d: normalised image coordinates. points3d: scene units. The draws
-    are the same for each sample: a sample's result depends neither on the other samples nor on padding.
+    The draws are the same for each sample: a result depends neither on the other samples nor on padding.
 
-    Returns rotation and translation, best first, NaN in empty slots. A sample whose P has no mass or is not finite, or
-    with fewer than 3 points of a side, has none.
+    Args:
+        assignment: (b, m, n) P, non-negative, of any sum.
+        points2d: (b, m, 2) normalised image coordinates.
+        points3d: (b, n, 3) scene units.
+        mask2d: (b, m), False for padding.
+        mask3d: (b, n), False for padding.
+        count: Number s of poses.
+
+    Returns:
+        Rotation (b, s, 3, 3) and translation (b, s, 3), best first, NaN in empty slots. A sample has no pose if P has
+        no mass or is not finite, or with fewer than 3 points on a side.
     """
     n = assignment.shape[2]
     probability = assignment.masked_fill(~(mask2d.unsqueeze(-1) & mask3d.unsqueeze(-2)), 0).flatten(1)
@@ -82,11 +89,21 @@ def drawn_poses(
     seed: int,
     aligned: bool = False,
 ) -> Float[Tensor, "b s 3 4"]:
-    """All poses of the widest quarter of so many triples of matches drawn in proportion to P; NaN in empty slots.
+    """Return all poses of the widest quarter of triples of matches drawn in proportion to P.
 
-    The arguments are those of `pose_hypotheses`, unpadded; P has mass. seed: of the draws. aligned: whether the axes of
-    the scene are about those of the camera. Of the wider half of the triples those are solved, an eighth of all, whose
-    triangles are most alike: the cosine between the sides of one and those of the other seen along the third axis.
+    With `aligned`, an eighth of the triples is solved, from the wider half. They have the largest cosine between the
+    edges of the image triangle and those of the scene triangle seen along the third axis.
+
+    Args:
+        assignment: (b, m, n) P, non-negative, with mass.
+        points2d: (b, m, 2) normalised image coordinates, without padding.
+        points3d: (b, n, 3) scene units, without padding.
+        triples: Number of triples that are drawn.
+        seed: Seed of the draws.
+        aligned: True if the axes of the scene are about those of the camera.
+
+    Returns:
+        Poses [R | t], NaN in empty slots.
     """
     drawn = weighted_draws(assignment.flatten(1), 3 * triples, seed)
     n = assignment.shape[2]
@@ -100,7 +117,7 @@ def drawn_poses(
 def _poses_of_widest(
     image: Float[Tensor, "b k 3 2"], scene: Float[Tensor, "b k 3 3"], *, aligned: bool = False
 ) -> Float[Tensor, "b s 3 4"]:
-    """Poses of the quarter of the triples whose triangles have the largest products of areas, or as `drawn_poses`."""
+    """Return the poses of the quarter of the triples with the largest products of areas; `aligned` as in `drawn_poses`."""
     (x, y), (along, across) = ((points[:, :, 1:] - points[:, :, :1]).unbind(2) for points in (image, scene))
     area2d = (x[..., 0] * y[..., 1] - x[..., 1] * y[..., 0]).abs()
     area3d = torch.linalg.cross(along, across).norm(dim=-1)

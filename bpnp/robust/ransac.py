@@ -1,7 +1,7 @@
 """RANSAC of this and of other libraries on candidate matches: one signature, one pose a sample.
 
-`consensus` works on a whole batch at once, on its device. No shape depends on the data: the minimal problems alone are
-solved on the CPU, of all samples at once.
+`consensus` works on a whole batch at once, on its device. No shape depends on the data. Only the minimal problems are
+solved on the CPU, those of all samples at once.
 """
 
 from collections.abc import Callable
@@ -26,9 +26,9 @@ SUBSET = 512  # matches of largest weight, on which all hypotheses are scored; w
 SHORTLIST = 256  # hypotheses that are then scored on all matches
 REFINED = 16  # hypotheses that are refined locally on the subset
 LOCAL_STEPS, FINAL_STEPS = 4, 6  # Gauss-Newton steps of these, and of the best one on all matches
-DAMPING = 1e-9  # share of the Hessian's mean diagonal
-FEWEST = 25  # hypotheses of PoseLib; it ends after three times as many as meet a true triple with probability 0.9999
-KEPT_SHARE = 0.9  # of its inliers that OpenCV's refit must keep
+DAMPING = 1e-9  # fraction of the Hessian's mean diagonal
+FEWEST = 25  # hypotheses of PoseLib; it ends after 3 times the number that has a true triple with probability 0.9999
+KEPT_SHARE = 0.9  # fraction of its inliers that OpenCV's refit must keep
 Array = NDArray[np.float64]
 # points2d (k, 2), points3d (k, 3), threshold, most hypotheses, seed -> pose [R | t] and hypotheses, None for no pose
 SingleEstimator = Callable[[Array, Array, float, int, int], tuple[Array, int] | None]
@@ -38,14 +38,22 @@ Estimator = Callable[[Matches, float, int, int], tuple[Float[Tensor, "b 3 4"], I
 def consensus(
     matches: Matches, threshold: float, hypotheses: int, seed: int
 ) -> tuple[Float[Tensor, "b 3 4"], Int[Tensor, " b"]]:
-    """Pose [R | t] of lowest truncated squared reprojection error sum_i min(r_i^2, threshold^2), and `hypotheses`.
+    """Estimate the pose [R | t] of lowest truncated squared reprojection error sum_i min(r_i^2, threshold^2).
 
-    matches: as `bpnp.robust.matches.normalised` gives them, most probable first. A point may be in many matches.
-    hypotheses: triples for each sample. They come from a pool of the most probable matches that grows to all matches
-    (PROSAC; Chum, Matas, CVPR 2005), `p3p` solves each, all poses are scored (MSAC; a point behind the camera is an
-    outlier), and the best are refined. A last fit uses Cauchy's loss with a scale of four times the median squared
-    residual of the inliers (95 % efficient for normal noise), which reduces the influence of wrong matches below the
-    threshold. Computed in float64 but for the scores. A sample without a pose may hold any, or NaN.
+    Triples come from a pool of the most probable matches that grows to all matches (PROSAC; Chum, Matas, CVPR 2005).
+    `p3p` solves each, all poses are scored (MSAC; a point behind the camera is an outlier), and the best are refined. A
+    last fit uses Cauchy's loss with a scale of four times the median squared residual of the inliers (95 % efficient
+    for normal noise). It reduces the influence of wrong matches below the threshold. Only the scores are computed in
+    float32.
+
+    Args:
+        matches: Matches of `bpnp.robust.matches.normalised`, most probable first. A point may be in many matches.
+        threshold: Largest reprojection error of an inlier.
+        hypotheses: Triples for each sample.
+        seed: Seed of the draws.
+
+    Returns:
+        Poses, and the number of hypotheses. The pose of a sample without one is arbitrary or NaN.
     """
     threshold2 = threshold**2
     subset = Matches(*(values[:, :SUBSET] for values in matches))
@@ -53,7 +61,7 @@ def consensus(
     last = matches.real.sum(-1, keepdim=True).clamp(min=3).double()
     first = last.clamp(max=SMALLEST_POOL)
     triples = distinct_triples((first * (last / first) ** progress).ceil(), seed)
-    # Fewer than three matches: repeated ones, no pose.
+    # With fewer than three matches, a triple repeats one and has no pose.
     triples = triples.clamp(max=matches.real.shape[1] - 1).flatten(1)
     rays, scene = (
         take(v, triples).unflatten(1, (hypotheses, 3)) for v in (bearings(matches.points2d), matches.points3d)
@@ -71,7 +79,7 @@ def consensus(
 
 
 def _best(poses: Float[Tensor, "b c 3 4"], score: Float[Tensor, "b c"], size: int) -> Float[Tensor, "b s 3 4"]:
-    """The poses of lowest score; NaN, that of a slot without a pose, counts as the highest."""
+    """Return the poses of lowest score; NaN, the score of an empty slot, counts as the highest."""
     return take(poses, score.topk(min(size, score.shape[1]), largest=False).indices)
 
 
@@ -86,9 +94,17 @@ def refine_locally(
     """Reduce sum_i min(r_i^2, threshold2), or with Cauchy's loss sum_i min(s log(1 + r_i^2 / s), s log(1 + t / s)).
 
     Each step is a Gauss-Newton step on the inliers of the current pose, weighted by the derivative of the loss in r^2.
-    Poses are refined independently, and the best one met on the way is returned, the initial pose included.
+    Poses are refined independently.
 
-    threshold2: squared reprojection error t of an inlier. cauchy: scale s, squared residual units; None for r^2.
+    Args:
+        poses: (b, c, 3, 4) initial poses [R | t].
+        matches: Candidate matches.
+        threshold2: Squared reprojection error t of an inlier.
+        steps: Number of steps.
+        cauchy: (b, c) scale s, squared residual units; None for the squared error.
+
+    Returns:
+        The best pose visited, which may be the initial one.
     """
     scale = None if cauchy is None else cauchy.clamp(min=1e-24).unsqueeze(-1)
     best = poses
@@ -117,9 +133,12 @@ def refine_locally(
 def _jacobian(
     camera: Float[Tensor, "b c k 3"], turned: Float[Tensor, "b c k 3"], inlier: Bool[Tensor, "b c k"]
 ) -> Float[Tensor, "b c 6 2*k"]:
-    """Derivatives of x/z, then of y/z, by the step (w, s) of `retract`; zero for outliers.
+    """Return the derivatives of x/z, then of y/z, by the step (w, s) of `retract`; zero for outliers.
 
-    camera: y = R p + t, which a step moves by w x R p + s. turned: R p.
+    Args:
+        camera: y = R p + t, which a step moves by w x R p + s.
+        turned: R p.
+        inlier: True for inliers.
     """
     inverse = torch.where(inlier, 1 / camera[..., 2], 0)
     u, v = camera[..., 0] * inverse, camera[..., 1] * inverse
@@ -133,7 +152,7 @@ def _jacobian(
 def _each(
     estimate: SingleEstimator, matches: Matches, threshold: float, max_iterations: int, seed: int
 ) -> tuple[Float[Tensor, "b 3 4"], Int[Tensor, " b"]]:
-    """One sample after the other; those with fewer than 4 matches have no pose and no iterations."""
+    """Estimate the samples one by one; those with fewer than 4 matches have no pose and no iterations."""
     poses, iterations = matches.points3d.new_full((len(matches.real), 3, 4), torch.nan), matches.real.sum(-1)
     for i, count in enumerate(iterations.tolist()):
         iterations[i] = 0 if count < MIN_POINTS else max_iterations
@@ -144,7 +163,7 @@ def _each(
 
 
 def _poselib(x: Array, p: Array, threshold: float, max_iterations: int, seed: int) -> tuple[Array, int]:
-    """LO-RANSAC with progressive sampling."""
+    """Run LO-RANSAC with progressive sampling."""
     options = {
         "max_reproj_error": threshold,
         "max_iterations": max_iterations,
@@ -158,8 +177,8 @@ def _poselib(x: Array, p: Array, threshold: float, max_iterations: int, seed: in
 
 
 def _opencv(x: Array, p: Array, threshold: float, max_iterations: int, seed: int) -> tuple[Array, int] | None:
-    """P3P-RANSAC, then EPnP on its inliers, as in the paper; SQPnP where EPnP loses inliers."""
-    del seed  # OpenCV's generator starts afresh at each call
+    """Run P3P-RANSAC, then EPnP on its inliers, as in the paper; SQPnP where EPnP loses inliers."""
+    del seed  # OpenCV resets its generator at each call
     try:
         ok, rotvec, translation, inliers = cv2.solvePnPRansac(
             p, x, np.eye(3), None, iterationsCount=max_iterations, reprojectionError=threshold, flags=cv2.SOLVEPNP_P3P
@@ -167,7 +186,7 @@ def _opencv(x: Array, p: Array, threshold: float, max_iterations: int, seed: int
         if not ok:
             return None
         pose = np.column_stack([cv2.Rodrigues(rotvec)[0], translation])
-        # EPnP has no unique solution for points of one plane: it may have left the pose that it was to refit.
+        # EPnP has no unique solution for points of one plane: its result may be far from the RANSAC pose.
         x, p = x[inliers.ravel()], p[inliers.ravel()]
         kept = _count_inliers(pose, x, p, threshold)
         if kept < KEPT_SHARE * len(x):
@@ -180,12 +199,13 @@ def _opencv(x: Array, p: Array, threshold: float, max_iterations: int, seed: int
 
 
 def _count_inliers(pose: NDArray[Any], x: Array, p: Array, threshold: float) -> int:
+    """Return the number of inliers of one pose [R | t]."""
     matches = Matches(*(torch.as_tensor(values)[None] for values in (x, p, np.ones(len(x), bool))))
     return int(residuals(torch.as_tensor(pose)[None, None], matches, threshold**2).inlier.sum())
 
 
-# Matches as `bpnp.robust.matches.normalised` gives them, most probable first, threshold, most hypotheses, seed ->
-# poses [R | t], NaN for none, and hypotheses, or the bound on them where the library does not tell.
+# Matches of `bpnp.robust.matches.normalised`, most probable first, threshold, most hypotheses, seed ->
+# poses [R | t], NaN for none, and hypotheses; their bound where the library does not report the number.
 BACKENDS: dict[str, Estimator] = {
     "poselib": partial(_each, _poselib),
     "opencv": partial(_each, _opencv),

@@ -1,13 +1,18 @@
-"""Annealing of many poses on clusters, a kernel for each pair of a bearing and a point; one start stays in the cache.
+"""Annealing of many poses on clusters, with a kernel for each pair of a bearing and a point; one pose fits the cache.
 
 docs/search.md states the mathematics. Arrays are float32 and coordinate-major, so that loops over points vectorise.
-Directions are held as offsets d = f - e, e = (0, 0, 1) the view's mean bearing (`Scene`): the small numbers of a narrow
+Directions are held as offsets d = f - e, e = (0, 0, 1) the view's mean bearing (`Scene`). The small numbers of a narrow
 view keep their digits, where float32 rounds f . u - 1 to a multiple of 6e-8.
 
-Shapes, for m bearings and n points: f (3, m) offsets of the bearings; p (3, n) points; rotation
-(3, 3), translation (3,); q (4, n) sums over the bearings of W_ij (f_i - u_j) and, in the last row, of W_ij, W the soft
-assignment and u_j = g(R p_j + t); system (8, 6) the Hessian, of which the lower half is used, the gradient and the step
-in (w, s). Whatever is overwritten comes from the caller: without an allocation the loops compile in half the time.
+Shapes, for m bearings and n points:
+    f: (3, m) offsets of the bearings.
+    p: (3, n) points.
+    rotation, translation: (3, 3) and (3,).
+    q: (4, n) sums over the bearings of W_ij (f_i - u_j) and, in the last row, of W_ij. W is the soft assignment, and
+        u_j = g(R p_j + t).
+    system: (8, 6) Hessian (lower half), gradient, and step in (w, s).
+
+The caller provides all buffers: without an allocation the loops compile in half the time.
 """
 
 import math
@@ -18,15 +23,15 @@ import numpy as np
 from bpnp.loops.vectors import F, compiled, cross, direction, part, rotated, sum_of, turn
 from bpnp.search.kernels.sides import Array, visible_weights
 
-RELAXATION = 1.7  # times the Gauss-Newton step on clusters: expectation and maximisation in turns take short steps
-DAMPING = 1e-3  # of each diagonal entry of the Hessian, so that a direction that the points do not fix stays put
+RELAXATION = 1.7  # times the Gauss-Newton step on clusters: alternating expectation and maximisation take short steps
+DAMPING = 1e-3  # of each diagonal entry of the Hessian: a direction that the points do not fix is left unchanged
 POWER = 256  # of the kernel: eight squarings
 LEAST = 0.85  # of the base: a kernel of 1e-18, whose square is no denormal number, which are 2.5 times as slow
 
 
 @part
 def normal_equations(q: Any, p: Any, rotation: Any, translation: Any, system: Any) -> None:
-    """Fill Hessian and gradient of sum_j q_j . u_j in (w, s), y = R p + t moving by w x Rp + s, Gauss-Newton's.
+    """Fill the Gauss-Newton Hessian and gradient of sum_j q_j . u_j in (w, s), where y = R p + t moves by w x Rp + s.
 
     For one point the gradient in y is (q - (q.u) u) / |y|, the Hessian |q| (I - u u^T) / |y|^2, q the sum W_ij f_i.
     Both are written in W_ij (f_i - u_j) and in u_x, u_y, which are small numbers in a narrow view.
@@ -71,7 +76,7 @@ def normal_equations(q: Any, p: Any, rotation: Any, translation: Any, system: An
 
 @part
 def solve_normal_equations(system: Any) -> bool:
-    """Solve Hessian step = gradient by Cholesky, in place; False if it is not positive definite, or not finite."""
+    """Solve Hessian step = gradient by Cholesky, in place; return False if not positive definite or not finite."""
     for j in range(6):
         pivot = system[j, j]
         for k in range(j):
@@ -94,7 +99,11 @@ def solve_normal_equations(system: Any) -> bool:
 
 @part
 def move(q: Any, p: Any, rotation: Any, translation: Any, length: Any, system: Any) -> bool:
-    """`length` times one damped Gauss-Newton step of the pose, in place; False if the points do not fix the pose."""
+    """Take `length` times a damped Gauss-Newton step of the pose, in place.
+
+    Returns:
+        False if the points do not fix the pose.
+    """
     normal_equations(q, p, rotation, translation, system)
     for k in range(6):
         system[k, k] *= F(1 + DAMPING)
@@ -111,7 +120,7 @@ def move(q: Any, p: Any, rotation: Any, translation: Any, length: Any, system: A
 
 @part
 def see(p: Any, rotation: Any, translation: Any, u: Any) -> None:
-    """u (3, n): the offsets of the directions in which a pose sees points (3, n)."""
+    """Fill u (3, n) with the offsets of the directions in which a pose sees points (3, n)."""
     for j in range(p.shape[1]):
         x, y, z = rotated(rotation, p[0, j], p[1, j], p[2, j])
         x, y, z, _ = direction(x + translation[0], y + translation[1], z + translation[2])
@@ -119,7 +128,7 @@ def see(p: Any, rotation: Any, translation: Any, u: Any) -> None:
 
 
 class DenseScratch(NamedTuple):
-    """What `descend` overwrites, for m bearings and n points."""
+    """Buffers of `descend`, for m bearings and n points."""
 
     kernel: Array  # (n, m)
     base: Array  # (m,)
@@ -132,16 +141,28 @@ class DenseScratch(NamedTuple):
 
 
 def dense_scratch(m: int, n: int) -> DenseScratch:
+    """Allocate the buffers of `descend` for m bearings and n points."""
     return DenseScratch(*(np.empty(shape, F) for shape in ((n, m), m, m, (3, n), n, n, (4, n), (8, 6))))
 
 
 @part
 def assign(bearings: Any, points: Any, rotation: Any, translation: Any, scale: Any, outlier: Any, scratch: Any) -> Any:
-    """Fill q with the soft assignment in product form; return the mean log-likelihood of the bearings.
+    """Fill q with the soft assignment in product form.
 
-    The kernel is (1 + z/256)^256, z = -|f - u|^2 / 2 s^2: within 3 % of exp(z) where it exceeds 0.02, and without a
-    call. bearings, points: a `WeightedBearings` and a `WeightedPoints`, both in the order of their labels; the weights
-    of the points under this pose are in the scratch. scale: s, radians. outlier: o of `Scene.outlier_density`.
+    The kernel is (1 + z/256)^256, z = -|f - u|^2 / 2 s^2. It is within 3 % of exp(z) where that exceeds 0.02, and needs
+    no function call.
+
+    Args:
+        bearings: A `WeightedBearings`, in the order of the labels.
+        points: A `WeightedPoints`, in the order of the labels; their weights under this pose are in the scratch.
+        rotation: (3, 3).
+        translation: (3,).
+        scale: s, radians.
+        outlier: o of `Scene.outlier_density`.
+        scratch: A `DenseScratch`, overwritten.
+
+    Returns:
+        The mean log-likelihood of the bearings.
     """
     f, a, p, blocks = bearings.f, bearings.a, points.p, points.blocks
     kernel, base, row, u, column, weight, q, _ = scratch
@@ -202,10 +223,18 @@ def assign(bearings: Any, points: Any, rotation: Any, translation: Any, scale: A
 def descend(
     bearings: Any, points: Any, rotation: Any, translation: Any, scales: Any, outlier: Any, score: Any, scratch: Any
 ) -> None:
-    """Anneal starts (S, 3, 3), (S, 3) in place through `scales` (k,), radians; outlier: o / s^2 of the scene.
+    """Anneal poses in place through decreasing scales.
 
-    score (S,): the mean log-likelihood at the last scale; -inf for a pose that is not finite, or that the points do
-    not fix.
+    Args:
+        bearings: A `WeightedBearings`, in the order of the labels.
+        points: A `WeightedPoints`, in the order of the labels.
+        rotation: (S, 3, 3), overwritten.
+        translation: (S, 3), overwritten.
+        scales: (k,) radians.
+        outlier: o / s^2 of the scene.
+        score: (S,) mean log-likelihood at the last scale, written. It is -inf for a pose that is not finite, or that
+            the points do not fix.
+        scratch: A `DenseScratch`, overwritten.
     """
     for k in range(len(rotation)):
         for step in range(len(scales)):

@@ -1,5 +1,4 @@
-"""Points that are near others: sums over the directions near each image point, at several scales in one pass, and
-scene points in a hash table, which tells whether a place is near one of them."""
+"""Points near others: weighted sums over the directions near each image point, and a hash table of scene points."""
 
 import math
 from typing import Any, NamedTuple
@@ -16,10 +15,18 @@ CELLS = 64  # along a side of the grid, at most
 def sums_near(
     bearings: Array, directions: Array, axes: Array, radii: Array, sharpness: Array, weights: Array | None = None
 ) -> Array:
-    """sum_j w_j exp(-sharpness_s |f_i - u_j|^2) over the directions u_j (n, 3) nearer than radii_s to bearing f_i.
+    """Sum w_j exp(-sharpness_s |f_i - u_j|^2) over the directions u_j nearer than radii_s to each bearing f_i.
 
-    axes: (3, 2) orthonormal, along which the bearings spread most; they are sorted into a grid over these. radii (S,):
-    ascending. sharpness (S,): 0 counts the directions. weights (n,): one each by default.
+    Args:
+        bearings: (m, 3) unit vectors f.
+        directions: (n, 3) unit vectors u.
+        axes: (3, 2) orthonormal axes of the grid, along which the bearings spread most.
+        radii: (S,) ascending radii.
+        sharpness: (S,); 0 counts the directions.
+        weights: (n,); None for weights of 1.
+
+    Returns:
+        (m, S) sums.
     """
     at = bearings @ axes
     low, extent = at.min(0), float(np.ptp(at, 0).max())
@@ -50,9 +57,20 @@ def _add_up(
     sharpness: Any,
     sums: Any,
 ) -> None:
-    """bearings (3, k), sorted by cell: those of (x, y) begin at start[x * side + y]. cells (n, 2, 2): the first ones in
-    x and y around each direction (n, 3), and those after the last; none for one far beyond the grid. sums (S, k): added
-    to."""
+    """Add to the sums (S, k) of `sums_near`.
+
+    Args:
+        bearings: (3, k) sorted by cell.
+        start: Index of the first bearing of cell (x, y), at x * side + y.
+        side: Cells along a side of the grid.
+        directions: (n, 3).
+        weights: (n,).
+        cells: (n, 2, 2) first cells in x and y around each direction, and those after the last; no cell beyond the
+            grid.
+        squares: (S,) squared radii.
+        sharpness: (S,).
+        sums: (S, k), updated.
+    """
     for j in range(len(directions)):
         x, y, z = directions[j, 0], directions[j, 1], directions[j, 2]
         for row in range(cells[j, 0, 0], cells[j, 0, 1]):
@@ -66,9 +84,13 @@ def _add_up(
 
 
 class HashedPoints(NamedTuple):
-    """Points (n, 3) in cells of twice a tolerance: each in those of the corners of the cube around it.
+    """Points in cells of twice a tolerance, each in the cells of the corners of the cube around it.
 
-    heads (2^k,): the last slot of a cell, or -1. links (8 n,): the slot before it; slot e is of point e // 8.
+    Attributes:
+        points: (n, 3).
+        tolerance: Distance within which a location lies on a point.
+        heads: (2^k,) last slot of a cell, or -1.
+        links: (8 n,) previous slot of the same cell; slot e belongs to point e // 8.
     """
 
     points: Array
@@ -78,6 +100,7 @@ class HashedPoints(NamedTuple):
 
 
 def hashed(points: Array, tolerance: float) -> HashedPoints:
+    """Build the hash table of points (n, 3) for `lies_on`."""
     slots = 8 * len(points)
     heads, links = np.full(1 << slots.bit_length(), -1), np.empty(slots, np.int64)
     table = HashedPoints(np.ascontiguousarray(points), tolerance, heads, links)
@@ -87,14 +110,14 @@ def hashed(points: Array, tolerance: float) -> HashedPoints:
 
 @part
 def entry(heads: Any, x: Any, y: Any, z: Any, cell: Any) -> Any:
-    """Place in the table `heads`, 2^k long, of the cell with the point (x, y, z): Teschner et al., VMV 2003."""
+    """Return the index in `heads` (2^k,) of the cell that contains (x, y, z) (Teschner et al., VMV 2003)."""
     i, j, k = math.floor(x / cell), math.floor(y / cell), math.floor(z / cell)
     return (73856093 * i ^ 19349663 * j ^ 83492791 * k) & (len(heads) - 1)
 
 
 @compiled
 def _enter(table: Any) -> None:
-    """Fill links, and heads that are -1."""
+    """Fill the links, and the heads, which are -1 before."""
     points, tolerance, heads, links = table
     for e in range(len(links)):
         x, y, z = points[e >> 3, 0], points[e >> 3, 1], points[e >> 3, 2]

@@ -1,6 +1,6 @@
-"""Poses scored by looking up where each point falls in a raster of the view: one addition a point.
+"""Fast scores of poses on a density map of the view: one lookup and one addition a point.
 
-Arrays are float32 and coordinate-major. A direction u has the coordinates 2 (u_x, u_y) / (1 + u_z) in the raster, the
+Arrays are float32 and coordinate-major. A direction u has the map coordinates 2 (u_x, u_y) / (1 + u_z), the
 stereographic projection around (0, 0, 1), which keeps small shapes and covers every field of view.
 """
 
@@ -14,10 +14,12 @@ from bpnp.search.kernels.sides import Array, visible_weights
 
 
 class Raster(NamedTuple):
-    """What a point adds to the score of a pose by where it falls.
+    """Density map: the score that a point adds by its location in the view.
 
-    values: (g, g), rows are y; the outermost ones are 0. The first cell begins at -half in both coordinates. per_cell:
-    cells a unit.
+    Attributes:
+        values: (g, g), rows are y; the outermost cells are 0.
+        half: The first cell begins at -half in both coordinates.
+        per_cell: Cells a unit.
     """
 
     values: Array
@@ -27,7 +29,7 @@ class Raster(NamedTuple):
 
 @part
 def place(half: Any, per_cell: Any, p: Any, j: Any, turn: Any, t: Any) -> Any:
-    """Column and row, as fractions, of the raster where the point p[:, j] is seen from the pose (3, 3), (3,)."""
+    """Return the fractional column and row of the density map where a pose (3, 3), (3,) sees the point p[:, j]."""
     x, y, z = rotated(turn, p[0, j], p[1, j], p[2, j])
     x, y, z = x + t[0], y + t[1], z + t[2]
     shrink = F(2) / (math.sqrt(x * x + y * y + z * z) + z + F(1e-9))
@@ -36,17 +38,23 @@ def place(half: Any, per_cell: Any, p: Any, j: Any, turn: Any, t: Any) -> Any:
 
 @compiled
 def add_up(raster: Any, points: Any, rotation: Any, translation: Any, score: Any, weight: Any, cell: Any) -> None:
-    """score (S,): the sum of the points' weights times the raster's values where pose k sees them, 0 outside it.
+    """Score poses by the density map: sum the weighted values at the projections of all points, 0 outside.
 
-    raster, points: a `Raster` and a `WeightedPoints`, whose labels are ignored. rotation (S, 3, 3), translation (S, 3).
-    weight (n,), cell (n,) int32: overwritten.
+    Args:
+        raster: A density map.
+        points: A `WeightedPoints`; the labels are ignored.
+        rotation: (S, 3, 3).
+        translation: (S, 3).
+        score: (S,), written.
+        weight: (n,), overwritten.
+        cell: (n,) int32, overwritten.
     """
     cells, values = np.int32(len(raster.values)), raster.values.reshape(-1)
     half, per_cell = raster.half, raster.per_cell
     last = F(cells - 1)
     for k in range(len(rotation)):
         visible_weights(points, rotation[k], translation[k], weight)
-        for j in range(len(cell)):  # in a loop of its own, without a branch: several points at once
+        for j in range(len(cell)):  # a separate loop without a branch, so that it vectorises
             column, row = place(half, per_cell, points.p, j, rotation[k], translation[k])
             column = column if column > F(0) else F(0)  # NaN too
             row = row if row > F(0) else F(0)

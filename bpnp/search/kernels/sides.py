@@ -1,7 +1,8 @@
-"""The two sides of a problem with what is known of single points: their clusters, and as the compiled loops read them.
+"""Both sides of a problem with the annotations of their points: clusters, and the arrays of the compiled loops.
 
-m bearings f_i have the weights a_i, n points p_j the weights b_j: how many of the given points they stand for, times
-the probability that such a point has a partner. Under a pose a point counts b_j v_j, with its visibility
+m bearings f_i have the weights a_i, n points p_j the weights b_j. A weight is the number of given points that it stands
+for, times the probability that such a point has a correspondence. Under a pose a point counts b_j v_j, with its
+visibility
 
     v_j = min(max(1/2 + (n_j . c_j - k_j) / 2 h, l), 1),
 
@@ -23,8 +24,14 @@ FORWARD = np.array([0.0, 0.0, 1.0])
 
 
 class WeightedBearings(NamedTuple):
-    """f: (3, m) offsets (`kernels.dense`). a: (m,) weights. odds: (m,) share of the points that can be its partner, by
-    which the density of outliers is multiplied. label: (m,), -1 fits any."""
+    """Bearings with weights.
+
+    Attributes:
+        f: (3, m) offsets (`kernels.dense`).
+        a: (m,) weights.
+        odds: (m,) fraction of the points with a fitting label; it multiplies the density of outliers.
+        label: (m,); -1 fits any label.
+    """
 
     f: Array
     a: Array
@@ -33,12 +40,18 @@ class WeightedBearings(NamedTuple):
 
 
 class WeightedPoints(NamedTuple):
-    """p: (3, n). b: (n,) weights. odds: (n,) share of the bearings that can be its partner. label: (n,), -1 fits any.
+    """Scene points with weights.
 
-    blocks: (k, 4) of clusters, which are in the order of their labels: the bearings from blocks[:, 0] to [:, 1] fit the
-    points from [:, 2] to [:, 3].
-    cones: (6, n), v_j = min(max((cones[:3, j] . C + cones[3, j]) / |C - p_j| + cones[4, j], cones[5, j]), 1), C the
-    camera's centre; (6, 0) if all points are seen from everywhere.
+    Attributes:
+        p: (3, n).
+        b: (n,) weights.
+        odds: (n,) fraction of the bearings with a fitting label.
+        label: (n,); -1 fits any label.
+        blocks: (k, 4) of clusters in the order of their labels. The bearings from blocks[:, 0] to [:, 1] fit the points
+            from [:, 2] to [:, 3].
+        cones: (6, n) coefficients of the visibility, (6, 0) if all points are seen from everywhere:
+            v_j = min(max((cones[:3, j] . C + cones[3, j]) / |C - p_j| + cones[4, j], cones[5, j]), 1), C the camera's
+            centre.
     """
 
     p: Array
@@ -51,7 +64,7 @@ class WeightedPoints(NamedTuple):
 
 @part
 def visible_weights(points: Any, rotation: Any, translation: Any, weight: Any) -> None:
-    """weight (n,): b_j v_j of points, a `WeightedPoints`, under a pose (3, 3), (3,)."""
+    """Fill weight (n,) with b_j v_j of points, a `WeightedPoints`, under a pose (3, 3), (3,)."""
     p, b, cones = points.p, points.b, points.cones
     if cones.shape[1] == 0:
         for j in range(len(b)):
@@ -70,9 +83,12 @@ def visible_weights(points: Any, rotation: Any, translation: Any, weight: Any) -
 class Side(NamedTuple):
     """One side of a problem in random order.
 
-    points: (k, 3) offsets of bearings, or points. weights: (k,) probability of a partner, 1 where nothing is known.
-    labels: (k,), -1 fits any. cones: (k, 4) unit normals and the cosine at which a point is half visible; (k, 0)
-    for bearings, and for points that are seen from everywhere.
+    Attributes:
+        points: (k, 3) offsets of bearings, or points.
+        weights: (k,) probability of a correspondence; 1 without annotations.
+        labels: (k,); -1 fits any label.
+        cones: (k, 4) unit normals and the cosine at which a point is half visible. (k, 0) for bearings, and for points
+            that are seen from everywhere.
     """
 
     points: Array
@@ -81,15 +97,15 @@ class Side(NamedTuple):
     cones: Array
 
     def at(self, chosen: slice | NDArray[np.int64]) -> "Side":
-        """Some of the points."""
+        """Return a subset of the points."""
         return Side(self.points[chosen], self.weights[chosen], self.labels[chosen], self.cones[chosen])
 
     def clustered(self, count: int, settings: SearchSettings, rng: np.random.Generator) -> "Side":
-        """About `count` clusters in the order of their labels, each of points of one label; the weights add up.
+        """Return about `count` clusters in the order of their labels, each of points of one label; the weights add up.
 
-        Points with normals are near each other if these are too: half an extent counts as much as half a radian.
+        Points with normals are only close if the normals are too: half an extent counts as much as half a radian.
         """
-        parts = [self.at(slice(0))]  # in case no point has a partner: their clusters are dropped
+        parts = [self.at(slice(0))]  # an empty side, in case all clusters are dropped for a weight of 0
         for label in np.unique(self.labels):
             members = np.flatnonzero(self.labels == label)
             share = count if len(members) == len(self.labels) else -(-count * len(members) // len(self.labels))
@@ -98,7 +114,15 @@ class Side(NamedTuple):
 
 
 def side_of(points: Array, scores: Any, labels: Any, cones: Any, order: NDArray[np.int64]) -> Side:
-    """A side from points in this order already, and annotations in the user's, None for those that are missing."""
+    """Build a side.
+
+    Args:
+        points: (k, 3) points, already in the given order.
+        scores: Probabilities of a correspondence in the user's order; None for 1.
+        labels: Labels in the user's order; None for none.
+        cones: (-, 4) normals and cosines in the user's order; None for none.
+        order: (k,) indices in the user's order.
+    """
     k = len(points)
     return Side(
         points,
@@ -109,14 +133,14 @@ def side_of(points: Array, scores: Any, labels: Any, cones: Any, order: NDArray[
 
 
 def with_partners(side: Side, other: Side) -> Side:
-    """The side with the weight 0 for each point whose label none of the other side fits."""
+    """Return the side with weight 0 for each point whose label fits no point of the other side."""
     fitting = np.unique(other.labels)
     possible = np.isin(side.labels, fitting) | (side.labels < 0) | (-1 in fitting)
     return side._replace(weights=np.where(possible, side.weights, np.float32(0)))
 
 
 def _clusters(side: Side, count: int, settings: SearchSettings, rng: np.random.Generator) -> Side:
-    """At most `count` clusters of points of one label."""
+    """Return at most `count` clusters of points of one label."""
     k = len(side.points)
     if k <= count:
         return side
@@ -135,9 +159,17 @@ def _clusters(side: Side, count: int, settings: SearchSettings, rng: np.random.G
 
 
 def lloyd(points: Array, centres: Array, iterations: int, weights: Array) -> tuple[Array, NDArray[np.float64]]:
-    """Centres (k, d) after some iterations of k-means (Lloyd), and the weights of the points that were nearest to each.
+    """Run k-means (Lloyd).
 
-    A centre that has lost all its points stays where it was, with the weight 0.
+    Args:
+        points: (n, d).
+        centres: (k, d) initial centres.
+        iterations: Number of iterations.
+        weights: (n,) weights of the points.
+
+    Returns:
+        Centres (k, d), and the weights (k,) of the points nearest to each. A centre without points keeps its last
+        value.
     """
     extended = np.column_stack([points, np.ones(len(points), points.dtype)])
     for i in range(iterations + 1):
@@ -153,7 +185,7 @@ def lloyd(points: Array, centres: Array, iterations: int, weights: Array) -> tup
 
 
 def kernel_sides(bearings: Side, points: Side, facing: Facing) -> tuple[WeightedBearings, WeightedPoints]:
-    """Both sides as the compiled loops read them, before there are blocks (`blocks_of`)."""
+    """Convert both sides to the arrays of the compiled loops; the blocks are empty (`blocks_of`)."""
     return (
         WeightedBearings(
             np.ascontiguousarray(bearings.points.T), bearings.weights, _fitting(bearings, points), bearings.labels
@@ -170,7 +202,7 @@ def kernel_sides(bearings: Side, points: Side, facing: Facing) -> tuple[Weighted
 
 
 def blocks_of(labels2d: NDArray[np.int32], labels3d: NDArray[np.int32]) -> NDArray[np.uintp]:
-    """(k, 4) as `WeightedPoints` has them, of labels in ascending order."""
+    """Return the blocks (k, 4) of `WeightedPoints` for labels in ascending order."""
     blocks, free = [], int(np.searchsorted(labels2d, 0))
     for label in np.unique(labels3d):
         own = np.searchsorted(labels3d, (label, label + 1))
@@ -182,7 +214,7 @@ def blocks_of(labels2d: NDArray[np.int32], labels3d: NDArray[np.int32]) -> NDArr
 
 
 def _fitting(side: Side, other: Side) -> Array:
-    """For each point the share, by weight, of the other side whose labels fit; above 0, for points without any."""
+    """Return the fraction of the other side, by weight, with a fitting label; at least 1e-6."""
     if (side.labels < 0).all():
         return np.ones(len(side.labels), np.float32)
     values, place = np.unique(other.labels, return_inverse=True)
@@ -194,7 +226,7 @@ def _fitting(side: Side, other: Side) -> Array:
 
 
 def _cones(points: Side, facing: Facing) -> Array:
-    """(6, n) as `WeightedPoints` has them."""
+    """Return the coefficients (6, n) of the visibility of `WeightedPoints`."""
     if not points.cones.shape[1]:
         return np.empty((6, 0), np.float32)
     normals, cosine, slope = points.cones[:, :3], points.cones[:, 3], 1 / (2 * facing.softness)

@@ -1,10 +1,10 @@
-"""Annealing of a few poses on all points: at a small scale a point sees only its neighbours, found in tiles.
+"""Annealing of a few poses on all points: at a small scale only neighbours interact, and tiles find them.
 
 An iteration costs O(m + n) times the neighbours within three scales, not O(m n). Bearings are sorted into tiles of 16
-that lie near each other, points under a pose into the cells of a grid across the view; a tile meets the points of the
-cells around it. In a view of more than 180 degrees a cell holds directions of both hemispheres. Arrays and offsets are
-those of `bpnp.search.kernels.dense`; the loops over the bearings of a tile have a constant length, for which compilers
-use the widest instructions that there are.
+that lie near each other, points under a pose into the cells of a grid across the view. A tile is paired with the points
+of the cells around it. In a view of more than 180 degrees a cell holds directions of both hemispheres. Arrays and
+offsets are those of `bpnp.search.kernels.dense`. The loops over the bearings of a tile have a constant length, so that
+compilers use the widest vector instructions.
 """
 
 import math
@@ -18,8 +18,8 @@ from bpnp.search.kernels.dense import move, see
 from bpnp.search.kernels.sides import Array, WeightedBearings, visible_weights
 
 SWEEPS = 2
-TILES = 12  # with neighbours, of a point in the mean, before there is place for more
-LEAST_SEEN = 0.25  # of all weights: if fewer points face the camera, they count as so many
+TILES = 12  # mean number of tiles near a point that the first buffer holds
+LEAST_SEEN = 0.25  # of all weights: smallest weight of the points that face the camera
 REACH = 3.0  # scales; the kernel is below 0.012 beyond
 LANES = 16  # bearings of a tile
 CELLS = 64  # along the longer side of the grid
@@ -28,9 +28,17 @@ CELLS = 64  # along the longer side of the grid
 class Tiles(NamedTuple):
     """Bearings in c tiles, and a grid across the view.
 
-    f: (c, 3, LANES) offsets. a, odds, label: (c, LANES) as of `WeightedBearings`; the last tile is filled up with
-    bearings of weight 0. box: (c, 4) least x and y of a tile, and largest. low: (2,) corner of the grid. cell: width of
-    its cells. shape: (2,) cells along x and y. Cell (i, j) is number 1 + i * shape[1] + j; number 0 is outside.
+    Cell (i, j) of the grid is number 1 + i * shape[1] + j; number 0 is outside.
+
+    Attributes:
+        f: (c, 3, LANES) offsets.
+        a: (c, LANES) weights; the last tile is filled up with bearings of weight 0.
+        odds: (c, LANES), as in `WeightedBearings`.
+        label: (c, LANES), as in `WeightedBearings`.
+        box: (c, 4) least x and y of a tile, and largest.
+        low: (2,) corner of the grid.
+        cell: Width of a cell.
+        shape: (2,) cells along x and y.
     """
 
     f: Array
@@ -43,7 +51,7 @@ class Tiles(NamedTuple):
     shape: NDArray[np.int32]
 
     def with_margin(self, scale: float) -> "Tiles":
-        """With a grid over the bearings and as much around them as a kernel of this scale reaches, radians."""
+        """Return the tiles with a grid that covers the bearings and the reach of a kernel of this scale, radians."""
         margin = F(REACH * scale)
         low, high = self.box[:, :2].min(0) - margin, self.box[:, 2:].max(0) + margin
         cell = F((high - low).max() / CELLS)
@@ -53,7 +61,10 @@ class Tiles(NamedTuple):
 class Near(NamedTuple):
     """Pairs e of a tile and a point near it, in the order of the tiles: those of tile t from end[t] to end[t + 1].
 
-    point: (e,). kernel: (e, LANES), of the tile's bearings and this point. end: (c + 1,).
+    Attributes:
+        point: (e,) indices of points.
+        kernel: (e, LANES) kernel of the tile's bearings and this point.
+        end: (c + 1,).
     """
 
     point: NDArray[np.int32]
@@ -62,7 +73,7 @@ class Near(NamedTuple):
 
 
 def build_tiles(bearings: WeightedBearings) -> Tiles:
-    """Tiles of bearings, cut from stripes across x that are sorted by y, before there is a grid (`with_margin`)."""
+    """Cut bearings into tiles, from stripes across x that are sorted by y; the grid is set by `with_margin`."""
     x, y = bearings.f[:2]
     m = len(x)
     stripe = np.empty(m, np.int64)
@@ -78,7 +89,7 @@ def build_tiles(bearings: WeightedBearings) -> Tiles:
 
 @part
 def sort_points(tiles: Any, u: Any, cells: Any, start: Any, order: Any) -> None:
-    """order (n,): the points, seen in directions u (3, n), by their cells; those of cell c end at start[c]."""
+    """Fill order (n,) with the points, seen in directions u (3, n), by their cells; those of cell c end at start[c]."""
     low, shape = tiles.low, tiles.shape
     inverse = F(1) / tiles.cell
     for c in range(len(start)):
@@ -101,17 +112,29 @@ def sort_points(tiles: Any, u: Any, cells: Any, start: Any, order: Any) -> None:
 
 @part
 def cells_between(first: Any, last: Any, low: Any, cell: Any, size: Any) -> tuple[int, int]:
-    """First and last of `size` cells along an axis that meet an interval."""
+    """Return the first and last of `size` cells along an axis that overlap an interval."""
     i, j = math.floor((first - low) / cell), math.floor((last - low) / cell)
     return i if i > 0 else 0, j if j < size else size - 1
 
 
 @part
 def meet(tiles: Any, labels: Any, u: Any, scale: Any, start: Any, order: Any, near: Any) -> bool:
-    """Pairs e of a tile t and a point near it, end[t] <= e < end[t + 1]: point[e], and kernel[e, k] for bearing k of t;
-    False if `near`, a `Near`, has no place for all of them.
+    """Fill `near` with the pairs of a tile and a point within reach, and their kernels.
 
-    The kernel is (1 + y + y^2/2 + y^3/6)^64, y = -|f - u|^2 / 128 s^2, within 1e-4 of exp(64 y), and 0 beyond REACH.
+    The kernel is (1 + y + y^2/2 + y^3/6)^64, y = -|f - u|^2 / 128 s^2, within 1e-4 of exp(64 y), and 0 beyond REACH. It
+    is also 0 for labels that do not fit.
+
+    Args:
+        tiles: Tiles of the bearings.
+        labels: (n,) labels of the points.
+        u: (3, n) offsets of their directions.
+        scale: s, radians.
+        start: Ends of the cells, from `sort_points`.
+        order: Points by their cells, from `sort_points`.
+        near: A `Near`, overwritten.
+
+    Returns:
+        False if `near` is too small for all pairs.
     """
     f, label, box, low, cell, shape = tiles.f, tiles.label, tiles.box, tiles.low, tiles.cell, tiles.shape
     point, kernel, end = near
@@ -141,7 +164,7 @@ def meet(tiles: Any, labels: Any, u: Any, scale: Any, start: Any, order: Any, ne
                     v = v * v if (squared < bound) & partners else F(0)
                     kernel[place, k] = v
                     total += v
-                # Without a branch: the next pair takes the place of one that does not count.
+                # Without a branch: the next pair overwrites one whose kernel is 0.
                 point[place] = j
                 place += total > 0
         end[t + 1] = place
@@ -150,7 +173,7 @@ def meet(tiles: Any, labels: Any, u: Any, scale: Any, start: Any, order: Any, ne
 
 @part
 def add_to_bearings(values: Any, near: Any, sums: Any) -> None:
-    """sums (c, LANES): sum_j K_ij values_j."""
+    """Fill sums (c, LANES) with sum_j K_ij values_j."""
     point, kernel, end = near
     for t in range(len(sums)):
         for k in range(LANES):
@@ -163,7 +186,7 @@ def add_to_bearings(values: Any, near: Any, sums: Any) -> None:
 
 @part
 def add_to_points(values: Any, near: Any, sums: Any) -> None:
-    """sums (n,): sum_i K_ij values_i, of values (c, LANES)."""
+    """Fill sums (n,) with sum_i K_ij values_i, of values (c, LANES)."""
     point, kernel, end = near
     for j in range(len(sums)):
         sums[j] = 0
@@ -177,7 +200,7 @@ def add_to_points(values: Any, near: Any, sums: Any) -> None:
 
 @part
 def add_moments(f: Any, u: Any, row: Any, column: Any, near: Any, q: Any) -> None:
-    """q (4, n): sum_i W_ij (f_i - u_j) and sum_i W_ij, W_ij = row_i K_ij column_j."""
+    """Fill q (4, n) with sum_i W_ij (f_i - u_j) and sum_i W_ij, W_ij = row_i K_ij column_j."""
     point, kernel, end = near
     for j in range(len(column)):
         q[0, j], q[1, j], q[2, j], q[3, j] = F(0), F(0), F(0), F(0)
@@ -200,9 +223,23 @@ def add_moments(f: Any, u: Any, row: Any, column: Any, near: Any, q: Any) -> Non
 
 
 class SparseScratch(NamedTuple):
-    """What `descend_sparse` overwrites, for c tiles and n points: directions u (3, n), cells (n,), start (of a cell)
-    and order (n,) of the points in the grid, the pairs that are near, sums and row (c, LANES), column and weight (n,),
-    q (4, n), the normal equations (8, 6), the best pose of a start and its first one (4, 3)."""
+    """Buffers of `descend_sparse`, for c tiles and n points.
+
+    Attributes:
+        u: (3, n) directions of the points.
+        cells: (n,) their cells.
+        start: End of each cell in the order, which is the start of the next.
+        order: (n,) points by their cells.
+        near: Pairs of tiles and points.
+        sums: (c, LANES).
+        row: (c, LANES).
+        column: (n,).
+        weight: (n,).
+        q: (4, n).
+        system: (8, 6) normal equations.
+        best: (4, 3) best pose of an annealing.
+        first: (4, 3) its initial pose.
+    """
 
     u: Any
     cells: Any
@@ -220,7 +257,7 @@ class SparseScratch(NamedTuple):
 
 
 def sparse_scratch(tiles: Tiles, n: int, pairs: int = 0) -> SparseScratch:
-    """pairs: of a tile and a point, at least."""
+    """Allocate the buffers of `descend_sparse`, for n points and at least `pairs` pairs of a tile and a point."""
     most, c = max(pairs, n * TILES) + 1, len(tiles.f)
     cells, order, start, point = (np.empty(k, np.int32) for k in (n, n, tiles.shape.prod() + 1, most))
     near = Near(point, np.empty((most, LANES), F), np.zeros(c + 1, np.int32))
@@ -233,15 +270,24 @@ def sparse_scratch(tiles: Tiles, n: int, pairs: int = 0) -> SparseScratch:
 def assign_sparse(
     tiles: Any, points: Any, rotation: Any, translation: Any, scale: Any, outlier: Any, scratch: Any
 ) -> Any:
-    """Fill q by Sinkhorn with slack; return the mean log-likelihood of the bearings, the matched share, and whether
-    there was place for all pairs that are near.
+    """Fill q by Sinkhorn iterations with slack.
 
     W_ij = x_i K_ij y_j, x_i = a_i/(e_i + sum_j K_ij y_j), y_j = b_j/(e_j + sum_i K_ij x_i), e^2 = o sqrt(A B) times the
-    odds, A and B the sums of the weights a and b: of points of weight 1 a lone pair is matched where its kernel exceeds
-    e^2, where the outlier density takes over in the product form too.
+    odds, A and B the sums of the weights a and b. Among points of weight 1 a lone pair is matched where its kernel
+    exceeds e^2. The outlier density dominates below that in the product form too.
 
-    tiles, points: `Tiles` and a `WeightedPoints`, whose weights b_j under this pose are in the scratch. scale: radians.
-    outlier: o of `Scene.outlier_density`.
+    Args:
+        tiles: Tiles of the bearings.
+        points: A `WeightedPoints`; the weights b_j under this pose are in the scratch.
+        rotation: (3, 3).
+        translation: (3,).
+        scale: Radians.
+        outlier: o of `Scene.outlier_density`.
+        scratch: A `SparseScratch`, overwritten.
+
+    Returns:
+        The mean log-likelihood of the bearings, the matched fraction, and False if the scratch is too small for all
+        pairs.
     """
     a, odds2d, odds3d, n = tiles.a, tiles.odds, points.odds, points.p.shape[1]
     u, near, sums = scratch.u, scratch.near, scratch.sums
@@ -286,12 +332,23 @@ def descend_sparse(
     result: Any,
     scratch: Any,
 ) -> int:
-    """Anneal starts (S, 3, 3), (S, 3) in place to the one of `scales` (k,), radians, that explains the bearings best;
-    of how many there was place in the scratch for the pairs that are near. The next one is as it was.
+    """Anneal poses in place to the scale that explains the bearings best.
 
-    A start stops `patience` scales after its likelihood was highest and returns to the pose of that scale.
-    result (S, 3): likelihood, matched share and scale there; -inf, 0, 0 for a pose that is not finite. outlier: o / s^2
-    of `Scene.outlier_density`.
+    An annealing stops `patience` scales after its likelihood was highest and returns to the pose of that scale.
+
+    Args:
+        tiles: Tiles of the bearings.
+        points: A `WeightedPoints`.
+        rotation: (S, 3, 3), overwritten.
+        translation: (S, 3), overwritten.
+        scales: (k,) radians.
+        outlier: o / s^2 of `Scene.outlier_density`.
+        patience: Scales without a higher likelihood.
+        result: (S, 3) likelihood, matched fraction and scale, written; -inf, 0, 0 for a pose that is not finite.
+        scratch: A `SparseScratch`, overwritten.
+
+    Returns:
+        The number of poses annealed. If it is less than S, the scratch was too small for the next pose, left unchanged.
     """
     best, first = scratch.best, scratch.first
     for k in range(len(rotation)):

@@ -2,7 +2,7 @@
 
 P3P gives the poses of triples of matches. The best are refined on all matches (least squares), and on those that agree
 with the pose (iterated weights of an inlier mixture), so that one wrong match does not spoil the others. The residual
-may have any size: a search that looks for matches within a radius would lose it.
+may have any size: a search for matches within a radius would miss large ones.
 """
 
 import math
@@ -31,11 +31,11 @@ SETTLED, EXACT = 1e-6, 1e-24  # relative and absolute change of a sum of squares
 
 
 def known_matches(problem: Problem) -> tuple[Labels, Labels] | None:
-    """Return the matches that the labels leave, or None.
+    """Return the matches that unique labels define, or None.
 
     Returns:
-        Indices (k,) of image points and (k,) of scene points, where each point with a possible partner has one alone,
-        and there are more matches than fix a pose. Otherwise None.
+        Indices (k,) of image points and (k,) of scene points. None unless each point with a possible correspondence has
+        exactly one, and there are more matches than fix a pose.
 
     >>> problem = Problem(np.eye(4, 3), np.eye(4, 3), labels2d=np.array([3, 2, 1, 0]), labels3d=np.arange(4))
     >>> known_matches(problem)
@@ -65,7 +65,7 @@ def poses_of_matches(problem: Problem, i: Labels, j: Labels, seed: int = 0) -> H
     """
     rays, points = problem.bearings[i], problem.points3d[j]
     middle = points.mean(0)
-    points = points - middle  # about which a turn and a shift are nearly independent
+    points = points - middle  # rotation and translation are nearly independent about the centroid
     rng = np.random.default_rng(seed)
     triples = _triples(len(i), rng)
     poses = p3p_poses(rays[triples], points[triples]).reshape(-1, 4, 3)
@@ -102,7 +102,7 @@ def poses_of_matches(problem: Problem, i: Labels, j: Labels, seed: int = 0) -> H
 
 
 def _triples(count: int, rng: np.random.Generator) -> Labels:
-    """Return all triples (t, 3) of so many matches, or `TRIPLES` of them."""
+    """Return all triples (t, 3) of `count` matches, or `TRIPLES` of them."""
     if math.comb(count, 3) <= TRIPLES:
         a, b, c = np.meshgrid(*[np.arange(count)] * 3, indexing="ij")
         return np.argwhere((a < b) & (b < c))
@@ -110,7 +110,7 @@ def _triples(count: int, rng: np.random.Generator) -> Labels:
 
 
 def _scales(problem: Problem) -> Array:
-    """Return scales (S,) of residuals, radians: from the smallest of the image up to its spread."""
+    """Return scales (S,) of residuals, radians: from the smallest of the image up to its RMS angular radius."""
     smallest = float(problem.image.scales[0])
     return np.geomspace(smallest, max(2 * smallest, problem.image.spread), 12)
 
@@ -123,7 +123,7 @@ def _squared(rays: Array, points: Array, poses: Array) -> Array:
 
 
 def _inlier_probability(squared: Array, scale: Array, density: float) -> Array:
-    """Return the probability that a residual is one of an inlier, not of a point that is anywhere in view."""
+    """Return the probability that a residual belongs to an inlier, not to a point anywhere in view."""
     inlier = (1 - WRONG) * np.exp(-0.5 * squared / scale**2) / (2 * math.pi * scale**2)
     return np.asarray(inlier / (inlier + WRONG * density))
 
@@ -173,8 +173,7 @@ def _refined(rays: Array, points: Array, poses: Array, weights: Array, steps: in
 
 
 def _scored(problem: Problem, i: Labels, j: Labels, rotation: Array, translation: Array, scales: Array) -> Hypotheses:
-    """Return the distinct ones of poses (h, 3, 3), (h, 3) with the scale of their residuals, and likelihood and number
-    of matches at it."""
+    """Return the distinct poses with the scale of their residuals, and likelihood and match count at this scale."""
     poses = np.concatenate([rotation, translation[:, None]], 1)
     squared, density = _squared(problem.bearings[i], problem.points3d[j], poses), 1 / problem.image.solid_angle
     own = scales[_agreement(squared, scales, density)[1]]

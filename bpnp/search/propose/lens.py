@@ -1,8 +1,8 @@
-"""Another lens for a pose: the focal length and the radial distortion that fit its points best.
+"""Camera model of a pose: the focal length and the radial distortion that fit its points best.
 
-The camera model is COLMAP's SIMPLE_RADIAL with the principal point at the origin: a point (X, Y, Z) in the camera's
-frame, x = (X, Y) / Z, is seen at z (1 + k |x|^2) x, with the zoom z over the focal length of the bearings and the
-radial coefficient k. Everything here is a pure function of arrays.
+The camera model is COLMAP's SIMPLE_RADIAL with the principal point at the origin. A point (X, Y, Z) in the camera's
+frame, x = (X, Y) / Z, is seen at z (1 + k |x|^2) x. z is the scale factor over the focal length of the bearings, and k
+the radial coefficient. Everything here is a pure function of arrays.
 """
 
 import math
@@ -19,9 +19,9 @@ from bpnp.search.problem import Problem
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
 FEW_PARTNERS = 2  # scene points that may correspond to each image point
-MOST_ZOOM, MOST_BEND = 0.2, 0.1  # largest step of log zoom, and of the shift of the outermost point, of its radius
-SAME_ZOOM = 0.01  # change of log zoom below which no other round of steps is taken
-LEAST_SLOPE = 0.2  # of the seen over the true radius; a lens that is flatter at a point does not see it
+MOST_ZOOM, MOST_BEND = 0.2, 0.1  # largest step of the log scale factor, and relative shift of the outermost point
+SAME_ZOOM = 0.01  # change of the log scale factor below which no other round of steps is taken
+LEAST_SLOPE = 0.2  # smallest derivative of the seen by the true radius at which a point is visible
 UNDISTORTED = 20  # Newton steps
 MOST_ROUNDS = 4
 SETTLED_ZOOM, MOST_STEPS = 2e-5, 40  # the same for the last steps, with all points; steps at most
@@ -29,14 +29,14 @@ WIDTHS = (4.0, 2.0, 2.0, 1.0, 1.0)  # scales of the residuals, of the Gauss-Newt
 
 
 class LensFit(NamedTuple):
-    """A pose and a lens, and the normal equations of the next Gauss-Newton step.
+    """Pose and camera model, with the normal equations of the next Gauss-Newton step.
 
     Attributes:
         rotation: (3, 3).
-        middle: (3,) the middle of the scene in the camera's frame.
-        zoom: Focal length over that of the bearings.
+        middle: (3,) centroid of the scene in the camera's frame.
+        zoom: Scale factor: focal length over that of the bearings.
         radial: Radial coefficient k; None if only the focal length is fitted.
-        products: (7, 7) J^T J of rotation, shift and log zoom; (8, 8) with k.
+        products: (7, 7) J^T J of rotation, shift and log scale factor; (8, 8) with k.
         gradient: (7,) or (8,) J^T r.
     """
 
@@ -51,17 +51,17 @@ class LensFit(NamedTuple):
 def fit_lens(
     problem: Problem, rotation: Array, middle: Array, scale: float, radial: float | None = None
 ) -> LensFit | None:
-    """Fit pose and focal length, and the radial coefficient if wanted, to soft matches by Gauss-Newton steps.
+    """Fit pose, focal length and optionally the radial coefficient to soft matches by Gauss-Newton steps.
 
     The first steps use some of the image points and matches of wider scales. The last ones use all points, until the
     focal length has converged.
 
     Args:
         problem: Points; the bearings are those of a camera without distortion.
-        rotation: (3, 3) rotation to start from.
-        middle: (3,) middle of the scene in the camera's frame, to start from.
+        rotation: (3, 3) initial rotation.
+        middle: (3,) initial centroid of the scene in the camera's frame.
         scale: Scale of the residuals, radians.
-        radial: Radial coefficient to start from; None to fit no distortion.
+        radial: Initial radial coefficient; None to fit no distortion.
 
     Returns:
         The fit, or None if no points match.
@@ -93,9 +93,10 @@ def fit_lens(
 
 
 def undistort(bearings: Array, zoom: float, radial: float) -> Array:
-    """Return the bearings (m, 3) of a lens, given as a pinhole camera of 1 / zoom times its focal length saw them.
+    """Convert bearings (m, 3) of a distorted camera to those of a pinhole with 1 / zoom times its focal length.
 
-    Newton steps solve r (1 + k r^2) = r_seen / zoom; a point beyond the largest radius of the lens stays at that.
+    Newton steps solve r (1 + k r^2) = r_seen / zoom; a point beyond the largest radius of the camera model stays at
+    that.
 
     >>> x = np.array([[0.6, 0.3, 1.0]])
     >>> bent = x * [[1.2 * (1 - 0.2 * 0.45)] * 2 + [1]]
@@ -115,7 +116,7 @@ def undistort(bearings: Array, zoom: float, radial: float) -> Array:
 
 
 def lens_columns(seen: Array, radial: float) -> Array:
-    """Return the derivatives of directions by the lens, whose bearings were undistorted with it.
+    """Return the derivatives of directions by the camera model with which their bearings were undistorted.
 
     With y = (1 + k |x|^2) x fixed by the image, dx = x (1 + k |x|^2) / (1 + 3 k |x|^2) d log f, and
     dx = x |x|^2 / (1 + 3 k |x|^2) dk.
@@ -140,7 +141,7 @@ def centre_columns(seen: Array) -> Array:
 
 
 def _linearise(problem: Problem, chosen: Labels, scale: float, at: LensFit) -> LensFit | None:
-    """Return the same pose and lens with its normal equations, None without a match."""
+    """Return the pose and camera model with their normal equations, or None without a match."""
     turned = (problem.points3d - problem.middle) @ at.rotation.T
     places = facing(problem, turned + at.middle, at.rotation)
     camera = turned[places] + at.middle
@@ -185,7 +186,7 @@ def _take_step(problem: Problem, chosen: Labels, scale: float, at: LensFit) -> L
         products, gradient = products.copy(), gradient.copy()
         products[6, 6] += (scale / focal.sigma) ** 2
         gradient[6] -= (scale / focal.sigma) ** 2 * (focal.offset + math.log(at.zoom))
-    size = np.diag(products)  # of turn, shift and lens, each in a unit of its own
+    size = np.diag(products)  # of rotation, shift and camera model, each in its own unit
     damped = products + np.diag(np.where(size > 0, 1e-6 * size, 1.0))
     step = np.linalg.solve(damped, gradient)
     zoom = at.zoom * math.exp(float(np.clip(step[6], -MOST_ZOOM, MOST_ZOOM)))

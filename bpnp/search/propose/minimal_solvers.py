@@ -1,4 +1,4 @@
-"""Minimal solvers, compiled: three matches (P3P), or two where a direction is known (P2P).
+"""Minimal solvers, compiled: three matches (P3P), or two with a prior direction (P2P).
 
 The three sides of a triangle are 01, 12, 20, the longest one between 1 and 2. A division by zero is infinite, as in C;
 every root is tested before it is used. Poses are (4, 3): R, and t below it.
@@ -19,18 +19,21 @@ part = compiler(part=True, forceinline=True)  # called by compiled functions alo
 FLAT = 1e-12  # squared height of a triangle over its squared longest side
 TOLERANCE = 1e-6  # of the squared sides, in units of the longest
 ROUNDING = 1e-12  # of a discriminant: what is smaller than this counts as zero
-LEVEL = 1e-6  # sine of both rays' height, below which a known vertical says nothing about their depths
-UPRIGHT = 1e-3  # horizontal part of the way between two points, below which it says nothing about the heading
+LEVEL = 1e-6  # sine of both rays' height, below which a prior vertical does not determine their depths
+UPRIGHT = 1e-3  # horizontal fraction of the vector between two points, below which it does not determine the heading
 Array = NDArray[np.float64]
 
 
 class Triangles(NamedTuple):
-    """What P3P needs of t triples of scene points.
+    """Triangles of scene points, for P3P.
 
-    triples: (t, 3) places of the points, turned so that the longest side is 12. sides: (t, 3), |p_0 - p_1|^2 / s^2,
-    |p_2 - p_0|^2 / s^2 and s = |p_1 - p_2|. frames: (t, 3, 3), rows along the longest side, across it, and the normal.
-    middles: (t, 3). orientation: (t,), 1 where a camera can see the points in the order of the triangle's normal, 2 in
-    the other order, 3 either, 0 where the points lie on a line or are not finite.
+    Attributes:
+        triples: (t, 3) indices of the points, in cyclic order so that the longest side is 12.
+        sides: (t, 3) |p_0 - p_1|^2 / s^2, |p_2 - p_0|^2 / s^2 and s = |p_1 - p_2|.
+        frames: (t, 3, 3), rows along the longest side, across it, and the normal.
+        middles: (t, 3) centroids.
+        orientation: (t,), 1 where a camera can see the points in the order of the triangle's normal, 2 in the other
+            order, 3 either, 0 where the points lie on a line or are not finite.
     """
 
     triples: NDArray[np.int64]
@@ -41,7 +44,7 @@ class Triangles(NamedTuple):
 
 
 def triangles_of(points: Array, triples: NDArray[np.int64]) -> Triangles:
-    """The triangles of triples (t, 3) of points (n, 3), seen in either order."""
+    """Build the triangles of triples (t, 3) of points (n, 3), seen in either order."""
     p = points[triples]
     opposite = ((np.roll(p, -1, 1) - np.roll(p, -2, 1)) ** 2).sum(-1)
     turn = (opposite.argmax(1)[:, None] + np.arange(3)) % 3
@@ -89,7 +92,7 @@ def p3p_poses(rays: Array, points: Array) -> Array:
 
 @compiled
 def _solve_each(rays: Any, triangles: Any, poses: Any, scratch: Any) -> None:
-    """Fill `poses` (t, 4, 4, 3), NaN before, of each triangle. scratch: (4, 4, 3)."""
+    """Fill `poses` (t, 4, 4, 3), NaN before, with the solutions of each triangle; scratch (4, 4, 3) is overwritten."""
     for t in range(len(poses)):
         i, j, k = triangles.triples[t, 0], triangles.triples[t, 1], triangles.triples[t, 2]
         if triangles.orientation[t]:
@@ -101,9 +104,18 @@ def _solve_each(rays: Any, triangles: Any, poses: Any, scratch: Any) -> None:
 
 @part
 def solve_p3p(rays: Any, seen: Any, chords: Any, triangles: Any, t: int, poses: Any) -> int:
-    """Fill `poses` (4, 4, 3) with those under which triangle t is seen along three of the rays (m, 4); how many.
+    """Fill `poses` with those under which triangle t is seen along three of the rays.
 
-    seen: the three places of the rays. chords: of `chords_between` these.
+    Args:
+        rays: (m, 3) unit vectors.
+        seen: Three indices of rays.
+        chords: Result of `chords_between` for these rays.
+        triangles: A `Triangles`.
+        t: Index of the triangle.
+        poses: (4, 4, 3), written.
+
+    Returns:
+        The number of poses.
     """
     i, j, k = seen
     sides, frame, middle = triangles.sides[t], triangles.frames[t], triangles.middles[t]
@@ -136,7 +148,7 @@ def solve_p3p(rays: Any, seen: Any, chords: Any, triangles: Any, t: int, poses: 
 
 @part
 def chords_between(rays: Any, i: int, j: int, k: int) -> tuple[float, float, float]:
-    """|f_i - f_j|^2 of three unit rays, between the first and second, second and third, third and first."""
+    """Return |f_i - f_j|^2 of three unit rays, between the first and second, second and third, third and first."""
     return _distance2(rays[i], rays[j]), _distance2(rays[j], rays[k]), _distance2(rays[k], rays[i])
 
 
@@ -148,10 +160,18 @@ def _distance2(f: Any, g: Any) -> float:
 
 @part
 def p3p_depths(chords: Any, a: float, b: float, poses: Any) -> int:
-    """The depths d_i > 0 of three rays with |d_i f_i - d_j f_j| = |p_i - p_j|; how many solutions there are (0 to 4).
+    """Solve |d_i f_i - d_j f_j| = |p_i - p_j| for the depths d_i > 0 of three rays.
 
-    chords: of `chords_between` the rays. a, b: |p_0 - p_1|^2 and |p_2 - p_0|^2 over |p_1 - p_2|^2.
-    poses: the depths are written to poses[:, 3], in units of |p_1 - p_2|. `p3p_poses` defines the conics and lines.
+    `p3p_poses` defines the conics and lines.
+
+    Args:
+        chords: Result of `chords_between` for the rays.
+        a: |p_0 - p_1|^2 over |p_1 - p_2|^2.
+        b: |p_2 - p_0|^2 over |p_1 - p_2|^2.
+        poses: The depths are written to poses[:, 3], in units of |p_1 - p_2|.
+
+    Returns:
+        The number of solutions, 0 to 4.
     """
     m01, m12, m20 = 1 - 0.5 * chords[0], 1 - 0.5 * chords[1], 1 - 0.5 * chords[2]
     # Symmetric matrices by their components xx, xy, xw, yy, yw, ww.
@@ -210,7 +230,7 @@ def _size(values: Any) -> float:
 
 @part
 def cubic_root(c0: float, c1: float, c2: float, c3: float) -> float:
-    """The real root of c_0 s^3 + c_1 s^2 + c_2 s + c_3 that lies farthest from the other two, so the best determined.
+    """Return the best determined real root of c_0 s^3 + c_1 s^2 + c_2 s + c_3: the one farthest from the other two.
 
     Cardano for t^3 - 3 p t - 2 q with s = t - c_1/3c_0, by the cosine where all roots are real; then Newton steps.
     """
@@ -269,7 +289,7 @@ def _meet(line: Any, conics: Any, chords: Any, a: float, b: float, poses: Any, c
 
 @part
 def _restricted(conic: Any, steep: bool, slope: float, offset: float) -> tuple[float, float, float]:
-    """A conic on a line, as coefficients q, h, k of q u^2 + 2 h u + k."""
+    """Return a conic on a line, as coefficients q, h, k of q u^2 + 2 h u + k."""
     xx, xy, xw, yy, yw, ww = conic
     if not steep:
         xx, xw, yy, yw = yy, yw, xx, xw
@@ -279,7 +299,11 @@ def _restricted(conic: Any, steep: bool, slope: float, offset: float) -> tuple[f
 
 @part
 def polished(d0: float, d1: float, d2: float, chords: Any, a: float, b: float, depths: Any) -> bool:
-    """Newton steps on the three equations, written to `depths` (3,); whether they hold there and all d_i > 0."""
+    """Refine depths by Newton steps on the three equations, written to `depths` (3,).
+
+    Returns:
+        True if the equations hold there and all d_i > 0.
+    """
     (chord01, chord12, chord20), worst = chords, math.inf
     for step in range(4):
         e0 = (d0 - d1) * (d0 - d1) + d0 * d1 * chord01 - a
@@ -303,12 +327,24 @@ def polished(d0: float, d1: float, d2: float, chords: Any, a: float, b: float, d
 
 @part
 def solve_p2p(i: int, j: int, a: int, b: int, heading: Any, rays: Any, points: Any, poses: Any) -> int:
-    """Fill `poses` with those under which points a and b are seen along the rays i and j, a direction being known; how
-    many there are, up to two.
+    """Fill `poses` with those under which points a and b are seen along the rays i and j, with a prior direction.
 
     f, g: the rays, p, q: the points, in frames whose z axis is the direction. With d g - c f = R (q - p), its z
     component is linear in the depths c and d, and the length of its horizontal part quadratic (Kukelova, Bujnak,
     Pajdla: Closed-form solutions to minimal absolute pose problems with known vertical direction, ACCV 2010).
+
+    Args:
+        i: Index of the first ray.
+        j: Index of the second ray.
+        a: Index of the first point.
+        b: Index of the second point.
+        heading: A `Heading`.
+        rays: (m, 3) unit vectors.
+        points: (n, 3) scene points.
+        poses: (4, 4, 3), written.
+
+    Returns:
+        The number of poses, up to two.
     """
     f, g, p, q = heading.rays[i], heading.rays[j], heading.points[a], heading.points[b]
     if max(abs(f[2]), abs(g[2])) < LEVEL:
@@ -317,7 +353,7 @@ def solve_p2p(i: int, j: int, a: int, b: int, heading: Any, rays: Any, points: A
     length2 = along0 * along0 + along1 * along1
     if length2 < UPRIGHT * UPRIGHT * (length2 + rise * rise):
         return 0
-    # The way R (q - p) lies in the plane of the rays: a turn of the known rotation has to bring it there.
+    # R (q - p) lies in the plane of the rays; the prior rotation must bring it there within its largest error.
     n0, n1, n2 = cross(f[0], f[1], f[2], g[0], g[1], g[2])
     volume = n0 * along0 + n1 * along1 + n2 * rise
     if volume * volume > heading.sine2 * (n0 * n0 + n1 * n1 + n2 * n2) * (length2 + rise * rise):

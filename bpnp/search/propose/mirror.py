@@ -1,4 +1,4 @@
-"""The mirror image of a scene: coordinates of the wrong handedness have no pose, but their mirror image has one."""
+"""Mirror image of a scene: coordinates of the wrong handedness have no pose, but their mirror image has one."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from bpnp.search.enumeration.settings import DEFAULT
 from bpnp.search.evidence.false_alarms import alarms_of
 from bpnp.search.problem import Problem
 
-HYPOTHESES = 20_000  # that are tried, some 10 ms: a right pose of clean points is among the first thousands
+HYPOTHESES = 20_000  # tried, in some 10 ms: a correct pose of clean points is among the first thousands
 MIRROR = np.array([1.0, 1.0, -1.0])
 
 

@@ -4,9 +4,10 @@ If p -> S p + d maps scene points onto other scene points, the pose (R S^T, t - 
 points to where (R, t) projects the points themselves. Every such pose is a competitor of (R, t).
 
 The motions are found by registering the scene with itself. A base of three points is matched with every congruent
-triangle of the scene: its edges decide the motion, and a sample of the points confirms it. Bases lie in a neighbourhood
-of some points, so that the cost of a base grows linearly with the scene. A motion that maps a fraction x of the points
-is missed by B bases with a probability of (1 - x^3)^B, and of less if the part is connected in space.
+triangle of the scene. Its edges determine the motion, and a sample of the points confirms it. Bases lie in a
+neighbourhood of some points, so that the cost of a base grows linearly with the scene. A motion that maps a fraction x
+of the points is missed by B bases with a probability of (1 - x^3)^B. The probability is lower if the part is connected
+in space.
 
 Source: D. Aiger, N. J. Mitra, D. Cohen-Or, 4-points congruent sets for robust pairwise surface registration, ACM TOG
 2008, with triangles in place of coplanar bases.
@@ -26,21 +27,21 @@ from bpnp.search.kernels.neighbours import HashedPoints, hashed, lies_on
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-# Points of the neighbourhood in which a base and its matches lie, of scenes up to so many points and of larger ones.
+# Neighbours of a point that a base and its matches come from, in scenes up to MANY points, and in larger ones.
 NEIGHBOURS, MANY_NEIGHBOURS, MANY = 96, 48, 500
 BASES = 32  # a motion of half of the points is missed by (1 - 1/8)^32 = 1.4 % of the registrations, at most
-COMPACT = 4  # part of a neighbourhood, from which every other base is drawn
-WIDEST = 4  # triangles of which a base is the largest
+COMPACT = 4  # every other base is drawn from this fraction (1 / COMPACT) of a neighbourhood
+WIDEST = 4  # triangles drawn for a base, the largest of them
 FEWEST = 5  # moved points that lie on others: three fix a motion and are no evidence of it
-FIRST = 7  # sampled points of which at least one confirms: one of 12 motions of a third of the points fails
+FIRST = 7  # sampled points; at least one must confirm a motion, which one of 12 motions of a third of the points fails
 CHECKED = 32  # sampled points that confirm a motion before all points do
 MOST_WORK = 30_000_000  # pairs of points that are compared for all bases together, some 0.1 s; the rest is left out
 CONFIRMING = 8  # pairs that take as long as a sampled point
 MOST_FOUND = 4096  # motions of all bases together that are ranked
 REFINED = 48  # motions, those of the largest fraction first, that are refined
-NEAR_SYMMETRY = 0.02  # of the extent, by which a point of a near symmetry may lie off
+NEAR_SYMMETRY = 0.02  # largest error of a point under a near symmetry, as a fraction of the extent
 SPACING = 0.25  # at a quarter of the spacing 1 to 6 % of the points lie on others by chance
-FLAT = 0.1  # of a scene's second extent, that the third one has at most where the scene counts as flat
+FLAT = 0.1  # largest third extent of a flat scene, as a fraction of its second extent
 ROUNDS = 3  # of the refinement: nearest points, rigid fit
 SAME_DEG = 3.0  # motions with rotations closer than this and shifts closer than four tolerances are one
 
@@ -204,8 +205,16 @@ def matching_tolerance(points3d: Array, sources: Indices, noise: float) -> float
 
 
 class Scene(NamedTuple):
-    """What the compiled loops read: points (n, 3), a table of them, distances (n, c) and indices (n, c) of the nearest
-    points of each, labels (n,) and normals (n, 3) or (0, 3)."""
+    """Inputs of the compiled loops.
+
+    Attributes:
+        points: (n, 3).
+        table: Hash table of the points.
+        distance: (n, c) distances of the nearest points, ascending.
+        neighbours: (n, c) their indices.
+        labels: (n,); -1 fits any label.
+        normals: (n, 3), or (0, 3) for none.
+    """
 
     points: Array
     table: HashedPoints
@@ -216,7 +225,13 @@ class Scene(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Motions that the compiled loops write: rotation (c, 3, 3), shift (c, 3) and number of confirming points (c,)."""
+    """Motions that the compiled loops write.
+
+    Attributes:
+        rotation: (c, 3, 3).
+        shift: (c, 3).
+        score: (c,) numbers of confirming points.
+    """
 
     rotation: Array
     shift: Array
@@ -230,7 +245,7 @@ def _bases(points: Array, moved: Indices, count: int) -> Indices:
     first = moved[rng.permutation(len(moved))[np.arange(count) % len(moved)]]
     around = tree.query(points[first], min(_neighbours(points) + 1, len(moved)))[1]
     around = around.reshape(count, -1)
-    # The widest of several triangles decides the motion best. Every other base is compact, for small parts.
+    # The widest of several triangles determines the motion best. Every other base is compact, for small parts.
     size = around.shape[1]
     last = np.where(np.arange(count) % 2, size, max(size // COMPACT, min(size, 4)))
     drawn = 1 + (rng.random((count, WIDEST, 2)) * (last - 1)[:, None, None]).astype(np.int64)
@@ -243,11 +258,12 @@ def _bases(points: Array, moved: Indices, count: int) -> Indices:
 
 
 def _neighbours(points: Array) -> int:
+    """Return the number of neighbours of a point that bases and matches come from."""
     return NEIGHBOURS if len(points) <= MANY else MANY_NEIGHBOURS
 
 
 def _sample(moved: Indices) -> Indices:
-    """Return at most `CHECKED` sources that are spread evenly over their order."""
+    """Return at most `CHECKED` sources, drawn at random."""
     order = np.random.default_rng(1).permutation(len(moved))
     return np.ascontiguousarray(moved[order[:CHECKED]])
 
@@ -262,7 +278,7 @@ def _refine(
     labels: Indices,
     normals: Array,
 ) -> tuple[Array, Array, float]:
-    """Return a motion that is fitted to the nearest scene points of the moved ones, and the fraction that it maps."""
+    """Return a motion fitted to the nearest scene points of the moved ones, and the fraction that it maps."""
     own, near, reach = points[moved], np.zeros(len(moved), bool), 2 * tolerance
     for step in range(ROUNDS + 1):
         distance, target = tree.query(own @ rotation.T + shift, distance_upper_bound=reach)
@@ -284,7 +300,7 @@ def _refine(
 
 
 def _moves(motion: tuple[Array, Array, float], own: Array, least: float) -> bool:
-    """Return whether a motion is no identity: it moves the points (k, 3) by more than `least`, in root mean square."""
+    """Return whether a motion is not the identity: its root mean square shift of points (k, 3) exceeds `least`."""
     rotation, shift, _ = motion
     return float(np.sqrt(((own @ rotation.T + shift - own) ** 2).sum(-1).mean())) > least
 
@@ -293,10 +309,21 @@ def _moves(motion: tuple[Array, Array, float], own: Array, least: float) -> bool
 def _register(
     scene: Any, bases: Any, sample: Any, tolerance: float, least: int, most: int, found: Any, work: Any
 ) -> Any:
-    """Write the motions that match a base with a congruent one and that at least `least` of the sample confirm; return
-    their number, which may exceed the room for them.
+    """Find the motions that map a base onto a congruent one and that enough sampled points confirm.
 
-    most: work of a base. work: (4, 3, 3), overwritten."""
+    Args:
+        scene: A `Scene`.
+        bases: (b, 3) indices of points.
+        sample: Indices of sampled points.
+        tolerance: Largest distance of a moved point from a scene point.
+        least: Sampled points that must confirm a motion.
+        most: Largest work for a base.
+        found: A `Found`, written; the motions with the most confirming points are kept.
+        work: (4, 3, 3), overwritten.
+
+    Returns:
+        The number of motions, which may exceed the slots of `found`.
+    """
     points, count = scene.points, 0
     frame, target, rotation, shift = work[0], work[1], work[2], work[3, 0]
     for base in range(len(bases)):
@@ -366,12 +393,14 @@ def _register(
 
 @part
 def _fits(scene: Any, a: int, i: int) -> Any:
+    """Return whether the labels of two points are compatible."""
     one, other = scene.labels[a], scene.labels[i]
     return one < 0 or other < 0 or one == other
 
 
 @part
 def _between(points: Any, a: int, b: int) -> Any:
+    """Return the distance of two points."""
     x, y, z = points[a, 0] - points[b, 0], points[a, 1] - points[b, 1], points[a, 2] - points[b, 2]
     return math.sqrt(x * x + y * y + z * z)
 
@@ -407,7 +436,7 @@ def _frame(points: Any, a: int, b: int, c: int, frame: Any) -> Any:
 
 @part
 def _on(scene: Any, rotation: Any, shift: Any, k: int) -> Any:
-    """Return whether the moved point lies near a scene point."""
+    """Return whether a moved point lies near a scene point."""
     points = scene.points
     x, y, z = points[k, 0], points[k, 1], points[k, 2]
     return lies_on(
