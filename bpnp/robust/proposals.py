@@ -117,7 +117,7 @@ def drawn_poses(
 def _poses_of_widest(
     image: Float[Tensor, "b k 3 2"], scene: Float[Tensor, "b k 3 3"], *, aligned: bool = False
 ) -> Float[Tensor, "b s 3 4"]:
-    """Return the poses of the quarter of the triples with the largest products of areas; `aligned` as in `drawn_poses`."""
+    """Return the poses of the quarter of the triples with the largest area products; `aligned` as in `drawn_poses`."""
     (x, y), (along, across) = ((points[:, :, 1:] - points[:, :, :1]).unbind(2) for points in (image, scene))
     area2d = (x[..., 0] * y[..., 1] - x[..., 1] * y[..., 0]).abs()
     area3d = torch.linalg.cross(along, across).norm(dim=-1)

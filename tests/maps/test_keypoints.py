@@ -37,7 +37,7 @@ def test_discs_are_found_at_their_centres_and_large_ones_are_stronger(blobs) -> 
 
 
 def test_keypoints_of_a_photo_to_be_shown_turned_are_where_its_pixels_are_stored(blobs, tmp_path: Path) -> None:
-    """As COLMAP has them, and the camera of EXIF, the check of sizes and the picture over the photo."""
+    """COLMAP, the camera of EXIF, the check of sizes and the picture over the photo use these axes too."""
     path, *_ = blobs
     tags = Image.Exif()
     tags[0x0112] = 6  # to be shown turned by 90 degrees, as phones have it
@@ -48,7 +48,7 @@ def test_keypoints_of_a_photo_to_be_shown_turned_are_where_its_pixels_are_stored
 
 
 def test_keypoints_are_as_faint_as_those_of_colmap_and_the_largest(tmp_path: Path) -> None:
-    """A map's points come from them, so that without the faint ones most of the map would have no partner."""
+    """A map's points come from faint keypoints too; without them most of the map would have no correspondence."""
     noise = np.random.default_rng(0).normal(size=(200, 240))
     picture = sum(gaussian_filter(noise, width) * width for width in (1.5, 3.0, 6.0)) * 0.04 + 0.5
     Image.fromarray((255 * picture).round().clip(0, 255).astype(np.uint8)).save(tmp_path / "noise.png")

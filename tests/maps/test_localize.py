@@ -207,7 +207,7 @@ def test_bad_input_is_one_clear_error(planted: tuple[SceneMap, Planted]) -> None
 
 
 def found_with_few_points(found: Solution) -> Solution:
-    """As chance explains the few points of a view, though their pose is right."""
+    """Return the solution as not significant, although its pose is right."""
     return replace(found, verdict="failed", reason="no pose fits better than chance", log10_false_alarms=3.0)
 
 

@@ -1,4 +1,4 @@
-"""What the picture of a photo in a map shows, read back from the figure."""
+"""Picture of a photo in a map, read back from the figure."""
 
 from dataclasses import replace
 from pathlib import Path

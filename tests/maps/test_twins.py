@@ -42,13 +42,13 @@ def box(rng: np.random.Generator, turns: tuple[float, ...], alike: int = ALIKE) 
 
 
 def pose_at(degrees: float, distance: float, tilt: float = 5.0) -> tuple[Array, Array]:
-    """Of a camera that looks at the middle of the box; at 0 degrees from the front."""
+    """Return the pose of a camera that looks at the centre of the box, at 0 degrees from the front."""
     rotation = Rotation.from_euler("x", tilt, degrees=True).as_matrix() @ about_y(degrees).T
     return rotation, np.array([0.0, 0.0, distance])
 
 
 def facing(points: Array, normals: Array, rotation: Array, translation: Array) -> Array:
-    """Places of the points that face the camera."""
+    """Return the indices of the points that face the camera."""
     towards = -rotation.T @ translation - points
     return np.flatnonzero((towards * normals).sum(-1) > 0.2 * np.linalg.norm(towards, axis=-1))
 

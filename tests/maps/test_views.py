@@ -1,4 +1,4 @@
-"""The rank of views: planted places of clumped points, photos beside one of them."""
+"""Rank of views: planted locations with clumped points, and photos near one of them."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,7 @@ def in_image(points2d: Array) -> NDArray[np.bool_]:
 
 
 def photo(scene: SceneMap, k: int, seed: int, turned_deg: float = 6.0) -> Array:
-    """Half of the points of a place, from beside its view, and as many keypoints of nothing."""
+    """Return the keypoints of a photo near view k: half of the points there, and as many outliers."""
     rng, view = np.random.default_rng([seed, k]), scene.views[k]
     camera = scene.points3d[k * POINTS : (k + 1) * POINTS] @ view.rotation.T + view.translation
     turn = Rotation.from_rotvec(np.radians(turned_deg) * rng.standard_normal(3)).as_matrix()

@@ -52,7 +52,7 @@ def test_an_image_point_that_stands_for_several_counts_as_often() -> None:
 
 
 def test_a_parameter_that_is_not_fitted_adds_what_it_moves() -> None:
-    """An offset with a standard deviation of 0.3 moves the least-squares estimate by as much as it is moved itself."""
+    """An offset with a standard deviation of 0.3 adds the outer product of the shift of the estimate that it causes."""
     jacobian, offset = rows(0), np.tile([[[0.3], [0.0]]], (60, 1, 1))
     moved = np.linalg.lstsq(jacobian.reshape(-1, 3), offset.ravel(), rcond=None)[0]
     matches = of_sure_matches(np.zeros((60, 2)), jacobian)

@@ -137,7 +137,7 @@ def test_residuals_below_the_floor_count_as_the_floor() -> None:
 def test_an_image_point_whose_label_no_scene_point_has_is_an_outlier(
     pairs: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its evidence is that of a point without a near partner, log(1 - w), however the density is measured."""
+    """Its evidence is that of a point without a near correspondence, log(1 - w), however the density is measured."""
     monkeypatch.setattr(problem_module, "PAIRS_A_POINT", pairs)
     points = np.random.default_rng(3).uniform(-1, 1, (12, 3)) + [0, 0, 6]
     labels = np.arange(12)

@@ -17,8 +17,10 @@ HARD = (
 
 @pytest.mark.parametrize("draw", HARD, ids=lambda draw: draw.__name__)
 def test_a_confident_pose_is_right(draw: Callable[[np.random.Generator], hard_scenes.Drawn]) -> None:
-    """Of equal parts another one would do; along lines and curves points agree by chance. No pose is right of points
-    that have nothing in common."""
+    """Equal parts have several valid poses; along lines and curves points agree by chance.
+
+    Points that have nothing in common have no correct pose.
+    """
     rng = np.random.default_rng(3)
     for _ in range(2):
         pixels, scene, poses = draw(rng)

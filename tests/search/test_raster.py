@@ -1,5 +1,7 @@
-"""Raster searches around a rough pose, or of all rotations, find a planted pose among more outliers than annealing on
-clusters can stand."""
+"""Density-map searches around a rough pose, or of all rotations.
+
+They find a planted pose among more outliers than the annealing on clusters does.
+"""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Which poses are the same one: planted turns and shifts."""
+"""Equality of poses, on planted rotations and shifts."""
 
 import numpy as np
 import pytest

@@ -21,7 +21,7 @@ def rays(image: Array) -> Array:
 
 
 def wall(seed: int, side: int = 250, matches: int = 120, background: int = 200) -> tuple[Problem, Array]:
-    """A wall with normals and other points on either face, of which the camera sees one; its rotation."""
+    """Return a wall with normals and points on both faces, one of them visible, and its rotation."""
     rng = np.random.default_rng(seed)
     rotation, facing = Rotation.random(rng=rng).as_matrix(), np.repeat([-1.0, 1.0], side)
     points = np.column_stack([rng.uniform(-1, 1, (2 * side, 2)), facing * rng.uniform(0.1, 0.3, 2 * side)])
@@ -33,7 +33,7 @@ def wall(seed: int, side: int = 250, matches: int = 120, background: int = 200) 
 
 
 def cluttered(seed: int, outliers: int, shared: int = 100) -> tuple[Array, Array, Array, NDArray[np.int64]]:
-    """Bearings and points, of which the first `shared` are pairs, the rotation, and the number of each point."""
+    """Return bearings and points, the first `shared` of them pairs, the rotation, and the index of each point."""
     rng = np.random.default_rng(seed)
     rotation = Rotation.random(rng=rng).as_matrix()
     points = rng.normal(size=(shared + outliers, 3)) * [0.8, 0.8, 0.3]

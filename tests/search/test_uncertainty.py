@@ -1,4 +1,4 @@
-"""How loose a pose is: against the spread of repeated fits, and the curvature of the likelihood by differences."""
+"""Uncertainty of a pose, against repeated fits and finite differences of the likelihood."""
 
 import math
 
@@ -32,13 +32,13 @@ def sigma_of(problem: Problem, rotation: Array, translation: Array) -> float:
 
 
 def test_a_share_may_be_without_bound() -> None:
-    """Of 80 degrees of freedom: Student's t is beyond 3.416 standard deviations once in a thousand."""
+    """With 80 degrees of freedom, Student's t is beyond 3.416 standard deviations once in a thousand."""
     bounds = [uncertainty.share_bound(np.array([[variance]]), 80.0) for variance in (1e-4, 1e9)]
     assert bounds == pytest.approx([math.expm1(0.03416), math.inf], rel=1e-3)
 
 
 def test_bounds_are_exceeded_once_in_a_thousand() -> None:
-    """Drawn from a normal distribution with the covariance, over a scale of so many degrees of freedom."""
+    """The errors are normal with the covariance, over a scale with the given degrees of freedom."""
     rng = np.random.default_rng(0)
     points = rng.uniform(-1, 1, (8, 3))
     problem = Problem(noisy(directions(points + SHIFT), rng), points)
@@ -69,7 +69,7 @@ def test_errors_are_within_what_a_covariance_claims_but_once_in_a_thousand() -> 
 
 
 def test_a_false_partner_among_few_is_allowed_for() -> None:
-    """Of eight points one is seen 2.5 standard deviations beside its place: least squares without it ends elsewhere."""
+    """One of eight points is seen 2.5 standard deviations off: least squares without it ends elsewhere."""
     rng = np.random.default_rng(3)
     points = rng.uniform(-1, 1, (8, 3))
     rays = noisy(directions(points + SHIFT), rng, 0.3 * NOISE)
@@ -114,7 +114,7 @@ CAMERA = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
 
 
 def test_a_focal_length_needs_no_more_points_than_its_own_fit() -> None:
-    """Seven points leave 7 numbers to test a focal length with, 3 to test it beside five strains: repeated images."""
+    """Seven points leave 7 numbers to test a focal length, and 3 to test it together with five strains."""
     rng, believed = np.random.default_rng(3), []
     for _ in range(20):
         points, turn = rng.standard_normal((7, 3)), Rotation.random(rng=rng)

@@ -1,4 +1,4 @@
-"""What a verdict asks for beside few false alarms: residuals that carry the evidence, a lead, a pose that is fixed."""
+"""Conditions of a verdict apart from few false alarms: evidence of the residuals, a margin, a well-determined pose."""
 
 import math
 import re
@@ -101,8 +101,11 @@ def test_the_focal_length_of_an_object_may_be_loose(distance: float, is_map: boo
     [(0, 0, "ambiguous"), (10, 0, "ambiguous"), (10, 1, "confident"), (6, 2, "confident")],
 )
 def test_matches_that_say_little_ask_for_starts_that_end_alike(basin_count: int, looks: int, verdict: str) -> None:
-    """400 points with residuals of their spacing: a match is worth a hundredth of a decade. Ten starts that might as
-    well have ended at a far better optimum exclude one, and a look around the pose one beside it."""
+    """400 points with residuals of their spacing: a match is worth a hundredth of a decade.
+
+    Ten initial poses could as well have ended at a far better optimum, which they make unlikely. A local search
+    excludes a better optimum near the pose.
+    """
     rng = np.random.default_rng(1)
     points = rng.uniform(-1, 1, (400, 3))
     rays = directions(directions(points + SHIFT) + 5e-3 * rng.standard_normal((400, 3)))
@@ -116,7 +119,7 @@ def test_matches_that_say_little_ask_for_starts_that_end_alike(basin_count: int,
 
 @pytest.mark.parametrize(("degrees", "verdict"), [(1.0, "confident"), (4.0, "ambiguous")])
 def test_starts_that_end_beside_a_pose_met_it(degrees: float, verdict: str) -> None:
-    """As above; all ten starts ended at another optimum, which is the same pose up to two degrees."""
+    """All ten initial poses end at another optimum, which is the same pose up to two degrees; the rest is as above."""
     rng = np.random.default_rng(1)
     points = rng.uniform(-1, 1, (400, 3))
     rays = directions(directions(points + SHIFT) + 5e-3 * rng.standard_normal((400, 3)))

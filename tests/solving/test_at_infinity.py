@@ -1,4 +1,4 @@
-"""`solve(..., at_infinity=True)`: planted rotations, laws, what is not believed, and what it says of bad input."""
+"""`solve(..., at_infinity=True)`: planted rotations, laws, rejected poses, and the errors for bad input."""
 
 import math
 from functools import partial

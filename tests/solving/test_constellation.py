@@ -1,4 +1,4 @@
-"""`solve` on few points: LEDs with normals, labels, gravity, a predicted pose; and what it says of bad input."""
+"""`solve` on few points: LEDs with normals, labels, gravity, a predicted pose; and its errors for bad input."""
 
 from functools import partial
 

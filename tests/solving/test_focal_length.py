@@ -81,7 +81,7 @@ def test_a_plane_seen_from_the_front_leaves_the_focal_length_open() -> None:
 
 
 def test_a_rough_focal_length_is_a_prior() -> None:
-    """Far away perspective says little of the focal length, so that what is told of it counts."""
+    """A distant scene shows little perspective, so that the given focal length counts."""
     pixels, scene, rotation = planted(700.0, distance=12.0)
     camera = ("SIMPLE_PINHOLE", (735.0, 320.0, 240.0))
     stds = []
@@ -95,7 +95,7 @@ def test_a_rough_focal_length_is_a_prior() -> None:
 
 @pytest.mark.parametrize("radial", [-0.3, 0.25, 0.0])
 def test_distortion_is_found_where_it_is_significantly_better(radial: float) -> None:
-    """Nobody says that the lens is distorted. Without its coefficient the focal length would be wrong by many sigma."""
+    """The distortion is not given. Without its coefficient the focal length would be wrong by many sigma."""
     pixels, scene, rotation = planted(600.0, points=150, radial=radial, distance=3.0)
     solution = solve(pixels, scene, image_size=SIZE, solver="search", time_limit=LIMIT)
     camera = json.loads(solution.to_json())["camera"]
@@ -108,7 +108,7 @@ def test_distortion_is_found_where_it_is_significantly_better(radial: float) -> 
 
 @pytest.mark.parametrize("radial", [-0.4, 0.4])
 def test_a_strong_distortion_is_found_among_dense_points(radial: float) -> None:
-    """From the true pose and focal length. Without distortion hardly a point has the right partner, of 1,200."""
+    """The fit starts from the true pose and focal length. Without distortion few of 1,200 points match correctly."""
     rng = np.random.default_rng(0)
     scene = rng.uniform(-1, 1, (1200, 3)) * [2.2, 1.8, 1]
     pose = Rotation.from_rotvec([0.2, -0.3, 0.4]).as_matrix(), np.array([0.1, -0.1, 4.0])

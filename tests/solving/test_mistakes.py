@@ -1,4 +1,4 @@
-"""What `solve`, `solve_many` and `verify` cannot mean is one clear error that names the argument."""
+"""Errors of `solve`, `solve_many` and `verify`: each names the wrong argument."""
 
 from functools import partial
 from typing import Any

@@ -1,4 +1,4 @@
-"""What a network is given, in which axes, and what a search makes of the poses that it proposes."""
+"""Inputs of a network and their axes, and the use that a search makes of the proposed poses."""
 
 from dataclasses import replace
 from typing import Literal

@@ -75,7 +75,7 @@ def test_twins_are_ambiguous_and_a_prior_says_which_it_is() -> None:
         near = Rotation.from_rotvec([0.03, -0.02, 0.03]).as_matrix() @ turned
         solution = solve(image, points, prior=PosePrior(near, translation, 3.0, 0.2))  # type: ignore[arg-type]
         assert degrees_between(solution.rotation, turned) < 1
-    up = np.array([1.0, 0, 0])  # of the scene: upside down in the twin
+    up = np.array([1.0, 0, 0])  # of the scene: upside down in the competing pose
     solution = solve(image, points, prior=GravityPrior(rotation @ up, up, 1.0))  # type: ignore[arg-type]
     assert degrees_between(solution.rotation, rotation) < 1
 
@@ -132,7 +132,7 @@ def test_normals_say_from_which_side_a_point_is_seen() -> None:
 
 
 def test_clutter_is_the_share_of_outliers_in_the_likelihood() -> None:
-    """Of points that all match, and not near others: log (1 - w), whatever else is in it."""
+    """If all points match, and none is near another, the score has the term log (1 - w), whatever its other terms."""
     planted = plant(1, 100)
     few, many = (solve(planted.points2d[0], planted.points3d[0], clutter=w).candidates[0].score for w in (0.1, 0.6))
     assert few - many == pytest.approx(math.log(0.9 / 0.4), abs=0.05)

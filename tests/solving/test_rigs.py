@@ -1,4 +1,4 @@
-"""Rigs: planted poses of two and three cameras, none of which sees enough alone."""
+"""Rigs: planted poses of two and three cameras that see too little on their own."""
 
 from typing import Any
 
@@ -70,7 +70,7 @@ def test_many_points_are_searched_and_joined() -> None:
 
 
 def test_a_rig_is_judged_at_the_scale_of_its_residuals() -> None:
-    """0.8 pixels, far above the smallest that is believed; points without a partner contest it in no camera alone."""
+    """The noise of 0.8 pixels is far above the smallest scale; unmatched points contest it in no single camera."""
     for seed in (0, 3):
         images, scene, mounts, pose, _ = planted_rig(seed, (60, 60, 60), points=150)
         rng = np.random.default_rng(seed)

@@ -10,7 +10,7 @@ from planted import seen, view_with_outliers
 import bpnp
 
 Array = NDArray[np.float64]
-SHARP = 1.48  # of which the likeliest of four classes is right in 70 %
+SHARP = 1.48  # the likeliest of four classes is right in 70 %
 
 
 def probabilities(rng: np.random.Generator, label: NDArray[np.int64], sharp: float = SHARP) -> Array:
@@ -23,7 +23,7 @@ def probabilities(rng: np.random.Generator, label: NDArray[np.int64], sharp: flo
 
 @pytest.fixture(scope="module")
 def view() -> Any:
-    """Bearings, points, pose, and the labels of both: 40 partners and 60 outliers a side."""
+    """Bearings, points, pose, and the labels of both: 40 correspondences and 60 outliers a side."""
     rng = np.random.default_rng(9)
     bearings, points, rotation, translation = view_with_outliers(rng, 40, 60)
     labels2d, labels3d = rng.integers(0, 4, (2, 100))

@@ -1,4 +1,4 @@
-"""What `solve` does with a user's modules, and in several threads."""
+"""`solve` with a user's modules, and in several threads."""
 
 import math
 import threading

@@ -13,7 +13,7 @@ import bpnp
 
 @pytest.fixture(scope="module")
 def view() -> Any:
-    """60 points with partners among 60 outliers a side, noise of a thousandth."""
+    """60 points with correspondences among 60 outliers a side, noise of a thousandth."""
     return view_with_outliers(np.random.default_rng(9), 60, 60)
 
 
@@ -74,7 +74,7 @@ def test_the_mirror_image_of_a_plane_is_met() -> None:
 
 
 def test_a_twin_speaks_against_a_right_pose() -> None:
-    """Three equal things of which one is seen: each pose fits equally well."""
+    """Three equal objects, one of them visible: each pose fits equally well."""
     motif = np.random.default_rng(9).uniform(0, 1, (80, 3))
     scene = np.concatenate([motif + [2 * k, 0, 6] for k in range(3)])
     image = motif + [0, 0, 6]
