@@ -1,4 +1,4 @@
-"""What `bpnp.solve` returns, and its JSON file."""
+"""Result of `bpnp.solve`, and its JSON file."""
 
 import base64
 import io
@@ -28,17 +28,22 @@ if TYPE_CHECKING:
     from bpnp.report.points import ProblemPoints
 
 Array = npt.NDArray[np.float64]
-ROTATION = 3  # numbers of a turn: of points at infinity, no more is known
-FORMAT = 2  # 2 has the false alarms
-LINE = 130  # characters of the reason in a picture
+ROTATION = 3  # parameters of a rotation: the whole pose of points at infinity
+FORMAT = 2  # since 2 with false alarms
+LINE = 130  # characters per line of the reason in a figure
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A distinct pose that was found, camera = R p + t.
+    """A distinct pose that the search found, camera = R p + t.
 
-    score: mean log-likelihood of the bearings, nats; larger is better. inlier_count: one-to-one inliers (paper Eq. 1).
-    log10_false_alarms: how likely unrelated points fit as well, see `Solution`; smaller is better. scale: see there.
+    Attributes:
+        rotation: (3, 3) rotation matrix.
+        translation: (3,) translation, scene units.
+        score: Mean log-likelihood of the bearings, nats; larger is better.
+        inlier_count: Number of one-to-one inliers (paper Eq. 1).
+        log10_false_alarms: Expected number of equally good poses for unrelated points, log10; see `Solution`.
+        scale: Scale of the scene, rig = scale R p + t; 1 unless it was estimated.
     """
 
     rotation: Array
@@ -50,15 +55,21 @@ class Candidate:
 
     @property
     def centre(self) -> Array:
-        """Centre of the camera in the scene, -R^T t / scale."""
+        """Camera centre in the scene, -R^T t / scale."""
         return -self.rotation.T @ self.translation / self.scale
 
 
 @dataclass(frozen=True)
 class SolutionStats:
-    """How the search went: rounds (batches of starts), what it left as residual, whether it stopped by itself because
-    the evidence was safe; how many 2D points could not be undistorted and were left out, and how many were left to
-    other problems of the same image (`solve_many`)."""
+    """Statistics of the search.
+
+    Attributes:
+        iterations: Number of batches of initial poses.
+        residual: Scale of the residuals, radians.
+        converged: True if the verdict is "confident", so that the search stopped by itself.
+        dropped2d: Number of 2D points that could not be undistorted and were dropped.
+        taken2d: Number of 2D points that other problems of the same image use (`solve_many`).
+    """
 
     iterations: int = 0
     residual: float = math.nan
@@ -69,34 +80,42 @@ class SolutionStats:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Solution:
-    """The pose of one problem, camera = R p + t; without a pose NaN, no matches and the verdict "failed".
+    """Pose of one problem, camera = R p + t. Without a pose it is NaN, with no matches and the verdict "failed".
 
-    rotation: (3, 3). translation: (3,), scene units.
-    matches: (k, 2) places of a 2D and of a 3D point in the arrays that were given; no point is in two of them.
-    inlier_count: how many matches there are within `inlier_threshold` (paper Eq. 1), inlier_ratio: of min(m, n).
-    inlier_threshold, reprojection_error: in `unit`, pixels with a camera, else normalised image units, or radians for
-        bearings; the error is the mean over the matches. reprojection_error_deg: the mean angle.
-    covariance: (6, 6) of (w, v), by which the true pose is off: R' = exp([w]x) R, t' = t + v, w in radians in the axes
-        of the camera, v in scene units, the first order of
+    Attributes:
+        rotation: (3, 3) rotation matrix.
+        translation: (3,) translation, scene units.
+        matches: (k, 2) indices of a 2D and a 3D point in the input arrays; no point is in two matches.
+        inlier_count: Number of matches within `inlier_threshold` (paper Eq. 1).
+        inlier_ratio: `inlier_count` as a fraction of min(m, n).
+        inlier_threshold: Largest reprojection error of a match, in `unit`.
+        reprojection_error: Mean reprojection error of the matches, in `unit`.
+        reprojection_error_deg: Mean angle between the bearings of the matches, degrees.
+        unit: Pixels with a camera, else normalised image units, or radians for bearings.
+        covariance: (6, 6) covariance of the pose error (w, v), with R' = exp([w]x) R and t' = t + v. Here w is in
+            radians in the camera axes, and v in scene units. It is the first-order estimate
 
-            C = max(H^-1, sum_i d_i d_i^T),  H = -d2 log p(image points | pose) / d(w, v)^2 + prior,
+                C = max(H^-1, sum_i d_i d_i^T),  H = -d2 log p(image points | pose) / d(w, v)^2 + prior,
 
-        with the ways d_i to the optimum without each image point, the partners unknown (docs/verdict.md). NaN if the
-        verdict is "failed", or the points do not fix the pose. (3, 3) of w for points at infinity; (7, 7) where the
-        focal length was not known: the last row and column are its error, pixels; or where the scale of a rig's scene
-        was not, for that.
-    scale: 1, or what was found with `scale=True`: rig = scale R p + t, with t in the unit of the rig.
-    candidates: the distinct poses that were found, best first; the first is this one.
-    verdict: "confident"; "ambiguous", it fits better than chance, but another pose may as well; "failed", no pose fits
-        better than chance, and this one, if there is one, is a guess. reason: why, in words.
-    log10_false_alarms: how many poses are expected to fit as well if the image had nothing to do with the scene
-        (docs/verdict.md), as a logarithm to base 10; infinite without a pose.
-    seconds: for this problem; a share of the time where many were solved together.
-    view, point_ids: of a photo in a `SceneMap`: the view whose points gave the pose, and the ids (n,) of `points3d` in
-        the map, to which `matches` then refer; `match_places` are their places. None for points without a map.
-    points2d: (m, 2) normalised image coordinates, NaN where a given point has none. points3d: (n, 3) as given.
-    normals3d: (n, 3) outward unit normals as given, None without.
-    camera: that of the pixels that were given, or was found; None for normalised coordinates and bearings.
+            where d_i is the step to the optimum without image point i, with unknown correspondences (docs/verdict.md).
+            NaN if the verdict is "failed" or the points do not fix the pose. (3, 3) of w for points at infinity. An
+            estimated focal length (pixels) or scale adds a last row and column.
+        scale: Scale of the scene, rig = scale R p + t, with t in the unit of the rig; 1 unless `scale=True`.
+        candidates: Distinct poses that the search found, best first; the first is this pose.
+        verdict: "confident"; "ambiguous" if the pose is significant but another one may fit as well; "failed" if no
+            pose is significant. A pose with the verdict "failed" is a guess.
+        reason: Reason of the verdict, a sentence.
+        log10_false_alarms: Expected number of poses that fit as well if image and scene were unrelated (NFA), log10;
+            infinite without a pose. See docs/verdict.md.
+        seconds: Run time of this problem. Problems that were solved together count equal parts of their time.
+        view: Name of the view of a `SceneMap` near which the pose was found; None without a map.
+        point_ids: (n,) ids of `points3d` in the map, which `matches` then hold instead of indices (see `match_places`);
+            None without a map.
+        points2d: (m, 2) normalised image coordinates; NaN for an input point that has none.
+        points3d: (n, 3) input points.
+        normals3d: (n, 3) input normals; None without.
+        camera: Input or estimated camera; None for normalised coordinates and bearings.
+        stats: Statistics of the search.
     """
 
     rotation: Array = field(default_factory=lambda: np.full((3, 3), math.nan))
@@ -125,7 +144,7 @@ class Solution:
 
     @property
     def match_places(self) -> npt.NDArray[np.int64]:
-        """(k, 2) places of the matches in `points2d` and `points3d`."""
+        """Indices (k, 2) of the matches into `points2d` and `points3d`."""
         if self.point_ids is None:
             return self.matches
         order = np.argsort(self.point_ids)
@@ -134,7 +153,7 @@ class Solution:
 
     @property
     def centre(self) -> Array:
-        """Centre of the camera in the scene, -R^T t / scale."""
+        """Camera centre in the scene, -R^T t / scale."""
         return -self.rotation.T @ self.translation / self.scale
 
     @property
@@ -152,18 +171,18 @@ class Solution:
 
     @property
     def focal_length(self) -> float:
-        """Of the camera, pixels: given, or found; NaN without a camera."""
+        """Focal length of the camera, pixels, given or estimated; NaN without a camera."""
         return math.nan if self.camera is None else self.camera.focal
 
     @property
     def focal_length_std(self) -> float:
-        """Standard deviation of a focal length that was found, pixels; 0 for one that was given."""
+        """Standard deviation of an estimated focal length, pixels; 0 for a given one."""
         has_focal = len(self.covariance) in (ROTATION + 1, 7) and not self._has_scale
         return math.sqrt(self.covariance[-1, -1]) if has_focal else 0.0
 
     @property
     def scale_std(self) -> float:
-        """Standard deviation of a scale that was found; 0 for one that was not asked for."""
+        """Standard deviation of an estimated scale; 0 if the scale was not estimated."""
         return math.sqrt(self.covariance[-1, -1]) if self._has_scale else 0.0
 
     @property
@@ -172,7 +191,7 @@ class Solution:
 
     @property
     def found(self) -> bool:
-        """Whether there is a pose at all; see `verdict` for whether to trust it."""
+        """True if there is a pose; `verdict` tells if it can be trusted."""
         return bool(np.isfinite(self.rotation).all() and np.isfinite(self.translation).all())
 
     def __bool__(self) -> bool:
@@ -193,11 +212,19 @@ class Solution:
         )
 
     def plot(self, *, photo: Path | str | npt.NDArray[np.uint8] | None = None, camera: Any = None) -> "Figure":
-        """The image points and the scene points where the pose puts them, as a matplotlib figure.
+        """Draw the image points and the projected scene points as a matplotlib figure.
 
-        camera: as for `bpnp.solve`, by default the one that was given there; the axes are its pixels, and normalised
-        coordinates without a camera. photo: a file or (h, w, 3) uint8 under the points, as it was taken; it needs a
-        camera. Raises ValueError for a photo without a camera, and if no image point is in front of the camera.
+        Args:
+            photo: File or (h, w, 3) uint8 image to draw under the points; not undistorted. It needs a camera. None for
+                none.
+            camera: Camera whose pixels are the axes, as for `bpnp.solve`. Default: `self.camera`; without a camera the
+                axes are normalised coordinates.
+
+        Returns:
+            The figure.
+
+        Raises:
+            ValueError: A photo was given without a camera, or no image point is in front of the camera.
         """
         from bpnp.report.images import read_photo
 
@@ -206,7 +233,7 @@ class Solution:
         return solution_picture(drawn, photo=picture)
 
     def _repr_html_(self) -> str:
-        """What a notebook shows: `repr`, and below it the picture if a point is in front of the camera."""
+        """Return `repr` as HTML, followed by the picture if a point is in front of the camera."""
         text = f"<pre style='white-space: pre-wrap'>{escape(repr(self))}</pre>"
         if not np.isfinite(self.points2d).all(-1).any():
             return text
@@ -218,23 +245,31 @@ class Solution:
     def to_colmap(
         self, folder: Path | str, *, camera: Any = None, name: str = "image.jpg", size: tuple[int, int] | None = None
     ) -> Path:
-        """A COLMAP model with this image, its matches as tracks, and all 3D points: cameras, images, points3D.txt.
+        """Write a COLMAP text model with this image, its matches as tracks, and all 3D points.
 
-        camera: as for `bpnp.solve`, by default the one that was given there, else a pinhole of 1000 pixels. name: of
-        the image file. size: its width and height, pixels; by default the camera's, or what holds the points. Raises
-        ValueError without a pose.
+        Args:
+            folder: Folder to write to.
+            camera: Camera to write, as for `bpnp.solve`. Default: `self.camera`, else a pinhole camera of 1000 pixels.
+            name: Name of the image file, default "image.jpg".
+            size: (width, height) of the image, pixels. Default: the size of the camera, else one that holds the points.
+
+        Returns:
+            The folder.
+
+        Raises:
+            ValueError: The solution has no pose.
         """
         from bpnp.datamodules.colmap.reconstruction import write_image
 
         if not self.found:
             raise ValueError(f"expected a solution with a pose to export, got none: {self.reason}")
-        pose = self.rotation, self.translation / self.scale  # a camera does not see the unit
+        pose = self.rotation, self.translation / self.scale  # in the unit of the scene
         lens = self.camera if camera is None else camera
         points = self.points2d, self.points3d, self.match_places
         return write_image(Path(folder), *points, pose, camera=lens, name=name, size=size)
 
     def to_json(self) -> str:
-        """All fields as strict JSON: null for NaN, every digit kept. `bpnp view` draws such a file."""
+        """Return all fields as strict JSON, with null for NaN and all digits. `bpnp view` draws such a file."""
         pose = {name: getattr(self, name) if self.found else None for name in ("rotation", "translation", "centre")}
         derived = "rotation_std_deg", "centre_std", "focal_length", "focal_length_std", "scale_std"
         content = {"format": FORMAT} | vars(self) | pose | {name: getattr(self, name) for name in derived}
@@ -243,7 +278,14 @@ class Solution:
 
     @classmethod
     def from_json(cls, text: str | bytes | Path) -> "Solution":
-        """The solution of `to_json`, or of a file with it. Raises ValueError for anything else."""
+        """Read a solution from the text of `to_json`, or from a file with it.
+
+        Args:
+            text: JSON text, or the path of a JSON file as a `Path`.
+
+        Raises:
+            ValueError: The text is not the JSON of a solution.
+        """
         name = f" in {text}" if isinstance(text, Path) else ""
         try:
             content = json.loads(text.read_bytes() if isinstance(text, Path) else text)
@@ -257,11 +299,11 @@ class Solution:
 
 
 def candidates_of(poses: Hypotheses, counts: Sequence[int]) -> tuple[Candidate, ...]:
-    """Return hypotheses as a user gets them.
+    """Return hypotheses as `Candidate` objects.
 
     Args:
-        poses: In the coordinates of the user; translations (c, 4) are homogeneous, the unit of the scene last.
-        counts: Inliers of each.
+        poses: Poses in the user's frame; translations (c, 3), or homogeneous (c, 4) with the unit of the scene last.
+        counts: Number of inliers of each pose.
     """
     unit = poses.translation[:, 3:] if poses.translation.shape[1] == 4 else np.ones((len(poses), 1))
     return tuple(
@@ -295,17 +337,17 @@ def with_pose(
     """Return a solution with the pose, the verdict and the candidates of a search.
 
     Args:
-        solution: Without a pose.
-        result: Verdict of the search.
-        poses: Hypotheses in the coordinates of the user, the best first; see `candidates_of`.
-        counts: Inliers of each.
-        matches: (k, 2) of the first pose.
-        errors: (k,) of the matches, in the unit of the solution.
-        angles: (k,) of the matches, radians.
+        solution: Solution without a pose.
+        result: Search result with the verdict.
+        poses: Hypotheses in the user's frame, best first; see `candidates_of`.
+        counts: Number of inliers of each hypothesis.
+        matches: (k, 2) matches of the first pose.
+        errors: (k,) reprojection errors of the matches, in the unit of the solution.
+        angles: (k,) angular errors of the matches, radians.
         most: Largest possible number of matches.
         threshold: Largest error of an inlier, in the unit of the solution.
         residual: Scale of the residuals, radians.
-        covariance: Of the first pose; None keeps that of the solution.
+        covariance: Covariance of the first pose; None keeps that of the solution.
     """
     candidates = candidates_of(poses, counts)
     return replace(
@@ -335,7 +377,7 @@ def with_pose(
 def solution_points(solution: Solution, *, title: str | None = None) -> "ProblemPoints":
     """Return the points of a solution, ready to draw.
 
-    Its id is the title, the verdict with its figures, none of a failed one, and the reason.
+    Their id is the caption: title, verdict with its figures, and reason. A failed solution has no figures.
 
     Raises:
         ValueError: A match has no point.
@@ -366,9 +408,9 @@ def solution_points(solution: Solution, *, title: str | None = None) -> "Problem
 
 
 def competing_points(solution: Solution, points: "ProblemPoints") -> "ProblemPoints | None":
-    """Return the points under the next candidate of an ambiguous solution, None if there is none.
+    """Return the points under the next candidate of an ambiguous solution; None if there is none.
 
-    Its matches are the pairs of points that are nearest to each other, within the inlier threshold.
+    The matches are mutual nearest neighbours within the inlier threshold.
     """
     if solution.verdict != "ambiguous" or len(solution.candidates) < 2:
         return None
@@ -404,7 +446,7 @@ def solution_picture(solution: Solution, *, title: str | None = None, photo: Any
 
 
 def _largest(covariance: Array) -> float:
-    """The root of the largest eigenvalue; NaN if there is none."""
+    """Return the root of the largest eigenvalue; NaN if the covariance is not finite."""
     known = np.isfinite(covariance).all()
     return math.sqrt(float(np.linalg.eigvalsh(covariance)[-1])) if known else math.nan
 
@@ -424,7 +466,7 @@ def _plain(value: Any) -> Any:
 
 
 def _read(kind: type, content: dict[str, Any]) -> Any:
-    """A dataclass of this file from its JSON. Files of version 0.1.0 lack fields whose default is None, and `LATER`."""
+    """Build a dataclass from its JSON; fields in `LATER` and fields that default to None may be missing."""
     missing = [field for field in fields(kind) if field.name not in content]
     optional = [field.name for field in missing if field.default is None or field.name in LATER]
     values = {field.name: content[field.name] for field in fields(kind) if field.name not in optional}
@@ -439,8 +481,8 @@ def _float(value: float | None, *, missing: float = math.nan) -> float:
     return missing if value is None else value
 
 
-LATER = {"covariance", "scale", "taken2d"}  # than version 0.1.0
-READERS: dict[str, Callable[[Any], Any]] = {  # of the fields that JSON holds in another form
+LATER = {"covariance", "scale", "taken2d"}  # fields added after version 0.1.0
+READERS: dict[str, Callable[[Any], Any]] = {  # of the fields with another form in JSON
     "rotation": partial(_array, shape=(3, 3)),
     "translation": partial(_array, shape=(3,)),
     "covariance": lambda values: np.array([[_float(x) for x in row] for row in values], np.float64),

@@ -1,4 +1,4 @@
-"""Pose from two point sets in one call: `solve`, and `solve_many` for many problems."""
+"""Camera pose from unmatched 2D and 3D points: `solve` for one problem, `solve_many` for many."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -34,7 +34,7 @@ from bpnp.solving.sources import Options, Progress, solutions_of
 if TYPE_CHECKING:
     import torch
 
-SECONDS, SECONDS_OF_MANY = 10.0, 5.0  # that a problem may take, of `solve` and of `solve_many`
+SECONDS, SECONDS_OF_MANY = 10.0, 5.0  # default time limits per problem of `solve` and `solve_many`
 
 
 def solve(
@@ -62,56 +62,68 @@ def solve(
     device: "str | torch.device | None" = None,
     progress: Progress | None = None,
 ) -> Solution:
-    """Camera pose from 2D and 3D points that nobody has matched.
+    """Estimate the camera pose from 2D and 3D points without correspondences.
 
-    points2d: (m, 2) pixels with a `camera`; without one normalised image coordinates, or (m, 3) unit bearings. numpy or
-        torch; also OpenCV's (m, 1, 2) arrays, rows of four or more numbers that begin with x and y, and lists of
-        cv2.KeyPoint, which get their half pixel but with OpenCV's (K, distortion): elsewhere (0.5, 0.5) is the centre
-        of the first pixel, as in COLMAP.
-    points3d: (n, 3) points of the scene, in any unit; also a cloud or mesh of trimesh or Open3D.
-    camera: 3x3 matrix K; OpenCV's (K, distortion); (COLMAP model, parameters) or (model, width, height, parameters); or
-        a pycolmap.Camera.
-        Distortion is undone; pixels for which that cannot be done are left out and counted in `stats.dropped2d`.
-    image_size: width and height of the image, pixels, where the focal length is unknown: it is found with the pose, the
-        principal point taken to be in the middle. `Solution.camera` is what was found. focal_error: standard deviation
-        of the focal length of `camera` where that is rough, as a share of it, such as 0.1. Radial distortion
-        is then unknown too, unless `camera` has it: a coefficient is fitted where it is significantly better, with
-        distortion=True always.
-    normals3d: (n, 3) outward unit normals: a point that faces away from the camera is not seen.
-    labels2d, labels3d: (m,) and (n,) integers, such as colours, classes or identities: only points of one label are
-        matched; -1 fits any. Or probabilities (m, c) and (n, c) of c classes, whose rows add up to 1, such as a
-        network's: a match counts as much more as its classes agree better than those of a mean one.
-    scores2d, scores3d: (m,) and (n,) probabilities, above 0 and up to 1, that a point has a partner, such as from the
-        strength of a keypoint, or the number of views that see a point; only their ratios matter. The search and the
-        verdict weigh the points with them.
-    solver: "search", which needs no training; "auto", the same, which asks a packaged matcher for poses to start from
-        when it is in doubt: "matcher-maps" with a `PosePrior`, such as the pose of a map's view of the same place, and
-        "matcher-sfm" without a prior, if 2D points times 3D points are at most four million; a module from `Batch` to
-        `Prediction`; or a checkpoint of a BPnPNet or a Matcher. Of a Matcher and many points not its own poses count,
-        but those that a search finds from poses of triples of matches drawn from its assignment, and nowhere else.
-    prior: a `PosePrior`; a pose, known to 10 degrees: a `Solution`, (R, t), [R | t] of shape (3, 4) or (4, 4), a
-        pycolmap.Rigid3d; a `GravityPrior`, or a BPnPNet or Matcher (or its checkpoint) whose pose is tried first.
-    inlier_threshold: largest reprojection error of a match, in pixels with a camera, else in units of the normalised
-        image (radians for bearings). By default three times the scale of the residuals. Few points are also searched
-        within this radius, by default within 3 pixels. Labels that pair each point with one other need no radius.
-    clutter: fraction of the points that has no partner, if it is known. The search and the verdict expect it.
-    at_infinity: `points3d` are unit directions, such as of stars: the rotation alone is found, and the translation is
-        zero. Pixels of a fisheye may lie 90 degrees and more off its axis. Points with the largest `scores2d` are tried
-        first. An `image_size` or `focal_error` is for an unknown focal length here too. See docs/stars.md.
-    rig: cam_from_rig, (3, 4), (4, 4) or (R, t), of each of several cameras that are fixed to each other. `points2d` and
-        `labels2d` are then lists with one array each, `camera` too or one for all; the pose is rig_from_world, in the
-        unit of the rig and of the scene, and `matches` count the 2D points of one camera after those of the other.
-    scale: whether the scene has a unit of its own, such as a COLMAP model's, while the rig's is known: `Solution.scale`
-        of it is found with the pose, rig = scale R p + t, t in the unit of the rig. Its cameras have to be apart.
-    time_limit: seconds for all of it, 10 by default, math.inf for no limit. At the limit each stage of the search ends
-        with the poses that it has, and the best of them is returned.
-    device: where a module computes, on a copy; by default where it is. The search always runs on the CPU.
-    progress: called with (problem, batch of starts, seconds); many problems are then solved in this process alone.
+    Args:
+        points2d: (m, 2) pixels with a `camera`; without one (m, 2) normalised image coordinates or (m, 3) unit
+            bearings. NumPy or torch arrays, OpenCV's (m, 1, 2) arrays, and rows of four or more numbers that begin with
+            x and y are accepted. The centre of the first pixel is (0.5, 0.5), as in COLMAP. A list of cv2.KeyPoint is
+            shifted by half a pixel, except with OpenCV's (K, distortion).
+        points3d: (n, 3) scene points in any unit; also a point cloud or mesh of trimesh or Open3D.
+        camera: 3x3 matrix K; OpenCV's (K, distortion); (COLMAP model, parameters); (model, width, height, parameters);
+            or a pycolmap.Camera. Points are undistorted. Pixels that cannot be undistorted are dropped and counted in
+            `stats.dropped2d`. None for normalised coordinates and bearings.
+        image_size: (width, height) of the image, pixels, if the focal length is unknown. The focal length is estimated
+            with the pose and returned in `Solution.camera`. The principal point is assumed at the image centre.
+        focal_error: Standard deviation of the focal length of `camera`, as a fraction of it, such as 0.1. The focal
+            length is then estimated too. None if the focal length is exact.
+        distortion: With `image_size` or `focal_error`: always fit a radial distortion coefficient. By default a
+            coefficient is kept only if it is significantly better, and none is fitted if `camera` has distortion.
+        normals3d: (n, 3) outward unit normals. A point that faces away from the camera is not visible. None: all points
+            are visible from all sides.
+        labels2d: (m,) integers, such as colours, classes or identities; only points with equal labels match, and -1
+            matches any. Or (m, c) class probabilities whose rows sum to 1, such as those of a network: a match then
+            weighs more, the better its classes agree.
+        labels3d: (n,) integers or (n, c) class probabilities, as `labels2d`.
+        scores2d: (m,) probabilities in (0, 1] that a point has a correspondence, such as from keypoint strength. They
+            weight the points in the search and the verdict. Only their ratios matter.
+        scores3d: (n,) probabilities in (0, 1], as `scores2d`, such as from the number of views that see a point.
+        solver: "search" runs the search, which needs no training. "auto", the default, also starts it from poses of a
+            packaged matcher if the search is undecided: "matcher-maps" with a `PosePrior`, and "matcher-sfm" without a
+            prior and with m n at most four million. Or a module from `Batch` to `Prediction`, or a checkpoint of a
+            BPnPNet or a Matcher. With a Matcher and too many points to enumerate, the search starts only from P3P poses
+            of match triples sampled from the assignment.
+        prior: A `PosePrior`; a pose with an uncertainty of 10 degrees, as a `Solution`, (R, t), [R | t] of shape (3, 4)
+            or (4, 4), or a pycolmap.Rigid3d; a `GravityPrior`; or a BPnPNet or Matcher, or its checkpoint, whose pose
+            is tried first. None for no prior.
+        inlier_threshold: Largest reprojection error of a match, in pixels with a camera, else in normalised image units
+            (radians for bearings). Default: three times the scale of the residuals. Small problems also use it as
+            search radius, by default 3 pixels. Labels that pair each point with one other need no radius.
+        clutter: Expected outlier fraction. None if it is unknown.
+        at_infinity: `points3d` are unit directions, such as of stars. Only the rotation is estimated; the translation
+            is zero. Pixels of a fisheye camera may lie 90 degrees or more off its axis. Points with the largest
+            `scores2d` are tried first. `image_size` and `focal_error` apply here too. See docs/stars.md.
+        rig: Extrinsics cam_from_rig of each camera of a rig, as (3, 4), (4, 4) or (R, t). `points2d` and `labels2d` are
+            then lists with one array per camera; `camera` is a list or one for all. The returned pose is
+            rig_from_world, in the unit of the rig and of the scene. `matches` index the 2D points of all cameras,
+            concatenated.
+        scale: With `rig`: also estimate the scale of a scene whose unit differs from the rig's, such as a COLMAP model.
+            `Solution.scale` satisfies rig = scale R p + t, with t in the unit of the rig. The rig needs a non-zero
+            baseline.
+        seed: Seed of the search, default 0.
+        time_limit: Seconds in total, 10 by default; math.inf for no limit. At the limit each stage of the search ends
+            with its current poses, and the best pose is returned.
+        device: Device on which a copy of a module runs; None for the module's own device. The search runs on the CPU.
+        progress: Callback with (problem index, batches of initial poses, seconds). Problems then run in this process
+            only.
 
-    A pose that is not to be trusted has the verdict "failed"; so have points from which none follows (on one line, or
-    fewer than four different ones). Raises ValueError for input that is not usable: wrong or swapped shapes, NaN, fewer
-    than 4 points (3 with a `GravityPrior`), a singular camera, an unknown option. A module that is given is left as it
-    is.
+    Returns:
+        Solution of the problem. The verdict is "failed" if the pose is not to be trusted. It is also "failed" if the
+        points do not determine a pose (collinear, or fewer than four distinct points). A given module is not modified.
+
+    Raises:
+        ValueError: The input has wrong or swapped shapes, NaN, fewer than 4 points (3 with a `GravityPrior`), a
+            singular camera matrix or an unknown option.
 
     >>> rng = np.random.default_rng(0)
     >>> scene = rng.normal(size=(60, 3))
@@ -169,7 +181,7 @@ def solve(
 
 
 def _refuse(options: Mapping[str, Any], kind: str) -> None:
-    """Raise ValueError for what such a problem says nothing of, or cannot have."""
+    """Raise ValueError if an option is set that this mode (`kind`) does not support."""
     for name, value in options.items():
         if value is not None:
             raise ValueError(f"expected no `{name}` with `{kind}`, got {value!r:.60}; try without one of them")
@@ -197,15 +209,38 @@ def solve_many(
     device: "str | torch.device | None" = None,
     progress: Progress | None = None,
 ) -> list[Solution]:
-    """`solve` for many problems; a solution depends on nothing but its own, unless few-point ones share an image.
+    """Solve many problems, each as `solve` does.
 
-    Where several devices are looked for in the same image points, no point is matched to two of them: the surest
-    device keeps its own, and another that claimed some of them is solved again without (`stats.taken2d`).
+    Problems are independent, except that small problems with the same image points never share a match. The problem
+    with the fewest false alarms keeps its matches. A later one that used some of them is solved again without these
+    points, which `stats.taken2d` counts.
 
-    points2d: a sequence of arrays (m_i, 2). points3d, normals3d, labels2d, labels3d, scores2d, scores3d: the same, or
-    one array that all problems share. camera, prior: one for all, or a list with one each. time_limit: seconds a
-    problem, 5 by default. Everything else as for `solve`. On a GPU a module solves problems of similar size together.
-    Raises ValueError as `solve`, before anything is solved; it names the problem.
+    Args:
+        points2d: Sequence of k arrays (m_i, 2) or (m_i, 3), one per problem.
+        points3d: Sequence of k arrays (n_i, 3), or one array for all problems.
+        camera: One camera for all problems, or a list of k cameras. None for normalised coordinates and bearings.
+        image_size: (width, height) of the images, pixels, for all problems; as for `solve`.
+        focal_error: Relative standard deviation of the focal length, for all problems; as for `solve`.
+        distortion: Always fit a radial distortion coefficient; as for `solve`.
+        normals3d: Sequence of k arrays (n_i, 3), or one array for all problems.
+        labels2d: Sequence of k arrays (m_i,) or (m_i, c), or one array for all problems.
+        labels3d: Sequence of k arrays (n_i,) or (n_i, c), or one array for all problems.
+        scores2d: Sequence of k arrays (m_i,), or one array for all problems.
+        scores3d: Sequence of k arrays (n_i,), or one array for all problems.
+        solver: As for `solve`. On a GPU a module solves problems of similar size in one batch.
+        prior: One prior for all problems, or a list of k priors.
+        inlier_threshold: Largest reprojection error of a match, for all problems; as for `solve`.
+        clutter: Expected outlier fraction, for all problems. None if it is unknown.
+        seed: Seed of the search, default 0.
+        time_limit: Seconds per problem, 5 by default; math.inf for no limit.
+        device: Device on which a copy of a module runs; as for `solve`.
+        progress: Callback with (problem index, batches of initial poses, seconds).
+
+    Returns:
+        List of k solutions, in the order of the problems.
+
+    Raises:
+        ValueError: The input is invalid, as for `solve`. The message names the problem; nothing has been solved then.
 
     >>> scene = np.random.default_rng(0).normal(size=(60, 3))
     >>> images = [(scene + [x, 0, 6])[:, :2] / (scene + [x, 0, 6])[:, 2:] for x in (0, 1)]
@@ -269,22 +304,22 @@ def solve_many(
 
 
 def _axes_of_labels(labels: Any) -> int:
-    """Of the labels of one problem: two if they are one array of class probabilities, for all problems."""
+    """Return the number of axes of one problem's labels: 2 for one array of class probabilities, else 1."""
     return 2 if getattr(labels, "ndim", 1) == 2 and "float" in str(labels.dtype) else 1
 
 
 def share_points(
     problems: Mapping[int, Problem], solutions: dict[int, Solution], again: Callable[[int, Labels], Solution]
 ) -> None:
-    """Leave each image point to one of the few-point problems that have the same image points.
+    """Assign each image point to at most one of the small problems that have the same image points.
 
-    The problem with the fewest false alarms keeps its matches. A later one that claimed one of their points is solved
-    again without these; its `stats.taken2d` counts them. A failed pose keeps none.
+    The problem with the fewest false alarms keeps its matches. A later one that used one of their points is solved
+    again without these; its `stats.taken2d` counts them. The points of a failed pose stay free.
 
     Args:
-        problems: By their numbers.
-        solutions: Of the problems; changed in place.
-        again: Solves a problem, given its number, without some of its 2D points, given their indices (k,).
+        problems: Problems by index.
+        solutions: Solutions by index of the problem; changed in place.
+        again: Solves the problem of an index without the 2D points of some indices (k,).
     """
     groups: dict[bytes, list[int]] = {}
     for i, problem in problems.items():

@@ -1,4 +1,4 @@
-"""Verify a pose from elsewhere: `verify`."""
+"""Verification of a given pose: `verify`."""
 
 import math
 import time
@@ -41,33 +41,40 @@ def verify(
     seed: int = 0,
     time_limit: float | int | None = None,
 ) -> Solution:
-    """Verify a pose that comes from elsewhere, and compute how well it is known.
+    """Verify a given pose and estimate its uncertainty.
 
-    One pose is tested. It is "confident" if it is significant (one pose was tried, not the many of a search, so that
-    about one match beyond the three that fix a pose excludes chance) and if no competing pose is about as likely. The
-    competing poses are the optimum beside the pose, its mirror image before a flat scene, repetitions of the scene, and
-    other focal lengths. No search is made: use `solve` where a better pose may exist far away.
+    The pose is "confident" if it is significant and no competing pose is about as likely. One pose is tested, not the
+    many of a search, so about one match beyond the three that fix a pose makes it significant. The competing poses are
+    the nearby optimum, the mirror image in front of a flat scene, repetitions of the scene, and other focal lengths.
+    No search is run: use `solve` if a better pose may exist far away.
 
     Args:
-        points2d, points3d, camera, normals3d, labels2d, labels3d, scores2d, scores3d: As for `solve`.
-        rotation: (3, 3) of the pose, camera = R p + t.
-        translation: (3,) of the pose, in the unit of the scene.
-        matches: (k, 2) indices of matched points in points2d and points3d, each point in one match. The pose is judged
-            on these alone; some of them may be wrong. None: the matches are unknown.
-        refine: Return and judge the optimum beside the pose. It is the same pose: turned by at most 2 degrees and the
-            middle of the scene moved by at most a twentieth of its distance, or within what the points leave open.
-            False: the pose stays as it is. It is "ambiguous" where the optimum beside it fits significantly better, and
-            `covariance` is that of the optimum plus the step to it.
+        points2d: (m, 2) pixels with a `camera`, else normalised image coordinates, or (m, 3) bearings; as for `solve`.
+        points3d: (n, 3) scene points in any unit; as for `solve`.
+        rotation: (3, 3) rotation matrix of the pose, camera = R p + t.
+        translation: (3,) translation of the pose, in the unit of the scene.
+        camera: Camera of the pixels, as for `solve`; None for normalised coordinates and bearings.
+        normals3d: (n, 3) outward unit normals; None if all points are visible from all sides.
+        labels2d: (m,) integers or (m, c) class probabilities, as for `solve`.
+        labels3d: (n,) integers or (n, c) class probabilities, as for `solve`.
+        scores2d: (m,) probabilities in (0, 1] that a point has a correspondence, as for `solve`.
+        scores3d: (n,) probabilities in (0, 1], as `scores2d`.
+        matches: (k, 2) indices into points2d and points3d, each point in one match at most. The pose is judged on these
+            matches alone; some of them may be wrong. None if the matches are unknown.
+        refine: Return and judge the nearby optimum. It counts as the same pose if it is rotated by at most 2 degrees
+            and shifts the centroid of the scene by at most a twentieth of its distance, or is within the pose's
+            uncertainty. With False the pose is kept. It is "ambiguous" if the nearby optimum fits significantly better,
+            and `covariance` is that of the optimum plus the outer product of the step to it.
         inlier_threshold: Largest reprojection error of a match, as for `solve`.
-        seed: Of the copies of the pose from which the optimum is refined.
+        seed: Seed of the perturbed copies of the pose from which it is refined, default 0.
         time_limit: Seconds, 10 by default; math.inf for no limit.
 
     Returns:
-        The solution of this pose, with its competitors in `candidates`. It is "failed" if the pose is no better than
-        chance, or if a competing pose is likelier by three decades; there may be no matches then.
+        Solution with this pose, and with its competing poses in `candidates`. It is "failed" if the pose is not
+        significant, or if a competing pose is more likely by three decades; `matches` may then be empty.
 
     Raises:
-        ValueError: As `solve`, and for a matrix that is no rotation.
+        ValueError: The input is invalid, as for `solve`, or `rotation` is not a rotation matrix.
 
     >>> import bpnp
     >>> rng = np.random.default_rng(0)
@@ -117,14 +124,19 @@ def verify_problem(
     seed: int = 0,
     time_limit: float | None = SECONDS,
 ) -> Solution:
-    """Verify a pose of a problem whose points have been checked; arguments and result are those of `verify`.
+    """Verify a pose of a problem whose points have been checked; see `verify`.
 
     Args:
-        problem: Points, and what is known of them.
-        rotation: (3, 3) of the pose.
-        translation: (3,) of the pose, scene units.
-        refine, inlier_threshold, seed: As for `verify`.
-        time_limit: Seconds; None for no limit.
+        problem: Points and their measured properties.
+        rotation: (3, 3) rotation matrix of the pose.
+        translation: (3,) translation of the pose, scene units.
+        refine: Return and judge the nearby optimum, as for `verify`.
+        inlier_threshold: Largest reprojection error of a match, as for `verify`.
+        seed: Seed of the refinement, default 0.
+        time_limit: Seconds, 10 by default; None for no limit.
+
+    Returns:
+        Solution with this pose, as of `verify`.
     """
     begun, deadline = time.perf_counter(), Deadline.after(time_limit)
     if problem.degenerate is not None:
@@ -144,7 +156,7 @@ def verify_problem(
 
 
 def _checked_matches(values: Any, problem: Problem) -> Labels:
-    """Places (k, 2) of a 2D and a 3D point, each in one match; of those that the camera can see."""
+    """Return the (k, 2) indices of matches whose 2D point is usable; raise ValueError if a point is in two matches."""
     matches, counts = numbers("matches", values), (len(problem.all2d), len(problem.points3d))
     if matches.ndim != 2 or matches.shape[1] != 2 or (matches != np.round(matches)).any():
         raise ValueError(f"expected `matches` as integers of shape (k, 2), got shape {matches.shape}")
@@ -160,7 +172,7 @@ def _checked_matches(values: Any, problem: Problem) -> Labels:
 
 
 def _of_matches(problem: Problem, matches: Labels) -> Problem:
-    """Return the matched points alone, each with a label that only its match has."""
+    """Return a problem of the matched points alone, with a unique label for each match."""
     (i, j), own = matches.T, np.arange(len(matches))
     matched = problem.choose(np.searchsorted(problem.usable, i), j)
     return replace(
@@ -175,7 +187,7 @@ def _of_matches(problem: Problem, matches: Labels) -> Problem:
 
 
 def _of_unrefined(problem: Problem, optimum: Hypotheses, rotation: Array, translation: Array) -> Array:
-    """Return the covariance (6, 6) of a user's pose beside a known optimum: that of the optimum, and the way to it."""
+    """Return the covariance (6, 6) of an unrefined pose: that of the optimum, plus the step to it squared."""
     best, scale = optimum.rotation[0], float(optimum.scale[0])
     linear = linearised(problem, best, optimum.translation[0], scale)
     covariance = pose_covariance(problem, linear, match_count(optimum, problem))
