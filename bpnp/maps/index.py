@@ -1,4 +1,4 @@
-"""The index of a large map in the cache folder: what opening a COLMAP model computes, in one file."""
+"""Index of a large map in the cache folder: one file with all that is computed when a COLMAP model is opened."""
 
 import json
 import zipfile
@@ -15,12 +15,12 @@ from bpnp.datamodules.colmap.model_files import FILES
 from bpnp.files import cache_folder, file_states, fingerprint, lock_folder, write_atomically
 from bpnp.maps.views import MARGIN_DEG, RANK, Array, Cones, Pictures, View
 
-LARGE = 200_000  # points of a map from which on it has an index: smaller ones are opened in two seconds without
+LARGE = 200_000  # least number of points of a map with an index; smaller maps open in two seconds without one
 FORMAT = 1
 
 
 class Index(NamedTuple):
-    """The parts of a `SceneMap`, and what it computes of them when they are first asked for."""
+    """Parts of a `SceneMap`, with its density images and cones."""
 
     points3d: Array
     point_ids: NDArray[np.int64]
@@ -31,26 +31,26 @@ class Index(NamedTuple):
 
 
 def _stamp(folder: Path) -> str:
-    """Of the files of a model, and of the constants with which its index is computed."""
+    """Return a fingerprint of the files of a model and of the constants of its index."""
     files = [folder / f"{name}.{suffix}" for name in FILES for suffix in ("bin", "txt")]
     model = file_states(file for file in files if file.is_file())
     return fingerprint([FORMAT, MARGIN_DEG, repr(RANK), model])
 
 
 def index_file(folder: Path) -> Path:
-    """Return the file for the index of the model in a folder, in ``maps`` in `cache_folder`."""
+    """Return the index file of the model in a folder, in ``maps`` in `cache_folder`."""
     return cache_folder() / "maps" / fingerprint(str(folder.resolve())) / "index.npz"
 
 
 def make_index(folder: Path, compute: Callable[[], Index]) -> Index:
-    """Return the index of the model in a folder, and keep it.
+    """Return the index of the model in a folder, and write it to the cache folder.
 
-    One process computes; others that open the same model wait for it. Where the cache folder cannot be written to,
-    nothing is kept.
+    One process computes it; others that open the same model wait. Nothing is written if the cache folder is not
+    writable.
 
     Args:
-        folder: COLMAP model.
-        compute: Makes the index from the model.
+        folder: Folder of the COLMAP model.
+        compute: Computes the index from the model.
     """
     with ExitStack() as stack:
         try:
@@ -65,7 +65,7 @@ def make_index(folder: Path, compute: Callable[[], Index]) -> Index:
 
 
 def _write_index(folder: Path, index: Index) -> None:
-    """Write the index of the model in a folder whole; nothing where the disk is full."""
+    """Write the index of the model in a folder atomically; write nothing if that fails, such as on a full disk."""
     views = index.views
     cameras = list({id(view.camera): view.camera for view in views}.values())
     number = {id(camera): k for k, camera in enumerate(cameras)}
@@ -92,7 +92,7 @@ def _write_index(folder: Path, index: Index) -> None:
 
 
 def read_index(folder: Path) -> Index | None:
-    """The index of the model in a folder; None if it has none, or one of other files or other constants."""
+    """Return the index of the model in a folder; None if there is none, or if its files or constants have changed."""
     try:
         with index_file(folder).open("rb") as opened, np.load(opened) as file:
             if file["stamp"].tobytes().decode() != _stamp(folder):

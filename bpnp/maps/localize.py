@@ -1,5 +1,4 @@
-"""The pose of a photo from its keypoints without descriptors: near one view of a map, which of several is best, and
-fitted to all points of the map that its camera sees."""
+"""Pose of a photo from its keypoints without descriptors: search near one view of a map, and fit to all map points."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -34,24 +33,29 @@ from bpnp.solving.solution import Candidate, Solution
 from bpnp.solving.sources import Options, solutions_of
 
 Array = NDArray[np.float64]
-MOST_KEYPOINTS = 2048  # the strongest; of the 2,000 largest SIFT keypoints half have a point, of the next an eighth
-VIEW_DEGREES = 15.0  # about the largest angle per axis between photos of which one sees a third of the other's points
-VIEW_SHARE = 0.2  # the same of the shift of what they look at, in distances to it
-# The view's pose is the one to look near, not the best pose of a view that was tried in vain.
-# A search of a fourth of the time meets four fifths as many poses: near one view after the other that is more.
+MOST_KEYPOINTS = 2048  # half of the 2,000 largest SIFT keypoints have a map point, an eighth of the next ones
+VIEW_DEGREES = 15.0  # about the largest angle per axis between photos that share a third of their points
+VIEW_SHARE = 0.2  # about the largest shift of the viewed points, as a fraction of their distance
+# The search stays near the view's pose, not near the best pose of an unsuccessful earlier search.
+# A search in a fourth of the time finds four fifths as many poses, so that short searches near many views pay.
 BRIEF = replace(DEFAULT, near=(DEFAULT.everywhere,)).limited(1)
 ONCE, LONGER = DEFAULT.limited(1), DEFAULT.limited(16)
-COMPETITORS = 4  # poses of an ambiguous solution that are judged with it on all points
-PROMISING = 3  # views that are tried longer if none is confident
-LIKELY = -20.0  # log10 of the false alarms below which a view is tried longer before the next one
+COMPETITORS = 4  # competing poses of an ambiguous solution that are judged with it on all points
+PROMISING = 3  # views that get a longer search if none is confident
+LIKELY = -20.0  # log10 NFA below which a view gets a longer search before the next view
 RANKS = {"failed": 0, "ambiguous": 1, "confident": 2}
 
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Points (k, 3) of the map that one view, or several, see, their ids and cones, and the view to look near.
+    """Map points that one view, or several, see, and the view to search near.
 
-    distance: from the view to its own points, the median.
+    Attributes:
+        view: View to search near.
+        points3d: (k, 3) scene points.
+        point_ids: (k,) ids of the points in the COLMAP model.
+        cones: Cones of directions from which the points are visible.
+        distance: Median distance from the view to its own points, scene units.
     """
 
     view: View
@@ -61,14 +65,23 @@ class Region:
     distance: float
 
     def prior(self) -> PosePrior:
-        """The view's pose, as wide as photos of one place lie apart."""
+        """Return a prior at the view's pose, as wide as the poses of photos of one place differ."""
         return PosePrior(self.view.rotation, self.view.translation, VIEW_DEGREES, VIEW_SHARE * self.distance)
 
 
 def problem_near(
     region: Region, keypoints: Any, camera: Any, prior: Any, focal: UnknownFocal | None = None, *, views: int = 1
 ) -> Problem:
-    """Return the problem of a photo's keypoints and the points of one region, of so many `views` that are tried."""
+    """Return the problem of a photo's keypoints and the points of one region.
+
+    Args:
+        region: Points to match.
+        keypoints: (m, 2) pixels.
+        camera: Camera of the photo.
+        prior: Prior of the pose; None for none.
+        focal: Prior of the focal length; None if it is known.
+        views: Number of views that are tried, which the NFA counts as tests. Default 1.
+    """
     lens, (axes, cosines) = camera_from(camera), region.cones
     known: dict[str, Any] = {"normals3d": axes, "cosines3d": cosines, "prior": prior, "focal": focal}
     problem = problem_from(keypoints, region.points3d, lens, **known)
@@ -82,9 +95,9 @@ def near_view(region: Region, keypoints: Any, camera: Any, prior: Any, options: 
         region: Points, and the view to search near.
         keypoints: (m, 2) pixels.
         camera: Camera, or an `UnknownCamera`.
-        prior: Of the photo's pose; None for the view's pose.
-        options: Of the search.
-        views: Number of views that are tried; each is as many tests again, which the NFA counts.
+        prior: Prior of the photo's pose; None for the view's pose.
+        options: Options of the search.
+        views: Number of views that are tried, which the NFA counts as tests. Default 1.
     """
     expected = checked_prior(region.prior() if prior is None else prior)
     if isinstance(camera, UnknownCamera):
@@ -100,8 +113,15 @@ def near_view(region: Region, keypoints: Any, camera: Any, prior: Any, options: 
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """What is localised, among which points, and near which views of the map, by their rank for image points (k, 2);
-    `seed` is of the search."""
+    """A photo to localise, and the part of the map to localise it in.
+
+    Attributes:
+        keypoints: (m, 2) pixels.
+        camera: Camera of the photo.
+        place: Points to match, and the view to search near.
+        regions: Returns regions of the map, ranked for keypoints (k, 2).
+        seed: Seed of the search, default 0.
+    """
 
     keypoints: Array
     camera: Any
@@ -111,25 +131,25 @@ class Photo:
 
     @cached_property
     def problem(self) -> Problem:
-        """Of the keypoints and all points of the place."""
+        """Problem of the keypoints and all points of the place."""
         return problem_near(self.place, self.keypoints, self.camera, None)
 
 
 def with_ids(solution: Solution, region: Region) -> Solution:
-    """A solution among the points of a region, with the ids of these in its matches."""
+    """Return a solution with point ids of a region instead of point indices in its matches."""
     matches = np.column_stack([solution.matches[:, 0], region.point_ids[solution.matches[:, 1]]])
     return replace(solution, matches=matches, view=region.view.name, point_ids=region.point_ids)
 
 
 def in_picture(problem: Problem, pose: Solution | Candidate) -> NDArray[np.bool_]:
-    """Which points (n,) of a problem a pose sees where the image points are."""
+    """Return a mask (n,) of the scene points visible from a pose, within the bounding box of the image points."""
     seen, image = problem.project_scene(*problem.from_user(pose.rotation, pose.translation)), problem.image_points
     inside = (seen >= image.min(0)) & (seen <= image.max(0))  # not NaN
     return np.asarray(inside.all(-1))
 
 
 def points_in_view(place: Region, camera: Any, pose: Solution | View, keypoints: Array) -> NDArray[np.int64]:
-    """Return the indices of the points of a place that a pose sees between the keypoints (m, 2), pixels."""
+    """Return the indices of the points visible from a pose, within the bounding box of the keypoints (m, 2), pixels."""
     in_camera = place.points3d @ pose.rotation.T + pose.translation
     ahead = (in_camera[:, 2] > 0) & faces(place.cones.axes, place.cones.cosines, in_camera, pose.rotation)
     indices = np.flatnonzero(ahead)
@@ -139,40 +159,40 @@ def points_in_view(place: Region, camera: Any, pose: Solution | View, keypoints:
 
 
 def strongest_of(scores: Any, shape: tuple[int, ...]) -> NDArray[np.int64]:
-    """Places of the strongest keypoints, ascending. Raises ValueError unless each of the keypoints has a score."""
+    """Return the indices of the strongest keypoints, ascending; raise ValueError unless each keypoint has a score."""
     if np.shape(scores) != shape:
         raise ValueError(f"expected `scores` of shape {shape}, one a keypoint, got {np.shape(scores)}")
     return np.sort(np.argsort(-np.asarray(scores), kind="stable")[:MOST_KEYPOINTS])
 
 
 def among_all(solution: Solution, used: NDArray[np.int64], keypoints: Any) -> Solution:
-    """The solution of some keypoints with its matches and points among all of them."""
+    """Return a solution of some keypoints (`used`) with its matches and points expressed among all keypoints."""
     matches = np.column_stack([used[solution.matches[:, 0]], solution.matches[:, 1]])
     points2d = camera_from(solution.camera).normalise(np.asarray(keypoints, np.float64))
     return replace(solution, matches=matches, points2d=points2d)
 
 
 def rank(solution: Solution) -> tuple[int, float]:
-    """Confident before ambiguous before failed; then the fewest false alarms."""
+    """Sort key: confident before ambiguous before failed, then fewer false alarms."""
     return RANKS[solution.verdict], -solution.log10_false_alarms
 
 
 @one_blas_thread
 def on_all_points(solution: Solution, photo: Photo, lens: Camera | UnknownCamera, views: int) -> Solution:
-    """Refine a pose on all map points that its camera sees, and judge it on them.
+    """Refine a pose on all map points in view, and judge it on them.
 
-    An unknown lens is fitted to them too. A pose that is not confident yet is judged beside its competing poses, and
-    beside those that searches around it find; `without_twins` searches for others.
+    An unknown focal length is fitted to them too. A pose that is not confident yet is compared with its competing
+    poses, and with those that local searches around it find. `without_twins` searches for others.
 
     Args:
         solution: Pose that was found with the points of one view.
-        photo: The keypoints and all points of the map.
-        lens: Camera that was given, or what is known of it.
+        photo: Keypoints, and all points of the map.
+        lens: Given camera, or its prior.
         views: Number of views that are tried.
 
     Returns:
-        The refined solution if its NFA is smaller, or if it is confident where the given one was not. Else the given
-        one, or the given one with a doubt that all points raise.
+        The refined solution if its NFA is smaller, or if it is confident and the given one was not. Otherwise the given
+        solution, or a copy whose verdict is lowered by a competing pose among all points.
     """
     place, camera, rule = photo.place, solution.camera, DEFAULT.evidence
     if not solution.found:
@@ -198,7 +218,7 @@ def on_all_points(solution: Solution, photo: Photo, lens: Camera | UnknownCamera
         least = problem.image.scales[0]
         ends = polished(Scene(problem, photo.seed, DEFAULT), rotation[None], shift[None], max(scale, least))
     scene, sure = Scene(problem, photo.seed, DEFAULT), solution.verdict == "confident"
-    # A coarse optimum may have a finer one beside it.
+    # A coarse optimum may have a finer one nearby.
     looks = int(ends.scale[0] > scale) if sure else looks_for_certainty(rule)
     start = Hypotheses.from_poses(*scene.enter(rotation[None], shift[None]))
     others = [] if sure else [one for one in solution.candidates[1:] if one.log10_false_alarms < 0][:COMPETITORS]
@@ -223,7 +243,7 @@ def on_all_points(solution: Solution, photo: Photo, lens: Camera | UnknownCamera
         return with_ids(replace(found, stats=stats, candidates=candidates), region)
     if not sure:
         return solution
-    if alone.verdict != "confident":  # which other cameras have not been asked of
+    if alone.verdict != "confident":  # other cameras have not been tested for it
         other = other_camera(alone, problem, lambda: scene, rule)
         return solution if other is None else _doubted(solution, other)
     confident = result.verdict == "confident"
@@ -231,7 +251,7 @@ def on_all_points(solution: Solution, photo: Photo, lens: Camera | UnknownCamera
 
 
 def looks_for_certainty(rule: Evidence) -> int:
-    """Return how many searches around a pose exclude a better one beside it, whatever starts led to it."""
+    """Return the number of local searches that exclude a better pose nearby, whatever its initial poses were."""
     again = (rule.missed - math.log10(rule.look_fails)) / math.log10(rule.again_fails)
     return 1 + max(math.ceil(again), 0)
 

@@ -1,4 +1,4 @@
-"""A map to localise photos in: the points and views of a COLMAP reconstruction."""
+"""Map for localising photos: the points and views of a COLMAP reconstruction."""
 
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -65,13 +65,13 @@ from bpnp.solving.sources import Options
 if TYPE_CHECKING:
     import torch
 
-LEAST_TRACK = 2  # views that fix a point; with one left it would not be in the map
+LEAST_TRACK = 2  # least number of views of a point after a view is removed
 UNKNOWN = "unknown"  # focal length
-SAME_FOCAL = 1.05  # largest ratio of the focal lengths of views whose camera is taken for that of a photo
+SAME_FOCAL = 1.05  # largest ratio of the focal lengths of views whose camera a photo can get
 
 
 class Place(NamedTuple):
-    """A view to look near, the points (k,) to look among, and what is known of the photo's camera there."""
+    """A view to search near, the indices (k,) of the points to use, and the camera model or its prior."""
 
     view: View
     points: NDArray[np.integer]
@@ -82,8 +82,11 @@ class Place(NamedTuple):
 class SceneMap:
     """A COLMAP reconstruction as a map: n points, and the views that see them.
 
-    points3d: (n, 3) scene units, in the order of their ids. point_ids: (n,) ids in the COLMAP model.
-    track_lengths: (n,) views that see each point. views: in the order of their names.
+    Attributes:
+        points3d: (n, 3) scene points, in the order of their ids.
+        point_ids: (n,) ids in the COLMAP model.
+        track_lengths: (n,) number of views that see each point.
+        views: Views in the order of their names.
 
     >>> from bpnp import SceneMap
     >>> scene = SceneMap.from_colmap("sparse/0")  # doctest: +SKIP
@@ -98,12 +101,17 @@ class SceneMap:
 
     @classmethod
     def from_colmap(cls, path: Any) -> "SceneMap":
-        """The map in a folder of cameras, images and points3D, all .bin or all .txt, or in a pycolmap.Reconstruction.
+        """Read a map from a COLMAP model.
 
-        Not used, and logged as a warning: images with a broken pose, and points that are not finite. A view without
-        points stays in the map. Keypoints are not kept: 10^6 points and 10^4 views of 1,000 points take 80 MB. The
-        first time that a large map is opened, an index is written to the cache folder (`bpnp.maps.index`).
-        Raises ColmapError, a ValueError, for a model that cannot be read or has no view that sees a point.
+        Images with an invalid pose and points that are not finite are skipped with a warning. A view without points
+        stays in the map. Keypoints are not kept: 10^6 points and 10^4 views of 1,000 points take 80 MB. When a large
+        map is opened for the first time, an index is written to the cache folder (`bpnp.maps.index`).
+
+        Args:
+            path: Folder with cameras, images and points3D, all .bin or all .txt; or a pycolmap.Reconstruction.
+
+        Raises:
+            ColmapError: The model cannot be read, or no view sees a point. It is a ValueError.
         """
         if callable(getattr(path, "write_binary", None)):
             with TemporaryDirectory() as folder:
@@ -141,21 +149,21 @@ class SceneMap:
 
     @cached_property
     def pictures(self) -> Pictures:
-        """What the views' ranks are told from."""
+        """Density images of the views, from which their ranks are computed."""
         return pictures_of_views(self.points3d, self.views)
 
     @cached_property
     def cones(self) -> Cones:
-        """From where each point is seen."""
+        """Cone of directions from which each point is visible."""
         return viewing_cones(self.points3d, ((view.centre, view.points) for view in self.views))
 
     @cached_property
     def view_numbers(self) -> dict[str, int]:
-        """Places in `views` by name."""
+        """Indices in `views` by name."""
         return {view.name: i for i, view in enumerate(self.views)}
 
     def named(self, names: Iterable[str]) -> list[View]:
-        """The views of these names. Raises ValueError for one that the map does not have."""
+        """Return the views with these names; raise ValueError for a name that is not in the map."""
         wanted = list(names)
         if unknown := [name for name in wanted if name not in self.view_numbers]:
             some = ", ".join(view.name for view in self.views[:5])
@@ -163,16 +171,20 @@ class SceneMap:
         return [self.views[self.view_numbers[name]] for name in wanted]
 
     def without(self, names: Collection[str]) -> "SceneMap":
-        """The map as it would be without these views: also points that then fewer than two views see are left out.
+        """Return the map without some views, and without points that fewer than two of the other views see.
 
-        Raises ValueError for a name that the map does not have, or if no view that sees a point is left.
+        Args:
+            names: Names of the views to remove.
+
+        Raises:
+            ValueError: A name is not in the map, or no view that sees a point is left.
         """
         left_out = {view.name for view in self.named(names)}
         views = tuple(view for view in self.views if view.name not in left_out)
         return replace(self, views=views).seen_by(LEAST_TRACK)
 
     def seen_by(self, least: int) -> "SceneMap":
-        """Only such points as `least` or more of the views see. Raises ValueError if none is left."""
+        """Return the map with only the points that `least` or more views see; raise ValueError if none is left."""
         tracks = np.zeros(len(self.points3d), np.int32)
         for view in self.views:
             tracks[view.points] += 1
@@ -184,14 +196,20 @@ class SceneMap:
         return SceneMap(self.points3d[enough], self.point_ids[enough], tracks[enough], views)
 
     def places(self, views: Iterable[str] | None, keypoints: Any, lens: Camera | UnknownCamera) -> "list[Place]":
-        """What to look near a photo's keypoints, in this order.
+        """Return the views to search near for a photo's keypoints, in this order.
 
-        Each of the given views, in their order, with the points that any of them sees, since they show one place; or
-        all views of the map, each with its own points, by their rank (`bpnp.maps.views`). Of an unknown focal length
-        several in turns, from the likeliest, the next one after `RUNG` views with that before. None with fewer points
-        than fix a pose.
+        With `views` these are the given views in their order. Each gets the points that any of them sees, since they
+        show one place. Otherwise they are all views of the map by rank (`bpnp.maps.views`), each with its own points.
+        With an unknown focal length several are tried, the likeliest first: the next one follows `RUNG` views behind.
+        Views with too few points to fix a pose are skipped.
 
-        Raises ValueError for unknown names, or if there is none.
+        Args:
+            views: Names of views, best first; None for all views of the map.
+            keypoints: (m, 2) pixels.
+            lens: Camera model, or its prior if the focal length is unknown.
+
+        Raises:
+            ValueError: A name is unknown, or `views` is empty.
         """
         if views is not None:
             named = self.named(views)
@@ -221,8 +239,10 @@ class SceneMap:
         return Region(view, self.points3d[points], self.point_ids[points], cones, distance)
 
     def _regions(self, views: Sequence[str] | None, camera: Any, keypoints: Array) -> Iterator[Region]:
-        """The surroundings of the given views, or of all views by their rank for keypoints of a known camera; also of
-        views that show the same place."""
+        """Yield the points seen by the given views, or by all views ranked for the keypoints of a known camera.
+
+        Several views may show the same place.
+        """
         if views is not None:
             order = self.named(views)
         else:
@@ -246,38 +266,47 @@ class SceneMap:
         seed: int = 0,
         time_limit: float | int | None = None,
     ) -> Solution:
-        """The pose of a photo in the map, from its keypoints alone.
+        """Estimate the pose of a photo in the map from its keypoints, without descriptors.
 
-        keypoints: (m, 2) pixels, COLMAP's: (0.5, 0.5) is the centre of the first one; or a list of cv2.KeyPoint, which
-            OpenCV counts from (0, 0).
-        camera: as for `bpnp.solve`. With OpenCV's (K, distortion) pixels count as OpenCV's do, those in an array too.
-        image_size: (width, height) in pixels of a photo whose focal length is unknown, as for `bpnp.solve`. The focal
-            length is looked for where those of the views are too.
-        focal_error: relative standard deviation of the focal length of `camera`, as for `bpnp.solve`.
-        distortion: whether a radial coefficient is always fitted, as for `bpnp.solve`.
-        views: names of views of the map that may show the same place, best first, from any image retrieval: the points
-            that any of them sees are used near each; None to try the points of one view of the whole map after the
-            other, those first where the density of its points is most like that of the keypoints.
-        scores: (m,) strength of the keypoints; the strongest are used first.
-        prior: what is known of the photo's pose, as for `bpnp.solve`; None to expect it near that of the view that is
+        Short searches run near each view until a pose is confident. If the NFA of a pose is very small, a longer search
+        follows at once. Then each view is tried once more, and the most promising ones with longer searches. If no pose
+        is confident, the pose with the fewest false alarms is returned.
+
+        A confident pose is compared with poses elsewhere in the map that explain the same image points
+        (`bpnp.maps.twins`), unless a prior is given. It is "ambiguous" if one of them is about as likely. Both are then
+        the first `candidates`.
+
+        Args:
+            keypoints: (m, 2) pixels in COLMAP's convention: (0.5, 0.5) is the centre of the first pixel. Or a list of
+                cv2.KeyPoint, which OpenCV counts from (0, 0).
+            camera: Camera of the photo, as for `bpnp.solve`. With OpenCV's (K, distortion) the keypoints, also in an
+                array, follow OpenCV's convention. None with `image_size`.
+            image_size: (width, height) of the photo, pixels, if its focal length is unknown, as for `bpnp.solve`. The
+                range of the search includes the focal lengths of the views.
+            focal_error: Relative standard deviation of the focal length of `camera`, as for `bpnp.solve`.
+            distortion: Always fit a radial distortion coefficient, as for `bpnp.solve`. Default False.
+            views: Names of views that may show the same place, best first, from any image retrieval. The search near
+                each uses the points that any of them sees. None to try all views of the map, each with its own points,
+                in the order in which their point density resembles that of the keypoints.
+            scores: (m,) strengths of the keypoints; the strongest 2,048 are used. None to use all keypoints.
+            prior: Prior of the photo's pose, as for `bpnp.solve`; None to use the pose of the view that is tried.
+            up_camera: (3,) direction up in the camera frame of the photo, accurate to a quarter turn, such as from the
+                EXIF orientation. Views are first rotated about their optical axes by quarter turns to match it. If no
+                pose is confident, they are tried unrotated. None for an unknown direction. It has no effect with a
+                prior.
+            solver: As for `bpnp.solve`. A network that needs the points in a camera frame gets them in that of the view
+                that is tried, or of the prior.
+            seed: Seed of the search, default 0.
+            time_limit: Seconds for all views together; None for no limit. After it no search starts, but competing
+                poses of a confident pose are still tested, which takes about a second.
+
+        Returns:
+            Solution of the photo. `view` is the view near which the pose was found. `matches` (k, 2) hold the index of
+            a keypoint and the id of a point in the COLMAP model. `points3d` and `point_ids` are the points that were
             tried.
-        up_camera: direction up (3,) in the camera of the photo, known to a quarter turn, such as from the orientation
-            of EXIF data. Views that are turned against it by a quarter turn or more are tried as if they were not. If
-            no pose is confident then, they are tried as they are. No effect with a prior.
-        solver: as for `bpnp.solve`; a network that expects the points in the camera of a view gets them in that of the
-            view that is tried, or of the prior.
-        seed: of the search.
-        time_limit: seconds for all views together, after which no search begins, but what speaks against a confident
-            pose is still looked for, about a second; None for no limit.
 
-        Poses near each view are tried briefly until one is confident, longer at once where hardly any unrelated points
-        would fit as well; then near each view once more, and near the most promising ones longer; else the pose with
-        the fewest false alarms is returned. A confident pose is compared with those that explain the same image points
-        elsewhere in the map (`bpnp.maps.twins`): "ambiguous" if one does so about as well, and both are the first
-        `candidates`; not if a prior is given. `solution.view` is the view near which it was found.
-        `solution.matches` (k, 2): place of a keypoint, and id of a point in the map's COLMAP model; `solution.points3d`
-        with the ids `solution.point_ids` are the points that were tried.
-        Raises ValueError for unknown views and for input that `bpnp.solve` refuses.
+        Raises:
+            ValueError: A view is unknown, or `bpnp.solve` rejects the input.
         """
         views = None if views is None else list(views)
         if up_camera is not None and prior is None and (turned := self._turned(up_camera)) is not self:
@@ -299,18 +328,18 @@ class SceneMap:
 
         def options_for(settings: SearchSettings) -> Options:
             limit = max(deadline.at - Clock.now(), 1e-3)
-            asks = solver == "auto" and settings is LONGER  # not of every view of the map
+            asks = solver == "auto" and settings is LONGER  # not for every view of the map
             return Options(module, asks, seed=checked_seed(seed), time_limit=limit, settings=settings, until=deadline)
 
         def near(camera: Any, options: Options, region: Region, expected: Any) -> Solution:
             return near_view(region, used, camera, expected, options, views=tries)
 
         def in_map(place: Place, solution: Solution, options: Options) -> Solution:
-            """Judge a pose on all points of the map in view and, if it is significant, beside its twins."""
+            """Judge a pose on all map points in view and, if confident, against competing poses elsewhere."""
             regions, own = partial(self._regions, views, solution.camera), solution
             photo = Photo(used, solution.camera, replace(whole(), view=place.view), regions, seed)
             solution = on_all_points(solution, photo, lens, tries)
-            if prior is None and solution.verdict == "confident":  # a prior would tell twins apart
+            if prior is None and solution.verdict == "confident":  # a prior would exclude competing poses elsewhere
                 photo = Photo(used, solution.camera, photo.place, regions, seed)
                 search = partial(near, solution.camera, options)
                 photo = photo if views is None else replace(photo, place=self._region(place.view, place.points))
@@ -332,7 +361,7 @@ class SceneMap:
             if not decided:
                 met.append(solution)
                 best = sorted([*best, (place, solution)], key=lambda item: rank(item[1]), reverse=True)[:PROMISING]
-                if not waiting:  # chance explains the others, but perhaps not with all points of the map
+                if not waiting:  # not significant so far, but perhaps with all points of the map
                     best = [(one, in_map(one, found, options)) for one, found in best]
                     best.sort(key=lambda item: rank(item[1]), reverse=True)
                     place, solution = best[0]
@@ -352,8 +381,10 @@ class SceneMap:
         return replace(solution, seconds=Clock.now() - start)
 
     def _turned(self, up_camera: Any) -> "SceneMap":
-        """The map with the camera of each view turned by quarter turns until its up is that of a photo (3,); the map
-        itself if none has to be turned."""
+        """Return the map with each view rotated by quarter turns until its up direction is that of a photo (3,).
+
+        Return the map itself if no view needs a rotation.
+        """
         up = numbers("up_camera", up_camera)
         if up.shape != (3,) or not np.isfinite(up).all() or not up.any():
             raise ValueError(f"`up_camera` is {up.tolist()}; three numbers that are not all zero are needed")
@@ -364,7 +395,7 @@ class SceneMap:
         if key not in self._turned_maps:
             views = tuple(map(turned_view, self.views, turns.tolist()))
             self._turned_maps[key] = turned = replace(self, views=views)
-            vars(turned).update(cones=self.cones)  # of the centres of the views, which stay
+            vars(turned).update(cones=self.cones)  # cones depend on the view centres only, which are unchanged
         return self._turned_maps[key]
 
     @cached_property
@@ -374,8 +405,10 @@ class SceneMap:
     def _localize_turned(
         self, turned: "SceneMap", keypoints: Any, camera: Any, time_limit: float | None, options: dict[str, Any]
     ) -> Solution:
-        """The pose of a photo in a map with turned views or, if that is not confident, the better one of it and that in
-        this map. Half of the time limit is for the first."""
+        """Localize a photo in a map with rotated views; if the result is not confident, also in this map.
+
+        Return the better solution. Half of the time limit is for the first attempt.
+        """
         start = Clock.now()
         half = None if time_limit is None else time_limit / 2
         upright = turned.localize(keypoints, camera, time_limit=half, **options)
@@ -390,23 +423,23 @@ class SceneMap:
     ) -> Solution:
         """Verify the pose of a view without its own observations.
 
-        The view is taken out of the map, with the points that fewer than two other views see: these have no position
+        The view is removed from the map, with the points that fewer than two other views see: these have no position
         without it. Its pose is judged on the other points that it can see, whatever points the reconstruction matched
-        its keypoints to, and compared with poses elsewhere in the map. The pose is "ambiguous" if another one is about
-        as likely, and "failed" if it fits no better than chance or another one is likelier by three decades.
+        its keypoints to. It is then compared with poses elsewhere in the map. It is "ambiguous" if another pose is
+        about as likely. It is "failed" if it is not significant, or another pose is more likely by three decades.
 
         Args:
-            name: Of the view.
-            keypoints: (m, 2) pixels, all that were detected in its image, COLMAP's: (0.5, 0.5) is the centre of the
-                first one.
-            seed: Of the copies of the pose from which its optimum is refined.
-            time_limit: Seconds until its competitors in view are no longer tested; None for no limit.
+            name: Name of the view.
+            keypoints: (m, 2) pixels, all that were detected in its image, in COLMAP's convention: (0.5, 0.5) is the
+                centre of the first pixel.
+            seed: Seed of the perturbed copies of the pose from which it is refined, default 0.
+            time_limit: Seconds until competing poses in view are no longer tested, default 10; None for no limit.
 
         Returns:
-            The solution, as of `bpnp.verify`; `matches` have the ids of points.
+            Solution as of `bpnp.verify`; its `matches` hold the ids of points.
 
         Raises:
-            ValueError: For a name that the map does not have, and if fewer than 4 points are left that it can see.
+            ValueError: The name is not in the map, or the view can see fewer than 4 of the remaining points.
         """
         view, rest = self.named([name])[0], self.without([name])
         pixels = np.asarray(pixels_from(keypoints, view.camera), np.float64)
@@ -417,7 +450,7 @@ class SceneMap:
     def _lens(
         self, camera: Any, image_size: Any, focal_error: float | int | None, distortion: bool
     ) -> Camera | UnknownCamera:
-        """The camera of a photo, or what is known of it."""
+        """Return the camera model of a photo, or its prior if the focal length is unknown."""
         if camera is None and image_size is None:
             raise ValueError("expected a `camera`, or `image_size` where the focal length is unknown, got neither")
         if image_size is None and focal_error is None and not distortion:
@@ -439,19 +472,28 @@ class SceneMap:
         ignore_orientation: bool = False,
         **options: Any,
     ) -> Solution:
-        """The pose of a photo from its file, as `bpnp localize` finds it.
+        """Estimate the pose of a photo from its file, as `bpnp localize` does.
 
-        camera: as for `localize`; None for the one that `camera_for` finds, that of the EXIF data, else of views of the
-            photo's size, else with an unknown focal length; a SceneMap for that of its views, scaled to the photo's
-            size; "unknown" for an unknown focal length whatever EXIF says.
-        keypoints: HDF5 file of hloc or COLMAP's database, which has those of the photo under its `name`, by default
-            that of the file; None to detect SIFT keypoints.
-        ignore_orientation: whether the orientation in the EXIF data is not used. It is a hint: the side that is up is
-            tried first (`up_camera` of `localize`). The photo is not turned, as in COLMAP.
-        options: focal_error, distortion, views, prior, solver, seed and time_limit, as for `localize`; the first one
-            has no effect on a photo whose camera is unknown.
-        Raises ValueError for a photo that cannot be read, or of another size than its camera or keypoints, and as
-        `localize`.
+        Args:
+            photo: Image file.
+            camera: Camera, as for `localize`. None for that of `camera_for`: from EXIF data, else from views of the
+                photo's size, else with an unknown focal length. A `SceneMap` for the camera of its views, scaled to the
+                photo's size. "unknown" for an unknown focal length even with EXIF data.
+            keypoints: HDF5 file of hloc, or database of COLMAP, with the keypoints of the photo; None to detect SIFT
+                keypoints.
+            name: Name of the photo in that file; None for the name of the image file.
+            ignore_orientation: Ignore the EXIF orientation. By default it is the `up_camera` of `localize`. The photo
+                is never rotated, as in COLMAP.
+            **options: focal_error, distortion, views, prior, solver, seed and time_limit, as for `localize`.
+            `focal_error` has
+                no effect on a photo with an unknown camera.
+
+        Returns:
+            Solution as of `localize`.
+
+        Raises:
+            ValueError: The photo cannot be read, its size differs from that of its camera or keypoints, or `localize`
+                rejects the input.
         """
         path = Path(photo)
         if camera is None or isinstance(camera, SceneMap):
@@ -473,11 +515,20 @@ class SceneMap:
         return self.localize(pixels, lens, scores=points.scores, **options)
 
     def camera_for(self, photo: Path, *, exif: bool = True) -> tuple[Camera | None, str]:
-        """The camera of a photo, and in words where it is from.
+        """Return the camera of a photo, and its source in words.
 
-        With the focal length of its EXIF data, the principal point in the middle; else that of views with images of its
-        size; None if there is none, or the focal lengths of such views differ by more than a twentieth. Without `exif`
-        that of views with images of its shape, scaled to its size: raises ValueError where that would be None.
+        Args:
+            photo: Image file.
+            exif: Use the focal length of the EXIF data, with the principal point at the image centre. Without EXIF data
+                use the camera of views with images of the photo's size. If False, use only the camera of views with
+                images of its aspect ratio, scaled to its size.
+
+        Returns:
+            Camera and source. The camera is None if there is none, or if the focal lengths of the views differ by more
+            than 5 %.
+
+        Raises:
+            ValueError: `exif` is False and there is no such camera.
         """
         size = width, height = photo_size(photo)
         if exif and (focal := focal_from_exif(photo)) is not None:
@@ -504,8 +555,10 @@ class SceneMap:
 
 
 def _near(lens: Camera | UnknownCamera, solution: Solution) -> Camera | UnknownCamera:
-    """The camera for a longer search about a solution: an unknown one has the focal length found, if that is more than
-    chance, else all of them are tried."""
+    """Return the camera for a longer search near a solution.
+
+    An unknown camera gets the focal length of a significant solution; otherwise all focal lengths are tried.
+    """
     if isinstance(lens, UnknownCamera) and solution.log10_false_alarms < 0:
         return lens.near(camera_from(solution.camera))
     return lens

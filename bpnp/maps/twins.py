@@ -1,8 +1,8 @@
-"""Whether a photo's pose is the only one: places of a map that look alike explain the same image points.
+"""Competing poses elsewhere in a map: similar places may explain the same image points.
 
-The poses that are compared with a confident one: those that were met with the points of other views; those that a
-motion of the map onto itself makes of it (`bpnp.search.evidence.repetitions`); and those that a brief look at views of
-other points finds for the image points that it explains.
+A confident pose is compared with three kinds of poses: those found with the points of other views; its images under
+motions that map the scene onto itself (`bpnp.search.evidence.repetitions`); and those that short searches near views of
+other points find for the image points that it explains.
 """
 
 import math
@@ -33,12 +33,16 @@ from bpnp.solving.solution import Candidate, Solution, candidates_of
 
 @dataclass(frozen=True)
 class TwinSettings:
-    """Constants of the looks at views of other points.
+    """Constants of the short searches near views of other points.
 
-    look: a search near each. Of the image points that a pose explains few are outliers beside a twin, so that fewer
-    starts, smoothed more, do than near a view that is tried. looks: views at most.
-    unseen: share of a view's points that the pose does not see. fewest: such points, and image points that a pose
-    explains. degrees, share: of the prior of a search about a twin.
+    Attributes:
+        look: Search near each view. Few of the explained image points are outliers for a competing pose. So fewer, more
+            smoothed initial poses suffice than near a view that is tried.
+        looks: Largest number of views.
+        unseen: Least fraction of a view's points that the pose does not see.
+        fewest: Least number of such points, and of image points that the pose explains.
+        degrees: Rotation uncertainty of the prior of a search near a competing pose, degrees.
+        share: Translation uncertainty of that prior, as a fraction of the distance to the points.
     """
 
     look: RasterSearch = RasterSearch(
@@ -59,8 +63,16 @@ TWINS = TwinSettings()
 
 @one_blas_thread
 def best_rival(photo: Photo, solution: Solution, met: Sequence[Solution]) -> tuple[float, Candidate] | None:
-    """The different pose that explains the image points of a solution best, and by how many decades it explains all of
-    them worse; None if there is none. met: solutions with the points of other views."""
+    """Return the best competing pose for the image points that a solution explains.
+
+    Args:
+        photo: Keypoints, and all points of the map.
+        solution: Confident pose.
+        met: Solutions with the points of other views.
+
+    Returns:
+        Margin in decades by which it explains the image points worse, and the pose. None if there is no different pose.
+    """
     problem, rule = photo.problem, DEFAULT.evidence
     scale = max(solution.stats.residual, problem.image.scales[0])
     best = problem.from_user(solution.rotation, solution.translation)
@@ -100,12 +112,14 @@ def _candidate(problem: Problem, solution: Solution, ends: Hypotheses, k: int, b
 
 
 def _looks(photo: Photo, solution: Solution, problem: Problem) -> Iterator[tuple[Array, Array]]:
-    """Poses for the image points that the solution explains, near views of whose points it does not see most; in the
-    order of the rank that these image points give to the views."""
+    """Yield poses for the explained image points of a solution, near views with mostly other points.
+
+    The views are ranked for these image points.
+    """
     places = np.flatnonzero(np.isin(problem.usable, solution.matches[:, 0]))
     explained, looks = photo.keypoints[problem.usable[places]], 0
     seen = _seen(photo, solution)
-    rasters: dict[tuple[RasterShape, float], Raster] = {}  # all of the same image points
+    rasters: dict[tuple[RasterShape, float], Raster] = {}  # shared, since the image points are the same
     for region in photo.regions(explained) if len(explained) >= TWINS.fewest else ():
         if looks == TWINS.looks:
             return
@@ -128,7 +142,7 @@ def _looks(photo: Photo, solution: Solution, problem: Problem) -> Iterator[tuple
 
 
 def _likeliest(poses: Hypotheses, scene: Scene, problem: Problem) -> Hypotheses:
-    """(1,) of the poses that with the fewest false alarms, in the frame of the problem."""
+    """Return the pose (1,) with the fewest false alarms, in the frame of the problem."""
     return weighed(to_problem_frame(poses, scene), problem)[:1]
 
 
@@ -140,8 +154,18 @@ def without_twins(
     *,
     again: bool = True,
 ) -> Solution:
-    """A confident solution, or where another pose explains the image points as well, an ambiguous one with both as its
-    first candidates. Where that explains them better, the solution about it that `search` finds is the one."""
+    """Return a confident solution, or an ambiguous one if a competing pose elsewhere explains the image points as well.
+
+    An ambiguous solution has both poses as its first candidates. If the competing pose is more likely by the margin
+    `Evidence.lead`, the solution that a search near it finds is used instead.
+
+    Args:
+        photo: Keypoints, and all points of the map.
+        solution: Confident solution.
+        met: Solutions with the points of other views.
+        search: Searches in a region near a prior.
+        again: Allow the replacement by a solution near the competing pose. Default True.
+    """
     rival = best_rival(photo, solution, met)
     if rival is None or rival[0] >= DEFAULT.evidence.lead:
         return solution
@@ -161,5 +185,5 @@ def without_twins(
 
 
 def _seen(photo: Photo, pose: Solution | Candidate) -> NDArray[np.int64]:
-    """Ids of the points that a pose sees where the image points are."""
+    """Return the ids of the points visible from a pose, within the bounding box of the image points."""
     return photo.place.point_ids[in_picture(photo.problem, pose)]

@@ -1,10 +1,9 @@
-"""The views of a map: which points they see and from where; and which of them a photo may be near, by the density of
-their points, before any pose is tried.
+"""Views of a map: the points that they see and from where, and a ranking of the views for a photo by point density.
 
-Where a place has texture, photos have keypoints and the map has points. Of a photo and of each view the contrast of
-the density of its points is drawn as a small picture, as wide as the points reach, whatever the focal length; the
-photo's is moved and scaled, and the view's rank is that of the largest correlation. All views together are one product
-of matrices. Where the photo's focal length is known, views of much wider or narrower points come last.
+Places with texture have keypoints in photos and points in the map. The local contrast of the point density is computed
+as a small image for the photo and for each view. Its width is that of the points, whatever the focal length. The
+photo's image is shifted and scaled; the score of a view is the largest correlation. All views together are one matrix
+product. If the photo's focal length is known, views whose points are much wider or narrower come last.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -19,17 +18,22 @@ from scipy.ndimage import gaussian_filter
 from bpnp.cameras import Camera
 
 Array = NDArray[np.float64]
-# A local feature is found again from some way beside the cameras that saw it, and hardly from farther: of the points
-# that photos of five models see, 95 % are seen from 22 degrees or less beyond the directions of the track, where of the
-# points that project into these photos and are not seen 21 to 85 % would be seen from more than 30 degrees beyond.
-MARGIN_DEG = 25.0  # beyond the directions of the track
+# A local feature is rarely detected far outside the directions of its track. In photos of five models, 95 % of the
+# detected points are seen from at most 22 degrees beyond these directions. Of the points that project into these photos
+# and are not detected, 21 to 85 % would be seen from more than 30 degrees beyond.
+MARGIN_DEG = 25.0  # margin beyond the directions of the track
 
 
 @dataclass(frozen=True, eq=False)
 class View:
     """A registered image of the map; camera = rotation p + translation (COLMAP's cam_from_world).
 
-    points: (k,) places in `SceneMap.points3d` of the points that it sees, ascending.
+    Attributes:
+        name: Name of the image.
+        camera: Camera model.
+        rotation: (3, 3) rotation matrix.
+        translation: (3,) translation, scene units.
+        points: (k,) indices in `SceneMap.points3d` of the points that it sees, ascending.
     """
 
     name: str
@@ -40,22 +44,31 @@ class View:
 
     @property
     def centre(self) -> Array:
-        """Centre of the camera in the scene, -R^T t."""
+        """Camera centre in the scene, -R^T t."""
         return -self.rotation.T @ self.translation
 
 
 class Cones(NamedTuple):
-    """axes: (n, 3) unit vectors. cosines: (n,) of the angle about the axis from within which a point is seen."""
+    """Cones of directions from which points are visible.
+
+    Attributes:
+        axes: (n, 3) unit vectors.
+        cosines: (n,) cosines of the half angles.
+    """
 
     axes: Array
     cosines: Array
 
 
 def viewing_cones(points3d: Array, views: Iterable[tuple[Array, NDArray[np.integer]]]) -> Cones:
-    """The cones of n points from views: the centre of the camera, and the places of the points that it sees.
+    """Return the visibility cones of n points.
 
-    The axis is the mean direction to the cameras; the cone holds all of them and MARGIN_DEG more. A point that no view
-    sees has a cone of all directions.
+    The axis is the mean direction to the cameras. The cone holds all of them with a margin of MARGIN_DEG. A point that
+    no view sees has a cone of all directions.
+
+    Args:
+        points3d: (n, 3) scene points.
+        views: Camera centre (3,) and indices of the visible points, for each view.
 
     >>> cones = viewing_cones(np.zeros((1, 3)), [(np.array([0.0, 0, 2]), np.array([0]))])
     >>> (cones.axes + 0.0).tolist(), round(float(np.degrees(np.arccos(cones.cosines[0]))))
@@ -76,13 +89,18 @@ def viewing_cones(points3d: Array, views: Iterable[tuple[Array, NDArray[np.integ
 
 
 def _directions(points: Array, centre: Array) -> Array:
-    """Unit vectors (n, 3) from points to a centre; zero for one that lies there."""
+    """Return unit vectors (n, 3) from points to a centre; zero for a point at the centre."""
     towards = centre - points
     return np.asarray(towards / np.maximum(np.linalg.norm(towards, axis=-1, keepdims=True), 1e-300))
 
 
 class Pictures(NamedTuple):
-    """contrasts: (k, cells^2). reaches: (k,) half widths of what the points take up, normalised image coordinates."""
+    """Density images of views or of a photo.
+
+    Attributes:
+        contrasts: (k, cells^2) contrast of the point density, unit length.
+        reaches: (k,) half widths of the area of the points, normalised image coordinates.
+    """
 
     contrasts: NDArray[np.float32]
     reaches: Array
@@ -90,13 +108,18 @@ class Pictures(NamedTuple):
 
 @dataclass(frozen=True)
 class RankSettings:
-    """Constants of the rank.
+    """Constants of the ranking of views.
 
-    cells: along a side of a picture. half: its half width, in units within which the share `within` of the points lies.
-    fine, wide: standard deviations of the smoothings whose difference is the contrast, cells. shifts: cells by which
-    the photo is moved along either axis; scales: by which it is scaled. ratio: largest one of what the points of a
-    photo of known focal length and those of a view take up. apart: share of a view's points that no better one sees,
-    from which it is another place.
+    Attributes:
+        cells: Cells along a side of a density image.
+        within: Fraction of the points within one unit, the reach of the points.
+        half: Half width of the density image, in units of the reach.
+        fine: Standard deviation of the narrow smoothing of the contrast, cells.
+        wide: Standard deviation of the wide smoothing of the contrast, cells.
+        shifts: Shifts of the photo along either axis, cells.
+        scales: Scale factors of the photo.
+        ratio: Largest ratio of the reaches of a view and of a photo with a known focal length.
+        apart: Least fraction of a view's points that no better view sees, for it to count as another place.
     """
 
     cells: int = 32
@@ -111,12 +134,12 @@ class RankSettings:
 
 
 RANK = RankSettings()
-STEP = 1.25  # factor from one focal length that a photo may have to the next
-RUNG = 4  # views that are tried with one before the next one
+STEP = 1.25  # factor between successive focal lengths of a photo
+RUNG = 4  # views that are tried with one focal length before the next one starts
 
 
 def pictures_of_views(points3d: Array, views: Sequence[View], rule: RankSettings = RANK) -> Pictures:
-    """Contrast of the points that each view sees."""
+    """Return the density images of the points that each view sees."""
     contrasts, reaches = np.zeros((len(views), rule.cells**2), np.float32), np.zeros(len(views))
     for k, view in enumerate(views):
         camera = points3d[view.points] @ view.rotation.T + view.translation
@@ -128,7 +151,7 @@ def pictures_of_views(points3d: Array, views: Sequence[View], rule: RankSettings
 
 
 def pictures_of_photo(points2d: Array, rule: RankSettings = RANK) -> Pictures:
-    """Contrast of a photo's normalised keypoints (m, 2), moved and scaled; (1,) what they take up as they are."""
+    """Return the density images of a photo's normalised keypoints (m, 2), shifted and scaled, and their reach (1,)."""
     side, most, found, unit = rule.cells, max(rule.shifts), [], reach(points2d, rule)
     for scale in rule.scales:
         wide = np.pad(contrast(points2d, unit / scale, rule).reshape(side, side), most)
@@ -138,13 +161,15 @@ def pictures_of_photo(points2d: Array, rule: RankSettings = RANK) -> Pictures:
 
 
 def reach(points2d: Array, rule: RankSettings = RANK) -> float:
-    """Half the side of the square about the image's centre that most of the points (k, 2) lie in."""
+    """Return the half side of the square about the image centre that holds most of the points (k, 2)."""
     return max(float(np.quantile(np.abs(points2d).max(-1), rule.within)), 1e-12) if len(points2d) else 1.0
 
 
 def contrast(points2d: Array, unit: float, rule: RankSettings = RANK) -> NDArray[np.float32]:
-    """(cells^2,) of points (k, 2), in a picture of `rule.half` units to each side: density smoothed a little less that
-    smoothed widely, of length one; 0 for none."""
+    """Return the density contrast (cells^2,) of points (k, 2), of unit length; 0 without points.
+
+    It is the narrowly smoothed density less the widely smoothed one, in an image of `rule.half` units to each side.
+    """
     edges = np.linspace(-rule.half, rule.half, rule.cells + 1) * unit
     counts, _, _ = np.histogram2d(points2d[:, 1], points2d[:, 0], bins=(edges, edges))
     density = np.sqrt(gaussian_filter(counts, rule.fine, mode="constant"))
@@ -155,8 +180,10 @@ def contrast(points2d: Array, unit: float, rule: RankSettings = RANK) -> NDArray
 def scores_of_views(
     points2d: Array, views: Pictures, rule: RankSettings = RANK, *, known_focal: bool = True
 ) -> NDArray[np.float32]:
-    """(views,) largest correlation of each view's picture with a photo of normalised keypoints (m, 2); less 2 for a
-    view whose points take up much more or less, if the photo's focal length is known."""
+    """Return the largest correlation (views,) of each view's density image with a photo of normalised keypoints (m, 2).
+
+    If the photo's focal length is known, the score of a view whose points are much wider or narrower is reduced by 2.
+    """
     photo = pictures_of_photo(points2d[np.isfinite(points2d).all(-1)], rule)
     scores = (views.contrasts @ photo.contrasts.T).max(-1)
     unlike = np.abs(np.log(views.reaches / photo.reaches)) > np.log(rule.ratio)
@@ -166,10 +193,7 @@ def scores_of_views(
 def places_first(
     views: Sequence[View], scores: NDArray[np.float32], count: int, rule: RankSettings = RANK
 ) -> Iterator[int]:
-    """Numbers of the views, best first, those of a place that a better one shows after all other places.
-
-    count: of the map's points.
-    """
+    """Yield the indices of the views, best first; views of a place that a better view shows come last."""
     unseen, later = np.ones(count, bool), []
     for k in np.argsort(-scores, kind="stable").tolist():
         points = views[k].points
