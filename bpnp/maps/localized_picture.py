@@ -1,4 +1,4 @@
-"""A photo that was found in a map, drawn: its matches over the photo, and the map from above with the camera."""
+"""Figure of a photo that was localised in a map: its matches over the photo, and the map from above with the camera."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -20,22 +20,23 @@ if TYPE_CHECKING:
     from bpnp.maps.views import View
 
 Array = npt.NDArray[Any]
-FADED = 0.55  # of the photo's contrast is taken, so that points stand out
+FADED = 0.55  # fraction of the photo's contrast that is kept, so that points stand out
 BOUND = 3.72  # standard deviations that hold 99.9 % of a plane's normal distribution
-SHOWN = 98.0  # % of the map's points that its drawing holds
-FARTHEST = 4.0  # extents of the points, around them, in which cameras are drawn where they are
-MOST_POINTS = 20_000  # of the map that are drawn
-WIDTHS = (9.0, 6.0)  # inches, of photo and map
+SHOWN = 98.0  # % of the map's points within the drawing
+FARTHEST = 4.0  # largest distance of a camera drawn in place, in extents of the points
+MOST_POINTS = 20_000  # largest number of map points drawn
+WIDTHS = (9.0, 6.0)  # widths of photo and map, inches
 
 
 def localized_picture(
     scene: "SceneMap", solution: Solution, *, photo: Array | None = None, title: str | None = None
 ) -> "Figure":
-    """Draw a photo in a map.
+    """Draw a photo and its pose in a map.
 
-    Left the photo with its matches, coloured by their residuals, and the other keypoints faint; right the map from
-    above with its views, and the camera with the ellipse that holds its centre at 99.9 %. Of an ambiguous solution the
-    next candidate is drawn too. Of a failed one neither matches nor camera are drawn: its pose is a guess.
+    The left part is the photo with its matches, coloured by their residuals, and the other keypoints faint. The right
+    part is the map from above with its views, and the camera with the 99.9 % ellipse of its centre. The next candidate
+    of an ambiguous solution is drawn too. A failed solution is drawn without matches and camera, since its pose is a
+    guess.
 
     Args:
         scene: The map.
@@ -58,10 +59,10 @@ def localized_picture(
 
 
 def draw_matches(axes: "Axes", solution: Solution, *, photo: Array | None = None) -> Any:
-    """Draw keypoints faint, and matches coloured by the distance to where their scene points are reprojected.
+    """Draw keypoints faint, and matches coloured by their reprojection errors.
 
     Returns:
-        What was coloured; None without a match, or for a failed solution, of which matches are not drawn.
+        The coloured lines; None without matches. Matches of a failed solution are not drawn.
     """
     from matplotlib.collections import LineCollection
 
@@ -91,9 +92,9 @@ def draw_matches(axes: "Axes", solution: Solution, *, photo: Array | None = None
 
 
 def plane_from_above(views: "Sequence[View]", forward: Array) -> Array:
-    """Return the axes (2, 3) of a drawing of a map from above: to the right, and ahead along `forward` (3,).
+    """Return the axes (2, 3) of a drawing of a map from above: right, and ahead along `forward` (3,).
 
-    The photos are taken for upright: down is the mean of their y axes.
+    Photos are assumed upright: down is the mean of their y axes.
     """
     down = np.mean([view.rotation[1] for view in views], axis=0)
     down /= np.linalg.norm(down)
@@ -103,10 +104,10 @@ def plane_from_above(views: "Sequence[View]", forward: Array) -> Array:
 
 
 def draw_from_above(axes: "Axes", scene: "SceneMap", solution: Solution) -> None:
-    """Draw points and views of the map from above, and the camera, which looks upwards in the drawing.
+    """Draw points and views of the map from above, and the camera, which points upwards in the drawing.
 
-    An ambiguous solution has its next candidate drawn as a hollow star; a failed one has no camera. A camera that is
-    far outside of the map stands at the edge of the drawing, and the legend says so.
+    The next candidate of an ambiguous solution is a hollow star; a failed solution has no camera. A camera far outside
+    the map is drawn at the edge, with a note in the legend.
     """
     found = solution.verdict != "failed"
     plane = plane_from_above(scene.views, solution.rotation[2] if found else scene.views[0].rotation[2])
@@ -145,7 +146,7 @@ def draw_from_above(axes: "Axes", scene: "SceneMap", solution: Solution) -> None
 
 
 def draw_ellipse(axes: "Axes", solution: Solution, plane: Array, colour: str) -> None:
-    """Draw the ellipse that holds the camera's centre at 99.9 %, in a plane (2, 3) of the scene, if it is known."""
+    """Draw the 99.9 % ellipse of the camera's centre in a plane (2, 3) of the scene, if its covariance is known."""
     from matplotlib.patches import Ellipse
 
     to_plane = plane @ solution.rotation.T

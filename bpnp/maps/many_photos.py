@@ -1,7 +1,7 @@
-"""Many photos in a map: what each is localised with, and the folder of their solutions, which a later run goes on with.
+"""Localisation of many photos in a map, and the folder of their solutions, which a later run continues.
 
-A solution is known by the content of all that it was made with, not by names: a photo, a map or a file of views that
-was replaced under its name is another one.
+A solution is identified by the content of all its inputs, not by their names. A photo, a map or a file of views with
+new content under the same name is a new input.
 """
 
 import contextlib
@@ -25,18 +25,25 @@ from bpnp.report.images import read_photo, save_figure
 from bpnp.solving.solution import Solution
 
 CHANGES = {"photo": "another photo", "map": "another map", "views": "other views", "keypoints": "other keypoints"}
-MADE_WITH = "made_with"  # beside the fields of a solution in its file
+MADE_WITH = "made_with"  # key in a solution's file, added to the fields of the solution
 REPORTED: tuple[str, ...] = ("verdict", "reason", "view", "inlier_count", "reprojection_error", "inlier_threshold")
 REPORTED += ("log10_false_alarms", "seconds", "rotation", "translation", "camera", "focal_length", "focal_length_std")
 REPORTED += (MADE_WITH,)
-ERROR = "error_to_map"  # of a photo that was left out of the map
+ERROR = "error_to_map"  # key for a photo that was left out of the map
 POSES_HEADER = "# NAME, QW, QX, QY, QZ, TX, TY, TZ (COLMAP's cam_from_world)\n"
-Record = dict[str, Any]  # what results.json has of a photo
+Record = dict[str, Any]  # entry of a photo in results.json
 
 
 @dataclass(frozen=True)
 class PhotoTask:
-    """A photo to localise: arguments of `SceneMap.localize_photo`, and the content of what it is localised with."""
+    """A photo to localise.
+
+    Attributes:
+        name: Name of the photo.
+        photo: Image file.
+        arguments: Arguments of `SceneMap.localize_photo`.
+        made_with: Fingerprints of all inputs of the solution.
+    """
 
     name: str
     photo: Path
@@ -44,7 +51,7 @@ class PhotoTask:
     made_with: Mapping[str, Any]
 
 
-Attempt = tuple[PhotoTask, Solution | str]  # a photo, and its solution or why it could not be tried
+Attempt = tuple[PhotoTask, Solution | str]  # a photo, and its solution or an error message
 
 
 def photo_task(
@@ -60,12 +67,22 @@ def photo_task(
     solver: str = "auto",
     **search: Any,
 ) -> PhotoTask:
-    """What to localise a photo with.
+    """Build the task of a photo.
 
-    camera, keypoints, solver: as for `SceneMap.localize_photo`. views: those to try by the name of the photo, None for
-    the whole map. leave_one_out: the photo is a view of the map and is taken out of it. search: focal_error,
-    distortion, ignore_orientation, seed and time_limit.
-    Raises ValueError for what is wrong with the photo, its camera, keypoints or views.
+    Args:
+        scene: The map.
+        name: Name of the photo.
+        photo: Image file.
+        map_content: Fingerprint of the files of the map.
+        camera: As for `SceneMap.localize_photo`.
+        views: Views to try, by photo name; None for the whole map.
+        keypoints: As for `SceneMap.localize_photo`.
+        leave_one_out: Remove the photo, which is a view of the map, from the map.
+        solver: As for `SceneMap.localize_photo`.
+        **search: focal_error, distortion, ignore_orientation, seed and time_limit.
+
+    Raises:
+        ValueError: The photo, its camera, its keypoints or its views are invalid.
     """
     photo_content, source = content_of(photo), "--camera"
     if camera is None or isinstance(camera, SceneMap):
@@ -96,7 +113,7 @@ def photo_task(
 
 
 def attempt(scene: SceneMap, task: PhotoTask) -> Solution | str:
-    """The solution of a photo, or why it could not be tried."""
+    """Return the solution of a photo, or the error message."""
     try:
         place = scene.without([task.name]) if task.made_with["leave_one_out"] else scene
         return place.localize_photo(task.photo, **task.arguments)
@@ -105,13 +122,19 @@ def attempt(scene: SceneMap, task: PhotoTask) -> Solution | str:
 
 
 def attempts(scene: SceneMap, tasks: Iterable[PhotoTask]) -> Iterator[Attempt]:
-    """The photos one after the other."""
+    """Return an iterator over the results of the photos, one after the other."""
     return ((task, attempt(scene, task)) for task in tasks)
 
 
 @dataclass
 class Outcome:
-    """Of the photos of a call: those kept as they were, why others were solved again, and why some were not tried."""
+    """Result of a run.
+
+    Attributes:
+        kept: Names of photos whose earlier solution is still valid.
+        again: Reasons why photos were solved again, by name.
+        errors: Error messages of photos that could not be tried, by name.
+    """
 
     kept: list[str] = field(default_factory=list)
     again: dict[str, str] = field(default_factory=dict)
@@ -128,10 +151,18 @@ def localize_photos(
     done: Callable[[str], None] = lambda name: None,
     **options: Any,
 ) -> Outcome:
-    """Localize photos, by name, into a folder; those that were solved there with the same content and options are kept.
+    """Localise photos into a folder; solutions there with the same inputs and options are kept.
 
-    attempts: what localises them, here or on a cluster. done: called with a few words on each photo. options: as for
-    `photo_task`. Each task is made when its turn comes: a photo may be replaced in the meantime.
+    Each task is built just before it runs, since a photo may be replaced in the meantime.
+
+    Args:
+        scene: The map.
+        files: Image files by name.
+        folder: Folder of the solutions.
+        attempts: Localises the photos, on this machine or on a cluster.
+        pictures: Draw a picture of each photo. Default True.
+        done: Callback with a short message for each photo.
+        **options: As for `photo_task`.
     """
     outcome = Outcome()
 
@@ -171,9 +202,10 @@ def localize_photos(
 
 
 def read_views(path: str | Path) -> dict[str, list[str]]:
-    """The views to try for each photo, from a text file of lines `photo view`, as hloc's retrieval writes its pairs.
+    """Read the views to try for each photo from a text file of lines `photo view`, as hloc writes retrieval pairs.
 
-    Raises ValueError for a file that cannot be read or a line without two names.
+    Raises:
+        ValueError: The file cannot be read, or a line does not have two names.
     """
     try:
         lines = Path(path).read_text(encoding="utf-8").splitlines()
@@ -190,7 +222,7 @@ def read_views(path: str | Path) -> dict[str, list[str]]:
 
 
 def content_of(*files: Path) -> str:
-    """Sizes and a hash of what is in files."""
+    """Return the sizes and a hash of the content of files."""
     digest, sizes = hashlib.blake2b(digest_size=16), []
     for file in files:
         with file.open("rb") as content:
@@ -200,13 +232,19 @@ def content_of(*files: Path) -> str:
 
 
 def content_of_map(folder: Path) -> str:
-    """The same of the files of a COLMAP model."""
+    """Return the sizes and a hash of the content of the files of a COLMAP model."""
     return content_of(*(folder / f"{name}.{model_format(folder)}" for name in FILES))
 
 
 @dataclass
 class SolutionFolder:
-    """solutions/<photo>.json, and of all of them together results.json and poses.txt, in the frame of one map."""
+    """Folder with solutions/<photo>.json for each photo, and results.json and poses.txt for all.
+
+    Attributes:
+        path: The folder.
+        map_content: Fingerprint of the files of the map, whose frame the poses are in.
+        records: Entries of results.json, by photo.
+    """
 
     path: Path
     map_content: str
@@ -215,19 +253,27 @@ class SolutionFolder:
     def __post_init__(self) -> None:
         folder = self.path / "solutions"
         for file in sorted(folder.rglob("*.json")):
-            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # not whole, or of another version
+            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # incomplete, or from another version
                 self._record(file.relative_to(folder).as_posix().removesuffix(".json"), file.read_text("utf-8"))
 
     def changes(self, task: PhotoTask) -> list[str] | None:
-        """What of the photo's solution was made with something else; None if there is no solution."""
+        """Return the names of the inputs that have changed since the photo's solution; None if there is no solution."""
         if task.name not in self.records:
             return None
         before = self.records[task.name][MADE_WITH]
         return [key for key, value in task.made_with.items() if before.get(key) != value]
 
     def keep(self, task: PhotoTask, solution: Solution | str, *, draw_in: SceneMap | None = None) -> None:
-        """Write the solution of a photo, what it was made with, and its picture with a map. Raises ValueError with the
-        reason if there is none."""
+        """Write the solution of a photo, the fingerprints of its inputs and, with a map, its picture.
+
+        Args:
+            task: The photo.
+            solution: Solution, or an error message.
+            draw_in: Map to draw the photo in; None for no picture.
+
+        Raises:
+            ValueError: There is no solution; with its error message.
+        """
         if isinstance(solution, str):
             raise ValueError(solution)
         self.picture(task.name).unlink(missing_ok=True)
@@ -239,7 +285,7 @@ class SolutionFolder:
         self._record(task.name, text)
 
     def forget_replaced(self, name: str, photo: Path) -> None:
-        """Delete solution and picture of a photo if they are of another one of that name."""
+        """Delete the solution and the picture of a photo if they belong to another photo of that name."""
         try:
             content = content_of(photo)
         except OSError:
@@ -250,11 +296,11 @@ class SolutionFolder:
             self.picture(name).unlink(missing_ok=True)
 
     def picture(self, name: str) -> Path:
-        """Return the file of a photo's picture, which has the photo's name and is a PNG."""
+        """Return the path of a photo's picture, a PNG file with the photo's name."""
         return self._file("pictures", name.removesuffix(".png"), "png")
 
     def compare(self, scene: SceneMap) -> None:
-        """Add to each photo that was left out of this map how far its pose is from that of the map."""
+        """Add the error relative to the map's pose to each photo that was left out of this map."""
         for name, record in self.records.items():
             known = record["rotation"] is not None and name in scene.view_numbers
             if known and record[MADE_WITH]["leave_one_out"] and record[MADE_WITH]["map"] == self.map_content:
@@ -264,11 +310,11 @@ class SolutionFolder:
                 record[ERROR] = {"rotation_deg": float(degrees), "centre": float(shift)}
 
     def of_other_maps(self) -> list[str]:
-        """Photos whose solutions are of another map, so that their poses have another frame."""
+        """Return the photos with solutions in another map, whose poses are in another frame."""
         return [name for name, record in self.records.items() if record[MADE_WITH]["map"] != self.map_content]
 
     def write(self) -> None:
-        """results.json; and poses.txt, a line for each confident photo of this map, whenever it was solved."""
+        """Write results.json, and poses.txt with a line for each confident photo of this map, from all runs."""
         photos = dict(sorted(self.records.items()))
         write_text(self.path / "results.json", json.dumps({"map": self.map_content, "photos": photos}, indent=1) + "\n")
         others = self.of_other_maps()

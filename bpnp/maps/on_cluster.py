@@ -1,4 +1,4 @@
-"""Photos localised by the workers of a Dask cluster; needs the extra `cluster`."""
+"""Localisation of photos on the workers of a Dask cluster; needs the extra `cluster`."""
 
 import asyncio
 import uuid
@@ -13,23 +13,31 @@ from bpnp.maps.many_photos import Attempt, PhotoTask, attempt
 from bpnp.maps.scene_map import SceneMap
 from bpnp.solving.solution import Solution
 
-QUEUED = 4  # photos for each thread of the workers: none waits for the next one, and the scheduler holds few
+QUEUED = 4  # photos per worker thread: no thread waits, and the scheduler holds few
 PATIENCE = 10  # seconds until a scheduler answers
 
 
 class MapOfWorker(WorkerPlugin):
-    """The map, which Dask sends once to each worker, also to one that joins later."""
+    """Worker plugin that holds the map; Dask sends it once to each worker, also to one that joins later."""
 
     def __init__(self, scene: SceneMap) -> None:
         self.scene, self.name = scene, f"bpnp-{uuid.uuid4().hex}"
 
 
 def attempts_on_cluster(scene: SceneMap, tasks: Iterable[PhotoTask], cluster: str) -> Iterator[Attempt]:
-    """The photos in the order in which they are finished.
+    """Yield the results of photos in the order in which they finish.
 
-    cluster: address of a scheduler, such as tcp://10.0.0.1:8786, or how many processes to start on this machine.
-    The workers need bpnp, and photos and keypoints under the same paths as here. A photo whose worker is lost is given
-    to another one. Raises ValueError if there is no scheduler at the address.
+    The workers need bpnp, and photos and keypoints under the same paths as here. If a worker is lost, its photos are
+    reassigned.
+
+    Args:
+        scene: The map.
+        tasks: Photos to localise.
+        cluster: Address of a scheduler, such as tcp://10.0.0.1:8786, or the number of processes to start on this
+            machine.
+
+    Raises:
+        ValueError: There is no scheduler at the address.
     """
     plugin = MapOfWorker(scene)
     with connected(cluster) as client:
@@ -53,7 +61,7 @@ def attempts_on_cluster(scene: SceneMap, tasks: Iterable[PhotoTask], cluster: st
 
 @contextmanager
 def connected(cluster: str) -> Iterator[Client]:
-    """A client of the scheduler at an address, or of as many single-threaded processes as a number says."""
+    """Yield a client of the scheduler at an address, or of a given number of new single-threaded processes."""
     if cluster.isdecimal():
         if int(cluster) < 1:
             raise ValueError(f"expected one or more processes, got {cluster}")
@@ -70,7 +78,7 @@ def connected(cluster: str) -> Iterator[Client]:
 
 
 async def _answers(address: str) -> None:
-    """Raise OSError or ValueError where no scheduler answers."""
+    """Raise OSError or ValueError if no scheduler answers."""
     comm = await connect(address, timeout=PATIENCE)
     await comm.close()
 

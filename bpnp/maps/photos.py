@@ -1,4 +1,4 @@
-"""What is read of a photo: which files there are, what they say about the camera, and the keypoints."""
+"""Photo files: discovery, camera data of EXIF, and keypoints."""
 
 import importlib
 import sqlite3
@@ -14,7 +14,7 @@ from bpnp.cameras import CENTRE, outside_image, same_aspect_ratio
 
 Array = NDArray[np.float64]
 Size = tuple[int, int]  # width and height, pixels
-# The last four are found too although Pillow may not read them, so that the error names the photo.
+# Pillow may not read the last four; they are listed so that the error names the photo.
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".avif", ".dng"}
 IFD_EXIF = 0x8769
 FOCAL_LENGTH, FOCAL_LENGTH_35MM = 0x920A, 0xA405
@@ -24,7 +24,7 @@ ORIENTATION = 0x0112
 UP_OF_ORIENTATION = {1: (0.0, -1.0, 0.0), 3: (0.0, 1.0, 0.0), 6: (-1.0, 0.0, 0.0), 8: (1.0, 0.0, 0.0)}
 PIXELS_X, PIXELS_Y = 0xA002, 0xA003
 DIAGONAL_35MM = 43.2666  # of a frame of 36 x 24 mm; equivalent focal lengths are by the diagonal (CIPA DCG-001)
-MILLIMETRES = {2: 25.4, 3: 10.0}  # of the resolution's unit, by its EXIF number: inch, centimetre
+MILLIMETRES = {2: 25.4, 3: 10.0}  # per unit of the resolution, by EXIF number: inch, centimetre
 MOST_DETECTED = 8192
 CONTRAST = 0.02  # of three layers together, of 1: COLMAP's peak_threshold of 0.02 / 3; half of OpenCV's default
 SQLITE = b"SQLite format 3\0"
@@ -35,9 +35,12 @@ QUERY = """SELECT rows, cols, data, width, height FROM images
 
 
 class Keypoints(NamedTuple):
-    """pixels: (m, 2) in COLMAP's coordinates, (0.5, 0.5) the centre of the first pixel. scores: (m,) strength.
+    """Keypoints of a photo.
 
-    size: width and height of the photo, pixels; None where it is not known.
+    Attributes:
+        pixels: (m, 2) pixels in COLMAP's convention: (0.5, 0.5) is the centre of the first pixel.
+        scores: (m,) strengths.
+        size: (width, height) of the photo, pixels; None if it is unknown.
     """
 
     pixels: Array
@@ -46,10 +49,14 @@ class Keypoints(NamedTuple):
 
 
 def photo_files(paths: Iterable[Path], besides: Path | None = None) -> dict[str, Path]:
-    """Photos by name: the files given, and those in given folders and folders within, named by their path in these.
+    """Return photo files by name: given files by file name, and files in given folders by their path in the folder.
 
-    besides: a folder within a given one whose files are no photos, such as that of the results.
-    Raises ValueError for none, or one name twice.
+    Args:
+        paths: Files and folders; folders are searched recursively.
+        besides: Folder to skip, such as that of the results. None to skip nothing.
+
+    Raises:
+        ValueError: A path does not exist, there is no photo, or two photos have one name.
     """
     files: dict[str, Path] = {}
     left_out = None if besides is None else besides.resolve()
@@ -67,17 +74,20 @@ def photo_files(paths: Iterable[Path], besides: Path | None = None) -> dict[str,
 
 
 def photo_size(photo: Path) -> Size:
-    """Width and height of a photo in pixels. Raises ValueError if it cannot be read."""
+    """Return (width, height) of a photo, pixels; raise ValueError if it cannot be read."""
     return _opened(photo)[0]
 
 
 def focal_from_exif(photo: Path) -> float | None:
-    """The focal length in pixels of the photo as it is, from EXIF; None where it has none that holds for its size.
+    """Return the focal length in pixels of a photo at its stored size, from EXIF; None if EXIF has none for this size.
 
-    From the equivalent at 35 mm film, which does not change when a photo is scaled; else from the millimetres and the
-    resolution of the sensor, scaled by the size that EXIF has of the photo as it was taken. A photo of another shape
-    than that was cropped, and no one knows from where. (pycolmap's `infer_camera_from_image` takes the resolution of
-    the sensor for that of a scaled photo too.) Raises ValueError for a photo that cannot be read.
+    The 35 mm equivalent has priority, since it is unchanged if a photo is scaled. Otherwise the focal length in
+    millimetres is multiplied by the sensor resolution and scaled by the ratio of the stored size to the original size.
+    A photo whose aspect ratio differs from the original was cropped at an unknown position, and the result is None.
+    (pycolmap's `infer_camera_from_image` does not correct the sensor resolution of a scaled photo.)
+
+    Raises:
+        ValueError: The photo cannot be read.
     """
     size, tags = _opened(photo)
     taken = int(tags.get(PIXELS_X, 0)), int(tags.get(PIXELS_Y, 0))
@@ -94,15 +104,19 @@ def focal_from_exif(photo: Path) -> float | None:
 
 
 def up_from_exif(photo: Path) -> tuple[float, float, float] | None:
-    """Return the direction up in the camera of a photo as it is stored, to a quarter turn, from EXIF's orientation.
+    """Return the direction up (3,) in the camera frame of a stored photo, to a quarter turn, from the EXIF orientation.
 
-    None if there is none, or a mirrored one. Raises ValueError for a photo that cannot be read.
+    Returns:
+        Unit vector; None if there is no orientation, or a mirrored one.
+
+    Raises:
+        ValueError: The photo cannot be read.
     """
     return UP_OF_ORIENTATION.get(_opened(photo)[1].get(ORIENTATION, 0))
 
 
 def _opened(photo: Path) -> tuple[Size, dict[int, Any]]:
-    """Size of a photo, and its EXIF tags, with that of its orientation."""
+    """Return the size of a photo and its EXIF tags, with the orientation."""
     from PIL import Image
 
     try:
@@ -114,7 +128,13 @@ def _opened(photo: Path) -> tuple[Size, dict[int, Any]]:
 
 
 def photo_keypoints(photo: Path, file: str | Path | None, name: str) -> Keypoints:
-    """The keypoints of a photo: those that a file, hloc's or COLMAP's, has of its `name`; without a file detected."""
+    """Return the keypoints of a photo.
+
+    Args:
+        photo: Image file.
+        file: HDF5 file of hloc, or database of COLMAP; None to detect SIFT keypoints.
+        name: Name of the photo in that file.
+    """
     if file is None:
         return detected_keypoints(photo)
     path, size = Path(file), photo_size(photo)
@@ -126,11 +146,18 @@ def photo_keypoints(photo: Path, file: str | Path | None, name: str) -> Keypoint
 
 
 def detected_keypoints(photo: Path, *, most: int = MOST_DETECTED) -> Keypoints:
-    """SIFT keypoints of a photo (Lowe 2004, OpenCV's), one for each place, the score its scale in pixels.
+    """Detect SIFT keypoints (Lowe 2004, with OpenCV), one per position; the score is the scale in pixels.
 
-    As faint as COLMAP's, and the `most` largest, of which COLMAP's maps are made too. Large ones are seen again from
-    other sides and triangulated, so that the scale tells better than the response which have a partner in a map.
-    Raises ValueError for a photo that cannot be read or has no keypoints.
+    The contrast threshold is COLMAP's. Like COLMAP, the `most` largest keypoints are kept. Large keypoints are more
+    often detected from other viewpoints and triangulated. So the scale predicts better than the response if a keypoint
+    has a map point.
+
+    Args:
+        photo: Image file.
+        most: Largest number of keypoints, default 8192.
+
+    Raises:
+        ValueError: The photo cannot be read, or has no keypoints.
     """
     import cv2
 
@@ -148,11 +175,16 @@ def detected_keypoints(photo: Path, *, most: int = MOST_DETECTED) -> Keypoints:
 
 
 def read_features(file: Path, photo: str, size: Size | None = None) -> Keypoints:
-    """The keypoints of a photo in an HDF5 file of hloc: `<photo>/keypoints` (m, 2), `scores` (m,) if there are some.
+    """Read the keypoints of a photo from an HDF5 file of hloc: `<photo>/keypoints` (m, 2) and optional `scores` (m,).
 
-    size: of the photo in pixels, to check them by; by default `<photo>/image_size`, if the file has it.
-    Raises ValueError, naming file and photo, if it is not in the file or of another size, or if keypoints lie outside
-    it (`outside_image`).
+    Args:
+        file: HDF5 file.
+        photo: Name of the photo in the file.
+        size: (width, height) of the photo, pixels, for a check; None for `<photo>/image_size`, if the file has it.
+
+    Raises:
+        ValueError: The photo is not in the file or has another size, or keypoints lie outside it (`outside_image`). The
+            message names file and photo.
     """
     try:
         h5py = importlib.import_module("h5py")  # optional
@@ -177,15 +209,22 @@ def read_features(file: Path, photo: str, size: Size | None = None) -> Keypoints
 
 
 def read_database(file: Path, photo: str, size: Size | None = None) -> Keypoints:
-    """The keypoints of a photo in a database of COLMAP, one for each place, the score its scale if the database has it.
+    """Read the keypoints of a photo from a COLMAP database, one per position; the score is the scale, if stored.
 
-    size: of the photo in pixels, to compare with that of the image's camera.
-    Raises ValueError, naming file and photo, if it is not in the database, has no keypoints or such of another size, or
-    if these are damaged or lie outside the photo. (`pycolmap.Database` writes to every file that it opens.)
+    The database is opened read-only; `pycolmap.Database` writes to every file that it opens.
+
+    Args:
+        file: SQLite database.
+        photo: Name of the image in the database.
+        size: (width, height) of the photo, pixels, to compare with the image's camera; None for no comparison.
+
+    Raises:
+        ValueError: The photo is not in the database, has no keypoints or another size, or its keypoints are damaged or
+            outside it. The message names file and photo.
     """
     try:
         logged = file.with_name(f"{file.name}-wal").exists()
-        mode = "mode=ro" if logged else "immutable=1"  # which leaves no file beside
+        mode = "mode=ro" if logged else "immutable=1"  # creates no journal file
         with closing(sqlite3.connect(f"{file.absolute().as_uri()}?{mode}", uri=True)) as content:
             row = content.execute(QUERY, (photo,)).fetchone()
             names = ", ".join(str(name) for (name,) in content.execute("SELECT name FROM images LIMIT 5"))
@@ -211,7 +250,7 @@ def read_database(file: Path, photo: str, size: Size | None = None) -> Keypoints
 
 
 def _checked(keypoints: Keypoints, size: Size | None, where: str) -> Keypoints:
-    """The keypoints of a photo of this size. Raises ValueError if theirs is another one, or they lie outside it."""
+    """Return keypoints with the size of their photo; raise ValueError if sizes differ or keypoints lie outside it."""
     if None not in (keypoints.size, size) and keypoints.size != size:
         raise ValueError(f"expected keypoints of {where} at the size {size} of the photo, got them at {keypoints.size}")
     known = size or keypoints.size

@@ -1,8 +1,7 @@
-"""The direction up in a map and in a photo: which views are turned against a photo by quarter turns of the camera.
+"""Direction up in a map and in a photo: quarter turns of the views that match the orientation of a photo.
 
-The orientation of EXIF data (tag 0x0112) says which side of a stored photo is up, to a quarter turn. COLMAP does not
-turn photos, so a photo that is stored on its side has a pose 90 degrees away from those of upright views of the same
-place.
+The EXIF orientation (tag 0x0112) gives the upper side of a stored photo, to a quarter turn. COLMAP does not rotate
+photos. So the pose of a photo that is stored on its side is 90 degrees away from those of upright views of the place.
 """
 
 from collections.abc import Sequence
@@ -19,12 +18,12 @@ IN_PLANE = 0.5  # least length of the direction up in the image plane: a steeper
 
 
 def up_of_views(views: Sequence[View]) -> Array | None:
-    """Return the direction up (3,) in the map, a unit vector, that most views agree on; None if too few agree.
+    """Return the direction up (3,) in the map, a unit vector, on which most views agree; None if too few agree.
 
-    The y axis of an upright photo points down. Photos that are stored on their side are outvoted.
+    The y axis of an upright photo points down. Photos stored on their side are outvoted.
     """
     ups = -np.array([view.rotation[1] for view in views])
-    agree = ups @ ups[:: -(-len(ups) // 200)].T > AGREE  # with each of 200 views at most
+    agree = ups @ ups[:: -(-len(ups) // 200)].T > AGREE  # compared with at most 200 views
     best = agree[:, int(agree.sum(0).argmax())]
     if best.mean() < LEAST_AGREEING:
         return None
@@ -33,14 +32,15 @@ def up_of_views(views: Sequence[View]) -> Array | None:
 
 
 def quarter_turns(views: Sequence[View], up_camera: Array) -> NDArray[np.int64]:
-    """Return the number of quarter turns about the optical axis (v,), 0 to 3, that take each view to a photo's upright.
+    """Return the number of quarter turns (v,), 0 to 3, that rotate each view to the orientation of a photo.
 
     Args:
-        views: Of a map.
-        up_camera: (3,) direction up in the camera of the photo.
+        views: Views of a map.
+        up_camera: (3,) direction up in the camera frame of the photo.
 
     Returns:
-        Turns, from x towards y; 0 for views that look steeply up or down, and for all if the map's up is unknown.
+        Turns about the optical axis, from x towards y. 0 for views that point steeply up or down, and for all views if
+        the direction up in the map is unknown.
     """
     up = up_of_views(views)
     if up is None or np.hypot(*up_camera[:2]) < IN_PLANE * np.linalg.norm(up_camera):
@@ -52,7 +52,7 @@ def quarter_turns(views: Sequence[View], up_camera: Array) -> NDArray[np.int64]:
 
 
 def turned_view(view: View, turns: int) -> View:
-    """Return a view whose camera is turned about its optical axis by quarter turns, from x towards y; same centre."""
+    """Return a view with its camera rotated about the optical axis by quarter turns, from x towards y; same centre."""
     cosine, sine = ((1, 0), (0, 1), (-1, 0), (0, -1))[turns]
     turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
     return replace(view, rotation=turn @ view.rotation, translation=turn @ view.translation)

@@ -1,4 +1,4 @@
-"""Verify all images of a COLMAP model: which poses are doubtful, as records and as a page."""
+"""Verification of all images of a COLMAP model: records of their verdicts, and a page."""
 
 import csv
 import io
@@ -21,21 +21,21 @@ from bpnp.maps.localized_picture import plane_from_above
 from bpnp.maps.scene_map import SceneMap
 from bpnp.report.terminal import INKS, VERDICTS, number
 
-SECONDS = 10.0  # an image
+SECONDS = 10.0  # per image
 UNTESTED = "untested"
 MATCHED_ONLY = "Significant on the matched keypoints alone, log10 NFA {0:.1f}, but not on all {2} keypoints, {1:.1f}"
 WORST_FIRST = ("failed", "ambiguous", UNTESTED, "confident")
 DRAWN = 3000  # points of the map on the page
-SIDE = 1000.0  # of the drawing
+SIDE = 1000.0  # side of the drawing
 
 
 @dataclass(frozen=True)
 class VerifiedView:
-    """The verdict on the pose of an image of a model.
+    """Verdict on the pose of an image of a model.
 
     Attributes:
-        name: Of the image.
-        verdict: As of `bpnp.verify`, or "untested" if the other images see too few of its points.
+        name: Name of the image.
+        verdict: Verdict as of `bpnp.verify`, or "untested" if the other images see too few of its points.
         reason: One sentence.
         points: Number of points in view that two other images see.
         matches: Number of keypoints that one of these points explains.
@@ -72,22 +72,22 @@ def verify_map(
 ) -> list[VerifiedView]:
     """Verify the pose of each image of a COLMAP model without the image's own observations.
 
-    A pose is judged on all keypoints of the image. Where it is not significant on these, but on the keypoints that the
-    model matched to some point, it is "ambiguous": thousands of other keypoints may hide a right pose, and the matched
-    ones alone do not exclude an equal building.
+    A pose is judged on all keypoints of the image. If it is significant only on the keypoints that the model matched,
+    it is "ambiguous". Thousands of other keypoints may hide a correct pose, and the matched ones alone do not exclude a
+    similar building.
 
     Args:
-        folder: Of the model; the keypoints of its images are read.
+        folder: Folder of the model; the keypoints of its images are read.
         scene: The map of the same model.
-        seed: As for `SceneMap.verify_view`.
-        time_limit: Seconds an image, as for `SceneMap.verify_view`.
-        done: Called with a few words on each image.
+        seed: Seed, as for `SceneMap.verify_view`. Default 0.
+        time_limit: Seconds per image, as for `SceneMap.verify_view`. Default 10.
+        done: Callback with a short message for each image.
 
     Returns:
         A record for each view of the map: failed, ambiguous, untested, confident; the largest NFA first.
 
     Raises:
-        ColmapError: A ValueError, if the model cannot be read.
+        ColmapError: The model cannot be read. It is a ValueError.
     """
     images = {image.name: image for image in read_records(folder).images}
     verified = []
@@ -137,7 +137,7 @@ def summary(verified: Sequence[VerifiedView]) -> str:
 
 
 def as_json(verified: Sequence[VerifiedView], folder: Path) -> str:
-    """Return the records as JSON; a number that is not finite is null."""
+    """Return the records as JSON, with null for numbers that are not finite."""
     images = [
         {
             key: None if isinstance(value, float) and not math.isfinite(value) else value
@@ -149,7 +149,7 @@ def as_json(verified: Sequence[VerifiedView], folder: Path) -> str:
 
 
 def as_csv(verified: Sequence[VerifiedView]) -> str:
-    """Return the records as comma-separated values with a head; a number that is not finite is empty."""
+    """Return the records as comma-separated values with a header; numbers that are not finite are empty."""
     text, columns = io.StringIO(), [key for key in asdict(verified[0]) if key != "other_centre"]
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*columns, "other_x", "other_y", "other_z"])
@@ -161,7 +161,7 @@ def as_csv(verified: Sequence[VerifiedView]) -> str:
 
 
 def page_html(verified: Sequence[VerifiedView], scene: SceneMap, folder: Path) -> str:
-    """Return a page of one file: the map from above with its views by their verdicts, and the table."""
+    """Return a self-contained HTML page: the map from above with its views coloured by verdict, and the table."""
     assets = files("bpnp.report") / "assets"
     page = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     return page.from_string((assets / "verified_map.html").read_text(encoding="utf-8")).render(
@@ -177,7 +177,7 @@ def page_html(verified: Sequence[VerifiedView], scene: SceneMap, folder: Path) -
 
 
 def cells(one: VerifiedView) -> tuple[str, str, str, str, str]:
-    """Return the numbers of a record as texts: points, matches, error, log10 NFA, rotation change."""
+    """Return the numbers of a record as text: points, matches, error, log10 NFA, rotation change."""
     if one.verdict == UNTESTED:
         return ("-",) * 5
     error, change = (None if math.isnan(x) else x for x in (one.reprojection_error, one.rotation_change_deg))
@@ -185,7 +185,7 @@ def cells(one: VerifiedView) -> tuple[str, str, str, str, str]:
 
 
 def _drawing(verified: Sequence[VerifiedView], scene: SceneMap) -> dict[str, Any]:
-    """Return where the page draws the points, the views and the competing poses, in a square of `SIDE`."""
+    """Return the page coordinates of the points, the views and the competing poses, in a square of side `SIDE`."""
     plane = plane_from_above(scene.views, scene.views[0].rotation[2]) * np.array([[1.0], [-1.0]])  # y is down
     views = scene.named([one.name for one in verified])
     centres = np.array([view.centre for view in views]) @ plane.T

@@ -1,4 +1,4 @@
-"""Verify the pose of a view of a map: by the points that other views see, against the rest of the map."""
+"""Verification of the pose of a view: against the points that other views see, and against the rest of the map."""
 
 from dataclasses import replace
 
@@ -15,18 +15,18 @@ from bpnp.solving.verify import verify_problem
 
 
 def verify_pose(photo: Photo, view: View, *, time_limit: float | None) -> Solution:
-    """Verify the pose of a view by the points of a map that was made without it.
+    """Verify the pose of a view with the points of a map that was built without it.
 
-    The pose is judged on the points that it sees (`verify_problem`), then compared with poses elsewhere in the map that
-    explain the same image points (`bpnp.maps.twins`).
+    The pose is judged on the points in view (`verify_problem`). It is then compared with poses elsewhere in the map
+    that explain the same image points (`bpnp.maps.twins`).
 
     Args:
-        photo: The keypoints of the view, its camera, and the points and views of the map without it.
-        view: The pose.
-        time_limit: Seconds for the first part; None for no limit.
+        photo: Keypoints of the view, its camera, and the points and views of the map without it.
+        view: View with the pose.
+        time_limit: Seconds for `verify_problem`; None for no limit.
 
     Raises:
-        ValueError: If there are fewer than 4 keypoints, or the pose sees fewer than 4 points of the map.
+        ValueError: There are fewer than 4 keypoints, or fewer than 4 map points in view.
     """
     if len(photo.keypoints) < MIN_POINTS:
         raise ValueError(f"{view.name} has {len(photo.keypoints)} keypoints; at least {MIN_POINTS} are needed")
