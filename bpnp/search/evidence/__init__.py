@@ -1,1 +1,1 @@
-"""What a verdict rests on: the number of false alarms of a pose, and how well its points fix it."""
+"""Evidence for a verdict: the number of false alarms of a pose, its covariance and its competitors."""

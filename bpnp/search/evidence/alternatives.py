@@ -1,9 +1,8 @@
-"""What speaks against a pose: every alternative that was met, and by how many decades the pose is likelier; and the
-probability that a better one was not met (`log10_missed`).
+"""Competing explanations of the points with their margins, and the miss probability of a better pose.
 
-Met are another pose; the same pose at residuals far larger than those of its matches; another focal length or other
-proportions of the scene. The poses that repeated structures confuse with it are made by
-`bpnp.search.evidence.repetitions` and are then other poses like those that were met.
+A competing explanation is another pose, the same pose at far larger residuals, another focal length, or other
+proportions of the scene. Competing poses of a repeated structure are proposed by `bpnp.search.evidence.repetitions`
+and are judged like any other pose.
 """
 
 import math
@@ -22,7 +21,7 @@ from bpnp.search.evidence.uncertainty import Linearised, Misfit, systematic_misf
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, label_groups
 
-SAME_ZOOM = 0.005  # change of the focal length that is not worth a word
+SAME_ZOOM = 0.005  # relative change of the focal length that a reason omits
 Array = NDArray[np.float64]
 Seen = Sequence[tuple[Hypotheses, Problem]]
 
@@ -31,8 +30,8 @@ class Alternative(NamedTuple):
     """A competing explanation.
 
     Attributes:
-        decades: by which the best pose is likelier (log10).
-        what: the explanation in words, a clause.
+        decades: Margin by which the best pose is likelier (log10).
+        what: The explanation in words, a clause.
     """
 
     decades: float
@@ -40,9 +39,12 @@ class Alternative(NamedTuple):
 
 
 def other_pose(candidates: Hypotheses, problem: Problem, rule: Evidence) -> Alternative | None:
-    """The different pose with the fewest false alarms; None if there is none.
+    """Return the competing pose with the fewest false alarms, or None.
 
-    Different: farther apart than `Evidence.same`.
+    Args:
+        candidates: Poses, best first.
+        problem: Points of the problem.
+        rule: Constants of the verdict; a competing pose differs from the best one by more than `rule.same`.
     """
     same = problem.same_pose(candidates.rotation, candidates.translation, rule.same)
     others = np.flatnonzero(~same)
@@ -54,14 +56,22 @@ def other_pose(candidates: Hypotheses, problem: Problem, rule: Evidence) -> Alte
 
 
 def fits_as_well(rotation: Array, other: Array, decades: float) -> Alternative:
-    """A different pose, whose false alarms are so many decades above those of the first one."""
+    """Return a different pose as a competing explanation.
+
+    Args:
+        rotation: (3, 3) of the best pose.
+        other: (3, 3) of the competing pose.
+        decades: log10 of the ratio of their false alarms.
+    """
     off = math.degrees(turned_by(rotation, other))
     return Alternative(decades, reasons.competing(off, decades))
 
 
 def rougher(candidates: Hypotheses) -> Alternative | None:
-    """The best pose at scales far beyond that of its residuals, where the points agree with it better there: what its
-    matches say of it beyond a rough alignment is then no more than chance. None otherwise."""
+    """Return the best pose at far larger residuals, or None if the points agree better at its own scale.
+
+    If the rough alignment has fewer false alarms, the matches add nothing significant to it.
+    """
     decades = float(candidates.log10_rough[0] - candidates.log10_false_alarms[0])
     if decades >= 0:
         return None
@@ -69,17 +79,21 @@ def rougher(candidates: Hypotheses) -> Alternative | None:
 
 
 def misfit(linear: Linearised | None, count: float, rule: Evidence) -> Alternative | None:
-    """Another focal length or other proportions of the scene, where these explain the residuals significantly better
-    and with them the pose would be a different one; None otherwise.
+    """Return another focal length or other proportions of the scene that fit significantly better, or None.
 
-    count: of the matches. Where the focal length cannot be told, the camera is believed as it was given; where another
-    one is significantly better and moves the middle of the scene by more than `rule.same.shift`, the pose is in doubt.
+    They compete only if the pose fitted with them is a different one (`rule.same`). If the points do not determine the
+    focal length, the given one is accepted.
+
+    Args:
+        linear: Pose from `linearised`, or None.
+        count: Number of matches.
+        rule: Constants of the verdict.
     """
     return of_misfit(systematic_misfit(linear, count, rule), rule)
 
 
 def of_misfit(off: Misfit, rule: Evidence) -> Alternative | None:
-    """The alternative that is so far off; None where it is the same pose."""
+    """Return the competing explanation of a misfit, or None if its pose is the same."""
     limits = (rule.zoomed.bend_deg, rule.zoomed.bend_shift) if off.radial else (rule.same.degrees, rule.same.shift)
     if math.degrees(off.turn) <= limits[0] and off.shift <= limits[1]:
         return None
@@ -92,22 +106,24 @@ def of_misfit(off: Misfit, rule: Evidence) -> Alternative | None:
 
 
 def contesting(seen: Seen, rule: Evidence) -> Alternative | None:
-    """The far candidate over which the first one leads least, if points that depend on each other are counted once.
+    """Return a far candidate over which the lead of the first one is not significant, or None.
 
-    The number of false alarms takes image points as independent. Points on lines or curves are not: a pose that lays
-    one line onto another explains all of its points, and that it explains more of them than another pose does is then
-    chance. With d_i the evidence of image point i for the one pose less that for the other, and either sign of each
-    d_i as likely (Hoeffding 1963)
+    The number of false alarms assumes independent image points. Points on lines or curves are dependent: a pose that
+    aligns one line with another explains all its points. A pose may then explain more points than another one by
+    chance. Let d_i be the evidence of image point i for the one pose less that for the other. If either sign of each
+    d_i is equally likely (Hoeffding 1963),
 
         P(sum_i d_i >= z sqrt(sum_i d_i^2)) <= exp(-z^2 / 2).
 
-    Where even equal signs of all d_i would be no less likely than the lead asks for, there are too few points to tell.
+    If even equal signs of all d_i would not reach the required lead, the points are too few for this test.
 
-    A pose that sees half of its partners where the first one sees its own is compared by its false alarms alone: it is
-    that pose, its mirror image, or repeats it in a repeated structure. Not so if it also explains points that the first
-    one does not, half as many as it leaves unexplained: both then slide along a curve.
+    A pose is compared by its false alarms alone if half of its correspondences coincide with those of the first pose.
+    It is then that pose, its mirror image, or a repetition of it. The exception is a pose that explains other points as
+    well, at least half as many as it leaves unexplained: both poses then slide along a curve.
 
-    seen: the candidates and the points of a camera, of each camera of a rig; those with too few points are left out.
+    Args:
+        seen: Candidates, best first, and points of each camera of a rig; cameras with too few points are left out.
+        rule: Constants of the verdict.
 
     Source: W. Hoeffding, Probability inequalities for sums of bounded random variables, JASA 1963.
     """
@@ -118,7 +134,7 @@ def contesting(seen: Seen, rule: Evidence) -> Alternative | None:
     candidates, problem = seen[0]
     poses, chosen = (candidates.rotation, candidates.translation), sum(len(each.image.chosen) for _, each in seen)
     others = np.flatnonzero(~problem.same_pose(*poses, rule.same.times(limits.far)))
-    # A lead that would be no chance if all gaps were as large as they can be needs no second look.
+    # A lead that is significant even with the largest possible gaps needs no test.
     decisive = limits.most * math.sqrt(least * chosen) / math.log(10)
     others = others[candidates.log10_false_alarms[others] - candidates.log10_false_alarms[0] < decisive]
     if not len(others):
@@ -144,8 +160,13 @@ def contesting(seen: Seen, rule: Evidence) -> Alternative | None:
 
 
 class _Partners(NamedTuple):
-    """Of k image points: the scene point (k,) that a pose sees nearest, where it is in the camera's frame (k, 3), and
-    whether it is near enough to be the partner."""
+    """Nearest scene points of k image points under a pose.
+
+    Attributes:
+        points: (k,) indices of the scene points, -1 if none is near.
+        places: (k, 3) these points in the camera's frame.
+        near: (k,) True if the point is near enough to be the correspondence.
+    """
 
     points: NDArray[np.int64]
     places: Array
@@ -153,8 +174,14 @@ class _Partners(NamedTuple):
 
 
 def _explained(seen: Seen, k: int, scale: float, near: float) -> tuple[Array, _Partners]:
-    """The evidence of the image points of all cameras for candidate k, with residuals of a scale, and their partners
-    within `near` scales."""
+    """Return the evidence of the image points of all cameras for candidate k, and their correspondences.
+
+    Args:
+        seen: Candidates and points of each camera.
+        k: Index of the candidate.
+        scale: Scale of the residuals, radians.
+        near: Reach of a correspondence, in scales.
+    """
     poses = [(problem, candidates.rotation[k], candidates.translation[k], scale) for candidates, problem in seen]
     parts = zip(*(_partners(near, *pose) for pose in poses), strict=True)
     return np.concatenate([own_evidence(*pose) for pose in poses]), _Partners(*map(np.concatenate, parts))
@@ -166,7 +193,7 @@ def _partners(near: float, problem: Problem, rotation: Array, translation: Array
     if problem.labelled_pairs is not None:
         i, j = problem.labelled_pairs
         distance = np.linalg.norm(problem.bearings[chosen[i]] - seen[j], axis=-1)
-        distance = np.where(distance < near * scale, distance, np.inf)  # also where a point is not seen
+        distance = np.where(distance < near * scale, distance, np.inf)  # infinite for unseen points too
         order = np.lexsort((distance, i))
         rows, first = np.unique(i[order], return_index=True)
         chord[rows] = distance[order][first]
@@ -184,31 +211,34 @@ def _partners(near: float, problem: Problem, rotation: Array, translation: Array
 def log10_missed(
     basin_count: int, decades_a_match: float, looks: float | int, rule: Evidence, *, symmetric: bool = False
 ) -> float:
-    """log10 of the probability that a better optimum than the best pose exists and was not met.
+    """Return log10 of the probability that a better optimum than the best pose exists and was missed.
 
-    It lies near the best pose or far from it, and what the matches say counts against both:
+    It lies near the best pose or far from it, and the evidence of the matches lowers the probability of both:
 
         P = 10^(-3 e) (max(2^-h, q) F G^(l - 1) + q 2^-h)
 
-    - Starts. Let a better optimum attract a start as often as the best pose does, or more often. Of h independent
-      starts that ended at one of the two, all ended at the best pose with a probability of at most 2^-h.
-    - Near. Starts that share a wide optimum end at whichever narrow one lies in their way: however many they are, a
-      better one lies beside it with the probability q. A look, starts drawn on purpose around the best pose, fails to
-      meet it with the probability F, and each one after that with G, since looks miss the same optima; without a look
-      F G^(l - 1) is 1.
-    - Far. A pose that exceeds chance and is far from a better one is a rare repetition or symmetry: q.
-    - Matches. A pose with a better one elsewhere explains a part of the points by coincidence: it aligns a part of the
-      scene, or slides along a surface, and each of its matches is worth little. With e decades of evidence a match, a
-      match is a coincidence with a probability of 10^-e. Matches depend on each other; but three fix a pose, and at
-      least as many others have to be independent coincidences: 10^-3e.
+    - Basin count h. Let a better optimum attract initial poses at least as often as the best pose. If h independent
+      ones ended at one of the two, all ended at the best pose with a probability of at most 2^-h.
+    - Near. Initial poses that share a wide optimum end at the same narrow one inside it. However many they are, a
+      better one lies near it with the probability q. The first of l local searches around the best pose misses it with
+      the probability F. Each further one misses it with G, since local searches miss the same optima. With l = 0,
+      F G^(l - 1) is replaced by 1.
+    - Far. A significant pose far from a better one is a rare repetition or symmetry: q.
+    - Matches. A pose with a better one elsewhere explains part of the points by coincidence: it aligns a part of the
+      scene or slides along a surface. Each of its matches then has little evidence. A match with e decades of evidence
+      is a coincidence with a probability of 10^-e. Matches are dependent; but three fix a pose, and at least three
+      others must be independent coincidences: 10^-3e.
 
-    The first is what remains of the posterior of unseen optima of Boender and Rinnooy Kan where only two optima matter.
+    The term 2^-h is the posterior of unseen optima of Boender and Rinnooy Kan for two optima.
     Source: C. G. E. Boender, A. H. G. Rinnooy Kan, Bayesian stopping rules for multistart global optimization methods,
     Math. Programming 1987.
 
-    basin_count: independent starts that ended at the best pose, or at a neighbour that is no different pose.
-    decades_a_match: of its evidence, 0 where its matches are no evidence of each other, as in repeated structures.
-    looks: how often its surroundings were searched in vain.
+    Args:
+        basin_count: Number h of independent initial poses that ended at the best pose or at one that is not different.
+        decades_a_match: Evidence e of a match; 0 if matches do not confirm each other, as in repeated structures.
+        looks: Number l of local searches around the best pose that found no better one.
+        rule: Constants; F is `rule.look_fails`, G is `rule.again_fails`, q is `rule.another`.
+        symmetric: Use `rule.uncompared` as q of a far optimum, since the scene's motions were tried.
 
     >>> rule = Evidence()
     >>> [round(log10_missed(*seen, rule), 2) for seen in ((0, 0.0, 0), (7, 0.0, 0), (7, 0.0, 1), (1, 1.0, 0))]
@@ -219,12 +249,14 @@ def log10_missed(
 
 
 def near_missed(basin_count: int, looks: float | int, rule: Evidence) -> float:
-    """Probability that a better optimum beside the best pose was not met."""
+    """Return the probability that a better optimum near the best pose was missed; arguments as for `log10_missed`."""
     overlooked = rule.look_fails * rule.again_fails ** (looks - 1) if looks else 1.0
     return max(0.5**basin_count, rule.another) * overlooked
 
 
 def far_missed(basin_count: int, rule: Evidence, *, symmetric: bool = False) -> float:
-    """Return the probability that a better optimum far from the best pose was not met: without the prior probability
-    that there is one where the scene is symmetric."""
+    """Return the probability that a better optimum far from the best pose was missed.
+
+    The prior probability is `rule.uncompared` in a symmetric scene, else `rule.another`.
+    """
     return (rule.uncompared if symmetric else rule.another) * 0.5**basin_count

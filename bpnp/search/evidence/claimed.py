@@ -1,10 +1,12 @@
-"""Verify a given pose: how likely it is by chance, which poses compete with it, and the optimum beside it.
+"""Verification of a given pose: its significance, its competing poses and the optimum near it.
 
-One pose was tried, so the number of tests is one; or, where the optimum beside the pose is judged instead, the number
-of poses that lie as near to the given one as this optimum. The competing poses are proposed from the pose and from the
-scene, not searched for: the optima that annealing reaches from the pose and from copies beside it, its mirror image
-before a flat scene, the motions that take the scene onto itself, and other focal lengths (`against_rivals`). Whether a
-better pose exists elsewhere is not tested.
+One pose was tried, so the number of tests is one. If the optimum near the pose is judged instead, it is the number of
+poses that are as near to the given one as this optimum.
+
+The competing poses are proposed from the pose and from the scene; no search is run. Some are the optima that annealing
+reaches from the pose, from perturbed copies, and from its mirror image in front of a flat scene. Others come from the
+motions that map the scene onto itself, and from other focal lengths (`against_rivals`). A better pose elsewhere is not
+tested for.
 """
 
 import math
@@ -35,7 +37,7 @@ from bpnp.search.verdict import SearchResult, judged, with_false_alarms
 
 Array = NDArray[np.float64]
 ONE_POSE = "only this pose and its competitors were tested, no better one was searched for"
-WITHIN = 22.5  # chi-squared with 6 degrees of freedom, one in a thousand: of a claim and the optimum that it means
+WITHIN = 22.5  # 99.9 % quantile of chi-squared with 6 degrees of freedom: distance of a given pose to its optimum
 
 
 @one_blas_thread
@@ -54,9 +56,9 @@ def judge_claim(
         problem: Points of the problem.
         rotation: (3, 3) of the pose.
         translation: (3,) of the pose, scene units.
-        refine: Judge the optimum near the pose. It is the same pose: turned and moved by no more than the verdict
-            takes for one pose, or than the points leave open.
-        seed: Of the copies near the pose.
+        refine: Judge the optimum near the pose instead. It differs by less than the tolerance of the verdict, or by
+            less than the uncertainty of the pose.
+        seed: Random seed of the perturbed copies of the pose.
         deadline: When to stop proposing poses.
 
     Returns:
@@ -68,7 +70,7 @@ def judge_claim(
     claim = _unrefined(one, rotation, translation)
     scene, few = Scene(one, seed, DEFAULT, deadline), is_enumerable(problem)
     others = _proposed(problem, claim, scene)
-    if few:  # as in an enumeration, whose candidates have been refined
+    if few:  # as in an enumeration, whose candidates are refined
         motions = registered(one, rotation, translation, float(claim.scale[0]), rule)
         copies = competing_poses(one, rotation, translation, motions, rule)
         if len(copies[0]):
@@ -85,7 +87,7 @@ def judge_claim(
         near = replace(problem, prior=prior).log10_share(optimum.rotation[0], optimum.translation[0])
         one = replace(problem, log10_tried=max(log10_tests(problem) + near, 0.0))
         claim = optimum
-    competing = others[~same & (others.log10_false_alarms <= 0)]  # chance explains the rest
+    competing = others[~same & (others.log10_false_alarms <= 0)]  # insignificant poses do not compete
     candidates = _weighed_anew(Hypotheses.concatenate([claim, competing]), one)
     result = judged(candidates, one, batches=0, exhaustive=True, rule=rule)
     result = against_rivals(result, one, lambda: scene, rule, exhaustive=True, contested=few)
@@ -93,18 +95,20 @@ def judge_claim(
     if result.verdict == "confident":
         result = replace(result, reason=f"{result.reason}; {ONE_POSE}")
     lead = float(claim.log10_false_alarms[0] - optimum.log10_false_alarms[0]) if better else 0.0
-    if not refine and result.verdict == "confident" and 2 * math.log(10) * lead > WITHIN:  # likelihoods, Wilks 1938
+    if not refine and result.verdict == "confident" and 2 * math.log(10) * lead > WITHIN:  # see Wilks 1938
         off = math.degrees(turned_by(rotation, optimum.rotation[0]))
         what = f"the optimum beside it, {off:.2g} deg away, fits better (by {lead:.1f} decades)"
         reason = reasons.against(what, float(claim.log10_false_alarms[0]))
         result = replace(result, verdict="ambiguous", reason=reason)
     refined = refine and result.verdict == "confident"
-    return replace(result, batches=int(refined)), optimum  # no last fit to the matches
+    return replace(result, batches=int(refined)), optimum  # 0 batches: no last fit to the matches
 
 
 def _proposed(problem: Problem, claim: Hypotheses, scene: Scene) -> Hypotheses:
-    """Return the distinct poses that annealing reaches from a pose (1,), from copies of it near it, and from
-    its mirror image before a flat scene."""
+    """Return the distinct poses that annealing reaches from a pose (1,).
+
+    It starts from the pose, from perturbed copies, and from its mirror image in front of a flat scene.
+    """
     start = to_scene_frame(claim, scene)
     wide = scene.settings.middle[-1].last_scale * scene.spread
     bulk = problem.points3d[in_bulk(problem.points3d)]
@@ -119,12 +123,12 @@ def _proposed(problem: Problem, claim: Hypotheses, scene: Scene) -> Hypotheses:
 
 
 def _weighed_anew(candidates: Hypotheses, problem: Problem) -> Hypotheses:
-    """With the false alarms of as many tests as the problem has."""
+    """Return the candidates with their false alarms recomputed for the number of tests of the problem."""
     return with_false_alarms(candidates.unweighed(), problem)
 
 
 def _unrefined(problem: Problem, rotation: Array, translation: Array) -> Hypotheses:
-    """Return a pose (1,) without refinement, at the scale of residuals with the fewest false alarms."""
+    """Return a pose (1,) without refinement, at the scale of residuals with the most evidence."""
     scale = likeliest_scale(problem, rotation, translation)
     score, count = explained(problem, rotation, translation, scale)
     pose = Hypotheses.from_poses(
@@ -138,7 +142,7 @@ def _unrefined(problem: Problem, rotation: Array, translation: Array) -> Hypothe
 
 
 def _is_same(problem: Problem, claim: Hypotheses, pose: Hypotheses, rule: Evidence) -> bool:
-    """Return whether a pose (1,) is the given one, or within what its points leave open of it."""
+    """Return whether a pose (1,) is the given one, within the tolerance or within its uncertainty."""
     rotations = np.concatenate([claim.rotation, pose.rotation])
     translations = np.concatenate([claim.translation, pose.translation])
     if problem.same_pose(rotations, translations, rule.same)[1]:
@@ -157,7 +161,7 @@ def _is_same(problem: Problem, claim: Hypotheses, pose: Hypotheses, rule: Eviden
 
 
 def _of_claim(result: SearchResult, claim: Hypotheses) -> SearchResult:
-    """Turn a verdict on several poses into one on the given pose (1,), which becomes the first."""
+    """Convert a verdict on several poses into one on the given pose (1,), which becomes the first candidate."""
     candidates = result.candidates
     place = int(np.flatnonzero((candidates.translation == claim.translation[0]).all(-1))[0])
     ordered = candidates[np.r_[place, np.delete(np.arange(len(candidates)), place)]]
@@ -169,6 +173,6 @@ def _of_claim(result: SearchResult, claim: Hypotheses) -> SearchResult:
         off = math.degrees(turned_by(candidates.rotation[0], claim.rotation[0]))
         margin = alarms - float(candidates.log10_false_alarms[0])
         reason = reasons.against(f"a pose {off:.0f} deg away fits better (by {margin:.1f} decades)", alarms)
-        refuted = result.verdict == "confident"  # of the other pose, which explains the claim away
+        refuted = result.verdict == "confident"  # the other pose is confident and refutes the given one
         result = replace(result, verdict="failed" if refuted else "ambiguous", reason=reason)
     return replace(result, candidates=ordered)

@@ -1,7 +1,7 @@
-"""Covariance of what is fitted to matches: a rotation, a pose, a focal length or a rig, the matches known or not.
+"""Covariance of parameters fitted to matches: a rotation, a pose, a focal length or a rig.
 
-Everything here is a pure function of arrays. The matches are linearised about the estimate, in standard deviations of
-their residuals.
+The matches may be certain or only probable. All functions are pure functions of arrays. The matches are
+linearised about the estimate, in standard deviations of their residuals.
 """
 
 from typing import NamedTuple
@@ -13,13 +13,13 @@ from scipy.special import stdtrit
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
-SLIGHT = 0.01  # share of an image point in the information below which the estimate hardly moves by leaving it out
-FIXED = 1e-9  # least eigenvalue of the information, in units of its own size, of points that fix the estimate
+SLIGHT = 0.01  # fraction of the information; image points below it hardly move the estimate
+FIXED = 1e-9  # smallest eigenvalue of the normalised information if the points fix the estimate
 ONE_SIGMA = 0.8413447460685429  # probability of a normal variable below one standard deviation
 
 
 class Linearisation(NamedTuple):
-    """k possible matches as they depend on p fitted numbers.
+    """k possible matches, linearised in p fitted parameters.
 
     Attributes:
         residual: (k, d) of each match, in standard deviations.
@@ -39,7 +39,7 @@ class Linearisation(NamedTuple):
 
 
 def join(parts: list[Linearisation]) -> Linearisation:
-    """Return the matches of independent cameras together; `known` adds up."""
+    """Concatenate the matches of independent cameras; the sum of their `known` is taken."""
     first = np.cumsum([0, *(len(part.weight) for part in parts[:-1])])
     return Linearisation(
         np.concatenate([part.residual for part in parts]),
@@ -52,7 +52,12 @@ def join(parts: list[Linearisation]) -> Linearisation:
 
 
 def of_sure_matches(residual: Array, jacobian: Array) -> Linearisation:
-    """Return the linearisation of k matches that are known, one of each image point: (k, d) and (k, d, p)."""
+    """Return the linearisation of k certain matches, one per image point.
+
+    Args:
+        residual: (k, d), in standard deviations.
+        jacobian: (k, d, p), in the same unit.
+    """
     count, size = len(residual), jacobian.shape[-1]
     return Linearisation(residual, jacobian, np.ones(count), np.arange(count), np.ones(count), np.zeros((size, size)))
 
@@ -60,20 +65,20 @@ def of_sure_matches(residual: Array, jacobian: Array) -> Linearisation:
 def covariance_of(
     matches: Linearisation, *, fitted: int, blocks: Labels | None = None, considered: Array | None = None
 ) -> Array | None:
-    """Compute the covariance of the fitted numbers.
+    """Compute the covariance of the fitted parameters.
 
-    The larger of two matrices along each of their common axes: the inverse of the observed information H, in which what
-    is open about the matches is missing (Louis), and the jackknife
+    It is the larger of two matrices along each of their common axes. One is the inverse of the observed information H,
+    which excludes the information lost to uncertain matches (Louis). The other is the jackknife
 
         sum_i d_i d_i^T,  d_i = (H - H_i)^-1 g_i,
 
-    g_i the gradient and H_i the information of image point i. d_i is the way to the optimum without it. See
+    with g_i the gradient and H_i the information of image point i. d_i is the step to the optimum without it. See
     `bpnp.search.evidence.uncertainty.local_covariance`.
 
     Args:
         matches: Linearised about the optimum.
-        fitted: Number of numbers that the matches have to fix; the jackknife leaves no point out unless they stay
-            overdetermined without one.
+        fitted: Number of parameters that the matches have to fix. The jackknife leaves a point out only if they stay
+            overdetermined without it.
         blocks: (g,) block of each image point; the jackknife leaves out one block at a time. None: one point.
         considered: (k, d, c) derivative of the predicted image points by parameters that are not fitted, times their
             standard deviations. With S = H^-1 sum_k p_k J_k^T J_c,k, S S^T is added.
@@ -103,7 +108,7 @@ def covariance_of(
         weight = np.bincount(block, weight) / np.bincount(block)
     counted = matches.probability * matches.weight[matches.point]
     complete = np.einsum("k,kab,kab->b", counted, matches.jacobian, matches.jacobian)
-    # In units in which the complete information is one, so that its rank can be told.
+    # The complete information has a unit diagonal in these units, so that the rank can be determined.
     unit = 1 / np.sqrt(np.maximum(complete + np.diag(matches.known), 1e-300))
     values, vectors = np.linalg.eigh(observed * np.outer(unit, unit))
     if values[0] <= FIXED:
@@ -112,9 +117,9 @@ def covariance_of(
     steps = expected @ root
     matters = np.flatnonzero(own.reshape(-1, size * size) @ (root @ root.T).ravel() > SLIGHT)
     if 2 * (round(float(counted.sum())) - 1) <= fitted:
-        matters = matters[:0]  # without one of so few matches the others fix several estimates, or none
+        matters = matters[:0]  # without one of these matches, the others fix several estimates or none
     without = np.eye(size) - root.T @ own[matters] @ root
-    fixed = np.linalg.eigvalsh(without)[:, 0] > FIXED  # also without the point
+    fixed = np.linalg.eigvalsh(without)[:, 0] > FIXED  # the estimate is fixed without the point too
     steps[matters[fixed]] = np.linalg.solve(without[fixed], steps[matters[fixed], :, None])[..., 0]
     ratio, axes = np.linalg.eigh((weight[:, None] * steps).T @ steps + root.T @ matches.known @ root)
     along = root @ axes
@@ -126,6 +131,8 @@ def covariance_of(
 
 
 def student_factor(free: float | int) -> float:
-    """Return the factor of a covariance whose scale was estimated with so many degrees of freedom: the square of the
-    quantile of Student's t that has one sigma of a normal distribution."""
+    """Return the factor that widens a covariance whose scale was estimated from few residuals.
+
+    It is the square of the one-sigma quantile of Student's t with `free` degrees of freedom.
+    """
     return float(stdtrit(free, ONE_SIGMA)) ** 2

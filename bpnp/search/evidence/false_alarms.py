@@ -1,37 +1,39 @@
-"""How likely a pose fits by chance: the a-contrario number of false alarms, for 4 points or 10,000.
+"""A-contrario number of false alarms (NFA) of a pose, for 4 points or 10,000.
 
-The question: were the image points unrelated to the scene, how many of all the poses that could have been tried would
-fit as well as this one? Unrelated means: at scales finer than h, half the spread of the bearings, image point i falls
-with the density l_i of the projected points around it, wherever those happen to lie. A pose that explains it predicts
+The NFA is the expected number of poses that fit as well as this one if the image points are unrelated to the scene. It
+counts all poses that could have been tried. Unrelated means: at scales finer than h, half the RMS angular radius of the
+bearings, image point i falls with the density l_i of the projected points around it. A pose that explains it predicts
 the mixture
 
     x_i = 1 - w + w g_i / l_i,    g_i = sum_j N(f_i - u_j; s^2),    l_i = max(sum_j N(f_i - u_j; h^2), n / A)
 
-u_j the direction in which the pose sees scene point j, N the normal density on the tangent plane, s the scale of the
-residuals, w the share of the image points that have a partner, n the projected points in the view and A its solid
-angle. For unrelated points x_i has the mean 1, so that the product of the x_i exceeds a bound b with a probability of
-at most 1 / b (Markov). From this follow
+The pose sees scene point j in the direction u_j. N is the normal density on the tangent plane, s the scale of the
+residuals and w the fraction of image points that have a correspondence. The view has n projected points and the solid
+angle A. For unrelated points x_i has the mean 1. The product of the x_i therefore exceeds a bound b with
+a probability of at most 1 / b (Markov), so that
 
     log10 NFA = log10 T - log10 mean_{s, w} prod_i x_i^(1 / c_i),
 
-T = 2 (m)_3 (n)_3 / 6, the number of poses that fit three matches exactly, (m)_3 = m (m - 1) (m - 2); at a scale s at
-which fewer poses can be told apart, the number of these (`log10_cells`). The three largest x_i are left out, whatever
-their c_i: three matches fix the six degrees of freedom and are no evidence. c_i is the number of image points within
-2 s of point i: keypoints that lie together are one observation. So is the place of a clump: of log x_i, what is gained
-from one scale to the next finer one s' counts with 1 / c_i(s'), over its expected value, where more points lie within
-2 s' than an even spread explains (`ImageStatistics.weights`). The mean over a fixed set of (s, w) counts what was
-looked at. A prior reduces T to the share of the poses that it allows.
+T = 2 (m)_3 (n)_3 / 6 is the number of poses that fit three matches exactly, (m)_3 = m (m - 1) (m - 2). At a scale s
+with fewer distinguishable poses, T is their number (`log10_cells`). The three largest x_i are left out, for any c_i:
+three matches fix the six degrees of freedom and are no evidence. c_i is the number of image points within 2 s of
+point i: keypoints that lie together are one observation.
 
-Where the focal length is fitted too, four matches fix the seven unknowns, and an eighth, a radial coefficient:
-T = 2 (m)_4 (n)_4 / 4!, or that of a pose times the number of lenses that can be told apart, if that is smaller; and
-the four largest x_i are left out.
+The location of a clump is one observation as well. A clump has more points within 2 s' than an even spread explains.
+There, the gain of log x_i from one scale to the next finer one s' counts with 1 / c_i(s'), over its expected value
+(`ImageStatistics.weights`). The mean over a fixed set of (s, w) accounts for the tested values. A prior reduces T to
+the fraction of the poses that it allows.
 
-A pose claims that its points agree with it at the scale of its residuals. Where that is known, only the s within a
-factor of two of it count; the terms from four times it on say how well a rougher alignment explains the image.
+If the focal length is fitted too, four matches fix the seven unknowns, and an eighth, a radial coefficient. Then
+T = 2 (m)_4 (n)_4 / 4!, or T of a pose times the number of distinguishable lenses if that is smaller. The four largest
+x_i are left out.
+
+If the scale of the residuals of a pose is given, only the s within a factor of two of it count. The terms from four
+times it on measure how well a rougher alignment explains the image.
 
 Sources: A. Desolneux, L. Moisan, J.-M. Morel, Meaningful alignments, IJCV 2000; L. Moisan, B. Stival, A probabilistic
-criterion to detect rigid point matches, IJCV 2004. That the likelihood ratio takes the place of a binomial tail keeps
-the evidence of dense points, whose neighbours lie as close as their residuals.
+criterion to detect rigid point matches, IJCV 2004. The likelihood ratio replaces their binomial tail, which loses the
+evidence of dense points, whose neighbours lie as close as their residuals.
 """
 
 import math
@@ -48,14 +50,14 @@ from bpnp.search.problem import Problem, faces, label_groups
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
 
-FIXING = 3  # matches that fix a pose; one more fixes a focal length or the scale of a rig's scene too
+FIXING = 3  # matches that fix a pose; one more also fixes a focal length or the scale of a rig's scene
 FIXING_ROTATION = 2  # matches that fix a rotation
 SHARES = np.array([0.15, 0.4, 0.75])  # w
-LEAST_SHARE, MOST_SHARE = 0.02, 0.98  # of w where clutter or scores are given
-OUTLINE = 0.5  # width of the smoothing of l, in spreads of the bearings: the outline is no evidence beyond it
-MOST_SMOOTHED = 256  # projected points from which l is estimated
-FARTHEST = math.sqrt(18.0)  # distance over s beyond which a pair adds nothing to g
-OWN, ROUGH = 2.0, 4.0  # factors of the scale of a pose's residuals within which s is its own, and beyond which rougher
+LEAST_SHARE, MOST_SHARE = 0.02, 0.98  # range of w if clutter or scores are given
+OUTLINE = 0.5  # smoothing width of l, in RMS angular radii of the bearings; the outline beyond it is no evidence
+MOST_SMOOTHED = 256  # number of projected points from which l is estimated
+FARTHEST = math.sqrt(18.0)  # distance over s beyond which a pair does not contribute to g
+OWN, ROUGH = 2.0, 4.0  # factors of the scale of the residuals: s up to OWN is a pose's own, from ROUGH on rougher
 
 
 class Terms(NamedTuple):
@@ -65,8 +67,8 @@ class Terms(NamedTuple):
         logs: (k, S, W) log x_i / c_i, clumps weighted.
         together: (k, S) c_i.
         own: (S,) True at the scales of the residuals of the pose.
-        rough: (S,) True at scales far beyond them.
-        pairs: Number of pairs (s, w) over which the mean is taken, those of finer scales that are left out among them.
+        rough: (S,) True at far larger scales.
+        pairs: Number of pairs (s, w) over which the mean is taken, including those of omitted finer scales.
         fewer: (S,) log of the number of tests at each scale, over the number of all.
     """
 
@@ -78,7 +80,7 @@ class Terms(NamedTuple):
     fewer: Array
 
     def by_scale(self, left_out: int) -> Array:
-        """Return log of sum_w prod_i x_i^(1 / c_i) / pairs at each scale (S,), without the largest x_i."""
+        """Return log of sum_w prod_i x_i^(1 / c_i) / pairs at each scale (S,), without the `left_out` largest x_i."""
         evidence = self.logs.sum(0) - sum_of_largest(self.logs * self.together[:, :, None], left_out)
         return np.asarray(np.logaddexp.reduce(evidence, 1) - math.log(self.pairs) - self.fewer)
 
@@ -88,7 +90,7 @@ class Terms(NamedTuple):
         return np.asarray(own[:, own.sum(0).argmax()])
 
     def evidence(self, left_out: int) -> Array:
-        """Return the log of the evidence at the own scales and at the rough ones (2,), without the largest x_i."""
+        """Return the log evidence (2,) at the own and at the rough scales, without the `left_out` largest x_i."""
         each = self.by_scale(left_out)
         return np.array([np.logaddexp.reduce(each[some], initial=-math.inf) for some in (self.own, self.rough)])
 
@@ -100,17 +102,17 @@ def log10_nfa(
 
         NFA = T / prod_cameras mean_{s, w} prod_i x_i^(1 / c_i)
 
-    It is the same for a rotation, a pose, a pose with a focal length and a rig; these differ in the number T of tests
-    and in how many matches fix them, which are no evidence.
+    The formula holds for a rotation, a pose, a pose with a focal length and a rig. They differ in the number T of tests
+    and in the number of matches that fix them, which are no evidence.
 
     Args:
-        cameras: Evidence of each camera, which are independent; None for a camera without any.
-        log10_tests: Logarithm of the number of tests.
+        cameras: Evidence of each camera; cameras are independent. None for a camera without evidence.
+        log10_tests: log10 of the number T of tests.
         fixing: Ways to choose the matches that fix the pose, each as their number in each camera. The way that leaves
-            least evidence counts.
+            the least evidence counts.
 
     Returns:
-        Logarithms at the scales of the residuals, and at rougher ones.
+        log10 NFA at the scales of the residuals, and at rougher ones.
     """
     counts = {count for way in fixing for count in way}
     none = np.zeros(2)
@@ -121,17 +123,23 @@ def log10_nfa(
 
 
 class Alarms(NamedTuple):
-    """log10 of the number of false alarms (c,) of poses: at the scales of their own residuals, and at rougher ones."""
+    """log10 NFA (c,) of poses at the scales of their own residuals, and at rougher ones."""
 
     own: Array
     rough: Array
 
 
 def alarms_of(problem: Problem, rotations: Array, translations: Array, scales: Array | None = None) -> Alarms:
-    """Of poses (c, 3, 3), (c, 3) with residuals of `scales` (c,), radians; all s are a pose's own if that is None.
+    """Compute log10 NFA of poses.
 
-    A pose under which three points or fewer are seen has as many as there are tests: no evidence at all. With each of
-    several sets of scene points (`Problem.log10_views`) there are as many tests again.
+    A pose that sees at most as many points as fix it has no evidence: its NFA is the number of tests. Several sets of
+    scene points multiply the number of tests (`Problem.log10_views`).
+
+    Args:
+        problem: Points of the problem.
+        rotations: (c, 3, 3) of the poses.
+        translations: (c, 3) of the poses.
+        scales: (c,) scales of the residuals, radians; None counts all scales as a pose's own.
 
     >>> import numpy as np
     >>> points = np.random.default_rng(0).uniform(-1, 1, (12, 3))
@@ -148,7 +156,7 @@ def alarms_of(problem: Problem, rotations: Array, translations: Array, scales: A
     result = Alarms(none, none.copy())
     for k in range(len(none)):
         seen = directions_of(problem, rotations[k], translations[k])
-        # Fewer tests at a scale are as much more evidence, but a pose has no less chance than all of them.
+        # Fewer tests at a scale add evidence by their ratio to all tests; a prior leaves at least one test.
         fewer = math.log(10) * (np.maximum(cells + share[k], 0.0) - none[k])
         scale = None if scales is None else float(scales[k])
         terms = camera_terms(problem, seen, scale, fewer=fewer)
@@ -157,9 +165,9 @@ def alarms_of(problem: Problem, rotations: Array, translations: Array, scales: A
 
 
 def log10_tests(problem: Problem) -> float:
-    """log10 of 2 (m)_3 (n)_3 / 3!: choices of three matches with about two poses each; of labels that agree, if given.
+    """Return log10 of the number of tests, 2 (m)_3 (n)_3 / 3!: choices of three matches with about two poses each.
 
-    The number of poses that were tried, where the problem has it.
+    Labels, if given, have to agree. `Problem.log10_tried` replaces the number if it is set.
     """
     if problem.log10_tried is not None:
         return problem.log10_tried
@@ -184,9 +192,9 @@ def _fixing(problem: Problem) -> int:
 
 
 def log10_lenses(problem: Problem) -> Array:
-    """Return log10 (S,) of the number of lenses that differ at each scale s of the image, 0 for a known lens.
+    """Return log10 (S,) of the number of distinguishable lenses at each scale s of the image, 0 for a given lens.
 
-    A focal length moves points at the spread h by h d log f, a radial coefficient by h^3 dk.
+    A focal length moves points at the RMS angular radius h by h d log f, a radial coefficient by h^3 dk.
     """
     if problem.focal is None:
         return np.zeros(len(problem.image.scales))
@@ -196,10 +204,13 @@ def log10_lenses(problem: Problem) -> Array:
 
 
 def log10_cells(image: ImageStatistics) -> Array:
-    """log10 (S,) of the number of poses that differ at each scale s of an image: of cells of this width.
+    """Return log10 (S,) of the number of distinguishable poses, cells of width s, at each scale s of an image.
 
-    8 pi^2 (h / s)^3 of rotations about the middle of the scene, which move points h off it by s; A / s^2 places of the
-    middle in the view; and log(30) h / s distances of it, up to a factor of 30; h the spread of the bearings.
+    Let h be the RMS angular radius of the bearings. The number is the product of:
+
+    - 8 pi^2 (h / s)^3 rotations about the scene centroid, which move points at h from it by s,
+    - A / s^2 positions of the centroid in the view,
+    - log(30) h / s distances of it, up to a factor of 30.
     """
     across = image.spread / image.scales
     cells = 8 * math.pi**2 * across**4 * (image.solid_angle / image.scales**2) * math.log(30)
@@ -207,15 +218,20 @@ def log10_cells(image: ImageStatistics) -> Array:
 
 
 def log10_rotations(spread: float, scales: Array) -> Array:
-    """Return log10 (S,) of the number of rotations that differ at each scale s of an image: 8 pi^2 h / s^3.
+    """Return log10 (S,) of the number of distinguishable rotations at each scale s of an image, 8 pi^2 h / s^3.
 
-    4 pi / s^2 directions of the axis, and 2 pi h / s rotations about it, which move points h off it by s.
+    It is the product of 4 pi / s^2 directions of the axis and 2 pi h / s rotations about it. Each rotation moves points
+    at h from the axis by s.
+
+    Args:
+        spread: RMS angular radius h of the image points, radians.
+        scales: (S,) scales s, radians.
     """
     return np.asarray(np.log10(np.maximum(8 * math.pi**2 * spread / scales**3, 1.0)))
 
 
 def directions_of(problem: Problem, rotation: Array, translation: Array) -> Array:
-    """Unit directions (n, 3) in the camera's frame; NaN for a point in the camera or facing away."""
+    """Return unit directions (n, 3) in the camera's frame; NaN for points at the camera centre or facing away."""
     camera = problem.points3d @ rotation.T + translation
     length = np.linalg.norm(camera, axis=-1, keepdims=True)
     seen = np.divide(camera, length, out=np.full_like(camera, np.nan), where=length > 0)
@@ -227,16 +243,16 @@ def directions_of(problem: Problem, rotation: Array, translation: Array) -> Arra
 def camera_terms(
     problem: Problem, seen: Array, scale: float | None = None, *, fewer: Array | float = 0.0
 ) -> Terms | None:
-    """Return the evidence of one camera for points seen in directions.
+    """Return the evidence of one camera.
 
     Args:
         problem: Points of the problem.
-        seen: (n, 3) unit directions, NaN for points that are not seen.
-        scale: Scale of the residuals, radians; None counts all scales as their own.
+        seen: (n, 3) unit directions of the scene points, NaN for those that are not seen.
+        scale: Scale of the residuals, radians; None counts all scales as the pose's own.
         fewer: (S,) log of the number of tests at each scale of the image, over the number of all.
 
     Returns:
-        The terms from the finest own scale on; None where no more points are seen than fix the pose.
+        Terms from the finest own scale on; None if no more points are seen than fix the pose.
     """
     if min(len(problem.bearings), int(np.isfinite(seen[:, 0]).sum())) <= _fixing(problem):
         return None
@@ -249,20 +265,22 @@ def camera_terms(
 
 
 def own_evidence(problem: Problem, rotation: Array, translation: Array, scale: float) -> Array:
-    """Return log x_i / c_i (k,) of each chosen image point under a pose, clumps weighted, at the fraction and the s
-    within a factor of two of the scale of its residuals, radians, at which their sum is largest."""
+    """Return log x_i / c_i (k,) of each chosen image point under a pose, clumps weighted.
+
+    It is taken at the fraction w and the scale s with the largest sum; s is within a factor of two of `scale`, radians.
+    """
     terms = camera_terms(problem, directions_of(problem, rotation, translation), scale)
     return np.zeros(len(problem.image.chosen)) if terms is None else terms.of_points()
 
 
 def likeliest_scale(problem: Problem, rotation: Array, translation: Array) -> float:
-    """Return the scale of the residuals, radians, with the most evidence; the largest if a pose sees nothing."""
+    """Return the scale of the residuals, radians, with the most evidence; the largest scale if there is none."""
     terms = camera_terms(problem, directions_of(problem, rotation, translation))
     return float(problem.image.scales[-1 if terms is None else terms.by_scale(_fixing(problem)).argmax()])
 
 
 def _ratio(image: ImageStatistics, scale: float) -> Array:
-    """(S,) of the scales of an image to that of residuals."""
+    """Return the ratios (S,) of the scales of an image to the scale of residuals."""
     return np.asarray(image.scales / np.clip(scale, image.scales[0], image.scales[-1]))
 
 
@@ -271,8 +289,11 @@ def _is_own(ratio: Array) -> NDArray[np.bool_]:
 
 
 def _shares(problem: Problem) -> Array:
-    """Return the fractions w of image points with a partner that are tried: (W,), or (k, 1, W) of each chosen point in
-    proportion to its score."""
+    """Return the fractions w of image points with a correspondence that are tried.
+
+    Returns:
+        (W,), or with scores (k, 1, W), in proportion to the score of each chosen point.
+    """
     shares = SHARES if problem.clutter is None else np.array([1 - problem.clutter])
     if problem.scores2d is not None:
         shares = shares * (problem.scores2d[problem.image.chosen] / problem.scores2d.mean())[:, None, None]
@@ -282,8 +303,7 @@ def _shares(problem: Problem) -> Array:
 
 
 def _terms(problem: Problem, seen: Array, finest: int) -> Array:
-    """log x_i / c_i (k, S', W), clumps weighted, at the scales from the finest one on, of points seen in directions
-    (n, 3)."""
+    """Return log x_i / c_i (k, S', W), clumps weighted, at the scales from index `finest` on."""
     image = problem.image
     return np.asarray(
         image.weights[:, finest:, finest:] @ point_evidence(problem, seen, image.scales[finest:], _shares(problem))
@@ -291,7 +311,10 @@ def _terms(problem: Problem, seen: Array, finest: int) -> Array:
 
 
 def sum_of_largest(values: Array, count: int) -> Array:
-    """Of the `count` largest of values (k, ...), as far as positive; a partition stumbles over so many equal ones."""
+    """Return the sum of the `count` largest values (k, ...), negative ones as 0.
+
+    Equal values make a partition slow; a few maxima are faster.
+    """
     rest, total = values.copy(), np.zeros(values.shape[1:])
     for _ in range(count):
         largest = rest.argmax(0)[None]
@@ -301,21 +324,25 @@ def sum_of_largest(values: Array, count: int) -> Array:
 
 
 def point_evidence(problem: Problem, seen: Array, scales: Array, shares: Array, *, even: bool = False) -> Array:
-    """log x_i (k, S, W) of each chosen image point, at `scales` (S,) and `shares` (W,), of points seen in directions
-    (n, 3).
+    """Return log x_i (k, S, W) of each chosen image point.
 
-    even: against scene points that are spread evenly over the view instead of as they are seen.
+    Args:
+        problem: Points of the problem.
+        seen: (n, 3) unit directions of the scene points, NaN for those that are not seen.
+        scales: (S,) scales s of the residuals, radians.
+        shares: (W,) fractions w of image points with a correspondence, or (k, 1, W).
+        even: Assume that unrelated image points fall evenly over the view instead of with the density of `seen`.
     """
     image = problem.image
     predicted, smooth, inside, every = _sums(problem, seen, scales, even)
-    # A point without a possible partner has no density to be compared with: it counts as one that has none near.
+    # A point without possible correspondences has no density; it counts as one with no scene point near.
     density = (np.where(every > 0, every, 1) if even else np.maximum(inside, 1)) / image.solid_angle
     ratio = predicted / (2 * math.pi * scales**2 * np.maximum(density, smooth)[:, None])
     return np.asarray(np.log1p(shares * (ratio - 1)[:, :, None]))
 
 
 def _sums(problem: Problem, seen: Array, scales: Array, even: bool) -> tuple[Array, Array, Array, Array]:
-    """Sum kernels and counts over the possible partners of each chosen image point.
+    """Sum kernels and counts over the possible correspondences of each chosen image point.
 
     Args:
         problem: Points of the problem, with k chosen image points.
@@ -324,7 +351,7 @@ def _sums(problem: Problem, seen: Array, scales: Array, even: bool) -> tuple[Arr
         even: Leave the outline out.
 
     Returns:
-        Kernels (k, S); density of the outline (k,), 0 if `even`; number of partners in view (k,) and of all (k,).
+        Kernels (k, S); density of the outline (k,), 0 if `even`; number in view (k,) and of all (k,).
     """
     image, count = problem.image, len(problem.image.chosen)
     weight = np.ones(len(seen)) if problem.scores3d is None else problem.scores3d / problem.scores3d.mean()
@@ -371,9 +398,12 @@ def _sums_of_pairs(
 
 
 def _partners(problem: Problem, weight: Array) -> Iterator[tuple[Labels, Labels, Array, Array]]:
-    """Places in the chosen image points (k,) and in the scene of possible partners, the odds (k,) of the former and the
-    share (n,) of the latter, times its weight: those of a label, or all with their probability of a class, one class
-    after the other."""
+    """Iterate over groups of possible correspondences: one per label, or all points once per class.
+
+    Yields:
+        Indices (k,) of chosen image points and (n,) of scene points. Probabilities of the class for the image points
+        (k,), and for the scene points times their weight (n,); they are 1 without classes.
+    """
     chosen, n = problem.image.chosen, len(weight)
     if problem.odds2d is None or problem.classes3d is None:
         for rows, columns in label_groups(chosen, problem.labels2d, problem.labels3d, n):
@@ -384,13 +414,13 @@ def _partners(problem: Problem, weight: Array) -> Iterator[tuple[Labels, Labels,
 
 
 def _smoothed(image: ImageStatistics, bearings: Array, directions: Array, share: Array) -> Array:
-    """Directions per steradian around each bearing, weighed with their share, smoothed by OUTLINE spreads."""
+    """Return the weighted directions per steradian around each bearing, smoothed by `OUTLINE` RMS angular radii."""
     step = -(-len(directions) // MOST_SMOOTHED) or 1
     some, share = directions[::step], share[::step]
     if not len(some):
         return np.zeros(len(bearings))
     width2 = (OUTLINE * image.spread) ** 2
-    # From the centre of the view float32 has the digits of a narrow one.
+    # Relative to the centre of the view, float32 is precise enough for a narrow one.
     one, other = ((points - image.centre) / math.sqrt(2 * width2) for points in (bearings, some))
     one = np.column_stack([2 * one, -(one * one).sum(1), np.ones(len(one))]).astype(np.float32)
     other = np.column_stack([other, np.ones(len(other)), -(other * other).sum(1)]).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Which scene points may be the partners of image points under a pose."""
+"""Possible correspondences of image points and scene points under a pose."""
 
 import math
 from typing import Any
@@ -11,14 +11,20 @@ from bpnp.search.problem import Problem, faces
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
-FARTHEST = 4.0  # scales from an image point within which scene points may be its partner
-FEW_NEIGHBOURS, NEIGHBOURS = 8, 64  # of an image point that are looked up: of most, and where more are near
+FARTHEST = 4.0  # reach, in scales, within which a scene point may be the correspondence of an image point
+FEW_NEIGHBOURS, NEIGHBOURS = 8, 64  # nearest scene points of an image point: first try, and if all are in reach
 DENSE = 4096  # possible matches up to which all distances are computed
-OUTLIERS = 0.3  # share of the image points without a partner that the assignment expects
+OUTLIERS = 0.3  # expected fraction of image points without a correspondence
 
 
 def facing(problem: Problem, camera: Array, rotation: Array) -> Labels:
-    """Places of the scene points (n, 3), in the camera's frame, that it may see."""
+    """Return the indices of the scene points that the camera may see.
+
+    Args:
+        problem: Points of the problem, with normals if they are given.
+        camera: (n, 3) scene points in the camera's frame.
+        rotation: (3, 3) of the pose.
+    """
     used = np.einsum("ki,ki->k", camera, camera) > 0
     if problem.normals3d is not None:
         used &= faces(problem.normals3d, problem.cosines3d, camera, rotation)
@@ -26,18 +32,28 @@ def facing(problem: Problem, camera: Array, rotation: Array) -> Labels:
 
 
 def across(seen: Array) -> Array:
-    """Projections (k, 3, 3) to the planes that directions (k, 3) are perpendicular to."""
+    """Return the projections (k, 3, 3) onto the planes perpendicular to directions (k, 3)."""
     return np.asarray(np.eye(3) - seen[:, :, None] * seen[:, None, :])
 
 
 def partners(
     problem: Problem, seen: Array, places: Labels, chosen: Labels, scale: float, most: int = NEIGHBOURS
 ) -> tuple[Any, Any, Array, Array]:
-    """Possible matches (k,) of a chosen image point and a scene point near it, and the density (k,) of each; and the
-    density (m,) of the image points, with that of having no partner.
+    """Return the possible matches of chosen image points and scene points near them.
 
-    seen: (n, 3) directions of the scene points at `places`. Points of different labels are no match. most: neighbours
-    of an image point that are looked up.
+    Points of different labels do not match.
+
+    Args:
+        problem: Points of the problem.
+        seen: (n, 3) unit directions of the scene points.
+        places: (n,) indices of these scene points.
+        chosen: (m,) indices of the image points.
+        scale: Standard deviation of the residuals, radians.
+        most: Largest number of neighbours of an image point.
+
+    Returns:
+        Index (k,) into `chosen`, index (k,) into `seen` and density (k,) of each match; and the total density (m,) of
+        each image point, which includes that of no correspondence.
     """
     bearings, reach = problem.bearings[chosen], FARTHEST * scale
     if len(bearings) * len(seen) <= DENSE:
@@ -68,8 +84,18 @@ def partners(
 
 
 def explained(problem: Problem, rotation: Array, translation: Array, scale: float) -> tuple[float, float]:
-    """Mean log-likelihood of the bearings under a pose with residuals of `scale`, radians, in nats as the annealing has
-    it: in units in which a kernel is 1 / s^2 where it is largest; and the expected number of matches."""
+    """Return the mean log-likelihood of the bearings under a pose and the expected number of matches.
+
+    Args:
+        problem: Points of the problem.
+        rotation: (3, 3) of the pose.
+        translation: (3,) of the pose.
+        scale: Standard deviation s of the residuals, radians.
+
+    Returns:
+        Log-likelihood in nats, in the units of the annealing: the maximum of a kernel is 1 / s^2; -inf if no scene
+        point is seen. Number of matches, at most that of the image points or scene points.
+    """
     camera, chosen = problem.points3d @ rotation.T + translation, problem.image.chosen
     places = facing(problem, camera, rotation)
     if not len(places):

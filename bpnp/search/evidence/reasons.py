@@ -1,4 +1,4 @@
-"""The sentences that give the reason of a verdict (`Solution.reason`)."""
+"""Sentences that give the reason of a verdict (`Solution.reason`)."""
 
 MIRRORED = "the mirror image of the scene has a significant pose: check the directions of its axes"
 LEAST_SHOWN = 0.05  # decades that are shown as 0.0
@@ -26,7 +26,11 @@ def confident(log10_false_alarms: float, lead: float, bound_deg: float, focal: f
 
 
 def against(what: str, log10_false_alarms: float) -> str:
-    """Return a reason that says what speaks against a pose.
+    """Return the reason of a pose that is not confident.
+
+    Args:
+        what: The objection, a clause.
+        log10_false_alarms: log10 NFA of the pose.
 
     Examples:
         >>> against("its 4 matches do not fix the rotation", -5.02)
@@ -36,36 +40,36 @@ def against(what: str, log10_false_alarms: float) -> str:
 
 
 def insignificant(log10_false_alarms: float, most: float) -> str:
-    """Return the reason of a pose that chance may explain; `most` is the largest logarithm that is significant."""
+    """Return the reason of a pose that is not significant; `most` is the largest significant log10 NFA."""
     return f"Not significant: {nfa(log10_false_alarms)}, and at most {most:g} is needed"
 
 
 def competing(degrees: float, margin: float) -> str:
-    """Return what a competing pose says: so many degrees away, less likely by `margin` decades (log10)."""
+    """Return the clause of a competing pose, `degrees` away and less likely by `margin` decades (log10)."""
     return f"a competing pose {degrees:.0f} deg away fits about as well (margin {margin:.1f} decades)"
 
 
 def incomplete(log10_missed: float) -> str:
-    """Return what an unfinished search says: the probability that a better pose was missed, as its logarithm."""
+    """Return the clause of an incomplete search; `log10_missed` is log10 of its miss probability."""
     return f"a better pose may exist (miss probability up to {number(min(log10_missed, 0.0))})"
 
 
 def undecided(reason: str, seconds: float) -> str:
-    """Return the reason of a pose that a search could not decide before its time limit."""
+    """Return the reason of a pose that is undecided at the time limit of the search."""
     return f"{reason}; not decided in {seconds:.3g} s, a longer time limit may decide it"
 
 
 def rounded(bound: float) -> str:
-    """Return a bound: one digit below ten, whole numbers above."""
+    """Format a bound: one digit below ten, whole numbers above."""
     return f"{bound:.1g}" if bound < 9.5 else f"{bound:.0f}"
 
 
 def nfa(log10_false_alarms: float) -> str:
-    """Return the logarithm of a number of false alarms."""
+    """Format the logarithm of a number of false alarms."""
     shown = 0.0 if abs(log10_false_alarms) < LEAST_SHOWN else log10_false_alarms
     return f"log10 NFA {shown:.1f}"
 
 
 def number(log10: float) -> str:
-    """Return 10^x as a short number."""
+    """Format 10^x as a short number."""
     return f"{10**log10:.2g}" if -3 < log10 < 5 else f"1e{log10:.0f}"

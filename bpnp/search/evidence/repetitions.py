@@ -1,4 +1,4 @@
-"""Poses that a symmetric or repeated structure confuses: an object turned by a symmetry, a facade moved by a window."""
+"""Competing poses of symmetric and repeated structures, such as a facade shifted by a window."""
 
 import math
 from functools import lru_cache
@@ -22,17 +22,19 @@ DEFAULT = Repetitions()
 def registered(problem: Problem, rotation: Array, translation: Array, scale: float, rule: Evidence) -> Motions:
     """Return the rigid motions that map the matched points of a pose onto other scene points.
 
-    If a pose is wrong because of a symmetry or a repetition, one of these motions maps (nearly) all of its matched
-    points onto those of the right pose, whatever fraction of the scene they are.
+    If a pose is wrong because of a symmetry or a repetition, one of these motions maps nearly all of its matched points
+    onto those of the correct pose. They may be any fraction of the scene.
 
     Args:
-        problem: the points of a problem.
-        rotation: (3, 3), translation: (3,) of the pose.
-        scale: standard deviation of its residuals, radians.
-        rule: constants of the verdict.
+        problem: Points of the problem.
+        rotation: (3, 3) of the pose.
+        translation: (3,) of the pose.
+        scale: Standard deviation of its residuals, radians.
+        rule: Constants of the verdict.
 
     Returns:
-        Motions with the fraction of the matched points that each maps, the largest first; none of too few points.
+        Motions with the fraction of the matched points that each maps, the largest first; none if there are too few
+        matched points.
     """
     limits, points = rule.repetitions, problem.points3d
     camera = points @ rotation.T + translation
@@ -68,13 +70,13 @@ Frozen = tuple[bytes, str, tuple[int, ...]] | None
 
 
 def _frozen(array: NDArray[Any] | None) -> Frozen:
-    """Return an array as a key of a cache."""
+    """Convert an array to a key of a cache."""
     return None if array is None else (np.ascontiguousarray(array).tobytes(), array.dtype.str, array.shape)
 
 
 @lru_cache(maxsize=64)
 def _of_scene(points: Frozen, labels: Frozen, normals: Frozen, tolerance: float) -> Motions:
-    """Return the motions of a whole scene, which all problems of it share."""
+    """Return the motions of a whole scene, cached for all problems of it."""
     arrays = [None if x is None else np.frombuffer(x[0], x[1]).reshape(x[2]).copy() for x in (points, labels, normals)]
     assert arrays[0] is not None
     return self_motions(
@@ -88,8 +90,18 @@ def _of_scene(points: Frozen, labels: Frozen, normals: Frozen, tolerance: float)
 
 
 def competing_poses(problem: Problem, rotation: Array, translation: Array, motions: Motions, rule: Evidence) -> Pose:
-    """Return the poses (c, 3, 3), (c, 3) that motions, and the mirror image of a flat scene, confuse with a pose; those
-    that a verdict takes for different from it."""
+    """Return the competing poses of a pose due to motions and to the mirror image of a flat scene.
+
+    Args:
+        problem: Points of the problem.
+        rotation: (3, 3) of the pose.
+        translation: (3,) of the pose.
+        motions: Motions that map the scene onto itself.
+        rule: Constants of the verdict.
+
+    Returns:
+        Rotations (c, 3, 3) and translations (c, 3) of poses that differ from the given one by over `rule.same`.
+    """
     poses = motions.competitors(rotation, translation)
     every = [rotation[None], poses[0]], [translation[None], poses[1]]
     if (mirrored := mirror_pose(problem.points3d, rotation, translation)) is not None:
@@ -103,18 +115,19 @@ def competing_poses(problem: Problem, rotation: Array, translation: Array, motio
 def repeated_poses(
     problem: Problem, rotation: Array, translation: Array, scale: float, rule: Evidence, *, least: float = 0.0
 ) -> tuple[Hypotheses, Motions]:
-    """Return the poses that the scene's own motions confuse with one, and these motions.
+    """Return the competing poses of a pose due to the motions of the scene, and these motions.
 
     Args:
-        problem: the points of a problem.
-        rotation: (3, 3), translation: (3,) of the pose.
-        scale: standard deviation of its residuals, radians.
-        rule: constants of the verdict.
-        least: smallest fraction of the matched points that a motion maps.
+        problem: Points of the problem.
+        rotation: (3, 3) of the pose.
+        translation: (3,) of the pose.
+        scale: Standard deviation of its residuals, radians.
+        rule: Constants of the verdict.
+        least: Smallest fraction of the matched points that a motion maps, default 0.
 
     Returns:
-        Those poses that a verdict takes for different from the given one (`Evidence.same`), at most
-        `Repetitions.kept`, as they are, with the fewest false alarms first; of a flat scene also its mirror image.
+        Unrefined poses that differ from the given one (`Evidence.same`), at most `Repetitions.kept`, the fewest false
+        alarms first. A flat scene adds the mirror image.
 
     Examples:
         >>> import numpy as np
@@ -146,13 +159,22 @@ def decades_behind(
     *,
     fraction: float = 0.0,
 ) -> Array:
-    """Decades (c,) by which the poses `rivals` (c, 3, 3), (c, 3) explain the image points worse than the best one.
+    """Return the margins (c,), in decades, by which competing poses explain the image points worse than the best one.
 
-    All at one scale of the residuals, radians, and against scene points that are evenly spread: their density does not
-    say which of equal things is seen. An image point does not count against a rival if the map may end there: if it
-    lies beyond the rival's projected points, and its scene point is one of those that the motions of the `repeated`
-    poses take onto others. Any point may be missing in the map, as is the share q of the image points that the best
-    pose does not explain: none counts for more than (1 - q) / q.
+    All poses are compared at one scale and against an even density of scene points, since their actual density does not
+    distinguish between copies of a structure. An image point does not count against a competing pose if the map may end
+    there. It then lies outside the projected points of that pose, and a motion of the `repeated` poses maps its scene
+    point onto another one. Any point may be missing in the map. With q the fraction of image points that the best
+    pose does not explain, no point counts for more than (1 - q) / q.
+
+    Args:
+        problem: Points of the problem.
+        best: Rotation (3, 3) and translation (3,) of the best pose.
+        repeated: Rotations and translations of the unrefined poses that the motions give.
+        rivals: Rotations (c, 3, 3) and translations (c, 3) of the competing poses.
+        scale: Scale of the residuals, radians.
+        limits: Constants.
+        fraction: Fraction of the matched points that every motion maps; it limits q to 1 - `fraction`. Default 0.
     """
     seen = [directions_of(problem, *best), *(directions_of(problem, r, t) for r, t in zip(*rivals, strict=True))]
     logs = np.stack([point_evidence(problem, one, np.array([scale]), SHARES[-1:], even=True)[:, 0, 0] for one in seen])
@@ -166,8 +188,10 @@ def decades_behind(
 
 
 def _is_repeated(problem: Problem, best: Pose, repeated: Pose, reach: float) -> NDArray[np.bool_]:
-    """Of which of the chosen image points (k,) a motion p -> Q p + d, or its inverse, takes the scene point onto
-    another one; Q p + d is the point that a repeated pose sees where the best one sees p."""
+    """Return for each chosen image point (k,) if a motion, or its inverse, maps its scene point onto another one.
+
+    A motion is p -> Q p + d. A repeated pose sees the point Q p + d where the best pose sees p.
+    """
     points, (rotation, translation) = problem.points3d, best
     camera = points @ rotation.T + translation
     depth = np.linalg.norm(camera, axis=-1)
@@ -182,12 +206,12 @@ def _is_repeated(problem: Problem, best: Pose, repeated: Pose, reach: float) -> 
 
 
 def _among(problem: Problem, seen: Array) -> NDArray[np.bool_]:
-    """Which of the chosen image points lie in the convex hull of the directions (n, 3) that a pose sees."""
+    """Return which chosen image points lie in the convex hull of the directions (n, 3) of the scene points."""
     image = problem.image
-    ahead = seen[seen @ image.centre > 0]  # none that is NaN
+    ahead = seen[seen @ image.centre > 0]  # leaves out NaN
     plane, points = (x @ image.axes / (x @ image.centre)[:, None] for x in (ahead, problem.bearings[image.chosen]))
     try:
         sides = ConvexHull(plane).equations
-    except (QhullError, ValueError):  # on a line, or too few
+    except (QhullError, ValueError):  # collinear or too few points
         return np.zeros(len(points), bool)
     return np.asarray((points @ sides[:, :2].T + sides[:, 2] <= 0).all(-1))

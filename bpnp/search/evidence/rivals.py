@@ -1,5 +1,4 @@
-"""Poses that are sought on purpose to contest a confident one: those that a repeated structure confuses with it, and
-those beside it at other focal lengths."""
+"""Search for competing poses of a confident one: those of a repeated structure, and those at other focal lengths."""
 
 import math
 from collections.abc import Callable
@@ -36,12 +35,23 @@ def against_rivals(
     exhaustive: bool = False,
     contested: bool = False,
 ) -> SearchResult:
-    """A confident result once more, beside the poses that a repeated structure would confuse with it, and beside those
-    at other focal lengths; if one of the former is better, so is that one.
+    """Judge a confident result again with competing poses of a repeated structure and at other focal lengths.
 
-    contested: whether the poses of a repeated structure were proposed before. The camera is believed as it was given
-    unless another focal length, which is paid for as an unknown, has fewer false
-    alarms by the factor `rule.focal_chance`."""
+    A better pose of a repeated structure becomes the best one and is judged likewise. The given camera is accepted
+    unless another focal length, which counts as an unknown, has fewer false alarms by the factor `rule.focal_chance`.
+
+    Args:
+        result: Verdict; returned unchanged unless it is confident.
+        problem: Points of the problem.
+        entered: Function that returns the normalised scene.
+        rule: Constants of the verdict.
+        looks: Number of local searches around the best pose that found no better one.
+        exhaustive: True if every pose was tried.
+        contested: True if the poses of a repeated structure are among the candidates, as after an enumeration.
+
+    Returns:
+        The verdict, with the competing poses among its candidates.
+    """
     result = _against_repetitions(result, problem, entered, rule, looks, exhaustive, contested)
     if result.verdict != "confident":
         return result
@@ -56,9 +66,9 @@ def other_camera(
 ) -> Alternative | None:
     """Return another lens with which a different pose fits better than the best one, or None.
 
-    Better is a smaller number of false alarms, by the factor `focal_chance`, though it counts the focal length and the
-    radial coefficient as unknowns. The lens is fitted from the best pose; and, where three matches may be coincidences,
-    from the likeliest pose beside it at other focal lengths. If there was no time for these, that is returned.
+    Better means fewer false alarms by the factor `focal_chance`, with focal length and radial coefficient counted as
+    unknowns. The lens is fitted from the best pose. If three matches may be coincidences, it is also fitted from the
+    likeliest pose at other focal lengths. If the time limit prevents this, the result reports it.
     """
     count = match_count(result.candidates, problem)
     if problem.focal is not None or count < rule.zoomed.fewest:
@@ -93,7 +103,7 @@ class AtZoom(NamedTuple):
 
     Attributes:
         zoom: Focal length over the given one.
-        problem: The points as seen with it.
+        problem: Points of the problem at this focal length.
         pose: One hypothesis.
     """
 
@@ -103,18 +113,25 @@ class AtZoom(NamedTuple):
 
     @property
     def middle(self) -> Array:
-        """(3,) middle of the scene in the camera's frame."""
+        """Scene centroid (3,) in the camera's frame."""
         return np.asarray(self.pose.rotation[0] @ self.problem.middle + self.pose.translation[0])
 
     @property
     def likelihood(self) -> float:
-        """Mean log-likelihood of the bearings, nats, against an even density over the view."""
+        """Mean log-likelihood of the bearings, nats, relative to an even density over the view."""
         return float(self.pose.log_likelihood[0]) + math.log(self.problem.image.solid_angle)
 
 
 def likeliest_zoom(start: AtZoom, scene: Scene, rule: OtherFocal) -> AtZoom:
-    """Return the likeliest pose at other focal lengths: the likelier one of a step to either side, and farther on that
-    side while the likelihood grows. The settings and the deadline are those of `scene`."""
+    """Return the likeliest pose at other focal lengths.
+
+    One step is tried to either side. The likelier side is followed while the likelihood grows.
+
+    Args:
+        start: Pose at the given focal length.
+        scene: Scene whose settings and deadline are used.
+        rule: Constants of the steps.
+    """
     steps = [(step, beside(start, step, scene)) for step in (1 / rule.step, rule.step)]
     step, best = max(steps, key=lambda one: one[1].likelihood)
     while 1 / rule.widest < best.zoom * step < rule.widest:
@@ -126,8 +143,10 @@ def likeliest_zoom(start: AtZoom, scene: Scene, rule: OtherFocal) -> AtZoom:
 
 
 def beside(found: AtZoom, zoom: float, scene: Scene) -> AtZoom:
-    """Return the likeliest pose at `zoom` times the focal length of one, near that which sees the scene as large; the
-    given one after the deadline."""
+    """Return the likeliest pose at `zoom` times the focal length of a given one, or the given one after the deadline.
+
+    The search starts from the pose that shows the scene at the same size.
+    """
     problem = at_focal_length(found.problem, zoom)
     there = Scene(problem, 0, scene.settings, scene.deadline)
     shift = found.middle * (1, 1, zoom) - found.pose.rotation[0] @ problem.middle
@@ -137,7 +156,7 @@ def beside(found: AtZoom, zoom: float, scene: Scene) -> AtZoom:
 
 
 def _alarms(problem: Problem, other: LensFit, rule: Evidence) -> float:
-    """Return log10 of the number of false alarms of a pose whose lens is unknown too."""
+    """Return log10 NFA of a pose with its lens counted as unknown."""
     lens = UnknownFocal(2 * math.log(rule.zoomed.widest))
     zoomed = replace(at_focal_length(problem, other.zoom), focal=lens)
     if other.radial is not None:
@@ -150,7 +169,7 @@ def _alarms(problem: Problem, other: LensFit, rule: Evidence) -> float:
 
 
 def at_focal_length(problem: Problem, zoom: float) -> Problem:
-    """The same image points, seen with `zoom` times the focal length."""
+    """Return the problem with its image points at `zoom` times the focal length."""
     bearings = problem.bearings * (1 / zoom, 1 / zoom, 1)
     return replace(problem, bearings=bearings / np.linalg.norm(bearings, axis=-1, keepdims=True))
 
@@ -164,10 +183,10 @@ def _against_repetitions(
     exhaustive: bool,
     contested: bool,
 ) -> SearchResult:
-    """Judge a confident result again with the poses that a repeated structure confuses with it; return the best first.
+    """Judge a confident result again with the competing poses of a repeated structure.
 
-    Those of an enumeration were refined and are among its candidates. They are judged once more as if the map ended
-    somewhere, which makes them likelier.
+    If they were enumerated (`contested`), they are refined and among the candidates already. They are judged again with
+    the assumption that the map may end anywhere, which makes them likelier.
     """
     if result.verdict != "confident":
         return result

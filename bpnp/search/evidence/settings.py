@@ -1,4 +1,4 @@
-"""Every constant that decides what is evidence and what a pose is believed on."""
+"""Constants of the evidence and of the verdict on a pose."""
 
 from dataclasses import dataclass
 
@@ -7,13 +7,15 @@ from bpnp.poses import SAME, Tolerance
 
 @dataclass(frozen=True)
 class ImageSettings:
-    """What is evidence of image points (`bpnp.search.image_statistics`).
+    """Statistics of the image points (`bpnp.search.image_statistics`).
 
-    scale_step: from one scale of the residuals to the next. coarsest: scale in spacings sqrt(A / m) of the points;
-    beyond, only the outline fits. floor: smallest scale in spreads of the bearings, some hundredths of a pixel of an
-    ordinary camera. together: distance in scales below which points are one observation. crowded: standard deviations
-    by which the points around one exceed those of an even spread before it is a clump. most: that are looked at,
-    evenly spread over the given ones.
+    Attributes:
+        scale_step: Factor from one scale of the residuals to the next.
+        coarsest: Largest scale, in spacings sqrt(A / m) of the points; beyond it only the outline fits.
+        floor: Smallest scale, in RMS angular radii of the bearings: some hundredths of a pixel of an ordinary camera.
+        together: Distance, in scales, below which points count as one observation.
+        crowded: Standard deviations above the count of an even spread from which neighbours form a clump.
+        most: Largest number of image points that are used, evenly spaced among the given ones.
     """
 
     scale_step: float = 2.0
@@ -26,13 +28,15 @@ class ImageSettings:
 
 @dataclass(frozen=True)
 class Contested:
-    """When a far pose contests the best one (`bpnp.search.evidence.alternatives.contesting`).
+    """Conditions under which a far pose competes with the best one (`bpnp.search.evidence.alternatives.contesting`).
 
-    near: scales of the residuals within which an image point has a partner, and two partners are in one place. far:
-    times as far as a different pose; nearer ones slide along the same lines and surfaces. most: nats of evidence of an
-    image point, what 100 scene points leave to one that is met to the finest scale. alone: share of the points that the
-    first pose alone explains; a pose that explains so many alone is no repetition of it. same: share of a pose's
-    partners in the places of those of another from which both say the same of the scene.
+    Attributes:
+        near: Distance, in scales of the residuals, within which an image point has a match and two matches coincide.
+        far: Smallest distance, in multiples of `Evidence.same`; nearer poses slide along the same lines and surfaces.
+        most: Largest evidence of an image point, nats: that of a match among 100 scene points at the finest scale.
+        alone: A pose is no repetition of the best one from this ratio on: points that only it explains, over points
+            that only the best one explains.
+        same: Fraction of the matches of a pose that coincide with those of the best one; from it on, they agree.
     """
 
     near: float = 3.0
@@ -46,16 +50,22 @@ class Contested:
 class Repetitions:
     """Motions that map a scene onto itself (`bpnp.search.evidence.repetitions`).
 
-    near: scales of the residuals within which an image point has a match, and a moved point lies on another.
-    fewest: matched points; with fewer, three that fix a pose are too large a part.
-    share: smallest fraction of the matched points that a motion maps, share_of_scene: the same of a whole scene.
-    symmetric: fraction of the matched points; a motion that maps more of them could by itself explain a better pose.
-    whole: points up to which a scene is registered as a whole, once for all problems of it; bases_of_scene: of that, a
-        motion of a third of the points is missed by (1 - 1/27)^128 = 0.8 % of the registrations, at most.
-    around: points nearest to the matched ones that these are registered with. bases, fewer_bases: of such a
-        registration, with up to `many` points and with more: a motion of nine tenths of the matches is missed by
-        (1 - 0.9^3)^8 = 3e-5 of the latter.
-    kept: competing poses, those with the fewest false alarms. most_missing: fraction of its points that a map may lack.
+    Attributes:
+        near: Distance, in scales of the residuals, within which an image point has a match.
+        fewest: Smallest number of matched points; with fewer, the three that fix a pose are too large a part.
+        share: Smallest fraction of the matched points that a motion maps.
+        share_of_scene: Smallest fraction of all points that a motion of a whole scene maps.
+        symmetric: Fraction of the matched points from which a motion could by itself explain a better pose.
+        whole: Largest number of points of a scene that is registered as a whole, once for all problems of it.
+        bases_of_scene: Number of bases of that registration. A motion of a third of the points is missed by at most
+            (1 - 1/27)^128 = 0.8 % of the registrations.
+        around: Number of points nearest to the matched ones that these are registered with, in a larger scene.
+        many: Number of points up to which such a registration has `bases` bases; with more, `fewer_bases`.
+        bases: Number of bases with few points.
+        fewer_bases: Number of bases with many points. A motion of nine tenths of the matches is missed by
+            (1 - 0.9^3)^8 = 3e-5 of the registrations.
+        kept: Largest number of competing poses; those with the fewest false alarms are kept.
+        most_missing: Largest fraction of its points that a map may lack.
     """
 
     near: float = 3.0
@@ -75,12 +85,16 @@ class Repetitions:
 
 @dataclass(frozen=True)
 class OtherFocal:
-    """Where another focal length is looked for beside a confident pose (`bpnp.search.evidence.rivals`).
+    """Search for another focal length near a confident pose (`bpnp.search.evidence.rivals`).
 
-    step: factor from one that is tried to the next; widest: the last one. bearings: that most steps of the focal length
-    are fitted to. fewest: matches; of fewer a seventh unknown explains too much. bend: largest radial distortion, as
-    a fraction of the distance of the outermost image point from the axis. bend_deg, bend_shift: with radial distortion,
-    poses farther apart are different, in degrees and in distances of the scene.
+    Attributes:
+        step: Factor from one focal length to the next.
+        widest: Largest factor on the given focal length; its inverse is the smallest.
+        bearings: Largest number of bearings that most steps are fitted to.
+        fewest: Smallest number of matches; a seventh unknown explains too much of fewer.
+        bend: Largest radial distortion, as a fraction of the distance of the outermost image point from the axis.
+        bend_deg: Rotation, degrees, from which poses with radial distortion are different.
+        bend_shift: Shift, in distances of the scene, from which poses with radial distortion are different.
     """
 
     step: float = 1.08
@@ -94,26 +108,29 @@ class OtherFocal:
 
 @dataclass(frozen=True)
 class Evidence:
-    """When a pose is believed (`bpnp.search.verdict`). Logarithms to base 10.
+    """Conditions of a confident pose (`bpnp.search.verdict`). Logarithms have base 10.
 
-    false_alarms: of the number of false alarms, at most. It is a bound; on unrelated points an exhaustive search stayed
-    above 1 in 999 of 1000 cases, and never came below 0.1.
-    lead: by which every alternative must be less likely: once in a thousand a wrong one is by chance. same: poses
-        that are farther apart are different.
-    missed: of the probability that a better optimum was not met, at most (`bpnp.search.evidence.alternatives`).
-    independent: matches that have to be coincidences for it, as many as fix a pose. another: probability that there is
-        a better optimum though several starts ended at a pose that exceeds chance. uncompared: probability that a
-        better pose of a symmetric scene is not among those that its motions give. look_fails: that starts around a
-        wrong pose miss a better one beside it, as 40 of 922 did; again_fails: that others miss it after these, as 8 of
-        29 did.
-    focal_chance: with which another focal length may be significantly better by chance; with 0.001 a camera that is a
-        tenth wrong is believed half as often again.
-    contested, repetitions, zoomed: constants of these alternatives.
-    focal: fraction by which a focal length that is fitted may be off, once in a thousand; with it the distance is off,
-        and by `same.shift` the pose is a different one. focal_few: the same of an object, a scene of at
-        most `Repetitions.whole` points that is no map, such as LEDs: its rotation is right long before its distance.
-        The reason says how far the focal length may be off; beyond a factor of two it is open. scale: the same of the
-        scale of a rig's scene.
+    Attributes:
+        false_alarms: Largest log of the number of false alarms (NFA). The NFA is an upper bound: on unrelated points,
+            an exhaustive search stayed above 1 in 999 of 1000 cases and never fell below 0.1.
+        lead: Smallest margin to every competing pose; by chance a wrong pose has it once in a thousand cases.
+        same: Tolerance within which two poses are the same.
+        missed: Largest log of the miss probability of a better optimum (`bpnp.search.evidence.alternatives`).
+        independent: Number of matches that must be coincidences for a better optimum to exist, as many as fix a pose.
+        another: Probability of a better optimum although several initial poses ended at a significant one.
+        uncompared: Probability that a better pose of a symmetric scene is not among those of its motions.
+        look_fails: Probability that a local search around a wrong pose misses a better one near it: 40 of 922 did.
+        again_fails: Probability that a further local search misses it as well: 8 of 29 did.
+        focal_chance: Significance level of a test for another focal length. With 0.001, cameras with a focal length
+            off by a tenth are accepted 1.5 times as often.
+        contested: Constants of the competing far poses.
+        repetitions: Constants of the competing poses of a repeated structure.
+        zoomed: Constants of the competing focal lengths.
+        focal: Largest 99.9 % bound of a fitted focal length, as a fraction. The distance has the same error, and from
+            `same.shift` on the pose is a different one.
+        focal_few: Bound as `focal` for an object: a scene of at most `Repetitions.whole` points that is no map, such
+            as LEDs. Its rotation is correct long before its distance. The reason gives the bound.
+        scale: Largest 99.9 % bound of the scale of a rig's scene, as a fraction.
     """
 
     false_alarms: float = -2.0

@@ -1,5 +1,7 @@
-"""How well points fix a pose: its covariance, bounds of its rotation and focal length that allow for few residuals, and
-residuals that no pose explains, but another focal length or other proportions of the scene would."""
+"""Uncertainty of a pose: its covariance, and 99.9 % bounds of its rotation and focal length.
+
+Also tests for systematic residuals, which another focal length or other proportions of the scene would explain.
+"""
 
 import math
 from typing import NamedTuple
@@ -19,10 +21,10 @@ from bpnp.search.starts import GravityPrior, PosePrior
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
-MANY = 1e9  # degrees of freedom, of a number that does not vary
-EXCEEDED = 1e-3  # probability that a pose is farther off than its bound, and of a test
+MANY = 1e9  # degrees of freedom of a number that does not vary
+EXCEEDED = 1e-3  # probability that an error exceeds its bound, and significance level of a test
 
-# Strains that leave the volume as it is, a basis; the sixth is the unit of length, which no image shows.
+# Basis of the strains that preserve the volume; the sixth is the unit of length, which no image shows.
 STRAINS = np.array(
     [
         [[1, 0, 0], [0, -1, 0], [0, 0, 0]],
@@ -33,14 +35,17 @@ STRAINS = np.array(
     ],
     np.float64,
 )
-POSE = 6  # numbers that are fitted with every pose
-BLOCKS = 4  # of image points, along each axis of the image
+POSE = 6  # parameters of a pose
+BLOCKS = 4  # number of blocks of image points along each axis of the image
 
 
 def rotation_bound(problem: Problem, linear: "Linearised | None", count: float) -> float:
-    """Angle, radians, that the error of the rotation exceeds once in a thousand; see `exceeded_once`.
+    """Return the 99.9 % bound of the rotation error, radians; see `exceeded_once`.
 
-    linear: `linearised` with the standard deviation of the residuals, estimated from `count` matches.
+    Args:
+        problem: Points of the problem.
+        linear: Pose from `linearised` with the standard deviation of the residuals; None gives an infinite bound.
+        count: Number of matches that the standard deviation was estimated from.
 
     >>> import numpy as np
     >>> rng = np.random.default_rng(0)
@@ -71,25 +76,36 @@ def is_redundant(problem: Problem, count: float) -> bool:
 
 
 def focal_bound(problem: Problem, linear: "Linearised | None", count: float) -> float:
-    """Share by which the focal length may be wrong, exceeded once in a thousand; see `exceeded_once`."""
+    """Return the 99.9 % bound of the focal length, as a fraction; arguments as for `rotation_bound`."""
     covariance = local_covariance(linear)
     return math.inf if covariance is None else share_bound(covariance[POSE:, POSE:], 2 * count - problem.fitted)
 
 
 def share_bound(covariance: Array, free: float) -> float:
-    """Share by which a number may be wrong of whose logarithm this is the variance (1, 1), exceeded once in a
-    thousand; infinite where it may be anything."""
+    """Return the 99.9 % bound of the relative error of a positive number.
+
+    Args:
+        covariance: (1, 1) variance of the logarithm of the number.
+        free: Degrees of freedom with which the scale of the residuals was estimated.
+
+    Returns:
+        Bound as a fraction; infinite if the number is not determined.
+    """
     with np.errstate(over="ignore"):
         return float(np.expm1(exceeded_once(covariance, free)))
 
 
 def exceeded_once(covariance: Array, free: float) -> float:
-    """Length that a vector of this covariance (3, 3) exceeds once in a thousand.
+    """Return the length that a vector of this covariance exceeds once in a thousand.
 
-    The square of its length has the cumulants tr C, 2 tr C^2 and 8 tr C^3, as a + (b / d) x has, x chi-squared with d =
-    (tr C^2)^3 / (tr C^3)^2 degrees of freedom, one for a single loose axis and three for equal ones, b^2 = d tr C^2 and
-    a = tr C - b (Buckley and Eagleson 1988). The scale of the residuals was estimated with `free` degrees of freedom:
-    the square is at most a and b times the quantiles of F with them.
+    Args:
+        covariance: (3, 3), or (1, 1) for a number.
+        free: Degrees of freedom with which the scale of the residuals was estimated; infinite length if none.
+
+    The square of its length has the cumulants tr C, 2 tr C^2 and 8 tr C^3. The variable a + (b / d) x has the same, with
+    x chi-squared with d = (tr C^2)^3 / (tr C^3)^2 degrees of freedom, b^2 = d tr C^2 and a = tr C - b (Buckley and
+    Eagleson 1988). A single loose axis gives d = 1, equal ones d = 3. As the scale of the residuals was estimated with
+    `free` degrees of freedom, the bound of the square is a and b times the quantiles of F with them.
 
     Source: M. J. Buckley, G. K. Eagleson, An approximation to the distribution of quadratic forms in normal random
     variables, Australian J. Statistics 1988.
@@ -105,11 +121,11 @@ def exceeded_once(covariance: Array, free: float) -> float:
 
 
 def is_within(error: Array, covariance: Array, free: float | int) -> bool:
-    """Return whether an error is in the region that a covariance claims to hold it with a probability of 99.9 %.
+    """Return whether an error lies in the 99.9 % region of a covariance.
 
     Args:
-        error: (d,) of some of what is fitted.
-        covariance: (d, d) as `pose_covariance` gives it, widened for few residuals. With F's quantile it is not.
+        error: (d,) error of some of the fitted parameters.
+        covariance: (d, d) of `pose_covariance`, widened for few residuals. The widening is undone: F allows for it.
         free: Degrees of freedom with which the scale of the residuals was estimated.
 
     >>> is_within(np.array([3.0]), np.eye(1), MANY), is_within(np.array([3.4]), np.eye(1), MANY)
@@ -123,29 +139,36 @@ def is_within(error: Array, covariance: Array, free: float | int) -> bool:
 
 
 def pose_covariance(problem: Problem, linear: "Linearised | None", count: float) -> Array | None:
-    """Covariance (6, 6) of a pose, None where the points do not fix it; (7, 7) with the logarithm of a focal length
-    that is fitted.
+    """Return the covariance of a pose in the user's coordinates.
 
-    Of (w, v): the true pose is R' = exp([w]x) R, t' = t + v, w in radians in the camera's axes, v in the user's unit,
-    and t the translation in the user's coordinates. `local_covariance`, times the square of the quantile of
-    Student's t that has one sigma of a normal distribution, as the scale is estimated from `count` matches.
+    It is the covariance of (w, v). The true pose is R' = exp([w]x) R, t' = t + v, with w in radians in the camera's
+    axes and v in the user's unit. It is `local_covariance`, widened by `student_factor` because the scale is estimated.
+
+    Args:
+        problem: Points of the problem.
+        linear: Pose from `linearised`, or None.
+        count: Number of matches that the scale of the residuals was estimated from.
+
+    Returns:
+        (6, 6), or (7, 7) with the logarithm of a fitted focal length; None if the points do not fix the pose.
     """
     covariance = local_covariance(linear)
     if covariance is None or linear is None:
         return None
     free = max(2 * count - problem.fitted, 1.0)
-    moved = np.eye(len(covariance))  # the shift of the middle, as that of the origin: v = s + (R m) x w
+    moved = np.eye(len(covariance))  # from the shift s of the centroid to that of the origin: v = s + (R m) x w
     moved[3:POSE, 3:POSE] *= problem.size
     moved[3:POSE, :3] = crossed(linear.rotation @ problem.middle_of_user)
     return np.asarray(student_factor(free) * moved @ covariance @ moved.T)
 
 
 def centre_covariance(covariance: Array, translation: Array, scale: float | None = None) -> Array:
-    """Covariance (3, 3), in the camera's axes, of the centre of the camera, -R' (v + t x w) for a pose's (w, v); what
-    else is in `covariance` is left aside.
+    """Return the covariance (3, 3) of the camera centre in the camera's axes: of v + t x w for a pose's (w, v).
 
-    translation: of the point about which the pose turns: t for the scene's origin. scale: where the centre is -R^T t /
-    scale, of which `covariance` has the error too.
+    Args:
+        covariance: Covariance of the pose; parameters beyond those used here are ignored.
+        translation: (3,) of the point about which the pose rotates: t for the scene's origin.
+        scale: Scale of a centre -R^T t / scale; `covariance` has its error as the seventh parameter. None: no scale.
     """
     moved = np.concatenate([crossed(translation), np.eye(3)], 1)
     if scale is not None:
@@ -155,35 +178,39 @@ def centre_covariance(covariance: Array, translation: Array, scale: float | None
 
 
 def local_covariance(linear: "Linearised | None") -> Array | None:
-    """Covariance (6, 6) of the turn w and the shift of the middle of the scene, from noise of `linear.scale`; None if
-    the points do not fix the pose. (7, 7) with the logarithm of a focal length that is fitted.
+    """Return the covariance of the rotation w and the shift of the scene centroid, for noise of `linear.scale`.
 
-    Image point i has scene point j as its partner with the probability p_ij. With J_ij the derivative of the direction
-    u_j by the turn and the shift, and the scores g_ij = J_ij^T (f_i - u_j) / s^2, g_i = sum_j p_ij g_ij, the observed
-    information is (Louis 1982)
+    Image point i corresponds to scene point j with the probability p_ij. J_ij is the derivative of the direction u_j
+    by the rotation and the shift. With the scores g_ij = J_ij^T (f_i - u_j) / s^2 and g_i = sum_j p_ij g_ij, the
+    observed information is (Louis 1982)
 
         H = sum_ij p_ij (J_ij^T J_ij / s^2 - g_ij g_ij^T) + sum_i g_i g_i^T + that of the prior:
 
-    where scene points lie as close as the residuals, what their partners leave open is subtracted. What a prior knows
-    of the pose counts as a measurement beside the points. The jackknife
+    where scene points lie as close as the residuals, the information lost to uncertain correspondences is subtracted.
+    A prior of the pose counts as a further measurement. The jackknife
 
-        sum_i d_i d_i^T,  d_i = (H - H_i)^-1 g_i,  H_i the share of image point i in H,
+        sum_i d_i d_i^T,  d_i = (H - H_i)^-1 g_i,  H_i the part of image point i in H,
 
-    allows for residuals that are not as the model says, and for an image point with a false partner: d_i is the way to
-    the optimum without it. With H^-1 = L L^T, the larger of both counts along each of the common axes, the eigenvectors
-    of L^-1 (sum_i d_i d_i^T) L^-T. Where H is not positive definite, since points that lie between two partners
-    outweigh the others, that of half the variance s^2 counts, at which fewer have two, times two.
+    allows for residuals that deviate from the model, and for false correspondences: d_i is the step to the optimum
+    without image point i. Let H^-1 = L L^T. The larger of both matrices is taken along each of the common axes, the
+    eigenvectors of L^-1 (sum_i d_i d_i^T) L^-T.
+
+    H is not positive definite if image points between two correspondences outweigh the others. Half the variance s^2
+    is then used, at which fewer points have two, and the result is doubled.
 
     Sources: T. A. Louis, Finding the observed information matrix when using the EM algorithm, J. R. Stat. Soc. B 1982;
     J. G. MacKinnon, H. White, Some heteroskedasticity-consistent covariance matrix estimators with improved finite
     sample properties, J. Econometrics 1985; B. Efron, C. Stein, The jackknife estimate of variance, Annals of
     Statistics 1981; S. F. Schmidt, Application of state-space methods to navigation problems, 1966.
 
-    With an unknown lens, the jackknife leaves out blocks of neighbouring image points: what a lens of this model leaves
-    unexplained, and errors of a map, are alike for neighbours, and a focal length adds them up. The radial coefficient
-    is eliminated, with the standard deviation that is expected of it unless it was fitted. The principal point is a
+    With an unknown focal length, the jackknife leaves out blocks of neighbouring image points. Errors of the lens
+    model and of the map are similar for neighbours, and they add up in the focal length. The radial coefficient
+    is eliminated. Its expected standard deviation counts as a prior unless it was fitted. The principal point is a
     considered parameter: with c its standard deviation and J_c the derivatives by it, C becomes C + c^2 S S^T,
     S = H^-1 sum_ij p_ij J_ij^T J_c / s^2.
+
+    Returns:
+        (6, 6), or (7, 7) with the logarithm of a fitted focal length; None if the points do not fix the pose.
     """
     if linear is None:
         return None
@@ -196,14 +223,14 @@ def local_covariance(linear: "Linearised | None") -> Array | None:
 
 
 def matches_of(linear: "Linearised") -> Linearisation:
-    """Return the matches of a pose as `covariance_of` takes them."""
+    """Convert the matches of a pose to the input of `covariance_of`."""
     chosen = linear.problem.image.chosen
     weight = np.full(len(chosen), len(linear.problem.bearings) / len(chosen))
     return Linearisation(linear.residual, linear.jacobian, linear.probability, linear.image, weight, _known(linear))
 
 
 def _of_louis(linear: "Linearised") -> Array | None:
-    """See `local_covariance`; None where the information is not positive definite."""
+    """Compute `local_covariance` at one scale; None if the information is not positive definite."""
     problem, matches = linear.problem, matches_of(linear)
     if problem.focal is None:
         return covariance_of(matches, fitted=problem.fitted)
@@ -215,7 +242,7 @@ def _of_louis(linear: "Linearised") -> Array | None:
 
 
 def _blocks(problem: Problem, matched: Array) -> Labels:
-    """Return the block (k,) of each chosen image point, of at most `BLOCKS`^2 with as many matched points each.
+    """Return the block (k,) of each chosen image point; the at most `BLOCKS`^2 blocks have equal expected matches.
 
     Args:
         problem: Points.
@@ -229,7 +256,7 @@ def _blocks(problem: Problem, matched: Array) -> Labels:
 
 
 def _quantile(values: Array, weights: Array) -> Labels:
-    """Return which of `BLOCKS` intervals of equal weight each value is in."""
+    """Return the index of each value among `BLOCKS` intervals of equal weight."""
     order = np.argsort(values, kind="stable")
     below = np.empty(len(values))
     below[order] = np.cumsum(weights[order]) - weights[order] / 2
@@ -237,13 +264,20 @@ def _quantile(values: Array, weights: Array) -> Labels:
 
 
 class Linearised(NamedTuple):
-    """A pose, and the k possible matches that are near each other under it, as they depend on it.
+    """A pose and its k possible matches, linearised in the pose.
 
-    image: (k,) places among the chosen image points. probability: (k,) of the match. seen: (k, 3) direction in which
-    the pose sees the scene point. points: (k, 3) of the latter in the camera's axes, from the middle of the scene.
-    residual: (k, 3) of the image point, jacobian: (k, 3, 6) of `seen` by turn and shift about that middle, (k, 3, 7) by
-    the logarithm of a focal length that is fitted too, (k, 3, 8) by a radial coefficient; in scales.
-    scale: standard deviation of the residuals, radians.
+    Attributes:
+        problem: Points of the problem.
+        rotation: (3, 3) of the pose.
+        translation: (3,) of the pose.
+        image: (k,) indices into the chosen image points.
+        probability: (k,) of each match.
+        seen: (k, 3) unit directions of the scene points in the camera's frame.
+        points: (k, 3) scene points in the camera's axes, relative to the scene centroid.
+        residual: (k, 3) of the image points, in units of `scale`.
+        jacobian: (k, 3, 6) derivative of `seen` by rotation and shift about the centroid, in units of `scale`;
+            (k, 3, 7) with the logarithm of a fitted focal length, (k, 3, 8) with a radial coefficient.
+        scale: Standard deviation of the residuals, radians.
     """
 
     problem: Problem
@@ -259,12 +293,22 @@ class Linearised(NamedTuple):
 
     @property
     def middle(self) -> Array:
-        """(3,) of the scene, seen from the camera, in its axes."""
+        """Scene centroid (3,) in the camera's frame."""
         return np.asarray(self.rotation @ self.problem.middle + self.translation)
 
 
 def linearised(problem: Problem, rotation: Array, translation: Array, scale: float) -> Linearised | None:
-    """A pose with the matches that are within a few scales, radians, of each other; None if there is none."""
+    """Linearise a pose and its possible matches.
+
+    Args:
+        problem: Points of the problem.
+        rotation: (3, 3) of the pose.
+        translation: (3,) of the pose.
+        scale: Standard deviation of the residuals, radians; the points of a match are within a few of it.
+
+    Returns:
+        The linearised pose, or None if there is no match.
+    """
     camera = problem.points3d @ rotation.T + translation
     places = facing(problem, camera, rotation)
     if not len(places):
@@ -286,7 +330,7 @@ def linearised(problem: Problem, rotation: Array, translation: Array, scale: flo
 
 
 def _known(linear: Linearised) -> Array:
-    """Return the information (p, p) of the priors about rotation, shift and the fitted parameters of the lens."""
+    """Return the information (p, p) of the priors on rotation, shift and the fitted lens parameters."""
     focal, prior = linear.problem.focal, linear.problem.prior
     size = linear.jacobian.shape[-1]
     information = np.zeros((size, size))
@@ -305,16 +349,19 @@ def _known(linear: Linearised) -> Array:
 
 
 def crossed(vector: Array) -> Array:
-    """The matrix (3, 3) that gives the cross product of `vector` with another."""
+    """Return the cross-product matrix (3, 3) of a vector (3,)."""
     x, y, z = vector
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
 class Misfit(NamedTuple):
-    """How far the pose would be if the camera and the scene were free.
+    """Change of a pose when parameters of the camera or the scene are fitted with it.
 
-    turn: radians. shift: of the middle of the scene, in distances from the camera. zoom: the focal length over the
-    given one, 1 if not that is wrong. radial: radial coefficient, 0 if not that is wrong.
+    Attributes:
+        turn: Rotation of the pose, radians.
+        shift: Shift of the scene centroid, in distances from the camera.
+        zoom: Fitted focal length over the given one; 1 if the given one fits.
+        radial: Radial coefficient; 0 without radial distortion.
     """
 
     turn: float
@@ -324,13 +371,18 @@ class Misfit(NamedTuple):
 
 
 def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = DEFAULT.evidence) -> Misfit:
-    """What is significant in the residuals of a pose, `linearised`, with `count` matches: the largest step of two.
+    """Return the largest change of a pose that its residuals support significantly.
 
-    - Beside the pose, five strains of the scene are fitted to the residuals, weighed with the probabilities of the
-      partners. Of their principal directions, the pose eliminated, those count whose F statistic chance exceeds once in
-      a thousand.
-    - The same with the log of the focal length, once in a hundred (`rule.focal_chance`); with other partners too
-      (`fit_lens`), since those of a linear fit hold it back.
+    - Five strains of the scene are fitted to the residuals together with the pose. Correspondences are weighted with
+      their probabilities. The pose is eliminated, and the principal directions of the strains with a significant F
+      statistic count (level 0.001).
+    - The log of the focal length is fitted and tested likewise (level `rule.focal_chance`, 0.01). If it is significant,
+      `fit_lens` fits it again with new correspondences, since those of a linear fit bias it towards the given one.
+
+    Args:
+        linear: Pose from `linearised`, or None for no change.
+        count: Number of matches.
+        rule: Constants of the verdict.
 
     >>> import numpy as np
     >>> rng = np.random.default_rng(0)
@@ -345,7 +397,7 @@ def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = 
     free = 2 * min(count, float(linear.probability.sum())) - POSE
     zoomed = lens_columns(linear.seen, 0.0)[..., :1] / linear.scale
     strained = linear.jacobian[:, :, 3:POSE] @ (linear.points @ STRAINS).transpose(1, 2, 0)
-    distance = max(float(np.linalg.norm(linear.middle)), 1e-300)  # the unit of the shift, as a radian is of the turn
+    distance = max(float(np.linalg.norm(linear.middle)), 1e-300)  # unit of the shift, like a radian of rotation
     posed = linear.jacobian[:, :, :POSE] * np.repeat([1.0, distance], 3)
     columns = np.concatenate([posed, zoomed, strained, linear.residual[..., None]], -1)
     weighed = (np.sqrt(linear.probability)[:, None, None] * columns).reshape(-1, columns.shape[-1])
@@ -369,20 +421,26 @@ def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = 
 
 
 def misfit_of(rotation: Array, middle: Array, other: LensFit) -> Misfit:
-    """How far a pose with another focal length is from a pose that sees the middle of the scene at (3,)."""
+    """Return the difference between a pose and the pose of another lens.
+
+    Args:
+        rotation: (3, 3) of the pose.
+        middle: (3,) scene centroid in its camera's frame.
+        other: Fitted lens with its pose.
+    """
     shift = float(np.linalg.norm(other.middle - middle)) / max(float(np.linalg.norm(middle)), 1e-300)
     return Misfit(turned_by(rotation, other.rotation), shift, other.zoom, other.radial or 0.0)
 
 
 def bends_significantly(linear: Linearised | None, count: float, rule: Evidence = DEFAULT.evidence) -> bool:
-    """Return whether radial distortion explains the residuals of a pose significantly better, beside a focal length.
+    """Return whether radial distortion explains the residuals of a pose significantly better than a focal length.
 
-    The F test of the radial coefficient, with pose and focal length eliminated, at `focal_chance`.
+    An F test of the radial coefficient at the level `focal_chance`, with pose and focal length eliminated.
 
     Args:
         linear: The pose and its possible matches.
         count: Number of matches.
-        rule: Settings.
+        rule: Constants of the verdict.
     """
     if linear is None or not (linear.problem.bearings[:, 2] > 0).all():
         return False
@@ -390,18 +448,24 @@ def bends_significantly(linear: Linearised | None, count: float, rule: Evidence 
     lens = lens_columns(linear.seen, 0.0) / linear.scale
     columns = [linear.jacobian[:, :, :POSE], lens, linear.residual[..., None]]
     rows = (np.sqrt(linear.probability)[:, None, None] * np.concatenate(columns, -1)).reshape(-1, POSE + 3)
-    # The last two values of R are the radial column and the residuals, without what the columns before explain.
+    # The last column of R ends with the gain of the radial coefficient and the remaining residual.
     triangle = np.asarray(np.linalg.qr(rows, mode="r"))
     gain, rest = float(triangle[-2, -1] ** 2), float(triangle[-1, -1] ** 2)
     return bool(free > 0 and fdtrc(1, free, gain * free / max(rest, free, 1.0)) < rule.focal_chance)
 
 
 def _moved(products: Array, pose: Array, fitted: slice, free: float, chance: float) -> tuple[Array, Array]:
-    """The step (6,) of the pose if the `fitted` columns are fitted to the residuals beside it, and that of these.
+    """Fit parameters to the residuals together with the pose, and keep the significant directions.
 
-    products: of the columns with each other; the first six are the pose's, the last one holds the residuals. pose:
-    (6, 6), the inverse of those of the pose. free: numbers that were measured, less those of the pose. chance: with
-    which less may be significant.
+    Args:
+        products: Inner products of the columns; the first six are the pose's, the last one holds the residuals.
+        pose: (6, 6) inverse of the products of the pose.
+        fitted: Columns of the fitted parameters.
+        free: Number of measurements less the six of the pose.
+        chance: Significance level.
+
+    Returns:
+        Step (6,) of the pose and step of the fitted parameters.
     """
     across = pose @ products[:POSE, fitted]
     values, directions = np.linalg.eigh(products[fitted, fitted] - products[fitted, :POSE] @ across)
@@ -413,7 +477,7 @@ def _moved(products: Array, pose: Array, fitted: slice, free: float, chance: flo
     step = (products[fitted, -1] - across.T @ products[:POSE, -1]) @ directions / values
     gain = step**2 * values
     rest = products[-1, -1] - float(products[-1, :POSE] @ pose @ products[:POSE, -1]) - float(gain.sum())
-    # Beyond `free` is what several possible partners of a point add, not the scale of the residuals.
+    # A value above `free` comes from points with several possible correspondences, not from the scale of the residuals.
     significant = fdtrc(1, free, gain * free / np.clip(rest, 1e-300, free)) < chance / len(values)
     step = directions @ np.where(significant, step, 0.0)
     return np.asarray(across @ step), step

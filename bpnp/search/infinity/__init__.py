@@ -1,1 +1,1 @@
-"""Rotations from points at infinity, such as stars, that nobody has matched."""
+"""Rotations from unmatched points at infinity, such as stars."""

@@ -1,4 +1,4 @@
-"""How likely a rotation fits by chance, how well it is known, and whether the camera is to blame.
+"""Significance and uncertainty of a rotation, and a test for a wrong camera model.
 
 The number of false alarms is that of `bpnp.search.evidence.false_alarms` (`log10_nfa`) for three unknowns: an unrelated
 image point f_i falls with the density l_i of the directions around it; a rotation that explains a fraction w of the
@@ -6,14 +6,15 @@ points with residuals of s predicts
 
     x_i = 1 - w + w exp(-r_i^2 / 2 s^2) / (2 pi s^2 l_i),
 
-r_i the distance to the nearest direction, times as many. Its mean is at most 1 for unrelated points, so that
+times that density, with r_i the distance to the nearest direction. The mean of x_i is at most 1 for unrelated points,
+so that
 
     log10 NFA = log10 T - log10 mean_{s, w} prod_i x_i^(1 / c_i),    T = (m)_2 (n)_2 / 2,
 
-bounds how many rotations fit unrelated points as well: each pair of image points gives one for each pair of directions.
-Two matches fix a rotation, so the two largest x_i are no evidence. c_i image points within 2 s of point i are one
-observation. Where fewer rotations can be told apart than there are pairs, 8 pi^2 h / s^3 of cells of width s, h the
-spread of the image points, that is T.
+bounds the expected number of rotations that fit unrelated points as well. T counts one rotation for each pair of image
+points and pair of directions. Two matches fix a rotation, so the two largest x_i are no evidence. The c_i image points
+within 2 s of point i are one observation. With h the RMS angular radius of the image points, 8 pi^2 h / s^3 rotations
+are distinguishable at s; T is this number if it is smaller.
 
 Sources: A. Desolneux, L. Moisan, J.-M. Morel, Meaningful alignments, IJCV 2000; F. L. Markley, Attitude determination
 using vector observations and the singular value decomposition, J. Astronautical Sciences 1988 (covariance).
@@ -33,13 +34,19 @@ from bpnp.search.kernels.neighbours import sums_near
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
-EXACT = 1e-12  # pixels; matches without noise count as so exact
-STEPS = 5  # scales s, each half of the one before, from the largest noise that is searched for
+EXACT = 1e-12  # smallest noise of matches, pixels
+STEPS = 5  # number of scales s; each is half the previous one, from the largest noise on
 
 
 class Background(NamedTuple):
-    """What chance is measured against, for one problem: scales s (S,) in pixels, logarithm of the number of rotations
-    (S,) and c_i (m, S); the angle of a pixel (m,)."""
+    """Constants of the number of false alarms for one problem.
+
+    Attributes:
+        scales: (S,) scales s, pixels.
+        log_tests: (S,) natural log of the number of tests at each scale.
+        together: (m, S) c_i.
+        pixel: (m,) angle of a pixel, radians.
+    """
 
     scales: Array
     log_tests: Array
@@ -48,13 +55,20 @@ class Background(NamedTuple):
 
 
 def background_of(bearings: Array, pixel: Array, count: int, noise: float, zooms: float = 0.0) -> Background:
-    """Of image points and `count` directions; noise: the largest s, pixels; zooms: of an unknown focal length, the log
-    of the largest over the smallest one."""
+    """Compute the constants of the number of false alarms.
+
+    Args:
+        bearings: (m, 3) of the image points.
+        pixel: (m,) angle of a pixel, radians.
+        count: Number of directions.
+        noise: Largest scale s, pixels.
+        zooms: Log of the largest over the smallest focal length if it is unknown; default 0.
+    """
     m, scales = len(bearings), np.asarray(noise * 0.5 ** np.arange(STEPS), np.float64)
     spread = float(np.sqrt(((bearings - bearings.mean(0)) ** 2).sum(-1).mean()))
     radians = scales * np.median(pixel)
     cells = math.log(10) * log10_rotations(spread, radians)
-    focal_lengths = np.log(np.maximum(zooms * spread / radians, 1.0))  # that differ
+    focal_lengths = np.log(np.maximum(zooms * spread / radians, 1.0))  # distinguishable
     tests = np.minimum(cells + focal_lengths, math.log(max(m * (m - 1) / 2 * count * (count - 1), 1.0)))
     axes = np.linalg.svd(bearings - bearings.mean(0), full_matrices=False)[2][:2].T
     together = sums_near(bearings, bearings, axes, 2 * scales[::-1] * np.median(pixel), np.zeros(STEPS))
@@ -66,8 +80,8 @@ def log10_false_alarms(squared: Array, density: Array, known: Background) -> tup
 
     Args:
         squared: (m,) squared distances to the nearest directions, in squared pixels; infinite beyond reach.
-        density: (m,) of these, a steradian.
-        known: What chance gives.
+        density: (m,) density around these directions, per steradian.
+        known: Constants from `background_of`.
 
     Returns:
         log10 NFA, and the log x_i / c_i (m,) of each image point at the scale and fraction with the largest sum.
@@ -81,11 +95,11 @@ def log10_false_alarms(squared: Array, density: Array, known: Background) -> tup
 
 
 class Known(NamedTuple):
-    """How well a rotation is known.
+    """Uncertainty of a rotation.
 
     Attributes:
-        covariance: (3, 3) of the turn w, R' = exp([w]x) R, radians squared; larger with other fitted numbers.
-        bound: Angle that its error exceeds once in a thousand, radians.
+        covariance: (3, 3) of w, R' = exp([w]x) R, radians squared; (3 + q, 3 + q) with q other fitted parameters.
+        bound: 99.9 % bound of the rotation error, radians.
     """
 
     covariance: Array
@@ -93,23 +107,28 @@ class Known(NamedTuple):
 
 
 def noise_of(seen: Array, bearings: Array, pixel: Array) -> float:
-    """Standard deviation, pixels, of matches between directions `seen` (k, 3) in the camera and bearings (k, 3), whose
-    pixels have the angles `pixel`; NaN if they do not tell one."""
+    """Return the standard deviation of matches, pixels; NaN if the matches are too few.
+
+    Args:
+        seen: (k, 3) directions in the camera's frame.
+        bearings: (k, 3) of the image points.
+        pixel: (k,) angle of a pixel, radians.
+    """
     free = 2 * len(seen) - 3
     return float(np.linalg.norm((bearings - seen) / pixel[:, None])) / math.sqrt(free) if free > 0 else math.nan
 
 
 def how_well_known(seen: Array, bearings: Array, pixel: Array, others: Array | None = None) -> Known:
-    """Compute how well matches fix a rotation, and other numbers that are fitted with it.
+    """Compute the uncertainty of a rotation and of other parameters fitted to matches.
 
     Args:
         seen: (k, 3) directions in the camera.
         bearings: (k, 3) of the image points.
         pixel: (k,) angle of a pixel, radians.
-        others: (k, 3, q) derivatives of `seen` by the other numbers; None for the rotation alone.
+        others: (k, 3, q) derivatives of `seen` by the other parameters; None for the rotation alone.
 
     Returns:
-        The covariance (3 + q, 3 + q), NaN where the matches do not fix them, and the bound of the rotation.
+        Covariance (3 + q, 3 + q), NaN if the matches do not fix the parameters, and the bound of the rotation.
     """
     jacobian = _turned(seen) if others is None else np.concatenate([_turned(seen), others], -1)
     size = jacobian.shape[-1]
@@ -125,19 +144,30 @@ def how_well_known(seen: Array, bearings: Array, pixel: Array, others: Array | N
 
 
 def _turned(seen: Array) -> Array:
-    """Return the derivatives (k, 3, 3) of directions (k, 3) by a turn w, w x v."""
+    """Return the derivatives (k, 3, 3) of directions v (k, 3) by a rotation w, w x v."""
     return np.cross(np.eye(3)[None], seen[:, None]).swapaxes(1, 2)
 
 
 def strain_of(seen: Array, bearings: Array, pixel: Array, all_bearings: Array) -> float:
-    """How far the strain of the image that the residuals of matches show moves a point of it, pixels; 0 where none is
-    significant. A strain, f ~ (I + S) f, is another focal length or a camera that is not as given."""
+    """Return the largest shift of an image point by the strain that the residuals of matches show, pixels.
+
+    A strain, f ~ (I + S) f, is another focal length or another error of the camera model.
+
+    Args:
+        seen: (k, 3) directions of the matches in the camera's frame.
+        bearings: (k, 3) of their image points.
+        pixel: (k,) angle of a pixel, radians.
+        all_bearings: (m, 3) of all image points.
+
+    Returns:
+        Shift in pixels; 0 if no strain is significant.
+    """
     weight = np.repeat(1 / pixel, 3)[:, None]
     cross = _turned(seen).reshape(-1, 3)
     residual = (bearings - seen).ravel() * weight[:, 0]
 
     def moved(points: Array) -> Array:
-        """(k, 3, 5) by each strain."""
+        """Return the derivatives (k, 3, 5) of points by each strain."""
         stretched = np.einsum("sab,kb->kas", STRAINS, points)
         return stretched - points[:, :, None] * np.einsum("ka,kas->ks", points, stretched)[:, None]
 

@@ -1,5 +1,8 @@
-"""A catalogue of directions as it is looked up, each one's neighbours and those near a place of the sphere; and the
-compiled loops over it: directions whose neighbours lie as those of an image point do, and rotations that are fitted."""
+"""Look-up tables of a catalogue of directions, and the compiled loops over them.
+
+The tables hold the nearest neighbours of each direction, and the directions near a point of the sphere. One loop scores
+directions whose neighbours match those of an image point; the other fits rotations.
+"""
 
 import math
 from functools import lru_cache
@@ -13,25 +16,34 @@ from bpnp.loops.vectors import F, compiled, cross, part, rotated, turn
 from bpnp.search.kernels.neighbours import HashedPoints, entry
 
 Array = NDArray[np.float64]
-LOG_HALF = math.log(0.5)  # of a point that the true rotation explains
-TURN = 1 << 16  # steps of an azimuth
-CROWDED = 0.45  # probability that chance puts a direction within reach of a point; beyond, a match says nothing
-DENSITIES = (8, 32)  # neighbours from whose distance the density around a direction is taken; the larger one counts
-KEPT = 4  # catalogues that are remembered: a camera looks at one sky again and again
-MOST = 600_000  # neighbours of all directions, 7 megabytes
+LOG_HALF = math.log(0.5)  # log probability of a match under the true rotation
+TURN = 1 << 16  # steps of an azimuth in a full circle
+CROWDED = 0.45  # probability of a direction in reach by chance, from which a match is no evidence
+DENSITIES = (8, 32)  # numbers of neighbours that give the density around a direction; the larger density counts
+KEPT = 4  # size of the cache of catalogues: a camera sees the same sky repeatedly
+MOST = 600_000  # number of stored neighbours of all directions, 7 megabytes
 
 
 class Sky(NamedTuple):
-    """Directions (n, 3) in a table to be looked up within a chord, and how many there are around each (n,), a
-    steradian."""
+    """Directions for look-up within a chord.
+
+    Attributes:
+        table: Hash table of unit directions (n, 3).
+        density: (n,) density around each direction, per steradian.
+    """
 
     table: HashedPoints
     density: Array
 
 
 class Neighbours(NamedTuple):
-    """The nearest directions of each, by ascending distance: place (n, k), chord (n, k), and azimuth (n, k) in `TURN`
-    steps a turn, from a zero of each."""
+    """Nearest neighbours of each direction, by ascending distance.
+
+    Attributes:
+        place: (n, k) indices of the neighbours.
+        chord: (n, k) chords to them.
+        azimuth: (n, k) azimuths in `TURN` steps per circle, from a zero of each direction.
+    """
 
     place: NDArray[np.int32]
     chord: NDArray[np.float32]
@@ -39,7 +51,13 @@ class Neighbours(NamedTuple):
 
 
 class Catalogue(NamedTuple):
-    """Unit directions (n, 3), their density (n,) a steradian, and the nearest neighbours of each."""
+    """Catalogue of directions.
+
+    Attributes:
+        directions: (n, 3) unit vectors.
+        density: (n,) density around each, per steradian.
+        neighbours: Nearest neighbours of each.
+    """
 
     directions: Array
     density: Array
@@ -47,14 +65,18 @@ class Catalogue(NamedTuple):
 
 
 def catalogue_of(directions: Array) -> Catalogue:
-    """What is looked up of unit directions (n, 3); the last ones are remembered."""
+    """Build the catalogue of unit directions (n, 3); the last `KEPT` ones are cached."""
     return _catalogue(directions.tobytes())
 
 
 @lru_cache(KEPT)
 def _catalogue(content: bytes) -> Catalogue:
-    """Of n directions k - 1 more lie within the chord d of one: their density is k / (pi d^2), for a cap of the sphere
-    has the area pi d^2. With the direction itself among the k the mean of its inverse is that of an even spread."""
+    """Build the catalogue of the n directions with these bytes.
+
+    A cap of the sphere with the chord d has the area pi d^2. If d is the chord to the k-th neighbour, the density is
+    k / (pi d^2): k - 1 neighbours lie within d, and the direction itself. The mean of its inverse is that of an even
+    spread.
+    """
     directions = np.frombuffer(content).reshape(-1, 3)
     count = len(directions)
     nearest = min(max(MOST // count, DENSITIES[-1]), count - 1)
@@ -68,8 +90,15 @@ def _catalogue(content: bytes) -> Catalogue:
 
 
 def azimuths(centres: Array, others: Array) -> NDArray[np.int32]:
-    """Directions (c, k) in which unit vectors (c, k, 3) lie from others (c, 3), in `TURN` steps a turn, from a zero of
-    each centre."""
+    """Return the azimuths of unit vectors around centres.
+
+    Args:
+        centres: (c, 3) unit vectors.
+        others: (c, k, 3) unit vectors.
+
+    Returns:
+        (c, k) azimuths in `TURN` steps per circle, from a zero of each centre.
+    """
     across = np.cross(centres, np.eye(3)[np.abs(centres).argmin(-1)])
     across /= np.linalg.norm(across, axis=-1, keepdims=True)
     x, y = (np.einsum("cka,ca->ck", others, axis) for axis in (across, np.cross(centres, across)))
@@ -77,8 +106,14 @@ def azimuths(centres: Array, others: Array) -> NDArray[np.int32]:
 
 
 class Rays(NamedTuple):
-    """The image points around one, by ascending distance: between which chords each may lie (k,), its azimuth (k,), and
-    the nats by which a neighbour there is likelier under the true rotation than by chance (k,)."""
+    """Image points around one, by ascending distance.
+
+    Attributes:
+        low: (k,) smallest possible chord to the point.
+        high: (k,) largest possible chord.
+        azimuth: (k,) azimuth in `TURN` steps per circle.
+        nats: (k,) log likelihood ratio of a neighbour there under the true rotation and by chance.
+    """
 
     low: NDArray[np.float32]
     high: NDArray[np.float32]
@@ -87,15 +122,26 @@ class Rays(NamedTuple):
 
 
 class Image(NamedTuple):
-    """Image points: unit bearings (m, 3), and the angle of a pixel at each (m,), radians."""
+    """Image points.
+
+    Attributes:
+        bearings: (m, 3) unit vectors.
+        pixel: (m,) angle of a pixel at each, radians.
+    """
 
     bearings: Array
     pixel: Array
 
 
 class Fit(NamedTuple):
-    """A rotation (3, 3), normal matrix (3, 3) and matches of the m points: place of the direction, -1 for none, and
-    squared chord in squared pixels."""
+    """Rotation that is fitted.
+
+    Attributes:
+        rotation: (3, 3).
+        normal: (3, 3) normal matrix.
+        match: (m,) index of the direction of each image point, -1 for none.
+        squared: (m,) squared chord to it, in squared pixels.
+    """
 
     rotation: Array
     normal: Array
@@ -105,7 +151,7 @@ class Fit(NamedTuple):
 
 @part
 def _nearest(sky: Any, x: Any, y: Any, z: Any, squared: Any) -> Any:
-    """Place of the direction nearest to (x, y, z) within the squared chord, -1 for none, and its squared chord."""
+    """Return the index of the nearest direction within a squared chord, -1 for none, and its squared chord."""
     directions, reach, heads, links = sky.table
     place, least = -1, squared
     e = heads[entry(heads, x, y, z, 2 * reach)]
@@ -121,10 +167,16 @@ def _nearest(sky: Any, x: Any, y: Any, z: Any, squared: Any) -> Any:
 
 @compiled
 def vote(neighbours: Any, places: Any, rays: Any, shift: int, bins: Any, value: Any, bin_of: Any) -> None:
-    """How well an image point agrees with directions: each ray votes for the turns that take it to a neighbour.
+    """Score the agreement of an image point with directions: each ray votes for azimuth shifts to neighbours.
 
-    places (p,): of the directions. shift: of an azimuth to its place in bins (2^s,), of which two that lie side by side
-    count together. value, bin_of (p,): the most nats, and the second of the bins that have them.
+    Args:
+        neighbours: `Neighbours` of all directions.
+        places: (p,) indices of the directions.
+        rays: `Rays` of the image point.
+        shift: Right shift of an azimuth that gives its bin.
+        bins: (2^s,) working memory for the votes; two adjacent bins count together.
+        value: (p,) output, the largest votes, nats.
+        bin_of: (p,) output, the second of the two bins with these votes.
     """
     count, mask = neighbours.chord.shape[1], len(bins) - 1
     for p in range(len(places)):
@@ -148,7 +200,7 @@ def vote(neighbours: Any, places: Any, rays: Any, shift: int, bins: Any, value: 
 
 @part
 def _invert(normal: Any, matrix: Any) -> None:
-    """matrix (3, 3): the inverse of a positive definite one, a little damped, by Gauss and Jordan."""
+    """Invert a positive definite matrix (3, 3), slightly damped, by Gauss-Jordan elimination; write it to `matrix`."""
     size = len(matrix)
     for r in range(size):
         for c in range(size):
@@ -169,12 +221,21 @@ def _invert(normal: Any, matrix: Any) -> None:
 
 @compiled
 def fit(image: Any, chosen: Any, sky: Any, reach: float, rounds: int, result: Any, scratch: Any) -> float:
-    """Gauss-Newton steps on the nearest directions within `reach` pixels, and as much more as the fit is uncertain.
+    """Fit a rotation by Gauss-Newton steps on the nearest directions.
 
-    chosen (k,): the image points that take part. result: `Fit`, in place; its normal matrix is that of what is known
-    before. scratch (4, 3). Returns the nats by which the matches are likelier than by chance.
+    For the rotation w of a direction v seen at f, the normal matrix is the sum of I - f f^T, and v x f the gradient.
 
-    For the turn w of a direction v seen at f, (I - f f^T) summed is the normal matrix and v x f the gradient.
+    Args:
+        image: `Image` with m points.
+        chosen: (k,) indices of the image points that are used.
+        sky: `Sky` of the directions.
+        reach: Largest distance of a match, pixels; it grows with the uncertainty of the rotation.
+        rounds: Number of steps.
+        result: `Fit`, updated in place; its normal matrix is the prior information.
+        scratch: (4, 3) working memory.
+
+    Returns:
+        Log likelihood ratio of the matches under the rotation and by chance, nats.
     """
     covariance, step, turned, normal = scratch[:3], scratch[3], result.rotation, result.normal
     directions, widest, total = sky.table.points, sky.table.tolerance, 0.0

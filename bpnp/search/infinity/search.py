@@ -1,11 +1,11 @@
-"""The rotation of a camera that sees directions, of which nobody knows which is which.
+"""Search for the rotation of a camera that sees unmatched directions.
 
-An image point is compared with every direction by what lies around it: a neighbour at the distance of another image
-point votes for the turn about the two that takes the one to the other. The rotations with most votes are fitted, and
-what is left is weighed.
+An image point is compared with every direction by their neighbours. A neighbour of the direction at the distance of
+another image point votes for the rotation that aligns both pairs. The rotations with the most votes are fitted and
+judged.
 
-Of an alternative that could contest the best rotation it is known how many points it explains at least, and each of
-them gives it: that none was met bounds the probability that there is one.
+A rotation that could compete with the best one explains a minimum number of points. Each of these points, when tried,
+proposes it. If no competing rotation was found, this bounds the miss probability.
 """
 
 import math
@@ -49,32 +49,41 @@ from bpnp.search.kernels.neighbours import hashed
 from bpnp.search.settings import DEFAULT as SEARCH
 from bpnp.search.verdict import SearchResult, no_pose
 
-BINS = (6, 7)  # log2 of the fewest and most bins of azimuths
+BINS = (6, 7)  # log2 of the smallest and largest number of azimuth bins
 
 
 @dataclass(frozen=True)
 class InfinitySettings:
-    """Every constant that tunes the search for a rotation.
+    """Constants of the search for a rotation.
 
-    noise: standard deviations of image points, pixels, for which it is searched, one after the other.
-    reach: standard deviations within which a point is a match. cell: of the hash table, in reaches; what is less
-        certain is no match yet.
-    around: image points around one whose turn about it has to agree. narrowest: least distance of them, in those by
-        which a chord may be off, so that their azimuths are known to a tenth.
-    first, promising: of these, how many nearest ones choose how many directions, which all of them look at.
-    refined: rotations of a point that are fitted: in `rounds` steps to the points around it, then in `last_rounds` to
-        `sample` others too, and to all.
-    contests: share of the nats of the best rotation that one of a sample of the points has to have to be fitted to all.
-    power: share of the true matches that give their rotation. turns: image points that are tried, at most.
-    rougher: of the noise that is searched for, how much more matches may show before a larger one is.
-    strained: matches, at most, that are asked whether another camera explains them better.
-    least_share: of the image points that a rotation explains, for which those that were tried have to be enough
-        where chance explains all that was found.
-    zoom: factor from one focal length to the next, where it is unknown. zoom_noise: pixels, of the first search with
-        each, since points near the edge are off by the error of the focal length; where it fails, `noise` is tried,
-        since among many directions chance fits as well at the rough one. zoom_share: `least_share` of these searches.
-        zoom_alarms: log10 of the false alarms up to which the focal length is fitted to the matches; those of chance
-        are mostly above 8. zoom_rounds: of fits and searches, until the focal length changes by less than zoom_same.
+    Attributes:
+        noise: Standard deviations of image points, pixels, that are tried one after the other.
+        reach: Distance, in standard deviations, within which a point is a match.
+        cell: Cell of the hash table, in reaches; a point with a larger reach gets no match yet.
+        around: Number of image points around one that vote.
+        narrowest: Smallest chord to them, in errors of a chord, which limits the azimuth error to 1/10 radian.
+        first: Number of the nearest of them that preselect directions.
+        promising: Number of preselected directions, which all of them vote on.
+        refined: Number of rotations of a point that are fitted.
+        sample: Number of further points that a rotation is fitted to before it is fitted to all.
+        rounds: Steps of the fit to the points around one.
+        last_rounds: Steps of the fit to the sample, and of that to all points.
+        contests: Smallest evidence on the sample of a rotation that is fitted to all points, as a fraction of that of
+            the best one.
+        power: Fraction of the true matches that propose their rotation.
+        turns: Largest number of image points that are tried.
+        rougher: Largest noise of the matches, in multiples of the tried one, before the next one is tried.
+        strained: Largest number of matches that are tested for an error of the camera model.
+        least_share: Fraction of the image points that a rotation explains. An unsuccessful search ends when it would
+            have found such a rotation.
+        zoom: Factor from one focal length to the next if it is unknown.
+        zoom_noise: Noise of the first search at each focal length, pixels; it includes the error of the focal length
+            near the edge. If it fails, `noise` is tried, since many directions are not significant at a large noise.
+        zoom_share: `least_share` of these searches.
+        zoom_alarms: Largest log10 NFA from which the focal length is fitted to the matches; by chance it is mostly
+            above 8.
+        zoom_rounds: Largest number of rounds of fit and search.
+        zoom_same: Relative change of the focal length below which these end.
     """
 
     noise: tuple[float, ...] = (0.35, 1.4)
@@ -106,7 +115,18 @@ DEFAULT = InfinitySettings()
 
 
 class Sight(NamedTuple):
-    """One problem at one noise: what is looked for where."""
+    """One problem at one noise.
+
+    Attributes:
+        image: Image points.
+        catalogue: Directions with their neighbours.
+        sky: Directions for look-up.
+        known: Constants of the number of false alarms.
+        reach: Largest distance of a match, pixels.
+        density: Median density of the directions, per steradian.
+        sample: Indices of the sample of image points.
+        settings: Constants.
+    """
 
     image: Image
     catalogue: Catalogue
@@ -119,10 +139,16 @@ class Sight(NamedTuple):
 
 
 def log10_missed(tried: int, count: int, least: int, power: float) -> float:
-    """Compute log10 of the probability that a rotation which explains `least` of `count` points was not found.
+    """Compute log10 of the probability that a rotation which explains `least` of `count` points was missed.
 
-    Each tried point that it explains gives it with the probability `power`, so that a rotation may be missed even where
-    all points were tried. The number of tried points among the explained ones is hypergeometric.
+    Each tried point that it explains proposes it with the probability `power`, so a rotation may be missed even if all
+    points were tried. The number of tried points among the explained ones is hypergeometric.
+
+    Args:
+        tried: Number of image points that were tried.
+        count: Number of image points.
+        least: Number of image points that the rotation explains.
+        power: Probability that one of these, when tried, proposes the rotation.
 
     >>> round(log10_missed(10, 10, 4, 0.9), 6)
     -4.0
@@ -130,7 +156,7 @@ def log10_missed(tried: int, count: int, least: int, power: float) -> float:
     hit = np.arange(tried + 1)
     chosen = _log_choose(least, hit) + _log_choose(count - least, tried - hit)
     unmet = chosen - _log_choose(count, np.array([tried])) + hit * math.log(1 - power)
-    return round(float(np.logaddexp.reduce(unmet)) / math.log(10), 9)  # exact where all were tried
+    return round(float(np.logaddexp.reduce(unmet)) / math.log(10), 9)  # exact if all were tried
 
 
 def _log_choose(n: int, k: Labels) -> Array:
@@ -149,20 +175,20 @@ def search_rotation(
     deadline: Deadline = NEVER,
     settings: InfinitySettings = DEFAULT,
 ) -> SearchResult:
-    """Search the rotation under which image points see directions.
+    """Search for the rotation under which image points see directions.
 
     Args:
         image: Image points (m).
         directions: (n, 3) unit vectors.
-        scores: (m,) points with the largest ones are tried first.
+        scores: (m,) scores; points with the largest ones are tried first. None: random order.
         noise: Standard deviation of the image points, pixels; None if it is unknown.
-        zooms: Logarithm of the largest over the smallest focal length, of one that is one of several.
-        seed: Of the order in which points are tried.
+        zooms: Logarithm of the largest over the smallest focal length, if this is one of several; default 0.
+        seed: Random seed of the order in which points are tried.
         deadline: When to stop.
         settings: Constants.
 
     Returns:
-        The verdict and the rotations, with translations of 0; `batches` is the number of image points that were tried.
+        Verdict and rotations, with translations of 0; `batches` is the number of image points that were tried.
     """
     catalogue, sample = catalogue_of(directions), np.random.default_rng(seed).permutation(len(image.bearings))
     density = float(np.median(catalogue.density))
@@ -171,7 +197,7 @@ def search_rotation(
         if turns and deadline.passed():
             break
         reach = settings.reach * scale
-        # A copy may be written to, as the points that are looked up elsewhere: the loops are compiled once.
+        # A writable copy has the type of other look-up points, so that the loops are compiled once.
         table = hashed(directions.copy(), settings.cell * reach * float(np.median(image.pixel)))
         background = background_of(image.bearings, image.pixel, len(directions), 2 * scale, zooms)
         sight = Sight(
@@ -194,8 +220,11 @@ def search_rotation(
 
 
 def _matches(sight: Sight, found: Hypotheses) -> tuple[Array, Array, Array]:
-    """Return the matches of the best rotation: directions in the camera (k, 3), bearings (k, 3) and angles of a pixel
-    (k,)."""
+    """Return the matches of the best rotation.
+
+    Returns:
+        Directions in the camera's frame (k, 3), bearings (k, 3) and angles of a pixel (k,).
+    """
     assert found.matches is not None
     matched = np.flatnonzero(found.matches[0] >= 0)
     seen = sight.catalogue.directions[found.matches[0, matched]] @ found.rotation[0].T
@@ -230,9 +259,9 @@ def _search(sight: Sight, scores: Array | None, seed: int, deadline: Deadline) -
 
 
 def _rays(sight: Sight, i: int, tree: cKDTree) -> tuple[Labels, Rays, int]:
-    """The image points around one (k,), what they say of its neighbours, and in how many bins their votes are counted.
+    """Return the indices (k,) of the image points around one, their rays, and the number of azimuth bins.
 
-    A chord is off by the noise of both ends, and an azimuth by as much over the chord.
+    The error of a chord is the noise of both ends. That of an azimuth is this error over the chord.
     """
     settings, bearings, pixel = sight.settings, sight.image.bearings, sight.image.pixel
     chord, around = tree.query(bearings[i], min(4 * settings.around, len(bearings)))
@@ -250,8 +279,11 @@ def _rays(sight: Sight, i: int, tree: cKDTree) -> tuple[Labels, Rays, int]:
 
 
 def _agreeing(sight: Sight, i: int, around: Labels, rays: Rays, bins: int) -> Iterator[tuple[Array, int]]:
-    """The rotations for which most speaks that lies around an image point, likeliest first, and the farthest point that
-    does so."""
+    """Propose rotations that the neighbours of an image point support.
+
+    Yields:
+        Rotation (3, 3), most votes first, and the index of the farthest image point that supports it.
+    """
     settings, neighbours = sight.settings, sight.catalogue.neighbours
     shift = (TURN // bins).bit_length() - 1
     places, bin_of = np.arange(len(neighbours.chord)), np.empty(0, np.int64)
@@ -277,18 +309,26 @@ def _agreeing(sight: Sight, i: int, around: Labels, rays: Rays, bins: int) -> It
             k, e = np.nonzero(agrees)
             seen, directions = np.r_[i, around[k]], np.r_[a, neighbours.place[a, e]]
             left, _, right = np.linalg.svd(sight.image.bearings[seen].T @ sight.catalogue.directions[directions])
-            yield left * [1, 1, np.linalg.det(left @ right)] @ right, int(seen[-1])  # with least squares
+            yield left * [1, 1, np.linalg.det(left @ right)] @ right, int(seen[-1])  # least squares
 
 
 def _fitted(
     sight: Sight, rotation: Array, near: Labels, farthest: int, some: Labels, found: Hypotheses
 ) -> Hypotheses | None:
-    """Fit a rotation to the points near a first one, then to some others, and to all of them.
+    """Fit a rotation to the points near a first one, then to a sample, and then to all points.
 
-    It is known as well as two points fix it, the first and the farthest that agrees.
+    Its initial uncertainty is that of a rotation fixed by two points, the first and the farthest that supports it.
+
+    Args:
+        sight: The problem.
+        rotation: (3, 3) initial rotation.
+        near: Indices of the first point and those around it.
+        farthest: Index of the farthest point that supports the rotation.
+        some: Indices of these points and the sample.
+        found: Rotations that were found, best first.
 
     Returns:
-        The rotation (1,); None where it does not compete with the best one that was found, or is one of those.
+        The rotation (1,); None if it cannot compete with the best one, or was found before.
     """
     image, settings, m = sight.image, sight.settings, len(sight.image.bearings)
     two, weight = image.bearings[[near[0], farthest]], image.pixel[[near[0], farthest]] ** -2.0
@@ -319,14 +359,16 @@ def _fitted(
 
 
 def _is_same(sight: Sight, rotations: Array, other: Array, indices: Labels) -> NDArray[np.bool_]:
-    """Return which of rotations (c, 3, 3) see some points where another one does, to within the reach."""
+    """Return which rotations (c, 3, 3) agree with another one to within the reach at the points `indices`."""
     limit = sight.reach * float(np.median(sight.image.pixel[indices]))
     return np.asarray((np.linalg.norm(sight.image.bearings[indices] @ (rotations - other), axis=-1) < limit).all(-1))
 
 
 def _merge(found: Hypotheses, new: Hypotheses, sight: Sight) -> Hypotheses:
-    """Return the rotations with another one (1,), the best first; of those that are the same the best, and of those
-    that are not significant none but a first one."""
+    """Add a rotation (1,) to the others, best first.
+
+    Only the best of equal rotations is kept, and a rotation that is not significant only if it is the best of all.
+    """
     alike = _is_same(sight, found.rotation, new.rotation[0], np.arange(len(sight.image.bearings)))
     if (found.log10_false_alarms[alike] <= new.log10_false_alarms).any():
         return found
@@ -345,7 +387,7 @@ def _judged(found: Hypotheses, sight: Sight, turns: int) -> SearchResult:
         return SearchResult(found, "failed", reasons.against("no rotation fits better than chance", alarms), turns)
     hit = np.flatnonzero(found.matches[0] >= 0)
     worth = found.point_evidence[0, hit] / math.log(10)
-    most = float(worth.mean() + 2 * worth.std() / math.sqrt(len(hit)))  # that a match of an alternative may be worth
+    most = float(worth.mean() + 2 * worth.std() / math.sqrt(len(hit)))  # largest for a competing rotation
     least = max(math.ceil((float(worth.sum()) - rule.lead) / most), FIXING_ROTATION + 1)
     count = len(sight.image.bearings)
     missed = log10_missed(turns, count, min(least, count), sight.settings.power)
@@ -357,7 +399,7 @@ def _judged(found: Hypotheses, sight: Sight, turns: int) -> SearchResult:
         doubt = f"another rotation fits about as well (margin {lead:.1f} decades)"
     elif missed > rule.missed:
         doubt = f"a better rotation may exist (miss probability up to {reasons.number(missed)})"
-    else:  # what costs more is asked only where the verdict depends on it
+    else:  # the costly tests are run only if the verdict depends on them
         seen, bearings, pixel = _matches(sight, found)
         some = np.linspace(0, len(hit) - 1, min(len(hit), sight.settings.strained)).astype(np.int64)
         known = how_well_known(seen, bearings, pixel)

@@ -1,1 +1,1 @@
-"""One pose of several cameras that are fixed to each other."""
+"""Pose of a rig: several cameras that are fixed to each other."""

@@ -1,13 +1,13 @@
-"""Cameras that are fixed to each other: their common pose, what is evidence for it, and the optimum beside it.
+"""Pose of a rig, cameras that are fixed to each other: its evidence, covariance and refinement.
 
 The image points of the cameras are independent, so the logs of their likelihood ratios add up. Three matches fix the
-pose of all: the three largest terms are left out once, in that camera where they count most. The tests are those of all
-cameras together, for each of them proposes poses from its own triples.
+pose of the rig. The three largest terms are left out once, in the camera where they count most. The numbers of tests of
+all cameras add up, since each camera proposes poses from its own triples.
 
-Image points do not tell the unit of the scene, but cameras that are apart tell it in units of the rig. Translations of
-the rig are homogeneous, (t, u) in units of the scene with u of them in a unit of the rig, so that camera k has the
-translation [C_k | c_k] (t, u). Where u is not known one more match is left out and counted in the tests, in another
-camera than the three.
+Image points do not determine the unit of the scene, but cameras with a non-zero baseline determine it in units of the
+rig. Translations of the rig are homogeneous: (t, u) in units of the scene, with u of them in a unit of the rig. Camera
+k has the translation [C_k | c_k] (t, u). If u is unknown, one more match is left out and counted in the tests. It is in
+another camera than the three.
 """
 
 import math
@@ -28,17 +28,21 @@ from bpnp.search.scene import Scene
 
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]
-WIDE = 60.0  # smallest believable scales, at which proposals are compared: a pose of one camera is off in another
-STEPS, AGAIN = 9, 2  # scales, each smaller than the one before, and Gauss-Newton steps at each
-WEIGHED = 7  # scales, the last ones, at which poses are weighed
-SAME_CENTRE = 1e-6  # of the farthest centre from the origin of the rig
+WIDE = 60.0  # scale at which proposals are compared, in smallest scales: a pose of one camera is inaccurate in another
+STEPS, AGAIN = 9, 2  # number of decreasing scales, and Gauss-Newton steps at each
+WEIGHED = 7  # number of the last scales at which the false alarms of poses are computed
+SAME_CENTRE = 1e-6  # fraction of the largest coordinate of a camera centre in the rig; nearer centres coincide
 
 
 class Rig:
-    """Cameras with their points, all of the same scene; `mounts`, camera_k = C_k rig + c_k. Its translations are
-    homogeneous; is_metric: whether their last number is 1, else it is looked for.
+    """Rig cameras with their points of one scene. Translations of the rig are homogeneous.
 
-    c_k is in sizes of the scene, as are the translations: a rig and a scene in one unit are divided by the same number.
+    c_k and the translations are in sizes of the scene: a rig and a scene with the same unit are divided by one number.
+
+    Args:
+        problems: Points of each camera.
+        mounts: Extrinsics (C_k, c_k) of each camera, camera_k = C_k rig + c_k.
+        is_metric: True if the last component of the translations is 1; else it is unknown. Default True.
     """
 
     def __init__(self, problems: Sequence[Problem], mounts: Sequence[Pose], *, is_metric: bool = True) -> None:
@@ -52,30 +56,34 @@ class Rig:
         self.apart = [(k, other) for k, other in pairs if np.linalg.norm(centres[k] - centres[other]) > least]
 
     def pose_of(self, k: int, rotation: Array, translation: Array) -> Pose:
-        """Of camera k, for poses (..., 3, 3), (..., 4) of the rig."""
+        """Return the poses of camera k for poses (..., 3, 3), (..., 4) of the rig."""
         turn, shift = self.mounts[k]
         return turn @ rotation, translation[..., :3] @ turn.T + translation[..., 3:] * shift
 
     def rig_of(self, k: int, rotation: Array, translation: Array, unit: Array | float = 1.0) -> Pose:
-        """Of the rig, for those of camera k, whose scene has this many of its units in one of the rig."""
+        """Return the poses of the rig for poses of camera k; `unit` is the length of a rig unit in scene units."""
         turn, shift = self.mounts[k]
         units = np.broadcast_to(unit, (*translation.shape[:-1], 1))
         return turn.T @ rotation, np.concatenate([(translation - units * shift) @ turn, units], -1)
 
     def join(self, scenes: Mapping[int, Scene]) -> None:
-        """Make the scenes of cameras companions of each other, if their unit is known."""
+        """Register the scenes of the cameras with each other for common searches, if the unit is known."""
         for k, other in permutations(scenes, 2) if self.unknowns == 6 else ():
             (turn, shift), (others, moved) = self.mounts[k], self.mounts[other]
             scenes[k].join(scenes[other], others @ turn.T, moved - others @ turn.T @ shift)
 
     def seen(self, k: int, poses: Hypotheses) -> Hypotheses:
-        """Poses of the rig as those of camera k, whose alternatives that need a derivative are asked of one camera."""
+        """Convert poses of the rig to poses of camera k, for tests of competing explanations in one camera."""
         turns, shifts = self.pose_of(k, poses.rotation, poses.translation)
         return replace(poses, rotation=turns, translation=shifts)
 
     def linearised(self, rotation: Array, translation: Array, scale: float) -> list[tuple[Array, Linearised]]:
-        """Each camera that sees a point near an image point, and the matrix (6, unknowns) that makes a step of the rig
-        one of it; the seventh number is the logarithm of the scale."""
+        """Linearise the pose in each camera with a possible match.
+
+        Returns:
+            For each such camera, the matrix (6, unknowns) that converts a step of the rig to one of the camera, and its
+            linearised pose. The seventh unknown is the logarithm of the scale.
+        """
         found = []
         for k, problem in enumerate(self.problems):
             linear = linearised(problem, *self.pose_of(k, rotation, translation), scale)
@@ -87,7 +95,11 @@ class Rig:
         return found
 
     def refined(self, rotation: Array, translation: Array) -> Iterator[tuple[Array, Array, float, float]]:
-        """The optimum beside a pose at ever smaller scales, radians, with that scale and the number of matches."""
+        """Refine a pose at decreasing scales.
+
+        Yields:
+            Rotation, translation, scale (radians) and expected number of matches after each step.
+        """
         middle = self.problems[0].middle
         for scale in np.geomspace(WIDE, 1.0, STEPS).repeat(AGAIN) * self.floor:
             information, gradient, count = np.zeros((self.unknowns, self.unknowns)), np.zeros(self.unknowns), 0.0
@@ -110,7 +122,7 @@ class Rig:
     def alarms(self, rotation: Array, translation: Array, scale: float) -> tuple[float, float]:
         """Return log10 of the number of false alarms at the scale of the residuals, and at rougher ones.
 
-        Three matches of a camera fix the pose; of an unknown scale, one more of a camera that is apart from it.
+        Three matches of a camera fix the pose. An unknown scale needs one more, of a camera with a non-zero baseline.
         """
         tests = math.log10(sum(10 ** log10_tests(each) for each in self.problems))
         if self.unknowns == 7:
@@ -127,14 +139,19 @@ class Rig:
         return [camera_terms(*each, scale) for each in zip(self.problems, seen, strict=True)]
 
     def evidence(self, rotation: Array, translation: Array, scale: float | None = None) -> Array:
-        """log (cameras,) of how much likelier the bearings of each are under a pose than by chance, at the scale of the
-        residuals, or of each camera at any."""
+        """Return the log likelihood ratio (cameras,) of the bearings under a pose and by chance.
+
+        It is taken at the scale of the residuals, radians; None takes the mean over all scales.
+        """
         terms = self._terms(rotation, translation, scale)
         return np.array([0.0 if one is None else one.evidence(0)[0] for one in terms])
 
     def covariance(self, rotation: Array, translation: Array, scale: float) -> Array | None:
-        """Covariance of the turn, of the shift of the middle of the scene, in the axes of the rig, and of the logarithm
-        of the scale if that is unknown."""
+        """Return the covariance of the pose in the axes of the rig, or None if the points do not fix it.
+
+        It is that of the rotation, the shift of the scene centroid and the logarithm of an unknown scale, (6, 6) or
+        (7, 7).
+        """
         for sharper in (1.0, 1 / math.sqrt(2)):  # as `local_covariance`
             parts = []
             for turn, linear in self.linearised(rotation, translation, sharper * scale):
@@ -146,7 +163,7 @@ class Rig:
         return None
 
     def candidates(self, rotations: Array, translations: Array) -> Hypotheses:
-        """Return poses refined on all cameras, at the scale at which their false alarms are fewest."""
+        """Return poses refined on all cameras, each at the scale with the fewest false alarms."""
         ends = []
         for rotation, translation in zip(rotations, translations, strict=True):
             last = list(self.refined(rotation, translation))[AGAIN - 1 :: AGAIN][-WEIGHED:]

@@ -1,9 +1,9 @@
-"""One pose of several cameras that are fixed to each other: proposed by each alone, refined and judged on all of them.
+"""Search for the pose of a rig: proposed by each camera alone, refined and judged on all cameras.
 
-Few points of a camera are enumerated. Cameras with many search in turns, each as if it were alone but that raster
-searches look points up in all of them; of what a turn finds those poses are refined that have most evidence in all
-cameras together, and the search ends where the best is certain. As long as none exceeds chance, each round ends with a
-raster search around that with most evidence.
+A camera with few points enumerates poses. Cameras with many points search in rounds, one iteration each. Their
+iterations are those of a single camera, except that density-map searches use the points of all cameras. The poses of an
+iteration with the most evidence in all cameras are refined. The search ends when the best pose is confident. Until a
+pose is significant, each round ends with a density-map search around the pose with the most evidence.
 """
 
 import math
@@ -29,18 +29,28 @@ from bpnp.search.search import lacks_partners
 from bpnp.search.settings import DEFAULT
 from bpnp.search.verdict import SearchResult, judged, missed, no_pose
 
-PROPOSING = replace(ENUMERATION, kept=4000)  # poses of few points that a camera proposes
-REFINED = 16  # poses of all cameras
-A_TURN = 2  # poses that a turn of a camera finds and that are refined
-COMPARED = 64  # proposals of which it is asked how much evidence they have
-BEFORE = 1e9  # nats, more than any pose explains: of those that were refined before
-AGREE_DEG, AGREE, PAIRS = 6.0, 0.2, 50_000  # of poses of two cameras that tell a scale: turn, shift in distances, most
-LEAST_APART = 0.01  # of two cameras, in distances of the scene: a scale with which they are nearer cannot be told
+PROPOSING = replace(ENUMERATION, kept=4000)  # number of poses that a camera with few points proposes
+REFINED = 16  # number of enumerated poses that are refined, and of distinct poses that are kept
+A_TURN = 2  # number of poses of an iteration that are refined
+COMPARED = 64  # largest number of proposals whose evidence is computed
+BEFORE = 1e9  # score of the poses that were refined before, nats: above the evidence of any pose
+AGREE_DEG, AGREE, PAIRS = 6.0, 0.2, 50_000  # two poses agree within: deg, distances; most pairs
+LEAST_APART = 0.01  # smallest baseline of two cameras, in distances of the scene, that determines the scale
 
 
 @one_blas_thread
 def search_rig(rig: Rig, *, clutter: float | None = None, seed: int = 0, deadline: Deadline = NEVER) -> SearchResult:
-    """Distinct poses of the rig, best first, and the verdict on the first one; arguments as for `search_poses`."""
+    """Search for the pose of a rig.
+
+    Args:
+        rig: Cameras with their points.
+        clutter: Expected outlier fraction; None if it is unknown.
+        seed: Random seed.
+        deadline: When to stop.
+
+    Returns:
+        Distinct poses of the rig, best first, and the verdict on the first one.
+    """
     settings = DEFAULT if clutter is None else DEFAULT.expecting(clutter)
     together, searches, few = Together(rig), dict[int, Iterator[Hypotheses]](), dict[int, Hypotheses]()
     for k, problem in enumerate(rig.problems):
@@ -75,11 +85,15 @@ def search_rig(rig: Rig, *, clutter: float | None = None, seed: int = 0, deadlin
 
 
 class Together:
-    """What the cameras of a rig have proposed, and the best of it refined on all.
+    """Proposals of the cameras of a rig, and the best of them refined on all cameras.
 
-    met: of each camera all poses, in the frame of its problem. pools: of those that search. starts: poses of the rig
-    that were refined, with their evidence. looked: those around which was searched. best: distinct poses, best first.
-    exhaustive: whether every pose was looked at.
+    Attributes:
+        met: All poses of each camera, in the frame of its problem.
+        pools: Pool of each camera that searches, by index.
+        starts: Initial poses of the rig that were refined, with their evidence.
+        looked: Initial poses that had a local search.
+        best: Distinct refined poses, best first.
+        exhaustive: True if every pose was tried.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -90,12 +104,16 @@ class Together:
 
     @property
     def turns(self) -> int:
-        """Of all cameras."""
+        """Number of iterations of all cameras."""
         return sum(pool.turns for pool in self.pools.values())
 
     def take(self, new: Mapping[int, Hypotheses], most: int) -> None:
-        """Refine at most so many of the poses that cameras propose, in the frames of their scenes if they have one,
-        those that all agree with best."""
+        """Refine those proposals of the cameras that have the most evidence in all cameras.
+
+        Args:
+            new: Poses of each camera, by index; in the normalised frame for cameras that search.
+            most: Largest number of poses that are refined.
+        """
         new = {k: to_problem_frame(p, self.pools[k].scene) if k in self.pools else p for k, p in new.items()}
         rotation, translation = _proposals(self.rig, new, self.met)
         for k, poses in new.items():
@@ -111,7 +129,7 @@ class Together:
         self._add(self.rig.candidates(every.rotation[order], every.translation[order]))
 
     def look_around(self) -> None:
-        """Search around the pose with most evidence, if none exceeds chance, around none twice."""
+        """Run a local search around the best unused initial pose unless a pose is significant."""
         if not self.pools or not len(self.starts) or self.best.log10_false_alarms[:1].min(initial=math.inf) < 0:
             return
         poses = Hypotheses.concatenate([self.looked, self.starts])
@@ -128,7 +146,7 @@ class Together:
             self.take({k: search_beside(scene, pose, scene.settings.beside)}, A_TURN)
 
     def _add(self, refined: Hypotheses) -> None:
-        """Take up refined poses; the best one has the basin counts of all cameras."""
+        """Add refined poses; the basin count of the best one is the sum over all cameras."""
         every = Hypotheses.concatenate([self.best, refined])
         self.best = every[self._distinct(every, -every.log10_false_alarms, REFINED)]
         if len(self.best):
@@ -137,7 +155,7 @@ class Together:
             )
 
     def _distinct(self, poses: Hypotheses, score: Array, count: int) -> NDArray[np.int64]:
-        """Return the indices of the best poses, of which no two are the same to all cameras."""
+        """Return the indices of the best poses that are pairwise different in at least one camera."""
         seen = []
         for k, problem in enumerate(self.rig.problems):
             turns, shifts = self.rig.pose_of(k, poses.rotation, poses.translation)
@@ -145,31 +163,31 @@ class Together:
         return distinct(poses.rotation, seen_from(np.stack(seen, 1)), score, count, *self.rule.same)
 
     def _looks(self) -> int:
-        """How often its surroundings were searched in vain."""
+        """Return the number of local searches around the best pose that found no better one."""
         return sum(
             int(self._as_best(k, to_problem_frame(pool.surrounded, pool.scene)).sum()) for k, pool in self.pools.items()
         )
 
     def _as_best(self, k: int, poses: Hypotheses) -> NDArray[np.bool_]:
-        """Which poses of a camera are the best one."""
+        """Return which poses of camera k are the same as the best pose."""
         turn, shift = self.rig.pose_of(k, self.best.rotation[:1], self.best.translation[:1])
         both = np.concatenate([turn, poses.rotation]), np.concatenate([shift, poses.translation])
         return self.rig.problems[k].same_pose(*both, self.rule.same)[1:]
 
     def may_be_certain(self) -> bool:
-        """Whether chance is excluded, and that a better pose was missed."""
+        """Return whether the best pose is significant and its miss probability is low enough."""
         if not len(self.best) or self.best.log10_false_alarms[0] > self.rule.false_alarms:
             return False
         strongest, seen = self._strongest()
         return missed(seen, self.rig.problems[strongest], self._looks(), self.rule) <= self.rule.missed
 
     def _strongest(self) -> tuple[int, Hypotheses]:
-        """The camera in which the best pose has most evidence, and the poses as its own."""
+        """Return the index of the camera with the most evidence for the best pose, and the poses in that camera."""
         k = int(self.rig.evidence(self.best.rotation[0], self.best.translation[0], float(self.best.scale[0])).argmax())
         return k, self.rig.seen(k, self.best)
 
     def result(self) -> SearchResult:
-        """The verdict on the best poses, beside those that a repeated structure would confuse with a confident one."""
+        """Judge the best poses; a confident one also against the competing poses of a repeated structure."""
         if not len(self.best):
             return no_pose("no pose was found")
         result = self._judged()
@@ -204,8 +222,11 @@ class Together:
 
 
 def _proposals(rig: Rig, new: Mapping[int, Hypotheses], met: Sequence[Hypotheses]) -> Pose:
-    """Poses of the rig: those of each camera; or, of an unknown scale, those in which two cameras that are apart agree,
-    one of them with what it had `met` before, the middle of the scene where it is with least squares."""
+    """Return the poses of the rig that new poses of the cameras give.
+
+    If the scale is unknown, they are those in which two cameras with a non-zero baseline agree. The poses of the second
+    camera include those it had `met` before.
+    """
     if rig.unknowns == 6:
         parts = [rig.rig_of(k, poses.rotation, poses.translation) for k, poses in new.items()]
     else:
@@ -222,7 +243,14 @@ def _proposals(rig: Rig, new: Mapping[int, Hypotheses], met: Sequence[Hypotheses
 
 
 def _told_by(rig: Rig, pair: tuple[int, int], first: Hypotheses, second: Hypotheses) -> Pose:
-    """Poses of the rig in which two cameras agree."""
+    """Return the poses of the rig in which two cameras agree; the scene centroid is at its least-squares position.
+
+    Args:
+        rig: Cameras.
+        pair: Indices of the two cameras.
+        first: Poses of the first camera.
+        second: Poses of the second camera.
+    """
     (turn, shift), (other, moved) = (rig.mounts[k] for k in pair)
     middle = rig.problems[0].middle
     turns, others = (turn.T @ first.rotation).reshape(-1, 9), (other.T @ second.rotation).reshape(-1, 9)
@@ -230,7 +258,7 @@ def _told_by(rig: Rig, pair: tuple[int, int], first: Hypotheses, second: Hypothe
     near = np.flatnonzero(traces.ravel() > 1 + 2 * math.cos(math.radians(AGREE_DEG)))
     i, j = np.divmod(near[np.argsort(-traces.ravel()[near], kind="stable")[:PAIRS]], max(len(others), 1))
     rotation = turn.T @ first.rotation[i]
-    seen = (first.rotation[i] @ middle + first.translation[i]) @ turn  # from the first camera, in the axes of the rig
+    seen = (first.rotation[i] @ middle + first.translation[i]) @ turn  # from the first camera, in the rig's axes
     way = seen - (second.rotation[j] @ middle + second.translation[j]) @ other
     apart = shift @ turn - moved @ other
     distance, length = np.linalg.norm(seen, axis=-1), float(np.linalg.norm(apart))
@@ -243,7 +271,7 @@ def _told_by(rig: Rig, pair: tuple[int, int], first: Hypotheses, second: Hypothe
 
 
 def _agreement(rig: Rig, rotations: Array, translations: Array) -> Array:
-    """How well poses (p, 3, 3), (p, 4) explain the bearings of all cameras at a wide scale, nats (p,)."""
+    """Score poses (p, 3, 3), (p, 4) cheaply: robust log-likelihood (p,) of all bearings at a wide scale, nats."""
     total, scale = np.zeros(len(rotations)), WIDE * rig.floor
     for k, problem in enumerate(rig.problems):
         turns, shifts = rig.pose_of(k, rotations, translations)
