@@ -1,1 +1,1 @@
-"""What `bpnp.solve` is made of: checked arguments, candidates, matches and the solution."""
+"""Parts of `bpnp.solve`: checked arguments, candidates, matches and the solution."""

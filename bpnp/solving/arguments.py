@@ -1,4 +1,4 @@
-"""The arguments of `solve`, `solve_many` and `verify`, checked: ValueError for what is not usable."""
+"""Checks of the arguments of `solve`, `solve_many` and `verify`; they raise ValueError for invalid values."""
 
 import math
 import sys
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]
 Prior = Union[PosePrior, GravityPrior, "torch.nn.Module"]  # a TrainedNet
-ROUNDING = 1e-12  # of R R^T: a rotation in float64; others are made orthonormal
-UNIT = 1e-3  # largest error of a length, of a rotation, and of a sum of probabilities
-SURE = 0.97  # probability of a class from which a search matches a point to none of another one
-PRIOR_DEGREES = 10.0  # standard deviation of a rotation that is given without one, about each axis
+ROUNDING = 1e-12  # largest error of R R^T of a rotation in float64; others are made orthonormal
+UNIT = 1e-3  # largest error of a unit length, of a rotation, and of a sum of probabilities
+SURE = 0.97  # probability of a class above which points match only within the class
+PRIOR_DEGREES = 10.0  # default standard deviation of a given rotation, about each axis
 INSIDE_ONE_PIXEL = 3.0
-WIDEST_ROW = 8  # numbers of a keypoint; an array with more columns is the wrong way round
+WIDEST_ROW = 8  # most numbers per keypoint; an array with more columns is transposed
 
 
 @contextmanager
 def about(problem: str | None) -> Iterator[None]:
-    """Errors within begin with what they are about, where there are several problems."""
+    """Prefix the messages of errors in this context with the name of the problem, if there are several."""
     try:
         yield
     except ValueError as error:
@@ -40,18 +40,18 @@ def about(problem: str | None) -> Iterator[None]:
 
 
 def is_network(value: object) -> "TypeGuard[torch.nn.Module]":
-    """Return True for a torch module. Without torch loaded there is none, so it is not imported."""
+    """Return True for a torch module; torch is not imported for this check."""
     torch = sys.modules.get("torch")
     return torch is not None and isinstance(value, torch.nn.Module)
 
 
 def source_from(solver: "str | Path | torch.nn.Module") -> "torch.nn.Module | None":
-    """The module that solves, None for the search, alone or not."""
+    """Return the module of a `solver` argument; None for the search, with or without packaged matchers."""
     if is_network(solver):
         return solver
     if isinstance(solver, str) and solver in ("auto", "search"):
         return None
-    from bpnp.models.weights import TrainedNet, pretrained_names  # the networks, where one is asked for
+    from bpnp.models.weights import TrainedNet, pretrained_names  # imports torch, so only if a network is named
 
     path = Path(str(solver))
     if not isinstance(solver, (str, Path)) or not (path.suffix or path.is_file() or str(solver) in pretrained_names()):
@@ -63,10 +63,10 @@ def source_from(solver: "str | Path | torch.nn.Module") -> "torch.nn.Module | No
 
 
 def device_from(wanted: "str | torch.device | None") -> "torch.device | None":
-    """The device that a user names, if it can be used."""
+    """Return the torch device of a `device` argument, if it is available."""
     if wanted is None:
         return None
-    import torch  # seconds, so only where a device is named
+    import torch  # takes seconds, so only if a device is named
 
     try:
         device = torch.device(wanted)
@@ -77,7 +77,7 @@ def device_from(wanted: "str | torch.device | None") -> "torch.device | None":
 
 
 def each_set(name: str, values: Any, count: int | None, axes: int = 2) -> list[Any]:
-    """The arrays of `count` problems, of `axes` axes each; one array, or None, is shared by all where that is known."""
+    """Return the arrays of `count` problems; one array of `axes` axes, or None, is repeated if `count` is given."""
     dims = getattr(values, "ndim", axes + 1)
     if count is not None and (values is None or dims == axes):
         return [values] * count
@@ -91,7 +91,7 @@ def each_set(name: str, values: Any, count: int | None, axes: int = 2) -> list[A
 
 
 def each_of(name: str, value: Any, count: int) -> list[Any]:
-    """A list has one each; anything else is for all problems."""
+    """Return a list of `count` values: the list itself, or any other value repeated."""
     if not isinstance(value, list):
         return [value] * count
     if len(value) != count:
@@ -100,7 +100,10 @@ def each_of(name: str, value: Any, count: int) -> list[Any]:
 
 
 def each_camera(value: Any, count: int) -> list[Any]:
-    """One camera for all, or a list or stack of them, as they are. A 3x3 matrix as a list of lists is one camera."""
+    """Return the cameras of `count` problems, unchanged, from one camera or a list or stack of cameras.
+
+    A list of lists of numbers is one 3x3 matrix.
+    """
     if getattr(value, "ndim", 2) == 3:
         value = list(value)
     elif isinstance(value, list) and value and not isinstance(value[0], tuple):
@@ -110,7 +113,7 @@ def each_camera(value: Any, count: int) -> list[Any]:
 
 
 def positive(name: str, value: Any, *, finite: bool = False) -> float | None:
-    """Return the number as a float; None stays."""
+    """Return a positive number as a float; None stays None."""
     real = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
     if value is not None and not (real and value > 0 and (value < math.inf or not finite)):
         raise ValueError(f"expected a positive `{name}`, got {value!r}")
@@ -118,14 +121,14 @@ def positive(name: str, value: Any, *, finite: bool = False) -> float | None:
 
 
 def checked_seed(seed: Any) -> int:
-    """Return a seed of random numbers. Raises ValueError unless it is a whole number of at least 0."""
+    """Return a random seed; raise ValueError unless it is a non-negative integer."""
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
         raise ValueError(f"`seed` is {seed!r}; it is a whole number, 0 or more")
     return int(seed)
 
 
 def pose_of(value: Any) -> tuple[Any, Any] | None:
-    """Return rotation and translation of what holds a pose, None for anything else.
+    """Return rotation and translation of an object that holds a pose; None for anything else.
 
     Args:
         value: (R, t); [R | t] of shape (3, 4) or (4, 4); an object with `rotation` and `translation`, such as a
@@ -147,7 +150,7 @@ def pose_of(value: Any) -> tuple[Any, Any] | None:
 
 
 def checked_prior(prior: Any) -> Prior | None:
-    """A prior with its numbers as float64 arrays, or a net: itself, of a checkpoint, or "learned", the packaged one."""
+    """Return a prior with float64 arrays, or a network: the given one, a checkpoint's, or the packaged "learned"."""
     if prior is None:
         return None
     if not isinstance(prior, (PosePrior, GravityPrior)) and (pose := pose_of(prior)) is not None:
@@ -162,7 +165,7 @@ def checked_prior(prior: Any) -> Prior | None:
         if not (camera.any() and scene.any() and prior.sigma_deg > 0):
             raise ValueError(f"expected directions and a positive sigma_deg in `prior`, got {prior}")
         return GravityPrior(camera, scene, float(prior.sigma_deg))
-    from bpnp.models.weights import LEARNED, TrainedNet  # where a network is asked for
+    from bpnp.models.weights import LEARNED, TrainedNet  # imports torch, so only if a network is named
 
     if isinstance(prior, (str, Path)):
         return TrainedNet.from_pretrained(LEARNED) if str(prior) == "learned" else TrainedNet.from_checkpoint(prior)
@@ -175,7 +178,7 @@ def checked_prior(prior: Any) -> Prior | None:
 
 
 def checked_pose(prefix: str, rotation: Any, translation: Any) -> tuple[Array, Any]:
-    """A rotation (3, 3), orthonormal, and a translation (3,) or None; `prefix` goes before their names."""
+    """Return an orthonormal rotation (3, 3) and a translation (3,) or None; messages name them with `prefix`."""
     matrix = _finite(f"{prefix}rotation", rotation, (3, 3))
     off = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
     if off > UNIT or np.linalg.det(matrix) < 0:
@@ -185,7 +188,7 @@ def checked_pose(prefix: str, rotation: Any, translation: Any) -> tuple[Array, A
 
 
 def numbers(name: str, values: Any) -> Array:
-    """The values in float64."""
+    """Return the values as a float64 array."""
     values = _on_host(values)
     try:
         array = np.asarray(values)
@@ -197,7 +200,7 @@ def numbers(name: str, values: Any) -> Array:
 
 
 def _on_host(values: Any) -> Any:
-    """Return a torch tensor as a NumPy array, and anything else as it is."""
+    """Return a torch tensor as a NumPy array, and any other value unchanged."""
     if not hasattr(values, "detach"):
         return values
     tensor = values.detach().cpu()
@@ -212,15 +215,14 @@ def _finite(name: str, values: Any, shape: tuple[int, ...]) -> Array:
 
 
 def pixels_from(values: Any, camera: Any) -> Any:
-    """The pixels (m, 2) of a list of cv2.KeyPoint as their camera, as a user gives it, counts them; anything else as it
-    is."""
+    """Return the pixels (m, 2) of a list of cv2.KeyPoint in the convention of their camera; other values unchanged."""
     if not isinstance(values, (list, tuple)) or not len(values) or not all(hasattr(value, "pt") for value in values):
         return values
     return np.array([value.pt for value in values]) + (0.0 if camera is None or is_opencv(camera) else CENTRE)
 
 
 def checked_size(image_size: Any) -> tuple[int, int]:
-    """Width and height of images in pixels."""
+    """Return (width, height) of images, pixels."""
     try:
         width, height = (int(side) for side in image_size)
         whole = (width, height) == tuple(image_size)
@@ -235,11 +237,11 @@ def check_inside(points2d: Any, size: Any) -> None:
     """Check that pixels lie in an image.
 
     Args:
-        points2d: (m, 2) pixels; NaN is left aside.
-        size: Width and height of the image, pixels.
+        points2d: (m, 2) pixels; NaN is ignored.
+        size: (width, height) of the image, pixels.
 
     Raises:
-        ValueError: For another shape, or where `outside_image` tells another size.
+        ValueError: The shape is wrong, or `outside_image` finds pixels outside.
     """
     pixels, sides = image_points(points2d), np.array(checked_size(size))
     if pixels.ndim != 2 or pixels.shape[1] != 2:
@@ -255,14 +257,17 @@ def check_inside(points2d: Any, size: Any) -> None:
 
 
 def image_points(values: Any) -> Array:
-    """Image points (m, 2) or (m, 3) from what detectors return: OpenCV's (m, 1, 2) arrays, and rows of four or more
-    numbers that begin with x and y (scale, orientation, strength)."""
+    """Return image points (m, 2) or (m, 3) from the output of detectors.
+
+    OpenCV's (m, 1, 2) arrays are accepted, and rows of four or more numbers that begin with x and y (scale,
+    orientation, strength).
+    """
     points = scene_points(values, "points2d")
     return points[:, :2] if points.ndim == 2 and 3 < points.shape[1] <= WIDEST_ROW else points
 
 
 def scene_points(values: Any, name: str = "points3d") -> Array:
-    """Return points (k, d), also of OpenCV's (k, 1, d), of the clouds and meshes of trimesh and of Open3D's."""
+    """Return points (k, d) from arrays, OpenCV's (k, 1, d), or clouds and meshes of trimesh and Open3D."""
     if not isinstance(values, np.ndarray):
         values = getattr(values, "vertices", getattr(values, "points", values))
     points = numbers(name, values)
@@ -270,7 +275,7 @@ def scene_points(values: Any, name: str = "points3d") -> Array:
 
 
 def check_points(name: str, points: Array, widths: tuple[int, ...], fewest: int) -> None:
-    """Points (k, width), k `fewest` or more, all finite."""
+    """Check that points have shape (k, width), with k at least `fewest`, and are finite."""
     if points.ndim != 2 or points.shape[1] not in widths:
         shapes = " or ".join(f"(k, {width})" for width in widths)
         swapped = points.ndim == 2 and points.shape[1] in (2, 3)
@@ -282,14 +287,14 @@ def check_points(name: str, points: Array, widths: tuple[int, ...], fewest: int)
 
 
 def _check_rows(expected: str, rows: Array, good: Any, hint: str = "") -> None:
-    """Raise ValueError that names the first row that is not good."""
+    """Raise ValueError with the first invalid row."""
     if not good.all():
         bad = int(good.argmin())
         raise ValueError(f"expected {expected}, got {rows[bad].tolist()} at point {bad}{hint}")
 
 
 def unit_bearings(rays: Array) -> Array:
-    """Bearings (m, 3) of length one, to rounding."""
+    """Return bearings (m, 3), normalised; raise ValueError if a length differs from one by more than `UNIT`."""
     length = np.linalg.norm(rays, axis=-1, keepdims=True)
     if np.abs(length - 1).max() > UNIT:
         worst = float(length[np.abs(length - 1).argmax(), 0])
@@ -301,7 +306,7 @@ def unit_bearings(rays: Array) -> Array:
 
 
 def check_unit(points2d: Array, camera: Camera | None) -> None:
-    """Raise ValueError for pixels without a camera, or the reverse."""
+    """Raise ValueError for pixels without a camera, or for normalised coordinates with one."""
     largest = np.abs(points2d).max()
     if camera is None:
         check_normalised(points2d, "camera=K")
@@ -313,25 +318,25 @@ def check_unit(points2d: Array, camera: Camera | None) -> None:
 
 
 def unit_vectors(name: str, vectors: Array, hint: str = "try to divide by the lengths") -> Array:
-    """Vectors (n, 3) of length one, to rounding."""
+    """Return vectors (n, 3), normalised; raise ValueError if a length differs from one by more than `UNIT`."""
     length = np.linalg.norm(vectors, axis=-1)
     _check_rows(f"unit vectors in `{name}`", vectors, np.abs(length - 1) <= UNIT, f"; {hint}")
     return np.asarray(vectors / length[:, None])
 
 
 def checked_normals(values: Any, count: int) -> Array | None:
-    """Unit normals (n, 3) of `count` 3D points."""
+    """Return the unit normals (n, 3) of `count` 3D points."""
     if values is None:
         return None
     return unit_vectors("normals3d", _one_each("normals3d", numbers("normals3d", values), (count, 3)))
 
 
 def checked_labels(labels2d: Any, labels3d: Any, counts: tuple[int, int]) -> dict[str, Any]:
-    """The labels in `Problem`, of integers for the 2D and the 3D points, -1 for any, or of probabilities (m, c),
-    (n, c); both or neither.
+    """Return the labels as fields of `Problem`: integers, with -1 for any, or probabilities (m, c) and (n, c).
 
-    Of image point i with the probabilities p_i and scene point j with q_j, the appearance of i is likelier if they
-    belong together than if not by sum_c p_ic q_jc / b_c, b the mean of the p_i, over its mean over j.
+    Both sets of points have labels, or neither. For image point i with probabilities p_i and scene point j with q_j,
+    the likelihood ratio of the appearance, match against non-match, is sum_c p_ic q_jc / b_c over its mean over j. Here
+    b is the mean of the p_i.
     """
     labels = {"labels2d": labels2d, "labels3d": labels3d}
     missing = [name for name, values in labels.items() if values is None]
@@ -357,8 +362,8 @@ def compact_labels(labels2d: Labels, labels3d: Labels) -> tuple[Labels, Labels]:
     """Number labels by their order in the scene.
 
     Args:
-        labels2d: (m,) labels of any size; -1 fits any.
-        labels3d: (n,) the same.
+        labels2d: (m,) labels, any integers; -1 matches any.
+        labels3d: (n,) labels, any integers; -1 matches any.
 
     Returns:
         Labels (m,) and (n,) from 0 to the number k of those in the scene; k for an image point whose label no scene
@@ -375,7 +380,7 @@ def compact_labels(labels2d: Labels, labels3d: Labels) -> tuple[Labels, Labels]:
 
 
 def _classes(name: str, values: Any, count: int) -> Array:
-    """Probabilities (count, c) of classes."""
+    """Return class probabilities (count, c)."""
     shares = numbers(name, values)
     if shares.ndim != 2 or len(shares) != count:
         raise ValueError(
@@ -397,7 +402,7 @@ def _integers(name: str, values: Any, count: int) -> Labels:
 
 
 def checked_scores(name: str, values: Any, count: int) -> Array | None:
-    """Probabilities (count,) that a point has a partner, in (0, 1]."""
+    """Return the probabilities (count,) that a point has a correspondence, in (0, 1]; None stays None."""
     if values is None:
         return None
     scores = _one_each(name, numbers(name, values), (count,))

@@ -1,9 +1,10 @@
-"""The pose and the focal length of a camera together.
+"""Joint estimation of the pose and the focal length of a camera.
 
-The search tries a ladder of focal lengths: with one that is a quarter off it still ends near the pose of many points.
-From there Gauss-Newton steps of the pose and the focal length, and annealing of the pose, in turns, lead to the best of
-both, where the search looks again. Its verdict counts the seventh unknown (`bpnp.search.evidence.false_alarms`), wants
-the focal length to be known (`Evidence.focal`), and what the other focal lengths of the ladder led to are alternatives.
+The search tries a sweep of focal lengths. With many points it still ends near the pose if the focal length is a quarter
+off. From there, Gauss-Newton steps of pose and focal length alternate with annealing of the pose. The search then runs
+again at the optimum. Its NFA counts the focal length as a seventh unknown (`bpnp.search.evidence.false_alarms`), and a
+confident pose needs a well-determined focal length (`Evidence.focal`). The solutions of the other focal lengths of the
+sweep are competing poses.
 """
 
 import math
@@ -41,7 +42,7 @@ from bpnp.solving.solution import Solution
 from bpnp.solving.sources import Options, solutions_of
 
 ProblemAt = Callable[[Camera, UnknownFocal], Problem]
-RADIAL_PLACES = {"SIMPLE_RADIAL": 3, "OPENCV": 4}  # of the coefficient among the parameters of a bent camera
+RADIAL_PLACES = {"SIMPLE_RADIAL": 3, "OPENCV": 4}  # index of the radial coefficient in the parameters of a camera model
 LEAST_REACH = 1e-3  # focal lengths
 AROUND = (1.0, OtherFocal.step, 1 / OtherFocal.step)  # focal lengths around one that has converged
 
@@ -50,18 +51,26 @@ AROUND = (1.0, OtherFocal.step, 1 / OtherFocal.step)  # focal lengths around one
 class FocalSettings:
     """Constants of the search for a focal length.
 
-    smallest, largest: that are tried, in larger sides of the image: fields of view of 90 and 19 degrees across it.
-    usual: that is tried first. step, step_few: factor from one that is tried to the next, of many points and of few.
-    sigmas: of the error of a rough focal length within which it is looked for.
-    turns: of the first search with each. alternations: searches and refinements, in turns, from each. rounds: of a
-    refinement, until the logarithm moves by less than `same`.
-    bends: radial distortions from which it is fitted beside none: what they move a point at the corner of the image by,
-    a fraction of its distance from the principal point. From none too few points match to lead to a larger one.
-    bend_sigma: standard deviation of what an unknown radial distortion moves a point at the corner of the image by, a
-    fraction of its distance from the principal point; most_bend: the largest. fewest_bent: matches from which it is
-    fitted.
-    centre_sigma: standard deviation of the principal point, a share of the same distance: about a quarter of a per
-    cent of the larger side of the image.
+    Lengths in the image are relative to the larger image side, distortions to the distance from the principal point.
+
+    Attributes:
+        smallest: Least focal length that is tried: a field of view of 90 degrees.
+        largest: Largest focal length that is tried: a field of view of 19 degrees.
+        usual: Focal length that is tried first.
+        step: Factor between successive focal lengths, for many points.
+        step_few: Factor between successive focal lengths, for few points.
+        sigmas: Half width of the range of an approximate focal length, standard deviations.
+        turns: Iterations of the first search with each focal length.
+        alternations: Largest number of alternations of search and refinement from each focal length.
+        rounds: Largest number of iterations of a refinement.
+        same: Change of the logarithm of the focal length below which a refinement stops.
+        bends: Radial displacements at the image corner from which a fit of the distortion also starts. Started at zero
+            distortion, too few points match to reach a large one.
+        bend_sigma: Standard deviation of the radial displacement at the image corner by an unknown distortion.
+        most_bend: Largest radial displacement at the image corner.
+        fewest_bent: Least number of matches for a fit of the distortion.
+        centre_sigma: Standard deviation of the principal point, as a fraction of the distance to the image corner:
+            about a quarter of a per cent of the larger image side.
     """
 
     smallest: float = 0.5
@@ -85,20 +94,20 @@ RULE = FocalSettings()
 
 
 class UnknownCamera(NamedTuple):
-    """A camera whose focal length is unknown, and its distortion where the reference has none.
+    """A camera with an unknown focal length, and an unknown distortion if the reference has none.
 
     Attributes:
-        reference: Camera of which the others are variants.
+        reference: Camera that the others are variants of.
         smallest: Least focal length, over that of the reference.
         largest: Largest focal length, over that of the reference.
         usual: Focal length to try first, over that of the reference.
-        sigma: Standard deviation of the logarithm of the focal length; infinite if nothing is known of it.
-        bends: Whether radial distortion is a competitor. The reference is then a pinhole camera.
-        distorted: Whether a radial coefficient is fitted even where it is not significantly better.
+        sigma: Standard deviation of the logarithm of the focal length; infinite without a prior.
+        bends: Fit a radial distortion as an alternative. The reference is then a pinhole camera.
+        distorted: Fit a radial coefficient even if it is not significantly better.
         radial: Radial coefficient to start with; None to start without distortion.
-        alone: Whether to start with no other focal length than the usual one.
-        reach: Distance of the corner of the image, or of the outermost image point where the size of the image is not
-            known, from the principal point, in focal lengths of the reference.
+        alone: Start with the usual focal length only.
+        reach: Distance from the principal point to the image corner, in focal lengths of the reference. Without an
+            image size it is that of the outermost image point.
     """
 
     reference: Camera
@@ -118,7 +127,7 @@ class UnknownCamera(NamedTuple):
         return camera if radial is None else with_radial_distortion(camera, radial)
 
     def parts(self, camera: Camera) -> tuple[float, float | None]:
-        """Return the zoom and the radial coefficient, None for none, of one of these cameras."""
+        """Return the zoom and the radial coefficient of one of these cameras; None without distortion."""
         zoom = camera.focal / self.reference.focal
         if not self.bends or is_pinhole(camera) or not isinstance(camera, Lens):
             return zoom, None
@@ -129,7 +138,7 @@ class UnknownCamera(NamedTuple):
         return max(self.reach / zoom, LEAST_REACH)
 
     def focal(self, camera: Camera) -> UnknownFocal:
-        """Return what is known of the lens of one of these cameras."""
+        """Return the prior of the focal length and distortion of one of these cameras."""
         zoom, radial = self.parts(camera)
         sigma = math.inf if radial is not None else RULE.bend_sigma if self.bends else 0.0
         return UnknownFocal(
@@ -149,12 +158,12 @@ class UnknownCamera(NamedTuple):
         return [self.at(self.usual * step**k, self.radial) for k in steps]
 
     def near(self, camera: Camera) -> "UnknownCamera":
-        """Return the same with one of these cameras to start with alone."""
+        """Return a copy that starts with one of these cameras only."""
         zoom, radial = self.parts(camera)
         return self._replace(usual=zoom, radial=radial, alone=True)
 
     def seen_by(self, problem: Problem) -> "UnknownCamera":
-        """Return the same with the reach of the image points of a problem, whose camera is the reference."""
+        """Return a copy with the reach of the image points of a problem whose camera is the reference."""
         outermost = float(np.linalg.norm(problem.all2d[problem.usable], axis=-1).max())
         return self._replace(reach=max(self.reach, outermost))
 
@@ -162,13 +171,19 @@ class UnknownCamera(NamedTuple):
 def unknown_camera(
     camera: Any, image_size: Any, focal_error: float | int | None, distortion: bool = False
 ) -> UnknownCamera:
-    """Return the camera of images of a size in pixels, or one with about the focal length of `camera`.
+    """Return the unknown camera of images of a given size, or one with approximately the focal length of `camera`.
 
     Radial distortion is unknown too, unless `camera` has a model with distortion.
 
+    Args:
+        camera: Camera with an approximate focal length; None with `image_size`.
+        image_size: (width, height) of the images, pixels; None with `camera`.
+        focal_error: Relative standard deviation of the focal length of `camera`, between 0 and 1.
+        distortion: Always fit a radial coefficient. Default False.
+
     Raises:
-        ValueError: The size is none, there are both a camera and a size, an error without a camera, or `distortion`
-            without an unknown lens.
+        ValueError: The size is invalid, there are both a camera and a size, an error without a camera, or `distortion`
+            for a known lens.
     """
     if distortion and image_size is None and focal_error is None:
         raise ValueError(
@@ -209,7 +224,13 @@ def unknown_camera(
 
 @one_blas_thread
 def solved_with_focal_length(problem_at: ProblemAt, unknown: UnknownCamera, options: Options) -> Solution:
-    """The solution with the fewest false alarms, pose and focal length, of what `problem_at` makes of a camera."""
+    """Return the solution with the fewest false alarms over pose and focal length.
+
+    Args:
+        problem_at: Returns the problem of a camera.
+        unknown: Unknown camera.
+        options: Options of the search.
+    """
     problem = problem_at(unknown.reference, unknown.focal(unknown.reference))
     if problem.degenerate is not None:
         return solutions_of({0: problem}, options)[0]
@@ -227,7 +248,7 @@ def solved_with_focal_length(problem_at: ProblemAt, unknown: UnknownCamera, opti
 
 @dataclass
 class _Ladder:
-    """Searches with several focal lengths, and the solutions `ends` that each of them led to."""
+    """Searches with several focal lengths, and their final solutions `ends`."""
 
     problem_at: ProblemAt
     unknown: UnknownCamera
@@ -243,7 +264,7 @@ class _Ladder:
         return min(self.ends, key=lambda end: end.log10_false_alarms)
 
     def climb(self, camera: Camera, turns: int, rungs: int) -> None:
-        """Search with a camera, and with those that fit the poses better that are found."""
+        """Search with a camera, then with cameras that fit the found poses better."""
         found = self._search(camera, turns, rungs)
         for _ in range(RULE.alternations):
             if found.verdict == "failed":
@@ -268,7 +289,7 @@ class _Ladder:
         return solutions_of({0: self.problem(camera)}, options)[0]
 
     def _refined(self, solution: Solution, camera: Camera, zooms: Sequence[float] = (1.0,)) -> tuple[Camera, bool]:
-        """Return the camera that fits best near a pose, and whether it is the one that was given."""
+        """Return the camera that fits best near a pose, and True if it equals the given one."""
         pose, scale = (solution.rotation, solution.translation), solution.stats.residual
         fitted = fit_camera(self.problem_at, self.unknown, camera, pose, scale, self.options.seed, zooms)
         (zoom, radial), (before, old) = self.unknown.parts(fitted.camera), self.unknown.parts(camera)
@@ -276,8 +297,10 @@ class _Ladder:
         return fitted.camera, max(abs(math.log(zoom / before)), bend) < RULE.same
 
     def contested(self) -> Solution:
-        """The best solution, ambiguous where another focal length led to a different pose that fits about as well and
-        is beyond what the best one claims."""
+        """Return the best solution, "ambiguous" if another focal length has a different pose that fits about as well.
+
+        A pose within the uncertainty of the best solution does not count as different.
+        """
         best, rule = self.best, SEARCH.evidence
         if best.verdict != "confident":
             return best
@@ -300,9 +323,9 @@ class _Ladder:
 
 
 def is_claimed(solution: Solution, rotation: Array, zoom: float) -> bool:
-    """Return whether a rotation and `zoom` times the focal length are within the 99.9 % bound of a solution.
+    """Return True if a rotation and `zoom` times the focal length are within the 99.9 % bound of a solution.
 
-    Not one that is turned by more than `Contested.far` times what makes a different pose, whatever the bound.
+    A rotation difference of more than `Contested.far` times the limit of the same pose is outside, whatever the bound.
     """
     turn, rule = Rotation.from_matrix(rotation @ solution.rotation.T).as_rotvec(), SEARCH.evidence
     if math.degrees(float(np.linalg.norm(turn))) > rule.contested.far * rule.same.degrees:
@@ -312,7 +335,7 @@ def is_claimed(solution: Solution, rotation: Array, zoom: float) -> bool:
 
 
 class FittedCamera(NamedTuple):
-    """A camera that is fitted to a pose, its problem, and the poses (1,) there, in the frame of the problem."""
+    """A camera fitted to a pose, its problem, and the pose (1,) in the frame of the problem."""
 
     camera: Camera
     problem: Problem
@@ -332,20 +355,20 @@ def fit_camera(
     seed: int,
     zooms: Sequence[float] = (1.0,),
 ) -> FittedCamera:
-    """Fit focal length, distortion and pose to the points, beside a pose and a camera.
+    """Fit focal length, distortion and pose to the points, starting from a pose and a camera.
 
-    Radial distortion is a competitor of the same camera without it. It is taken if its number of false alarms, which
-    counts the additional unknown, is smaller by the factor `Evidence.focal_chance`.
+    The camera with radial distortion competes with the one without. It is used if its NFA, which counts the additional
+    unknown, is smaller by the factor `Evidence.focal_chance`.
 
     Args:
         problem_at: Returns the problem of a camera.
-        unknown: What is known of the camera.
-        camera: Camera to start from.
-        pose: Rotation (3, 3) and translation (3,), in the user's frame.
+        unknown: Prior of the camera.
+        camera: Initial camera.
+        pose: Initial rotation (3, 3) and translation (3,), in the user's frame.
         scale: Scale of the residuals, radians.
-        seed: Of the refinement.
-        zooms: Factors of the focal length, and of the distance, to start from; the fit with the fewest false alarms
-            counts.
+        seed: Seed of the refinement.
+        zooms: Factors of the focal length and of the distance to start from; the fit with the fewest false alarms is
+            used.
     """
     zoom, radial = unknown.parts(camera)
 
@@ -373,9 +396,16 @@ def _fit_track(
     seed: int,
     farther: float,
 ) -> FittedCamera:
-    """Fit the lens and anneal the pose in turns, with a radial coefficient or without one.
+    """Alternate fits of the lens and annealing of the pose, with or without a radial coefficient.
 
-    farther: Factor of the distance of the scene to start with.
+    Args:
+        problem_at: Returns the problem of a camera.
+        unknown: Prior of the camera.
+        start: Initial zoom and radial coefficient; None for a fit without distortion.
+        pose: Initial rotation (3, 3) and translation (3,), in the user's frame.
+        scale: Scale of the residuals, radians.
+        seed: Seed of the annealing.
+        farther: Factor of the initial distance of the scene.
     """
     first, radial = start
     zoom, camera = first, unknown.at(*start)

@@ -1,4 +1,4 @@
-"""`solve` where the scene points are directions: checked arguments, a search for the rotation, and its `Solution`."""
+"""`solve` for scene points that are directions: argument checks, the search for the rotation, and the `Solution`."""
 
 import math
 from dataclasses import replace
@@ -28,21 +28,31 @@ from bpnp.solving.matches import SCALES, angles_between, count_one_to_one, one_t
 from bpnp.solving.solution import Solution, SolutionStats, with_pose
 from bpnp.solving.sources import Options
 
-FEWEST = 3  # two fix a rotation and are no evidence
-HALF = 0.5  # pixel, of which the angle is measured
-NOMINAL = 1e-3  # of the spread of bearings without a camera: what a pixel is taken to be
+FEWEST = 3  # two fix a rotation and leave no evidence
+HALF = 0.5  # pixels, step for the angle per pixel
+NOMINAL = 1e-3  # nominal pixel without a camera, as a fraction of the RMS angular radius of the bearings
 
 
 def solve_directions(
     points2d: Any, directions: Any, camera: Any, unknown: UnknownCamera | None, scores2d: Any, options: Options
 ) -> Solution:
-    """The rotation under which unit directions (n, 3) are seen at image points; arguments as for `bpnp.solve`.
+    """Estimate the rotation of a camera from image points and unit directions (n, 3); arguments as for `bpnp.solve`.
 
-    unknown: of a camera whose focal length is looked for: at focal lengths so near to each other that points half an
-    image from its middle stay within reach, at a rougher noise; then fitted to the matches, and searched again there.
+    With an unknown focal length a sweep of focal lengths is searched at a coarse noise. Its steps are so small that
+    points half an image from the image centre still match. The focal length is then fitted to the matches, and the
+    search repeated.
 
-    Raises ValueError for wrong shapes, fewer than 3 points, directions that are not unit vectors, pixels without a
-    camera or the reverse.
+    Args:
+        points2d: (m, 2) pixels, or normalised coordinates or bearings (m, 3) without a camera.
+        directions: (n, 3) unit directions.
+        camera: Camera of the pixels; None without one, or with `unknown`.
+        unknown: Camera with an unknown focal length; None if it is known.
+        scores2d: (m,) probabilities in (0, 1]; points with the largest ones are tried first. None for no order.
+        options: Options of the search.
+
+    Raises:
+        ValueError: The shapes are wrong, there are fewer than 3 points, the directions are not unit vectors, or there
+            are pixels without a camera or the reverse.
     """
     begun, deadline = Clock.now(), Deadline.after(options.time_limit)
     image, scene = image_points(points2d), scene_points(directions)
@@ -64,7 +74,7 @@ def solve_directions(
     exact = replace(rough, noise=DEFAULT.noise)
     for rung in unknown.ladder(DEFAULT.zoom):
         found, camera = seen_by(rung, rough), rung
-        if found.verdict == "failed":  # among many directions chance fits as well at the rough noise
+        if found.verdict == "failed":  # among many directions unrelated ones fit as well at the coarse noise
             found = seen_by(rung, exact if ends else DEFAULT)
         promising = found.log10_false_alarms <= DEFAULT.zoom_alarms
         for _ in range(DEFAULT.zoom_rounds if promising else 0):
@@ -83,7 +93,7 @@ def solve_directions(
 
 
 def _fitted(camera: Camera, image: Array, scene: Array, solution: Solution) -> Camera:
-    """The camera with the focal length that fits the matches best, with a turn beside it."""
+    """Return the camera with the focal length that fits the matches best, fitted together with a rotation."""
     pixels, seen = image[solution.matches[:, 0]], scene[solution.matches[:, 1]] @ solution.rotation.T
 
     def residuals(step: Array) -> Array:
@@ -97,7 +107,7 @@ def _fitted(camera: Camera, image: Array, scene: Array, solution: Solution) -> C
 
 
 def _with_focal_length(camera: Camera, pixels: Array, seen: Array) -> Array:
-    """Return the covariance (4, 4) of the turn and of the focal length, pixels, of matches with directions (k, 3)."""
+    """Return the covariance (4, 4) of rotation and focal length, pixels, from matches with directions (k, 3)."""
     step = 1e-5
     bearings, _, pixel = _bearings(pixels, camera)
     ends = [_bearings(pixels, scale_focal_length(camera, math.exp(sign * step)))[0] for sign in (1, -1)]
@@ -116,13 +126,13 @@ def _seen_by(
     deadline: Deadline,
     settings: InfinitySettings,
 ) -> Solution:
-    """The rotation of a camera, which is one of the `unknown` ones where the focal length is looked for."""
+    """Return the solution for one camera, which is one of the sweep if the focal length is unknown."""
     bearings, plane, pixel = _bearings(image, lens)
     inlier_threshold = options.inlier_threshold
     usable = np.flatnonzero(np.isfinite(bearings).all(-1) & np.isfinite(pixel))
     check_seen(usable, image, FEWEST)
     bearings, pixel = np.ascontiguousarray(bearings[usable]), np.ascontiguousarray(pixel[usable])
-    middle = float(np.median(pixel))  # radians a pixel
+    middle = float(np.median(pixel))  # radians per pixel
     per_radian = 1.0 if lens is None else 1 / middle
     noise = None if inlier_threshold is None else inlier_threshold / per_radian / middle / settings.reach
     with one_blas_thread:
@@ -177,7 +187,7 @@ def _seen_by(
 
 
 def _bearings(image: Array, camera: Camera | None) -> tuple[Array, Array, Array]:
-    """Unit bearings (m, 3) and normalised coordinates (m, 2), NaN where there are none, and radians a pixel (m,)."""
+    """Return unit bearings (m, 3), normalised coordinates (m, 2), NaN if undefined, and radians per pixel (m,)."""
     if camera is None:
         bearings, plane = bearings_of(image, None)
         spread = math.sqrt(((bearings - bearings.mean(0)) ** 2).sum(-1).mean())

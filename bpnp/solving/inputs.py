@@ -1,4 +1,4 @@
-"""One `Problem` from a user's arrays: checked and undistorted."""
+"""Construction of a `Problem` from a user's arrays: checks and undistortion."""
 
 from typing import Any
 
@@ -22,7 +22,7 @@ from bpnp.solving.arguments import (
     unit_bearings,
 )
 
-FLOOR_PIXELS = 0.1  # no detector of points is better
+FLOOR_PIXELS = 0.1  # no point detector is more accurate
 
 
 def problem_from(
@@ -39,11 +39,15 @@ def problem_from(
     prior: Prior | None = None,
     focal: UnknownFocal | None = None,
 ) -> Problem:
-    """Check the arrays of one problem; they are as for `bpnp.solve`, camera and prior are checked.
+    """Check the arrays of one problem, undistort its pixels, and build it.
 
-    cosines3d, focal: as in `Problem`, not checked. Pixels that cannot be undistorted are left out. Raises ValueError
-    that names the argument: wrong shape, swapped, fewer points than fix a pose (3 where gravity is known, else 4), NaN,
-    pixels without a camera or the reverse, normals, labels or scores that do not go with the points.
+    The arrays are as for `bpnp.solve`; camera and prior are already checked. `cosines3d` and `focal` are fields of
+    `Problem` and not checked. Pixels that cannot be undistorted are dropped.
+
+    Raises:
+        ValueError: The arrays have a wrong or swapped shape, too few points (3 with a known gravity, else 4) or NaN;
+            there are pixels without a camera or the reverse; or normals, labels or scores do not fit the points. The
+            message names the argument.
     """
     fewest = MIN_POINTS - isinstance(prior, GravityPrior)
     image, scene = image_points(points2d), scene_points(points3d)
@@ -78,8 +82,11 @@ def problem_from(
 
 
 def bearings_of(image: Array, camera: Camera | None) -> tuple[Array, Array]:
-    """Unit bearings (m, 3) of image points in front of a camera and their normalised coordinates (m, 2), NaN for none.
-    Raises ValueError for pixels without a camera or the reverse."""
+    """Return unit bearings (m, 3) of image points and their normalised coordinates (m, 2), NaN for points not in front.
+
+    Raises:
+        ValueError: There are pixels without a camera, or the reverse.
+    """
     if image.shape[1] == 3:
         bearings = unit_bearings(image)
         return bearings, in_front(bearings)[:, :2]
@@ -90,12 +97,12 @@ def bearings_of(image: Array, camera: Camera | None) -> tuple[Array, Array]:
 
 
 def unit_of(image: Array, camera: Camera | None) -> Unit:
-    """In which residuals of such image points are measured."""
+    """Return the unit in which the residuals of such image points are measured."""
     return "rad" if image.shape[1] == 3 else "normalised" if camera is None else "px"
 
 
 def check_seen(usable: Labels, image: Array, fewest: int) -> None:
-    """Raise ValueError where too few of the 2D points are usable."""
+    """Raise ValueError if too few of the 2D points are usable."""
     if len(usable) < fewest:
         raise ValueError(
             f"expected {fewest} or more 2D points that the camera can see, got {len(usable)} of {len(image)}"

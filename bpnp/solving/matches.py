@@ -1,4 +1,4 @@
-"""One-to-one matches of two point sets in the image, the pose that fits them best, and the `Solution` made of both."""
+"""One-to-one matches of two point sets in the image, the pose that fits them best, and the `Solution` of both."""
 
 import math
 import time
@@ -21,16 +21,24 @@ from bpnp.solving.arguments import Array, Labels
 from bpnp.solving.solution import Solution, SolutionStats, with_pose
 
 Allowed = Callable[[Labels, Labels], NDArray[np.bool_]]
-DENSE = 4096  # possible matches up to which all of them are compared
-NEIGHBOURS = 8  # of a point that can be its match; more only where the radius is far too large
-SCALES = 3.0  # of the residuals: the threshold of an inlier, if none is given
+DENSE = 4096  # largest number of possible matches that are all compared
+NEIGHBOURS = 8  # candidate matches of a point; there are more only if the radius is far too large
+SCALES = 3.0  # default inlier threshold, in scales of the residuals
 FIT_ROUNDS = 5
-DIFFERENCE = 6e-6  # of a step of the pose, the cube root of the precision: of central differences
+DIFFERENCE = 6e-6  # step of the central differences: cube root of the machine precision
 SIGNIFICANT = 22.5  # chi-squared with 6 degrees of freedom, one in a thousand
 
 
 def finished(problem: Problem, result: SearchResult, seconds: float, inlier_threshold: float | None) -> Solution:
-    """What a search of so many seconds found, with matches, a last fit to them, and the inliers of every candidate."""
+    """Build a `Solution` of a search result: refine the best pose, match points, count the inliers of each candidate.
+
+    Args:
+        problem: The problem.
+        result: Result of the search.
+        seconds: Run time of the search; the run time of this function is added.
+        inlier_threshold: Largest error of an inlier, in the unit of the problem; None for three times the residual
+            scale.
+    """
     start, found = time.perf_counter(), result.candidates
     if not len(found):
         return without_pose(problem, _note_duplicates(problem, result), inlier_threshold, seconds)
@@ -64,7 +72,7 @@ def finished(problem: Problem, result: SearchResult, seconds: float, inlier_thre
 
 
 def _note_duplicates(problem: Problem, result: SearchResult) -> str:
-    """Return the reason of a verdict; unless it is confident, with the number of points that are given twice."""
+    """Return the reason of a verdict, with the number of duplicate points unless the verdict is "confident"."""
     if result.verdict == "confident" or len(problem.points3d) > DENSE:
         return result.reason
     sides = {"image": problem.image_points, "scene": problem.points3d}
@@ -74,13 +82,13 @@ def _note_duplicates(problem: Problem, result: SearchResult) -> str:
 
 
 def angles_between(bearings: Array, directions: Array) -> Array:
-    """Angles (k,) between vectors (k, 3), radians, also small ones to the last digits."""
+    """Return the angles (k,) between vectors (k, 3), radians, accurate also for small angles."""
     sine = np.linalg.norm(np.cross(bearings, directions), axis=-1)
     return np.arctan2(sine, (bearings * directions).sum(-1))
 
 
 def without_pose(problem: Problem, reason: str, inlier_threshold: float | None, seconds: float = 0.0) -> Solution:
-    """The failed solution of a problem."""
+    """Return a failed solution of a problem, without a pose."""
     return Solution(
         inlier_threshold=math.nan if inlier_threshold is None else inlier_threshold,
         unit=problem.unit,
@@ -97,7 +105,7 @@ def without_pose(problem: Problem, reason: str, inlier_threshold: float | None, 
 
 
 def _of_pixels(problem: Problem, covariance: Array | None) -> Array:
-    """A covariance with the focal length in pixels instead of its logarithm, NaN for none."""
+    """Return a covariance with the focal length in pixels instead of its logarithm; NaN for None."""
     size = 6 if problem.focal is None else 7
     if covariance is None or problem.camera is None:
         return np.full((size, size), math.nan) if covariance is None else covariance
@@ -106,11 +114,11 @@ def _of_pixels(problem: Problem, covariance: Array | None) -> Array:
 
 
 def _fitted(problem: Problem, rotation: Array, translation: Array, threshold: float) -> tuple[Array, Array]:
-    """Least squares on mutually nearest points, where that explains them significantly better than the search's pose.
+    """Fit the pose to mutual nearest neighbours by least squares; keep the search's pose unless the fit is better.
 
-    The search weighs all matches by their probability, which is the better estimate unless its steps in float32 were
-    too coarse for the data. At an optimum of the same precision n log(S / S_min), S the sum of n squared residuals, is
-    distributed as chi-squared with 6 degrees of freedom.
+    The difference must be significant. The search weights all matches by their probability. This is the better estimate
+    unless its float32 steps were too coarse for the data. At an optimum of the same precision n log(S / S_min), S the
+    sum of n squared residuals, is distributed as chi-squared with 6 degrees of freedom.
     """
     image = problem.image_points
     for _ in range(FIT_ROUNDS):
@@ -129,22 +137,32 @@ def _fitted(problem: Problem, rotation: Array, translation: Array, threshold: fl
 
 
 def one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed | None = None) -> Labels:
-    """As many matches (i, j) with |image_i - projected_j| <= radius as there can be with no point in two of them (paper
-    Eq. 1), and of such sets one with the least sum of squared distances: (k, 2), ordered by i; NaN is no one's match.
+    """Return a maximum one-to-one matching of image points and projected points within a radius (paper Eq. 1).
 
-    allowed: which places i and j may be matched, None for all. A minimum-weight matching, in which leaving an image
-    point out costs more than all distances together; of many points on the graph of each one's `NEIGHBOURS` nearest.
+    The matches (i, j) satisfy |image_i - projected_j| <= radius, and no point is in two of them. Among the maximum
+    matchings it has the least sum of squared distances. It is a minimum-weight matching in which an unmatched image
+    point costs more than all distances together. With many points only the `NEIGHBOURS` nearest neighbours of each are
+    edges.
+
+    Args:
+        image: (m, 2) image points.
+        projected: (n, 2) projected points; a NaN point has no match.
+        radius: Largest distance of a match.
+        allowed: Returns which indices i and j may match; None for all.
+
+    Returns:
+        Indices (k, 2), ordered by i.
     """
     matches, distance = _near(image, projected, radius, allowed)
     alone = np.logical_and(*(np.bincount(side)[side] == 1 for side in matches.T)) if len(matches) else np.ones(0, bool)
     if alone.all():
         return matches
-    # Only points that have a choice take part. Column `count + i` stands for leaving row i out.
+    # Only points with several candidates take part. Column `count + i` leaves row i unmatched.
     sure, matches, distance = matches[alone], matches[~alone], distance[~alone]
     rows, row = np.unique(matches[:, 0], return_inverse=True)
     columns, column = np.unique(matches[:, 1], return_inverse=True)
     count, every = len(columns), np.arange(len(rows))
-    cost = (distance / radius) ** 2 + 1e-9  # zero would be no edge
+    cost = (distance / radius) ** 2 + 1e-9  # a zero would be no edge
     out = np.full(len(rows), float(min(len(rows), count) + 2))
     graph = csr_array((np.r_[cost, out], (np.r_[row, every], np.r_[column, count + every])))
     i, j = min_weight_full_bipartite_matching(graph)
@@ -154,16 +172,16 @@ def one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed |
 
 
 def count_one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed | None = None) -> int:
-    """How many matches `one_to_one` has: a maximum matching, faster than one of least cost."""
+    """Return the number of matches of `one_to_one`, by a maximum matching, which is faster than one of least cost."""
     matches, _ = _near(image, projected, radius, allowed)
     if all(np.bincount(side).max(initial=0) <= 1 for side in matches.T):
-        return len(matches)  # no point has a choice
+        return len(matches)  # no point has several candidates
     graph = csr_array((np.ones(len(matches)), tuple(matches.T)), shape=(len(image), len(projected)))
     return int((maximum_bipartite_matching(graph, perm_type="column") >= 0).sum())
 
 
 def mutual_nearest(image: Array, projected: Array, radius: float, allowed: Allowed | None = None) -> Labels:
-    """Matches within `radius` in which each is the other's nearest: fewer than `one_to_one`, and fewer wrong ones."""
+    """Return the mutual nearest neighbours within `radius`: fewer matches than `one_to_one`, and fewer wrong ones."""
     matches, distance = _near(image, projected, radius, allowed)
     nearest = np.ones(len(matches), np.bool_)
     for side, size in zip(matches.T, (len(image), len(projected)), strict=True):
@@ -184,16 +202,16 @@ def fit_pose(
 ) -> tuple[Array, Array]:
     """Fit a pose to matches by least squares, with Levenberg-Marquardt steps from a pose nearby.
 
-    The derivatives by (w, s), R = exp([w]x) rotation, t = translation + size s, are central differences, so that any
-    camera can be used.
+    The derivatives with respect to (w, s), R = exp([w]x) rotation, t = translation + size s, are central differences.
+    So any camera model can be used.
 
     Args:
         project: Returns the image points (k, d) of points (k, 3) in the camera's frame.
         points: (k, 3) scene points.
         target: (k, d) their image points.
-        rotation: (3, 3) to start from.
-        translation: (3,) to start from.
-        scale: Scale of the residuals; a point that leaves the view has a thousand times as much.
+        rotation: (3, 3) initial rotation.
+        translation: (3,) initial translation.
+        scale: Scale of the residuals; a point that leaves the view has a residual of a thousand times the scale.
 
     Returns:
         Rotation (3, 3) and translation (3,).
@@ -205,7 +223,7 @@ def fit_pose(
         return Rotation.from_rotvec(steps[:, :3]).as_matrix() @ rotation, translation + size * steps[:, 3:]
 
     def residuals(steps: Array) -> Array:
-        """Return the residuals (s, k d) of steps (s, 6), which are all projected at once."""
+        """Return the residuals (s, k d) of steps (s, 6), all projected at once."""
         turns, shifts = poses(steps)
         seen = project((points @ turns.transpose(0, 2, 1) + shifts[:, None]).reshape(-1, 3))
         off = seen.reshape(len(steps), *target.shape) - target
@@ -230,7 +248,7 @@ def fit_pose(
 
 
 def _near(image: Array, projected: Array, radius: float, allowed: Allowed | None) -> tuple[Labels, Array]:
-    """Allowed matches (e, 2) within `radius`, ordered, and their distances; among the nearest of many points."""
+    """Return the allowed matches (e, 2) within `radius`, ordered, and their distances; nearest neighbours if many."""
     seen = np.flatnonzero(np.isfinite(projected).all(-1))
     if len(image) * len(seen) <= DENSE:
         distance = np.sqrt(((image[:, None] - projected[seen]) ** 2).sum(-1))
@@ -239,7 +257,7 @@ def _near(image: Array, projected: Array, radius: float, allowed: Allowed | None
         both = _neighbours(image, projected[seen], radius)
         if np.bincount(both[:, 0]).max(initial=0) == NEIGHBOURS:  # there may be more
             both = np.concatenate([both, _neighbours(projected[seen], image, radius)[:, ::-1]])
-        # One number a match: unique rows would be sorted as records, ten times as long.
+        # One number per match: sorting unique rows as records takes ten times as long.
         matches = np.stack(np.divmod(np.unique(both[:, 0] * len(seen) + both[:, 1]), len(seen)), -1)
     matches[:, 1] = seen[matches[:, 1]]
     matches = matches if allowed is None else matches[allowed(*matches.T)]
@@ -247,7 +265,7 @@ def _near(image: Array, projected: Array, radius: float, allowed: Allowed | None
 
 
 def _neighbours(points: Array, others: Array, radius: float) -> Labels:
-    """Places (e, 2) of each point and of the nearest others within `radius`."""
+    """Return the indices (e, 2) of each point and of its nearest neighbours within `radius`."""
     count = min(NEIGHBOURS, len(others))
     distance, index = cKDTree(others).query(points, range(1, count + 1), distance_upper_bound=radius)
     point, nth = np.nonzero(np.isfinite(distance))

@@ -1,4 +1,4 @@
-"""What a trained network says of a problem: its poses, or poses to start a search from."""
+"""Poses of a trained network for a problem, as results or as initial poses of a search."""
 
 import copy
 from functools import cache
@@ -19,17 +19,20 @@ from bpnp.types import Batch
 if TYPE_CHECKING:
     from bpnp.models.matcher import Matcher
 
-FAR = 100.0  # sizes of the scene from the origin; further off float32 steps by 1e-5 of that distance
-ESTIMATES = ("refined", "ransac", "pnp")  # of a prediction, the one to trust most first
-DRAWN = 80_000  # triples of an assignment; one match in fifty is right, one triple in 10^5, but some nearly are
-NET_SIGMA_DEG, NET_SIGMA_SHIFT = 10.0, 0.1  # of a net's pose; the latter of its distance from the scene
+FAR = 100.0  # largest distance from the origin, in sizes of the scene, at which float32 is precise enough
+ESTIMATES = ("refined", "ransac", "pnp")  # estimates of a prediction, the most reliable first
+DRAWN = 80_000  # match triples per assignment: with 2 % correct matches one in 10^5 is correct, more nearly so
+NET_SIGMA_DEG, NET_SIGMA_SHIFT = 10.0, 0.1  # uncertainty of a network's pose; the latter as a fraction of the distance
 
 
 def evaluation_copy(module: nn.Module, device: torch.device | None) -> nn.Module:
-    """The module in evaluation mode on `device` (None: where it is).
+    """Return the module in evaluation mode on a device; a copy unless it is so already.
 
-    A copy unless it is that already: the caller's keeps its device and its training flags, and may be in use by other
-    threads.
+    The caller's module keeps its device and its training flags, and may be in use by other threads.
+
+    Args:
+        module: The module.
+        device: Device to run on; None for the module's own device.
     """
     evaluates = not any(part.training for part in module.modules())
     if evaluates and device in (None, device_of(module)):
@@ -38,13 +41,13 @@ def evaluation_copy(module: nn.Module, device: torch.device | None) -> nn.Module
 
 
 def device_of(module: nn.Module) -> torch.device:
-    """Where the parameters of a module are; the CPU if it has none."""
+    """Return the device of a module's parameters; the CPU if it has none."""
     parameter = next(module.parameters(), None)
     return torch.device("cpu") if parameter is None else parameter.device
 
 
 def pose_prior(net: nn.Module, problem: Problem, deadline: Deadline) -> PosePrior | None:
-    """The net's pose, None if it has none."""
+    """Return a prior at the network's pose; None if it has no pose."""
     (asked,) = predicted(net, [problem], deadline)
     if not len(asked.candidates):
         return None
@@ -54,7 +57,7 @@ def pose_prior(net: nn.Module, problem: Problem, deadline: Deadline) -> PosePrio
 
 
 def predicted(net: nn.Module, members: list[Problem], deadline: Deadline) -> list[SearchResult]:
-    """The poses of a module's prediction, scored."""
+    """Return the scored poses of a module's prediction for each problem."""
     views, batch = _given(net, members)
     with torch.no_grad():
         poses = net(batch).poses
@@ -70,11 +73,11 @@ def predicted(net: nn.Module, members: list[Problem], deadline: Deadline) -> lis
 
 
 def proposed(net: "Matcher", problem: Problem, seed: int) -> tuple[Array, Array]:
-    """Poses (s, 3, 3), (s, 3) of triples of matches drawn in proportion to the root of a matcher's assignment.
+    """Return poses (s, 3, 3), (s, 3) of match triples sampled in proportion to the root of a matcher's assignment.
 
-    Drawn in proportion to the assignment itself they are too alike where it is wrong.
+    Sampled in proportion to the assignment itself, they are too similar where it is wrong.
     """
-    from bpnp.robust.proposals import drawn_poses  # the networks, where one is asked
+    from bpnp.robust.proposals import drawn_poses  # imports torch modules only if needed
 
     (view,), batch = _given(net, [problem])
     with torch.no_grad():
@@ -97,7 +100,7 @@ def packaged_matcher(weights: str) -> "Matcher":
 
 
 class View(NamedTuple):
-    """Coordinates R s p + t, in the user's unit, in which a network expects the points p of a problem of size s."""
+    """Coordinates R s p + t, in the user's unit, that a network expects for the points p of a problem of size s."""
 
     rotation: Array
     translation: Array
@@ -113,10 +116,12 @@ class View(NamedTuple):
 
 
 def view_for(net: nn.Module, problem: Problem) -> View:
-    """The coordinates in which the network expects the 3D points: those given, or of the view of the prior.
+    """Return the coordinates in which a network expects the 3D points: the user's, or those of the view of the prior.
 
-    A view of an unknown place looks at the points from where they look as large as those of the image.
-    Raises ValueError for a network of the frame "view" without a `PosePrior`.
+    A prior without a translation gets one at which the points appear as large as the image points.
+
+    Raises:
+        ValueError: The network has the frame "view" and there is no `PosePrior`.
     """
     if getattr(net, "frame", "any") == "any":
         return View(np.eye(3), _near_origin(problem), problem.size)
@@ -136,19 +141,19 @@ def view_for(net: nn.Module, problem: Problem) -> View:
 
 
 def _near_origin(problem: Problem) -> Array:
-    """Return the origin of a problem in the user's coordinates; 0 where float32 would lose digits so far away."""
+    """Return the origin of a problem in the user's coordinates; 0 if it is too far away for float32."""
     is_far = problem.origin is None or np.linalg.norm(problem.origin) > FAR * problem.size
     return np.zeros(3) if is_far else np.asarray(problem.origin)
 
 
 def _seen(problem: Problem) -> Array:
-    """The 2D points that an image can show (m, 2)."""
+    """Return the usable, finite 2D points (m, 2)."""
     points2d = problem.all2d[problem.usable]
     return points2d[np.isfinite(points2d).all(-1)]
 
 
 def _given(net: nn.Module, members: list[Problem]) -> tuple[list[View], Batch]:
-    """The coordinates that the network expects, and the problems in them; without points that no image shows."""
+    """Return the coordinates that the network expects for each problem, and the batch of problems in them."""
     views = [view_for(net, problem) for problem in members]
     batch = Batch.from_arrays(
         [_seen(problem).astype(np.float32) for problem in members],

@@ -1,4 +1,4 @@
-"""`solve` with a `rig`: checked arguments, a search for one pose of all cameras, and its `Solution`."""
+"""`solve` with a `rig`: argument checks, the search for one pose of all cameras, and the `Solution`."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -32,8 +32,17 @@ def solve_rig(
     *,
     scale: bool = False,
 ) -> Solution:
-    """`bpnp.solve` with a `rig`: the pose rig_from_world. known: normals and labels. scale: whether the scene's unit is
-    unknown."""
+    """Estimate the pose rig_from_world of a rig; arguments as for `bpnp.solve`.
+
+    Args:
+        points2d: List of arrays (m_i, 2), one per camera.
+        points3d: (n, 3) scene points.
+        camera: One camera for all, or a list with one each.
+        rig: Extrinsics cam_from_rig of each camera.
+        known: Normals and labels.
+        options: Options of the search.
+        scale: Estimate the scale of the scene too. Default False.
+    """
     begun, labels2d = Clock.now(), known["labels2d"]
     mounts = [_mount(f"rig[{k}]", mount) for k, mount in enumerate(rig)]
     images = each_set("points2d", points2d, None)
@@ -61,7 +70,7 @@ def solve_rig(
 
 
 def _mount(name: str, value: Any) -> Pose:
-    """cam_from_rig as (3, 4), (4, 4) or (R, t)."""
+    """Return rotation and translation of extrinsics cam_from_rig, given as (3, 4), (4, 4) or (R, t)."""
     if isinstance(value, tuple) and len(value) == 2:
         return checked_pose(f"{name}.", *value)
     matrix = numbers(name, value)
@@ -71,7 +80,7 @@ def _mount(name: str, value: Any) -> Pose:
 
 
 def _finished(rig: Rig, problems: Sequence[Problem], result: SearchResult, inlier_threshold: float | None) -> Solution:
-    """The matches of all cameras; their 2D points count on from one camera to the next."""
+    """Build the solution with the matches of all cameras; 2D points are indexed over all cameras, concatenated."""
     found, first = result.candidates, problems[0]
     solution = replace(without_pose(first, result.reason, inlier_threshold), camera=None)
     if rig.unknowns == 7:
@@ -115,14 +124,14 @@ def _finished(rig: Rig, problems: Sequence[Problem], result: SearchResult, inlie
 
 
 def _about_origin(covariance: Array, size: float, middle: Array, shift: Array, scale: float, free: int) -> Array:
-    """Return the covariance of the turn, of the translation in units of the rig, and of the scale if it is unknown.
+    """Return the covariance of the rotation, of the translation in units of the rig, and of the scale if it is unknown.
 
     Args:
-        covariance: Of the turn, of the shift of the middle of the scene in unit size, and of the log of the scale.
-        size: Of the scene, user's unit.
-        middle: (3,) of the scene from its origin, in the axes of the rig, user's unit.
+        covariance: Covariance of the rotation, of the shift of the scene's centroid in unit size, and of the log scale.
+        size: Size of the scene, user's unit.
+        middle: (3,) centroid of the scene from its origin, in the axes of the rig, user's unit.
         shift: (3,) translation, unit of the scene.
-        scale: Units of the rig in one of the scene.
+        scale: Units of the rig in one unit of the scene.
         free: Degrees of freedom of Student's t.
     """
     moved = np.eye(7)

@@ -191,7 +191,7 @@ class Solution:
 
     @property
     def found(self) -> bool:
-        """True if there is a pose; `verdict` tells if it can be trusted."""
+        """True if there is a pose; see `verdict` for its reliability."""
         return bool(np.isfinite(self.rotation).all() and np.isfinite(self.translation).all())
 
     def __bool__(self) -> bool:

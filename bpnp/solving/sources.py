@@ -1,4 +1,4 @@
-"""From problems to their solutions: by the search, by a trained module, or by one after the other."""
+"""Solutions of problems: by the search, or by a trained module."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -22,20 +22,28 @@ from bpnp.solving.solution import Solution
 if TYPE_CHECKING:
     import torch
 
-Progress = Callable[[int, int, float], None]  # problem, batches of starts so far, seconds
-TOGETHER = 2**26  # cells of the assignments, 2D points x 3D points, that a module solves together on a GPU
-VIEW_MATCHER, SCENE_MATCHER = "matcher-maps", "matcher-sfm"  # packaged weights of the frames "view" and "any"
-MOST_CELLS = 2**22  # of an assignment, 2D points x 3D points, with which a matcher's time and memory grow: seconds
-# Seconds, and seconds a 2D or 3D point, that the verdict and matching take after the search; of a limit at most half.
+Progress = Callable[[int, int, float], None]  # problem index, batches of initial poses so far, seconds
+TOGETHER = 2**26  # largest assignment matrix, 2D points x 3D points, of a batch on a GPU
+VIEW_MATCHER, SCENE_MATCHER = "matcher-maps", "matcher-sfm"  # packaged weights for the frames "view" and "any"
+MOST_CELLS = 2**22  # largest assignment matrix of a packaged matcher, 2D points x 3D points: seconds
+# Seconds, and seconds per 2D or 3D point, of verdict and matching after the search; at most half of a limit.
 ENDING, ENDING_A_POINT = 4e-3, 8e-6
 
 
 class Options(NamedTuple):
-    """What applies to all problems; see `bpnp.solve`.
+    """Options for all problems; see `bpnp.solve`.
 
-    solver: None for the search. asks: whether a search in doubt asks packaged matchers for poses.
-    time_limit: seconds a problem, None for none. until: when all of it has to end. device: None for that of each
-    module. settings: of the search.
+    Attributes:
+        solver: Module that solves the problems; None for the search.
+        asks: Let an undecided search start from poses of the packaged matchers.
+        inlier_threshold: Largest reprojection error of a match; None for the default.
+        clutter: Expected outlier fraction; None if it is unknown.
+        seed: Seed of the search, default 0.
+        time_limit: Seconds per problem; None for no limit.
+        device: Device of the modules; None for that of each module.
+        progress: Callback with (problem index, batches of initial poses, seconds).
+        settings: Settings of the search.
+        until: Deadline for all problems together.
     """
 
     solver: "torch.nn.Module | None" = None
@@ -50,7 +58,7 @@ class Options(NamedTuple):
     until: Deadline = Deadline()
 
     def deadline(self, problem: Problem) -> Deadline:
-        """When to leave off searching, so that all ends in time; of a problem that is begun now."""
+        """Return when the search of a problem that starts now has to stop, so that verdict and matching end in time."""
         begun = Clock.now()
         end = min(self.until.at, Deadline.after(self.time_limit).at)
         ending = ENDING + ENDING_A_POINT * (len(problem.bearings) + len(problem.points3d))
@@ -58,7 +66,7 @@ class Options(NamedTuple):
 
 
 def solutions_of(problems: Mapping[int, Problem], options: Options) -> dict[int, Solution]:
-    """The solution of each problem, which has its number."""
+    """Return the solution of each problem, by the index of the problem."""
     solutions: dict[int, Solution] = {}
     solvable: dict[int, Problem] = {}
     copies: dict[int, torch.nn.Module] = {}
@@ -113,10 +121,11 @@ def _pose_of_network(net: "torch.nn.Module", problem: Problem, deadline: Deadlin
 
 
 def _proposals_of_matcher(problem: Problem, seed: int) -> Proposals | None:
-    """Return a function that proposes poses of the packaged matcher for a problem, None where no matcher applies.
+    """Return a function that proposes poses of the packaged matcher for a problem; None if no matcher applies.
 
-    The matcher for views around a known pose applies with a `PosePrior`, that for scenes in any axes without a prior
-    and for few enough points. Networks are imported when the function is called: the search is undecided only then.
+    The matcher for views near a known pose applies with a `PosePrior`. The matcher for scenes in any axes applies
+    without a prior and with few enough points. Networks are imported only when the function is called, if the search is
+    undecided.
     """
     weights = VIEW_MATCHER if isinstance(problem.prior, PosePrior) else SCENE_MATCHER
     too_many = len(problem.bearings) * len(problem.points3d) > MOST_CELLS
@@ -134,8 +143,11 @@ def _proposals_of_matcher(problem: Problem, seed: int) -> Proposals | None:
 def _by_module(
     net: "torch.nn.Module", problems: Mapping[int, Problem], options: Options
 ) -> Iterator[tuple[int, Solution]]:
-    """A matcher's assignment of many points proposes poses, from which the search goes on. Of other modules the poses
-    count; on a GPU they get problems of similar size together."""
+    """Yield the solutions of a module, by the index of the problem.
+
+    With a Matcher and too many points to enumerate, a search starts from poses sampled from its assignment. Otherwise
+    the poses of the module are the result. On a GPU the module gets problems of similar size together.
+    """
     from bpnp.models.matcher import Matcher
     from bpnp.solving.networks import device_of, predicted, proposed
 
