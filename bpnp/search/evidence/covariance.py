@@ -39,7 +39,7 @@ class Linearisation(NamedTuple):
 
 
 def join(parts: list[Linearisation]) -> Linearisation:
-    """Concatenate the matches of independent cameras; the sum of their `known` is taken."""
+    """Concatenate the matches of independent cameras and add up their `known`."""
     first = np.cumsum([0, *(len(part.weight) for part in parts[:-1])])
     return Linearisation(
         np.concatenate([part.residual for part in parts]),

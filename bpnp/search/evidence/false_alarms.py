@@ -267,7 +267,16 @@ def camera_terms(
 def own_evidence(problem: Problem, rotation: Array, translation: Array, scale: float) -> Array:
     """Return log x_i / c_i (k,) of each chosen image point under a pose, clumps weighted.
 
-    It is taken at the fraction w and the scale s with the largest sum; s is within a factor of two of `scale`, radians.
+    It is taken at the fraction w and the scale s with the largest sum.
+
+    Args:
+        problem: Points of the problem, with k chosen image points.
+        rotation: (3, 3) of the pose.
+        translation: (3,) of the pose.
+        scale: Scale of its residuals, radians; s is within a factor of two of it.
+
+    Returns:
+        (k,) natural logs; 0 if too few points are seen.
     """
     terms = camera_terms(problem, directions_of(problem, rotation, translation), scale)
     return np.zeros(len(problem.image.chosen)) if terms is None else terms.of_points()

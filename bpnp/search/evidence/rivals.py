@@ -69,6 +69,12 @@ def other_camera(
     Better means fewer false alarms by the factor `focal_chance`, with focal length and radial coefficient counted as
     unknowns. The lens is fitted from the best pose. If three matches may be coincidences, it is also fitted from the
     likeliest pose at other focal lengths. If the time limit prevents this, the result reports it.
+
+    Args:
+        result: Confident verdict on the best pose.
+        problem: Points of the problem.
+        entered: Function that returns the normalised scene.
+        rule: Constants of the verdict.
     """
     count = match_count(result.candidates, problem)
     if problem.focal is not None or count < rule.zoomed.fewest:
@@ -146,6 +152,11 @@ def beside(found: AtZoom, zoom: float, scene: Scene) -> AtZoom:
     """Return the likeliest pose at `zoom` times the focal length of a given one, or the given one after the deadline.
 
     The search starts from the pose that shows the scene at the same size.
+
+    Args:
+        found: Pose at its focal length.
+        zoom: Factor on this focal length.
+        scene: Scene whose settings and deadline are used.
     """
     problem = at_focal_length(found.problem, zoom)
     there = Scene(problem, 0, scene.settings, scene.deadline)

@@ -102,8 +102,8 @@ def exceeded_once(covariance: Array, free: float) -> float:
         covariance: (3, 3), or (1, 1) for a number.
         free: Degrees of freedom with which the scale of the residuals was estimated; infinite length if none.
 
-    The square of its length has the cumulants tr C, 2 tr C^2 and 8 tr C^3. The variable a + (b / d) x has the same, with
-    x chi-squared with d = (tr C^2)^3 / (tr C^3)^2 degrees of freedom, b^2 = d tr C^2 and a = tr C - b (Buckley and
+    The square of its length has the cumulants tr C, 2 tr C^2 and 8 tr C^3. The variable a + (b / d) x has the same:
+    x is chi-squared with d = (tr C^2)^3 / (tr C^3)^2 degrees of freedom, b^2 = d tr C^2 and a = tr C - b (Buckley and
     Eagleson 1988). A single loose axis gives d = 1, equal ones d = 3. As the scale of the residuals was estimated with
     `free` degrees of freedom, the bound of the square is a and b times the quantiles of F with them.
 

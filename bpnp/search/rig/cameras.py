@@ -61,7 +61,17 @@ class Rig:
         return turn @ rotation, translation[..., :3] @ turn.T + translation[..., 3:] * shift
 
     def rig_of(self, k: int, rotation: Array, translation: Array, unit: Array | float = 1.0) -> Pose:
-        """Return the poses of the rig for poses of camera k; `unit` is the length of a rig unit in scene units."""
+        """Return the poses of the rig for poses of camera k.
+
+        Args:
+            k: Index of the camera.
+            rotation: (..., 3, 3) of the camera.
+            translation: (..., 3) of the camera.
+            unit: Length of a rig unit in scene units, default 1.
+
+        Returns:
+            Rotations (..., 3, 3) and homogeneous translations (..., 4).
+        """
         turn, shift = self.mounts[k]
         units = np.broadcast_to(unit, (*translation.shape[:-1], 1))
         return turn.T @ rotation, np.concatenate([(translation - units * shift) @ turn, units], -1)
@@ -141,7 +151,10 @@ class Rig:
     def evidence(self, rotation: Array, translation: Array, scale: float | None = None) -> Array:
         """Return the log likelihood ratio (cameras,) of the bearings under a pose and by chance.
 
-        It is taken at the scale of the residuals, radians; None takes the mean over all scales.
+        Args:
+            rotation: (3, 3) of the rig.
+            translation: (4,) of the rig, homogeneous.
+            scale: Scale of the residuals, radians; None takes the mean over all scales.
         """
         terms = self._terms(rotation, translation, scale)
         return np.array([0.0 if one is None else one.evidence(0)[0] for one in terms])
@@ -149,8 +162,13 @@ class Rig:
     def covariance(self, rotation: Array, translation: Array, scale: float) -> Array | None:
         """Return the covariance of the pose in the axes of the rig, or None if the points do not fix it.
 
-        It is that of the rotation, the shift of the scene centroid and the logarithm of an unknown scale, (6, 6) or
-        (7, 7).
+        Args:
+            rotation: (3, 3) of the rig.
+            translation: (4,) of the rig, homogeneous.
+            scale: Standard deviation of the residuals, radians.
+
+        Returns:
+            (6, 6) of the rotation and the shift of the scene centroid; (7, 7) with the logarithm of an unknown scale.
         """
         for sharper in (1.0, 1 / math.sqrt(2)):  # as `local_covariance`
             parts = []
