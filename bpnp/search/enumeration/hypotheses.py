@@ -177,9 +177,9 @@ class Kept(NamedTuple):
         evidence: (c,) nats; -inf for an empty slot.
         counts: (c,) numbers of matches.
         point: (c, m) scene point of each image point, or -1.
-        distance2: (c, m) squared distances, in radii.
+        distance2: (c, m) squared distances, in match radii.
         best: (1,) index of the best pose.
-        most: (1,) largest number of matches of a hypothesis in this stage, less those that it lacks.
+        most: (1,) largest number of matches of a hypothesis in this stage, less `RULES.lacking` for each missing point.
         basin_count: (c,) number of image sets with a hypothesis that ended at the pose.
         last: (c,) image set that was counted last.
         at: (1,) current image set; -1 for a pose from elsewhere.

@@ -170,6 +170,7 @@ class ImageSide:
 
     @functools.cached_property
     def nearest(self) -> Places:
+        """Nearest points (m, k) of each image point."""
         return nearest_of(self.arrays.rays, np.empty((0, 3)))
 
 
@@ -182,6 +183,7 @@ def scene_side(points3d: Array, normals3d: Array | None, labels3d: Places | None
 
 @functools.lru_cache(maxsize=SCENES)
 def _remembered(points3d: bytes, normals3d: bytes | None, labels3d: bytes | None) -> SceneSide:
+    """Build a scene from the bytes of its arrays, which are the key of the cache."""
     return SceneSide(
         np.frombuffer(points3d).reshape(-1, 3),
         None if normals3d is None else np.frombuffer(normals3d).reshape(-1, 3),

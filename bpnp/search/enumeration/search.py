@@ -175,6 +175,7 @@ class Enumeration:
         self._explored(0, 0, 0, 0.0, reach)
 
     def _explored(self, *where: int | float) -> tuple[int, int, int]:
+        """Call the compiled loops; return the next row, the next triangle and the number of hypotheses solved."""
         return explore(*where, self._block, self.tables, self.kept, self.work)
 
 

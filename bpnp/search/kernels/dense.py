@@ -26,7 +26,7 @@ from bpnp.search.kernels.sides import Array, visible_weights
 RELAXATION = 1.7  # times the Gauss-Newton step on clusters: alternating expectation and maximisation take short steps
 DAMPING = 1e-3  # of each diagonal entry of the Hessian: a direction that the points do not fix is left unchanged
 POWER = 256  # of the kernel: eight squarings
-LEAST = 0.85  # of the base: a kernel of 1e-18, whose square is no denormal number, which are 2.5 times as slow
+LEAST = 0.85  # smallest base: a kernel of 1e-18, whose square is not denormal; denormal numbers are 2.5 times as slow
 
 
 @part

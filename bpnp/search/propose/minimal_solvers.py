@@ -154,6 +154,7 @@ def chords_between(rays: Any, i: int, j: int, k: int) -> tuple[float, float, flo
 
 @part
 def _distance2(f: Any, g: Any) -> float:
+    """Return |f - g|^2."""
     x, y, z = f[0] - g[0], f[1] - g[1], f[2] - g[2]
     return x * x + y * y + z * z
 
@@ -225,6 +226,7 @@ def p3p_depths(chords: Any, a: float, b: float, poses: Any) -> int:
 
 @part
 def _size(values: Any) -> float:
+    """Return the largest absolute value of three."""
     return max(abs(values[0]), abs(values[1]), abs(values[2]))
 
 

@@ -29,7 +29,7 @@ Indices = NDArray[np.int64]
 
 # Neighbours of a point that a base and its matches come from, in scenes up to MANY points, and in larger ones.
 NEIGHBOURS, MANY_NEIGHBOURS, MANY = 96, 48, 500
-BASES = 32  # a motion of half of the points is missed by (1 - 1/8)^32 = 1.4 % of the registrations, at most
+BASES = 32  # at most (1 - 1/8)^32 = 1.4 % of the registrations miss a motion of half of the points
 COMPACT = 4  # every other base is drawn from this fraction (1 / COMPACT) of a neighbourhood
 WIDEST = 4  # triangles drawn for a base, the largest of them
 FEWEST = 5  # moved points that lie on others: three fix a motion and are no evidence of it
