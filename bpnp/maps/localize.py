@@ -192,7 +192,7 @@ def on_all_points(solution: Solution, photo: Photo, lens: Camera | UnknownCamera
 
     Returns:
         The refined solution if its NFA is smaller, or if it is confident and the given one was not. Otherwise the given
-        solution, or a copy whose verdict is lowered by a competing pose among all points.
+            solution, or a copy whose verdict is lowered by a competing pose among all points.
     """
     place, camera, rule = photo.place, solution.camera, DEFAULT.evidence
     if not solution.found:

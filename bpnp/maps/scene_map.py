@@ -302,8 +302,8 @@ class SceneMap:
 
         Returns:
             Solution of the photo. `view` is the view near which the pose was found. `matches` (k, 2) hold the index of
-            a keypoint and the id of a point in the COLMAP model. `points3d` and `point_ids` are the points that were
-            tried.
+                a keypoint and the id of a point in the COLMAP model. `points3d` and `point_ids` are the points that
+                were tried.
 
         Raises:
             ValueError: A view is unknown, or `bpnp.solve` rejects the input.
@@ -485,8 +485,7 @@ class SceneMap:
             ignore_orientation: Ignore the EXIF orientation. By default it is the `up_camera` of `localize`. The photo
                 is never rotated, as in COLMAP.
             **options: focal_error, distortion, views, prior, solver, seed and time_limit, as for `localize`.
-            `focal_error` has
-                no effect on a photo with an unknown camera.
+                `focal_error` has no effect on a photo with an unknown camera.
 
         Returns:
             Solution as of `localize`.
@@ -525,7 +524,7 @@ class SceneMap:
 
         Returns:
             Camera and source. The camera is None if there is none, or if the focal lengths of the views differ by more
-            than 5 %.
+                than 5 %.
 
         Raises:
             ValueError: `exif` is False and there is no such camera.

@@ -40,7 +40,7 @@ def quarter_turns(views: Sequence[View], up_camera: Array) -> NDArray[np.int64]:
 
     Returns:
         Turns about the optical axis, from x towards y. 0 for views that point steeply up or down, and for all views if
-        the direction up in the map is unknown.
+            the direction up in the map is unknown.
     """
     up = up_of_views(views)
     if up is None or np.hypot(*up_camera[:2]) < IN_PLANE * np.linalg.norm(up_camera):

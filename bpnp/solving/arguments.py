@@ -367,7 +367,7 @@ def compact_labels(labels2d: Labels, labels3d: Labels) -> tuple[Labels, Labels]:
 
     Returns:
         Labels (m,) and (n,) from 0 to the number k of those in the scene; k for an image point whose label no scene
-        point has. -1 stays. The numbers of scene points do not depend on the image.
+            point has. -1 stays. The numbers of scene points do not depend on the image.
 
     >>> [labels.tolist() for labels in compact_labels(np.array([-1, 2**40, 9, 3]), np.array([9, -1, 2**40]))]
     [[-1, 1, 0, 2], [0, -1, 1]]

@@ -71,7 +71,7 @@ def verify(
 
     Returns:
         Solution with this pose, and with its competing poses in `candidates`. It is "failed" if the pose is not
-        significant, or if a competing pose is more likely by three decades; `matches` may then be empty.
+            significant, or if a competing pose is more likely by three decades; `matches` may then be empty.
 
     Raises:
         ValueError: The input is invalid, as for `solve`, or `rotation` is not a rotation matrix.
