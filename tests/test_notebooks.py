@@ -30,8 +30,13 @@ def test_a_notebook_is_stored_with_its_outputs(notebook: Path) -> None:
 
 
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_runs(notebook: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_notebook_runs(
+    notebook: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
     monkeypatch.chdir(tmp_path)
+    if notebook.stem == "hloc":
+        photos = request.getfixturevalue("shared_data") / "photos" / "sacre_coeur"
+        (tmp_path / "sacre_coeur").symlink_to(photos)
     cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
     codes = ["".join(cell["source"]).replace(*SHORTER) for cell in cells if cell["cell_type"] == "code"]
     assert codes[0].startswith("%matplotlib inline\n"), "without it a figure is shown as its name"
