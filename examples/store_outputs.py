@@ -2,9 +2,9 @@
 
     python examples/store_outputs.py [NOTEBOOK...]
 
-It needs `pip install nbclient ipykernel`, and `hloc.ipynb` the photos in a folder `sacre_coeur` of the working directory
-(without them its stored outputs stay). Cells with the tag `photo` are stored without their pictures, which would
-make the repository large.
+It needs `pip install nbclient ipykernel`, and `hloc.ipynb` the photos in a folder `sacre_coeur` of the working
+directory (without them its stored outputs stay). Cells with the tag `photo` are stored without their pictures, which
+would make the repository large.
 """
 
 import sys
