@@ -1,4 +1,4 @@
-"""Put CHANGELOG.md, which lies beside the folder of the documentation, on the site, and formulas as MathML.
+"""Put CHANGELOG.md, which is next to the folder of the documentation, on the site, and formulas as MathML.
 
 Browsers draw MathML themselves: the site needs no script and no network for its formulas.
 """
@@ -14,7 +14,7 @@ from mkdocs.structure.files import File, Files
 # What pymdownx.arithmatex makes of $...$ and $$...$$: \\(...\\) in a span, \\[...\\] in a div.
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 TIGHT = re.compile(r"<mo([^>]*>&#x0(?:002F|007C|2016);)</mo>")  # / | and ||, without space around them
-# A function before its argument, which stands beside it without a space.
+# A function before its argument, which follows it without a space.
 FUNCTION = re.compile(
     r"((?<!<msub>)(?<!<msup>)(?<!<munder>)<mi>(?:log|ln|exp|sin|cos|tan|det|max|min)</mi>"
     r"|<msub><mi>log</mi>(?:<mn>\d+</mn>|<mrow><mn>\d+</mn></mrow>)</msub>)"
