@@ -71,7 +71,7 @@ def plant_model(
 
 
 def plant_keypoints(database: Path, truth: Planted, views: dict[str, int]) -> None:
-    """A database anew: photos by name, each taken where a view of the model was, with noise of 0.3 pixels."""
+    """Write a new database: photos by name, each taken where a view of the model was, with noise of 0.3 pixels."""
     database.unlink(missing_ok=True)
     rng = np.random.default_rng(0)
     with pycolmap.Database.open(database) as content:

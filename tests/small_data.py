@@ -140,7 +140,7 @@ def write_off(path: Path, mesh: Mesh, *, joined_header: bool) -> None:
 
 
 def is_written(path: Path, text: bytes) -> bool:
-    """Whether another process writes this to a file within half a minute."""
+    """Return whether another process writes this to a file within half a minute."""
     deadline = time.monotonic() + 30
     while text not in path.read_bytes() and time.monotonic() < deadline:
         time.sleep(0.1)

@@ -119,8 +119,11 @@ def test_shapes_are_seen_where_the_pose_puts_them() -> None:
 
 @pytest.mark.parametrize("matches", [7, 1000])
 def test_a_true_pose_is_beyond_its_bound_as_often_as_that_says(matches: int) -> None:
-    """Errors drawn as claimed, of a scale that is estimated from the matches: once in a thousand for the rotation, once
-    for the pose. The covariance is widened so that one sigma holds 68 %."""
+    """Draw errors from the stated distribution, with the scale estimated from the matches.
+
+    One in a thousand exceeds the bound of the rotation, and one in a thousand that of the pose. The covariance is
+    widened so that one sigma contains 68 %.
+    """
     rng, root = np.random.default_rng(0), np.diag([0.01, 0.02, 0.01, 5.0, 3.0, 40.0])
     root[3:, :3] = 30 * rng.standard_normal((3, 3))
     turn, shift = Rotation.from_euler("xyz", [50, 20, -70], degrees=True), np.array([100.0, 20, 900])
@@ -134,7 +137,7 @@ def test_a_true_pose_is_beyond_its_bound_as_often_as_that_says(matches: int) -> 
     assert 1 <= sum(beyond) <= 16
     found.covariance = (root @ root.T)[:3, :3]  # of directions at infinity
     assert not record.beyond_bound(found, (found.rotation, shift))
-    found.covariance = np.full((6, 6), np.nan)  # nothing is claimed
+    found.covariance = np.full((6, 6), np.nan)  # there is no bound
     assert record.beyond_bound(found, (found.rotation, shift))
     outcomes = [record.Outcome("", 5.0, 0.0, "confident", 1.0, outside) for outside in (True, False)]
     row = record.Row("", list, 3.0)
@@ -329,7 +332,7 @@ def test_symmetric_objects_have_equal_parts(kind: symmetric.Kind) -> None:
 
 @pytest.mark.parametrize("name", ["rigs: LEDs, 2 cameras", "stars: 2,000 stars, 20 deg"])
 def test_a_row_of_another_benchmark_has_its_problems(name: str, tmp_path: Path) -> None:
-    """As many as were asked for, another seed draws others, and the known pose is found."""
+    """The number is as requested, another seed gives other problems, and the planted pose is found."""
     row = next(row for row in results.ROWS if results.key(row) == name)
     one, other = (list(row.measure(2, seed, tmp_path)) for seed in (1, 2))
     assert len(one) == len(other) == 2

@@ -19,7 +19,7 @@ OTHERS = ("roma", "torch._dynamo", "bpnp.models", "sympy", "scipy.optimize", "nu
 
 
 def loaded(statements: str, names: tuple[str, ...]) -> list[str]:
-    """Which of the modules `names` are loaded after `statements` in a new interpreter."""
+    """Return which of the modules `names` are loaded after `statements` in a new interpreter."""
     ask = f"import sys\n{statements}\nprint(*[name for name in {names} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, check=True)
     return done.stdout.splitlines()[-1].split()
@@ -30,7 +30,7 @@ def test_importing_the_package_loads_neither_compilers_nor_optimisers() -> None:
 
 
 def run_loads(*lines: str) -> list[str]:
-    """Which of the modules COSTLY these commands load, and torch."""
+    """Return which of the modules COSTLY these commands load, and torch."""
     calls = "\n".join(f"try:\n    main({line.split()})\nexcept SystemExit:\n    pass" for line in lines)
     return loaded(f"from bpnp.cli import main\n{calls}", (*COSTLY, "torch"))
 

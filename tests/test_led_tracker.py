@@ -73,7 +73,7 @@ def test_a_device_that_was_hidden_or_moved_is_found_again() -> None:
 
 
 def test_a_prediction_goes_on_as_the_device_moved() -> None:
-    """Three poses a constant turn and step apart, of which the tracker was given two."""
+    """Three poses a constant turn and step apart, two of them given to the tracker."""
     step = Rotation.from_euler("xyz", [2, -1, 3], degrees=True).as_matrix()
     tracked = tracker()
     tracked.poses = [(np.eye(3), np.array([0, 0, 1.0])), (step, np.array([0.01, 0, 1.02]))]

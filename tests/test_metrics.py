@@ -51,7 +51,7 @@ def test_rotation_and_centre_errors_do_not_change_when_the_scene_moves() -> None
     translation, translation_gt, shift = torch.randn(3, 10, 3, dtype=torch.float64)
 
     def moved(r: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-        """The same camera once the scene is moved by p -> motion p + shift."""
+        """Return the pose of the same camera after the scene is moved by p -> motion p + shift."""
         r = r @ motion.mT
         return r, t - (r @ shift.unsqueeze(-1)).squeeze(-1)
 

@@ -181,7 +181,7 @@ def test_the_picture_has_a_curve_a_row_and_the_papers_quartiles() -> None:
 def test_the_pages_hold_the_tables_of_their_records(
     benchmark: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As they are, and no longer once a record has another figure."""
+    """Pass for the committed pages, and fail if a record has another figure."""
     monkeypatch.setattr("sys.argv", ["benchmark", "--check"])
     benchmark.main()
     changed = benchmark.FILE.read_text().replace('"problems": ', '"problems": 9')

@@ -1,4 +1,4 @@
-"""What version 0.1.0 wrote is read, or refused by an error that says what to do."""
+"""Files of version 0.1.0 are read, or refused with an error that names a remedy."""
 
 import json
 from pathlib import Path

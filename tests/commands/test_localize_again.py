@@ -45,7 +45,7 @@ class Place:
         return bool(np.allclose(self.poses()[photo], self.truth.rotations[view], atol=5e-3))
 
     def write(self, views: dict[str, int]) -> None:
-        """The database anew: the photo was taken where this view of the map was."""
+        """Write the database again: the photo was taken at this view of the map."""
         plant_keypoints(self.folder / "database.db", self.truth, views)
 
 
@@ -87,13 +87,13 @@ def test_the_same_photo_is_kept_and_the_output_says_so(place: Place, capsys: pyt
 
 
 def overwritten(place: Place) -> dict[str, int]:
-    """As by a camera that writes frame.jpg."""
+    """Move a file over another one, like a camera that writes frame.jpg."""
     shot(place.folder / "a.png", 7)
     return {"a.png": 0}
 
 
 def taken_elsewhere(place: Place) -> dict[str, int]:
-    """Its keypoints were extracted anew too."""
+    """Its keypoints were extracted again, too."""
     shot(place.folder / "a.png", 7)
     place.write({"a.png": 2, "b.png": 1})
     return {"a.png": 2, "b.png": 1}

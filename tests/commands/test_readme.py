@@ -1,4 +1,4 @@
-"""What the README and the documentation tell users to type exists."""
+"""Commands, options and files in the README and the documentation exist."""
 
 import re
 import shlex

@@ -58,7 +58,7 @@ def test_json_is_all_that_is_printed(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 def test_options_and_columns_reach_the_search_as_they_are_written(tmp_path: Path) -> None:
-    """What each does there: tests/solving/test_options.py."""
+    """Pass all options to `solve`; their effects are tested in tests/solving/test_options.py."""
     rng = np.random.default_rng(9)
     sides = np.column_stack([P, np.tile([0.0, 0, 1], (40, 1)), rng.integers(0, 2, 40)])
     colours = np.empty((40, 1))

@@ -52,7 +52,7 @@ def test_a_pose_in_numbers_with_matches_is_judged(
 
 
 def test_options_reach_the_verdict_as_they_are_written(files: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """What each does there: tests/solving/test_verify.py."""
+    """Pass all options to `verify`; their effects are tested in tests/solving/test_verify.py."""
     asked, solution = list[dict[str, Any]](), bpnp.solve(X, P)
 
     def noted(*given: Any, **options: Any) -> Solution:

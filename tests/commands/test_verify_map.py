@@ -114,7 +114,7 @@ def test_thousands_of_other_keypoints_do_not_refute_a_pose(tmp_path: Path) -> No
 
 
 def test_images_whose_points_hardly_another_one_sees_are_untested(tmp_path: Path) -> None:
-    """Of two images no point is left that two others see."""
+    """A map of two images has no point that two others observe."""
     plant_model(tmp_path / "map", camera=PINHOLE, images=2)
     verified = verify_map(tmp_path / "map", SceneMap.from_colmap(tmp_path / "map"))
     assert [one.verdict for one in verified] == ["untested"] * 2

@@ -18,7 +18,7 @@ from bpnp.types import Batch
 
 
 def planted(count: int = 60, *, free2d: int = 0, free3d: int = 0, seed: int = 0) -> Problem:
-    """A camera's problem without noise; points without a partner have coordinates above 50."""
+    """A camera's problem without noise; outliers have coordinates above 50."""
     rng = np.random.default_rng(seed)
     points3d = rng.normal(size=(count, 3))
     rotation, translation = cv2.Rodrigues(rng.normal(size=3))[0], np.array([0.1, -0.2, 9.0])

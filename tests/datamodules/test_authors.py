@@ -89,7 +89,7 @@ def test_bad_samples_are_left_out_and_listed(tmp_path: Path) -> None:
 
 
 def test_a_2d_point_is_matched_once(tmp_path: Path) -> None:
-    """Of two 3D points that share a 2D point the first is its partner."""
+    """If two 3D points have the same 2D point, the first one is its match."""
     samples = [sample(i) for i in range(8)]
     count = int(samples[0]["num_points_2d"][0])
     samples[0]["W_gt"][1] = samples[0]["W_gt"][0]

@@ -1,4 +1,4 @@
-"""Point clouds in ModelNet's layouts: the points of the files, fixed or drawn anew, and errors that name the file."""
+"""Point clouds in ModelNet's layouts: fixed or sampled points of the files, and errors that name the file."""
 
 from pathlib import Path
 

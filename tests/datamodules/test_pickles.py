@@ -49,7 +49,7 @@ def test_round_trip(tmp_path: Path, protocol: int) -> None:
 
 
 def test_pickles_of_python_2(tmp_path: Path) -> None:
-    """What Python 2 and its numpy wrote for {0: np.array([1.0, 2.0])}: byte strings for the names and the contents."""
+    """The pickle of Python 2 and its numpy for {0: np.array([1.0, 2.0])}: byte strings for names and contents."""
     raw = np.array([1.0, 200.0]).tobytes()
     text = (
         b"\x80\x02}q\x01K\x00cnumpy.core.multiarray\n_reconstruct\nq\x02cnumpy\nndarray\nq\x03K\x00\x85U\x01b\x87R"

@@ -219,7 +219,7 @@ def test_files_of_one_stem_are_shapes_of_their_own(tmp_path: Path) -> None:
 
 
 def test_a_worker_that_is_killed_is_one_error(meshes: Path, tmp_path: Path) -> None:
-    """As the system ends a process that takes too much memory."""
+    """End this process like the system ends one that takes too much memory."""
     recipe = Recipe("toy", {"points": 3}, {}, [(os.getpid(),)] * 4, end_worker, "mesh", "here")
     with pytest.raises(OSError, match="a process that was reading here ended, .* try fewer --processes"):
         prepare(recipe, tmp_path / "store", processes=2)

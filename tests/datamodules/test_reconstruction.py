@@ -25,7 +25,7 @@ PARAMETERS = {
 
 
 def equal(a, b) -> bool:
-    """Whether two reconstructions hold the same, name apart; rotations up to rounding, for pycolmap normalises them."""
+    """Return whether two reconstructions are equal, except for the name; pycolmap normalises rotations."""
     return np.array_equal(a.points3d, b.points3d) and all(
         all(np.array_equal(getattr(x, field), getattr(y, field)) for field in EXACT)
         and np.array_equal(x.camera.matrix, y.camera.matrix)
@@ -59,7 +59,7 @@ def test_planted_points_come_back_through_every_camera_model(model: str, tmp_pat
 
 
 def editable(folder: Path, monkeypatch: pytest.MonkeyPatch) -> ModelRecords:
-    """What the files of a model hold, to be changed before the model is read."""
+    """The content of the files of a model, to be changed before the model is read."""
     records = read_records(folder)
     copies = [replace(im, keypoints=im.keypoints.copy(), point_ids=im.point_ids.copy()) for im in records.images]
     records = replace(records, images=copies)

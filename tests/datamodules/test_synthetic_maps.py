@@ -25,7 +25,7 @@ def shown(problem: Problem) -> np.ndarray:
 
 
 def errors_px(problem: Problem) -> np.ndarray:
-    """Of each coordinate of the matches' keypoints."""
+    """Return the error of each coordinate of the matched keypoints, in pixels."""
     return (shown(problem)[: problem.matched] - problem.points2d[: problem.matched]).ravel() * problem.focal
 
 

@@ -13,7 +13,7 @@ from bpnp.layers.pnp import ClippedColumns
 
 
 def test_lbfgs_reaches_the_optimum_of_newton() -> None:
-    """Of soft assignments with outliers on both sides."""
+    """Draw soft assignments with outliers on both sides."""
     planted = plant(8, 100, outliers2d=10, outliers3d=10)
     problem = planted.diffuse(0.15), planted.bearings, planted.points3d
     start = planted.near(0.1)

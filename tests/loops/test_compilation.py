@@ -46,7 +46,7 @@ print(double(bpnp.factor.Scaled(4, 1)), double(bpnp.factor.Scaled(5, 1)), Clock.
 
 @pytest.fixture
 def package(tmp_path: Path) -> Path:
-    """A folder with a package `bpnp` of a compiled loop beside which nothing can be written, whoever runs the test."""
+    """Create a package `bpnp` with a compiled loop, in a folder that no user can write to."""
     folder = tmp_path / "installed" / "bpnp"
     source = Path(bpnp.loops.compilation.__file__).parents[1]
     shutil.copytree(source / "loops", folder / "loops")

@@ -32,7 +32,7 @@ def test_the_image_of_a_view_holds_what_is_before_it_and_the_rest_at_its_edge() 
 
 
 def test_each_side_hears_of_the_other() -> None:
-    """What BPnPNet's features cannot do: the features of the image change with the scene."""
+    """Unlike those of BPnPNet, the features of the image change with the scene."""
     net, batch = small_matcher(), cluttered(12)
     other = replace(batch, points3d=batch.points3d.flip(-1) ** 3)
     assert (net.features(other)[0] - net.features(batch)[0]).abs().max() > 1e-3

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 
 
 def views_of_shapes(count: int, folder: Path, **options: Any) -> Batch:
-    """Of test shapes, 64 points each."""
+    """Draw problems of test shapes, 64 points each."""
     sizes = {"num_points": 64, "pool_size": 64, "test_shapes": count, "batch_size": count}
     data = MeshDataModule(**sizes, cache_dir=str(folder), **options)
     data.setup("test")
@@ -86,12 +86,12 @@ def test_the_weights_of_the_paper_have_its_inference_and_show_what_its_pose_loss
 
 @pytest.fixture(scope="module")
 def cluttered(tmp_path_factory: pytest.TempPathFactory) -> Batch:
-    """As in the paper, with half as many outliers as pairs on each side."""
+    """Draw problems as in the paper, with half as many outliers as pairs on each side."""
     return views_of_shapes(16, tmp_path_factory.mktemp("c"), test_outliers=Outliers(ratio=0.5))
 
 
 def test_the_matcher_finds_the_partners_among_clutter(cluttered: Batch) -> None:
-    """The most probable partner of a paired point is the true one or a near one; of 96, chance is in the middle."""
+    """The most probable match of a paired point is the true one or a near one; of 96, chance is in the middle."""
     assert cluttered.rotation is not None
     net = Matcher.from_pretrained("matcher-clutter")
     moved = replace(cluttered, points3d=7 * cluttered.points3d + torch.tensor([5.0, -3.0, 1.0]))
@@ -116,7 +116,7 @@ def test_the_matcher_is_a_prior_and_a_solver_of_solve(cluttered: Batch) -> None:
 
 
 def test_the_matcher_for_maps_finds_partners_in_the_axes_of_the_view() -> None:
-    """Of synthetic maps; a partner is worth as little as any other point if the points are turned away."""
+    """Use synthetic maps; a match is as improbable as any other pair if the points are rotated away."""
     data = SyntheticMapDataModule(frame="view", num_points=128, outliers=0.5, test_problems=8, seed=7)
     data.setup("test")
     batch = next(iter(data.test_dataloader()))
@@ -129,7 +129,7 @@ def test_the_matcher_for_maps_finds_partners_in_the_axes_of_the_view() -> None:
 
 
 def shares_of_partners(net: Matcher, batch: Batch) -> float:
-    """Median probability of the true partner of a 3D point that has one."""
+    """Return the median probability of the true match of 3D points that have one."""
     with torch.no_grad():
         assignment = net.match(batch).assignment
     true = assignment.gather(1, batch.match3d.clamp_min(0).unsqueeze(1)).squeeze(1) / assignment.sum(1)

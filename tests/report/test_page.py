@@ -17,7 +17,7 @@ from bpnp.report.terminal import number
 
 
 class Elements(HTMLParser):
-    """What a browser would make of the page: its elements and the text of its scripts."""
+    """The page as a browser parses it: its elements and the text of its scripts."""
 
     def __init__(self, page: str) -> None:
         super().__init__()

@@ -125,7 +125,7 @@ def test_an_image_point_with_two_scene_points_is_not_alone() -> None:
     assert loss.item() == pytest.approx(-sum(pairs) / 4 - sum(alone) / 2, rel=1e-12)
     (slope,) = torch.autograd.grad(loss.sum(), left2d)
     assert slope[0, 1] < 0  # more mass in the bin of a point that is alone is better
-    assert slope[0, 0] > 0  # and worse in that of a point with partners
+    assert slope[0, 0] > 0  # and worse in that of a point with matches
 
 
 def test_matching_likelihood_loss_ignores_padding_and_has_its_derivative() -> None:

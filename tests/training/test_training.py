@@ -48,7 +48,7 @@ def finish(process: subprocess.Popen[bytes]) -> None:
 
 @pytest.fixture(autouse=True)
 def _one_thread() -> Iterator[None]:
-    """As the processes have."""
+    """Use one thread, like the processes that the results are compared with."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
