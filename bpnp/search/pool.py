@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from bpnp.poses import close_poses
 from bpnp.search.annealing import finish
-from bpnp.search.evidence.false_alarms import log10_tests
 from bpnp.search.evidence.rivals import against_rivals
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
+from bpnp.search.pose_model import log10_tests
 from bpnp.search.problem import Problem
 from bpnp.search.scene import Scene
 from bpnp.search.verdict import SearchResult, judged, missed, weighed, with_false_alarms

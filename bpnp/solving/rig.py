@@ -10,7 +10,7 @@ import numpy as np
 from bpnp.cameras import camera_from
 from bpnp.loops.parallel import Clock, Deadline
 from bpnp.search.evidence.covariance import student_factor
-from bpnp.search.evidence.uncertainty import crossed
+from bpnp.search.pose_model import crossed
 from bpnp.search.problem import Problem
 from bpnp.search.rig.cameras import Pose, Rig
 from bpnp.search.rig.search import search_rig

@@ -45,13 +45,12 @@ from numpy.typing import NDArray
 
 from bpnp.search.image_statistics import ImageStatistics
 from bpnp.search.kernels.neighbours import sums_near
+from bpnp.search.pose_model import PoseModel, log10_cells, log10_lenses, log10_tests
 from bpnp.search.problem import Problem, faces, label_groups
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
 
-FIXING = 3  # matches that fix a pose; one more also fixes a focal length or the scale of a rig's scene
-FIXING_ROTATION = 2  # matches that fix a rotation
 SHARES = np.array([0.15, 0.4, 0.75])  # w
 LEAST_SHARE, MOST_SHARE = 0.02, 0.98  # range of w if clutter or scores are given
 OUTLINE = 0.5  # smoothing width of l, in RMS angular radii of the bearings; the outline beyond it is no evidence
@@ -160,74 +159,8 @@ def alarms_of(problem: Problem, rotations: Array, translations: Array, scales: A
         fewer = math.log(10) * (np.maximum(cells + share[k], 0.0) - none[k])
         scale = None if scales is None else float(scales[k])
         terms = camera_terms(problem, seen, scale, fewer=fewer)
-        result.own[k], result.rough[k] = log10_nfa([terms], float(none[k]), [[_fixing(problem)]])
+        result.own[k], result.rough[k] = log10_nfa([terms], float(none[k]), [[PoseModel.of(problem).fixing]])
     return Alarms(result.own + problem.log10_views, result.rough + problem.log10_views)
-
-
-def log10_tests(problem: Problem) -> float:
-    """Return log10 of the number of tests, 2 (m)_3 (n)_3 / 3!: choices of three matches with about two poses each.
-
-    Labels, if given, have to agree. `Problem.log10_tried` replaces the number if it is set.
-    """
-    if problem.log10_tried is not None:
-        return problem.log10_tried
-    tests = _log10_choices(problem, FIXING)
-    if problem.focal is None:
-        return tests
-    return min(_log10_choices(problem, FIXING + 1), tests + float(log10_lenses(problem)[0]))
-
-
-def _log10_choices(problem: Problem, pairs: int) -> float:
-    m, n = len(problem.bearings), len(problem.points3d)
-    choices = math.prod((m - i) * (n - i) / (i + 1) for i in range(pairs))
-    if problem.labels2d is not None and problem.labels3d is not None:
-        groups = label_groups(np.arange(m), problem.labels2d, problem.labels3d, n)
-        agreeing = sum(len(rows) * len(columns) for rows, columns in groups)
-        choices = min(choices, math.prod((agreeing - i) / (i + 1) for i in range(pairs)))
-    return math.log10(2 * max(choices, 1.0))
-
-
-def _fixing(problem: Problem) -> int:
-    return FIXING + (problem.focal is not None)
-
-
-def log10_lenses(problem: Problem) -> Array:
-    """Return log10 (S,) of the number of distinguishable lenses at each scale s of the image, 0 for a given lens.
-
-    A focal length moves points at the RMS angular radius h by h d log f, a radial coefficient by h^3 dk.
-    """
-    if problem.focal is None:
-        return np.zeros(len(problem.image.scales))
-    h, scales = problem.image.spread, problem.image.scales
-    moved = problem.focal.log_range * h, problem.focal.radial_range * h**3
-    return np.asarray(sum(np.log10(np.maximum(each / scales, 1.0)) for each in moved))
-
-
-def log10_cells(image: ImageStatistics) -> Array:
-    """Return log10 (S,) of the number of distinguishable poses, cells of width s, at each scale s of an image.
-
-    Let h be the RMS angular radius of the bearings. The number is the product of:
-
-    - 8 pi^2 (h / s)^3 rotations about the scene centroid, which move points at h from it by s,
-    - A / s^2 positions of the centroid in the view,
-    - log(30) h / s distances of it, up to a factor of 30.
-    """
-    across = image.spread / image.scales
-    cells = 8 * math.pi**2 * across**4 * (image.solid_angle / image.scales**2) * math.log(30)
-    return np.asarray(np.log10(np.maximum(cells, 1.0)))
-
-
-def log10_rotations(spread: float, scales: Array) -> Array:
-    """Return log10 (S,) of the number of distinguishable rotations at each scale s of an image, 8 pi^2 h / s^3.
-
-    It is the product of 4 pi / s^2 directions of the axis and 2 pi h / s rotations about it. Each rotation moves points
-    at h from the axis by s.
-
-    Args:
-        spread: RMS angular radius h of the image points, radians.
-        scales: (S,) scales s, radians.
-    """
-    return np.asarray(np.log10(np.maximum(8 * math.pi**2 * spread / scales**3, 1.0)))
 
 
 def directions_of(problem: Problem, rotation: Array, translation: Array) -> Array:
@@ -254,7 +187,7 @@ def camera_terms(
     Returns:
         Terms from the finest own scale on; None if no more points are seen than fix the pose.
     """
-    if min(len(problem.bearings), int(np.isfinite(seen[:, 0]).sum())) <= _fixing(problem):
+    if min(len(problem.bearings), int(np.isfinite(seen[:, 0]).sum())) <= PoseModel.of(problem).fixing:
         return None
     ratio = np.ones(len(problem.image.scales)) if scale is None else _ratio(problem.image, scale)
     own, rough = _is_own(ratio), ratio >= ROUGH
@@ -285,7 +218,7 @@ def own_evidence(problem: Problem, rotation: Array, translation: Array, scale: f
 def likeliest_scale(problem: Problem, rotation: Array, translation: Array) -> float:
     """Return the scale of the residuals, radians, with the most evidence; the largest scale if there is none."""
     terms = camera_terms(problem, directions_of(problem, rotation, translation))
-    return float(problem.image.scales[-1 if terms is None else terms.by_scale(_fixing(problem)).argmax()])
+    return float(problem.image.scales[-1 if terms is None else terms.by_scale(PoseModel.of(problem).fixing).argmax()])
 
 
 def _ratio(image: ImageStatistics, scale: float) -> Array:

@@ -31,11 +31,6 @@ def facing(problem: Problem, camera: Array, rotation: Array) -> Labels:
     return np.flatnonzero(used)
 
 
-def across(seen: Array) -> Array:
-    """Return the projections (k, 3, 3) onto the planes perpendicular to directions (k, 3)."""
-    return np.asarray(np.eye(3) - seen[:, :, None] * seen[:, None, :])
-
-
 def partners(
     problem: Problem, seen: Array, places: Labels, chosen: Labels, scale: float, most: int = NEIGHBOURS
 ) -> tuple[Any, Any, Array, Array]:

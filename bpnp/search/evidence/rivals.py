@@ -16,8 +16,9 @@ from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
 from bpnp.search.evidence.settings import Evidence, OtherFocal
 from bpnp.search.evidence.uncertainty import bends_significantly, linearised, misfit_of
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
+from bpnp.search.pose_model import undistort
 from bpnp.search.problem import Problem, UnknownFocal
-from bpnp.search.propose.lens import LensFit, fit_lens, undistort
+from bpnp.search.propose.lens import LensFit, fit_lens
 from bpnp.search.raster_search import search_beside
 from bpnp.search.scene import Scene
 from bpnp.search.verdict import SearchResult, is_symmetric, judged, match_count, with_false_alarms

@@ -12,10 +12,11 @@ from scipy.special import fdtrc, fdtri
 
 from bpnp.poses import turned_by
 from bpnp.search.evidence.covariance import Linearisation, covariance_of, student_factor
-from bpnp.search.evidence.partners import across, facing, partners
+from bpnp.search.evidence.partners import facing, partners
 from bpnp.search.evidence.settings import Evidence
+from bpnp.search.pose_model import across, centre_columns, crossed, lens_columns
 from bpnp.search.problem import Problem
-from bpnp.search.propose.lens import LensFit, centre_columns, fit_lens, lens_columns
+from bpnp.search.propose.lens import LensFit, fit_lens
 from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import GravityPrior, PosePrior
 
@@ -346,12 +347,6 @@ def _known(linear: Linearised) -> Array:
             moved = np.concatenate([crossed(linear.rotation @ linear.problem.middle), np.eye(3)], 1)
             information[:POSE, :POSE] += moved.T @ moved / prior.translation_sigma**2
     return information
-
-
-def crossed(vector: Array) -> Array:
-    """Return the cross-product matrix (3, 3) of a vector (3,)."""
-    x, y, z = vector
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
 class Misfit(NamedTuple):

@@ -28,9 +28,10 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from bpnp.search.evidence.covariance import covariance_of, of_sure_matches, student_factor
-from bpnp.search.evidence.false_alarms import FIXING_ROTATION, SHARES, Terms, log10_nfa, log10_rotations
+from bpnp.search.evidence.false_alarms import SHARES, Terms, log10_nfa
 from bpnp.search.evidence.uncertainty import EXCEEDED, STRAINS, exceeded_once
 from bpnp.search.kernels.neighbours import sums_near
+from bpnp.search.pose_model import FIXING_ROTATION, log10_rotations
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]

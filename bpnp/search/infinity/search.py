@@ -20,7 +20,6 @@ from scipy.special import betaln
 
 from bpnp.loops.parallel import NEVER, Deadline
 from bpnp.search.evidence import reasons
-from bpnp.search.evidence.false_alarms import FIXING_ROTATION
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.infinity.evidence import (
     Array,
@@ -46,6 +45,7 @@ from bpnp.search.infinity.kernels import (
     vote,
 )
 from bpnp.search.kernels.neighbours import hashed
+from bpnp.search.pose_model import FIXING_ROTATION
 from bpnp.search.settings import DEFAULT as SEARCH
 from bpnp.search.verdict import SearchResult, no_pose
 

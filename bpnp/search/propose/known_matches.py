@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bpnp.poses import SAME, distinct, seen_from
-from bpnp.search.evidence.partners import across, explained
+from bpnp.search.evidence.partners import explained
 from bpnp.search.hypotheses import Hypotheses
+from bpnp.search.pose_model import across
 from bpnp.search.problem import Problem
 from bpnp.search.propose.minimal_solvers import p3p_poses
 

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.search.evidence.partners import across, facing, partners
+from bpnp.search.evidence.partners import facing, partners
 from bpnp.search.evidence.settings import OtherFocal
+from bpnp.search.pose_model import LEAST_SLOPE, across
 from bpnp.search.problem import Problem
 
 Array = NDArray[np.float64]
@@ -21,8 +22,6 @@ Labels = NDArray[np.int64]
 FEW_PARTNERS = 2  # scene points that may correspond to each image point
 MOST_ZOOM, MOST_BEND = 0.2, 0.1  # largest step of the log scale factor, and relative shift of the outermost point
 SAME_ZOOM = 0.01  # change of the log scale factor below which no other round of steps is taken
-LEAST_SLOPE = 0.2  # smallest derivative of the seen by the true radius at which a point is visible
-UNDISTORTED = 20  # Newton steps
 MOST_ROUNDS = 4
 SETTLED_ZOOM, MOST_STEPS = 2e-5, 40  # the same for the last steps, with all points; steps at most
 WIDTHS = (4.0, 2.0, 2.0, 1.0, 1.0)  # scales of the residuals, of the Gauss-Newton steps of a round
@@ -90,54 +89,6 @@ def fit_lens(
         if last is None or step is None or abs(math.log(step.zoom / last.zoom)) < SETTLED_ZOOM:
             break
     return step
-
-
-def undistort(bearings: Array, zoom: float, radial: float) -> Array:
-    """Convert bearings (m, 3) of a distorted camera to those of a pinhole with 1 / zoom times its focal length.
-
-    Newton steps solve r (1 + k r^2) = r_seen / zoom; a point beyond the largest radius of the camera model stays at
-    that.
-
-    >>> x = np.array([[0.6, 0.3, 1.0]])
-    >>> bent = x * [[1.2 * (1 - 0.2 * 0.45)] * 2 + [1]]
-    >>> back = undistort(bent / np.linalg.norm(bent), 1.2, -0.2)
-    >>> np.round(back / back[:, 2:], 9).tolist()
-    [[0.6, 0.3, 1.0]]
-    """
-    seen = bearings[:, :2] / bearings[:, 2:] / zoom
-    radius = np.linalg.norm(seen, axis=-1)
-    most = math.sqrt((1 - LEAST_SLOPE) / (-3 * radial)) if radial < 0 else math.inf
-    true = np.minimum(radius, most)
-    for _ in range(UNDISTORTED):
-        slope = np.maximum(1 + 3 * radial * true**2, LEAST_SLOPE)
-        true = np.clip(true - (true * (1 + radial * true**2) - radius) / slope, 0.0, most)
-    rays = np.column_stack([seen * (true / np.maximum(radius, 1e-300))[:, None], np.ones(len(seen))])
-    return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
-
-
-def lens_columns(seen: Array, radial: float) -> Array:
-    """Return the derivatives of directions by the camera model with which their bearings were undistorted.
-
-    With y = (1 + k |x|^2) x fixed by the image, dx = x (1 + k |x|^2) / (1 + 3 k |x|^2) d log f, and
-    dx = x |x|^2 / (1 + 3 k |x|^2) dk.
-
-    Args:
-        seen: (n, 3) unit directions.
-        radial: Radial coefficient k of the camera.
-
-    Returns:
-        (n, 3, 2) derivatives by the logarithm of the focal length and by k.
-    """
-    ahead = seen[:, 2] > 0
-    squared = (seen[:, :2] ** 2).sum(-1) / np.where(ahead, seen[:, 2], 1.0) ** 2 * ahead
-    slope = np.maximum(1 + 3 * radial * squared, LEAST_SLOPE)
-    factors = np.stack([(1 + radial * squared) / slope, squared / slope], -1)
-    return np.asarray((across(seen) @ (seen * (1, 1, 0))[..., None]) * factors[:, None])
-
-
-def centre_columns(seen: Array) -> Array:
-    """Return the derivatives (n, 3, 2) of unit directions (n, 3) by the principal point, in focal lengths."""
-    return np.asarray(across(seen)[:, :, :2] * np.maximum(seen[:, 2], 0.0)[:, None, None])
 
 
 def _linearise(problem: Problem, chosen: Labels, scale: float, at: LensFit) -> LensFit | None:

@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bpnp.search.evidence.covariance import covariance_of, join
-from bpnp.search.evidence.false_alarms import FIXING, Terms, camera_terms, directions_of, log10_nfa, log10_tests
+from bpnp.search.evidence.false_alarms import Terms, camera_terms, directions_of, log10_nfa
 from bpnp.search.evidence.uncertainty import Linearised, linearised, matches_of
 from bpnp.search.hypotheses import Hypotheses
+from bpnp.search.pose_model import FIXING, log10_tests
 from bpnp.search.problem import Problem
 from bpnp.search.scene import Scene
 
