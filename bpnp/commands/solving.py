@@ -145,9 +145,9 @@ def solve(
         )
     messages = _print_solution(solution, annotations, json=json, quiet=quiet, output=output)
     if picture is not None:
-        from bpnp.solving.solution import solution_picture
+        from bpnp.report.solutions import draw_solution
 
-        figure = solution_picture(solution, title=points2d.stem, photo=background)
+        figure = draw_solution(solution, title=points2d.stem, photo=background)
         say(f"wrote {save_figure(figure, picture)}", to=messages)
     if colmap is not None:
         written = solution.to_colmap(colmap, name="image.jpg" if photo is None else photo.name)

@@ -48,9 +48,9 @@ def verify_images(
 
     from bpnp.maps.scene_map import SceneMap
     from bpnp.maps.verified_map import SECONDS, as_csv, as_json, page_html, summary, verify_map
-    from bpnp.solving.arguments import positive
+    from bpnp.solving.arguments import seconds_from
 
-    limit = positive("time_limit", SECONDS if time_limit is None else time_limit)
+    limit = seconds_from(time_limit, SECONDS)
     scene = SceneMap.from_colmap(map)
     with count_items("verifying", len(scene.views), quiet=quiet) as done:
         verified = verify_map(map, scene, seed=seed, time_limit=limit, done=done)

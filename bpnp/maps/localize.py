@@ -136,9 +136,8 @@ class Photo:
 
 
 def with_ids(solution: Solution, region: Region) -> Solution:
-    """Return a solution with point ids of a region instead of point indices in its matches."""
-    matches = np.column_stack([solution.matches[:, 0], region.point_ids[solution.matches[:, 1]]])
-    return replace(solution, matches=matches, view=region.view.name, point_ids=region.point_ids)
+    """Return a solution with the point ids of a region and the name of its view."""
+    return replace(solution, view=region.view.name, point_ids=region.point_ids)
 
 
 def in_picture(problem: Problem, pose: Solution | Candidate) -> NDArray[np.bool_]:

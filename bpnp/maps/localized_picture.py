@@ -10,7 +10,7 @@ from bpnp.cameras import camera_from
 from bpnp.report.images import size_in_camera
 from bpnp.report.terminal import LIGHT, QUIET, VERDICTS, number
 from bpnp.search.evidence.uncertainty import centre_covariance
-from bpnp.solving.solution import Solution, solution_points
+from bpnp.solving.solution import Solution
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,6 +46,8 @@ def localized_picture(
     """
     from matplotlib.figure import Figure
 
+    from bpnp.report.solutions import solution_points
+
     figure = Figure(figsize=(sum(WIDTHS), 6.5), layout="constrained")
     image, above = figure.subplots(1, 2, width_ratios=WIDTHS)
     marks = draw_matches(image, solution, photo=photo)
@@ -68,8 +70,7 @@ def draw_matches(axes: "Axes", solution: Solution, *, photo: Array | None = None
 
     camera = camera_from(solution.camera)
     seen = camera.project(np.column_stack([solution.points2d, np.ones(len(solution.points2d))]))
-    places = solution.match_places if solution.verdict != "failed" else solution.match_places[:0]
-    image, scene = places.T
+    image, scene = solution.matches.T if solution.verdict != "failed" else solution.matches[:0].T
     reprojected = camera.project(solution.points3d[scene] @ solution.rotation.T + solution.translation)
     residuals = np.linalg.norm(seen[image] - reprojected, axis=-1)
     if photo is not None:

@@ -1,5 +1,6 @@
 """Map for localising photos: the points and views of a COLMAP reconstruction."""
 
+import warnings
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -56,11 +57,13 @@ from bpnp.solving.arguments import (
     numbers,
     pixels_from,
     positive,
+    seconds_from,
     source_from,
 )
 from bpnp.solving.focal_length import UnknownCamera, unknown_camera
 from bpnp.solving.solution import Solution
 from bpnp.solving.sources import Options
+from bpnp.solving.verify import SECONDS as SECONDS_OF_VERIFICATION
 
 if TYPE_CHECKING:
     import torch
@@ -91,7 +94,7 @@ class SceneMap:
     >>> from bpnp import SceneMap
     >>> scene = SceneMap.from_colmap("sparse/0")  # doctest: +SKIP
     >>> solution = scene.localize_photo("photo.jpg")  # doctest: +SKIP
-    >>> solution.verdict, solution.view, solution.matches  # doctest: +SKIP
+    >>> solution.verdict, solution.view, solution.matched_point_ids  # doctest: +SKIP
     """
 
     points3d: Array
@@ -301,9 +304,9 @@ class SceneMap:
                 poses of a confident pose are still tested, which takes about a second.
 
         Returns:
-            Solution of the photo. `view` is the view near which the pose was found. `matches` (k, 2) hold the index of
-                a keypoint and the id of a point in the COLMAP model. `points3d` and `point_ids` are the points that
-                were tried.
+            Solution of the photo. `view` is the view near which the pose was found. `points3d` are the points of
+                the map that were tried, and `point_ids` their ids in the COLMAP model. `matches` (k, 2) are indices
+                into `points2d` and `points3d`; `matched_point_ids` are the ids of the matched points.
 
         Raises:
             ValueError: A view is unknown, or `bpnp.solve` rejects the input.
@@ -419,7 +422,7 @@ class SceneMap:
         return replace(best, seconds=Clock.now() - start)
 
     def verify_view(
-        self, name: str, keypoints: Any, *, seed: int = 0, time_limit: float | int | None = 10.0
+        self, name: str, keypoints: Any, *, seed: int = 0, time_limit: float | int | None = SECONDS_OF_VERIFICATION
     ) -> Solution:
         """Verify the pose of a view without its own observations.
 
@@ -433,19 +436,24 @@ class SceneMap:
             keypoints: (m, 2) pixels, all that were detected in its image, in COLMAP's convention: (0.5, 0.5) is the
                 centre of the first pixel.
             seed: Seed of the perturbed copies of the pose from which it is refined, default 0.
-            time_limit: Seconds until competing poses in view are no longer tested, default 10; None for no limit.
+            time_limit: Seconds until competing poses in view are no longer tested, 10 by default; math.inf for no
+                limit.
 
         Returns:
-            Solution as of `bpnp.verify`; its `matches` hold the ids of points.
+            Solution as of `bpnp.verify`. `points3d` and `point_ids` are the points in view.
 
         Raises:
             ValueError: The name is not in the map, or the view can see fewer than 4 of the remaining points.
         """
+        if time_limit is None:
+            message = "`time_limit=None` of `verify_view` is its default limit now, 10 s; math.inf is no limit"
+            warnings.warn(message, DeprecationWarning, stacklevel=2)
+        limit = seconds_from(time_limit, SECONDS_OF_VERIFICATION)
         view, rest = self.named([name])[0], self.without([name])
         pixels = np.asarray(pixels_from(keypoints, view.camera), np.float64)
         place = replace(rest._region(rest.views[0], np.arange(len(rest.points3d))), view=view)
         photo = Photo(pixels, view.camera, place, partial(rest._regions, None, view.camera), seed)
-        return verify_pose(photo, view, time_limit=positive("time_limit", time_limit))
+        return verify_pose(photo, view, time_limit=limit)
 
     def _lens(
         self, camera: Any, image_size: Any, focal_error: float | int | None, distortion: bool

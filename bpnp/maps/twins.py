@@ -80,7 +80,7 @@ def best_rival(photo: Photo, solution: Solution, met: Sequence[Solution]) -> tup
     met_poses = [one for other in met for one in other.candidates if one.log10_false_alarms < 0]
     poses = [problem.from_user(one.rotation, one.translation) for one in met_poses]
     poses += [*zip(repeated.rotation, repeated.translation, strict=True), *_looks(photo, solution, problem)]
-    matched = np.median(problem.points_from_user(solution.points3d[solution.match_places[:, 1]]), 0)
+    matched = np.median(problem.points_from_user(solution.points3d[solution.matches[:, 1]]), 0)
 
     def different(rotations: Array, translations: Array) -> NDArray[np.bool_]:
         rotations, translations = np.concatenate([best[0][None], rotations]), np.r_[best[1][None], translations]

@@ -20,8 +20,8 @@ from bpnp.datamodules.colmap.model_files import read_records
 from bpnp.maps.localized_picture import plane_from_above
 from bpnp.maps.scene_map import SceneMap
 from bpnp.report.terminal import INKS, VERDICTS, number
+from bpnp.solving.verify import SECONDS
 
-SECONDS = 10.0  # per image
 UNTESTED = "untested"
 MATCHED_ONLY = "Significant on the matched keypoints alone, log10 NFA {0:.1f}, but not on all {2} keypoints, {1:.1f}"
 WORST_FIRST = ("failed", "ambiguous", UNTESTED, "confident")
@@ -67,7 +67,7 @@ def verify_map(
     scene: SceneMap,
     *,
     seed: int = 0,
-    time_limit: float | None = SECONDS,
+    time_limit: float = SECONDS,
     done: Callable[[str], None] = lambda words: None,
 ) -> list[VerifiedView]:
     """Verify the pose of each image of a COLMAP model without the image's own observations.
@@ -80,7 +80,7 @@ def verify_map(
         folder: Folder of the model; the keypoints of its images are read.
         scene: The map of the same model.
         seed: Seed, as for `SceneMap.verify_view`. Default 0.
-        time_limit: Seconds per image, as for `SceneMap.verify_view`. Default 10.
+        time_limit: Seconds per image, as for `SceneMap.verify_view`. Default 10; math.inf for no limit.
         done: Callback with a short message for each image.
 
     Returns:
@@ -106,9 +106,7 @@ def verify_map(
     return sorted(verified, key=lambda one: (WORST_FIRST.index(one.verdict), -one.log10_false_alarms, one.name))
 
 
-def _verified(
-    scene: SceneMap, name: str, keypoints: NDArray[np.float64], seed: int, time_limit: float | None
-) -> VerifiedView:
+def _verified(scene: SceneMap, name: str, keypoints: NDArray[np.float64], seed: int, time_limit: float) -> VerifiedView:
     view = scene.named([name])[0]
     try:
         solution = scene.verify_view(name, keypoints, seed=seed, time_limit=time_limit)

@@ -14,7 +14,7 @@ from bpnp.solving.solution import Solution
 from bpnp.solving.verify import verify_problem
 
 
-def verify_pose(photo: Photo, view: View, *, time_limit: float | None) -> Solution:
+def verify_pose(photo: Photo, view: View, *, time_limit: float) -> Solution:
     """Verify the pose of a view with the points of a map that was built without it.
 
     The pose is judged on the points in view (`verify_problem`). It is then compared with poses elsewhere in the map
@@ -23,7 +23,7 @@ def verify_pose(photo: Photo, view: View, *, time_limit: float | None) -> Soluti
     Args:
         photo: Keypoints of the view, its camera, and the points and views of the map without it.
         view: View with the pose.
-        time_limit: Seconds for `verify_problem`; None for no limit.
+        time_limit: Seconds for `verify_problem`; math.inf for no limit.
 
     Raises:
         ValueError: There are fewer than 4 keypoints, or fewer than 4 map points in view.

@@ -9,4 +9,7 @@ from .results import ProblemRow as ProblemRow
 from .results import Results as Results
 from .results import read_results as read_results
 from .results import write_results as write_results
+from .solutions import competing_points as competing_points
+from .solutions import draw_solution as draw_solution
+from .solutions import solution_points as solution_points
 from .tables import table as table

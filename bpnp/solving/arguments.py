@@ -120,6 +120,11 @@ def positive(name: str, value: Any, *, finite: bool = False) -> float | None:
     return None if value is None else float(value)
 
 
+def seconds_from(time_limit: Any, default: float) -> float:
+    """Return a time limit in seconds: None is the default of the function, math.inf no limit."""
+    return positive("time_limit", time_limit) or default
+
+
 def checked_seed(seed: Any) -> int:
     """Return a random seed; raise ValueError unless it is a non-negative integer."""
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:

@@ -25,7 +25,7 @@ from bpnp.solving.arguments import (
 from bpnp.solving.focal_length import UnknownCamera
 from bpnp.solving.inputs import bearings_of, check_seen, unit_of
 from bpnp.solving.matches import SCALES, angles_between, count_one_to_one, one_to_one
-from bpnp.solving.solution import Solution, SolutionStats, with_pose
+from bpnp.solving.solution import FOCAL_LENGTH, ROTATION_PARAMETERS, Solution, SolutionStats, with_pose
 from bpnp.solving.sources import Options
 
 FEWEST = 3  # two fix a rotation and leave no evidence
@@ -146,7 +146,10 @@ def _seen_by(
             deadline=deadline,
             settings=settings,
         )
+    parameters = ROTATION_PARAMETERS if unknown is None else (*ROTATION_PARAMETERS, FOCAL_LENGTH)
     solution = Solution(
+        covariance=np.full((len(parameters), len(parameters)), math.nan),
+        parameters=parameters,
         verdict=result.verdict,
         reason=result.reason,
         unit=unit_of(image, lens),

@@ -18,7 +18,7 @@ from bpnp.search.evidence.uncertainty import linearised, pose_covariance
 from bpnp.search.problem import Problem
 from bpnp.search.verdict import SearchResult
 from bpnp.solving.arguments import Array, Labels
-from bpnp.solving.solution import Solution, SolutionStats, with_pose
+from bpnp.solving.solution import FOCAL_LENGTH, POSE_PARAMETERS, Solution, SolutionStats, with_pose
 
 Allowed = Callable[[Labels, Labels], NDArray[np.bool_]]
 DENSE = 4096  # largest number of possible matches that are all compared
@@ -93,6 +93,7 @@ def without_pose(problem: Problem, reason: str, inlier_threshold: float | None, 
         inlier_threshold=math.nan if inlier_threshold is None else inlier_threshold,
         unit=problem.unit,
         covariance=_of_pixels(problem, None),
+        parameters=POSE_PARAMETERS if problem.focal is None else (*POSE_PARAMETERS, FOCAL_LENGTH),
         verdict="failed",
         reason=reason,
         stats=SolutionStats(dropped2d=problem.dropped2d, taken2d=problem.taken2d),

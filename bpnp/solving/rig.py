@@ -18,7 +18,7 @@ from bpnp.search.verdict import SearchResult, no_pose
 from bpnp.solving.arguments import Array, about, checked_pose, each_camera, each_set, numbers
 from bpnp.solving.inputs import problem_from
 from bpnp.solving.matches import SCALES, one_to_one, without_pose
-from bpnp.solving.solution import Solution, with_pose
+from bpnp.solving.solution import POSE_PARAMETERS, SCALE, Solution, with_pose
 from bpnp.solving.sources import Options
 
 
@@ -84,7 +84,8 @@ def _finished(rig: Rig, problems: Sequence[Problem], result: SearchResult, inlie
     found, first = result.candidates, problems[0]
     solution = replace(without_pose(first, result.reason, inlier_threshold), camera=None)
     if rig.unknowns == 7:
-        solution = replace(solution, scale=math.nan, covariance=np.full((7, 7), math.nan))
+        parameters = (*POSE_PARAMETERS, SCALE)
+        solution = replace(solution, scale=math.nan, covariance=np.full((7, 7), math.nan), parameters=parameters)
     if not len(found):
         return solution
     rotation, translation = found.rotation[0], found.translation[0]

@@ -4,7 +4,7 @@ import base64
 import io
 import json
 import math
-import textwrap
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
-from bpnp.cameras import Camera, camera_from, camera_to_json, in_front
+from bpnp.cameras import Camera, camera_from, camera_to_json
 from bpnp.search.evidence.uncertainty import centre_covariance
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Unit
@@ -25,12 +24,12 @@ from bpnp.search.verdict import SearchResult, Verdict
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from bpnp.report.points import ProblemPoints
-
 Array = npt.NDArray[np.float64]
-ROTATION = 3  # parameters of a rotation: the whole pose of points at infinity
-FORMAT = 2  # since 2 with false alarms
-LINE = 130  # characters per line of the reason in a figure
+ROTATION_PARAMETERS = ("rotation_x", "rotation_y", "rotation_z")  # rotation vector in the camera axes, radians
+POSE_PARAMETERS = (*ROTATION_PARAMETERS, "translation_x", "translation_y", "translation_z")
+FOCAL_LENGTH, SCALE = "focal_length", "scale"
+FORMAT = 3  # 2: with false alarms; 3: matches of a photo in a map are indices, names of the parameters
+MATCHES_ARE_IDS = 2  # format in which the matches of a photo in a map held the ids of points
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,21 +84,24 @@ class Solution:
     Attributes:
         rotation: (3, 3) rotation matrix.
         translation: (3,) translation, scene units.
-        matches: (k, 2) indices of a 2D and a 3D point in the input arrays; no point is in two matches.
+        matches: (k, 2) indices into `points2d` and `points3d`; no point is in two matches.
         inlier_count: Number of matches within `inlier_threshold` (paper Eq. 1).
         inlier_ratio: `inlier_count` as a fraction of min(m, n).
         inlier_threshold: Largest reprojection error of a match, in `unit`.
         reprojection_error: Mean reprojection error of the matches, in `unit`.
         reprojection_error_deg: Mean angle between the bearings of the matches, degrees.
         unit: Pixels with a camera, else normalised image units, or radians for bearings.
-        covariance: (6, 6) covariance of the pose error (w, v), with R' = exp([w]x) R and t' = t + v. Here w is in
-            radians in the camera axes, and v in scene units. It is the first-order estimate
+        covariance: (p, p) covariance of the errors of `parameters`, which for a pose are (w, v) with R' = exp([w]x) R
+            and t' = t + v. Here w is in radians in the camera axes, and v in scene units. It is the first-order
+            estimate
 
                 C = max(H^-1, sum_i d_i d_i^T),  H = -d2 log p(image points | pose) / d(w, v)^2 + prior,
 
             where d_i is the step to the optimum without image point i, with unknown correspondences (docs/verdict.md).
-            NaN if the verdict is "failed" or the points do not fix the pose. (3, 3) of w for points at infinity. An
-            estimated focal length (pixels) or scale adds a last row and column.
+            NaN if the verdict is "failed" or the points do not fix the pose.
+        parameters: Names of the p estimated parameters, in the order of the covariance: "rotation_x", "rotation_y",
+            "rotation_z"; then "translation_x", "translation_y", "translation_z", except for points at infinity; then
+            "focal_length" (pixels) or "scale" if it was estimated.
         scale: Scale of the scene, rig = scale R p + t, with t in the unit of the rig; 1 unless `scale=True`.
         candidates: Distinct poses that the search found, best first; the first is this pose.
         verdict: "confident"; "ambiguous" if the pose is significant but another one may fit as well; "failed" if no
@@ -109,8 +111,7 @@ class Solution:
             infinite without a pose. See docs/verdict.md.
         seconds: Run time of this problem. Problems that were solved together count equal parts of their time.
         view: Name of the view of a `SceneMap` near which the pose was found; None without a map.
-        point_ids: (n,) ids of `points3d` in the map, which `matches` then hold instead of indices (see `match_places`);
-            None without a map.
+        point_ids: (n,) ids of `points3d` in the map; None without a map. See `matched_point_ids`.
         points2d: (m, 2) normalised image coordinates; NaN for an input point that has none.
         points3d: (n, 3) input points.
         normals3d: (n, 3) input normals; None without.
@@ -128,6 +129,7 @@ class Solution:
     reprojection_error_deg: float = math.nan
     unit: Unit
     covariance: Array = field(default_factory=lambda: np.full((6, 6), math.nan), repr=False)
+    parameters: tuple[str, ...] = POSE_PARAMETERS
     scale: float = 1.0
     candidates: tuple[Candidate, ...] = ()
     verdict: Verdict
@@ -143,13 +145,15 @@ class Solution:
     point_ids: npt.NDArray[np.int64] | None = field(default=None, repr=False)
 
     @property
+    def matched_point_ids(self) -> npt.NDArray[np.int64] | None:
+        """Ids (k,) in the map of the 3D points of the matches; None without a map."""
+        return None if self.point_ids is None else self.point_ids[self.matches[:, 1]]
+
+    @property
     def match_places(self) -> npt.NDArray[np.int64]:
-        """Indices (k, 2) of the matches into `points2d` and `points3d`."""
-        if self.point_ids is None:
-            return self.matches
-        order = np.argsort(self.point_ids)
-        place = order[np.searchsorted(self.point_ids, self.matches[:, 1], sorter=order)]
-        return np.column_stack([self.matches[:, 0], place])
+        """Deprecated name of `matches`."""
+        warnings.warn("`match_places` is now `matches`, and will be removed", DeprecationWarning, stacklevel=2)
+        return self.matches
 
     @property
     def centre(self) -> Array:
@@ -164,9 +168,9 @@ class Solution:
     @property
     def centre_std(self) -> float:
         """Standard deviation of `centre` along its least certain axis, scene units; NaN for points at infinity."""
-        if len(self.covariance) in (ROTATION, ROTATION + 1):
+        if "translation_x" not in self.parameters:
             return math.nan
-        scale = self.scale if self._has_scale else None
+        scale = self.scale if SCALE in self.parameters else None
         return _largest(centre_covariance(self.covariance, self.translation, scale))
 
     @property
@@ -177,21 +181,23 @@ class Solution:
     @property
     def focal_length_std(self) -> float:
         """Standard deviation of an estimated focal length, pixels; 0 for a given one."""
-        has_focal = len(self.covariance) in (ROTATION + 1, 7) and not self._has_scale
-        return math.sqrt(self.covariance[-1, -1]) if has_focal else 0.0
+        return self._std(FOCAL_LENGTH)
 
     @property
     def scale_std(self) -> float:
         """Standard deviation of an estimated scale; 0 if the scale was not estimated."""
-        return math.sqrt(self.covariance[-1, -1]) if self._has_scale else 0.0
+        return self._std(SCALE)
 
-    @property
-    def _has_scale(self) -> bool:
-        return len(self.covariance) == 7 and self.camera is None
+    def _std(self, parameter: str) -> float:
+        """Return the standard deviation of a parameter; 0 if it was not estimated."""
+        if parameter not in self.parameters:
+            return 0.0
+        k = self.parameters.index(parameter)
+        return math.sqrt(self.covariance[k, k])
 
     @property
     def found(self) -> bool:
-        """True if there is a pose; see `verdict` for its reliability."""
+        """True if there is a pose, which is a guess if the verdict is "failed". `bool(solution)` is the same."""
         return bool(np.isfinite(self.rotation).all() and np.isfinite(self.translation).all())
 
     def __bool__(self) -> bool:
@@ -227,10 +233,11 @@ class Solution:
             ValueError: A photo was given without a camera, or no image point is in front of the camera.
         """
         from bpnp.report.images import read_photo
+        from bpnp.report.solutions import draw_solution
 
         picture = read_photo(photo) if isinstance(photo, (Path, str)) else photo
         drawn = self if camera is None else replace(self, camera=camera_from(camera))
-        return solution_picture(drawn, photo=picture)
+        return draw_solution(drawn, photo=picture)
 
     def _repr_html_(self) -> str:
         """Return `repr` as HTML, followed by the picture if a point is in front of the camera."""
@@ -265,7 +272,7 @@ class Solution:
             raise ValueError(f"expected a solution with a pose to export, got none: {self.reason}")
         pose = self.rotation, self.translation / self.scale  # in the unit of the scene
         lens = self.camera if camera is None else camera
-        points = self.points2d, self.points3d, self.match_places
+        points = self.points2d, self.points3d, self.matches
         return write_image(Path(folder), *points, pose, camera=lens, name=name, size=size)
 
     def to_json(self) -> str:
@@ -289,11 +296,11 @@ class Solution:
         name = f" in {text}" if isinstance(text, Path) else ""
         try:
             content = json.loads(text.read_bytes() if isinstance(text, Path) else text)
-            if content["format"] != FORMAT:
+            if content["format"] not in (MATCHES_ARE_IDS, FORMAT):
                 raise ValueError(f"format {content['format']}, try the bpnp that wrote it")
             if content["verdict"] not in get_args(Verdict):
                 raise ValueError(f"verdict {content['verdict']!r}")
-            return _read(cls, content)
+            return _read(cls, content if content["format"] == FORMAT else _converted(content))
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(f"expected the JSON of a solution{name}, got {error}") from error
 
@@ -374,77 +381,6 @@ def with_pose(
     )
 
 
-def solution_points(solution: Solution, *, title: str | None = None) -> "ProblemPoints":
-    """Return the points of a solution, ready to draw.
-
-    Their id is the caption: title, verdict with its figures, and reason. A failed solution has no figures.
-
-    Raises:
-        ValueError: A match has no point.
-    """
-    from bpnp.report.points import ProblemPoints
-
-    shown = "no match"
-    if len(solution.matches):
-        share, error = f"{100 * solution.inlier_ratio:.0f} %", f"{solution.reprojection_error:.3g} {solution.unit}"
-        shown = f"{solution.inlier_count} matches ({share}), mean error {error}"
-    matches, points2d, points3d = solution.match_places, solution.points2d, solution.points3d
-    assigned = np.full(len(points3d), -1, np.int32)
-    if len(matches):
-        most = np.max(matches, axis=0)
-        if np.min(matches) < 0 or most[0] >= len(points2d) or most[1] >= len(points3d):
-            sizes = f"{len(points2d)} 2D and {len(points3d)} 3D points"
-            raise ValueError(f"expected `matches` of {sizes}, got indices up to {most.tolist()}")
-        assigned[matches[:, 1]] = matches[:, 0]
-    verdict = [f"{solution.verdict}: {shown}", solution.reason]
-    if solution.verdict == "failed":
-        verdict = [f"failed: {solution.reason}"]
-    lines = [*([] if title is None else [title]), *(textwrap.fill(line, LINE) for line in verdict)]
-    return ProblemPoints(
-        0, "\n".join(lines), points2d, points3d, np.full_like(assigned, -1), assigned,
-        estimates={"solution": (solution.rotation, solution.translation / solution.scale)}, camera=solution.camera,
-        normals3d=solution.normals3d,
-    )  # fmt: skip
-
-
-def competing_points(solution: Solution, points: "ProblemPoints") -> "ProblemPoints | None":
-    """Return the points under the next candidate of an ambiguous solution; None if there is none.
-
-    The matches are mutual nearest neighbours within the inlier threshold.
-    """
-    if solution.verdict != "ambiguous" or len(solution.candidates) < 2:
-        return None
-    other = solution.candidates[1]
-    pose = other.rotation, other.translation / other.scale
-    projected, seen = in_front(points.points3d @ pose[0].T + pose[1])[:, :2], points.points2d
-    ahead, known = (np.flatnonzero(np.isfinite(side).all(-1)) for side in (projected, seen))
-    assigned = np.full(len(projected), -1, np.int32)
-    if len(ahead) and len(known):
-        reach = solution.inlier_threshold / (1.0 if solution.camera is None else solution.camera.focal)
-        distance, nearest = cKDTree(seen[known]).query(projected[ahead], distance_upper_bound=reach)
-        back = cKDTree(projected[ahead]).query(seen[known])[1]
-        mutual = np.flatnonzero(np.isfinite(distance))
-        mutual = mutual[back[nearest[mutual]] == mutual]
-        assigned[ahead[mutual]] = known[nearest[mutual]]
-    title = f"next candidate: {other.inlier_count} matches"
-    return replace(points, id=title, assigned3d=assigned, estimates={"next candidate": pose})
-
-
-def solution_picture(solution: Solution, *, title: str | None = None, photo: Any = None) -> "Figure":
-    """Draw `solution_points`, a close-up of the residuals, and the next candidate of an ambiguous solution.
-
-    Args:
-        solution: What to draw.
-        title: First line of the caption.
-        photo: (h, w, 3) uint8, to draw under the points.
-    """
-    from bpnp.report.figures import plot_matches
-    from bpnp.report.terminal import VERDICTS
-
-    points, colour = solution_points(solution, title=title), VERDICTS[solution.verdict]
-    return plot_matches(points, colour=colour, photo=photo, competing=competing_points(solution, points))
-
-
 def _largest(covariance: Array) -> float:
     """Return the root of the largest eigenvalue; NaN if the covariance is not finite."""
     known = np.isfinite(covariance).all()
@@ -473,6 +409,17 @@ def _read(kind: type, content: dict[str, Any]) -> Any:
     return kind(**{name: READERS[name](value) if name in READERS else value for name, value in values.items()})
 
 
+def _converted(content: dict[str, Any]) -> dict[str, Any]:
+    """Return the content of a file of format `MATCHES_ARE_IDS` with matches as indices and the names of parameters."""
+    matches, size = content["matches"], len(content.get("covariance", POSE_PARAMETERS))
+    if content.get("point_ids") is not None:
+        index = {point_id: j for j, point_id in enumerate(content["point_ids"])}
+        matches = [(i, index[point_id]) for i, point_id in matches]
+    pose = ROTATION_PARAMETERS if size in (3, 4) else POSE_PARAMETERS
+    other = FOCAL_LENGTH if content.get("camera") is not None else SCALE
+    return content | {"matches": matches, "parameters": (*pose, other)[:size]}
+
+
 def _array(values: Any, *, shape: tuple[int, ...]) -> Array:
     return np.full(shape, math.nan) if values is None else np.array(values, np.float64).reshape(shape)
 
@@ -489,6 +436,7 @@ READERS: dict[str, Callable[[Any], Any]] = {  # of the fields with another form 
     "points2d": partial(_array, shape=(-1, 2)),
     "points3d": partial(_array, shape=(-1, 3)),
     "normals3d": lambda values: None if values is None else _array(values, shape=(-1, 3)),
+    "parameters": tuple,
     "matches": lambda values: np.array(values, np.int64).reshape(-1, 2),
     "camera": lambda value: None if value is None else camera_from(value),
     "point_ids": lambda values: None if values is None else np.array(values, np.int64),
@@ -497,3 +445,16 @@ READERS: dict[str, Callable[[Any], Any]] = {  # of the fields with another form 
     "candidates": lambda values: tuple(_read(Candidate, value) for value in values),
     "stats": lambda value: _read(SolutionStats, value),
 }
+
+MOVED = {"solution_points": "solution_points", "solution_picture": "draw_solution"}  # now in bpnp.report.solutions
+
+
+def __getattr__(name: str) -> Any:
+    """Return a function that moved to `bpnp.report.solutions`, with a DeprecationWarning."""
+    if name not in MOVED:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from bpnp.report import solutions
+
+    successor = f"bpnp.report.solutions.{MOVED[name]}"
+    warnings.warn(f"`{__name__}.{name}` is now `{successor}`, and will be removed", DeprecationWarning, stacklevel=2)
+    return getattr(solutions, MOVED[name])

@@ -22,6 +22,7 @@ from bpnp.solving.arguments import (
     each_set,
     pixels_from,
     positive,
+    seconds_from,
     source_from,
 )
 from bpnp.solving.focal_length import solved_with_focal_length, unknown_camera
@@ -142,7 +143,7 @@ def solve(
         inlier_threshold=positive("inlier_threshold", inlier_threshold, finite=True),
         clutter=clutter,
         seed=checked_seed(seed),
-        time_limit=positive("time_limit", SECONDS if time_limit is None else time_limit),
+        time_limit=seconds_from(time_limit, SECONDS),
     )
     beside: dict[str, Any] = {
         "solver": None if solver in ("auto", "search") else solver,
@@ -251,7 +252,7 @@ def solve_many(
     begun = Clock.now()
     images = each_set("points2d", points2d, None)
     count = len(images)
-    seconds = positive("time_limit", SECONDS_OF_MANY if time_limit is None else time_limit)
+    seconds = seconds_from(time_limit, SECONDS_OF_MANY)
     options = Options(
         source_from(solver),
         solver == "auto",
@@ -261,7 +262,7 @@ def solve_many(
         seconds,
         device_from(device),
         progress,
-        until=Deadline(begun + seconds) if count == 1 and seconds is not None else Deadline(),
+        until=Deadline(begun + seconds) if count == 1 else Deadline(),
     )
     known = {
         "normals3d": each_set("normals3d", normals3d, count),

@@ -15,7 +15,7 @@ from bpnp.search.evidence.uncertainty import linearised, pose_covariance
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem
 from bpnp.search.verdict import match_count
-from bpnp.solving.arguments import Array, Labels, checked_pose, checked_seed, numbers, positive
+from bpnp.solving.arguments import Array, Labels, checked_pose, checked_seed, numbers, positive, seconds_from
 from bpnp.solving.inputs import problem_from
 from bpnp.solving.matches import finished, without_pose
 from bpnp.solving.solution import Solution
@@ -86,7 +86,7 @@ def verify(
     >>> bpnp.verify(image, scene, np.eye(3), [0, 1, 6]).verdict
     'failed'
     """
-    limit = positive("time_limit", SECONDS if time_limit is None else time_limit)
+    limit = seconds_from(time_limit, SECONDS)
     threshold = positive("inlier_threshold", inlier_threshold, finite=True)
     rotation, translation = checked_pose("", rotation, translation)
     problem = problem_from(
@@ -122,7 +122,7 @@ def verify_problem(
     refine: bool = True,
     inlier_threshold: float | None = None,
     seed: int = 0,
-    time_limit: float | None = SECONDS,
+    time_limit: float = SECONDS,
 ) -> Solution:
     """Verify a pose of a problem whose points have been checked; see `verify`.
 
@@ -133,7 +133,7 @@ def verify_problem(
         refine: Return and judge the nearby optimum, as for `verify`.
         inlier_threshold: Largest reprojection error of a match, as for `verify`.
         seed: Seed of the refinement, default 0.
-        time_limit: Seconds, 10 by default; None for no limit.
+        time_limit: Seconds, 10 by default; math.inf for no limit.
 
     Returns:
         Solution with this pose, as of `verify`.

@@ -63,7 +63,7 @@ def test_photos_left_out_of_their_map_are_found_and_a_broken_one_is_named(
         )
         solution = Solution.from_json(output / "solutions" / f"{name}.json")
         assert solution.view in ("0003.jpg", "0005.jpg", "0007.jpg")
-        assert set(solution.matches[:, 1].tolist()) <= set(scene.point_ids.tolist())
+        assert set(solution.matched_point_ids.tolist()) <= set(scene.point_ids.tolist())
         assert (output / "pictures" / f"{name}.png").stat().st_size > 20000
         error = json.loads((output / "results.json").read_text())["photos"][name]["error_to_map"]
         angle = (rotation * Rotation.from_matrix(view.rotation).inv()).magnitude()

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import math
 import re
 import shutil
 from collections.abc import Callable
@@ -85,7 +86,7 @@ def test_an_image_is_judged_without_the_points_that_it_made(tmp_path: Path) -> N
         model.add_point3D(point, pycolmap.Track([pycolmap.TrackElement(6, k)]))
     model.write_binary(tmp_path / "map")
     scene = SceneMap.from_colmap(tmp_path / "map")
-    verified = verify_map(tmp_path / "map", scene, time_limit=None)
+    verified = verify_map(tmp_path / "map", scene, time_limit=math.inf)
     assert verified[0].name == "turned.jpg"
     assert (verified[0].verdict, [one.verdict for one in verified[1:]]) == ("failed", ["confident"] * 5)
     assert len(scene.points3d) == 180

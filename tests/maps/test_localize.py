@@ -1,5 +1,6 @@
-"""A photo's pose in a map comes from its keypoints alone; matches are ids of the map's points."""
+"""A photo's pose in a map comes from its keypoints alone."""
 
+import json
 import math
 from dataclasses import replace
 from typing import Any
@@ -41,7 +42,7 @@ def assert_right(solution: Solution, truth: Planted, number: int, ids: np.ndarra
     turn = Rotation.from_euler("xyz", [4, -6, 3], degrees=True).as_matrix()
     np.testing.assert_allclose(solution.rotation, turn @ truth.rotations[number], atol=2e-3)
     np.testing.assert_allclose(solution.translation, truth.translations[number], atol=2e-2)
-    right = ids[solution.matches[:, 0]] == solution.matches[:, 1]
+    right = ids[solution.matches[:, 0]] == solution.matched_point_ids
     tried = truth.seen[int(str(solution.view).removeprefix("photo ").removesuffix(".jpg"))] + 1
     assert right.sum() > 0.8 * np.isin(ids, tried).sum()
     assert right.mean() > 0.9
@@ -57,15 +58,45 @@ def test_a_photo_near_a_given_view_or_somewhere(planted: tuple[SceneMap, Planted
     assert solution.view == "photo 1.jpg" or views is None
 
 
-def test_matches_and_their_places_name_the_same_points(planted: tuple[SceneMap, Planted]) -> None:
+def test_matches_are_indices_and_their_ids_are_those_of_the_map(planted: tuple[SceneMap, Planted]) -> None:
     scene, truth = planted
-    solution = scene.localize(photo_of(truth, 0)[0], PINHOLE, views=["photo 0.jpg", "photo 2.jpg"])
+    pixels, ids = photo_of(truth, 0)
+    solution = scene.localize(pixels, PINHOLE, views=["photo 0.jpg", "photo 2.jpg"])
     assert solution.point_ids is not None
-    assert np.isin(solution.point_ids, scene.point_ids).all()
-    np.testing.assert_array_equal(solution.point_ids[solution.match_places[:, 1]], solution.matches[:, 1])
+    i, j = solution.matches.T
+    known = ids[i] > 0
+    np.testing.assert_allclose(solution.points2d[i], (pixels[i] - [400, 300]) / 520)
+    right = (solution.points3d[j[known]] == truth.points3d[ids[i[known]] - 1]).all(1)
+    assert right.mean() > 0.9
+    np.testing.assert_array_equal(solution.matched_point_ids[known][right], ids[i[known]][right])
     again = Solution.from_json(solution.to_json())
     assert again.view == "photo 0.jpg"
-    np.testing.assert_array_equal(again.match_places, solution.match_places)
+    np.testing.assert_array_equal(again.matches, solution.matches)
+    np.testing.assert_array_equal(again.matched_point_ids, solution.matched_point_ids)
+    with pytest.warns(DeprecationWarning, match="`match_places` is now `matches`"):
+        np.testing.assert_array_equal(solution.match_places, solution.matches)
+
+
+def test_the_ids_of_an_earlier_file_become_indices(planted: tuple[SceneMap, Planted]) -> None:
+    """Format 2 had the ids of the points in `matches`, and no names of the parameters."""
+    scene, truth = planted
+    solution = scene.localize(photo_of(truth, 0)[0], PINHOLE, views=["photo 0.jpg"])
+    content = json.loads(solution.to_json())
+    ids = solution.matched_point_ids
+    assert ids is not None
+    before = content | {"format": 2, "matches": np.column_stack([solution.matches[:, 0], ids]).tolist()}
+    del before["parameters"]
+    read = Solution.from_json(json.dumps(before))
+    np.testing.assert_array_equal(read.matches, solution.matches)
+    np.testing.assert_array_equal(read.matched_point_ids, ids)
+    assert read.parameters == solution.parameters
+
+
+def test_no_time_limit_is_the_default_one_and_is_said_where_it_was_none(planted: tuple[SceneMap, Planted]) -> None:
+    scene, truth = planted
+    pixels = 520 * seen(truth.points3d, truth.rotations[1], truth.translations[1]) + [400, 300]
+    with pytest.warns(DeprecationWarning, match="`time_limit=None` of `verify_view` is its default limit"):
+        scene.verify_view("photo 1.jpg", pixels, time_limit=None)
 
 
 def test_the_pose_is_fitted_to_all_points_that_its_camera_sees(planted: tuple[SceneMap, Planted]) -> None:
@@ -73,9 +104,9 @@ def test_the_pose_is_fitted_to_all_points_that_its_camera_sees(planted: tuple[Sc
     pixels = 520 * seen(truth.points3d, truth.rotations[1], truth.translations[1]) + [400, 300]
     pixels += np.random.default_rng(0).normal(0, 0.5, pixels.shape)
     solution = scene.localize(pixels, PINHOLE, views=["photo 1.jpg"])
-    others = ~np.isin(solution.matches[:, 1], truth.seen[1] + 1)
+    others = ~np.isin(solution.matched_point_ids, truth.seen[1] + 1)
     assert others.sum() > 4
-    assert (solution.matches[:, 0] + 1 == solution.matches[:, 1]).mean() > 0.9
+    assert (solution.matches[:, 0] + 1 == solution.matched_point_ids).mean() > 0.9
     of_view = bpnp.solve(pixels, truth.points3d[truth.seen[1]], PINHOLE)
     assert solution.rotation_std_deg < of_view.rotation_std_deg
     assert solution.log10_false_alarms < of_view.log10_false_alarms
@@ -224,7 +255,7 @@ def test_a_pose_that_one_view_does_not_decide_is_judged_on_all_points(
     solution = scene.localize(pixels, **known, views=["photo 1.jpg"], solver="search", time_limit=1e5)
     assert solution.verdict == "confident"
     assert degrees_between(solution.rotation, truth.rotations[1]) < 0.2
-    assert (~np.isin(solution.matches[:, 1], truth.seen[1] + 1)).sum() > 4
+    assert (~np.isin(solution.matched_point_ids, truth.seen[1] + 1)).sum() > 4
 
 
 def test_an_unknown_lens_is_fitted_to_all_points(planted: tuple[SceneMap, Planted]) -> None:
@@ -238,7 +269,7 @@ def test_an_unknown_lens_is_fitted_to_all_points(planted: tuple[SceneMap, Plante
     part = replace(scene, views=(scene.views[0], half, scene.views[2]))
     solution = part.localize(pixels, image_size=(800, 600), views=["photo 1.jpg"], solver="search", time_limit=1e5)
     assert abs(solution.focal_length - 520) < 3 * solution.focal_length_std < 50
-    assert (~np.isin(solution.matches[:, 1], scene.point_ids[half.points])).sum() > 10
+    assert (~np.isin(solution.matched_point_ids, scene.point_ids[half.points])).sum() > 10
 
 
 def test_each_view_that_is_tried_counts_once(planted: tuple[SceneMap, Planted]) -> None:

@@ -23,7 +23,7 @@ def test_matches_have_the_colour_of_their_residual_and_the_camera_stands_where_i
 
     image, above = Figure().subplots(1, 2)
     marks = draw_matches(image, solution)
-    matched = solution.match_places[:, 0]
+    matched = solution.matches[:, 0]
     np.testing.assert_allclose(marks.get_offsets(), keypoints[matched], atol=1e-6)
     assert float(np.mean(marks.get_array())) == pytest.approx(solution.reprojection_error, rel=1e-6)
     assert {len(line.get_xdata()) for line in image.lines} == {len(keypoints) - len(matched)}

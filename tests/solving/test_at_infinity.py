@@ -87,6 +87,7 @@ def test_an_unknown_focal_length_is_found_with_the_rotation(field: float, count:
     assert solution.verdict == "confident", solution.reason
     assert degrees_between(solution.rotation, rotation) < 0.05
     assert solution.covariance.shape == (4, 4)
+    assert solution.parameters == ("rotation_x", "rotation_y", "rotation_z", "focal_length")
     assert abs(solution.focal_length - focal) < 4 * solution.focal_length_std < 0.002 * focal
     assert math.isnan(solution.centre_std)
 
@@ -158,6 +159,7 @@ def test_a_rotation_survives_its_file_and_is_drawn(tmp_path: Path) -> None:
     solution = look(image, directions, lens(180.0).model)
     read = Solution.from_json(solution.to_json())
     assert np.array_equal(read.covariance, solution.covariance)
+    assert read.parameters == ("rotation_x", "rotation_y", "rotation_z")
     assert read.rotation_std_deg == solution.rotation_std_deg
     assert np.isnan(read.centre_std)
     solution.plot().savefig(tmp_path / "sky.png")

@@ -49,8 +49,11 @@ def test_pose_and_focal_length_are_found_together(found: tuple[Solution, Array])
     assert abs(solution.focal_length - 900) < 4 * solution.focal_length_std < 120
     assert solution.verdict == "confident"
     assert solution.covariance.shape == (7, 7)
+    pose = [f"{part}_{axis}" for part in ("rotation", "translation") for axis in "xyz"]
+    assert solution.parameters == (*pose, "focal_length")
     again = Solution.from_json(solution.to_json())
     np.testing.assert_array_equal(again.covariance, solution.covariance)
+    assert again.parameters == solution.parameters
     assert again.focal_length == solution.focal_length
 
 
@@ -59,6 +62,7 @@ def test_the_verdict_pays_for_the_focal_length(found: tuple[Solution, Array]) ->
     known = solve(pixels, scene, found[0].camera, solver="search", time_limit=LIMIT)
     assert known.log10_false_alarms < found[0].log10_false_alarms - 1
     assert known.covariance.shape == (6, 6)
+    assert known.parameters == found[0].parameters[:6]
     assert known.focal_length_std == 0
     assert known.centre_std < found[0].centre_std
 

@@ -102,6 +102,8 @@ def test_cameras_that_are_apart_tell_the_scale_of_the_scene(scale: float) -> Non
         assert np.linalg.norm(solution.centre - centre) < 4 * solution.centre_std < 0.4 / scale
         again = bpnp.Solution.from_json(solution.to_json())
         assert (again.scale, again.scale_std) == (solution.scale, solution.scale_std)
+        assert again.parameters == solution.parameters
+        assert solution.parameters[5:] == ("translation_z", "scale")
     assert 1 < np.mean(errors) < 20  # seven
 
 

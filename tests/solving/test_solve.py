@@ -1,5 +1,6 @@
 """`solve` and `solve_many` on planted problems."""
 
+import math
 from dataclasses import replace
 
 import cv2
@@ -141,8 +142,16 @@ def test_points_that_fix_no_pose_fail_with_the_reason(change2d, change3d, reason
     assert solution.verdict == "failed"
     assert reason in solution.reason
     assert not solution.found
+    assert not solution
     assert np.isnan(solution.rotation).all()
     assert (solution.matches.shape, solution.inlier_count, solution.candidates) == ((0, 2), 0, ())
+
+
+def test_a_failed_guess_is_true_since_it_has_a_pose() -> None:
+    """`bool` is about the pose; whether the pose is to be trusted is the verdict."""
+    rng = np.random.default_rng(0)
+    guess = solve(rng.uniform(-1, 1, (60, 2)), rng.normal(size=(60, 3)), solver="search", time_limit=math.inf)
+    assert (guess.verdict, guess.found, bool(guess)) == ("failed", True, True)
 
 
 def test_a_module_solves_and_is_judged_by_the_points() -> None:

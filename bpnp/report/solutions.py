@@ -1,0 +1,85 @@
+"""Pictures of a `bpnp.Solution`: its points ready to draw, and the figure of `Solution.plot`."""
+
+import textwrap
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from bpnp.cameras import in_front
+from bpnp.report.figures import plot_matches
+from bpnp.report.points import ProblemPoints
+from bpnp.report.terminal import VERDICTS
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Solution = Any  # a `bpnp.Solution`, which imports this part
+LINE = 130  # characters per line of the reason in a figure
+
+
+def solution_points(solution: Solution, *, title: str | None = None) -> ProblemPoints:
+    """Return the points of a solution, ready to draw.
+
+    Their id is the caption: title, verdict with its figures, and reason. A failed solution has no figures.
+
+    Raises:
+        ValueError: A match has no point.
+    """
+    shown = "no match"
+    if len(solution.matches):
+        share, error = f"{100 * solution.inlier_ratio:.0f} %", f"{solution.reprojection_error:.3g} {solution.unit}"
+        shown = f"{solution.inlier_count} matches ({share}), mean error {error}"
+    matches, points2d, points3d = solution.matches, solution.points2d, solution.points3d
+    assigned = np.full(len(points3d), -1, np.int32)
+    if len(matches):
+        most = np.max(matches, axis=0)
+        if np.min(matches) < 0 or most[0] >= len(points2d) or most[1] >= len(points3d):
+            sizes = f"{len(points2d)} 2D and {len(points3d)} 3D points"
+            raise ValueError(f"expected `matches` of {sizes}, got indices up to {most.tolist()}")
+        assigned[matches[:, 1]] = matches[:, 0]
+    verdict = [f"{solution.verdict}: {shown}", solution.reason]
+    if solution.verdict == "failed":
+        verdict = [f"failed: {solution.reason}"]
+    lines = [*([] if title is None else [title]), *(textwrap.fill(line, LINE) for line in verdict)]
+    return ProblemPoints(
+        0, "\n".join(lines), points2d, points3d, np.full_like(assigned, -1), assigned,
+        estimates={"solution": (solution.rotation, solution.translation / solution.scale)}, camera=solution.camera,
+        normals3d=solution.normals3d,
+    )  # fmt: skip
+
+
+def competing_points(solution: Solution, points: ProblemPoints) -> ProblemPoints | None:
+    """Return the points under the next candidate of an ambiguous solution; None if there is none.
+
+    The matches are mutual nearest neighbours within the inlier threshold.
+    """
+    if solution.verdict != "ambiguous" or len(solution.candidates) < 2:
+        return None
+    other = solution.candidates[1]
+    pose = other.rotation, other.translation / other.scale
+    projected, seen = in_front(points.points3d @ pose[0].T + pose[1])[:, :2], points.points2d
+    ahead, known = (np.flatnonzero(np.isfinite(side).all(-1)) for side in (projected, seen))
+    assigned = np.full(len(projected), -1, np.int32)
+    if len(ahead) and len(known):
+        reach = solution.inlier_threshold / (1.0 if solution.camera is None else solution.camera.focal)
+        distance, nearest = cKDTree(seen[known]).query(projected[ahead], distance_upper_bound=reach)
+        back = cKDTree(projected[ahead]).query(seen[known])[1]
+        mutual = np.flatnonzero(np.isfinite(distance))
+        mutual = mutual[back[nearest[mutual]] == mutual]
+        assigned[ahead[mutual]] = known[nearest[mutual]]
+    title = f"next candidate: {other.inlier_count} matches"
+    return replace(points, id=title, assigned3d=assigned, estimates={"next candidate": pose})
+
+
+def draw_solution(solution: Solution, *, title: str | None = None, photo: Any = None) -> "Figure":
+    """Draw `solution_points`, a close-up of the residuals, and the next candidate of an ambiguous solution.
+
+    Args:
+        solution: Solution to draw.
+        title: First line of the caption.
+        photo: (h, w, 3) uint8, to draw under the points.
+    """
+    points, colour = solution_points(solution, title=title), VERDICTS[solution.verdict]
+    return plot_matches(points, colour=colour, photo=photo, competing=competing_points(solution, points))
