@@ -9,14 +9,16 @@ import threading
 
 # Import zlib before pycolmap 4.2: in the other order zlib.compress and np.savez_compressed abort Python.
 import zlib  # noqa: F401
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, SupportsFloat, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+
+from bpnp.argument_types import ArrayLike, HasArray, HasCameraModel, Numbers
 
 Array = npt.NDArray[np.float64]
 ROUND_TRIP = 0.01  # largest error of a pixel that is undistorted and distorted again, pixels
@@ -139,6 +141,20 @@ class Lens:
 
 
 Camera = Pinhole | Lens
+if TYPE_CHECKING:  # what `camera_from` converts, which checks it at run time
+    CameraObject: TypeAlias = (
+        HasArray
+        | tuple[ArrayLike, ArrayLike | None]
+        | tuple[str, Numbers]
+        | tuple[str, int, int, Numbers]
+        | Mapping[str, Any]
+        | HasCameraModel
+        | Camera
+    )
+    CameraLike: TypeAlias = CameraObject | Sequence[Sequence[SupportsFloat]]
+    ManyCameras: TypeAlias = CameraObject | Sequence[CameraLike | Sequence[SupportsFloat] | None]
+else:
+    CameraLike = ManyCameras = Any
 
 
 def _of_length_one(rays: Array) -> Array:

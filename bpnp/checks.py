@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-Arrays = Any  # one array, or a sequence of arrays of different sizes; numpy or torch
+from bpnp.argument_types import ManyArrays
+
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 
@@ -145,7 +146,7 @@ def _check(name: str, value: Any, kind: Any, sizes: dict[str, tuple[int, str]]) 
         raise ValueError(f"expected `{name}` of type {numbers}, got {value.dtype}; try .{numbers}()")
 
 
-def as_tensor_list(name: str, values: Arrays, ndim: int) -> list[Tensor]:
+def as_tensor_list(name: str, values: ManyArrays | float, ndim: int) -> list[Tensor]:
     """Convert one array, a stack of arrays, or a sequence of arrays to a list of CPU tensors.
 
     Args:
@@ -164,7 +165,7 @@ def as_tensor_list(name: str, values: Arrays, ndim: int) -> list[Tensor]:
     return list(array) if array.ndim == ndim + 1 else [array]
 
 
-def as_tensor(name: str, values: Arrays) -> Tensor:
+def as_tensor(name: str, values: ManyArrays | float) -> Tensor:
     """Convert an array to a CPU tensor, in this machine's byte order."""
     if isinstance(values, Tensor):
         return values.cpu()

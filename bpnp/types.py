@@ -14,8 +14,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from bpnp.argument_types import ManyArrays
 from bpnp.cameras import check_normalised
-from bpnp.checks import Arrays, as_tensor_list, check_match3d, check_points, stack_values
+from bpnp.checks import as_tensor_list, check_match3d, check_points, stack_values
 from bpnp.geometry import is_finite
 
 _T = TypeVar("_T")
@@ -186,13 +187,13 @@ class Batch(Tensors):
     @classmethod
     def from_arrays(
         cls,
-        points2d: Arrays,
-        points3d: Arrays,
-        rotation: Arrays | None = None,
-        translation: Arrays | None = None,
-        match3d: Arrays | None = None,
+        points2d: ManyArrays,
+        points3d: ManyArrays,
+        rotation: ManyArrays | None = None,
+        translation: ManyArrays | None = None,
+        match3d: ManyArrays | None = None,
         *,
-        focal: Arrays | None = None,
+        focal: ManyArrays | float | None = None,
         index: Sequence[int] | None = None,
         ids: Sequence[str] | None = None,
     ) -> "Batch":

@@ -6,7 +6,7 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "bpnp"
 FILES = sorted(PACKAGE.rglob("*.py"))
-GROUND = {"types", "geometry", "poses", "cameras", "files", "metrics", "loops", "precision", "checks"}
+GROUND = {"argument_types", "types", "geometry", "poses", "cameras", "files", "metrics", "loops", "precision", "checks"}
 # Parts that each part may import, in addition to itself and the ground floor.
 MAY_IMPORT = {
     **dict.fromkeys(GROUND, set()),

@@ -1,5 +1,7 @@
 """Pixels and rays of every kind of camera, against pycolmap and OpenCV."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pycolmap
@@ -53,7 +55,7 @@ def test_a_lens_is_undone_and_applied_as_in_opencv(given: object) -> None:
         np.array([0.2, -0.1, 0.004, -0.006, 0.02, 0.3, -0.12, 0.01, 0, 0, 0, 0]),
     ],
 )
-def test_opencvs_matrix_and_distortion_are_a_camera(distortion: object) -> None:
+def test_opencvs_matrix_and_distortion_are_a_camera(distortion: Any) -> None:
     matrix = K * [[1, 0, 1], [1, 1, 1], [1, 1, 1]]  # OpenCV has no skew
     camera = camera_from((matrix, distortion))
     coefficients = np.zeros(5) if distortion is None else np.array(distortion)

@@ -109,7 +109,8 @@ def photo_task(
     }
     arguments = {"camera": lens, "keypoints": keypoints, "name": name, "solver": solver}
     ignore = {"ignore_orientation": bool(search.get("ignore_orientation"))}
-    return PhotoTask(name, photo.absolute(), arguments | shared | ignore, made_with | shared)
+    arguments = {key: value for key, value in (arguments | shared | ignore).items() if value is not None}
+    return PhotoTask(name, photo.absolute(), arguments, made_with | shared)
 
 
 def attempt(scene: SceneMap, task: PhotoTask) -> Solution | str:

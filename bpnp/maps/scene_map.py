@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.cameras import CENTRE, Camera, camera_from, is_opencv, resize_camera, same_aspect_ratio
+from bpnp.argument_types import ArrayLike, HasReconstruction, ImageSize, PointsLike
+from bpnp.cameras import CENTRE, Camera, CameraLike, camera_from, is_opencv, resize_camera, same_aspect_ratio
 from bpnp.cameras import image_size as image_size_of
 from bpnp.datamodules.colmap.model_files import ColmapError
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
@@ -51,6 +52,7 @@ from bpnp.maps.views import (
 from bpnp.poses import MIN_POINTS
 from bpnp.search.settings import SearchSettings
 from bpnp.solving.arguments import (
+    PriorLike,
     check_inside,
     checked_prior,
     checked_seed,
@@ -103,7 +105,7 @@ class SceneMap:
     views: tuple[View, ...]
 
     @classmethod
-    def from_colmap(cls, path: Any) -> "SceneMap":
+    def from_colmap(cls, path: str | Path | HasReconstruction) -> "SceneMap":
         """Read a map from a COLMAP model.
 
         Images with an invalid pose and points that are not finite are skipped with a warning. A view without points
@@ -116,7 +118,7 @@ class SceneMap:
         Raises:
             ColmapError: The model cannot be read, or no view sees a point. It is a ValueError.
         """
-        if callable(getattr(path, "write_binary", None)):
+        if not isinstance(path, (str, Path)):
             with TemporaryDirectory() as folder:
                 path.write_binary(folder)
                 return cls.from_colmap(folder)
@@ -198,7 +200,7 @@ class SceneMap:
         views = tuple(replace(view, points=place[view.points[enough[view.points]]]) for view in self.views)
         return SceneMap(self.points3d[enough], self.point_ids[enough], tracks[enough], views)
 
-    def places(self, views: Iterable[str] | None, keypoints: Any, lens: Camera | UnknownCamera) -> "list[Place]":
+    def places(self, views: Iterable[str] | None, keypoints: ArrayLike, lens: Camera | UnknownCamera) -> "list[Place]":
         """Return the views to search near for a photo's keypoints, in this order.
 
         With `views` these are the given views in their order. Each gets the points that any of them sees, since they
@@ -255,16 +257,16 @@ class SceneMap:
 
     def localize(
         self,
-        keypoints: Any,
-        camera: Any = None,
+        keypoints: PointsLike,
+        camera: CameraLike | None = None,
         *,
-        image_size: Any = None,
+        image_size: ImageSize | None = None,
         focal_error: float | int | None = None,
         distortion: bool = False,
         views: Iterable[str] | None = None,
-        scores: Any = None,
-        prior: Any = None,
-        up_camera: Any = None,
+        scores: ArrayLike | None = None,
+        prior: PriorLike | None = None,
+        up_camera: ArrayLike | None = None,
         solver: "str | Path | torch.nn.Module" = "auto",
         seed: int = 0,
         time_limit: float | int | None = None,
@@ -422,7 +424,12 @@ class SceneMap:
         return replace(best, seconds=Clock.now() - start)
 
     def verify_view(
-        self, name: str, keypoints: Any, *, seed: int = 0, time_limit: float | int | None = SECONDS_OF_VERIFICATION
+        self,
+        name: str,
+        keypoints: PointsLike,
+        *,
+        seed: int = 0,
+        time_limit: float | int | None = SECONDS_OF_VERIFICATION,
     ) -> Solution:
         """Verify the pose of a view without its own observations.
 
@@ -473,12 +480,18 @@ class SceneMap:
     def localize_photo(
         self,
         photo: str | Path,
-        camera: Any = None,
+        camera: "CameraLike | SceneMap | Literal['unknown'] | None" = None,
         *,
         keypoints: str | Path | None = None,
         name: str | None = None,
         ignore_orientation: bool = False,
-        **options: Any,
+        focal_error: float | int | None = None,
+        distortion: bool = False,
+        views: Iterable[str] | None = None,
+        prior: PriorLike | None = None,
+        solver: "str | Path | torch.nn.Module" = "auto",
+        seed: int = 0,
+        time_limit: float | int | None = None,
     ) -> Solution:
         """Estimate the pose of a photo from its file, as `bpnp localize` does.
 
@@ -492,8 +505,14 @@ class SceneMap:
             name: Name of the photo in that file; None for the name of the image file.
             ignore_orientation: Ignore the EXIF orientation. By default it is the `up_camera` of `localize`. The photo
                 is never rotated, as in COLMAP.
-            **options: focal_error, distortion, views, prior, solver, seed and time_limit, as for `localize`.
-                `focal_error` has no effect on a photo with an unknown camera.
+            focal_error: Relative standard deviation of the focal length of the camera, as for `localize`. It has no
+                effect on a photo with an unknown camera.
+            distortion: Always fit a radial distortion coefficient, as for `localize`. Default False.
+            views: Names of views that may show the same place, best first, as for `localize`; None for all views.
+            prior: Prior of the photo's pose, as for `localize`.
+            solver: As for `localize`.
+            seed: Seed of the search, default 0.
+            time_limit: Seconds for all views together; None for no limit.
 
         Returns:
             Solution as of `localize`.
@@ -512,14 +531,21 @@ class SceneMap:
                 f"{size[1]}; try a camera with the focal length and the centre of this size, or that of the map"
             )
         points = photo_keypoints(path, keypoints, path.name if name is None else name)
-        options = {option: value for option, value in options.items() if value is not None}
-        if not ignore_orientation:
-            options.setdefault("up_camera", up_from_exif(path))
-        if lens is None:
-            options.pop("focal_error", None)
-            return self.localize(points.pixels, image_size=size, scores=points.scores, **options)
-        pixels = points.pixels - (CENTRE if is_opencv(camera) else 0.0)
-        return self.localize(pixels, lens, scores=points.scores, **options)
+        known_lens = lens is not None
+        return self.localize(
+            points.pixels - (CENTRE if known_lens and is_opencv(camera) else 0.0),
+            lens,
+            image_size=None if known_lens else size,
+            focal_error=focal_error if known_lens else None,
+            distortion=distortion,
+            views=views,
+            scores=points.scores,
+            prior=prior,
+            up_camera=None if ignore_orientation else up_from_exif(path),
+            solver=solver,
+            seed=seed,
+            time_limit=time_limit,
+        )
 
     def camera_for(self, photo: Path, *, exif: bool = True) -> tuple[Camera | None, str]:
         """Return the camera of a photo, and its source in words.

@@ -2,20 +2,39 @@
 
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeGuard, Union
+from typing import TYPE_CHECKING, Any, SupportsFloat, TypeAlias, TypeGuard, Union
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from bpnp.argument_types import ArrayLike, HasArray, HasMatrix, HasPose
 from bpnp.cameras import CENTRE, Camera, check_normalised, is_opencv, outside_image
 from bpnp.search.starts import GravityPrior, PosePrior
 
 if TYPE_CHECKING:
     import torch
+
+    from bpnp.models.weights import TrainedNet
+
+    PriorObject: TypeAlias = (
+        PosePrior
+        | GravityPrior
+        | HasArray
+        | tuple[ArrayLike, ArrayLike]
+        | HasPose
+        | HasMatrix
+        | TrainedNet
+        | str
+        | Path
+    )
+    PriorLike: TypeAlias = PriorObject | Sequence[Sequence[SupportsFloat]]
+    ManyPriors: TypeAlias = PriorObject | Sequence[PriorLike | Sequence[SupportsFloat] | None]
+else:
+    PriorLike = ManyPriors = Any
 
 Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]

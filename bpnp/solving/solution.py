@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 import numpy.typing as npt
 
-from bpnp.cameras import Camera, camera_from, camera_to_json
+from bpnp.cameras import Camera, CameraLike, camera_from, camera_to_json
 from bpnp.search.evidence.uncertainty import centre_covariance
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Unit
@@ -217,7 +217,9 @@ class Solution:
             f"  candidates: {len(self.candidates)}, seconds: {self.seconds:.2f})"
         )
 
-    def plot(self, *, photo: Path | str | npt.NDArray[np.uint8] | None = None, camera: Any = None) -> "Figure":
+    def plot(
+        self, *, photo: Path | str | npt.NDArray[np.uint8] | None = None, camera: CameraLike | None = None
+    ) -> "Figure":
         """Draw the image points and the projected scene points as a matplotlib figure.
 
         Args:
@@ -250,7 +252,12 @@ class Solution:
         return f'{text}<img style="max-width: 100%" alt="the matches" src="data:image/png;base64,{picture}">'
 
     def to_colmap(
-        self, folder: Path | str, *, camera: Any = None, name: str = "image.jpg", size: tuple[int, int] | None = None
+        self,
+        folder: Path | str,
+        *,
+        camera: CameraLike | None = None,
+        name: str = "image.jpg",
+        size: tuple[int, int] | None = None,
     ) -> Path:
         """Write a COLMAP text model with this image, its matches as tracks, and all 3D points.
 

@@ -6,12 +6,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bpnp.cameras import Camera, camera_from
+from bpnp.argument_types import ArrayLike, Extrinsics, ImageSize, ManyArrays, ManyPoints, PointsLike
+from bpnp.cameras import Camera, ManyCameras, camera_from
 from bpnp.loops.parallel import Clock, Deadline
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.solving.arguments import (
     Labels,
+    ManyPriors,
+    PriorLike,
     about,
     check_inside,
     checked_prior,
@@ -39,24 +42,24 @@ SECONDS, SECONDS_OF_MANY = 10.0, 5.0  # default time limits per problem of `solv
 
 
 def solve(
-    points2d: Any,
-    points3d: Any,
-    camera: Any = None,
+    points2d: ManyPoints,
+    points3d: PointsLike,
+    camera: ManyCameras | None = None,
     *,
-    image_size: Any = None,
+    image_size: ImageSize | None = None,
     focal_error: float | int | None = None,
     distortion: bool = False,
-    normals3d: Any = None,
-    labels2d: Any = None,
-    labels3d: Any = None,
-    scores2d: Any = None,
-    scores3d: Any = None,
+    normals3d: ArrayLike | None = None,
+    labels2d: ManyArrays | None = None,
+    labels3d: ArrayLike | None = None,
+    scores2d: ArrayLike | None = None,
+    scores3d: ArrayLike | None = None,
     solver: "str | Path | torch.nn.Module" = "auto",
-    prior: Any = None,
+    prior: PriorLike | None = None,
     inlier_threshold: float | int | None = None,
     clutter: float | int | None = None,
     at_infinity: bool = False,
-    rig: Sequence[Any] | None = None,
+    rig: Sequence[Extrinsics] | None = None,
     scale: bool = False,
     seed: int = 0,
     time_limit: float | int | None = None,
@@ -162,11 +165,10 @@ def solve(
         lens = {"image_size": image_size, "focal_error": focal_error, "distortion": distortion or None}
         _refuse(scores | beside | lens, "rig")
         return solve_rig(points2d, points3d, camera, rig, normals_and_labels, options, scale=scale)
-    arrays: dict[str, Any] = {name: [values] for name, values in (normals_and_labels | scores).items()}
+    points: dict[str, Any] = {"points2d": points2d, "points3d": points3d}
+    arrays: dict[str, Any] = {name: [values] for name, values in (points | normals_and_labels | scores).items()}
     return solve_many(
-        [points2d],
-        [points3d],
-        camera,
+        camera=camera,
         image_size=image_size,
         focal_error=focal_error,
         distortion=distortion,
@@ -190,20 +192,20 @@ def _refuse(options: Mapping[str, Any], kind: str) -> None:
 
 
 def solve_many(
-    points2d: Any,
-    points3d: Any,
-    camera: Any = None,
+    points2d: ManyPoints,
+    points3d: ManyPoints,
+    camera: ManyCameras | None = None,
     *,
-    image_size: Any = None,
+    image_size: ImageSize | None = None,
     focal_error: float | int | None = None,
     distortion: bool = False,
-    normals3d: Any = None,
-    labels2d: Any = None,
-    labels3d: Any = None,
-    scores2d: Any = None,
-    scores3d: Any = None,
+    normals3d: ManyArrays | None = None,
+    labels2d: ManyArrays | None = None,
+    labels3d: ManyArrays | None = None,
+    scores2d: ManyArrays | None = None,
+    scores3d: ManyArrays | None = None,
     solver: "str | Path | torch.nn.Module" = "auto",
-    prior: Any = None,
+    prior: ManyPriors | None = None,
     inlier_threshold: float | int | None = None,
     clutter: float | int | None = None,
     seed: int = 0,

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bpnp.cameras import camera_from
+from bpnp.argument_types import ArrayLike, PointsLike
+from bpnp.cameras import CameraLike, camera_from
 from bpnp.loops.parallel import Deadline
 from bpnp.search.evidence.claimed import judge_claim
 from bpnp.search.evidence.uncertainty import linearised, pose_covariance
@@ -24,18 +25,18 @@ SECONDS = 10.0
 
 
 def verify(
-    points2d: Any,
-    points3d: Any,
-    rotation: Any,
-    translation: Any,
-    camera: Any = None,
+    points2d: PointsLike,
+    points3d: PointsLike,
+    rotation: ArrayLike,
+    translation: ArrayLike,
+    camera: CameraLike | None = None,
     *,
-    normals3d: Any = None,
-    labels2d: Any = None,
-    labels3d: Any = None,
-    scores2d: Any = None,
-    scores3d: Any = None,
-    matches: Any = None,
+    normals3d: ArrayLike | None = None,
+    labels2d: ArrayLike | None = None,
+    labels3d: ArrayLike | None = None,
+    scores2d: ArrayLike | None = None,
+    scores3d: ArrayLike | None = None,
+    matches: ArrayLike | None = None,
     refine: bool = True,
     inlier_threshold: float | int | None = None,
     seed: int = 0,
@@ -88,7 +89,7 @@ def verify(
     """
     limit = seconds_from(time_limit, SECONDS)
     threshold = positive("inlier_threshold", inlier_threshold, finite=True)
-    rotation, translation = checked_pose("", rotation, translation)
+    pose = checked_pose("", rotation, translation)
     problem = problem_from(
         points2d,
         points3d,
@@ -102,7 +103,7 @@ def verify(
     given = None if matches is None else _checked_matches(matches, problem)
     judged = problem if given is None else _of_matches(problem, given)
     limits: dict[str, Any] = {"inlier_threshold": threshold, "seed": checked_seed(seed), "time_limit": limit}
-    solution = verify_problem(judged, rotation, translation, refine=refine, **limits)
+    solution = verify_problem(judged, *pose, refine=refine, **limits)
     if given is None or judged.degenerate is not None:
         return solution
     return replace(

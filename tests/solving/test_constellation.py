@@ -1,6 +1,7 @@
 """`solve` on few points: LEDs with normals, labels, gravity, a predicted pose; and its errors for bad input."""
 
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -73,7 +74,7 @@ def test_a_confident_pose_of_a_ring_is_confident_when_it_is_verified_and_its_hal
     rng, checked = np.random.default_rng(45), 0
     for seed in range(12):
         seen = picture(Setting("ring, 3 lights", "ring", 3), seed, rng)
-        known = {"camera": CAMERA, "normals3d": seen.device.normals3d, "time_limit": 60}
+        known: dict[str, Any] = {"camera": CAMERA, "normals3d": seen.device.normals3d, "time_limit": 60}
         solution = solve(seen.pixels, seen.device.points3d, **known)
         if solution.verdict != "confident":
             continue
@@ -134,7 +135,7 @@ def test_two_devices_in_one_picture_share_no_light() -> None:
     rng = np.random.default_rng(8)
     known = device("ring", 8)
     image = np.concatenate([frame(known, Setting("ring", "ring"), rng).pixels for _ in range(2)])
-    search = {"points3d": known.points3d, "camera": CAMERA, "normals3d": known.normals3d}
+    search: dict[str, Any] = {"points3d": known.points3d, "camera": CAMERA, "normals3d": known.normals3d}
     solutions = solve_many([image] * 2, **search)
     lights = [set(solution.matches[:, 0].tolist()) for solution in solutions]
     assert min(len(own) for own in lights) >= 6

@@ -3,6 +3,7 @@
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -143,7 +144,7 @@ def test_distortion_that_is_asked_for_is_always_fitted() -> None:
 
 def test_a_rough_pinhole_camera_may_be_distorted_and_one_with_distortion_keeps_it() -> None:
     pixels, scene, rotation = planted(600.0, points=150, radial=-0.3, distance=3.0)
-    known = {"focal_error": 0.1, "solver": "search", "time_limit": LIMIT}
+    known: dict[str, Any] = {"focal_error": 0.1, "solver": "search", "time_limit": LIMIT}
     solution = solve(pixels, scene, ("PINHOLE", (630.0, 630.0, 320.0, 240.0)), **known)
     assert degrees_between(solution.rotation, rotation) < 0.5
     assert json.loads(solution.to_json())["camera"]["params"][-1] == pytest.approx(-0.3, abs=0.05)

@@ -19,9 +19,10 @@ PIXELS = np.r_[500 * X[:19] + [320, 240], [[600.0, 240.0]]]
 SIZE = (640, 480)
 WITH_NAN = np.where(np.arange(20)[:, None] == 7, np.nan, P)
 EVEN = np.full((20, 4), 0.25)  # class probabilities
-SEEN = {"points2d": X, "points3d": P}
-SKY = {"points2d": PIXELS, "points3d": P / np.linalg.norm(P, axis=1, keepdims=True), "camera": CAMERA}
-RIG = {"points2d": [PIXELS[:6], PIXELS[6:12]], "points3d": P, "camera": [CAMERA] * 2, "rig": [np.eye(4)] * 2}
+SEEN: dict[str, Any] = {"points2d": X, "points3d": P}
+SKY: dict[str, Any] = {"points2d": PIXELS, "points3d": P / np.linalg.norm(P, axis=1, keepdims=True), "camera": CAMERA}
+RIG: dict[str, Any] = {"points2d": [PIXELS[:6], PIXELS[6:12]], "points3d": P}
+RIG |= {"camera": [CAMERA] * 2, "rig": [np.eye(4)] * 2}
 CALLS: dict[str, Any] = {
     "points": partial(solve, **SEEN),
     "sky": partial(solve, at_infinity=True, **SKY),

@@ -1,7 +1,7 @@
 """Inputs of a network and their axes, and the use that a search makes of the proposed poses."""
 
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -57,7 +57,7 @@ def test_a_view_of_unknown_place_sees_the_points_where_and_as_large_as_the_image
 @pytest.mark.parametrize("place", ["solver", "prior"])
 def test_a_network_for_views_without_a_view_says_what_it_expects(place: str) -> None:
     planted = plant(1, 30)
-    net = Matcher(channels=16, depth=1, heads=2, neighbours=3, frame="view").eval()
+    net: Any = Matcher(channels=16, depth=1, heads=2, neighbours=3, frame="view").eval()
     with pytest.raises(ValueError, match=r"expected a view near .* try prior=PosePrior"):
         solve(planted.points2d[0], planted.points3d[0], **{place: net})
 
@@ -86,7 +86,7 @@ def test_a_matcher_solves_with_one_right_pair_in_twenty_alone_and_beside_a_pair_
     image, points, rotation, translation = scene(clutter=60)
     prior = PosePrior(VIEW, np.array([0.0, 0.0, 7.0]), 10.0, 0.5)
     noise = np.random.default_rng(3).normal(size=points.shape)
-    one = {"solver": Knowing(0.05, frame).eval(), "prior": prior}
+    one: dict[str, Any] = {"solver": Knowing(0.05, frame).eval(), "prior": prior}
     found, other = solve_many([image, image], [points, noise], **one)
     np.testing.assert_allclose(found.rotation, rotation, atol=1e-4)
     np.testing.assert_allclose(found.translation, translation, atol=1e-3)

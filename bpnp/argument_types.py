@@ -1,0 +1,86 @@
+"""Types of the arguments of public functions.
+
+For type checkers these are unions of what a function accepts. At run time they are `Any`: the functions check the
+values themselves, and raise a ValueError that names the argument.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, Protocol, SupportsFloat, TypeAlias, runtime_checkable
+
+import numpy.typing as npt
+
+
+class HasArray(Protocol):
+    """A NumPy array, a torch tensor, a data frame, or another object that NumPy converts."""
+
+    def __array__(self) -> npt.NDArray[Any]: ...
+
+
+class HasVertices(Protocol):
+    """A mesh or cloud of trimesh, or a mesh of Open3D."""
+
+    @property
+    def vertices(self) -> Any: ...
+
+
+class HasPoints(Protocol):
+    """A point cloud of Open3D."""
+
+    @property
+    def points(self) -> Any: ...
+
+
+class KeyPoint(Protocol):
+    """A cv2.KeyPoint."""
+
+    @property
+    def pt(self) -> Sequence[float]: ...
+
+
+class HasPose(Protocol):
+    """An object with a rotation and a translation, such as a `Solution`."""
+
+    @property
+    def rotation(self) -> Any: ...
+
+    @property
+    def translation(self) -> Any: ...
+
+
+class HasMatrix(Protocol):
+    """A pycolmap.Rigid3d."""
+
+    @property
+    def matrix(self) -> Callable[..., Any]: ...
+
+
+class HasCameraModel(Protocol):
+    """A pycolmap.Camera."""
+
+    @property
+    def cam_from_img(self) -> Callable[..., Any]: ...
+
+    @property
+    def img_from_cam(self) -> Callable[..., Any]: ...
+
+
+@runtime_checkable
+class HasReconstruction(Protocol):
+    """A pycolmap.Reconstruction."""
+
+    @property
+    def write_binary(self) -> Callable[..., Any]: ...
+
+
+# A union has one `Sequence` at most: mypy then infers the type of a list of different things.
+if TYPE_CHECKING:
+    Numbers: TypeAlias = HasArray | Sequence[SupportsFloat]
+    ArrayLike: TypeAlias = HasArray | Sequence[SupportsFloat | Sequence[SupportsFloat]]
+    ManyArrays: TypeAlias = HasArray | Sequence[ArrayLike | SupportsFloat | None]
+    Points: TypeAlias = HasArray | HasVertices | HasPoints
+    PointsLike: TypeAlias = Points | Sequence[KeyPoint | Sequence[SupportsFloat]]
+    ManyPoints: TypeAlias = Points | Sequence[PointsLike | KeyPoint | Sequence[SupportsFloat]]
+    Extrinsics: TypeAlias = HasArray | Sequence[Sequence[SupportsFloat]] | tuple[ArrayLike, ArrayLike]
+    ImageSize: TypeAlias = HasArray | Sequence[int]
+else:
+    Numbers = ArrayLike = ManyArrays = PointsLike = ManyPoints = Extrinsics = ImageSize = Any
