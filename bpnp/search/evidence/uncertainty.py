@@ -12,13 +12,12 @@ from scipy.special import fdtrc, fdtri
 
 from bpnp.poses import turned_by
 from bpnp.search.evidence.covariance import Linearisation, covariance_of, student_factor
-from bpnp.search.evidence.partners import facing, partners
 from bpnp.search.evidence.settings import Evidence
-from bpnp.search.pose_model import across, centre_columns, crossed, lens_columns
+from bpnp.search.pose_model import PoseModel, PoseState, Sight, centre_columns, crossed, lens_columns
 from bpnp.search.problem import Problem
 from bpnp.search.propose.lens import LensFit, fit_lens
+from bpnp.search.refine.gauss_newton import soft_matches
 from bpnp.search.settings import DEFAULT
-from bpnp.search.starts import GravityPrior, PosePrior
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
@@ -159,7 +158,7 @@ def pose_covariance(problem: Problem, linear: "Linearised | None", count: float)
     free = max(2 * count - problem.fitted, 1.0)
     moved = np.eye(len(covariance))  # from the shift s of the centroid to that of the origin: v = s + (R m) x w
     moved[3:POSE, 3:POSE] *= problem.size
-    moved[3:POSE, :3] = crossed(linear.rotation @ problem.middle_of_user)
+    moved[3:POSE, :3] = crossed(linear.state.rotation @ problem.middle_of_user)
     return np.asarray(student_factor(free) * moved @ covariance @ moved.T)
 
 
@@ -218,7 +217,7 @@ def local_covariance(linear: "Linearised | None") -> Array | None:
     covariance = _of_louis(linear)
     if covariance is not None:
         return covariance
-    sharper = linearised(linear.problem, linear.rotation, linear.translation, linear.scale / math.sqrt(2))
+    sharper = linearise(linear.model, linear.problem, linear.state, linear.scale / math.sqrt(2))
     covariance = None if sharper is None else _of_louis(sharper)
     return None if covariance is None else 2 * covariance
 
@@ -227,7 +226,8 @@ def matches_of(linear: "Linearised") -> Linearisation:
     """Convert the matches of a pose to the input of `covariance_of`."""
     chosen = linear.problem.image.chosen
     weight = np.full(len(chosen), len(linear.problem.bearings) / len(chosen))
-    return Linearisation(linear.residual, linear.jacobian, linear.probability, linear.image, weight, _known(linear))
+    known = linear.model.information(linear.state)
+    return Linearisation(linear.residual, linear.jacobian, linear.probability, linear.image, weight, known)
 
 
 def _of_louis(linear: "Linearised") -> Array | None:
@@ -237,7 +237,7 @@ def _of_louis(linear: "Linearised") -> Array | None:
         return covariance_of(matches, fitted=problem.fitted)
     matched = np.asarray(np.bincount(linear.image, linear.probability, len(problem.image.chosen)), np.float64)
     blocks = _blocks(problem, matched)
-    centre = problem.focal.centre_sigma / linear.scale * centre_columns(linear.seen)
+    centre = problem.focal.centre_sigma / linear.scale * centre_columns(linear.sight.directions)
     covariance = covariance_of(matches, fitted=problem.fitted, blocks=blocks, considered=centre)
     return None if covariance is None else covariance[: POSE + 1, : POSE + 1]
 
@@ -265,41 +265,33 @@ def _quantile(values: Array, weights: Array) -> Labels:
 
 
 class Linearised(NamedTuple):
-    """A pose and its k possible matches, linearised in the pose.
+    """A pose and its k possible matches in one camera, linearised in the unknowns.
 
     Attributes:
-        problem: Points of the problem.
-        rotation: (3, 3) of the pose.
-        translation: (3,) of the pose.
+        problem: Points of the camera.
+        model: The p unknowns.
+        state: The pose.
         image: (k,) indices into the chosen image points.
         probability: (k,) of each match.
-        seen: (k, 3) unit directions of the scene points in the camera's frame.
-        points: (k, 3) scene points in the camera's axes, relative to the scene centroid.
+        sight: The k scene points as the camera sees them.
         residual: (k, 3) of the image points, in units of `scale`.
-        jacobian: (k, 3, 6) derivative of `seen` by rotation and shift about the centroid, in units of `scale`;
-            (k, 3, 7) with the logarithm of a fitted focal length, (k, 3, 8) with a radial coefficient.
+        jacobian: (k, 3, p) derivatives of the directions by the unknowns, in units of `scale`.
         scale: Standard deviation of the residuals, radians.
     """
 
     problem: Problem
-    rotation: Array
-    translation: Array
+    model: PoseModel
+    state: PoseState
     image: Labels
     probability: Array
-    seen: Array
-    points: Array
+    sight: Sight
     residual: Array
     jacobian: Array
     scale: float
 
-    @property
-    def middle(self) -> Array:
-        """Scene centroid (3,) in the camera's frame."""
-        return np.asarray(self.rotation @ self.problem.middle + self.translation)
-
 
 def linearised(problem: Problem, rotation: Array, translation: Array, scale: float) -> Linearised | None:
-    """Linearise a pose and its possible matches.
+    """Linearise a pose of one camera and its possible matches.
 
     Args:
         problem: Points of the problem.
@@ -310,43 +302,30 @@ def linearised(problem: Problem, rotation: Array, translation: Array, scale: flo
     Returns:
         The linearised pose, or None if there is no match.
     """
-    camera = problem.points3d @ rotation.T + translation
-    places = facing(problem, camera, rotation)
-    if not len(places):
-        return None
-    camera = camera[places]
-    depth = np.linalg.norm(camera, axis=-1, keepdims=True)
-    seen = camera / depth
-    i, j, density, every = partners(problem, seen, places, problem.image.chosen, scale)
-    if not len(i):
-        return None
-    p, u = camera[j] - rotation @ problem.middle - translation, seen[j]
-    by_shift = across(u) / depth[j, None]
-    columns = [np.cross(p[:, None], by_shift, axisb=2, axisc=2), by_shift]
-    if problem.focal is not None:
-        columns.append(lens_columns(u, problem.focal.radial)[..., : 1 + (problem.focal.radial_sigma > 0)])
-    jacobian = np.concatenate(columns, -1) / scale
-    residual = (problem.bearings[problem.image.chosen[i]] - u) / scale
-    return Linearised(problem, rotation, translation, i, density / every[i], u, p, residual, jacobian, scale)
+    model = PoseModel.of(problem)
+    return linearise(model, problem, model.state(rotation, translation), scale)
 
 
-def _known(linear: Linearised) -> Array:
-    """Return the information (p, p) of the priors on rotation, shift and the fitted lens parameters."""
-    focal, prior = linear.problem.focal, linear.problem.prior
-    size = linear.jacobian.shape[-1]
-    information = np.zeros((size, size))
-    if focal is not None:
-        sigmas = np.array([focal.sigma, focal.radial_sigma][: size - POSE])
-        information[POSE:, POSE:] = np.diag(1 / sigmas**2)
-    if isinstance(prior, GravityPrior):
-        up = np.asarray(prior.up_camera, np.float64) / np.linalg.norm(prior.up_camera)
-        information[:3, :3] = (np.eye(3) - np.outer(up, up)) / math.radians(prior.sigma_deg) ** 2
-    elif isinstance(prior, PosePrior):
-        information[:3, :3] = np.eye(3) / math.radians(prior.rotation_sigma_deg) ** 2
-        if prior.translation is not None:
-            moved = np.concatenate([crossed(linear.rotation @ linear.problem.middle), np.eye(3)], 1)
-            information[:POSE, :POSE] += moved.T @ moved / prior.translation_sigma**2
-    return information
+def linearise(model: PoseModel, problem: Problem, state: PoseState, scale: float, camera: int = 0) -> Linearised | None:
+    """Linearise the possible matches of one camera in the unknowns of a model.
+
+    Args:
+        model: Unknowns.
+        problem: Points of the camera.
+        state: The pose.
+        scale: Standard deviation of the residuals, radians.
+        camera: Index of the camera in a rig.
+
+    Returns:
+        The linearised pose, or None if there is no match.
+    """
+    found = soft_matches(model, problem, state, scale, camera=camera)
+    if found is None:
+        return None
+    sight = found.sight.choose(found.point)
+    residual = (problem.bearings[problem.image.chosen[found.image]] - sight.directions) / scale
+    jacobian = model.jacobian(state, sight, camera) / scale
+    return Linearised(problem, model, state, found.image, found.probability, sight, residual, jacobian, scale)
 
 
 class Misfit(NamedTuple):
@@ -390,9 +369,9 @@ def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = 
     if linear is None:
         return Misfit(0.0, 0.0)
     free = 2 * min(count, float(linear.probability.sum())) - POSE
-    zoomed = lens_columns(linear.seen, 0.0)[..., :1] / linear.scale
-    strained = linear.jacobian[:, :, 3:POSE] @ (linear.points @ STRAINS).transpose(1, 2, 0)
-    distance = max(float(np.linalg.norm(linear.middle)), 1e-300)  # unit of the shift, like a radian of rotation
+    zoomed = lens_columns(linear.sight.directions, 0.0)[..., :1] / linear.scale
+    strained = linear.jacobian[:, :, 3:POSE] @ (linear.sight.turned @ STRAINS).transpose(1, 2, 0)
+    distance = max(float(np.linalg.norm(linear.state.centroid)), 1e-300)  # unit of the shift, like a radian of rotation
     posed = linear.jacobian[:, :, :POSE] * np.repeat([1.0, distance], 3)
     columns = np.concatenate([posed, zoomed, strained, linear.residual[..., None]], -1)
     weighed = (np.sqrt(linear.probability)[:, None, None] * columns).reshape(-1, columns.shape[-1])
@@ -404,10 +383,10 @@ def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = 
         moved, step = _moved(products, pose, fitted, free, chance)
         zoom = math.exp(float(step[0])) if len(step) == 1 else 1.0
         found.append(Misfit(float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:])), zoom))
-    pose_of = linear.problem, linear.rotation, linear.middle, linear.scale
-    other = fit_lens(*pose_of) if found[0].zoom != 1 else None
+    rotation, middle = linear.state.rotation, linear.state.centroid
+    other = fit_lens(linear.problem, rotation, middle, linear.scale) if found[0].zoom != 1 else None
     if other is not None:
-        found.append(misfit_of(linear.rotation, linear.middle, other))
+        found.append(misfit_of(rotation, middle, other))
     return Misfit(
         max(each.turn for each in found),
         max(each.shift for each in found),
@@ -440,7 +419,7 @@ def bends_significantly(linear: Linearised | None, count: float, rule: Evidence 
     if linear is None or not (linear.problem.bearings[:, 2] > 0).all():
         return False
     free = 2 * min(count, float(linear.probability.sum())) - POSE - 2
-    lens = lens_columns(linear.seen, 0.0) / linear.scale
+    lens = lens_columns(linear.sight.directions, 0.0) / linear.scale
     columns = [linear.jacobian[:, :, :POSE], lens, linear.residual[..., None]]
     rows = (np.sqrt(linear.probability)[:, None, None] * np.concatenate(columns, -1)).reshape(-1, POSE + 3)
     # The last column of R ends with the gain of the radial coefficient and the remaining residual.

@@ -17,20 +17,21 @@ from itertools import combinations, permutations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from bpnp.search.evidence.covariance import covariance_of, join
 from bpnp.search.evidence.false_alarms import Terms, camera_terms, directions_of, log10_nfa
-from bpnp.search.evidence.uncertainty import Linearised, linearised, matches_of
+from bpnp.search.evidence.uncertainty import linearise, matches_of
 from bpnp.search.hypotheses import Hypotheses
-from bpnp.search.pose_model import FIXING, log10_tests
+from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem
+from bpnp.search.refine.gauss_newton import soft_equations, steps
 from bpnp.search.scene import Scene
 
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]
 WIDE = 60.0  # scale at which proposals are compared, in smallest scales: a pose of one camera is inaccurate in another
 STEPS, AGAIN = 9, 2  # number of decreasing scales, and Gauss-Newton steps at each
+MOST_SCALE = 1.0  # largest step of the log scale
 WEIGHED = 7  # number of the last scales at which the false alarms of poses are computed
 SAME_CENTRE = 1e-6  # fraction of the largest coordinate of a camera centre in the rig; nearer centres coincide
 
@@ -50,7 +51,8 @@ class Rig:
         self.problems = problems
         self.mounts = [(turn, shift / problem.size) for problem, (turn, shift) in zip(problems, mounts, strict=True)]
         self.floor = max(each.floor or float(each.image.scales[0]) for each in self.problems)
-        self.unknowns = 6 if is_metric else 7
+        self.model = PoseModel(problems[0].middle, mounts=self.mounts, scale=not is_metric)
+        self.unknowns = self.model.size
         centres = np.array([-turn.T @ shift for turn, shift in mounts])
         least = SAME_CENTRE * np.abs(centres).max()
         pairs = combinations(range(len(mounts)), 2)
@@ -88,60 +90,27 @@ class Rig:
         turns, shifts = self.pose_of(k, poses.rotation, poses.translation)
         return replace(poses, rotation=turns, translation=shifts)
 
-    def linearised(self, rotation: Array, translation: Array, scale: float) -> list[tuple[Array, Linearised]]:
-        """Linearise the pose in each camera with a possible match.
-
-        Returns:
-            For each such camera, the matrix (6, unknowns) that converts a step of the rig to one of the camera, and its
-            linearised pose. The seventh unknown is the logarithm of the scale.
-        """
-        found = []
-        for k, problem in enumerate(self.problems):
-            linear = linearised(problem, *self.pose_of(k, rotation, translation), scale)
-            if linear is not None:
-                turn, shift = self.mounts[k]
-                by_scale = np.r_[np.zeros(3), -translation[3] * shift]
-                step = np.column_stack([np.kron(np.eye(2), turn), by_scale])[:, : self.unknowns]
-                found.append((np.asarray(step, np.float64), linear))
-        return found
-
     def refined(self, rotation: Array, translation: Array) -> Iterator[tuple[Array, Array, float, float]]:
         """Refine a pose at decreasing scales.
 
         Yields:
             Rotation, translation, scale (radians) and expected number of matches after each step.
         """
-        middle = self.problems[0].middle
-        for scale in np.geomspace(WIDE, 1.0, STEPS).repeat(AGAIN) * self.floor:
-            information, gradient, count = np.zeros((self.unknowns, self.unknowns)), np.zeros(self.unknowns), 0.0
-            for turn, linear in self.linearised(rotation, translation, scale):
-                rows = linear.jacobian @ turn
-                information = information + np.einsum("k,kia,kib->ab", linear.probability, rows, rows)
-                gradient = gradient + np.einsum("k,kia,ki->a", linear.probability, rows, linear.residual)
-                count += (
-                    float(linear.probability.sum()) * len(linear.problem.bearings) / len(linear.problem.image.chosen)
-                )
-            if count <= self.unknowns - 3:
-                return
-            step = np.linalg.lstsq(information, gradient, rcond=None)[0]
-            moved = rotation @ middle + translation[:3] + step[3:6]
-            rotation = Rotation.from_rotvec(step[:3]).as_matrix() @ rotation
-            unit = translation[3:] * np.exp(-np.clip(step[6:], -1, 1).sum())
-            translation = np.r_[moved - rotation @ middle, unit]
-            yield rotation, translation, float(scale), count
+        scales = (np.geomspace(WIDE, 1.0, STEPS).repeat(AGAIN) * self.floor).tolist()
+        linearise = soft_equations(self.model, self.problems, fewest=self.unknowns - 3)
+        largest = np.full(self.unknowns, math.inf)
+        largest[6:] = MOST_SCALE
+        for last in steps(self.model, self.model.state(rotation, translation), linearise, scales, largest=largest):
+            yield (*self.model.pose(last.state), last.scale, float(last.before.matched))
 
     def alarms(self, rotation: Array, translation: Array, scale: float) -> tuple[float, float]:
         """Return log10 of the number of false alarms at the scale of the residuals, and at rougher ones.
 
         Three matches of a camera fix the pose. An unknown scale needs one more, of a camera with a non-zero baseline.
         """
-        tests = math.log10(sum(10 ** log10_tests(each) for each in self.problems))
-        if self.unknowns == 7:
-            tests += math.log10(sum(len(each.bearings) * len(each.points3d) for each in self.problems))
-        cameras, one = self._terms(rotation, translation, scale), np.eye(len(self.problems), dtype=np.int64)
-        either = [*self.apart, *(pair[::-1] for pair in self.apart)]
-        fixing = FIXING * one if self.unknowns == 6 else np.array([FIXING * one[k] + one[other] for k, other in either])
-        return log10_nfa(cameras, tests, fixing.tolist())
+        cameras = self._terms(rotation, translation, scale)
+        ways = self.model.fixing_ways(len(self.problems), self.apart)
+        return log10_nfa(cameras, self.model.log10_tests(self.problems), ways)
 
     def _terms(self, rotation: Array, translation: Array, scale: float | None) -> list[Terms | None]:
         seen = (
@@ -171,12 +140,14 @@ class Rig:
         Returns:
             (6, 6) of the rotation and the shift of the scene centroid; (7, 7) with the logarithm of an unknown scale.
         """
+        state = self.model.state(rotation, translation)
         for sharper in (1.0, 1 / math.sqrt(2)):  # as `local_covariance`
-            parts = []
-            for turn, linear in self.linearised(rotation, translation, sharper * scale):
-                own = matches_of(linear)
-                parts.append(own._replace(jacobian=own.jacobian @ turn, known=turn.T @ own.known @ turn))
-            covariance = covariance_of(join(parts), fitted=self.unknowns) if parts else None
+            seen = [linearise(self.model, each, state, sharper * scale, k) for k, each in enumerate(self.problems)]
+            parts = [matches_of(linear) for linear in seen if linear is not None]
+            if not parts:
+                return None
+            matches = join(parts)._replace(known=self.model.information(state))
+            covariance = covariance_of(matches, fitted=self.unknowns)
             if covariance is not None:
                 return covariance / sharper**2
         return None

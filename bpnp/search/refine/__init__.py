@@ -1,0 +1,1 @@
+"""Refinement of poses to the end, in float64."""
