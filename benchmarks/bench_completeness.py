@@ -21,7 +21,7 @@ from bpnp.poses import Tolerance
 from bpnp.search.evidence.repetitions import competing_poses, registered
 from bpnp.search.pool import Pool
 from bpnp.search.scene import Scene
-from bpnp.search.schedule import turns
+from bpnp.search.schedule import Plan
 from bpnp.search.settings import DEFAULT
 from bpnp.search.verdict import no_pose, starts_met
 from bpnp.solving.inputs import problem_from
@@ -41,9 +41,11 @@ def reached(problem: Problem) -> dict[int, bool]:
     points, settings = problem_from(points2d, points3d, None), replace(DEFAULT, evidence=BLIND)
     pool = Pool(Scene(points, 0, settings), points, no_pose("no pose was found"))
     found: dict[int, bool] = {}
-    drawn = turns(pool, None, None)
+    plan = Plan.of(pool)
     for _ in range(TURNS):
-        pool.merge(next(drawn))
+        step = plan.next_step()
+        assert step is not None
+        pool.add(step, step.propose())
         leaders = pool.leaders()
         if not len(leaders) or leaders.log10_false_alarms[0] > BLIND.false_alarms:
             continue

@@ -14,9 +14,9 @@ from bpnp.loops.parallel import one_blas_thread
 from bpnp.maps.views import Cones, View
 from bpnp.poses import MIN_POINTS
 from bpnp.search.annealing import finish, polished
+from bpnp.search.competitors import other_lens, settle
 from bpnp.search.evidence import reasons
 from bpnp.search.evidence.alternatives import Alternative, fits_as_well
-from bpnp.search.evidence.rivals import against_rivals, other_camera
 from bpnp.search.evidence.settings import Evidence
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
 from bpnp.search.problem import Problem, UnknownFocal, faces
@@ -230,7 +230,7 @@ def on_all_points(solution: Solution, photo: Photo, lens: Camera | UnknownCamera
         beside = finish(scene, search_beside(scene, start, DEFAULT.beside), DEFAULT.finished)
         ends = Hypotheses.concatenate([ends, to_problem_frame(beside, scene)])
     alone = judged(ends, problem, batches=1, exhaustive=True, rule=rule)
-    result = against_rivals(alone, problem, lambda: scene, rule, exhaustive=True)
+    result = settle(alone, problem, lambda: scene, rule, exhaustive=True)
     rotations, shifts = np.stack([rotation, result.best[0]]), np.stack([shift, result.best[1]])
     behind = result.log10_false_alarms - solution.log10_false_alarms
     if sure and not problem.same_pose(rotations, shifts, rule.same)[1]:
@@ -243,7 +243,7 @@ def on_all_points(solution: Solution, photo: Photo, lens: Camera | UnknownCamera
     if not sure:
         return solution
     if alone.verdict != "confident":  # other cameras have not been tested for it
-        other = other_camera(alone, problem, lambda: scene, rule)
+        other = other_lens(alone, problem, lambda: scene, rule)
         return solution if other is None else _doubted(solution, other)
     confident = result.verdict == "confident"
     return solution if confident else replace(solution, verdict=result.verdict, reason=result.reason)

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from bpnp.poses import close_poses
 from bpnp.search.annealing import finish
-from bpnp.search.evidence.rivals import against_rivals
+from bpnp.search.competitors import settle
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
+from bpnp.search.loop import Step
 from bpnp.search.pose_model import log10_tests
 from bpnp.search.problem import Problem
 from bpnp.search.scene import Scene
@@ -32,7 +33,8 @@ class Pool:
 
     def __init__(self, scene: Scene, problem: Problem, enumerated: SearchResult) -> None:
         self.scene, self.problem, self.enumerated = scene, problem, enumerated
-        self.turns = 0
+        self.turns, self._judged = 0, 0.0
+        self._is_thinned = len(problem.bearings) > scene.settings.fine.bearings
         self._tests = log10_tests(problem)
         self.forget()
         if len(enumerated.candidates):
@@ -42,31 +44,33 @@ class Pool:
         """Drop all poses."""
         self.candidates = self.surrounded = Hypotheses.empty(dtype=np.float32)
         self.searched: list[Hypotheses] = []
-        self._around: Hypotheses | None = None
         self.missed = 0.0
 
-    def merge(self, found: Hypotheses) -> None:
+    def add(self, step: Step, found: Hypotheses) -> None:
         """Add the poses of an iteration.
 
-        Their NFA is computed first: a significant pose may be close to a likelier one that is not significant.
+        Their NFA is computed first: a significant pose may be close to a likelier one that is not significant. A local
+        search was unsuccessful if the best NFA does not fall by `Evidence.lead` decades.
+
+        Args:
+            step: Step that found them.
+            found: Poses in the frame of the scene.
         """
         rule, before = self.scene.settings.evidence, self.alarms
+        self.turns += 1
         self.candidates = self._weighed(merge_hypotheses([self.candidates, self._weighed(found)], self.scene), 1)
-        if self._around is not None and self.alarms > before - rule.lead and not self.scene.deadline.passed():
-            self.surrounded = Hypotheses.concatenate([self.surrounded, self._around])
-        self._around = None
+        if step.around is not None and self.alarms > before - rule.lead and not self.scene.deadline.passed():
+            self.surrounded = Hypotheses.concatenate([self.surrounded, step.around])
         self.missed = self._missed()
         if self.missed > rule.missed:  # otherwise `result` computes the NFA of the others
             self.candidates = self._weighed(self.candidates)
             self.candidates = self.candidates[np.argsort(-self.candidates.sort_key, kind="stable")]
             self.missed = self._missed()
 
-    def look_around(self, pose: Hypotheses) -> None:
-        """Record that the next iteration searches around a pose (1,).
-
-        The search counts as unsuccessful if the best NFA does not fall by `Evidence.lead` decades.
-        """
-        self._around = pose
+    def may_be_decided(self) -> bool:
+        """Return True if the verdict on the best pose may be final, or more points may be matched by it."""
+        bettered = self._is_thinned and self.alarms < self._judged - self.scene.settings.evidence.lead
+        return bettered or self.missed <= self.scene.settings.evidence.missed
 
     def _weighed(self, candidates: Hypotheses, count: int | None = None) -> Hypotheses:
         """Compute the NFA of the promising poses among the first `count` candidates.
@@ -94,6 +98,11 @@ class Pool:
         """Return the candidates with an NFA, in the frame of the problem, the best one first."""
         known = self.candidates[~np.isnan(self.candidates.log10_false_alarms)]
         return weighed(to_problem_frame(known, self.scene), self.problem, self.scene.settings.evidence)
+
+    @property
+    def best_key(self) -> float:
+        """Largest sort key of the candidates; -inf if there are none."""
+        return float(self.candidates.sort_key.max(initial=-math.inf))
 
     @property
     def alarms(self) -> float:
@@ -124,14 +133,16 @@ class Pool:
         leaders = self.leaders()
         return missed(leaders, self.problem, self.looks(leaders), self.scene.settings.evidence)
 
-    def result(self, annealed: int | None = None) -> SearchResult:
+    def result(self, *, ended: bool = True) -> SearchResult:
         """Compute the verdict on the best candidates.
 
         Args:
-            annealed: Number of candidates, best first, to anneal on all points; None for `settings.finished`.
+            ended: True after the last iteration, where the `settings.finished` best candidates are annealed on all
+                points; False to anneal only the best one.
         """
         scene, problem, rule = self.scene, self.problem, self.scene.settings.evidence
-        annealed = scene.settings.finished if annealed is None else annealed
+        self._judged = min(self._judged, self.alarms)
+        annealed = scene.settings.finished if ended else 1
         ends = finish(scene, self.candidates, annealed) if len(self.candidates) else self.candidates
         if len(ends) and problem.prior is not None:  # keep the version of each pose with the smaller NFA
             ends = self._weighed(ends)
@@ -141,4 +152,4 @@ class Pool:
         result = judged(leaders, problem, batches=self.turns, looks=looks, rule=rule)
         if self.enumerated.log10_false_alarms < result.log10_false_alarms:
             return replace(self.enumerated, batches=self.turns)
-        return against_rivals(result, problem, lambda: scene, rule, looks=looks)
+        return settle(result, problem, lambda: scene, rule, looks=looks)

@@ -1,6 +1,6 @@
-"""Order in which a search draws initial poses, until a pose is confident or the budget is spent.
+"""Steps of a search in order, until a pose is confident or the budget is spent.
 
-| best pose so far                | iterations                                                                 |
+| best pose so far                | steps                                                                      |
 |---------------------------------|----------------------------------------------------------------------------|
 | near a rough prior              | density-map search, then a batch of starts over all rotations              |
 | not significant                 | a batch of starts over all rotations, and density-map searches over all    |
@@ -8,11 +8,13 @@
 |                                 | local searches around its likeliest poses                                  |
 | significant, not yet confident  | batches and searches over all rotations, and local searches around it      |
 
-Each iteration draws starts, preselects them, anneals the best, and yields distinct poses, which the pool merges.
+Each step draws starts, preselects them, anneals the best, and returns distinct poses, which the loop
+(`bpnp.search.loop`) adds to the pool. The next step is chosen by what the pool holds then.
 """
 
-from collections.abc import Callable, Iterator
-from itertools import count, islice
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +22,7 @@ from numpy.typing import NDArray
 from bpnp.search.annealing import multistart
 from bpnp.search.evidence.alternatives import far_missed, near_missed
 from bpnp.search.hypotheses import Hypotheses, select_distinct, to_scene_frame
+from bpnp.search.loop import Step
 from bpnp.search.pool import Pool
 from bpnp.search.raster_search import (
     admitted,
@@ -33,113 +36,224 @@ from bpnp.search.starts import PosePrior, Prior
 from bpnp.search.verdict import is_symmetric, starts_met
 
 Proposals = Callable[[], tuple[NDArray[np.float64], NDArray[np.float64]]]  # rotations (s, 3, 3), translations (s, 3)
+PROPOSED_AFTER = 4  # steps near a prior after which proposals are requested
 
 
-def turns(pool: Pool, around: Prior | None, proposals: Proposals | None) -> Iterator[Hypotheses]:
-    """Yield the poses of one iteration after the other.
-
-    The caller merges the poses of an iteration into the pool before it requests the next.
-
-    Args:
-        pool: Poses found so far.
-        around: Guess of the pose in the frame of the problem, used before all other sources; None for none.
-        proposals: Function that returns poses to start from; None for none.
-    """
-    scene, settings = pool.scene, pool.scene.settings
-    guess, known = (None if prior is None else scene.enter_prior(prior) for prior in (around, pool.problem.prior))
-    if guess is not None:
-        for number in range(settings.schedule.around):
-            yield multistart(scene, number, guess).as_dependent()
-    if isinstance(known, PosePrior) and is_near(scene, known):
-        near = _near(pool, known, proposals)
-        yield from islice(near, settings.schedule.near)
-        while pool.alarms < 0:
-            yield from _sure(pool, near)
-        # The prior may be wrong: poses found near it would only displace others.
-        pool.forget()
-        known = None
-    yield from _anywhere(pool, known, proposals)
-
-
-def _near(pool: Pool, known: PosePrior, proposals: Proposals | None) -> Iterator[Hypotheses]:
-    """Yield poses near a prior, alternating with batches over all rotations, and proposals once."""
-    scene = pool.scene
-    for number in count():
-        yield search_near(scene, known)
-        yield multistart(scene, number, None)
-        if number == 1 and proposals is not None and pool.alarms > scene.settings.evidence.false_alarms:
-            yield proposed(pool, proposals)
-
-
-def _anywhere(pool: Pool, known: Prior | None, proposals: Proposals | None) -> Iterator[Hypotheses]:
-    """Yield poses from all rotations or a wide prior, with local searches and proposals, without end."""
-    drawn = _drawn(pool, known)
-    yield next(drawn)
-    for number in count():
-        if pool.alarms < 0:
-            yield from _sure(pool, drawn)
-            continue
-        yield from _with_surroundings(pool, next(drawn))
-        if pool.alarms > 0 and proposals is not None and number >= pool.scene.settings.schedule.unaided:
-            yield from _with_surroundings(pool, proposed(pool, proposals))
-            proposals = None
-
-
-def _sure(pool: Pool, drawn: Iterator[Hypotheses]) -> Iterator[Hypotheses]:
-    """Run the step that reduces the larger miss probability.
-
-    The step is a local search around the best pose, or the next source of starts.
-    """
-    leaders, settings = pool.leaders(), pool.scene.settings
-    looks, rule = pool.looks(leaders), settings.evidence
-    symmetric = bool(pool.problem.registered) and is_symmetric(leaders, pool.problem, rule)
-    basin_count = starts_met(leaders, pool.problem, rule, symmetric=symmetric)
-    far = far_missed(basin_count, rule, symmetric=symmetric)
-    if looks < settings.schedule.looks and near_missed(basin_count, looks, rule) > far:
-        yield _look(pool)
-    else:
-        yield next(drawn)
-
-
-def _look(pool: Pool) -> Hypotheses:
-    """Run a local search around the best pose."""
-    leader = to_scene_frame(pool.leaders()[:1], pool.scene)
-    pool.look_around(leader)
-    return search_beside(pool.scene, leader, pool.scene.settings.beside)
-
-
-def _drawn(pool: Pool, known: Prior | None) -> Iterator[Hypotheses]:
-    """Yield poses of batches of starts and of density-map searches over all rotations that take as long.
+@dataclass
+class Source:
+    """Batches of starts, and after each the density-map searches over all rotations that take as long.
 
     Every third batch ignores the prior, which may be wrong.
+
+    Attributes:
+        pool: Poses found so far.
+        known: Prior in the frame of the scene; None for none.
+        batches: Number of batches so far.
+        searches: Number of density-map searches so far.
+        waiting: Number of density-map searches until the next batch.
     """
-    scene, searches = pool.scene, count()
-    for number in count():
-        yield multistart(scene, number, None if number % 3 == 2 else known)
-        for _ in range(scene.settings.batch(number) // scene.settings.schedule.starts_a_search):
-            yield search_everywhere(scene, next(searches), known)
+
+    pool: Pool
+    known: Prior | None
+    batches: int = 0
+    searches: int = 0
+    waiting: int = 0
+
+    def next_step(self) -> Step:
+        """Return the next batch or density-map search."""
+        scene = self.pool.scene
+        if self.waiting:
+            number, self.searches, self.waiting = self.searches, self.searches + 1, self.waiting - 1
+            return Step(partial(search_everywhere, scene, number, self.known))
+        number, self.batches = self.batches, self.batches + 1
+        self.waiting = scene.settings.batch(number) // scene.settings.schedule.starts_a_search
+        return Step(partial(multistart, scene, number, None if number % 3 == 2 else self.known))
 
 
-def _with_surroundings(pool: Pool, found: Hypotheses) -> Iterator[Hypotheses]:
-    """Yield poses, then local searches around the best of different rotations.
+@dataclass
+class Surroundings:
+    """Local searches around the best poses of a step, of different rotations.
 
     Poses whose surroundings were searched before are skipped. The searches end after several without a better pose, or
     with a significant pose.
+
+    Attributes:
+        pool: Poses found so far.
+        poses: Poses to search around, best first.
+        in_vain: Number of consecutive searches without a better pose.
+        best: Largest sort key of the pool before the search that runs; None if none runs.
     """
-    yield found
-    settings, since = pool.scene.settings, 0
-    poses = select_distinct(found, pool.scene, settings.schedule.around_each, settings.schedule.apart_deg)
-    for k in range(len(poses)):
-        if since == settings.schedule.in_vain or pool.alarms < 0:
-            break
-        if not pool.is_searched(poses[k : k + 1]):
-            best = pool.candidates.sort_key.max(initial=-np.inf)
-            pool.searched.append(poses[k : k + 1])
-            yield search_beside(pool.scene, poses[k : k + 1], settings.beside)
-            since = 0 if pool.candidates.sort_key.max(initial=-np.inf) > best else since + 1
+
+    pool: Pool
+    poses: Hypotheses
+    in_vain: int = 0
+    best: float | None = None
+
+    def next_step(self) -> Step | None:
+        """Return the next local search; None after the last one."""
+        pool, settings = self.pool, self.pool.scene.settings
+        if self.best is not None:
+            self.in_vain = 0 if pool.best_key > self.best else self.in_vain + 1
+        while len(self.poses) and self.in_vain < settings.schedule.in_vain and pool.alarms >= 0:
+            pose, self.poses = self.poses[:1], self.poses[1:]
+            if not pool.is_searched(pose):
+                self.best = pool.best_key
+                pool.searched.append(pose)
+                return Step(partial(search_beside, pool.scene, pose, settings.beside))
+        return None
 
 
-def proposed(pool: Pool, proposals: Proposals) -> Hypotheses:
+@dataclass
+class Plan:
+    """Order of the steps of a search of one camera.
+
+    Attributes:
+        pool: Poses found so far.
+        guess: Guess of the pose in the frame of the scene, used before all other sources; None for none.
+        proposals: Function that returns poses to start from, called once; None for none.
+        near: Prior near which the search begins, in the frame of the scene; None after it was given up.
+        source: Starts over all rotations; None to start from proposals only.
+        taken: Number of steps that the guess gave.
+        taken_near: Number of steps near the prior.
+        asked_near: True if the proposals were requested near the prior.
+        rounds: Number of rounds over all rotations.
+        surroundings: Local searches that are under way.
+    """
+
+    pool: Pool
+    guess: Prior | None
+    proposals: Proposals | None
+    near: PosePrior | None
+    source: Source | None
+    taken: int = 0
+    taken_near: int = 0
+    asked_near: bool = False
+    rounds: int = 0
+    surroundings: Surroundings | None = None
+    _found: list[Hypotheses] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, pool: Pool, around: Prior | None = None, proposals: Proposals | None = None) -> "Plan":
+        """Return the plan of a search over all poses.
+
+        Args:
+            pool: Poses found so far.
+            around: Guess of the pose in the frame of the problem; None for none.
+            proposals: Function that returns poses to start from; None for none.
+        """
+        guess, known = (
+            None if prior is None else pool.scene.enter_prior(prior) for prior in (around, pool.problem.prior)
+        )
+        near = known if isinstance(known, PosePrior) and is_near(pool.scene, known) else None
+        return cls(pool, guess, proposals, near, Source(pool, None if near is not None else known))
+
+    @classmethod
+    def of_proposals(cls, pool: Pool, proposals: Proposals) -> "Plan":
+        """Return the plan of a search that starts from proposed poses only."""
+        return cls(pool, None, proposals, None, None)
+
+    def next_step(self) -> Step | None:
+        """Return the next step; None if there is none."""
+        if self.guess is not None and self.taken < self.pool.scene.settings.schedule.around:
+            self.taken += 1
+            return Step(partial(_dependent_batch, self.pool, self.taken - 1, self.guess))
+        if self.near is not None:
+            if self.taken_near < self.pool.scene.settings.schedule.near:
+                return self._next_near(self.near)
+            if self.pool.alarms < 0:
+                return self._next_of_significant(partial(self._next_near, self.near))
+            # The prior may be wrong: poses found near it would only displace others.
+            self.pool.forget()
+            self.near = None
+        return self._next_of_proposals() if self.source is None else self._next_anywhere(self.source)
+
+    def _next_near(self, prior: PosePrior) -> Step:
+        """Return a step near the prior: in turn near it and over all rotations, and the proposals once."""
+        scene, number = self.pool.scene, self.taken_near - self.asked_near
+        undecided = self.pool.alarms > scene.settings.evidence.false_alarms
+        self.taken_near += 1
+        if number == PROPOSED_AFTER and self.proposals is not None and undecided:
+            self.asked_near = True
+            return Step(self._take_proposals())
+        if number % 2:
+            return Step(partial(multistart, scene, number // 2, None))
+        return Step(partial(search_near, scene, prior))
+
+    def _next_anywhere(self, source: Source) -> Step:
+        """Return a step over all rotations or a wide prior, a local search, or the proposals."""
+        if not source.batches:
+            return source.next_step()
+        while True:
+            if (step := self._next_in_surroundings()) is not None:
+                return step
+            unaided = self.rounds > self.pool.scene.settings.schedule.unaided and self.pool.alarms > 0
+            if unaided and self.proposals is not None:
+                return self._and_surroundings(Step(self._take_proposals()))
+            self.rounds += 1
+            if self.pool.alarms < 0:
+                return self._next_of_significant(source.next_step)
+            return self._and_surroundings(source.next_step())
+
+    def _next_of_proposals(self) -> Step | None:
+        """Return the proposals, a local search around one of them, or one around a significant pose."""
+        if self.proposals is not None:
+            return self._and_surroundings(Step(self._take_proposals()))
+        if (step := self._next_in_surroundings()) is not None:
+            return step
+        pool = self.pool
+        enough = pool.alarms >= 0 or pool.looks(pool.leaders()) >= pool.scene.settings.schedule.looks
+        return None if enough else self._look()
+
+    def _take_proposals(self) -> Callable[[], Hypotheses]:
+        """Return a function that searches from the proposals, which are then used up."""
+        proposals, self.proposals = self.proposals, None
+        assert proposals is not None
+        return partial(search_proposed, self.pool, proposals)
+
+    def _and_surroundings(self, step: Step) -> Step:
+        """Return a step after which the surroundings of its best poses are searched."""
+
+        def propose() -> Hypotheses:
+            self._found.append(step.propose())
+            return self._found[-1]
+
+        return step._replace(propose=propose)
+
+    def _next_in_surroundings(self) -> Step | None:
+        """Return the next local search around the poses of the last step; None if there is none."""
+        if self._found:
+            found, schedule = self._found.pop(), self.pool.scene.settings.schedule
+            poses = select_distinct(found, self.pool.scene, schedule.around_each, schedule.apart_deg)
+            self.surroundings = Surroundings(self.pool, poses)
+        step = None if self.surroundings is None else self.surroundings.next_step()
+        if step is None:
+            self.surroundings = None
+        return step
+
+    def _next_of_significant(self, next_start: Callable[[], Step]) -> Step:
+        """Return the step that reduces the larger miss probability: a local search around the best pose, or a start."""
+        pool = self.pool
+        leaders, settings = pool.leaders(), pool.scene.settings
+        looks, rule = pool.looks(leaders), settings.evidence
+        symmetric = bool(pool.problem.registered) and is_symmetric(leaders, pool.problem, rule)
+        basin_count = starts_met(leaders, pool.problem, rule, symmetric=symmetric)
+        far = far_missed(basin_count, rule, symmetric=symmetric)
+        if looks < settings.schedule.looks and near_missed(basin_count, looks, rule) > far:
+            return self._look()
+        return next_start()
+
+    def _look(self) -> Step:
+        """Return a local search around the best pose."""
+        scene = self.pool.scene
+        leader = to_scene_frame(self.pool.leaders()[:1], scene)
+        return Step(partial(search_beside, scene, leader, scene.settings.beside), leader)
+
+
+def _dependent_batch(pool: Pool, number: int, guess: Prior) -> Hypotheses:
+    return multistart(pool.scene, number, guess).as_dependent()
+
+
+def search_proposed(pool: Pool, proposals: Proposals) -> Hypotheses:
     """Run a density-map search from proposed poses that the prior of the problem admits.
 
     Args:
@@ -151,10 +265,3 @@ def proposed(pool: Pool, proposals: Proposals) -> Hypotheses:
     """
     poses = admitted(pool.scene, Hypotheses.from_poses(*pool.scene.enter(*proposals())), pool.problem.prior)
     return raster_search(pool.scene, poses, pool.scene.settings.proposed)
-
-
-def only_proposed(pool: Pool, proposals: Proposals) -> Iterator[Hypotheses]:
-    """Yield proposed poses and local searches around them, and no other starts."""
-    yield from _with_surroundings(pool, proposed(pool, proposals))
-    while pool.alarms < 0 and pool.looks(pool.leaders()) < pool.scene.settings.schedule.looks:
-        yield _look(pool)

@@ -5,7 +5,7 @@ in advance.
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
@@ -15,12 +15,14 @@ from scipy.spatial import cKDTree
 
 from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
 from bpnp.search.annealing import anneal_on_clusters, anneal_on_points, finish, run_batch
-from bpnp.search.enumeration.search import exceeds_enumeration, is_enumerable, search_by_enumeration
-from bpnp.search.evidence.rivals import against_rivals
+from bpnp.search.competitors import SceneOf, settle
+from bpnp.search.enumeration.plan import EnumeratedPoses, EnumerationPlan
+from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame
 from bpnp.search.infinity.kernels import Image
 from bpnp.search.infinity.search import search_rotation
 from bpnp.search.kernels.sides import FORWARD
+from bpnp.search.loop import run
 from bpnp.search.pool import Pool
 from bpnp.search.problem import Problem
 from bpnp.search.propose.known_matches import known_matches, poses_of_matches
@@ -28,10 +30,10 @@ from bpnp.search.propose.minimal_solvers import p3p_poses
 from bpnp.search.propose.symmetries import self_motions
 from bpnp.search.raster_search import around_each, looked_up
 from bpnp.search.scene import Scene, degenerate
-from bpnp.search.schedule import Proposals, only_proposed, turns
+from bpnp.search.schedule import Plan, Proposals
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.starts import Prior
-from bpnp.search.verdict import REFINED, SearchResult, judged, no_pose
+from bpnp.search.verdict import SearchResult, judged, no_pose
 
 Progress = Callable[[int, float], None]  # batches so far, seconds
 WARMING = 8  # number of points of the problem that compiles the loops
@@ -88,79 +90,55 @@ def search_poses(
             progress(batches, time.monotonic() - start)
 
     @cache
-    def entered() -> Scene:
+    def scene_of() -> Scene:
         return Scene(problem, seed, settings, deadline)
 
     many = exceeds_enumeration(problem)
     matches = known_matches(problem)
     if matches is not None and (problem.prior is None or not is_enumerable(problem)):
-        return _of_known_matches(problem, *matches, entered, seed, settings)
+        return _of_known_matches(problem, *matches, scene_of, seed, settings)
     if not many:
         settings = settings.limited(min(settings.schedule.turns, settings.schedule.enumerated))
     if is_enumerable(problem) and not deadline.passed():
-        found, exhaustive = search_by_enumeration(problem, deadline, settings)
-        rule = settings.evidence
-        enumerated = judged(found, problem, batches=0, looks=REFINED, exhaustive=exhaustive, rule=rule)
-        enumerated = against_rivals(
-            enumerated, problem, entered, rule, looks=REFINED, exhaustive=exhaustive, contested=True
-        )
+        poses = EnumeratedPoses(problem, scene_of, settings)
+        enumerated = run(EnumerationPlan(poses, deadline), poses, most=1, deadline=NEVER)
         if matches is not None and enumerated.log10_false_alarms > 0:  # residuals may exceed its match radius
-            return _of_known_matches(problem, *matches, entered, seed, settings)
+            return _of_known_matches(problem, *matches, scene_of, seed, settings)
         tell(0)
         # More search helps only if no pose is significant yet, and there are enough points to anneal.
         small = min(len(problem.bearings), len(problem.points3d)) < settings.least_annealed
-        settled = exhaustive or enumerated.log10_false_alarms <= 0
+        settled = poses.is_exhausted or enumerated.log10_false_alarms <= 0
         if enumerated.verdict == "confident" or small or (settled and not many):
             return enumerated
     if degenerate(problem.bearings) or degenerate(problem.points3d):
         counts = f"{len(problem.bearings)} 2D and {len(problem.points3d)} 3D points"
         return no_pose(f"no pose fits: {counts}, too few or all on one line")
-    scene = entered()
+    scene = scene_of()
     if lacks_partners(scene):
         return no_pose("no pose fits: too few points with a label of the other side, or all on one line")
     pool = Pool(scene, problem, enumerated)
-    return _until_certain(pool, turns(pool, around, proposals if many else None), tell)
+    plan = Plan.of(pool, around, proposals if many else None)
+    return run(plan, pool, most=settings.schedule.turns, deadline=deadline, tell=tell)
 
 
 def _of_known_matches(
     problem: Problem,
     i: NDArray[np.int64],
     j: NDArray[np.int64],
-    entered: Callable[[], Scene],
+    scene_of: SceneOf,
     seed: int,
     settings: SearchSettings,
 ) -> SearchResult:
     """Compute the verdict on the poses that known matches, indices (k,) of image and of scene points, fit best."""
     found, rule = poses_of_matches(problem, i, j, seed), settings.evidence
     result = judged(found, problem, batches=0, exhaustive=True, rule=rule)
-    return against_rivals(result, problem, entered, rule, exhaustive=True)
+    return settle(result, problem, scene_of, rule, exhaustive=True)
 
 
 def lacks_partners(scene: Scene) -> bool:
     """Return True if the points whose label occurs on the other side are too few or all on one line."""
     lacking = (side for side in (scene.image, scene.seen) if not side.weights.all())
     return any(degenerate(side.points[side.weights > 0].astype(np.float64)) for side in lacking)
-
-
-def _until_certain(
-    pool: Pool, turns: Iterator[Hypotheses], tell: Callable[[int], None] = lambda turns: None
-) -> SearchResult:
-    """Run iterations until the verdict is settled or the budget is spent."""
-    settings, finished = pool.scene.settings, 0.0
-    thinned = len(pool.problem.bearings) > settings.fine.bearings
-    while pool.turns < settings.schedule.turns and not pool.scene.deadline.passed():
-        found = next(turns, None)
-        if found is None:
-            break
-        pool.turns += 1
-        pool.merge(found)
-        tell(pool.turns)
-        bettered = thinned and pool.alarms < finished - settings.evidence.lead  # more points match if all are used
-        if bettered or pool.missed <= settings.evidence.missed:
-            finished, result = min(finished, pool.alarms), pool.result(1)
-            if result.verdict == "confident" or result.settled:
-                return result
-    return pool.result()
 
 
 @one_blas_thread
@@ -193,7 +171,7 @@ def search_proposed(
     if clutter is not None:
         settings, problem = settings.expecting(clutter), replace(problem, clutter=clutter)
     pool = Pool(Scene(problem, seed, settings, deadline), problem, no_pose("no pose was proposed"))
-    return _until_certain(pool, only_proposed(pool, proposals))
+    return run(Plan.of_proposals(pool, proposals), pool, most=settings.schedule.turns, deadline=deadline)
 
 
 @one_blas_thread
@@ -274,7 +252,7 @@ def warm_up() -> None:
     rays = points + (0, 0, 6)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     problem = Problem(rays, points)
-    search_by_enumeration(problem, NEVER, DEFAULT)
+    enumerate_poses(problem)
     p3p_poses(rays[None, :3], points[None, :3])
     self_motions(points, 0.1)
     search_rotation(Image(rays, np.full(WARMING, 1e-3)), rays)

@@ -119,7 +119,7 @@ def elsewhere(result: SearchResult, *_: object, **__: object) -> SearchResult:
     return replace(result, candidates=replace(poses, rotation=turn @ poses.rotation, log10_false_alarms=alarms))
 
 
-def of_another_camera(*_: object, **__: object) -> Alternative:
+def of_another_lens(*_: object, **__: object) -> Alternative:
     return Alternative(-math.inf, "with 1.30 times the focal length they fit significantly better")
 
 
@@ -130,9 +130,9 @@ def not_sure(*known: Any, **options: Any) -> SearchResult:
 @pytest.mark.parametrize(
     ("stages", "reason"),
     [
-        ({"against_rivals": lambda result, *_, **__: replace(result, verdict="ambiguous", reason="a twin")}, "a twin"),
-        ({"against_rivals": elsewhere}, "A competing pose 10 deg away fits about as well"),
-        ({"judged": not_sure, "other_camera": of_another_camera}, "With 1.30 times the focal length"),
+        ({"settle": lambda result, *_, **__: replace(result, verdict="ambiguous", reason="a twin")}, "a twin"),
+        ({"settle": elsewhere}, "A competing pose 10 deg away fits about as well"),
+        ({"judged": not_sure, "other_lens": of_another_lens}, "With 1.30 times the focal length"),
     ],
     ids=["a rival", "another pose", "another camera of a pose that is in doubt"],
 )

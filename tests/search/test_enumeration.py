@@ -1,7 +1,5 @@
 import itertools
 import math
-from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,8 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.loops.parallel import Clock
 from bpnp.robust.minimal_solvers import p3p
-from bpnp.search.enumeration.search import Enumerated, enumerate_poses
-from bpnp.search.enumeration.settings import DEFAULT
+from bpnp.search.enumeration.search import Enumerated, Enumeration, enumerate_poses
 from bpnp.search.problem import Problem
 
 Array = NDArray[np.float64]
@@ -35,8 +32,8 @@ def planted(
     return directions(np.concatenate([rays, lights]))[order], points, rotation, translation, match
 
 
-def solved(rays: Array, points: Array, *, is_safe: Any = None) -> Enumerated:
-    return enumerate_poses(Problem.of(rays, points), radius=RADIUS, is_safe=is_safe, deadline=math.inf)
+def solved(rays: Array, points: Array, *, to_the_end: bool = False) -> Enumerated:
+    return enumerate_poses(Problem.of(rays, points), radius=RADIUS, to_the_end=to_the_end)
 
 
 @pytest.mark.parametrize(("seen", "hidden", "background"), [(4, 0, 0), (5, 0, 0), (6, 0, 3), (8, 6, 4), (12, 6, 5)])
@@ -73,7 +70,7 @@ def test_small_problems_are_exhausted(seed: int) -> None:
     """On exact points with one stray, the enumeration matches as many as trying everything does."""
     rng = np.random.default_rng(seed)
     rays, points, rotation, _, _ = planted(rng, 5, background=1, noise=0.0)
-    poses, ended = solved(rays, points, is_safe=lambda _: False)
+    poses, ended = solved(rays, points, to_the_end=True)
     assert ended == "exhausted"
     matches = (poses.residual <= 1e-6).sum(-1)
     assert matches.max() == brute_force(rays, points, 1e-6) == 5
@@ -94,12 +91,12 @@ def test_a_better_pose_is_missed_as_rarely_as_basin_counts_claim(basin_count: in
         rotation = Rotation.random(random_state=rng).as_matrix()
         camera = points @ rotation.T + [0, 0, 5]
         rays = rng.permutation(camera / np.linalg.norm(camera, axis=1, keepdims=True))
-        poses, ended = enumerate_poses(
-            Problem.of(rays, points),
-            is_safe=lambda poses: bool(poses.basin_count[0] >= basin_count),
-            settings=replace(DEFAULT, safe=-1e9, patience=10**9),
-        )
+        problem = Problem.of(rays, points)
+        run = Enumeration(problem, problem.match_radius)
+        while run.advance(math.inf) and run.poses().basin_count[0] < basin_count:
+            pass
+        poses = run.poses()
+        assert run.ended is None  # not every triple was tried
         assert poses.basin_count[0] >= basin_count
-        assert ended == "safe"
         wrong += degrees_between(poses.rotation[0], rotation) > 3
     assert wrong <= 40 * 0.5**basin_count

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import stdtrit
 
 from bpnp.loops.parallel import NEVER, Deadline
-from bpnp.search.evidence.rivals import AtZoom, likeliest_zoom, other_camera
+from bpnp.search.competitors import AtZoom, likeliest_zoom, other_lens
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.scene import Scene
@@ -164,7 +164,7 @@ def test_another_focal_length_is_climbed_to(factor: float) -> None:
     assert np.degrees(Rotation.from_matrix(climbed.pose.rotation[0]).magnitude()) < 0.5
     seen = verdict_on(problem, np.eye(3)[None], met.middle[None], 4e-3, 0.6)
     scenes = [Scene(problem, 0, DEFAULT, end) for end in (NEVER, Deadline(0.0))]
-    other, untried = (other_camera(seen, problem, lambda one=one: one, DEFAULT.evidence) for one in scenes)
+    other, untried = (other_lens(seen, problem, lambda one=one: one, DEFAULT.evidence) for one in scenes)
     assert untried is not None
     if other is None:
         assert (factor, untried.what) == (1.0, "there was no time to try other focal lengths")

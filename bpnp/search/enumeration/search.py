@@ -6,13 +6,12 @@ one-to-one. The neighbourhoods grow until the verdict is safe, every triple was 
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import numpy as np
 
-from bpnp.loops.parallel import Clock, Deadline
+from bpnp.loops.parallel import Clock
 from bpnp.search.enumeration.hypotheses import Block, Kept, Work, explore
 from bpnp.search.enumeration.matching import EnumerationTables, Matches
 from bpnp.search.enumeration.points import (
@@ -25,13 +24,9 @@ from bpnp.search.enumeration.points import (
     sets_within,
 )
 from bpnp.search.enumeration.settings import DEFAULT, RULES, EnumerationSettings, Stage
-from bpnp.search.evidence.partners import explained
-from bpnp.search.evidence.repetitions import competing_poses, registered
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem
-from bpnp.search.settings import SearchSettings
-from bpnp.search.starts import GravityPrior, PosePrior
-from bpnp.search.verdict import is_certain, weighed, with_false_alarms
+from bpnp.search.starts import PosePrior
 
 ORDERS = {
     2: np.array([[0, 1, 1], [1, 0, 0]]),
@@ -59,34 +54,36 @@ class Enumerated(NamedTuple):
     ended: Ended
 
 
-Competitors = Callable[[Hypotheses], tuple[Array, Array]]
-
-
 class Enumeration:
     """Enumeration of one problem.
 
     Attributes:
+        problem: Points.
         scene: Scene of the problem.
         image: Image of the problem.
         settings: Constants.
         reach: Largest radius of a match, in match radii.
         fixing: Number of matches that fix a pose.
         solved: Number of minimal problems solved so far.
-        contested: Poses (1,) whose competing poses were proposed.
+        ended: Why the enumeration ended, as in `Enumerated`; None before.
         tests: Logarithm of the number of minimal problems of these points times the number of radii tested.
         tables: Inputs of the compiled loops.
         kept: Poses found so far.
         work: Buffers of the compiled loops.
     """
 
-    def __init__(self, problem: Problem, radius: float, settings: EnumerationSettings) -> None:
+    def __init__(self, problem: Problem, radius: float, settings: EnumerationSettings = DEFAULT) -> None:
         scene = scene_side(problem.points3d, problem.normals3d, problem.labels3d)
         self.reach = _reach(problem, radius, settings)
         image = ImageSide(problem.bearings, radius, problem.labels2d, self.reach)
         (prior, heading, log_share), fixing = prior_arrays(problem, scene, image, settings), problem.fixing_matches
-        self.scene, self.image, self.settings = scene, image, settings
+        self.problem, self.scene, self.image, self.settings = problem, scene, image, settings
         self.fixing, self.solved, self._pace = fixing, 0, SLOWEST
-        self.contested: list[Hypotheses] = []  # poses (1,) whose competitors were proposed
+        self.ended: Ended | None = None
+        self._predicted, self._safe = predicted_pose(problem.prior), 0.0
+        self._stages = [stage for stage in settings.stages if stage.matches >= fixing]
+        self._stage: Stage | None = None
+        self._is_checked = self._is_complete = True
         m, n, kept = len(image.arrays.rays), len(scene.arrays.points), settings.kept
         self.tables = EnumerationTables(scene.arrays, image.arrays, prior, heading, fixing, image.density)
         self.kept = Kept(
@@ -111,6 +108,21 @@ class Enumeration:
         self._done: dict[tuple[int, float], tuple[int, int]] = {}
         none = np.empty((0, fixing), np.int64)
         self._block = Block(fixing, none, ORDERS[fixing], pairs(none), 0, 0, self._witnesses, 0, 1.0)
+
+    @property
+    def is_significant(self) -> bool:
+        """True if the best pose explains more than chance after all tests."""
+        return self.best >= self.tests
+
+    @property
+    def safe_margin(self) -> float:
+        """Margin in nats from which the best pose need not be doubted; it falls with the hypotheses solved."""
+        return self._safe * (1 - self.solved / self.settings.patience)
+
+    @property
+    def is_long(self) -> bool:
+        """True after so many hypotheses that a significant pose ends the enumeration."""
+        return self.solved >= 2 * self.settings.patience
 
     @property
     def best(self) -> float:
@@ -144,10 +156,54 @@ class Enumeration:
         self._row, self._triangle = 0, 0
         self.kept.most[0] = 0.0
 
-    @property
-    def ended(self) -> bool:
-        """True once all hypotheses of the stage were tried."""
-        return self._row >= len(self._block.sets) * len(self._block.orders)
+    def advance(self, deadline: float) -> bool:
+        """Continue until the best pose is significant, or to the end.
+
+        The predicted pose of the prior is tried first, then the hypotheses stage by stage. Once a pose is significant,
+        the function returns after every `EnumerationSettings.look` hypotheses.
+
+        Args:
+            deadline: When to stop (`Clock.now`).
+
+        Returns:
+            False at the end; `ended` then has the reason.
+        """
+        if self._predicted is not None:
+            predicted, self._predicted = self._predicted, None
+            self.propose(*predicted, self.reach)
+            if self.is_significant:
+                return True
+        self._safe = self.settings.safe
+        while self.ended is None:
+            self._advance(deadline)
+            if not self._is_checked and self.is_significant:
+                return True
+        return False
+
+    def _advance(self, deadline: float) -> None:
+        """Solve some hypotheses of the current stage, begin the next stage, or end."""
+        settings, stage = self.settings, self._stage
+        late = not self._is_checked and deadline - Clock.now() < SHORTEST
+        if not self._is_checked and (late or self.solved > settings.most):
+            self.ended = "interrupted" if late else "most"
+            return
+        self._is_checked = True
+        if stage is not None and self._row < len(self._block.sets) * len(self._block.orders):
+            self.sweep(settings.look if self.is_significant else settings.chunk, deadline)
+            self._is_checked = False
+            return
+        m, n = len(self.problem.bearings), len(self.problem.points3d)
+        if stage is not None:
+            self._is_complete = stage.near2d >= m - 1 and stage.near3d >= n - 1
+            if self._is_complete and stage.matches == 3 and stage.reach == settings.stages[-1].reach:
+                self._stages = []
+        if not self._stages:
+            self.ended = "exhausted" if stage is not None and self._is_complete else "most"
+        elif self.seconds_to_begin(self._stages[0]) > deadline - Clock.now():
+            self.ended = "interrupted"
+        else:
+            self._stage = self._stages.pop(0)
+            self.begin(self._stage)
 
     def sweep(self, most: int, deadline: float) -> None:
         """Solve hypotheses of the stage.
@@ -174,6 +230,30 @@ class Enumeration:
         self.work.poses[0] = pose
         self._explored(0, 0, 0, 0.0, reach)
 
+    def poses(self) -> Hypotheses:
+        """Return the kept poses, likeliest first, after the best one was refined again on wider matches."""
+        kept = self.kept
+        for reach in (0.5 * self.reach, self.reach) if math.isfinite(self.best) else ():
+            self.refine(kept.poses[int(kept.evidence.argmax())], reach)
+        order = np.argsort(-kept.evidence, kind="stable")
+        order = order[np.isfinite(kept.evidence[order])]
+        rotation = self.image.turn.T @ kept.poses[order, :3]
+        translation = kept.poses[order, 3] @ self.image.turn
+        matches, radii = kept.point[order], np.sqrt(kept.distance2[order])
+        matched, angle = matches >= 0, radii / self.image.arrays.per_radian
+        count = matched.sum(-1)
+        free = np.maximum(2 * count - 2 * self.fixing, 1)  # degrees of freedom
+        return Hypotheses.from_poses(
+            rotation,
+            translation,
+            match_count=count,
+            scale=np.sqrt((np.where(matched, angle, 0.0) ** 2).sum(-1) / free),
+            basin_count=kept.basin_count[order],
+            evidence=kept.evidence[order] - self.tests,
+            matches=matches,
+            residual=np.where(matched, angle, math.inf),
+        )
+
     def _explored(self, *where: int | float) -> tuple[int, int, int]:
         """Call the compiled loops; return the next row, the next triangle and the number of hypotheses solved."""
         return explore(*where, self._block, self.tables, self.kept, self.work)
@@ -184,8 +264,7 @@ def enumerate_poses(
     *,
     radius: float | None = None,
     deadline: float = math.inf,
-    is_safe: Callable[[Hypotheses], bool] | None = None,
-    competitors: Competitors | None = None,
+    to_the_end: bool = False,
     settings: EnumerationSettings = DEFAULT,
 ) -> Enumerated:
     """Enumerate poses under which image points see scene points, one-to-one within a radius.
@@ -196,8 +275,8 @@ def enumerate_poses(
         problem: Points.
         radius: Largest residual of a match, radians; None for the match radius of the problem.
         deadline: When to stop (`Clock.now`).
-        is_safe: Called once the best pose is significant and leads every other pose; True stops. None always stops.
-        competitors: Returns competing poses of the best one, which are tried too; None for none.
+        to_the_end: True to try every hypothesis; False to stop once the best pose is significant and leads every other
+            pose by a safe margin.
         settings: Constants.
 
     Returns:
@@ -213,53 +292,14 @@ def enumerate_poses(
     (True, [0, 1, 2, 3, 4, 5])
     """
     run = Enumeration(problem, problem.match_radius if radius is None else radius, settings)
-
-    def enough(safe: float = settings.safe) -> Enumerated | None:
-        if run.best < run.tests:
-            return None
-        poses = _poses(run)
-        if competitors is not None:
-            poses = _with_competitors(run, problem, poses, competitors)
-        if margin(poses, problem) >= safe * (1 - run.solved / settings.patience) and (
-            is_safe is None or is_safe(poses)
-        ):
+    while run.advance(deadline):
+        if not to_the_end and margin(poses := run.poses(), problem) >= run.safe_margin:
             return Enumerated(poses, "safe")
-        return Enumerated(poses, "most") if run.solved >= 2 * settings.patience else None
-
-    complete = False
-    if (predicted := predicted_pose(problem.prior)) is not None:
-        run.propose(*predicted, run.reach)
-        if (found := enough(0.0)) is not None:
-            return found
-    for stage in settings.stages:
-        if stage.matches < run.fixing:
-            continue
-        if run.seconds_to_begin(stage) > deadline - Clock.now():
-            return Enumerated(_poses(run), "interrupted")
-        run.begin(stage)
-        while not run.ended:
-            run.sweep(settings.look if run.best >= run.tests else settings.chunk, deadline)
-            if (found := enough()) is not None:
-                return found
-            late = deadline - Clock.now() < SHORTEST
-            if late or run.solved > settings.most:
-                return Enumerated(_poses(run), "interrupted" if late else "most")
-        complete = stage.near2d >= len(problem.bearings) - 1 and stage.near3d >= len(problem.points3d) - 1
-        if complete and stage.matches == 3 and stage.reach == settings.stages[-1].reach:
+        if run.is_long:
+            run.ended = "most"
             break
-    return Enumerated(_poses(run), "exhausted" if complete else "most")
-
-
-def _with_competitors(run: Enumeration, problem: Problem, poses: Hypotheses, competitors: Competitors) -> Hypotheses:
-    """Refine the competing poses of the best pose, and of each better pose that results; each pose once."""
-    while True:
-        known = Hypotheses.concatenate([poses[:1], *run.contested])
-        if problem.same_pose(known.rotation, known.translation)[1:].any():
-            return poses
-        run.contested.append(poses[:1])
-        for pose in zip(*competitors(poses), strict=True):
-            run.propose(*pose, run.reach)
-        poses = _poses(run)
+    assert run.ended is not None
+    return Enumerated(run.poses(), run.ended)
 
 
 def _reach(problem: Problem, radius: float, settings: EnumerationSettings) -> float:
@@ -274,31 +314,6 @@ def _reach(problem: Problem, radius: float, settings: EnumerationSettings) -> fl
         off = 2 * math.hypot(turn, problem.prior.translation_sigma / distance)
         needed = max(needed, min(off / radius, settings.widest))
     return needed
-
-
-def _poses(run: Enumeration) -> Hypotheses:
-    """Return the kept poses, likeliest first, after the best one was refined again on wider matches."""
-    kept = run.kept
-    for reach in (0.5 * run.reach, run.reach) if math.isfinite(run.best) else ():
-        run.refine(kept.poses[int(kept.evidence.argmax())], reach)
-    order = np.argsort(-kept.evidence, kind="stable")
-    order = order[np.isfinite(kept.evidence[order])]
-    rotation = run.image.turn.T @ kept.poses[order, :3]
-    translation = kept.poses[order, 3] @ run.image.turn
-    matches, radii = kept.point[order], np.sqrt(kept.distance2[order])
-    matched, angle = matches >= 0, radii / run.image.arrays.per_radian
-    count = matched.sum(-1)
-    free = np.maximum(2 * count - 2 * run.fixing, 1)  # degrees of freedom
-    return Hypotheses.from_poses(
-        rotation,
-        translation,
-        match_count=count,
-        scale=np.sqrt((np.where(matched, angle, 0.0) ** 2).sum(-1) / free),
-        basin_count=kept.basin_count[order],
-        evidence=kept.evidence[order] - run.tests,
-        matches=matches,
-        residual=np.where(matched, angle, math.inf),
-    )
 
 
 def margin(poses: Hypotheses, problem: Problem) -> float:
@@ -327,65 +342,3 @@ def exceeds_enumeration(problem: Problem) -> bool:
     With a prior they may be enumerated, but the enumeration may miss a pose.
     """
     return not is_enumerable(replace(problem, prior=None))
-
-
-def search_by_enumeration(problem: Problem, deadline: Deadline, settings: SearchSettings) -> tuple[Hypotheses, bool]:
-    """Search for the poses of few points by enumeration.
-
-    A closely predicted pose, as in tracking, is tried first; the whole space is searched if it fails. With a rough
-    prediction the whole space is searched if no pose near it is significant. If no pose with the prior gravity is
-    significant, the search is repeated without it: a hypothesis of two matches has the error of the prior.
-
-    Args:
-        problem: Points.
-        deadline: When to stop.
-        settings: Constants.
-
-    Returns:
-        The poses, best first, and whether every hypothesis was tried.
-    """
-    certain: Hypotheses | None = None
-    annotated = problem
-    if problem.cosines3d is not None:
-        problem = replace(problem, normals3d=None, cosines3d=None)
-
-    def is_safe(poses: Hypotheses) -> bool:
-        nonlocal certain
-        candidates = weighed(_candidates(poses, annotated, settings), problem, settings.evidence)
-        certain = candidates if is_certain(candidates, problem, settings.evidence) else None
-        return certain is not None
-
-    def competitors(poses: Hypotheses) -> tuple[Array, Array]:
-        pose = poses.rotation[0], poses.translation[0]
-        scale = max(float(poses.scale[0]), problem.floor or 1e-5)
-        motions = registered(annotated, *pose, scale, settings.evidence)
-        return competing_poses(annotated, *pose, motions, settings.evidence)
-
-    def enumerated(problem: Problem, rule: EnumerationSettings) -> tuple[Enumerated, Hypotheses]:
-        found = enumerate_poses(problem, deadline=deadline.at, is_safe=is_safe, competitors=competitors, settings=rule)
-        return found, _candidates(found.poses, annotated, settings) if certain is None else certain
-
-    tracked = predicted_pose(problem.prior) is not None
-    near = tracked and problem.fixing_matches == 2
-    found, candidates = enumerated(problem, replace(DEFAULT, stages=()) if near else DEFAULT)
-    if certain is None and isinstance(problem.prior, GravityPrior):
-        candidates = with_false_alarms(candidates, problem)
-        if candidates.log10_false_alarms.min(initial=math.inf) > settings.evidence.false_alarms:
-            found, others = enumerated(replace(problem, prior=None), DEFAULT)
-            candidates = with_false_alarms(Hypotheses.concatenate([candidates, others]), problem)
-            candidates = candidates[np.argsort(candidates.log10_false_alarms, kind="stable")[: settings.kept]]
-    elif certain is None and tracked and (near or margin(found.poses, problem) < 0):
-        found, others = enumerated(replace(problem, prior=None), DEFAULT)
-        candidates = Hypotheses.concatenate([candidates, others])
-        candidates = candidates[np.argsort(-candidates.log_likelihood, kind="stable")[: settings.kept]]
-    return candidates, found.ended == "exhausted"
-
-
-def _candidates(poses: Hypotheses, problem: Problem, settings: SearchSettings) -> Hypotheses:
-    """Return the poses not far less likely than the best, with the scale and likelihood of the annealing."""
-    if poses.evidence is None or not len(poses):
-        return poses
-    poses = poses[poses.evidence >= poses.evidence.max() - DEFAULT.near_nats][: settings.kept]
-    scale = np.maximum(poses.scale, problem.floor or 1e-5)
-    each = zip(poses.rotation, poses.translation, scale, strict=True)
-    return replace(poses, scale=scale, log_likelihood=np.array([explained(problem, *one)[0] for one in each]))

@@ -5,7 +5,7 @@ poses that are as near to the given one as this optimum.
 
 The competing poses are proposed from the pose and from the scene; no search is run. Some are the optima that annealing
 reaches from the pose, from perturbed copies, and from its mirror image in front of a flat scene. Others come from the
-motions that map the scene onto itself, and from other focal lengths (`against_rivals`). A better pose elsewhere is not
+motions that map the scene onto itself, and from other focal lengths (`settle`). A better pose elsewhere is not
 tested for.
 """
 
@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
 from bpnp.poses import turned_by
 from bpnp.search.annealing import anneal_on_points, finish, polished
+from bpnp.search.competitors import settle
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.evidence import reasons
 from bpnp.search.evidence.false_alarms import likeliest_scale
 from bpnp.search.evidence.partners import explained
 from bpnp.search.evidence.repetitions import competing_poses, registered
-from bpnp.search.evidence.rivals import against_rivals
 from bpnp.search.evidence.settings import Evidence
 from bpnp.search.evidence.uncertainty import linearised, local_covariance
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
@@ -91,7 +91,7 @@ def judge_claim(
     competing = others[~same & (others.log10_false_alarms <= 0)]  # insignificant poses do not compete
     candidates = _weighed_anew(Hypotheses.concatenate([claim, competing]), one)
     result = judged(candidates, one, batches=0, exhaustive=True, rule=rule)
-    result = against_rivals(result, one, lambda: scene, rule, exhaustive=True, contested=few)
+    result = settle(result, one, lambda: scene, rule, exhaustive=True, enumerated=few)
     result = _of_claim(result, candidates[:1])
     if result.verdict == "confident":
         result = replace(result, reason=f"{result.reason}; {ONE_POSE}")

@@ -85,7 +85,7 @@ class Repetitions:
 
 @dataclass(frozen=True)
 class OtherFocal:
-    """Search for another focal length near a confident pose (`bpnp.search.evidence.rivals`).
+    """Search for another focal length near a confident pose (`bpnp.search.competitors`).
 
     Attributes:
         step: Factor from one focal length to the next.

@@ -7,8 +7,9 @@ pose is significant, each round ends with a density-map search around the pose w
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +21,12 @@ from bpnp.search.enumeration.settings import DEFAULT as ENUMERATION
 from bpnp.search.evidence.repetitions import repeated_poses
 from bpnp.search.evidence.uncertainty import share_bound
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame, to_scene_frame
+from bpnp.search.loop import Step, run
 from bpnp.search.pool import Pool
 from bpnp.search.raster_search import search_beside
 from bpnp.search.rig.cameras import WIDE, Array, Pose, Rig
 from bpnp.search.scene import Scene
-from bpnp.search.schedule import turns
+from bpnp.search.schedule import Plan
 from bpnp.search.search import lacks_partners
 from bpnp.search.settings import DEFAULT
 from bpnp.search.verdict import SearchResult, judged, missed, no_pose
@@ -52,39 +54,49 @@ def search_rig(rig: Rig, *, clutter: float | None = None, seed: int = 0, deadlin
         Distinct poses of the rig, best first, and the verdict on the first one.
     """
     settings = DEFAULT if clutter is None else DEFAULT.expecting(clutter)
-    together, searches, few = Together(rig), dict[int, Iterator[Hypotheses]](), dict[int, Hypotheses]()
+    poses, few = RigPoses(rig), dict[int, Hypotheses]()
     for k, problem in enumerate(rig.problems):
         if is_enumerable(problem):
             until = (Clock.now() * (len(rig.problems) - k - 1) + deadline.at) / (len(rig.problems) - k)
-            found = enumerate_poses(problem, deadline=until, is_safe=lambda _: False, settings=PROPOSING)
+            found = enumerate_poses(problem, deadline=until, to_the_end=True, settings=PROPOSING)
             few[k] = Hypotheses.from_poses(found.poses.rotation, found.poses.translation)
-            together.exhaustive &= found.ended == "exhausted"
+            poses.exhaustive &= found.ended == "exhausted"
             continue
-        together.exhaustive = False
+        poses.exhaustive = False
         scene = Scene(problem, seed + k, settings, deadline)
         if not lacks_partners(scene):
-            together.pools[k] = Pool(scene, problem, no_pose("no pose was found"))
-            searches[k] = turns(together.pools[k], None, None)
-    rig.join({k: pool.scene for k, pool in together.pools.items()})
-    together.take(few, REFINED)
-    while searches and together.turns < settings.schedule.turns and not deadline.passed():
-        for k in list(searches):
-            new = next(searches[k], None)
-            if new is None or deadline.passed():
-                del searches[k]
-                continue
-            together.pools[k].turns += 1
-            together.pools[k].merge(new)
-            together.take({k: new}, A_TURN)
-            if together.may_be_certain():
-                result = together.result()
-                if result.verdict == "confident" or result.settled:
-                    return result
-        together.look_around()
-    return together.result()
+            poses.pools[k] = Pool(scene, problem, no_pose("no pose was found"))
+    rig.join({k: pool.scene for k, pool in poses.pools.items()})
+    poses.take(few, REFINED)
+    return run(RigPlan(poses), poses, most=settings.schedule.turns, deadline=deadline)
 
 
-class Together:
+class RigPlan:
+    """Steps of the cameras of a rig that search, one of each in turn; a local search for all of them ends a round.
+
+    Args:
+        poses: Poses found so far.
+    """
+
+    def __init__(self, poses: "RigPoses") -> None:
+        self._poses, self._plans = poses, {k: Plan.of(pool) for k, pool in poses.pools.items()}
+        self._waiting = list(self._plans)
+
+    def next_step(self) -> Step | None:
+        """Return the next step of a camera, or the local search at the end of a round; None if no camera searches."""
+        while self._plans:
+            if not self._waiting:
+                self._waiting = list(self._plans)
+                if (look := self._poses.next_look()) is not None:
+                    return look
+            k = self._waiting.pop(0)
+            if (step := self._plans[k].next_step()) is not None:
+                return step._replace(camera=k)
+            del self._plans[k]
+        return None
+
+
+class RigPoses:
     """Proposals of the cameras of a rig, and the best of them refined on all cameras.
 
     Attributes:
@@ -107,6 +119,12 @@ class Together:
         """Number of iterations of all cameras."""
         return sum(pool.turns for pool in self.pools.values())
 
+    def add(self, step: Step, found: Hypotheses) -> None:
+        """Add the poses of one camera, in the frame of its scene."""
+        if step.counts:
+            self.pools[step.camera].add(step, found)
+        self.take({step.camera: found}, A_TURN)
+
     def take(self, new: Mapping[int, Hypotheses], most: int) -> None:
         """Refine those proposals of the cameras that have the most evidence in all cameras.
 
@@ -128,22 +146,23 @@ class Together:
         self.starts = every[np.r_[:known, order]]
         self._add(self.rig.candidates(every.rotation[order], every.translation[order]))
 
-    def look_around(self) -> None:
-        """Run a local search around the best unused initial pose unless a pose is significant."""
+    def next_look(self) -> Step | None:
+        """Return a local search around the best unused initial pose; None if a pose is significant."""
         if not self.pools or not len(self.starts) or self.best.log10_false_alarms[:1].min(initial=math.inf) < 0:
-            return
+            return None
         poses = Hypotheses.concatenate([self.looked, self.starts])
         score = np.r_[np.full(len(self.looked), BEFORE), self.starts.log_likelihood]
         apart = DEFAULT.schedule.apart_deg
         order = distinct(poses.rotation, poses.translation, score, len(self.looked) + 1, apart, math.inf)
         new = poses[order[len(self.looked) :]]
         self.looked = Hypotheses.concatenate([self.looked, new])
+        if not len(new):
+            return None
         k = max(self.pools, key=lambda k: len(self.rig.problems[k].bearings))
         turn, shift = self.rig.pose_of(k, new.rotation, new.translation)
-        if len(new):
-            scene = self.pools[k].scene
-            pose = to_scene_frame(Hypotheses.from_poses(turn, shift), scene)
-            self.take({k: search_beside(scene, pose, scene.settings.beside)}, A_TURN)
+        scene = self.pools[k].scene
+        pose = to_scene_frame(Hypotheses.from_poses(turn, shift), scene)
+        return Step(partial(search_beside, scene, pose, scene.settings.beside), camera=k, counts=False)
 
     def _add(self, refined: Hypotheses) -> None:
         """Add refined poses; the basin count of the best one is the sum over all cameras."""
@@ -174,7 +193,7 @@ class Together:
         both = np.concatenate([turn, poses.rotation]), np.concatenate([shift, poses.translation])
         return self.rig.problems[k].same_pose(*both, self.rule.same)[1:]
 
-    def may_be_certain(self) -> bool:
+    def may_be_decided(self) -> bool:
         """Return whether the best pose is significant and its miss probability is low enough."""
         if not len(self.best) or self.best.log10_false_alarms[0] > self.rule.false_alarms:
             return False
@@ -186,7 +205,7 @@ class Together:
         k = int(self.rig.evidence(self.best.rotation[0], self.best.translation[0], float(self.best.scale[0])).argmax())
         return k, self.rig.seen(k, self.best)
 
-    def result(self) -> SearchResult:
+    def result(self, *, ended: bool = True) -> SearchResult:
         """Judge the best poses; a confident one also against the competing poses of a repeated structure."""
         if not len(self.best):
             return no_pose("no pose was found")

@@ -1,4 +1,8 @@
-"""Search for competing poses of a confident one: those of a repeated structure, and those at other focal lengths."""
+"""Competing poses of a confident pose: those of a repeated structure, and those of other lenses.
+
+They are proposed from the leader and from the scene, refined and scored like any other pose, and the verdict is then
+computed again with them among the candidates (`settle`).
+"""
 
 import math
 from collections.abc import Callable
@@ -24,47 +28,92 @@ from bpnp.search.scene import Scene
 from bpnp.search.verdict import SearchResult, is_symmetric, judged, match_count, with_false_alarms
 
 Array = NDArray[np.float64]
+SceneOf = Callable[[], Scene]
 
 
-def against_rivals(
+def settle(
     result: SearchResult,
     problem: Problem,
-    entered: Callable[[], Scene],
+    scene_of: SceneOf,
     rule: Evidence,
     *,
     looks: float | int = 0,
     exhaustive: bool = False,
-    contested: bool = False,
+    enumerated: bool = False,
 ) -> SearchResult:
-    """Judge a confident result again with competing poses of a repeated structure and at other focal lengths.
+    """Judge a confident pose again with its competing poses among the candidates.
 
-    A better pose of a repeated structure becomes the best one and is judged likewise. The given camera is accepted
-    unless another focal length, which counts as an unknown, has fewer false alarms by the factor `rule.focal_chance`.
+    A better pose of a repeated structure becomes the best one, and its competing poses are proposed in turn. The given
+    camera is accepted unless another lens, whose parameters count as unknowns, has fewer false alarms by the factor
+    `rule.focal_chance`.
 
     Args:
         result: Verdict; returned unchanged unless it is confident.
         problem: Points of the problem.
-        entered: Function that returns the normalised scene.
+        scene_of: Function that returns the scene for refinements; it is called only if one is needed.
         rule: Constants of the verdict.
         looks: Number of local searches around the best pose that found no better one.
         exhaustive: True if every pose was tried.
-        contested: True if the poses of a repeated structure are among the candidates, as after an enumeration.
+        enumerated: True if the competing poses of a repeated structure are among the candidates already.
 
     Returns:
         The verdict, with the competing poses among its candidates.
     """
-    result = _against_repetitions(result, problem, entered, rule, looks, exhaustive, contested)
-    if result.verdict != "confident":
-        return result
-    other = other_camera(result, problem, entered, rule)
+    while result.verdict == "confident":
+        competitors = repeated_competitors(result, problem, scene_of, rule, enumerated=enumerated)
+        if not len(competitors):
+            break
+        candidates, leader = Hypotheses.concatenate([result.candidates, competitors]), result.best[1]
+        result = judged(candidates, problem, batches=result.batches, looks=looks, exhaustive=exhaustive, rule=rule)
+        if np.array_equal(result.best[1], leader):
+            break
+    other = other_lens(result, problem, scene_of, rule) if result.verdict == "confident" else None
     if other is None:
         return result
     return replace(result, verdict="ambiguous", reason=reasons.against(other.what, result.log10_false_alarms))
 
 
-def other_camera(
-    result: SearchResult, problem: Problem, entered: Callable[[], Scene], rule: Evidence
-) -> Alternative | None:
+def repeated_competitors(
+    result: SearchResult, problem: Problem, scene_of: SceneOf, rule: Evidence, *, enumerated: bool = False
+) -> Hypotheses:
+    """Return the competing poses of a repeated structure, refined, with their NFA.
+
+    Their NFA is at most that of the leader times the factor by which they explain the image points worse
+    (`decades_behind`). Poses that were enumerated are refined already. They are scored again under the assumption that
+    the map may end anywhere, which makes them likelier.
+
+    Args:
+        result: Confident verdict.
+        problem: Points of the problem.
+        scene_of: Function that returns the scene for the refinement.
+        rule: Constants of the verdict.
+        enumerated: True if they are among the candidates already.
+
+    Returns:
+        Competing poses; none if the verdict does not depend on them.
+    """
+    if enumerated and not is_symmetric(result.candidates, problem, rule):
+        return Hypotheses.empty()
+    best, scale = result.best, max(result.residual, problem.image.scales[0])
+    least = rule.repetitions.symmetric if enumerated else 0.0
+    repeated, motions = repeated_poses(problem, *best, scale, rule, least=least)
+    if not len(repeated):
+        return repeated
+    poses, limits = (repeated.rotation, repeated.translation), rule.repetitions
+    if enumerated:
+        refined, limits = repeated, replace(limits, most_missing=1e-12)
+    else:
+        refined = with_false_alarms(polished(scene_of(), *poses, scale), problem)
+    others, fraction = (refined.rotation, refined.translation), float(motions.fraction.min(initial=1.0))
+    behind = decades_behind(problem, best, poses, others, scale, limits, fraction=fraction)
+    behind = np.maximum(behind, 0) if motions.complete else np.zeros(len(refined))
+    if enumerated and (behind >= rule.lead).all():
+        return Hypotheses.empty()
+    alarms = np.minimum(refined.log10_false_alarms, result.log10_false_alarms + behind)
+    return replace(refined, log10_false_alarms=alarms)
+
+
+def other_lens(result: SearchResult, problem: Problem, scene_of: SceneOf, rule: Evidence) -> Alternative | None:
     """Return another lens with which a different pose fits better than the best one, or None.
 
     Better means fewer false alarms by the factor `focal_chance`, with focal length and radial coefficient counted as
@@ -74,7 +123,7 @@ def other_camera(
     Args:
         result: Confident verdict on the best pose.
         problem: Points of the problem.
-        entered: Function that returns the normalised scene.
+        scene_of: Function that returns the scene, whose settings and deadline are used.
         rule: Constants of the verdict.
     """
     count = match_count(result.candidates, problem)
@@ -94,12 +143,12 @@ def other_camera(
             return None
         return of_misfit(misfit_of(rotation, middle, others[int(np.argmin(alarms))]), rule)
 
-    known = AtZoom(1.0, problem, result.candidates[:1])
-    other = better(known)
+    leader = AtZoom(1.0, problem, result.candidates[:1])
+    other = better(leader)
     if other is not None or rule.independent * result.log10_false_alarms / count <= rule.missed:
         return other
-    scene = entered()
-    likeliest = likeliest_zoom(known, scene, rule.zoomed)
+    scene = scene_of()
+    likeliest = likeliest_zoom(leader, scene, rule.zoomed)
     if scene.deadline.passed():
         return Alternative(-math.inf, "there was no time to try other focal lengths")
     return better(likeliest)
@@ -139,17 +188,17 @@ def likeliest_zoom(start: AtZoom, scene: Scene, rule: OtherFocal) -> AtZoom:
         scene: Scene whose settings and deadline are used.
         rule: Constants of the steps.
     """
-    steps = [(step, beside(start, step, scene)) for step in (1 / rule.step, rule.step)]
+    steps = [(step, search_at_zoom(start, step, scene)) for step in (1 / rule.step, rule.step)]
     step, best = max(steps, key=lambda one: one[1].likelihood)
     while 1 / rule.widest < best.zoom * step < rule.widest:
-        further = beside(best, step, scene)
+        further = search_at_zoom(best, step, scene)
         if further.likelihood <= best.likelihood:
             break
         best = further
     return best
 
 
-def beside(found: AtZoom, zoom: float, scene: Scene) -> AtZoom:
+def search_at_zoom(found: AtZoom, zoom: float, scene: Scene) -> AtZoom:
     """Return the likeliest pose at `zoom` times the focal length of a given one, or the given one after the deadline.
 
     The search starts from the pose that shows the scene at the same size.
@@ -184,47 +233,3 @@ def at_focal_length(problem: Problem, zoom: float) -> Problem:
     """Return the problem with its image points at `zoom` times the focal length."""
     bearings = problem.bearings * (1 / zoom, 1 / zoom, 1)
     return replace(problem, bearings=bearings / np.linalg.norm(bearings, axis=-1, keepdims=True))
-
-
-def _against_repetitions(
-    result: SearchResult,
-    problem: Problem,
-    entered: Callable[[], Scene],
-    rule: Evidence,
-    looks: float | int,
-    exhaustive: bool,
-    contested: bool,
-) -> SearchResult:
-    """Judge a confident result again with the competing poses of a repeated structure.
-
-    If they were enumerated (`contested`), they are refined and among the candidates already. They are judged again with
-    the assumption that the map may end anywhere, which makes them likelier.
-    """
-    if result.verdict != "confident":
-        return result
-    if contested and not is_symmetric(result.candidates, problem, rule):
-        return result
-    best, scale = result.best, max(result.residual, problem.image.scales[0])
-    least = rule.repetitions.symmetric if contested else 0.0
-    repeated, motions = repeated_poses(problem, *best, scale, rule, least=least)
-    if not len(repeated):
-        return result
-    poses, limits = (repeated.rotation, repeated.translation), rule.repetitions
-    if contested:
-        rivals = repeated
-        limits = replace(limits, most_missing=1e-12)
-    else:
-        rivals = with_false_alarms(polished(entered(), *poses, scale), problem)
-    others = rivals.rotation, rivals.translation
-    behind = decades_behind(
-        problem, best, poses, others, scale, limits, fraction=float(motions.fraction.min(initial=1.0))
-    )
-    behind = np.maximum(behind, 0) if motions.complete else np.zeros(len(rivals))
-    if contested and (behind >= rule.lead).all():
-        return result
-    alarms = np.minimum(rivals.log10_false_alarms, result.log10_false_alarms + behind)
-    candidates = Hypotheses.concatenate([result.candidates, replace(rivals, log10_false_alarms=alarms)])
-    beside = judged(candidates, problem, batches=result.batches, looks=looks, exhaustive=exhaustive, rule=rule)
-    if np.array_equal(beside.best[1], best[1]):
-        return beside
-    return _against_repetitions(beside, problem, entered, rule, looks, exhaustive, contested)

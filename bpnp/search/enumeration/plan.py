@@ -1,0 +1,181 @@
+"""Search with few points: the steps and the poses of an enumeration, for the loop `bpnp.search.loop.run`.
+
+A closely predicted pose, as in tracking, is tried first; the whole space is searched if it is not certain. With a rough
+prediction the whole space is searched if no pose near it is significant. If no pose with the prior gravity is
+significant, the search is repeated without it: a hypothesis of two matches has the error of the prior.
+"""
+
+import math
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from bpnp.loops.parallel import Deadline
+from bpnp.search.competitors import SceneOf, settle
+from bpnp.search.enumeration.points import predicted_pose
+from bpnp.search.enumeration.search import Enumeration, margin
+from bpnp.search.enumeration.settings import DEFAULT
+from bpnp.search.evidence.partners import explained
+from bpnp.search.evidence.repetitions import competing_poses, registered
+from bpnp.search.hypotheses import Hypotheses
+from bpnp.search.loop import Step
+from bpnp.search.problem import Problem
+from bpnp.search.settings import SearchSettings
+from bpnp.search.starts import GravityPrior
+from bpnp.search.verdict import REFINED, SearchResult, is_certain, judged, weighed, with_false_alarms
+
+SMALLEST = 1e-5  # smallest scale of the residuals if the pixel size is unknown, radians
+
+
+class EnumeratedPoses:
+    """Poses of few points that enumerations have found so far.
+
+    Attributes:
+        problem: Points.
+        settings: Constants of the search.
+        found: Poses of the current enumeration, likeliest first.
+        candidates: Poses of the earlier enumerations, and of the current one once it has ended or is certain.
+        is_certain: True if the best pose passes the cheap tests of the verdict.
+        is_exhausted: True if the last enumeration tried every hypothesis.
+        turns: 0, since an enumeration does not count as an iteration.
+    """
+
+    turns = 0
+
+    def __init__(self, problem: Problem, scene_of: SceneOf, settings: SearchSettings) -> None:
+        self.problem, self._scene_of, self.settings = problem, scene_of, settings
+        self.found = self.candidates = Hypotheses.empty()
+        self.is_certain = self.is_exhausted = False
+        # Without viewing cones, which an enumeration ignores.
+        has_cones = problem.cosines3d is not None
+        self.enumerated = replace(problem, normals3d=None, cosines3d=None) if has_cones else problem
+        self._result: SearchResult | None = None
+        is_tracked = predicted_pose(problem.prior) is not None
+        self.begin(self.enumerated, predicted_only=is_tracked and problem.fixing_matches == 2)
+
+    def begin(self, problem: Problem, *, predicted_only: bool = False) -> None:
+        """Begin an enumeration of a problem; with `predicted_only` of the predicted pose alone."""
+        settings = replace(DEFAULT, stages=()) if predicted_only else DEFAULT
+        self.run = Enumeration(problem, problem.match_radius, settings)
+        self._leaders: list[Hypotheses] = []  # poses (1,) whose competing poses were proposed
+
+    def add(self, step: Step, found: Hypotheses) -> None:
+        """Take the poses of the current enumeration."""
+        self.found = found
+
+    @property
+    def has_competitors(self) -> bool:
+        """True if the competing poses of the best pose were proposed."""
+        every = Hypotheses.concatenate([self.found[:1], *self._leaders])
+        return bool(self.run.problem.same_pose(every.rotation, every.translation)[1:].any())
+
+    def advance(self, deadline: float) -> Hypotheses:
+        """Solve further hypotheses, and return all poses."""
+        self.run.advance(deadline)
+        return self.run.poses()
+
+    def propose_competitors(self) -> Hypotheses:
+        """Refine the competing poses of the best pose, and return all poses."""
+        leader = self.found[:1]
+        self._leaders.append(leader)
+        pose, scale = (
+            (leader.rotation[0], leader.translation[0]),
+            max(float(leader.scale[0]), self.problem.floor or 1e-5),
+        )
+        motions = registered(self.problem, *pose, scale, self.settings.evidence)
+        for one in zip(*competing_poses(self.problem, *pose, motions, self.settings.evidence), strict=True):
+            self.run.propose(*one, self.run.reach)
+        return self.run.poses()
+
+    def may_be_decided(self) -> bool:
+        """Return True if the best pose leads by a safe margin and passes the cheap tests of the verdict."""
+        run, rule = self.run, self.settings.evidence
+        if not (run.is_significant and self.has_competitors and margin(self.found, run.problem) >= run.safe_margin):
+            return False
+        candidates = weighed(self._candidates(), self.enumerated, rule)
+        self.is_certain = is_certain(candidates, self.enumerated, rule)
+        if self.is_certain:
+            self._keep(candidates)
+        return self.is_certain
+
+    def end(self) -> None:
+        """Keep the poses of an enumeration that has ended without a certain one."""
+        self.is_exhausted = self.run.ended == "exhausted"
+        self._keep(self._candidates())
+
+    def _keep(self, candidates: Hypotheses) -> None:
+        """Add candidates to those of an earlier enumeration with the prior, if there was one."""
+        if not len(self.candidates):
+            self.candidates = candidates
+            return
+        every = Hypotheses.concatenate([self.candidates, candidates])
+        if isinstance(self.problem.prior, GravityPrior):
+            every = with_false_alarms(every, self.enumerated)
+            order = np.argsort(every.log10_false_alarms, kind="stable")
+        else:
+            order = np.argsort(-every.log_likelihood, kind="stable")
+        self.candidates = every[order[: self.settings.kept]]
+
+    def _candidates(self) -> Hypotheses:
+        """Return the poses not far less likely than the best, with the scale and likelihood of the annealing."""
+        poses = self.found
+        if poses.evidence is None or not len(poses):
+            return poses
+        poses = poses[poses.evidence >= poses.evidence.max() - DEFAULT.near_nats][: self.settings.kept]
+        scale = np.maximum(poses.scale, self.problem.floor or SMALLEST)
+        each = zip(poses.rotation, poses.translation, scale, strict=True)
+        likelihood = np.array([explained(self.problem, *one)[0] for one in each])
+        return replace(poses, scale=scale, log_likelihood=likelihood)
+
+    def is_better_without_prior(self) -> bool:
+        """Return True if the enumeration that has ended shall be repeated without the prior."""
+        prior, rule = self.problem.prior, self.settings.evidence
+        if isinstance(prior, GravityPrior):
+            self.candidates = with_false_alarms(self.candidates, self.enumerated)
+            return float(self.candidates.log10_false_alarms.min(initial=math.inf)) > rule.false_alarms
+        if predicted_pose(prior) is None:
+            return False
+        return self.problem.fixing_matches == 2 or margin(self.found, self.enumerated) < 0
+
+    def result(self, *, ended: bool = True) -> SearchResult:
+        """Compute the verdict on the best pose and its competing poses."""
+        if self._result is None:
+            rule, exhaustive = self.settings.evidence, self.is_exhausted
+            poses, problem = self.candidates, self.problem
+            result = judged(poses, problem, batches=0, looks=REFINED, exhaustive=exhaustive, rule=rule)
+            self._result = settle(
+                result, self.problem, self._scene_of, rule, looks=REFINED, exhaustive=exhaustive, enumerated=True
+            )
+        return self._result
+
+
+class EnumerationPlan:
+    """Steps of an enumeration, and of another one without the prior if it is not successful.
+
+    Args:
+        poses: Poses found so far, and the state of the enumeration.
+        deadline: When to stop.
+    """
+
+    def __init__(self, poses: EnumeratedPoses, deadline: Deadline) -> None:
+        self._poses, self._deadline = poses, deadline
+        self._repeated = False
+
+    def next_step(self) -> Step | None:
+        """Return the next step: more hypotheses, or the competing poses of the best pose; None at the end."""
+        poses, run = self._poses, self._poses.run
+        if poses.is_certain:
+            return None
+        if run.is_significant and not poses.has_competitors and run.ended is None:
+            return Step(poses.propose_competitors)
+        if run.ended is None and run.is_significant and run.is_long:
+            run.ended = "most"
+        if run.ended is None:
+            return Step(partial(poses.advance, self._deadline.at))
+        poses.end()
+        if self._repeated or not poses.is_better_without_prior():
+            return None
+        self._repeated = True
+        poses.begin(replace(poses.enumerated, prior=None))
+        return Step(partial(poses.advance, self._deadline.at))
