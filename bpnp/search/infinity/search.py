@@ -11,6 +11,7 @@ proposes it. If no competing rotation was found, this bounds the miss probabilit
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -46,6 +47,7 @@ from bpnp.search.infinity.kernels import (
 )
 from bpnp.search.kernels.neighbours import hashed
 from bpnp.search.pose_model import FIXING_ROTATION
+from bpnp.search.loop import Step, run
 from bpnp.search.settings import DEFAULT as SEARCH
 from bpnp.search.verdict import SearchResult, no_pose
 
@@ -210,7 +212,8 @@ def search_rotation(
             sample[: settings.sample],
             settings,
         )
-        new = _search(sight, scores, seed, deadline)
+        poses = RotationPoses(sight)
+        new = run(RotationPlan(poses, scores, seed), poses, most=settings.turns, deadline=deadline)
         turns += new.batches
         if new.log10_false_alarms <= result.log10_false_alarms:
             result = new
@@ -231,31 +234,73 @@ def _matches(sight: Sight, found: Hypotheses) -> tuple[Array, Array, Array]:
     return seen, sight.image.bearings[matched], sight.image.pixel[matched]
 
 
-def _search(sight: Sight, scores: Array | None, seed: int, deadline: Deadline) -> SearchResult:
-    settings, count, found = sight.settings, len(sight.image.bearings), Hypotheses.empty()
-    order, tried = np.random.default_rng(seed).permutation(count), 0
-    tree = cKDTree(sight.image.bearings, balanced_tree=False)
-    if scores is not None:
-        order = order[np.argsort(-scores[order], kind="stable")]
-    result = _judged(found, sight, tried)
-    for i in order.tolist():
-        around, rays, bins = _rays(sight, i, tree)
-        if len(around) < FIXING_ROTATION:
-            continue
-        tried += 1
+class RotationPoses:
+    """Rotations that a search has found so far, best first.
+
+    Attributes:
+        sight: The problem.
+        found: Rotations.
+        turns: Number of image points that were tried.
+    """
+
+    def __init__(self, sight: Sight) -> None:
+        self.sight, self.found, self.turns = sight, Hypotheses.empty(), 0
+
+    def add(self, step: Step, found: Hypotheses) -> None:
+        """Add the rotations that an image point proposed."""
+        self.turns += 1
+        for k in range(len(found)):
+            self.found = _merge(self.found, found[k : k + 1], self.sight)
+
+    def may_be_decided(self) -> bool:
+        """Return True: the verdict on a rotation is cheap."""
+        return True
+
+    def result(self, *, ended: bool = True) -> SearchResult:
+        """Compute the verdict; a failed one is settled if a rotation of enough points would have been found."""
+        settings, count = self.sight.settings, len(self.sight.image.bearings)
+        result = _judged(self.found, self.sight, self.turns)
+        least = max(math.ceil(settings.least_share * count), FIXING_ROTATION + 1)
+        hopeless = log10_missed(self.turns, count, least, settings.power) <= SEARCH.evidence.missed
+        return replace(result, settled=result.verdict == "failed" and hopeless)
+
+
+class RotationPlan:
+    """Steps of a search for a rotation: the image points, one after the other.
+
+    Args:
+        poses: Rotations found so far.
+        scores: (m,) scores of the image points, largest first; None for a random order.
+        seed: Seed of the order.
+    """
+
+    def __init__(self, poses: RotationPoses, scores: Array | None, seed: int) -> None:
+        bearings = poses.sight.image.bearings
+        order = np.random.default_rng(seed).permutation(len(bearings))
+        if scores is not None:
+            order = order[np.argsort(-scores[order], kind="stable")]
+        self._poses, self._order = poses, iter(order.tolist())
+        self._tree = cKDTree(bearings, balanced_tree=False)
+
+    def next_step(self) -> Step | None:
+        """Return the step of the next image point with enough others around it; None after the last one."""
+        for i in self._order:
+            around, rays, bins = _rays(self._poses.sight, i, self._tree)
+            if len(around) >= FIXING_ROTATION:
+                return Step(partial(self._propose, i, around, rays, bins))
+        return None
+
+    def _propose(self, i: int, around: Labels, rays: Rays, bins: int) -> Hypotheses:
+        """Return the rotations that an image point proposes and that may compete with the best one."""
+        sight, found, new = self._poses.sight, self._poses.found, list[Hypotheses]()
         near = np.r_[i, around]
         some = np.union1d(near, sight.sample)
         for rotation, farthest in _agreeing(sight, i, around, rays, bins):
             one = _fitted(sight, rotation, near, farthest, some, found)
-            found = found if one is None else _merge(found, one, sight)
-        result = _judged(found, sight, tried)
-        least = max(math.ceil(settings.least_share * count), FIXING_ROTATION + 1)
-        hopeless = log10_missed(tried, count, least, settings.power) <= SEARCH.evidence.missed
-        if result.verdict == "confident" or (result.verdict == "failed" and hopeless):
-            break
-        if tried >= settings.turns or deadline.passed():
-            break
-    return result
+            if one is not None:
+                new.append(one)
+                found = _merge(found, one, sight)
+        return Hypotheses.concatenate(new) if new else Hypotheses.empty()
 
 
 def _rays(sight: Sight, i: int, tree: cKDTree) -> tuple[Labels, Rays, int]:
