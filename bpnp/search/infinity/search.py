@@ -46,8 +46,8 @@ from bpnp.search.infinity.kernels import (
     vote,
 )
 from bpnp.search.kernels.neighbours import hashed
-from bpnp.search.pose_model import FIXING_ROTATION
 from bpnp.search.loop import Step, run
+from bpnp.search.pose_model import FIXING_ROTATION
 from bpnp.search.settings import DEFAULT as SEARCH
 from bpnp.search.verdict import SearchResult, no_pose
 
