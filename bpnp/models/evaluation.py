@@ -22,9 +22,11 @@ from bpnp.geometry import bearings, choose, chords
 from bpnp.loops.parallel import Deadline
 from bpnp.robust.proposals import pose_hypotheses
 from bpnp.search.problem import Problem
-from bpnp.search.search import refine_poses, search_poses
+from bpnp.search.propose.given import anneal_given
+from bpnp.search.scene import Scene, degenerate
+from bpnp.search.search import search_poses
 from bpnp.search.settings import DEFAULT, SearchSettings
-from bpnp.search.verdict import SearchResult
+from bpnp.search.verdict import SearchResult, judged, no_pose
 from bpnp.types import Batch, Pose, Prediction, SolveStats
 
 
@@ -74,9 +76,9 @@ class Search(nn.Module):
 
 
 def refine(batch: Batch, rotation: Float[Tensor, "b s 3 3"], translation: Float[Tensor, "b s 3"]) -> Pose:
-    """Refine poses by `refine_poses` and return the best one of each sample.
+    """Anneal poses (`anneal_given`) and return the best one of each sample.
 
-    Iterations count the refined poses; converged is true where there is a pose, since annealing always ends.
+    Iterations count the initial poses; converged is true where there is a pose, since annealing always ends.
 
     Args:
         batch: Problems.
@@ -84,9 +86,17 @@ def refine(batch: Batch, rotation: Float[Tensor, "b s 3 3"], translation: Float[
         translation: Initial translations (b, s, 3).
     """
     samples = zip(problems_of(batch), rotation, translation, strict=True)
-    results = ((problem, refine_poses(problem, *problem.from_user(_host(r), _host(t)))) for problem, r, t in samples)
+    results = ((problem, _refined(problem, *problem.from_user(_host(r), _host(t)))) for problem, r, t in samples)
     pose = best_poses(results, batch.points3d)
     return replace(pose, stats=replace(pose.stats, converged=pose.rotation.isfinite().all(-1).all(-1)))
+
+
+def _refined(problem: Problem, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> SearchResult:
+    """Return the annealed poses of one problem, the best one first."""
+    if degenerate(problem.bearings) or degenerate(problem.points3d):
+        return no_pose("no pose fits: too few points, or all on one line")
+    poses = anneal_given(Scene(problem, 0, DEFAULT), rotation, translation)
+    return judged(poses, problem, batches=int(np.isfinite(rotation).all((-2, -1)).sum()), rule=DEFAULT.evidence)
 
 
 def problems_of(batch: Batch) -> list[Problem]:

@@ -133,8 +133,15 @@ class Plan:
     _found: list[Hypotheses] = field(default_factory=list)
 
     @classmethod
-    def of(cls, pool: Pool, around: Prior | None = None, proposals: Proposals | None = None) -> "Plan":
-        """Return the plan of a search over all poses.
+    def of(
+        cls,
+        pool: Pool,
+        around: Prior | None = None,
+        proposals: Proposals | None = None,
+        *,
+        only_proposals: bool = False,
+    ) -> "Plan":
+        """Return the plan of a search over all poses, or from proposed poses only.
 
         Args:
             pool: Poses found so far.
@@ -146,11 +153,6 @@ class Plan:
         )
         near = known if isinstance(known, PosePrior) and is_near(pool.scene, known) else None
         return cls(pool, guess, proposals, near, Source(pool, None if near is not None else known))
-
-    @classmethod
-    def of_proposals(cls, pool: Pool, proposals: Proposals) -> "Plan":
-        """Return the plan of a search that starts from proposed poses only."""
-        return cls(pool, None, proposals, None, None)
 
     def next_step(self) -> Step | None:
         """Return the next step; None if there is none."""

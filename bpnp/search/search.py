@@ -11,24 +11,22 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
-from bpnp.search.annealing import anneal_on_clusters, anneal_on_points, finish, run_batch
+from bpnp.search.annealing import run_batch
 from bpnp.search.competitors import SceneOf, settle
 from bpnp.search.enumeration.plan import EnumeratedPoses, EnumerationPlan
 from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
-from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame
+from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.infinity.kernels import Image
 from bpnp.search.infinity.search import search_rotation
-from bpnp.search.kernels.sides import FORWARD
 from bpnp.search.loop import run
 from bpnp.search.pool import Pool
 from bpnp.search.problem import Problem
 from bpnp.search.propose.known_matches import known_matches, poses_of_matches
 from bpnp.search.propose.minimal_solvers import p3p_poses
 from bpnp.search.propose.symmetries import self_motions
-from bpnp.search.raster_search import around_each, looked_up
+from bpnp.search.raster_search import looked_up
 from bpnp.search.scene import Scene, degenerate
 from bpnp.search.schedule import Plan, Proposals
 from bpnp.search.settings import DEFAULT, SearchSettings
@@ -45,6 +43,7 @@ def search_poses(
     *,
     around: Prior | None = None,
     proposals: Proposals | None = None,
+    only_proposals: bool = False,
     clutter: float | None = None,
     seed: int = 0,
     deadline: Deadline = NEVER,
@@ -65,6 +64,7 @@ def search_poses(
             start there; their basin counts are 0, since they are dependent. None for no guess.
         proposals: Function that returns poses to start from, such as the likeliest ones of a network; basin counts are
             0. It is called only with too many points to enumerate, while the NFA of the best pose is not small enough.
+        only_proposals: True to start from the proposals only. Default False.
         clutter: Expected fraction of the points without a correspondence, from 0 to below 1
             (`SearchSettings.expecting`). None for the fraction of the settings, and several at the end.
         seed: Seed of all random numbers.
@@ -94,12 +94,12 @@ def search_poses(
         return Scene(problem, seed, settings, deadline)
 
     many = exceeds_enumeration(problem)
-    matches = known_matches(problem)
+    matches = None if only_proposals else known_matches(problem)
     if matches is not None and (problem.prior is None or not is_enumerable(problem)):
         return _of_known_matches(problem, *matches, scene_of, seed, settings)
     if not many:
         settings = settings.limited(min(settings.schedule.turns, settings.schedule.enumerated))
-    if is_enumerable(problem) and not deadline.passed():
+    if not only_proposals and is_enumerable(problem) and not deadline.passed():
         poses = EnumeratedPoses(problem, scene_of, settings)
         enumerated = run(EnumerationPlan(poses, deadline), poses, most=1, deadline=NEVER)
         if matches is not None and enumerated.log10_false_alarms > 0:  # residuals may exceed its match radius
@@ -117,7 +117,7 @@ def search_poses(
     if lacks_partners(scene):
         return no_pose("no pose fits: too few points with a label of the other side, or all on one line")
     pool = Pool(scene, problem, enumerated)
-    plan = Plan.of(pool, around, proposals if many else None)
+    plan = Plan.of(pool, around, proposals if many else None, only_proposals=only_proposals)
     return run(plan, pool, most=settings.schedule.turns, deadline=deadline, tell=tell)
 
 
@@ -139,107 +139,6 @@ def lacks_partners(scene: Scene) -> bool:
     """Return True if the points whose label occurs on the other side are too few or all on one line."""
     lacking = (side for side in (scene.image, scene.seen) if not side.weights.all())
     return any(degenerate(side.points[side.weights > 0].astype(np.float64)) for side in lacking)
-
-
-@one_blas_thread
-def search_proposed(
-    problem: Problem,
-    proposals: Proposals,
-    *,
-    clutter: float | None = None,
-    seed: int = 0,
-    deadline: Deadline = NEVER,
-    settings: SearchSettings = DEFAULT,
-) -> SearchResult:
-    """Search with many points from proposed poses alone, such as the likeliest ones of a network.
-
-    The method is that of `search_poses` with proposals, without its own starts.
-
-    Args:
-        problem: Points with priors of the points and of the pose.
-        proposals: Function that returns poses to start from.
-        clutter: Expected fraction of the points without a correspondence; None for that of the settings.
-        seed: Seed of all random numbers.
-        deadline: Time after which no new search begins.
-        settings: Constants of the search.
-
-    Returns:
-        Distinct poses with the verdict.
-    """
-    if degenerate(problem.bearings) or degenerate(problem.points3d):
-        return no_pose("no pose fits: too few points, or all on one line")
-    if clutter is not None:
-        settings, problem = settings.expecting(clutter), replace(problem, clutter=clutter)
-    pool = Pool(Scene(problem, seed, settings, deadline), problem, no_pose("no pose was proposed"))
-    return run(Plan.of_proposals(pool, proposals), pool, most=settings.schedule.turns, deadline=deadline)
-
-
-@one_blas_thread
-def refine_poses(problem: Problem, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> SearchResult:
-    """Refine given poses by annealing, with perturbed copies of the first few.
-
-    The objective is that of `search_poses`. An initial pose may be about 10 degrees off, and more if there are many. If
-    there are more than `refined_directly`, all are first annealed on clusters, as in the search, and the likeliest go
-    on.
-
-    Args:
-        problem: Points with priors of the points and of the pose.
-        rotation: (s, 3, 3) initial rotations; NaN for a missing one.
-        translation: (s, 3) initial translations.
-
-    Returns:
-        Distinct poses with the verdict. `batches` is the number of initial poses that were annealed. There are no
-        candidates without an initial pose, or with points that fix no pose.
-    """
-    settings, scene = DEFAULT, Scene(problem, 0, DEFAULT)
-    starts = _entered(scene, rotation, translation)
-    if not len(starts) or degenerate(problem.bearings) or degenerate(problem.points3d):
-        return no_pose("no start, or points that fix no pose")
-    crowd = len(starts)
-    if crowd > settings.refined_directly:
-        starts = anneal_on_clusters(scene, starts, (*settings.coarse, *settings.middle), settings.starts)
-    around = Hypotheses.concatenate([starts, around_each(scene, starts[: settings.copied])])
-    first_scale = settings.middle[-1].last_scale * scene.spread
-    clustered = anneal_on_clusters(scene, around, settings.middle, settings.starts)
-    clustered = anneal_on_points(scene, clustered, first_scale)
-    # A correct initial pose needs no clusters, which would only perturb it.
-    direct = anneal_on_points(scene, starts, first_scale)
-    poses = finish(scene, merge_hypotheses([clustered, direct], scene))
-    annealed = crowd + len(around) - len(starts)
-    return judged(to_problem_frame(poses, scene), problem, batches=annealed, rule=settings.evidence)
-
-
-@one_blas_thread
-def score_poses(
-    problem: Problem, rotation: NDArray[np.float64], translation: NDArray[np.float64], deadline: Deadline
-) -> SearchResult:
-    """Anneal poses a little and score them like those of a search.
-
-    The residuals are assumed to have the median distance of a point to the nearest bearing. Basin counts are 0, since
-    no other starts were tried: only overwhelming evidence makes the best pose confident.
-
-    Args:
-        problem: Points with priors of the points and of the pose.
-        rotation: (c, 3, 3) rotations; NaN for a missing one.
-        translation: (c, 3) translations.
-        deadline: Time after which the remaining poses are not annealed.
-    """
-    scene = Scene(problem, 0, DEFAULT, deadline)
-    starts = _entered(scene, rotation, translation)
-    if not len(starts):
-        return no_pose("the module found no pose")
-    camera = scene.points3d @ starts.rotation.transpose(0, 2, 1) + starts.translation[:, None]
-    length = np.maximum(np.linalg.norm(camera, axis=-1, keepdims=True), 1e-12)
-    distance, _ = cKDTree(scene.offsets + FORWARD).query(camera / length)
-    scale = np.asarray(np.maximum(np.median(distance, -1), scene.smallest_scale), np.float32)
-    poses = finish(scene, replace(starts, scale=scale))
-    return judged(to_problem_frame(poses, scene), problem, batches=len(starts))
-
-
-def _entered(scene: Scene, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Hypotheses:
-    """Return the poses of a problem that are not NaN, in the frame of a scene."""
-    known = np.isfinite(rotation).all((-2, -1)) & np.isfinite(translation).all(-1)
-    return Hypotheses.from_poses(*scene.enter(rotation[known], translation[known]))
 
 
 @one_blas_thread

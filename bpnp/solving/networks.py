@@ -9,10 +9,13 @@ import torch
 from torch import Tensor, nn
 
 from bpnp.loops.parallel import Deadline
+from bpnp.search.competitors import settle
 from bpnp.search.problem import Problem
-from bpnp.search.search import score_poses
+from bpnp.search.propose.given import score_given
+from bpnp.search.scene import Scene
+from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import PosePrior
-from bpnp.search.verdict import SearchResult
+from bpnp.search.verdict import SearchResult, judged, no_pose
 from bpnp.solving.arguments import Array
 from bpnp.types import Batch
 
@@ -66,10 +69,18 @@ def predicted(net: nn.Module, members: list[Problem], deadline: Deadline) -> lis
     order = sorted(poses, key=lambda name: ESTIMATES.index(name) if name in ESTIMATES else len(ESTIMATES))
     rotation = _host(torch.stack([poses[name].rotation for name in order], 1))
     translation = _host(torch.stack([poses[name].translation for name in order], 1))
-    return [
-        score_poses(problem, *view.before(r, t), deadline)
-        for problem, view, r, t in zip(members, views, rotation, translation, strict=True)
-    ]
+    given = zip(members, views, rotation, translation, strict=True)
+    return [_judged(problem, *view.before(r, t), deadline) for problem, view, r, t in given]
+
+
+def _judged(problem: Problem, rotation: Array, translation: Array, deadline: Deadline) -> SearchResult:
+    """Compute the verdict on poses of a network and their competing poses."""
+    scene = Scene(problem, 0, DEFAULT, deadline)
+    poses = score_given(scene, rotation, translation)
+    if not len(poses):
+        return no_pose("the module found no pose")
+    result = judged(poses, problem, batches=len(rotation), rule=DEFAULT.evidence)
+    return settle(result, problem, lambda: scene, DEFAULT.evidence)
 
 
 def proposed(net: "Matcher", problem: Problem, seed: int) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ from bpnp.search.evidence import reasons
 from bpnp.search.problem import Problem
 from bpnp.search.propose.mirror import mirrored_alarms
 from bpnp.search.schedule import Proposals
-from bpnp.search.search import search_poses, search_proposed
+from bpnp.search.search import search_poses
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.starts import PosePrior
 from bpnp.solving.arguments import Array
@@ -156,9 +156,10 @@ def _by_module(
     for i in sorted(problems, key=cells.__getitem__):
         start, problem = time.perf_counter(), problems[i]
         if isinstance(net, Matcher) and exceeds_enumeration(problem):
-            result = search_proposed(
+            result = search_poses(
                 problem,
-                partial(proposed, net, problem, options.seed),
+                proposals=partial(proposed, net, problem, options.seed),
+                only_proposals=True,
                 clutter=options.clutter,
                 seed=options.seed,
                 deadline=options.deadline(problem),

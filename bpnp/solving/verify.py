@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 from bpnp.argument_types import ArrayLike, PointsLike
 from bpnp.cameras import CameraLike, camera_from
 from bpnp.loops.parallel import Deadline
-from bpnp.search.evidence.claimed import judge_claim
 from bpnp.search.evidence.uncertainty import linearised, pose_covariance
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem
 from bpnp.search.verdict import match_count
+from bpnp.search.verification import judge_given_pose
 from bpnp.solving.arguments import Array, Labels, checked_pose, checked_seed, numbers, positive, seconds_from
 from bpnp.solving.inputs import problem_from
 from bpnp.solving.matches import finished, without_pose
@@ -143,7 +143,7 @@ def verify_problem(
     if problem.degenerate is not None:
         return without_pose(problem, problem.degenerate, inlier_threshold)
     claim = problem.from_user(rotation, translation)
-    result, optimum = judge_claim(problem, *claim, refine=refine, seed=seed, deadline=deadline)
+    result, optimum = judge_given_pose(problem, *claim, refine=refine, seed=seed, deadline=deadline)
     if result.verdict == "confident" and deadline.passed():
         reason = f"not decided in {time_limit:.3g} s: its competitors were not tested"
         result = replace(result, verdict="ambiguous", reason=reason)

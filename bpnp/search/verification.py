@@ -42,7 +42,7 @@ WITHIN = 22.5  # 99.9 % quantile of chi-squared with 6 degrees of freedom: dista
 
 
 @one_blas_thread
-def judge_claim(
+def judge_given_pose(
     problem: Problem,
     rotation: Array,
     translation: Array,

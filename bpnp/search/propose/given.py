@@ -1,0 +1,77 @@
+"""Poses from elsewhere, such as those of a network: annealed, or only scored at the scale of their residuals."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from bpnp.loops.parallel import one_blas_thread
+from bpnp.search.annealing import anneal_on_clusters, anneal_on_points, finish
+from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame
+from bpnp.search.kernels.sides import FORWARD
+from bpnp.search.raster_search import around_each
+from bpnp.search.scene import Scene
+
+Array = NDArray[np.float64]
+
+
+@one_blas_thread
+def anneal_given(scene: Scene, rotation: Array, translation: Array) -> Hypotheses:
+    """Anneal poses, with perturbed copies of the first few.
+
+    The objective is that of `bpnp.search.search.search_poses`. An initial pose may be about 10 degrees off, and more if
+    there are many. If there are more than `refined_directly`, all are first annealed on clusters, as in the search, and
+    the likeliest go on.
+
+    Args:
+        scene: Points, settings and deadline.
+        rotation: (s, 3, 3) initial rotations in the frame of the problem; NaN for a missing one.
+        translation: (s, 3) initial translations.
+
+    Returns:
+        Distinct poses in the frame of the problem, without an NFA; none without an initial pose.
+    """
+    settings, starts = scene.settings, enter_given(scene, rotation, translation)
+    if not len(starts):
+        return Hypotheses.empty()
+    if len(starts) > settings.refined_directly:
+        starts = anneal_on_clusters(scene, starts, (*settings.coarse, *settings.middle), settings.starts)
+    around = Hypotheses.concatenate([starts, around_each(scene, starts[: settings.copied])])
+    first_scale = settings.middle[-1].last_scale * scene.spread
+    clustered = anneal_on_clusters(scene, around, settings.middle, settings.starts)
+    clustered = anneal_on_points(scene, clustered, first_scale)
+    # A correct initial pose needs no clusters, which would only perturb it.
+    direct = anneal_on_points(scene, starts, first_scale)
+    return to_problem_frame(finish(scene, merge_hypotheses([clustered, direct], scene)), scene)
+
+
+@one_blas_thread
+def score_given(scene: Scene, rotation: Array, translation: Array) -> Hypotheses:
+    """Anneal poses a little, to score them like those of a search.
+
+    The residuals are assumed to have the median distance of a point to the nearest bearing. Basin counts are 0, since
+    no other starts were tried: only overwhelming evidence makes the best pose confident.
+
+    Args:
+        scene: Points, settings and deadline, after which the remaining poses are not annealed.
+        rotation: (c, 3, 3) rotations in the frame of the problem; NaN for a missing one.
+        translation: (c, 3) translations.
+
+    Returns:
+        Distinct poses in the frame of the problem, without an NFA; none without a pose.
+    """
+    starts = enter_given(scene, rotation, translation)
+    if not len(starts):
+        return Hypotheses.empty()
+    camera = scene.points3d @ starts.rotation.transpose(0, 2, 1) + starts.translation[:, None]
+    length = np.maximum(np.linalg.norm(camera, axis=-1, keepdims=True), 1e-12)
+    distance, _ = cKDTree(scene.offsets + FORWARD).query(camera / length)
+    scale = np.asarray(np.maximum(np.median(distance, -1), scene.smallest_scale), np.float32)
+    return to_problem_frame(finish(scene, replace(starts, scale=scale)), scene)
+
+
+def enter_given(scene: Scene, rotation: Array, translation: Array) -> Hypotheses:
+    """Return the poses of a problem that are not NaN, in the frame of a scene."""
+    finite = np.isfinite(rotation).all((-2, -1)) & np.isfinite(translation).all(-1)
+    return Hypotheses.from_poses(*scene.enter(rotation[finite], translation[finite]))
