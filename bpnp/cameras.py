@@ -269,8 +269,11 @@ def resize_camera(camera: Camera, size: tuple[int, int]) -> Camera:
     [[450.0, 0.0, 250.0], [0.0, 440.0, 200.0], [0.0, 0.0, 1.0]]
     """
     full_size = image_size(camera)
-    if full_size is None or not same_aspect_ratio(full_size, size):
-        raise ValueError(f"expected a camera with images of the shape {size[0]} x {size[1]}, got {full_size}")
+    if full_size is None:
+        raise ValueError("a camera without an image size cannot be scaled; give its width and height")
+    if not same_aspect_ratio(full_size, size):
+        sides = " x ".join(map(str, full_size))
+        raise ValueError(f"a camera of {sides} pixels cannot be scaled to {size[0]} x {size[1]}, another aspect ratio")
     if full_size == size:
         return camera
     scaled = camera_from(camera_to_json(camera))

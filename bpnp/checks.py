@@ -33,7 +33,7 @@ def check_shapes(function: _F) -> _F:
     ...     return points2d.mean(1)
     >>> mean(torch.zeros(5, 2))
     Traceback (most recent call last):
-    ValueError: expected `points2d` of shape (b, m, 2), got (5, 2); try .unsqueeze(0) for a batch of one
+    ValueError: `points2d` has the shape (5, 2), not (b, m, 2); use .unsqueeze(0) for a batch of one
     """
     signature = inspect.signature(function)
     expected = {name: kind for name, hint in typing.get_type_hints(function).items() if (kind := _tensor_type(hint))}
@@ -85,7 +85,7 @@ def check_positive(**options: int | float) -> None:
     """
     for name, value in options.items():
         if not value > 0:
-            raise ValueError(f"expected `{name}` > 0, got {value}")
+            raise ValueError(f"`{name}` is {value}; it must be above 0")
 
 
 def check_within(least: float | int, most: float | int, **options: Any) -> None:
@@ -99,14 +99,15 @@ def check_within(least: float | int, most: float | int, **options: Any) -> None:
     >>> check_within(0, 1, share=(0.2, 0.5))
     >>> check_within(0, 1, share=(0.5, 0.2))
     Traceback (most recent call last):
-    ValueError: expected `share` from 0 to 1 as (low, high), got (0.5, 0.2)
+    ValueError: `share` is (0.5, 0.2); it must be (low, high) with low <= high, from 0 to 1
     """
     for name, value in options.items():
         several = isinstance(value, (tuple, list))
         low, high = value if several else (value, value)
         if not (least <= low <= high <= most and abs(low) < np.inf and high < np.inf):
-            limits = f"of {least} or more" if most == np.inf else f"from {least} to {most}"
-            raise ValueError(f"expected `{name}` {limits}{' as (low, high)' * several}, got {value}")
+            limits = f"{least} or more" if most == np.inf else f"from {least} to {most}"
+            pair = "(low, high) with low <= high, " if several else ""
+            raise ValueError(f"`{name}` is {value}; it must be {pair}{limits}")
 
 
 def _tensor_type(hint: Any) -> Any:
@@ -129,21 +130,21 @@ def _check(name: str, value: Any, kind: Any, sizes: dict[str, tuple[int, str]]) 
     axes = kind.dim_str.split()
     shape = f"({', '.join(axes)}{',' * (len(axes) == 1)})"
     if not isinstance(value, Tensor):
-        raise ValueError(f"expected `{name}` as a tensor of shape {shape}, got {type(value).__name__}")
+        raise ValueError(f"`{name}` is a {type(value).__name__}; a tensor of shape {shape} is needed")
     actual = tuple(value.shape)
     if len(actual) != len(axes):
-        hint = "; try .unsqueeze(0) for a batch of one" if len(actual) == len(axes) - 1 else ""
-        raise ValueError(f"expected `{name}` of shape {shape}, got {actual}{hint}")
+        hint = "; use .unsqueeze(0) for a batch of one" if len(actual) == len(axes) - 1 else ""
+        raise ValueError(f"`{name}` has the shape {actual}, not {shape}{hint}")
     if 0 in actual:
-        raise ValueError(f"expected `{name}` of shape {shape} with no empty axis, got {actual}")
+        raise ValueError(f"`{name}` has the shape {actual}; no axis of {shape} may be empty")
     for axis, size in zip(axes, actual, strict=True):
         required, source = (int(axis), "") if axis.isdigit() else sizes.setdefault(axis, (size, name))
         if size != required:
             reason = f" with {axis} = {required} as in `{source}`" if source else ""
-            raise ValueError(f"expected `{name}` of shape {shape}{reason}, got {actual}")
+            raise ValueError(f"`{name}` has the shape {actual}, not {shape}{reason}")
     if str(value.dtype).removeprefix("torch.") not in kind.dtypes:
         numbers = kind.__name__.split("[")[0].lower()
-        raise ValueError(f"expected `{name}` of type {numbers}, got {value.dtype}; try .{numbers}()")
+        raise ValueError(f"`{name}` has the type {value.dtype}, not {numbers}; use .{numbers}()")
 
 
 def as_tensor_list(name: str, values: ManyArrays | float, ndim: int) -> list[Tensor]:
@@ -173,7 +174,7 @@ def as_tensor(name: str, values: ManyArrays | float) -> Tensor:
         array = np.asarray(values)
         return torch.as_tensor(np.array(array, array.dtype.newbyteorder("=")))
     except (TypeError, ValueError) as error:
-        raise ValueError(f"expected `{name}` as an array of numbers or a list of them, got {values!r:.80}") from error
+        raise ValueError(f"`{name}` is {values!r:.80}; give an array of numbers, or a list of them") from error
 
 
 def check_points(name: str, i: int | str, points: Tensor, dim: int) -> Tensor:
@@ -190,12 +191,14 @@ def check_points(name: str, i: int | str, points: Tensor, dim: int) -> Tensor:
     """
     if points.ndim != 2 or points.shape[1] != dim:
         hint = " (are points2d and points3d swapped?)" if points.ndim == 2 and points.shape[1] in (2, 3) else ""
-        raise ValueError(f"expected `{name}` of shape (k, {dim}), got {tuple(points.shape)} in problem {i}{hint}")
+        raise ValueError(f"`{name}` has the shape {tuple(points.shape)} in problem {i}, not (k, {dim}){hint}")
     if len(points) == 0:
         raise ValueError(f"`{name}` has no points in problem {i}; at least one is needed")
     if not points.isfinite().all():
         bad = int((~points.isfinite().all(-1)).nonzero()[0, 0])
-        raise ValueError(f"expected finite `{name}`, got {points[bad].tolist()} at point {bad} of problem {i}")
+        raise ValueError(
+            f"`{name}` is {points[bad].tolist()} at point {bad} of problem {i}; all numbers must be finite"
+        )
     return points
 
 
@@ -212,14 +215,18 @@ def check_match3d(i: int | str, match: Tensor, m: int, n: int) -> Tensor:
         ValueError: Another shape, no integers, or an index that is no 2D point.
     """
     if match.shape != (n,):
-        raise ValueError(f"expected `match3d` of shape ({n},), one a 3D point, got {tuple(match.shape)} in problem {i}")
+        raise ValueError(
+            f"`match3d` has the shape {tuple(match.shape)} in problem {i}, not ({n},), one index per 3D point"
+        )
     if match.is_floating_point() or match.is_complex() or match.dtype == torch.bool:
         raise ValueError(
-            f"expected `match3d` as integers, indices of 2D points, got {match.dtype} in problem {i}; try .astype(int)"
+            f"`match3d` has the type {match.dtype} in problem {i}; indices of 2D points are integers: use .astype(int)"
         )
     if int(match.min()) < -1 or int(match.max()) >= m:
         reach = f"{int(match.min())} to {int(match.max())}"
-        raise ValueError(f"expected `match3d` between -1 and {m - 1}, got {reach} in problem {i}")
+        raise ValueError(
+            f"`match3d` goes from {reach} in problem {i}; its indices of 2D points go from -1 (none) to {m - 1}"
+        )
     return match.long()
 
 
@@ -237,7 +244,7 @@ def stack_values(name: str, values: list[Tensor], shape: tuple[int, ...], dtype:
     """
     for i, value in enumerate(values):
         if value.shape != shape:
-            raise ValueError(f"expected `{name}` of shape {shape}, got {tuple(value.shape)} in problem {i}")
+            raise ValueError(f"`{name}` has the shape {tuple(value.shape)} in problem {i}, not {shape}")
         if not value.isfinite().all():
-            raise ValueError(f"expected finite `{name}`, got {value.tolist()} in problem {i}")
+            raise ValueError(f"`{name}` is {value.tolist()} in problem {i}; all numbers must be finite")
     return torch.stack([v.to(dtype) for v in values])

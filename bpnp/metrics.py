@@ -196,7 +196,7 @@ class RecallThresholds:
     def __post_init__(self) -> None:
         thresholds = (self.rotation_deg, self.translation, self.centre, self.reprojection_deg, *self.joint)
         if not all(0 <= limit < math.inf for limits in thresholds for limit in limits):
-            raise ValueError(f"expected finite thresholds >= 0, got {self}")
+            raise ValueError(f"the thresholds of {self} must be finite, and 0 or more")
 
 
 def pose_quartiles(errors: PoseErrors) -> dict[str, Tensor]:

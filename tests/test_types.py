@@ -71,15 +71,18 @@ def test_one_focal_serves_all() -> None:
 
 NAN = np.array([[0.0, 0.0], [np.nan, 1.0]])
 WRONG = {
-    r"expected `points2d` of shape \(k, 2\), got \(7, 3\) in problem 0 \(are points2d and points3d swapped\?\)": {
+    r"`points2d` has the shape \(7, 3\) in problem 0, not \(k, 2\) \(are points2d and points3d swapped\?\)": {
         "points2d": np.zeros((7, 3)),
         "points3d": np.zeros((7, 2)),
     },
-    r"expected `points3d` of shape \(k, 3\), got \(5, 4\)": {"points3d": np.zeros((5, 4))},
-    r"expected finite `points2d`, got \[nan, 1.0\] at point 1 of problem 0": {"points2d": NAN, "match3d": None},
-    r"expected finite `points3d`": {"points3d": np.full((7, 3), np.inf)},
-    r"expected finite `rotation`": {"rotation": np.full((3, 3), np.nan)},
-    r"expected finite `translation`": {"translation": np.full(3, np.inf)},
+    r"`points3d` has the shape \(5, 4\) in problem 0, not \(k, 3\)": {"points3d": np.zeros((5, 4))},
+    r"`points2d` is \[nan, 1.0\] at point 1 of problem 0; all numbers must be finite": {
+        "points2d": NAN,
+        "match3d": None,
+    },
+    r"`points3d` is \[inf.* all numbers must be finite": {"points3d": np.full((7, 3), np.inf)},
+    r"`rotation` is .* all numbers must be finite": {"rotation": np.full((3, 3), np.nan)},
+    r"`translation` is .* all numbers must be finite": {"translation": np.full(3, np.inf)},
     r"`points2d` has no points in problem 0; at least one is needed": {"points2d": np.zeros((0, 2))},
     r"`points3d` has no points in problem 0": {"points3d": np.zeros((0, 3))},
     r"`points2d` is empty; at least one problem is needed": {"points2d": np.zeros((0, 5, 2))},
@@ -88,17 +91,17 @@ WRONG = {
     r"`focal` has 2 problems, but `points2d` has 1": {"focal": [1.0, 2.0]},
     r"`ids` has 2 problems, but `points2d` has 1": {"ids": ["a", "b"]},
     r"`index` has 2 problems, but `points2d` has 1": {"index": [1, 2]},
-    r"expected `rotation` of shape \(3, 3\), got \(3, 4\)": {"rotation": np.zeros((3, 4))},
-    r"expected `translation` of shape \(3,\), got \(4,\)": {"translation": np.zeros(4)},
-    r"expected `match3d` of shape \(7,\), one a 3D point, got \(5,\)": {"match3d": np.zeros(5, int)},
-    r"expected `match3d` between -1 and 4, got 0 to 5": {"match3d": np.array([0, 1, 2, 3, 4, 5, 0])},
-    r"expected `match3d` between -1 and 4, got -2": {"match3d": np.array([0, 1, 2, 3, 4, -2, 0])},
-    r"expected `points2d` .* in problem 1": {
+    r"`rotation` has the shape \(3, 4\) in problem 0, not \(3, 3\)": {"rotation": np.zeros((3, 4))},
+    r"`translation` has the shape \(4,\) in problem 0, not \(3,\)": {"translation": np.zeros(4)},
+    r"`match3d` has the shape \(5,\) in problem 0, not \(7,\), one index per 3D point": {"match3d": np.zeros(5, int)},
+    r"`match3d` goes from 0 to 5 in problem 0; .* from -1 .none. to 4": {"match3d": np.array([0, 1, 2, 3, 4, 5, 0])},
+    r"`match3d` goes from -2 to .* from -1 .none. to 4": {"match3d": np.array([0, 1, 2, 3, 4, -2, 0])},
+    r"`points2d` .* problem 1": {
         "points2d": [np.zeros((5, 2)), np.zeros((5, 1))],
         "points3d": [np.zeros((7, 3))] * 2,
     },
-    r"expected `points2d` as an array of numbers or a list of them, got None": {"points2d": None},
-    r"expected `points3d` as an array of numbers or a list of them, got 'scene.ply'": {"points3d": "scene.ply"},
+    r"`points2d` is None; give an array of numbers, or a list of them": {"points2d": None},
+    r"`points3d` is 'scene.ply'; give an array of numbers, or a list of them": {"points3d": "scene.ply"},
 }
 
 
@@ -110,7 +113,9 @@ def test_says_what_is_wrong(message: str) -> None:
 
 @pytest.mark.parametrize("match", [np.array([0.0, 1.7]), torch.tensor([0.0, 1.0]), [True, False]])
 def test_match3d_is_never_rounded(match: Any) -> None:
-    with pytest.raises(ValueError, match="expected `match3d` as integers.*in problem 0; try .astype"):
+    with pytest.raises(
+        ValueError, match="`match3d` has the type .*in problem 0; indices of 2D points are integers: use .astype"
+    ):
         Batch.from_arrays(np.zeros((2, 2)), np.zeros((2, 3)), match3d=match)
 
 

@@ -153,7 +153,7 @@ def at_least(least: int, **options: float | int | None) -> None:
     """
     for name, value in options.items():
         if value is not None and not least <= value < math.inf:
-            raise ValueError(f"expected --{name} of {least:g} or more, got {value}")
+            raise ValueError(f"--{name} is {value}; it must be {least:g} or more")
 
 
 def first_line(command: Callable[..., None]) -> str:

@@ -132,7 +132,7 @@ def _solution(path: Path) -> "ProblemPoints":
     from bpnp.solving.solution import Solution
 
     try:
-        return solution_points(Solution.from_json(path), title=path.stem)
+        return solution_points(Solution.from_json(path.read_bytes()), title=path.stem)
     except ValueError as error:
         pictures = path.parent / "pictures"
         there = f"; the pictures of `bpnp localize` are in {pictures}" if pictures.is_dir() else ""

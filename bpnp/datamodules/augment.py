@@ -47,7 +47,9 @@ class Outliers:
         check_within(0, math.inf, ratio=self.ratio)
         check_within(0, 1, occlusion=self.occlusion)
         if bounds(self.occlusion)[1] == 1:
-            raise ValueError(f"expected `occlusion` below 1, got {self.occlusion}; 0.1 hides one point in ten")
+            raise ValueError(
+                f"`occlusion` is {self.occlusion}; it must be below 1, such as 0.1, which hides one point in ten"
+            )
         for name in ("side", "occluded_side"):
             if getattr(self, name) not in (*SIDES, "random"):
                 raise ValueError(f'`{name}` is {getattr(self, name)!r}; it is one of "both", "2d", "3d", "random"')
@@ -77,7 +79,7 @@ class Augmentation:
 
     def __post_init__(self) -> None:
         if self.max_points is not None and self.max_points < MIN_POINTS:
-            raise ValueError(f"expected `max_points` of {MIN_POINTS} or more, got {self.max_points}")
+            raise ValueError(f"`max_points` is {self.max_points}; it must be {MIN_POINTS} or more")
         check_clutter(self.clutter)
         if self.clutter_side not in SIDES:
             raise ValueError(f'`clutter_side` is {self.clutter_side!r}; it is one of "both", "2d", "3d"')
@@ -164,7 +166,7 @@ def augment(batch: Batch, how: Augmentation, keys: Sequence[Key]) -> Batch:
 def check_clutter(clutter: float) -> None:
     """Raise ValueError for a ratio below 0, or NaN."""
     if not clutter >= 0:
-        raise ValueError(f"expected `clutter` of 0 or more, got {clutter}; 0.5 adds half as many points")
+        raise ValueError(f"`clutter` is {clutter}; it must be 0 or more, such as 0.5, which adds half as many points")
 
 
 def bounds(value: NumberOrRange) -> tuple[float, float]:

@@ -167,7 +167,7 @@ def _column(file: Path) -> dict[int, Any]:
     elif isinstance(content, (list, tuple)) or (isinstance(content, np.ndarray) and content.ndim):
         column = dict(enumerate(content))
     else:
-        raise PickleError(f"expected a dict or list indexed by sample in {file}, got a {type(content).__name__}")
+        raise PickleError(f"{file} holds a {type(content).__name__}, not a dict or list with an entry per sample")
     if not column:
         raise PickleError(f"{file} has no samples")
     return column
@@ -219,7 +219,7 @@ def _problem(name: str, sample: Mapping[str, Any], *, by_2d: bool, focal: float)
     once = np.full_like(match3d, -1)
     once[first] = match3d[first]
     if (once >= 0).sum() < MIN_POINTS:
-        raise ValueError(f"expected {MIN_POINTS} or more matches, got {(once >= 0).sum()}")
+        raise ValueError(f"it has {(once >= 0).sum()} matches; at least {MIN_POINTS} are needed")
     return Problem.from_matches(name, points2d, points3d, rotation, translation, once, focal)
 
 
@@ -229,7 +229,7 @@ def _numbers(value: Any, name: str, width: int) -> NDArray[np.float64]:
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} is no array of numbers") from error
     if array.ndim != 2 or array.shape[1] != width or not len(array) or not np.isfinite(array).all():
-        raise ValueError(f"expected finite {name} of shape (k, {width}), got {array.shape} or NaN")
+        raise ValueError(f"{name} of shape {array.shape} is unusable; finite numbers of shape (k, {width}) are needed")
     return array
 
 
@@ -238,9 +238,9 @@ def _match3d(value: Any, m: int, n: int, *, by_2d: bool) -> NDArray[np.int64]:
     length, other = (m, n) if by_2d else (n, m)
     index = np.asarray(value).reshape(-1)[:length]
     if len(index) < length or not np.issubdtype(index.dtype, np.number):
-        raise ValueError(f"expected {length} indices in W_gt, got {len(index)}")
+        raise ValueError(f"W_gt has {len(index)} indices, not {length}")
     if not ((index >= -1) & (index <= other) & (index % 1 == 0)).all():
-        raise ValueError(f"expected W_gt as integers between -1 and {other}, got {index.min()} to {index.max()}")
+        raise ValueError(f"W_gt goes from {index.min()} to {index.max()}; its indices are integers from -1 to {other}")
     index = np.where(index == other, -1, index.astype(np.int64))
     if not by_2d:
         return index

@@ -311,9 +311,9 @@ def hold_out(count: int, fraction: float, *, seed: int) -> tuple[NDArray[np.int6
         ValueError: `fraction` is out of range, or there are fewer than two rows.
     """
     if not 0 < fraction < 1:
-        raise ValueError(f"expected `val_fraction` between 0 and 1, got {fraction}")
+        raise ValueError(f"`val_fraction` is {fraction}; it must be between 0 and 1")
     if count < 2:
-        raise ValueError(f"expected at least 2 training rows, to hold one out for validation, got {count}")
+        raise ValueError(f"the number of training rows is {count}; at least 2 are needed, one of them for validation")
     held = min(count - 1, max(1, round(fraction * count)))
     order = np.random.default_rng(seed).permutation(count)
     return np.sort(order[held:]), np.sort(order[:held])

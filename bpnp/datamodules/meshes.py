@@ -162,8 +162,8 @@ class MeshSource:
         if not self.sees_all and bool((few := visible.sum(-1) < MIN_POINTS).any()):
             first = int(few.nonzero()[0, 0])
             raise ValueError(
-                f"expected at least {MIN_POINTS} points in front of the camera, got {int(visible[first].sum())} in "
-                f"{ids[first]}; try normalisation unit_sphere or a larger `distance`"
+                f"{ids[first]} has {int(visible[first].sum())} points in front of the camera; at least {MIN_POINTS} "
+                "are needed: use normalisation unit_sphere, or a larger `distance`"
             )
         noise = normal(generators(keys, Purpose.NOISE), 2 * count).view(size, count, 2)
         points2d = project(camera) + noise * (self.cameras.noise_px / self.cameras.focal)
@@ -257,8 +257,8 @@ class MeshDataModule(ProblemDataModule):
         super().__init__(**loading)
         if not MIN_POINTS <= num_points <= pool_size:
             raise ValueError(
-                f"expected `num_points` from {MIN_POINTS} to `pool_size`, got {num_points} and {pool_size}; "
-                "try a larger `pool_size`"
+                f"`num_points` is {num_points} and `pool_size` is {pool_size}; `num_points` goes from {MIN_POINTS} to "
+                "`pool_size`"
             )
         self.root, self.cache_dir = None if root is None else Path(root), cache_dir
         self.problems = {"train": train_problems, "val": val_problems, "test": test_problems}

@@ -82,7 +82,7 @@ def read_mesh(path: Path) -> Mesh:
             return _parse_off(content)
         mesh = _load(content, suffix)
         if not isinstance(mesh, trimesh.Trimesh):
-            raise MeshError(f"expected a mesh, got a {type(mesh).__name__}")
+            raise MeshError(f"the file holds a {type(mesh).__name__}, not a mesh")
         corners, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
         return Mesh(corners.reshape(-1, 3), faces.reshape(-1, 3))
 
@@ -118,7 +118,8 @@ def read_vertices(path: Path) -> tuple[NDArray[np.float64], dict[str, NDArray[np
         declared = re.search(rb"^element vertex (\d+)", content, re.MULTILINE)
         expected = 1 if declared is None else int(declared[1])
         if len(vertices) < expected:  # trimesh reads a truncated text file without an error
-            raise MeshError(f"expected {expected} points, got {len(vertices)}")
+            header = "" if declared is None else f"; its header declares {expected}"
+            raise MeshError(f"the file has {len(vertices)} points{header}")
         raw = getattr(cloud, "metadata", {}).get("_ply_raw", {}).get("vertex")
         if raw is None:
             return vertices, {}
@@ -135,15 +136,15 @@ def _parse_off(content: bytes) -> Mesh:
     lines = [stripped for line in text.splitlines() if (stripped := line.partition("#")[0].strip())]
     header = re.match(r"(?:ST)?C?N?OFF\b|OFF(?=\d)", lines[0]) if lines else None
     if header is None:
-        raise MeshError(f"expected `OFF` in the first line, got {text[:20]!r}")
+        raise MeshError(f"the first line is {text[:20]!r}; an OFF file begins with `OFF`")
     rest = lines[0][header.end() :].split()
     counts, body = (rest, lines[1:]) if rest else (lines[1].split() if len(lines) > 1 else [], lines[2:])
     if len(counts) < 2 or not all(count.isdecimal() for count in counts[:2]):
-        raise MeshError(f"expected the numbers of vertices and faces after `OFF`, got {' '.join(counts)[:40]!r}")
+        raise MeshError(f"after `OFF` stands {' '.join(counts)[:40]!r} instead of the numbers of vertices and faces")
     num_vertices, num_faces = int(counts[0]), int(counts[1])
     if len(body) < num_vertices + num_faces:
         raise MeshError(
-            f"expected {num_vertices} vertices and {num_faces} faces, got {len(body)} lines: the file is truncated"
+            f"the file is truncated: it declares {num_vertices} vertices and {num_faces} faces in {len(body)} lines"
         )
     try:
         vertices = np.loadtxt(body[:num_vertices], usecols=(0, 1, 2), ndmin=2) if num_vertices else np.empty((0, 3))

@@ -137,12 +137,14 @@ class StoredDataModule(ProblemDataModule):
     ) -> None:
         super().__init__(**loading)
         if min_points < MIN_POINTS:
-            raise ValueError(f"expected `min_points` of {MIN_POINTS} or more, got {min_points}; fewer fix no pose")
-        for most in (max_points, eval_max_points):
+            raise ValueError(
+                f"`min_points` is {min_points}; it must be {MIN_POINTS} or more, since fewer do not determine a pose"
+            )
+        for option, most in (("max_points", max_points), ("eval_max_points", eval_max_points)):
             if most is not None and most < min_points:
-                raise ValueError(f"expected `max_points` of at least `min_points` = {min_points}, got {most}")
+                raise ValueError(f"`{option}` is {most}; it must be at least `min_points`, {min_points}")
         if not clutter < np.inf:
-            raise ValueError(f"expected a finite `clutter`, got {clutter}; 0.5 adds half as many points")
+            raise ValueError(f"`clutter` is {clutter}; it must be finite, such as 0.5, which adds half as many points")
         self.root, self.min_points, self.clutter, self.fresh = root, min_points, clutter, fresh_subsets
         training = Augmentation(max_points, clutter, clutter_side, rotate)
         evaluation = replace(training, max_points=eval_max_points)

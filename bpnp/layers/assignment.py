@@ -69,7 +69,7 @@ def sinkhorn(
     """
     for name, scalar in (("mu", mu), ("dustbin", dustbin)):
         if isinstance(scalar, Tensor) and scalar.ndim:
-            raise ValueError(f"expected `{name}` as a number or a scalar tensor, got shape {tuple(scalar.shape)}")
+            raise ValueError(f"`{name}` has the shape {tuple(scalar.shape)}; a number or a scalar tensor is needed")
     check_mu(mu)
     for name, mask in (("mask2d", mask2d), ("mask3d", mask3d)):
         if mask is not None and not bool(mask.any(-1).all()):
@@ -129,7 +129,7 @@ def dustbin_marginals(
 def check_mu(mu: float | Tensor) -> None:
     """Raise ValueError unless the entropy weight is positive."""
     if not mu > 0:
-        raise ValueError(f"expected `mu` > 0, got {float(mu)}; try 0.1")
+        raise ValueError(f"`mu` is {float(mu)}; it must be above 0, such as 0.1")
 
 
 class Sinkhorn(nn.Module):

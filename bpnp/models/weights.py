@@ -67,7 +67,7 @@ class TrainedNet(nn.Module):
         classes = {class_name(net): net for net in networks()}
         if not issubclass(classes.get(str(name), object), cls):
             wanted = " or ".join(classes) if cls is TrainedNet else class_name(cls)
-            raise ValueError(f"expected a checkpoint of {wanted}, got {name or 'another file'} in {path}")
+            raise ValueError(f"{path} is a checkpoint of {name or 'another program'}, not of {wanted}")
         try:
             net = build_solver(content, parts)
             net.load_state_dict(fitting_state(content, net)[0])
@@ -228,9 +228,7 @@ def fitting_state(
     saved, wanted = content.get("solver", {}), describe_module(solver)
     state, weights = solver_state(content), solver.state_dict()
     if saved.get("class") != wanted["class"]:
-        raise ValueError(
-            f"expected a checkpoint of {wanted['class']}, got one of {saved.get('class', 'another program')}"
-        )
+        raise ValueError(f"this is a checkpoint of {saved.get('class', 'another program')}, not of {wanted['class']}")
     added = {key: value for key, value in weights.items() if grown and key not in state and not value.any()}
     misfits = [
         key for key in state.keys() | weights.keys() if _shape((state | added).get(key)) != _shape(weights.get(key))
@@ -323,7 +321,7 @@ def build_module(description: Any, classes: Iterable[type[nn.Module]]) -> nn.Mod
         ValueError: A class is not among `classes`, or its settings are unusable.
     """
     if not is_description(description):
-        raise ValueError(f"expected the class and the settings of a module, got {description!r:.80}")
+        raise ValueError(f"the description of a module has its class and its settings; this one is {description!r:.80}")
     by_name = {class_name(cls): cls for cls in classes}
     name, settings = description["class"], description["settings"]
     if name not in by_name:

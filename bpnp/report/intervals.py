@@ -85,7 +85,9 @@ def paired_difference(
         ValueError: The lengths differ, there are no values, or one is NaN.
     """
     if len(first) != len(second):
-        raise ValueError(f"a paired difference needs the same problems, got {len(first)} and {len(second)}")
+        raise ValueError(
+            f"a paired difference needs values of the same problems; there are {len(first)} and {len(second)}"
+        )
     one, other = _check_values(first), _check_values(second)
     draws = _draws(len(one), seed)
     drawn = statistic(other[draws]) - statistic(one[draws])
@@ -113,7 +115,9 @@ def _draws(count: int, seed: int) -> NDArray[np.int64]:
 def _check_values(values: NDArray[np.float64]) -> NDArray[np.float64]:
     array = np.asarray(values, np.float64)
     if not len(array) or np.isnan(array).any():
-        raise ValueError(f"a bootstrap needs numbers, got {len(array)} with {int(np.isnan(array).sum())} NaN")
+        raise ValueError(
+            f"a bootstrap needs numbers; there are {len(array)}, of which {int(np.isnan(array).sum())} are NaN"
+        )
     return np.clip(array, -FINITE, FINITE)
 
 

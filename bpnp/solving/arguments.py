@@ -75,8 +75,8 @@ def source_from(solver: "str | Path | torch.nn.Module") -> "torch.nn.Module | No
     path = Path(str(solver))
     if not isinstance(solver, (str, Path)) or not (path.suffix or path.is_file() or str(solver) in pretrained_names()):
         raise ValueError(
-            f'expected `solver` "auto", "search", a module from Batch to Prediction, a checkpoint, or packaged weights '
-            f"({', '.join(pretrained_names())}), got {solver!r}"
+            f'`solver` is {solver!r}; it is "auto", "search", a module from Batch to Prediction, a checkpoint, or the '
+            f"name of packaged weights: {', '.join(pretrained_names())}"
         )
     return TrainedNet.from_checkpoint(solver)
 
@@ -91,7 +91,7 @@ def device_from(wanted: "str | torch.device | None") -> "torch.device | None":
         device = torch.device(wanted)
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError) as error:
-        raise ValueError(f"expected a `device` of this machine, got {wanted}: {str(error).splitlines()[0]}") from error
+        raise ValueError(f"this machine has no `device` {wanted}: {str(error).splitlines()[0]}") from error
     return device
 
 
@@ -101,11 +101,11 @@ def each_set(name: str, values: Any, count: int | None, axes: int = 2) -> list[A
     if count is not None and (values is None or dims == axes):
         return [values] * count
     if dims != axes + 1 or not hasattr(values, "__iter__"):
-        got = f"{values!r:.60}" if dims == axes + 1 else f"shape {tuple(values.shape)}"
-        raise ValueError(f"expected `{name}` as a sequence of arrays, one a problem, got {got}")
+        wrong = f"is {values!r:.60}" if dims == axes + 1 else f"has the shape {tuple(values.shape)}"
+        raise ValueError(f"`{name}` {wrong}; a sequence of arrays is needed, one per problem")
     arrays = list(values)
     if not arrays:
-        raise ValueError(f"expected one array a problem in `{name}`, got 0")
+        raise ValueError(f"`{name}` is empty; it holds one array per problem")
     return each_of(name, arrays, count or len(arrays))
 
 
@@ -114,7 +114,9 @@ def each_of(name: str, value: Any, count: int) -> list[Any]:
     if not isinstance(value, list):
         return [value] * count
     if len(value) != count:
-        raise ValueError(f"expected {count} of `{name}`, one a problem, got {len(value)}")
+        raise ValueError(
+            f"`{name}` has the length {len(value)}, but the number of problems is {count}; give one per problem"
+        )
     return value
 
 
@@ -135,7 +137,7 @@ def positive(name: str, value: Any, *, finite: bool = False) -> float | None:
     """Return a positive number as a float; None stays None."""
     real = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
     if value is not None and not (real and value > 0 and (value < math.inf or not finite)):
-        raise ValueError(f"expected a positive `{name}`, got {value!r}")
+        raise ValueError(f"`{name}` is {value!r}; it must be a positive number")
     return None if value is None else float(value)
 
 
@@ -187,7 +189,7 @@ def checked_prior(prior: Any) -> Prior | None:
     if isinstance(prior, GravityPrior):
         camera, scene = (_finite(f"prior.{name}", getattr(prior, name), (3,)) for name in ("up_camera", "up_scene"))
         if not (camera.any() and scene.any() and prior.sigma_deg > 0):
-            raise ValueError(f"expected directions and a positive sigma_deg in `prior`, got {prior}")
+            raise ValueError(f"`prior` is {prior}; its directions must not be zero, and its sigma_deg must be positive")
         return GravityPrior(camera, scene, float(prior.sigma_deg))
     from bpnp.models.weights import LEARNED, TrainedNet  # imports torch, so only if a network is named
 
@@ -196,8 +198,7 @@ def checked_prior(prior: Any) -> Prior | None:
     if isinstance(prior, TrainedNet):
         return prior
     raise ValueError(
-        "expected `prior` as PosePrior, GravityPrior, a pose, BPnPNet, Matcher, a checkpoint or 'learned', got "
-        f"{prior!r:.60}"
+        f"`prior` is {prior!r:.60}; give a PosePrior, a GravityPrior, a pose, or a BPnPNet, a Matcher or a checkpoint"
     )
 
 
@@ -206,7 +207,7 @@ def checked_pose(prefix: str, rotation: Any, translation: Any) -> tuple[Array, A
     matrix = _finite(f"{prefix}rotation", rotation, (3, 3))
     off = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
     if off > UNIT or np.linalg.det(matrix) < 0:
-        raise ValueError(f"expected a rotation in `{prefix}rotation`, R R^T = I and det R = 1, got {matrix.tolist()}")
+        raise ValueError(f"`{prefix}rotation` is no rotation matrix, R R^T = I and det R = 1: {matrix.tolist()}")
     shift = None if translation is None else _finite(f"{prefix}translation", translation, (3,))
     return Rotation.from_matrix(matrix).as_matrix() if off > ROUNDING else matrix, shift
 
@@ -220,7 +221,7 @@ def numbers(name: str, values: Any) -> Array:
             raise TypeError(f"{array.dtype}")
         return array.astype(np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"expected `{name}` as an array of numbers, got {values!r:.80}") from error
+        raise ValueError(f"`{name}` is {values!r:.80}; an array of numbers is needed") from error
 
 
 def _on_host(values: Any) -> Any:
@@ -234,7 +235,7 @@ def _on_host(values: Any) -> Any:
 def _finite(name: str, values: Any, shape: tuple[int, ...]) -> Array:
     array = numbers(name, values)
     if array.shape != shape or not np.isfinite(array).all():
-        raise ValueError(f"expected finite `{name}` of shape {shape}, got {array.tolist()}")
+        raise ValueError(f"`{name}` is {array.tolist()}; finite numbers of shape {shape} are needed")
     return array
 
 
@@ -253,7 +254,7 @@ def checked_size(image_size: Any) -> tuple[int, int]:
     except (TypeError, ValueError):
         whole = False
     if not whole or min(width, height) < 1:
-        raise ValueError(f"expected `image_size` as (width, height) in whole pixels, got {image_size!r:.60}")
+        raise ValueError(f"`image_size` is {image_size!r:.60}; it is (width, height) in whole pixels")
     return width, height
 
 
@@ -269,14 +270,16 @@ def check_inside(points2d: Any, size: Any) -> None:
     """
     pixels, sides = image_points(points2d), np.array(checked_size(size))
     if pixels.ndim != 2 or pixels.shape[1] != 2:
-        raise ValueError(f"expected pixels `points2d` of shape (m, 2) with an `image_size`, got {pixels.shape}")
+        raise ValueError(
+            f"`points2d` has the shape {pixels.shape}; with an `image_size` it holds pixels of shape (m, 2)"
+        )
     outside = outside_image(pixels, sides)
     if outside.any():
         fits_swapped = not outside_image(pixels, sides[::-1]).any()
-        hint = "are width and height swapped?" if fits_swapped else "try the size of the image in which they are"
+        hint = "are width and height swapped?" if fits_swapped else "give the size of the image in which they are"
         raise ValueError(
-            f"expected `points2d` inside the {sides[0]} x {sides[1]} pixels of `image_size`, got "
-            f"{int(outside.sum())} of {len(pixels)} outside, such as {pixels[outside][0].round(1).tolist()}; {hint}"
+            f"{int(outside.sum())} of {len(pixels)} `points2d` are outside the {sides[0]} x {sides[1]} pixels of "
+            f"`image_size`, such as {pixels[outside][0].round(1).tolist()}; {hint}"
         )
 
 
@@ -303,18 +306,18 @@ def check_points(name: str, points: Array, widths: tuple[int, ...], fewest: int)
     if points.ndim != 2 or points.shape[1] not in widths:
         shapes = " or ".join(f"(k, {width})" for width in widths)
         swapped = points.ndim == 2 and points.shape[1] in (2, 3)
-        hint = " (are points2d and points3d swapped?)" if swapped else "; try one row a point"
-        raise ValueError(f"expected `{name}` of shape {shapes}, got {points.shape}{hint}")
+        hint = " (are points2d and points3d swapped?)" if swapped else "; give one row per point"
+        raise ValueError(f"`{name}` has the shape {points.shape}, not {shapes}{hint}")
     if len(points) < fewest:
-        raise ValueError(f"expected {fewest} or more points in `{name}`, got {len(points)}: fewer fix no pose")
-    _check_rows(f"finite `{name}`", points, np.isfinite(points).all(-1))
+        raise ValueError(f"`{name}` has {len(points)} points; at least {fewest} are needed")
+    _check_rows(name, points, np.isfinite(points).all(-1), "all numbers must be finite")
 
 
-def _check_rows(expected: str, rows: Array, good: Any, hint: str = "") -> None:
-    """Raise ValueError with the first invalid row."""
+def _check_rows(name: str, rows: Array, good: Any, requirement: str) -> None:
+    """Raise ValueError with the first invalid row, and what is required of all."""
     if not good.all():
         bad = int(good.argmin())
-        raise ValueError(f"expected {expected}, got {rows[bad].tolist()} at point {bad}{hint}")
+        raise ValueError(f"`{name}` is {rows[bad].tolist()} at point {bad}; {requirement}")
 
 
 def unit_bearings(rays: Array) -> Array:
@@ -323,8 +326,8 @@ def unit_bearings(rays: Array) -> Array:
     if np.abs(length - 1).max() > UNIT:
         worst = float(length[np.abs(length - 1).argmax(), 0])
         raise ValueError(
-            f"expected unit bearings in `points2d` of shape (m, 3), got one of length {worst:g} (are points2d "
-            "and points3d swapped?); try points2d of shape (m, 2), or to divide by the lengths"
+            f"`points2d` of shape (m, 3) are unit bearings, but one has the length {worst:g} (are points2d and "
+            "points3d swapped?); divide bearings by their lengths, or give points2d of shape (m, 2)"
         )
     return rays / length
 
@@ -336,15 +339,15 @@ def check_unit(points2d: Array, camera: Camera | None) -> None:
         check_normalised(points2d, "camera=K")
     if camera is not None and largest < INSIDE_ONE_PIXEL and camera.focal > 100:
         raise ValueError(
-            f"expected pixels with a `camera`, got values up to {largest:g}, which look normalised; try without the "
-            "camera"
+            f"`points2d` has values up to {largest:g}, which look normalised; give pixels with a `camera`, or leave "
+            "the camera out"
         )
 
 
-def unit_vectors(name: str, vectors: Array, hint: str = "try to divide by the lengths") -> Array:
+def unit_vectors(name: str, vectors: Array, hint: str = "divide by the lengths") -> Array:
     """Return vectors (n, 3), normalised; raise ValueError if a length differs from one by more than `UNIT`."""
     length = np.linalg.norm(vectors, axis=-1)
-    _check_rows(f"unit vectors in `{name}`", vectors, np.abs(length - 1) <= UNIT, f"; {hint}")
+    _check_rows(name, vectors, np.abs(length - 1) <= UNIT, f"unit vectors are needed: {hint}")
     return np.asarray(vectors / length[:, None])
 
 
@@ -367,14 +370,14 @@ def checked_labels(labels2d: Any, labels3d: Any, counts: tuple[int, int]) -> dic
     if len(missing) == 2:
         return {}
     if missing:
-        raise ValueError(f"expected both `labels2d` and `labels3d`, or neither, got no `{missing[0]}`")
+        raise ValueError(f"`{missing[0]}` is missing; give both `labels2d` and `labels3d`, or neither")
     if all(getattr(values, "ndim", 1) < 2 for values in labels.values()):
         integers = [_integers(name, labels[name], count) for name, count in zip(labels, counts, strict=True)]
         return dict(zip(labels, compact_labels(*integers), strict=True))
     image, scene = (_classes(name, labels[name], count) for name, count in zip(labels, counts, strict=True))
     if image.shape[1] != scene.shape[1]:
         raise ValueError(
-            f"expected as many classes in `labels2d` as in `labels3d`, got {image.shape[1]} and {scene.shape[1]}"
+            f"`labels2d` has {image.shape[1]} classes and `labels3d` {scene.shape[1]}; both need the same classes"
         )
     odds = image / np.maximum(image.mean(0), 1e-12)
     odds /= np.maximum(odds @ scene.mean(0), 1e-12)[:, None]
@@ -408,20 +411,20 @@ def _classes(name: str, values: Any, count: int) -> Array:
     shares = numbers(name, values)
     if shares.ndim != 2 or len(shares) != count:
         raise ValueError(
-            f"expected probabilities in `{name}` of shape ({count}, c), as in the other one, got {shares.shape}"
+            f"`{name}` has the shape {shares.shape}; it needs class probabilities of shape ({count}, c), as the other "
+            "labels"
         )
     good = (shares >= 0).all(1) & (np.abs(shares.sum(1) - 1) <= UNIT)
-    expected = f"probabilities from 0 that add up to 1 in `{name}`"
-    _check_rows(expected, shares, good, "; try softmax, or to divide by the sums")
+    _check_rows(name, shares, good, "probabilities are 0 or more and add up to 1: use softmax, or divide by the sums")
     return np.asarray(shares / shares.sum(1, keepdims=True))
 
 
 def _integers(name: str, values: Any, count: int) -> Labels:
     labels = _one_each(name, np.asarray(_on_host(values)), (count,))
     if labels.dtype.kind not in "iu":
-        raise ValueError(f"expected integers in `{name}`, got {labels.dtype}; try .astype(int)")
+        raise ValueError(f"`{name}` has the type {labels.dtype}; labels are integers: use .astype(int)")
     if labels.min(initial=0) < -1:
-        raise ValueError(f"expected labels of 0 or more, or -1 for any, in `{name}`, got {labels.min()}")
+        raise ValueError(f"`{name}` has the label {labels.min()}; labels are 0 or more, or -1 for any")
     return labels.astype(np.int64)
 
 
@@ -431,11 +434,11 @@ def checked_scores(name: str, values: Any, count: int) -> Array | None:
         return None
     scores = _one_each(name, numbers(name, values), (count,))
     good = (scores > 0) & (scores <= 1)
-    _check_rows(f"probabilities above 0 and up to 1 in `{name}`", scores, good, "; try to divide by the largest")
+    _check_rows(name, scores, good, "scores are above 0 and at most 1: divide by the largest")
     return scores
 
 
 def _one_each(name: str, values: npt.NDArray[Any], shape: tuple[int, ...]) -> npt.NDArray[Any]:
     if values.shape != shape:
-        raise ValueError(f"expected `{name}` of shape {shape} as `points{name[-2:]}`, got {values.shape}")
+        raise ValueError(f"`{name}` has the shape {values.shape}, not {shape} for these `points{name[-2:]}`")
     return values

@@ -193,11 +193,13 @@ def unknown_camera(
     if image_size is not None:
         if camera is not None:
             raise ValueError(
-                "expected a `camera` or the `image_size` of one with an unknown focal length, got both; try camera=... "
-                "with focal_error=0.1 for a focal length that is known to a tenth"
+                "`camera` and `image_size` exclude each other: `image_size` is for an unknown focal length. For one "
+                "that is known to a tenth give `camera` and focal_error=0.1"
             )
         if focal_error is not None:
-            raise ValueError("expected `focal_error` beside a `camera`, got it beside `image_size`; try without")
+            raise ValueError(
+                "`focal_error` needs a `camera` and has no meaning with `image_size`; leave one of them out"
+            )
         width, height = checked_size(image_size)
         reference = camera_from(("SIMPLE_PINHOLE", width, height, (max(width, height), width / 2, height / 2)))
         return UnknownCamera(
@@ -210,9 +212,11 @@ def unknown_camera(
             reach=math.hypot(width, height) / 2 / max(width, height),
         )
     if camera is None:
-        raise ValueError("expected a `camera` whose focal length has the `focal_error`, got none; try image_size")
+        raise ValueError(
+            "`focal_error` needs the `camera` whose focal length it is about; without one give `image_size`"
+        )
     if focal_error is None or not 0 < focal_error < 1:
-        raise ValueError(f"expected `focal_error` above 0 and below 1, a share of the focal length, got {focal_error}")
+        raise ValueError(f"`focal_error` is {focal_error}; it is a fraction of the focal length, above 0 and below 1")
     widest, lens = math.exp(RULE.sigmas * focal_error), camera_from(camera)
     if distortion and not is_pinhole(lens):
         raise ValueError(

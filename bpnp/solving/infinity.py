@@ -59,7 +59,7 @@ def solve_directions(
     lens = unknown.reference if unknown is not None else None if camera is None else camera_from(camera)
     check_points("points2d", image, (2, 3) if lens is None else (2,), FEWEST)
     check_points("points3d", scene, (3,), FEWEST)
-    hint = "try to divide by the lengths, or points of a scene without `at_infinity`"
+    hint = "divide by the lengths, or leave out `at_infinity` for points of a scene"
     scene = np.ascontiguousarray(unit_vectors("points3d", scene, hint))
     scores = checked_scores("scores2d", scores2d, len(image))
 

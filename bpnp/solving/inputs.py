@@ -52,9 +52,10 @@ def problem_from(
     fewest = MIN_POINTS - isinstance(prior, GravityPrior)
     image, scene = image_points(points2d), scene_points(points3d)
     if image.ndim == 2 and image.shape[1] == 3 and (camera is not None or scene.shape[-1:] == (2,)):
-        wrong = image if camera is not None else scene
-        what = "`points3d` of shape (n, 3)" if camera is None else "pixels `points2d` of shape (m, 2) with a `camera`"
-        raise ValueError(f"expected {what}, got {wrong.shape} (are points2d and points3d swapped?)")
+        wrong = f"`points3d` has the shape {scene.shape}, not (n, 3)"
+        if camera is not None:
+            wrong = f"`points2d` has the shape {image.shape}; with a `camera` it holds pixels of shape (m, 2)"
+        raise ValueError(f"{wrong} (are points2d and points3d swapped?)")
     check_points("points2d", image, (2, 3) if camera is None else (2,), fewest)
     check_points("points3d", scene, (3,), fewest)
     unit, (bearings, plane) = unit_of(image, camera), bearings_of(image, camera)
@@ -104,6 +105,4 @@ def unit_of(image: Array, camera: Camera | None) -> Unit:
 def check_seen(usable: Labels, image: Array, fewest: int) -> None:
     """Raise ValueError if too few of the 2D points are usable."""
     if len(usable) < fewest:
-        raise ValueError(
-            f"expected {fewest} or more 2D points that the camera can see, got {len(usable)} of {len(image)}"
-        )
+        raise ValueError(f"the camera can see {len(usable)} of {len(image)} 2D points; at least {fewest} are needed")

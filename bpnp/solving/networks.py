@@ -65,7 +65,7 @@ def predicted(net: nn.Module, members: list[Problem], deadline: Deadline) -> lis
     with torch.no_grad():
         poses = net(batch).poses
     if not poses:
-        raise ValueError(f"expected a pose from the `solver` {type(net).__name__}, got a prediction without one")
+        raise ValueError(f"the `solver` {type(net).__name__} returned a prediction without a pose")
     order = sorted(poses, key=lambda name: ESTIMATES.index(name) if name in ESTIMATES else len(ESTIMATES))
     rotation = _host(torch.stack([poses[name].rotation for name in order], 1))
     translation = _host(torch.stack([poses[name].translation for name in order], 1))
@@ -138,8 +138,8 @@ def view_for(net: nn.Module, problem: Problem) -> View:
         return View(np.eye(3), _near_origin(problem), problem.size)
     if not isinstance(problem.prior, PosePrior):
         raise ValueError(
-            "expected a view near the photo's for a network that was trained in the coordinates of one, got no "
-            "`prior`; try prior=PosePrior(rotation, translation, ...) with the pose of the view, or SceneMap.localize"
+            "this network was trained in the coordinates of a view near the photo, and there is no `prior`; give "
+            "prior=PosePrior(rotation, translation, ...) with the pose of such a view, or use SceneMap.localize"
         )
     rotation = np.asarray(problem.prior.rotation, np.float64)
     if problem.prior.translation is not None:

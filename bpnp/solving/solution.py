@@ -276,7 +276,7 @@ class Solution:
         from bpnp.datamodules.colmap.reconstruction import write_image
 
         if not self.found:
-            raise ValueError(f"expected a solution with a pose to export, got none: {self.reason}")
+            raise ValueError(f"a solution without a pose cannot be exported: {self.reason}")
         pose = self.rotation, self.translation / self.scale  # in the unit of the scene
         lens = self.camera if camera is None else camera
         points = self.points2d, self.points3d, self.matches
@@ -309,7 +309,7 @@ class Solution:
                 raise ValueError(f"verdict {content['verdict']!r}")
             return _read(cls, content if content["format"] == FORMAT else _converted(content))
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"expected the JSON of a solution{name}, got {error}") from error
+            raise ValueError(f"this is not the JSON of a solution{name}: {error}") from error
 
 
 def candidates_of(poses: Hypotheses, counts: Sequence[int]) -> tuple[Candidate, ...]:

@@ -160,14 +160,20 @@ def _checked_matches(values: Any, problem: Problem) -> Labels:
     """Return the (k, 2) indices of matches whose 2D point is usable; raise ValueError if a point is in two matches."""
     matches, counts = numbers("matches", values), (len(problem.all2d), len(problem.points3d))
     if matches.ndim != 2 or matches.shape[1] != 2 or (matches != np.round(matches)).any():
-        raise ValueError(f"expected `matches` as integers of shape (k, 2), got shape {matches.shape}")
+        raise ValueError(
+            f"`matches` has the shape {matches.shape}; pairs of indices are needed, integers of shape (k, 2)"
+        )
     if (matches < 0).any() or (matches >= counts).any():
-        raise ValueError(f"expected `matches` below {counts}, the numbers of points, got {matches.max(0).tolist()}")
+        low, high = matches.min(0).astype(int).tolist(), matches.max(0).astype(int).tolist()
+        raise ValueError(
+            f"`matches` has indices from {low} to {high}; there are {counts[0]} 2D and {counts[1]} 3D points"
+        )
     for name, side in zip(("2D", "3D"), matches.T.astype(np.int64), strict=True):
         times = np.bincount(side)
         if times.max(initial=0) > 1:
-            twice = f"{name} point {times.argmax()} in {times.max()}"
-            raise ValueError(f"expected each point in one of the `matches`, got {twice}")
+            raise ValueError(
+                f"{name} point {times.argmax()} is in {times.max()} of the `matches`; a point has one at most"
+            )
     places = matches.astype(np.int64)
     return np.asarray(places[np.isin(places[:, 0], problem.usable)])
 

@@ -126,7 +126,9 @@ class BlindPnPTask(LightningModule):
         check_within(1, math.inf, decay_steps=decay_steps)
         self.warmup_steps, self.decay_start, self.decay_steps = warmup_steps, decay_start, decay_steps
         if matching_loss != "correspondence" and correspondence_angle is not None:
-            raise ValueError(f"expected `correspondence_angle` with matching_loss correspondence, got {matching_loss}")
+            raise ValueError(
+                f"`correspondence_angle` is for the matching loss correspondence, not for {matching_loss}; leave it out"
+            )
         if correspondence_angle is not None and not 0 < correspondence_angle <= WIDEST_MATCH:
             raise ValueError(
                 f"correspondence_angle is {correspondence_angle:g} radians ({math.degrees(correspondence_angle):.0f} "
@@ -142,7 +144,7 @@ class BlindPnPTask(LightningModule):
         self.table_metrics: set[str] = set()  # names of the metrics in the tables of a test
         estimates: tuple[str, ...] | str = getattr(self.solver, "estimates", ())
         if isinstance(estimates, str):
-            raise ValueError(f"expected `estimates` as a tuple of names, got {estimates!r}; try ({estimates!r},)")
+            raise ValueError(f"`estimates` of the solver is {estimates!r}; it is a tuple of names: ({estimates!r},)")
         estimates = tuple(estimates)
         validated = tuple(name for name in estimates if refine_validation or name != REFINED)
         self.estimates: dict[Stage, tuple[str, ...]] = {"val": validated, "test": estimates}

@@ -64,7 +64,7 @@ def test_options_of_the_network_and_its_parts_are_explained(
         (["fit", *MESHES, "--data.nonsense=3"], "error: Parser key \"data\": Option 'nonsense' is not accepted\n"),
         (["fit", *MESHES, "--data.train_pairs=3"], "'train_pairs' is not accepted; it is now train_problems\n"),
         (["fit", *MESHES, "--data.num_points=many"], "\"num_points\": Expected a <class 'int'>. Got value: many\n"),
-        (["fit", *MESHES, "--data.batch_size=0"], "error: expected `batch_size` of 1 or more, got 0\n"),
+        (["fit", *MESHES, "--data.batch_size=0"], "error: `batch_size` is 0; it must be 1 or more\n"),
         (["fit", *MESHES, "--model.loss=torch.nn.Nothing"], "'torch.nn' has no attribute 'Nothing' "),
         (["fit", *MESHES, "--data.root=nowhere"], "nowhere is not a folder; a folder with <class>/{train,test}"),
         (
@@ -82,7 +82,7 @@ def test_options_of_the_network_and_its_parts_are_explained(
             ["view", "nowhere"],
             "nowhere does not exist; give the folder of a test or the JSON of a solution",
         ),
-        (["view", __file__], "test_cli.py: expected"),
+        (["view", __file__], "test_cli.py: this is not the JSON of a solution: Expecting value"),
         (["view", __file__, "3"], "is one solution, which has no problem '3'"),
         (
             ["report", "nowhere", "--paper", "modelnet"],

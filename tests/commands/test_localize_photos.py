@@ -93,7 +93,7 @@ def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, 
         (("--keypoints", "nothing.h5"), "--keypoints nothing.h5 does not exist; give"),
         (("--solver", "nothing"), "or packaged weights"),
         (("--model", str(model)), "nrecognized arguments: --model"),
-        (("--time_limit", "-1"), "expected a positive `time_limit`, got -1.0"),
+        (("--time_limit", "-1"), "`time_limit` is -1.0; it must be a positive number"),
         (("--views", "nothing.txt"), "expected a text file of lines `photo view`"),
         (("--output", str(tmp_path / "plain.jpg")), ": it is a file, or lies in one"),
     ):

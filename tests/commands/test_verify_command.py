@@ -70,7 +70,7 @@ def test_options_reach_the_verdict_as_they_are_written(files: list[str], monkeyp
         (lambda files, folder: files, "give the JSON of a pose, or --rotation and --translation"),
         (lambda files, folder: [*files, *NUMBERS[:10]], "give the JSON of a pose, or --rotation and --translation"),
         (lambda files, folder: [*files[:2], "nothing.json", *files[2:]], "there is no file nothing.json"),
-        (lambda files, folder: [*files, *NUMBERS[:9], "7", *NUMBERS[10:]], "expected a rotation in `rotation`"),
+        (lambda files, folder: [*files, *NUMBERS[:9], "7", *NUMBERS[10:]], "`rotation` is no rotation matrix"),
         (lambda files, folder: [*files, *NUMBERS, "--matches", str(folder / "p.npy")], " needs two columns; it has"),
         (lambda files, folder: [*files, *NUMBERS, "--image", "a"], "--image needs a COLMAP model"),
         (lambda files, folder: [*files, *NUMBERS, "--surface", "9"], "--surface draws points from a mesh, and"),

@@ -73,7 +73,7 @@ def test_scenes_are_split_without_overlap() -> None:
     [
         ({"test": ["s77"]}, "there are no scenes s77; the scenes are s0, s1, "),
         ({"test": ["s1"], "train": ["s1"]}, "name s1 more than once"),
-        ({"test_fraction": 1.5}, "`test_fraction` from 0 to 1"),
+        ({"test_fraction": 1.5}, "`test_fraction` is 1.5; it must be from 0 to 1"),
     ],
 )
 def test_a_split_that_does_not_fit_is_one_error(options: dict, message: str) -> None:
@@ -109,15 +109,15 @@ def test_the_loaders_serve_disjoint_scenes(tmp_path: Path) -> None:
 
 
 WRONG: list[tuple[dict[str, Any], str]] = [
-    ({"clutter": -0.25}, "`clutter` of 0 or more, got -0.25"),
+    ({"clutter": -0.25}, "`clutter` is -0.25; it must be 0 or more"),
     ({"clutter": float("nan")}, "`clutter`"),
-    ({"clutter": float("inf")}, "finite `clutter`"),
-    ({"min_points": 1}, "`min_points` of 4 or more, got 1"),
-    ({"max_points": 8, "min_points": 9}, "`max_points` of at least `min_points` = 9, got 8"),
-    ({"eval_max_points": 3}, "`max_points` of at least `min_points` = 4, got 3"),
-    ({"batch_size": 0}, "`batch_size` of 1 or more, got 0"),
-    ({"eval_batch_size": 0}, "`eval_batch_size` of 1 or more, got 0"),
-    ({"num_workers": -1}, "`num_workers` of 0 or more, got -1"),
+    ({"clutter": float("inf")}, "`clutter` is inf; it must be finite"),
+    ({"min_points": 1}, "`min_points` is 1; it must be 4 or more"),
+    ({"max_points": 8, "min_points": 9}, "`max_points` is 8; it must be at least `min_points`, 9"),
+    ({"eval_max_points": 3}, "`eval_max_points` is 3; it must be at least `min_points`, 4"),
+    ({"batch_size": 0}, "`batch_size` is 0; it must be 1 or more"),
+    ({"eval_batch_size": 0}, "`eval_batch_size` is 0; it must be 1 or more"),
+    ({"num_workers": -1}, "`num_workers` is -1; it must be 0 or more"),
 ]
 
 

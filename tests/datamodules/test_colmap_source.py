@@ -91,5 +91,5 @@ def test_images_with_too_few_points_are_skipped_and_counted(tmp_path: Path) -> N
     assert len(problems.images) == 3
     with pytest.raises(StoreError, match="none of the 5 problems in few, many has 7 or more matches"):
         ColmapSource(scenes, min_points=7)
-    with pytest.raises(ValueError, match="`clutter` of 0 or more, got -0.1"):
+    with pytest.raises(ValueError, match="`clutter` is -0.1; it must be 0 or more"):
         ColmapSource(scenes, clutter=-0.1)

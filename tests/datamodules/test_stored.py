@@ -58,11 +58,17 @@ def test_pairs_come_back(store: Store) -> None:
 
 
 WRONG = [
-    ({"match3d": np.array([0.0, 1.5, -1.0, 2.0])}, "`match3d` as integers.*float64 in problem 'a/1'; try .astype"),
-    ({"match3d": np.array([0, 1, -1, 4])}, "`match3d` between -1 and 3, got -1 to 4 in problem 'a/1'"),
-    ({"match3d": np.arange(3)}, r"`match3d` of shape \(4,\).* in problem 'a/1'"),
+    (
+        {"match3d": np.array([0.0, 1.5, -1.0, 2.0])},
+        "`match3d` has the type .*float64 in problem 'a/1'; indices of 2D points are integers: use .astype",
+    ),
+    ({"match3d": np.array([0, 1, -1, 4])}, "`match3d` goes from -1 to 4 in problem 'a/1'; .* from -1 .none. to 3"),
+    ({"match3d": np.arange(3)}, r"`match3d` has the shape \(3,\) in problem 'a/1', not \(4,\)"),
     ({"match3d": np.array([0, 1, 1, 2])}, "`match3d` of 'a/1' assigns one 2D point to two 3D points"),
-    ({"points2d": np.full((4, 2), np.nan)}, "finite `points2d`.*'a/1'"),
+    (
+        {"points2d": np.full((4, 2), np.nan)},
+        "`points2d` is .nan, nan. at point 0 of problem 'a/1'; all numbers must be finite",
+    ),
     ({"translation": np.full(3, np.inf)}, "pose, focal length or origin of problem 'a/1' holds NaN or infinity"),
 ]
 

@@ -34,8 +34,8 @@ def test_off_headers_polygons_and_colours(tmp_path: Path, text: str) -> None:
 
 
 BROKEN = {
-    "empty": ("", "OFF` in the first line"),
-    "foreign": ("\x89PNG\r\n\x1a\n\x00", "OFF` in the first line"),
+    "empty": ("", "an OFF file begins with `OFF`"),
+    "foreign": ("\x89PNG\r\n\x1a\n\x00", "an OFF file begins with `OFF`"),
     "no counts": ("OFF\n", "numbers of vertices and faces"),
     "binary": ("OFF BINARY\n\x00\x01", "numbers of vertices and faces"),
     "truncated vertices": ("OFF\n5 2 0\n0 0 0\n2 0 0\n", "truncated"),

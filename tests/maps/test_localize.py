@@ -233,7 +233,7 @@ def test_bad_input_is_one_clear_error(planted: tuple[SceneMap, Planted]) -> None
         scene.localize(keypoints, PINHOLE, views=[])
     with pytest.raises(ValueError, match=r"expected `scores` of shape \(105,\), one a keypoint, got \(3,\)"):
         scene.localize(keypoints, PINHOLE, scores=[1, 2, 3])
-    with pytest.raises(ValueError, match="expected a positive `time_limit`, got 0"):
+    with pytest.raises(ValueError, match="`time_limit` is 0; it must be a positive number"):
         scene.localize(keypoints, PINHOLE, time_limit=0)
 
 

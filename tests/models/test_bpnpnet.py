@@ -72,7 +72,7 @@ def test_refinement_starts_from_hypotheses_too_unless_there_are_none() -> None:
     net.refinement.hypotheses = 0
     alone = net(batch).poses["refined"].stats.iterations
     assert int(alone) <= 2 * (1 + DEFAULT.copies) < int(crowd)
-    with pytest.raises(ValueError, match="expected `hypotheses` of 0 or more, got -1"):
+    with pytest.raises(ValueError, match="`hypotheses` is -1; it must be 0 or more"):
         Refinement(hypotheses=-1)
 
 

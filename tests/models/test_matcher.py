@@ -72,5 +72,5 @@ def test_learns_the_partners_and_the_clutter_of_one_pair() -> None:
 def test_says_what_is_wrong_with_its_options() -> None:
     with pytest.raises(ValueError, match=r"`channels` 30 is no multiple of `heads` 4"):
         Attention(30, 4)
-    with pytest.raises(ValueError, match=r"expected `mu` > 0, got 0"):
+    with pytest.raises(ValueError, match=r"`mu` is 0.0; it must be above 0"):
         Matcher(mu=0.0)

@@ -54,9 +54,9 @@ def test_problems_without_a_pose_are_infinite_and_leave_the_rest_alone() -> None
 
 
 def test_numbers_that_are_not_there_are_an_error() -> None:
-    with pytest.raises(ValueError, match="got 2 with 1 NaN"):
+    with pytest.raises(ValueError, match="there are 2, of which 1 are NaN"):
         bootstrap(np.array([1.0, np.nan]))
-    with pytest.raises(ValueError, match="the same problems, got 2 and 3"):
+    with pytest.raises(ValueError, match="the same problems; there are 2 and 3"):
         paired_difference(np.ones(2), np.ones(3))
 
 

@@ -65,7 +65,7 @@ def test_three_points_are_enough_with_gravity() -> None:
     prior = GravityPrior(rotation @ UP, UP, 0.5)
     solution = solve(pixels(points, rotation, translation), points, CAMERA, prior=prior)
     assert min(degrees_between(candidate.rotation, rotation) for candidate in solution.candidates) < 1
-    with pytest.raises(ValueError, match="expected 4 or more points in `points2d`, got 3"):
+    with pytest.raises(ValueError, match="`points2d` has 3 points; at least 4 are needed"):
         solve(pixels(points, rotation, translation), points, CAMERA)
 
 

@@ -58,7 +58,7 @@ def test_a_view_of_unknown_place_sees_the_points_where_and_as_large_as_the_image
 def test_a_network_for_views_without_a_view_says_what_it_expects(place: str) -> None:
     planted = plant(1, 30)
     net: Any = Matcher(channels=16, depth=1, heads=2, neighbours=3, frame="view").eval()
-    with pytest.raises(ValueError, match=r"expected a view near .* try prior=PosePrior"):
+    with pytest.raises(ValueError, match=r"a view near the photo, and there is no `prior`; give prior=PosePrior"):
         solve(planted.points2d[0], planted.points3d[0], **{place: net})
 
 

@@ -70,7 +70,7 @@ def test_functions_that_moved_to_the_report_warn(name: str, successor: str) -> N
 
 def test_a_solution_without_a_pose_cannot_be_exported(tmp_path: Path) -> None:
     problem = problem_from(np.random.default_rng(0).normal(size=(8, 2)), EXAMPLE.points3d, None)
-    with pytest.raises(ValueError, match="expected a solution with a pose to export, got none: a reason"):
+    with pytest.raises(ValueError, match="a solution without a pose cannot be exported: a reason"):
         without_pose(problem, "a reason", None).to_colmap(tmp_path / "model")
     assert not (tmp_path / "model").exists()
 
@@ -85,10 +85,13 @@ def test_the_file_of_a_solution_is_drawn_and_broken_ones_are_named(
     (tmp_path / "pictures").mkdir()
     content = json.loads(path.read_text())
     for text, message in (
-        ("", "expected the JSON of a solution in"),
+        ("", "castle.json: this is not the JSON of a solution:"),
         ('{"images": []}', "the pictures of `bpnp localize` are in"),
-        (json.dumps(content | {"points2d": [[1, 2, 3]]}), "expected the JSON of a solution in"),
-        (json.dumps(content | {"matches": [[0, 999]]}), "expected `matches` of 200 2D and 200 3D points"),
+        (json.dumps(content | {"points2d": [[1, 2, 3]]}), "castle.json: this is not the JSON of a solution:"),
+        (
+            json.dumps(content | {"matches": [[0, 999]]}),
+            "`matches` has indices up to [0, 999], but there are 200 2D and 200 3D points",
+        ),
     ):
         path.write_text(text)
         with pytest.raises(SystemExit):

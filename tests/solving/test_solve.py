@@ -212,7 +212,7 @@ def test_errors_are_as_large_as_the_solution_says() -> None:
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": 2}', "\0"])
 def test_what_is_no_solution_is_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="expected the JSON of a solution"):
+    with pytest.raises(ValueError, match="not the JSON of a solution"):
         Solution.from_json(text)
 
 

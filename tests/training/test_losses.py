@@ -153,7 +153,7 @@ def test_says_what_is_missing() -> None:
         matching_losses(
             Prediction(plant(1, 6).permutation()), replace(batch, match3d=None), kind="correspondence", angle=None
         )
-    with pytest.raises(ValueError, match="with matching_loss correspondence, got likelihood"):
+    with pytest.raises(ValueError, match="for the matching loss correspondence, not for likelihood"):
         BlindPnPTask(matching_loss="likelihood", correspondence_angle=0.1)
 
 

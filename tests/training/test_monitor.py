@@ -82,5 +82,5 @@ def test_a_training_logs_what_is_watched(tmp_path: Path) -> None:
     assert mass == pytest.approx([0.25] * 3)
     assert {float(row["val/pnp_iterations"]) for row in rows if row["val/pnp_iterations"]} == {7}
     assert watched_values(Prediction(), planted(5)) == {}
-    with pytest.raises(ValueError, match="expected `problems`"):
+    with pytest.raises(ValueError, match="`problems` is .*; it must be"):
         TrainingMonitor(problems=0)

@@ -274,7 +274,7 @@ def test_problems_that_are_numbered_within_their_batch_are_all_counted(tmp_path:
         (
             lambda batch: Prediction(poses={"a": posed(batch.rotation, batch.translation)}),
             "a",
-            r"as a tuple of names, got 'a'; try \('a',\)",
+            r"`estimates` of the solver is 'a'; it is a tuple of names: \('a',\)",
         ),
         (
             lambda batch: Prediction(poses={"a": posed(batch.rotation[:1], batch.translation[:1])}),

@@ -78,7 +78,7 @@ class MapOptions:
             raise ValueError(f"`frame` is {self.frame!r}; it is one of {', '.join(get_args(Frame))}")
         weights = list(self.kinds.values())
         if not set(self.kinds) <= set(KINDS) or not all(weight >= 0 for weight in weights) or not any(weights):
-            raise ValueError(f"expected `kinds` as weights of {', '.join(KINDS)}, got {dict(self.kinds)}")
+            raise ValueError(f"`kinds` is {dict(self.kinds)}; it needs weights of {', '.join(KINDS)}")
 
 
 def draw_map_problem(name: str, options: MapOptions, rng: np.random.Generator) -> Problem:

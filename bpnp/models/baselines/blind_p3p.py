@@ -45,7 +45,9 @@ class RandomRansac(SingleSolver):
         if time_limit is None and max_hypotheses is None:
             raise ValueError("`time_limit` and `max_hypotheses` are both null; set one of them, such as time_limit 30")
         if not 0 < confidence <= 1 or not threshold > 0:
-            raise ValueError(f"expected `threshold` > 0, `confidence` in (0, 1], got {threshold} and {confidence}")
+            raise ValueError(
+                f"`threshold` is {threshold} and `confidence` {confidence}; both must be above 0, `confidence` up to 1"
+            )
         self.threshold, self.confidence, self.seed = threshold, confidence, seed
         self.max_hypotheses = math.inf if max_hypotheses is None else max_hypotheses
 
