@@ -18,11 +18,11 @@ from record import Problem, parser
 from scipy.spatial.transform import Rotation
 
 from bpnp.poses import Tolerance
+from bpnp.search.config import DEFAULT
 from bpnp.search.evidence.repetitions import competing_poses, registered
 from bpnp.search.pool import Pool
 from bpnp.search.scene import Scene
 from bpnp.search.schedule import Plan
-from bpnp.search.settings import DEFAULT
 from bpnp.search.verdict import no_pose, starts_met
 from bpnp.solving.inputs import problem_from
 

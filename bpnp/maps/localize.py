@@ -15,14 +15,13 @@ from bpnp.maps.views import Cones, View
 from bpnp.poses import MIN_POINTS
 from bpnp.search.annealing import finish, polished
 from bpnp.search.competitors import other_lens, settle
+from bpnp.search.config import DEFAULT, Evidence
 from bpnp.search.evidence import reasons
 from bpnp.search.evidence.alternatives import Alternative, fits_as_well
-from bpnp.search.evidence.settings import Evidence
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
 from bpnp.search.problem import Problem, UnknownFocal, faces
 from bpnp.search.raster_search import search_beside
 from bpnp.search.scene import Scene
-from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import judged
 from bpnp.solving.arguments import checked_prior

@@ -50,7 +50,7 @@ from bpnp.maps.views import (
     viewing_cones,
 )
 from bpnp.poses import MIN_POINTS
-from bpnp.search.settings import SearchSettings
+from bpnp.search.config import SearchSettings
 from bpnp.solving.arguments import (
     PriorLike,
     check_inside,

@@ -17,6 +17,7 @@ from bpnp.maps.localize import Photo, Region, in_picture, problem_near
 from bpnp.maps.views import Array
 from bpnp.poses import same_pose, turned_by
 from bpnp.search.annealing import finish, polished
+from bpnp.search.config import DEFAULT, Draws, Narrowing, RasterSearch, RasterShape, Screens
 from bpnp.search.evidence.reasons import number
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
@@ -24,7 +25,6 @@ from bpnp.search.kernels.raster import Raster
 from bpnp.search.problem import Problem
 from bpnp.search.raster_search import search_beside, search_near
 from bpnp.search.scene import Scene
-from bpnp.search.settings import DEFAULT, Draws, Narrowing, RasterSearch, RasterShape, Screens
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import weighed
 from bpnp.solving.matches import count_one_to_one

@@ -8,8 +8,8 @@ from bpnp.maps.localize import Photo, points_in_view, problem_near, with_ids
 from bpnp.maps.twins import best_rival
 from bpnp.maps.views import Cones, View
 from bpnp.poses import MIN_POINTS
+from bpnp.search.config import DEFAULT
 from bpnp.search.evidence import reasons
-from bpnp.search.settings import DEFAULT
 from bpnp.solving.solution import Solution
 from bpnp.solving.verify import verify_problem
 

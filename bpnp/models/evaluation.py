@@ -21,11 +21,11 @@ from bpnp.checks import check_positive, check_within
 from bpnp.geometry import bearings, choose, chords
 from bpnp.loops.parallel import Deadline
 from bpnp.robust.proposals import pose_hypotheses
+from bpnp.search.config import DEFAULT, SearchSettings
 from bpnp.search.problem import Problem
 from bpnp.search.propose.given import anneal_given
 from bpnp.search.scene import Scene, degenerate
 from bpnp.search.search import search_poses
-from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.verdict import SearchResult, judged, no_pose
 from bpnp.types import Batch, Pose, Prediction, SolveStats
 

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bpnp.loops.parallel import in_time, thread_count
+from bpnp.search.config import Stages
 from bpnp.search.hypotheses import Hypotheses, select_distinct, to_problem_frame
 from bpnp.search.kernels.dense import dense_scratch, descend
 from bpnp.search.kernels.sparse import descend_sparse, sparse_scratch
 from bpnp.search.scene import Scene, Sides
-from bpnp.search.settings import Stages
 from bpnp.search.starts import Array, Prior, draw_poses
 
 

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.search.annealing import polished
+from bpnp.search.config import Evidence, OtherFocal
 from bpnp.search.evidence import reasons
 from bpnp.search.evidence.alternatives import Alternative, of_misfit
 from bpnp.search.evidence.false_alarms import alarms_of
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
-from bpnp.search.evidence.settings import Evidence, OtherFocal
 from bpnp.search.evidence.uncertainty import bends_significantly, linearised, misfit_of
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
 from bpnp.search.pose_model import undistort

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.evidence.settings import ImageSettings
+from bpnp.search.config import ImageSettings
 from bpnp.search.kernels.neighbours import sums_near
 
 Array = NDArray[np.float64]

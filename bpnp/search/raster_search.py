@@ -25,10 +25,10 @@ from scipy.ndimage import gaussian_filter
 
 from bpnp.loops.parallel import in_time
 from bpnp.search.annealing import anneal_on_points, turned_about_middle
+from bpnp.search.config import RasterSearch, RasterShape
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.kernels.raster import Raster, add_up
 from bpnp.search.scene import Scene
-from bpnp.search.settings import RasterSearch, RasterShape
 from bpnp.search.starts import PosePrior, Prior, aim_of, draw_poses
 
 WIDE = 5.0  # standard deviations beyond which a smoothing kernel is 0

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.loops.parallel import NEVER, Deadline
 from bpnp.poses import MIN_POINTS
+from bpnp.search.config import RasterShape, SearchSettings
 from bpnp.search.kernels.raster import Raster
 from bpnp.search.kernels.sides import (
     FORWARD,
@@ -22,7 +23,6 @@ from bpnp.search.kernels.sides import (
 )
 from bpnp.search.kernels.sparse import Tiles, build_tiles
 from bpnp.search.problem import Problem, in_bulk
-from bpnp.search.settings import RasterShape, SearchSettings
 from bpnp.search.starts import Array, GravityPrior, Prior, turned_to
 
 Sides = tuple[WeightedBearings, WeightedPoints]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
 from bpnp.search.annealing import run_batch
 from bpnp.search.competitors import SceneOf, settle
+from bpnp.search.config import DEFAULT, SearchSettings
 from bpnp.search.enumeration.plan import EnumeratedPoses, EnumerationPlan
 from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
 from bpnp.search.hypotheses import Hypotheses
@@ -29,7 +30,6 @@ from bpnp.search.propose.symmetries import self_motions
 from bpnp.search.raster_search import looked_up
 from bpnp.search.scene import Scene, degenerate
 from bpnp.search.schedule import Plan, Proposals
-from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.starts import Prior
 from bpnp.search.verdict import SearchResult, judged, no_pose
 

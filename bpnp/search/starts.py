@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.search.settings import Recipe
+from bpnp.search.config import Recipe
 
 Array = NDArray[np.float32]
 ALL_AROUND = 0.95  # RMS angular radius above which bearings fill about 220 degrees or more

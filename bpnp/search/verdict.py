@@ -18,16 +18,15 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.search.config import DEFAULT, Evidence
 from bpnp.search.evidence import reasons
 from bpnp.search.evidence.alternatives import Seen, contesting, log10_missed, misfit, other_pose, rougher
 from bpnp.search.evidence.false_alarms import alarms_of
 from bpnp.search.evidence.repetitions import registered
-from bpnp.search.evidence.settings import Evidence
 from bpnp.search.evidence.uncertainty import focal_bound, is_redundant, linearised, rotation_bound
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem
 from bpnp.search.propose.symmetries import Motions
-from bpnp.search.settings import DEFAULT
 
 Verdict = Literal["confident", "ambiguous", "failed"]
 HALF_TURN = 180.0  # degrees; a larger bound does not constrain a rotation

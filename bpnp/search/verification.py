@@ -19,12 +19,12 @@ from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
 from bpnp.poses import turned_by
 from bpnp.search.annealing import anneal_on_points, finish, polished
 from bpnp.search.competitors import settle
+from bpnp.search.config import DEFAULT, Evidence
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.evidence import reasons
 from bpnp.search.evidence.false_alarms import likeliest_scale
 from bpnp.search.evidence.partners import explained
 from bpnp.search.evidence.repetitions import competing_poses, registered
-from bpnp.search.evidence.settings import Evidence
 from bpnp.search.evidence.uncertainty import linearised, local_covariance
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.pose_model import log10_tests
@@ -32,7 +32,6 @@ from bpnp.search.problem import SIGMAS, Problem, in_bulk
 from bpnp.search.propose.symmetries import mirror_pose
 from bpnp.search.raster_search import around_each
 from bpnp.search.scene import Scene
-from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import SearchResult, judged, with_false_alarms
 

@@ -27,15 +27,15 @@ from bpnp.cameras import (
 from bpnp.loops.parallel import Clock, one_blas_thread
 from bpnp.poses import same_pose, turned_by
 from bpnp.search.annealing import polished
+from bpnp.search.config import DEFAULT as SEARCH
+from bpnp.search.config import OtherFocal
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.evidence.reasons import number
-from bpnp.search.evidence.settings import OtherFocal
 from bpnp.search.evidence.uncertainty import POSE, is_within
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.propose.lens import fit_lens
 from bpnp.search.scene import Scene
-from bpnp.search.settings import DEFAULT as SEARCH
 from bpnp.search.verdict import match_count, weighed
 from bpnp.solving.arguments import Array, checked_size
 from bpnp.solving.solution import Solution

@@ -10,10 +10,10 @@ from torch import Tensor, nn
 
 from bpnp.loops.parallel import Deadline
 from bpnp.search.competitors import settle
+from bpnp.search.config import DEFAULT
 from bpnp.search.problem import Problem
 from bpnp.search.propose.given import score_given
 from bpnp.search.scene import Scene
-from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import SearchResult, judged, no_pose
 from bpnp.solving.arguments import Array

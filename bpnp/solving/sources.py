@@ -7,13 +7,13 @@ from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 from bpnp.loops.parallel import Clock, Deadline
+from bpnp.search.config import DEFAULT, SearchSettings
 from bpnp.search.enumeration.search import exceeds_enumeration
 from bpnp.search.evidence import reasons
 from bpnp.search.problem import Problem
 from bpnp.search.propose.mirror import mirrored_alarms
 from bpnp.search.schedule import Proposals
 from bpnp.search.search import search_poses
-from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.starts import PosePrior
 from bpnp.solving.arguments import Array
 from bpnp.solving.matches import finished, without_pose

@@ -10,7 +10,7 @@ from bpnp.metrics import rotation_error
 from bpnp.models import Refinement
 from bpnp.models.nets import PointFeatures
 from bpnp.report.results import rows_from
-from bpnp.search.settings import DEFAULT
+from bpnp.search.config import DEFAULT
 from bpnp.training.losses import correspondence_loss, pose_terms
 
 

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from bpnp.metrics import rotation_error
 from bpnp.models import Search
 from bpnp.models.evaluation import best_poses
+from bpnp.search.config import DEFAULT, Schedule, SearchSettings
 from bpnp.search.problem import Problem
 from bpnp.search.search import search_poses
-from bpnp.search.settings import DEFAULT, Schedule, SearchSettings
 from bpnp.search.starts import PosePrior
 
 pytestmark = pytest.mark.slow

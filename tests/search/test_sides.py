@@ -6,9 +6,9 @@ from numpy.typing import NDArray
 from planted import degrees_between, directions, seen
 from scipy.spatial.transform import Rotation
 
+from bpnp.search.config import DEFAULT
 from bpnp.search.problem import Problem, faces
 from bpnp.search.search import search_poses
-from bpnp.search.settings import DEFAULT
 
 Array = NDArray[np.float64]
 TRANSLATION = np.array([0.1, -0.1, 5.0])

@@ -14,10 +14,10 @@ from scipy.special import stdtrit
 
 from bpnp.loops.parallel import NEVER, Deadline
 from bpnp.search.competitors import AtZoom, likeliest_zoom, other_lens
+from bpnp.search.config import DEFAULT
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.scene import Scene
-from bpnp.search.settings import DEFAULT
 from bpnp.search.verdict import SearchResult, judged
 
 Array = NDArray[np.float64]

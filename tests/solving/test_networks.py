@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp import GravityPrior, PosePrior, solve, solve_many
 from bpnp.models import Matcher
-from bpnp.search.settings import DEFAULT
+from bpnp.search.config import DEFAULT
 from bpnp.solving import networks
 from bpnp.solving.inputs import problem_from
 from bpnp.solving.sources import Options, solutions_of

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 import bpnp
 from bpnp import GravityPrior, PosePrior, Solution, solve
 from bpnp.cli import main
-from bpnp.search.settings import DEFAULT
+from bpnp.search.config import DEFAULT
 from bpnp.solving.arguments import checked_prior, scene_points
 from bpnp.solving.sources import Options
 

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bpnp.loops.vectors import rotated, turn
+from bpnp.search.config import RULES
 from bpnp.search.enumeration.points import Array, Heading, ImageArrays, Places, PriorArrays, SceneArrays
-from bpnp.search.enumeration.settings import RULES
 from bpnp.search.kernels.dense import solve_normal_equations
 from bpnp.search.propose.minimal_solvers import part
 

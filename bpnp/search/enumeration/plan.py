@@ -13,15 +13,14 @@ import numpy as np
 
 from bpnp.loops.parallel import Deadline
 from bpnp.search.competitors import SceneOf, settle
+from bpnp.search.config import ENUMERATION, SearchSettings
 from bpnp.search.enumeration.points import predicted_pose
 from bpnp.search.enumeration.search import Enumeration, margin
-from bpnp.search.enumeration.settings import DEFAULT
 from bpnp.search.evidence.partners import explained
 from bpnp.search.evidence.repetitions import competing_poses, registered
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.loop import Step
 from bpnp.search.problem import Problem
-from bpnp.search.settings import SearchSettings
 from bpnp.search.starts import GravityPrior
 from bpnp.search.verdict import REFINED, SearchResult, is_certain, judged, weighed, with_false_alarms
 
@@ -56,7 +55,7 @@ class EnumeratedPoses:
 
     def begin(self, problem: Problem, *, predicted_only: bool = False) -> None:
         """Begin an enumeration of a problem; with `predicted_only` of the predicted pose alone."""
-        settings = replace(DEFAULT, stages=()) if predicted_only else DEFAULT
+        settings = replace(ENUMERATION, stages=()) if predicted_only else ENUMERATION
         self.run = Enumeration(problem, problem.match_radius, settings)
         self._leaders: list[Hypotheses] = []  # poses (1,) whose competing poses were proposed
 
@@ -122,7 +121,7 @@ class EnumeratedPoses:
         poses = self.found
         if poses.evidence is None or not len(poses):
             return poses
-        poses = poses[poses.evidence >= poses.evidence.max() - DEFAULT.near_nats][: self.settings.kept]
+        poses = poses[poses.evidence >= poses.evidence.max() - ENUMERATION.near_nats][: self.settings.kept]
         scale = np.maximum(poses.scale, self.problem.floor or SMALLEST)
         each = zip(poses.rotation, poses.translation, scale, strict=True)
         likelihood = np.array([explained(self.problem, *one)[0] for one in each])

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.search.enumeration.settings import RULES, EnumerationSettings
+from bpnp.search.config import RULES, EnumerationSettings
 from bpnp.search.problem import Problem
 from bpnp.search.propose.minimal_solvers import Triangles, triangles_of
 from bpnp.search.starts import GravityPrior, PosePrior, Prior, turned_to

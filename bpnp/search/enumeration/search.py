@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from bpnp.loops.parallel import Clock
+from bpnp.search.config import ENUMERATION, RULES, EnumerationSettings, Stage
 from bpnp.search.enumeration.hypotheses import Block, Kept, Work, explore
 from bpnp.search.enumeration.matching import EnumerationTables, Matches
 from bpnp.search.enumeration.points import (
@@ -23,7 +24,6 @@ from bpnp.search.enumeration.points import (
     scene_side,
     sets_within,
 )
-from bpnp.search.enumeration.settings import DEFAULT, RULES, EnumerationSettings, Stage
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem
 from bpnp.search.starts import PosePrior
@@ -72,7 +72,7 @@ class Enumeration:
         work: Buffers of the compiled loops.
     """
 
-    def __init__(self, problem: Problem, radius: float, settings: EnumerationSettings = DEFAULT) -> None:
+    def __init__(self, problem: Problem, radius: float, settings: EnumerationSettings = ENUMERATION) -> None:
         scene = scene_side(problem.points3d, problem.normals3d, problem.labels3d)
         self.reach = _reach(problem, radius, settings)
         image = ImageSide(problem.bearings, radius, problem.labels2d, self.reach)
@@ -265,7 +265,7 @@ def enumerate_poses(
     radius: float | None = None,
     deadline: float = math.inf,
     to_the_end: bool = False,
-    settings: EnumerationSettings = DEFAULT,
+    settings: EnumerationSettings = ENUMERATION,
 ) -> Enumerated:
     """Enumerate poses under which image points see scene points, one-to-one within a radius.
 
@@ -333,7 +333,7 @@ def _log_choose(n: int, k: int) -> float:
 def is_enumerable(problem: Problem) -> bool:
     """Return whether the points are few enough to be enumerated."""
     products = len(problem.bearings) * len(problem.points3d)
-    return products <= (DEFAULT.most_products if problem.fixing_matches == 3 else DEFAULT.most_products_known)
+    return products <= (ENUMERATION.most_products if problem.fixing_matches == 3 else ENUMERATION.most_products_known)
 
 
 def exceeds_enumeration(problem: Problem) -> bool:

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bpnp.poses import turned_by
+from bpnp.search.config import Evidence
 from bpnp.search.evidence import reasons
 from bpnp.search.evidence.false_alarms import directions_of, own_evidence
-from bpnp.search.evidence.settings import Evidence
 from bpnp.search.evidence.uncertainty import Linearised, Misfit, systematic_misfit
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, label_groups

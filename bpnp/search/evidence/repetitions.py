@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
+from bpnp.search.config import Evidence, Repetitions
 from bpnp.search.evidence.false_alarms import SHARES, alarms_of, directions_of, point_evidence
-from bpnp.search.evidence.settings import Evidence, Repetitions
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem
 from bpnp.search.propose.symmetries import Motions, matching_tolerance, mirror_pose, self_motions

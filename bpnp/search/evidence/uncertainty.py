@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc, fdtri
 
 from bpnp.poses import turned_by
+from bpnp.search.config import DEFAULT, Evidence
 from bpnp.search.evidence.covariance import Linearisation, covariance_of, student_factor
-from bpnp.search.evidence.settings import Evidence
 from bpnp.search.pose_model import PoseModel, PoseState, Sight, centre_columns, crossed, lens_columns
 from bpnp.search.problem import Problem
 from bpnp.search.propose.lens import LensFit, fit_lens
 from bpnp.search.refine.gauss_newton import soft_matches
-from bpnp.search.settings import DEFAULT
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]

@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 from scipy.special import betaln
 
 from bpnp.loops.parallel import NEVER, Deadline
+from bpnp.search.config import DEFAULT as SEARCH
 from bpnp.search.evidence import reasons
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.infinity.evidence import (
@@ -48,7 +49,6 @@ from bpnp.search.infinity.kernels import (
 from bpnp.search.kernels.neighbours import hashed
 from bpnp.search.loop import Step, run
 from bpnp.search.pose_model import FIXING_ROTATION
-from bpnp.search.settings import DEFAULT as SEARCH
 from bpnp.search.verdict import SearchResult, no_pose
 
 BINS = (6, 7)  # log2 of the smallest and largest number of azimuth bins

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.loops.vectors import F, part
-from bpnp.search.settings import Facing, SearchSettings
+from bpnp.search.config import Facing, SearchSettings
 
 Array = NDArray[np.float32]
 FORWARD = np.array([0.0, 0.0, 1.0])

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bpnp.search.config import OtherFocal
 from bpnp.search.evidence.partners import facing, partners
-from bpnp.search.evidence.settings import OtherFocal
 from bpnp.search.pose_model import LEAST_SLOPE, across
 from bpnp.search.problem import Problem
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from bpnp.loops.parallel import Deadline
+from bpnp.search.config import ENUMERATION
 from bpnp.search.enumeration.search import enumerate_poses, is_enumerable
-from bpnp.search.enumeration.settings import DEFAULT
 from bpnp.search.evidence.false_alarms import alarms_of
 from bpnp.search.problem import Problem
 
@@ -35,7 +35,7 @@ def mirrored_alarms(problem: Problem, deadline: Deadline) -> float:
         return np.inf
     normals = None if problem.normals3d is None or problem.cosines3d is not None else problem.normals3d * MIRROR
     mirrored = replace(problem, points3d=problem.points3d * MIRROR, normals3d=normals, cosines3d=None)
-    found = enumerate_poses(mirrored, deadline=deadline.at, settings=replace(DEFAULT, most=HYPOTHESES)).poses
+    found = enumerate_poses(mirrored, deadline=deadline.at, settings=replace(ENUMERATION, most=HYPOTHESES)).poses
     if not len(found):
         return np.inf
     return float(alarms_of(mirrored, found.rotation[:1], found.translation[:1]).own[0])

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from bpnp.loops.parallel import NEVER, Clock, Deadline, one_blas_thread
 from bpnp.poses import distinct, seen_from
+from bpnp.search.config import DEFAULT, ENUMERATION
 from bpnp.search.enumeration.search import enumerate_poses, is_enumerable
-from bpnp.search.enumeration.settings import DEFAULT as ENUMERATION
 from bpnp.search.evidence.repetitions import repeated_poses
 from bpnp.search.evidence.uncertainty import share_bound
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame, to_scene_frame
@@ -28,7 +28,6 @@ from bpnp.search.rig.cameras import WIDE, Array, Pose, Rig
 from bpnp.search.scene import Scene
 from bpnp.search.schedule import Plan
 from bpnp.search.search import lacks_partners
-from bpnp.search.settings import DEFAULT
 from bpnp.search.verdict import SearchResult, judged, missed, no_pose
 
 PROPOSING = replace(ENUMERATION, kept=4000)  # number of poses that a camera with few points proposes

@@ -1,12 +1,263 @@
-"""Constants of the search, with unit and reason.
+"""Constants of the search, of the enumeration and of the verdict: meaning, unit and the reason for each value.
 
-The constants of the evidence are in `bpnp.search.evidence.settings`.
+They were chosen on the calibration set of docs/verdict.md. The tables of docs/results.md were measured on other scenes
+and seeds. Constants that only bound a numerical error, such as the step of a difference, stand beside their algorithm.
 """
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
-from bpnp.search.evidence.settings import Evidence
+from bpnp.poses import SAME, Tolerance
+
+
+@dataclass(frozen=True)
+class ImageSettings:
+    """Statistics of the image points (`bpnp.search.image_statistics`).
+
+    Attributes:
+        scale_step: Factor from one scale of the residuals to the next.
+        coarsest: Largest scale, in spacings sqrt(A / m) of the points; beyond it only the outline fits.
+        floor: Smallest scale, in RMS angular radii of the bearings: some hundredths of a pixel of an ordinary camera.
+        together: Distance, in scales, below which points count as one observation.
+        crowded: Standard deviations above the count of an even spread from which neighbours form a clump.
+        most: Largest number of image points that are used, evenly spaced among the given ones.
+    """
+
+    scale_step: float = 2.0
+    coarsest: float = 0.5
+    floor: float = 2e-4
+    together: float = 2.0
+    crowded: float = 2.0
+    most: int = 2000
+
+
+@dataclass(frozen=True)
+class Contested:
+    """Conditions under which a far pose competes with the best one (`bpnp.search.evidence.alternatives.contesting`).
+
+    Attributes:
+        near: Distance, in scales of the residuals, within which an image point has a match and two matches coincide.
+        far: Smallest distance, in multiples of `Evidence.same`; nearer poses slide along the same lines and surfaces.
+        most: Largest evidence of an image point, nats: that of a match among 100 scene points at the finest scale.
+        alone: A pose is no repetition of the best one from this ratio on: points that only it explains, over points
+            that only the best one explains.
+        same: Fraction of the matches of a pose that coincide with those of the best one; from it on, they agree.
+    """
+
+    near: float = 3.0
+    far: float = 5.0
+    most: float = 13.0
+    alone: float = 0.5
+    same: float = 0.5
+
+
+@dataclass(frozen=True)
+class Repetitions:
+    """Motions that map a scene onto itself (`bpnp.search.evidence.repetitions`).
+
+    Attributes:
+        near: Distance, in scales of the residuals, within which an image point has a match.
+        fewest: Smallest number of matched points; with fewer, the three that fix a pose are too large a part.
+        share: Smallest fraction of the matched points that a motion maps.
+        share_of_scene: Smallest fraction of all points that a motion of a whole scene maps.
+        symmetric: Fraction of the matched points from which a motion could by itself explain a better pose.
+        whole: Largest number of points of a scene that is registered as a whole, once for all problems of it.
+        bases_of_scene: Number of bases of that registration. A motion of a third of the points is missed by at most
+            (1 - 1/27)^128 = 0.8 % of the registrations.
+        around: Number of points nearest to the matched ones that these are registered with, in a larger scene.
+        many: Number of points up to which such a registration has `bases` bases; with more, `fewer_bases`.
+        bases: Number of bases with few points.
+        fewer_bases: Number of bases with many points. A motion of nine tenths of the matches is missed by
+            (1 - 0.9^3)^8 = 3e-5 of the registrations.
+        kept: Largest number of competing poses; those with the fewest false alarms are kept.
+        most_missing: Largest fraction of its points that a map may lack.
+    """
+
+    near: float = 3.0
+    fewest: int = 6
+    share: float = 0.3
+    share_of_scene: float = 0.2
+    symmetric: float = 0.5
+    whole: int = 64
+    bases_of_scene: int = 128
+    around: int = 4096
+    many: int = 500
+    bases: int = 16
+    fewer_bases: int = 8
+    kept: int = 6
+    most_missing: float = 1 / 3
+
+
+@dataclass(frozen=True)
+class OtherFocal:
+    """Search for another focal length near a confident pose (`bpnp.search.competitors`).
+
+    Attributes:
+        step: Factor from one focal length to the next.
+        widest: Largest factor on the given focal length; its inverse is the smallest.
+        bearings: Largest number of bearings that most steps are fitted to.
+        fewest: Smallest number of matches; a seventh unknown explains too much of fewer.
+        bend: Largest radial distortion, as a fraction of the distance of the outermost image point from the axis.
+        bend_deg: Rotation, degrees, from which poses with radial distortion are different.
+        bend_shift: Shift, in distances of the scene, from which poses with radial distortion are different.
+    """
+
+    step: float = 1.08
+    widest: float = 1.6
+    bearings: int = 400
+    fewest: int = 24
+    bend: float = 0.5
+    bend_deg: float = 1.0
+    bend_shift: float = 0.02
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Conditions of a confident pose (`bpnp.search.verdict`). Logarithms have base 10.
+
+    Attributes:
+        false_alarms: Largest log of the number of false alarms (NFA). The NFA is an upper bound: on unrelated points,
+            an exhaustive search stayed above 1 in 999 of 1000 cases and never fell below 0.1.
+        lead: Smallest margin to every competing pose; by chance a wrong pose has it once in a thousand cases.
+        same: Tolerance within which two poses are the same.
+        missed: Largest log of the miss probability of a better optimum (`bpnp.search.evidence.alternatives`).
+        independent: Number of matches that must be coincidences for a better optimum to exist, as many as fix a pose.
+        another: Probability of a better optimum although several initial poses ended at a significant one.
+        uncompared: Probability that a better pose of a symmetric scene is not among those of its motions.
+        look_fails: Probability that a local search around a wrong pose misses a better one near it: 40 of 922 did.
+        again_fails: Probability that a further local search misses it as well: 8 of 29 did.
+        focal_chance: Significance level of a test for another focal length. With 0.001, cameras with a focal length
+            off by a tenth are accepted 1.5 times as often.
+        contested: Constants of the competing far poses.
+        repetitions: Constants of the competing poses of a repeated structure.
+        zoomed: Constants of the competing focal lengths.
+        focal: Largest 99.9 % bound of a fitted focal length, as a fraction. The distance has the same error, and from
+            `same.shift` on the pose is a different one.
+        focal_few: Bound as `focal` for an object: a scene of at most `Repetitions.whole` points that is no map, such
+            as LEDs. Its rotation is correct long before its distance. The reason gives the bound.
+        scale: Largest 99.9 % bound of the scale of a rig's scene, as a fraction.
+    """
+
+    false_alarms: float = -2.0
+    lead: float = 3.0
+    same: Tolerance = SAME
+    missed: float = -3.0
+    independent: int = 3
+    another: float = 0.01
+    uncompared: float = 1e-3
+    look_fails: float = 1 / 20
+    again_fails: float = 1 / 3
+    focal_chance: float = 0.01
+    contested: Contested = Contested()
+    repetitions: Repetitions = Repetitions()
+    zoomed: OtherFocal = OtherFocal()
+    focal: float = 0.05
+    focal_few: float = 1.0
+    scale: float = 0.2
+
+
+class Stage(NamedTuple):
+    """Block of hypotheses: the `near2d` nearest of an image point with the `near3d` nearest of a scene point.
+
+    Attributes:
+        matches: Matches of a hypothesis: 3, or 2 where a prior lets two matches fix a pose.
+        near2d: Neighbours of an image point.
+        near3d: Neighbours of a scene point.
+        reach: Largest residual of a match before the pose is refined, in match radii.
+    """
+
+    matches: int
+    near2d: int
+    near3d: int
+    reach: float
+
+
+class Rules(NamedTuple):
+    """Constants of the compiled loops, compiled with them.
+
+    Attributes:
+        cells: Cells along a side of the grid of the image points.
+        matched_cosine: Smallest cosine between a normal and the line of sight at which a point can have a match.
+        expected_cosine: Smallest cosine at which a point with a normal is expected to be seen.
+        ladder: Number of radii 1, 1/2, 1/4 ... at which matches are counted.
+        missed: Nats subtracted for each expected but missing point; one in five is missed.
+        lacking: Matches subtracted from a hypothesis for each expected but missing point.
+        behind: Matches that a hypothesis may lack against the best one of its stage and still be refined.
+        skipped: Matches of the best pose from which its own triples are not solved again.
+        counted: Basin count of the best pose that this requires too.
+        tighter: Factor of the radius from one step of a refinement to the next.
+        final: Steps of a refinement at its last radius.
+        same_trace: Smallest trace of the rotation between two poses that are the same (`Tolerance`).
+        same_shift: Largest shift between them, as a fraction of the scene's distance.
+    """
+
+    cells: int = 48
+    matched_cosine: float = math.cos(math.radians(87.0))
+    expected_cosine: float = math.cos(math.radians(72.0))
+    ladder: int = 5
+    missed: float = 1.5
+    lacking: float = 0.25
+    behind: float = 1.0
+    skipped: int = 5
+    counted: int = 12
+    tighter: float = 0.55
+    final: int = 3
+    same_trace: float = 1 + 2 * math.cos(math.radians(SAME.degrees))
+    same_shift: float = SAME.shift
+
+
+@dataclass(frozen=True)
+class EnumerationSettings:
+    """Constants of the enumeration.
+
+    Attributes:
+        most_products: Largest number of image points times scene points that are enumerated: 60 x 60.
+        most_products_known: The limit where a prior lets two matches fix a pose.
+        stages: Blocks of hypotheses, in their order; those of two matches need a prior that lets two fix a pose.
+        kept: Distinct poses that are kept.
+        safe: Margin in nats, over chance and over any other pose, at which the search ends at once.
+        patience: Hypotheses after which the required margin has fallen linearly to 0. After twice as many the search
+            ends with any significant pose.
+        look: Hypotheses between checks of the best pose once it is significant.
+        chunk: Hypotheses between checks before.
+        most: Largest number of hypotheses.
+        widest: Largest radius within which points are matched to a predicted pose, in match radii.
+        near_nats: Evidence in nats by which a competing pose may be behind the best.
+        seen_witnesses: Preverification points that are seen, if the image points are spread evenly over the scene.
+        fewest_witnesses: Fewest preverification points of a hypothesis.
+        most_witnesses: Most preverification points of a hypothesis.
+        witness_chances: Expected chance matches of these points from which two, and three, matches are required.
+        sigmas: Standard deviations of a prior beyond which no pose is tried.
+        prior_weight: Match radii that weigh as much as one standard deviation of a prior. Noise is a tenth to a third
+            of a radius.
+    """
+
+    most_products: int = 4000
+    most_products_known: int = 250_000
+    stages: tuple[Stage, ...] = (
+        *(Stage(2, *near, 0.6) for near in ((5, 9), (9, 16), (63, 63))),
+        *(Stage(2, 63, 63, 2.0), Stage(3, 3, 5, 0.5), Stage(3, 4, 7, 0.5), Stage(3, 3, 5, 2.0)),
+        *(Stage(3, *near, reach) for near in ((5, 9), (8, 13), (24, 32), (63, 63)) for reach in (0.5, 2.0)),
+    )
+    kept: int = 16
+    safe: float = math.log(1e6)
+    patience: int = 25_000
+    look: int = 3_000
+    chunk: int = 20_000
+    most: int = 200_000
+    widest: float = 12.0
+    near_nats: float = 25.0
+    seen_witnesses: float = 3.0
+    fewest_witnesses: int = 10
+    most_witnesses: int = 32
+    witness_chances: tuple[float, float] = (0.05, 0.3)
+    sigmas: float = 4.0
+    prior_weight: float = 0.1
+
+
+RULES = Rules()
+ENUMERATION = EnumerationSettings()
 
 
 @dataclass(frozen=True)
