@@ -139,7 +139,7 @@ class PoseModel:
                 first += size
         return found
 
-    @property
+    @cached_property
     def size(self) -> int:
         """Number p of unknowns, the degrees of freedom."""
         return sum(columns.stop - columns.start for columns in self.columns.values())
@@ -208,8 +208,7 @@ class PoseModel:
                 by_point = by_point + _outwards(seen)[..., None] * (bend[..., None] * along)[..., None, :]
         columns = [self.by_pose(sight, by_point, k)]
         if self.lens is not None:
-            lens = _lens_columns(seen, reference, squared, radial)
-            columns.append(lens[..., : 1 + ("radial" in self.columns)])
+            columns.append(_lens_columns(seen, reference, squared, radial, bends="radial" in self.columns))
         if self.scale and self.mounts is not None:
             columns.append(by_point @ (-np.asarray(state.unit)[..., None] * self.mounts[k][1])[..., None, :, None])
         return np.concatenate(columns, -1) if len(columns) > 1 else columns[0]
@@ -225,7 +224,8 @@ class PoseModel:
         Returns:
             (..., n, d, 6), or (..., n, d, 3) of the rotation if the shift is given.
         """
-        columns = [np.cross(sight.turned[..., None, :], by_point)]
+        (x, y, z), (u, v, w) = (np.moveaxis(each, -1, 0) for each in (sight.turned[..., None, :], by_point))
+        columns = [np.stack([y * w - z * v, z * u - x * w, x * v - y * u], -1)]
         if self.moves:
             columns.append(by_point)
         if self.mounts is not None:
@@ -391,10 +391,11 @@ def _radii(seen: Array, radial: float) -> tuple[Array, Array]:
 
 def _outwards(seen: Array) -> Array:
     """Return the derivatives (..., 3) of directions (..., 3) by the logarithm of their distance from the axis."""
-    return np.asarray((across(seen) @ (seen * (1, 1, 0))[..., None])[..., 0])
+    flat = seen * (1, 1, 0)
+    return np.asarray(flat - seen * (flat * flat).sum(-1, keepdims=True))
 
 
-def _lens_columns(seen: Array, reference: float, squared: Array | None, radial: float) -> Array:
+def _lens_columns(seen: Array, reference: float, squared: Array | None, radial: float, *, bends: bool = True) -> Array:
     """Return the derivatives (..., 3, 2) of directions by log focal length and by radial coefficient.
 
     Args:
@@ -402,12 +403,17 @@ def _lens_columns(seen: Array, reference: float, squared: Array | None, radial: 
         reference: Radial coefficient k_0 with which the bearings were undistorted.
         squared: (...) |x|^2 of the points; None for |x'|^2 of the directions.
         radial: Radial coefficient k.
+        bends: Return the derivatives by the radial coefficient too; else (..., 3, 1).
     """
+    outwards = _outwards(seen)[..., None]
+    if not (bends or reference):
+        return outwards
     own, slope = _radii(seen, reference)
     squared = own if squared is None else squared
-    gain = (1 + reference * own) / slope
-    factors = np.stack([gain, gain * squared / (1 + radial * squared)], -1)
-    return np.asarray(_outwards(seen)[..., None] * factors[..., None, :])
+    by_focal = outwards * ((1 + reference * own) / slope)[..., None, None]
+    return np.concatenate([by_focal, by_focal * (squared / (1 + radial * squared))[..., None, None]], -1)[
+        ..., : 1 + bends
+    ]
 
 
 def log10_tests(problem: Problem) -> float:
