@@ -9,14 +9,14 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from bpnp.poses import SAME, distinct, seen_from
 from bpnp.search.evidence.partners import explained
 from bpnp.search.hypotheses import Hypotheses
-from bpnp.search.pose_model import across
+from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem
 from bpnp.search.propose.minimal_solvers import p3p_poses
+from bpnp.search.refine.gauss_newton import match_equations, refine
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
@@ -142,35 +142,21 @@ def _agreement(squared: Array, scales: Array, density: float) -> tuple[Array, La
     return evidence.max(1), evidence.argmax(1)
 
 
-def _refined(rays: Array, points: Array, poses: Array, weights: Array, steps: int = STEPS) -> Array:
-    """Return poses (h, 4, 3) after Levenberg-Marquardt steps on weighted residuals of unit rays (k, 3).
-
-    The step (w, s) of a pose is y -> exp([w]x) R p + t + s.
-    """
-    poses, damping = poses.copy(), np.full(len(poses), DAMPING)
-    cost = (weights * _squared(rays, points, poses)).sum(1)
-    for _ in range(steps if len(poses) else 0):
-        turned = points @ poses[:, :3].transpose(0, 2, 1)
-        camera = turned + poses[:, 3:]
-        length = np.maximum(np.linalg.norm(camera, axis=-1, keepdims=True), 1e-300)
-        seen = camera / length
-        by_shift = across(seen.reshape(-1, 3)).reshape(*seen.shape, 3) / length[..., None]
-        jacobian = np.concatenate([np.cross(turned[:, :, None], by_shift, axisb=3, axisc=3), by_shift], -1)
-        weighed = jacobian * weights[..., None, None]
-        products = np.einsum("hkai,hkaj->hij", weighed, jacobian)
-        gradient = np.einsum("hkai,hka->hi", weighed, rays - seen)
-        diagonal = np.einsum("hii->hi", products).copy()
-        diagonal = damping[:, None] * diagonal + 1e-12 * diagonal.max(1, keepdims=True) + 1e-300
-        step = np.linalg.solve(products + diagonal[..., None] * np.eye(6), gradient[..., None])[..., 0]
-        turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
-        trial = np.concatenate([turn @ poses[:, :3], poses[:, 3:] + step[:, None, 3:]], 1)
-        new = (weights * _squared(rays, points, trial)).sum(1)
-        if (np.abs(cost - new) <= SETTLED * cost + EXACT).all():
-            break
-        better = new < cost
-        poses[better], cost[better] = trial[better], new[better]
-        damping = np.where(better, damping / 10, damping * 10)
-    return poses
+def _refined(rays: Array, points: Array, poses: Array, weights: Array, most: int = STEPS) -> Array:
+    """Return poses (h, 4, 3) after Levenberg-Marquardt steps on weighted residuals of unit rays (k, 3)."""
+    if not len(poses):
+        return poses
+    model = PoseModel(np.zeros(3))
+    end = refine(
+        model,
+        model.state(poses[:, :3], poses[:, 3]),
+        match_equations(model, rays, points, weights),
+        [1.0] * most,
+        settled=lambda last: bool((np.abs(last.gain) <= SETTLED * last.before.cost + EXACT).all()),
+        damping=DAMPING,
+        adaptive=True,
+    )
+    return np.concatenate([end.state.rotation, end.state.centroid[:, None]], 1)
 
 
 def _scored(problem: Problem, i: Labels, j: Labels, rotation: Array, translation: Array, scales: Array) -> Hypotheses:
