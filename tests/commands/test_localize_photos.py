@@ -91,7 +91,7 @@ def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, 
     for given, message in (
         (("--camera", "PINHOLE,1"), "a PINHOLE camera has 4 parameters, not [1.0]"),
         (("--keypoints", "nothing.h5"), "--keypoints nothing.h5 does not exist; give"),
-        (("--solver", "nothing"), "or packaged weights"),
+        (("--solver", "nothing"), "name of packaged weights"),
         (("--model", str(model)), "nrecognized arguments: --model"),
         (("--time_limit", "-1"), "`time_limit` is -1.0; it must be a positive number"),
         (("--views", "nothing.txt"), "expected a text file of lines `photo view`"),
