@@ -71,7 +71,7 @@ def test_imports_go_one_way() -> None:
         assert own not in GROUND or own == "metrics" or used <= GROUND
 
 
-def test_lightning_has_its_places() -> None:
+def test_lightning_is_imported_only_by_its_folders() -> None:
     for file in FILES:
         used = {name.split(".")[0] for name in imports(file)}
         assert not used & {"lightning", "pytorch_lightning"} or part(module(file)) in LIGHTNING, named(file)
@@ -92,7 +92,7 @@ def test_modules_do_not_import_in_circles() -> None:
         visit(name, ())
 
 
-def test_no_assertion_decides_anything() -> None:
+def test_assertions_only_narrow_types() -> None:
     """`assert` may tell a type checker that something is not None; Python can drop it."""
     for file in FILES:
         for node in ast.walk(ast.parse(file.read_text())):

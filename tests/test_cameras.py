@@ -34,7 +34,7 @@ def test_a_matrix_is_the_projection_of_opencv(given: object) -> None:
         pycolmap.Camera(model="OPENCV", width=800, height=600, params=OPENCV[1]),
     ],
 )
-def test_a_lens_is_undone_and_applied_as_in_opencv(given: object) -> None:
+def test_distortion_is_removed_and_applied_as_in_opencv(given: object) -> None:
     camera = camera_from(given)
     fx, fy, cx, cy, *distortion = OPENCV[1]
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
@@ -99,6 +99,12 @@ def test_pixels_that_no_ray_reaches_are_none() -> None:
 def test_a_broken_camera_is_refused(given: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         camera_from(given)
+
+
+@pytest.mark.parametrize("params", [(-800, 800, 320, 240), (800, -800, 320, 240), (800, 0, 320, 240)])
+def test_each_focal_length_is_positive(params: tuple[float, ...]) -> None:
+    with pytest.raises(ValueError, match="focal length of a camera has to be positive"):
+        camera_from(("PINHOLE", params))
 
 
 def test_a_scaled_camera_sees_the_same_rays_at_scaled_pixels() -> None:

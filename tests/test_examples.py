@@ -48,6 +48,6 @@ def test_the_error_of_a_failed_solution_is_not_a_number() -> None:
     assert example.rotation_error_deg(turned) == pytest.approx(180)
 
 
-def test_other_names_are_refused() -> None:
+def test_an_unknown_example_is_refused() -> None:
     with pytest.raises(ValueError, match="there is no example 'video'; the examples are mesh, photo, leds, stars"):
         load("video")

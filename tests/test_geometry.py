@@ -29,7 +29,7 @@ def test_bearings_are_unit_rays_through_the_image_points() -> None:
     assert torch.equal(bearings(torch.zeros(2)), torch.tensor([0.0, 0.0, 1.0]))
 
 
-def test_projects_as_opencv_does() -> None:
+def test_points_project_as_in_opencv() -> None:
     planted = plant(1, 20)
     seen = project(transform(*planted.pose, planted.points3d))[0]
     vector = Rotation.from_matrix(planted.rotation[0].numpy()).as_rotvec()
@@ -40,7 +40,7 @@ def test_projects_as_opencv_does() -> None:
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 1.0, math.pi / 2, 3.0, math.pi - 1e-9, math.pi])
-def test_angles_keep_their_digits(angle: float) -> None:
+def test_small_angles_keep_their_digits(angle: float) -> None:
     axis = np.array([0.48, 0.6, 0.64])
     first = Rotation.from_rotvec([0.3, -0.2, 1.0])
     second = first * Rotation.from_rotvec(angle * axis)

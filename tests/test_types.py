@@ -50,12 +50,12 @@ def test_lists_of_pairs_are_padded_and_masked() -> None:
 
 @pytest.mark.parametrize("points", [[[0.1, 0.2], [0.3, 0.4]], np.array([[0.1, 0.2], [0.3, 0.4]])[::-1],
                                     np.array([[0.1, 0.2], [0.3, 0.4]], ">f8"), [[1, 2], [3, 4]]])  # fmt: skip
-def test_takes_what_numpy_takes(points: Any) -> None:
+def test_arrays_lists_and_tensors_give_the_same_batch(points: Any) -> None:
     batch = Batch.from_arrays(points, np.zeros((3, 3)))
     np.testing.assert_allclose(batch.points2d[0].numpy(), np.array(points, float))
 
 
-def test_is_a_copy_of_a_read_only_array() -> None:
+def test_a_batch_copies_a_read_only_array() -> None:
     points2d = np.zeros((4, 2), np.float32)
     points2d.flags.writeable = False
     batch = Batch.from_arrays(points2d, np.zeros((4, 3)))
@@ -63,7 +63,7 @@ def test_is_a_copy_of_a_read_only_array() -> None:
     assert not points2d.any()
 
 
-def test_one_focal_serves_all() -> None:
+def test_one_focal_length_is_used_for_all_problems() -> None:
     arrays = lists(pair(3, 4), pair(5, 5))
     assert Batch.from_arrays(**{**arrays, "focal": 800.0}).focal.tolist() == [800, 800]
     assert Batch.from_arrays(arrays["points2d"], arrays["points3d"]).focal.tolist() == [1, 1]
@@ -106,7 +106,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("message", WRONG)
-def test_says_what_is_wrong(message: str) -> None:
+def test_wrong_arrays_of_a_batch_are_named(message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Batch.from_arrays(**{**pair(5, 7), **WRONG[message]})
 

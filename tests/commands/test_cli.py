@@ -98,7 +98,7 @@ def test_a_users_mistake_is_one_clear_error(
     assert message in fails(*arguments)
 
 
-def test_a_reader_that_leaves_is_no_error() -> None:
+def test_a_closed_pipe_is_no_error() -> None:
     """As `bpnp --help | head -1` does."""
     process = subprocess.Popen(
         [sys.executable, "-m", "bpnp", "--help"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -156,7 +156,7 @@ def test_a_printed_configuration_and_that_of_a_run_can_be_used_again(
     assert (tmp_path / "again" / "checkpoints" / "last.ckpt").is_file()
 
 
-def test_another_script_named_lightning_is_told(
+def test_another_script_named_lightning_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     main(["fit", "--help"])
@@ -167,7 +167,7 @@ def test_another_script_named_lightning_is_told(
     assert capsys.readouterr().err.startswith("bpnp: lightning-sdk is installed, which has a script named `lightning`")
 
 
-def test_two_trainings_do_not_write_to_one_folder(tmp_path: Path, fails: Callable[..., str]) -> None:
+def test_a_fit_in_a_folder_in_use_is_refused(tmp_path: Path, fails: Callable[..., str]) -> None:
     arguments = ["fit", *MESHES, f"--trainer.default_root_dir={tmp_path}", f"--data.cache_dir={tmp_path}"]
     with lock_folder(tmp_path):
         assert "another process writes to" in fails(*arguments)
@@ -186,7 +186,7 @@ def test_a_broken_configuration_is_named(content: str, message: str, fails: Call
     assert re.search(message, fails("fit", f"--config={tmp_path}/wrong.yaml"))
 
 
-def test_fit_test_report(
+def test_training_test_and_report_work_in_sequence(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     fails: Callable[..., str],

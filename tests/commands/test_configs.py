@@ -1,6 +1,9 @@
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 from planted_model import plant_model
 from small_data import SMALL_NET, write_mesh_tree
 from torch import Tensor, nn
@@ -76,6 +79,19 @@ def test_every_preset_joins_a_recipe(preset: str, tmp_path: Path, monkeypatch: p
     configs = ["--config=quickstart", f"--config=presets/{Path(preset).stem}"]
     arguments = [*configs, *data_for("quickstart", tmp_path), *SMALL_NET[1:], "--pose_loss.start_epoch=0"]
     main(["fit", *arguments, f"--trainer.default_root_dir={tmp_path}"])
+    used = dict(settings(yaml.safe_load((tmp_path / "logs" / "version_0" / "config.yaml").read_text())))
+    wanted = dict(settings(yaml.safe_load((CONFIGS / "presets" / preset).read_text())))
+    wanted.pop("trainer.default_root_dir", None)  # the command line has another
+    assert wanted.items() <= used.items()
+
+
+def settings(config: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the dotted name and the value of each setting of a configuration."""
+    for key, value in config.items():
+        if isinstance(value, dict):
+            yield from settings(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", str(value)
 
 
 @pytest.mark.parametrize("file", sorted(CONFIGS.rglob("*.yaml")), ids=lambda file: file.stem)

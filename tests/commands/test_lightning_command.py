@@ -370,7 +370,7 @@ def test_a_training_in_a_pipe_prints_a_line_an_epoch(tmp_path: Path, capsys: pyt
     assert [line.split(":")[0] for line in lines] == ["epoch 1/2, step 2", "epoch 2/2, step 4"]
 
 
-def test_options_that_recipes_and_runs_store_stay() -> None:
+def test_option_names_stored_in_recipes_and_runs_are_kept() -> None:
     """The YAML files of users have these names."""
     assert set(inspect.signature(BlindPnPTask.__init__).parameters) == {
         "self", "solver", "weights", "learning_rate", "weight_decay", "warmup_steps", "decay_start", "decay_steps",

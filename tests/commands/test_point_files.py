@@ -33,13 +33,13 @@ def points_of(path: Path, **options: int) -> np.ndarray:
         ("a.xyz", rows(POINTS, "  ")),
     ],
 )
-def test_columns_of_text(name: str, text: str, tmp_path: Path) -> None:
+def test_text_columns_are_read_in_any_layout(name: str, text: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text(text, encoding="utf-8")
     np.testing.assert_array_equal(points_of(tmp_path / name), POINTS)
     np.testing.assert_array_equal(read_points2d(tmp_path / name)[0], POINTS)
 
 
-def test_arrays_of_numpy(tmp_path: Path) -> None:
+def test_npy_files_of_any_dtype_and_opencv_shape_are_read(tmp_path: Path) -> None:
     path = tmp_path / "a.npy"
     for dtype in (np.float32, np.float64, np.int32, ">f8"):
         np.save(path, POINTS.astype(dtype))
@@ -50,7 +50,7 @@ def test_arrays_of_numpy(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary"])
-def test_a_cloud_keeps_its_order(encoding: str, tmp_path: Path) -> None:
+def test_a_ply_cloud_keeps_the_order_of_its_points(encoding: str, tmp_path: Path) -> None:
     cloud = np.concatenate([POINTS, POINTS[:2]]).astype(np.float32)
     (tmp_path / "cloud.ply").write_bytes(trimesh.PointCloud(cloud).export(file_type="ply", encoding=encoding))
     np.testing.assert_allclose(points_of(tmp_path / "cloud.ply"), cloud, atol=1e-6)
@@ -106,7 +106,7 @@ def test_a_broken_file_is_named(name: str, content: bytes, message: str, tmp_pat
         read_points3d(tmp_path / name)
 
 
-def test_what_is_no_file_of_points_is_named(tmp_path: Path) -> None:
+def test_a_file_that_holds_no_points_is_refused_by_name(tmp_path: Path) -> None:
     path = tmp_path / "a.npy"
     with pytest.raises(ValueError, match="there is no file .*nowhere.npy"):
         read_points3d(tmp_path / "nowhere.npy")
@@ -125,7 +125,7 @@ def test_what_is_no_file_of_points_is_named(tmp_path: Path) -> None:
         read_points2d(tmp_path / "a.ply")
 
 
-def test_cameras_by_file_and_by_name(tmp_path: Path) -> None:
+def test_a_camera_is_read_from_a_file_or_from_a_colmap_name(tmp_path: Path) -> None:
     matrix = np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]])
     np.save(tmp_path / "k.npy", matrix)
     (tmp_path / "k.txt").write_text(rows(matrix, " "))
@@ -152,12 +152,12 @@ def test_of_several_cameras_of_a_colmap_model_that_of_an_image_is_taken(tmp_path
 
 
 @pytest.mark.parametrize("text", ["k.npy", "PINHOLE", "500,500,320,240", "PINHOLE,wide", ""])
-def test_what_is_no_camera_is_refused(text: str) -> None:
+def test_a_text_that_is_no_camera_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="is neither a file with a 3x3 matrix nor MODEL,PARAMETERS"):
         read_camera(text)
 
 
-def test_columns_of_normals_and_labels_by_name_and_by_place(tmp_path: Path) -> None:
+def test_normals_and_labels_are_found_by_column_name_or_position(tmp_path: Path) -> None:
     named, plain, image = (tmp_path / name for name in ("named.csv", "plain.txt", "image.csv"))
     named.write_text("label,x,y,z,nx,ny,nz\n7,1,2,3,0,0,1\n-1,4,5,6,1,0,0\n")
     plain.write_text("1 2 3 0 0 1 7\n4 5 6 1 0 0 -1\n")
@@ -194,7 +194,7 @@ def test_a_header_without_x_and_y_is_no_point(tmp_path: Path) -> None:
         "Name,U,V,label,note\nLED 1,1.5,2.5,7,\nLED 2,3.5,-4.5,8,weak\n",
     ],
 )
-def test_tables_of_other_programs(text: str, tmp_path: Path) -> None:
+def test_tables_written_by_r_and_spreadsheets_are_read(text: str, tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     path.write_text(text)
     points, labels = read_points2d(path)
@@ -202,7 +202,7 @@ def test_tables_of_other_programs(text: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(labels, [7, 8])
 
 
-def test_decimal_commas_without_names(tmp_path: Path) -> None:
+def test_decimal_commas_are_read_without_column_names(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("1,5;2,5;-1e-3\n3;4,25;0\n")
     np.testing.assert_array_equal(points_of(tmp_path / "a.csv"), [[1.5, 2.5, -1e-3], [3, 4.25, 0]])
 
@@ -223,7 +223,7 @@ def test_a_ply_cloud_has_normals_and_labels(encoding: str, tmp_path: Path) -> No
     np.testing.assert_array_equal(labels, [7, -1, 8])
 
 
-def test_normals_that_are_all_zero_are_none(tmp_path: Path) -> None:
+def test_normals_that_are_all_zero_are_ignored(tmp_path: Path) -> None:
     header = "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
     text = f"ply\nformat ascii 1.0\nelement vertex 2\n{header}end_header\n1 2 3 0 0 0\n4 5 6 0 0 0\n"
     (tmp_path / "a.ply").write_text(text)

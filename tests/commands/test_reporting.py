@@ -11,7 +11,7 @@ from bpnp.cli import main
 from bpnp.report.points import thin, write_points
 
 
-def test_commands_write_what_they_say(
+def test_report_and_view_write_the_files_that_they_print(
     tmp_path: Path, fails: Callable[..., str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_run(tmp_path / "run", 12, 0)

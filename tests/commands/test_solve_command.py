@@ -32,7 +32,7 @@ def write(folder: Path, points2d: np.ndarray = X, points3d: np.ndarray = P) -> l
     return [str(folder / "x.csv"), str(folder / "p.npy")]
 
 
-def test_files_become_a_pose(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_solve_writes_the_pose_the_json_and_the_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files = write(tmp_path, 800 * X + [320, 240])
     output, picture = tmp_path / "out" / "result.json", tmp_path / "out" / "result.png"
     main(["solve", *files, *CAMERA, "--output", str(output), "--picture", str(picture)])

@@ -51,7 +51,7 @@ def recipes(tmp_path: Path) -> list[str]:
     return ["table", f"--data={tmp_path}/data.yaml", "--methods", *methods, f"--output={tmp_path}/out"]
 
 
-def test_a_table_of_two_methods_and_what_it_leaves(
+def test_a_table_of_two_methods_is_printed_and_written(
     recipes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     main([*recipes, "--limit=3"])
@@ -242,7 +242,7 @@ def test_names_in_latex_are_text() -> None:
         *((name, False) for name in ("hungarian", "bpnpnet", "matcher")),
     ],
 )
-def test_every_short_name_can_be_built(name: str, limited: bool) -> None:
+def test_every_short_name_builds_a_solver(name: str, limited: bool) -> None:
     (method,) = parse_methods([name], time_limit=2.5)
     solver = method.build()
     assert not solver.training

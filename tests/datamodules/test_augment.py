@@ -41,7 +41,7 @@ def matches_of(batch: Batch) -> torch.Tensor:
 
 @pytest.mark.parametrize("ratio", [0.1, 0.5, 1.0, 2.5])
 @pytest.mark.parametrize("side", ["both", "2d", "3d"])
-def test_counts_and_box_of_the_protocol(ratio: float, side: str) -> None:
+def test_outliers_have_the_counts_and_the_box_of_the_protocol(ratio: float, side: str) -> None:
     problem = planted()
     result = augmented(raw(problem), outliers=Outliers(ratio=ratio, side=side))
     added = int(ratio * 60)
@@ -53,7 +53,7 @@ def test_counts_and_box_of_the_protocol(ratio: float, side: str) -> None:
     assert result.points3d[0].amax(0).tolist() == problem.points3d.max(0).tolist()
 
 
-def test_outliers_are_uniform_in_the_box_and_nowhere_first() -> None:
+def test_outliers_are_uniform_in_the_box_and_in_random_order() -> None:
     problem = planted(400)
     result = augmented(raw(problem), outliers=Outliers(ratio=5.0))
     false = result.match3d[0] < 0
@@ -66,7 +66,7 @@ def test_outliers_are_uniform_in_the_box_and_nowhere_first() -> None:
 
 
 @pytest.mark.parametrize(("side", "left2d", "left3d"), [("2d", 45, 60), ("3d", 60, 45), ("both", 53, 52)])
-def test_occlusion_leaves_points_without_a_partner(side: str, left2d: int, left3d: int) -> None:
+def test_occlusion_leaves_points_without_a_match(side: str, left2d: int, left3d: int) -> None:
     batch = raw(planted(), planted(6, seed=1))
     result = augmented(batch, outliers=Outliers(occlusion=0.25, occluded_side=side))
     assert (int(result.count2d[0]), int(result.count3d[0])) == (left2d, left3d)
@@ -91,7 +91,7 @@ def test_subsets_and_clutter_are_as_many_as_asked_for(clutter: float, side: str,
     assert (int(matches_of(whole)), int(whole.count2d), int(whole.count3d)) == (40, 52, 70)
 
 
-def test_a_turn_keeps_camera_coordinates_and_the_pose_in_the_scene() -> None:
+def test_a_rotation_keeps_camera_coordinates_and_the_pose_in_the_scene() -> None:
     """camera = R (p + origin) + t - R origin is the same however the problem is turned."""
     batch = raw(planted(), planted(seed=1))
     batch.origin = torch.tensor([[5e5, -3e6, 40.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
@@ -106,7 +106,7 @@ def test_a_turn_keeps_camera_coordinates_and_the_pose_in_the_scene() -> None:
     assert not torch.allclose(*(turned.rotation.mT @ straight.rotation))
 
 
-def test_turns_are_uniform() -> None:
+def test_random_rotations_of_the_scene_are_uniform() -> None:
     """The entries of a uniform rotation have mean 0 and variance 1/3."""
     batch = raw(*(planted(6, seed=seed) for seed in range(200)))
     turns = augmented(batch, rotate=True).rotation.mT @ augmented(batch).rotation
@@ -147,7 +147,7 @@ def test_a_problem_depends_on_its_key_alone_whatever_batch_it_is_in() -> None:
 
 
 @pytest.mark.parametrize(("valid", "name"), [(Outliers(), "side"), (Augmentation(), "clutter_side")])
-def test_a_side_that_there_is_not_is_named(valid: Any, name: str) -> None:
+def test_an_unknown_side_is_refused(valid: Any, name: str) -> None:
     object.__setattr__(valid, name, "2D")  # past the type checks of the tests, which users do not have
     with pytest.raises(ValueError, match=f'`{name}` is \'2D\'; it is one of "both", "2d"'):
         valid.__post_init__()

@@ -31,7 +31,7 @@ def check(store: Store, samples: list[Sample]) -> None:
         assert problem.points3d == pytest.approx(expected["p3d"][:count], abs=1e-6)
 
 
-def test_preprocessed_pickles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_preprocessed_pickles_become_a_store(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     samples = [sample(i) for i in range(8)]
     write(tmp_path / "data", samples)
     main(["prepare", "authors", str(tmp_path / "data"), "--output", str(tmp_path / "store")])
@@ -43,7 +43,7 @@ def test_preprocessed_pickles(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert len(prepare_authors(tmp_path / "data", tmp_path / "store")) == 16
 
 
-def test_correspondences_indexed_by_2d_points(tmp_path: Path) -> None:
+def test_correspondences_indexed_by_2d_points_are_read(tmp_path: Path) -> None:
     samples = [sample(i) for i in range(8)]
     for s in samples:
         count = s["num_points_2d"][0]
@@ -53,7 +53,7 @@ def test_correspondences_indexed_by_2d_points(tmp_path: Path) -> None:
     check(open_store(tmp_path / "store", PROBLEMS), samples)
 
 
-def test_the_form_before_preprocessing(tmp_path: Path) -> None:
+def test_pickles_before_preprocessing_become_a_store_by_scene(tmp_path: Path) -> None:
     samples = [sample(i) for i in range(6)]
     for split in ("train", "test"):
         for scene, part in (("0001", samples[:3]), ("0002", samples[3:])):
@@ -98,7 +98,7 @@ def test_a_2d_point_is_matched_once(tmp_path: Path) -> None:
     assert (problem.matched, len(problem.points2d), len(problem.points3d)) == (count - 1, count, count)
 
 
-def test_bad_sources_are_one_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unreadable_source_is_one_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     root, output = write(tmp_path / "data", [sample(i) for i in range(4)]), tmp_path / "store"
     for content, message in (
@@ -131,7 +131,7 @@ def test_bad_sources_are_one_error(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert not Path("hacked").exists()
 
 
-def test_data_module(tmp_path: Path) -> None:
+def test_the_data_module_splits_and_augments_the_samples(tmp_path: Path) -> None:
     samples = [sample(i) for i in range(20)]
     options = {"val_fraction": 0.2, "batch_size": 4, "cache_dir": str(tmp_path / "cache"), "max_points": 6}
     options |= {"test_outliers": Outliers(ratio=1.0), "min_points": 5}

@@ -12,7 +12,7 @@ from bpnp.datamodules.colmap.module import ColmapDataModule
 from bpnp.datamodules.stored import split_scenes
 
 
-def test_models_are_found_in_every_layout(tmp_path: Path) -> None:
+def test_colmap_models_are_found_in_every_folder_layout(tmp_path: Path) -> None:
     folders = [
         "castle/sparse/0",
         "0007/sparse/manhattan/0",

@@ -45,7 +45,9 @@ def test_an_image_is_its_keypoints_and_the_points_it_sees(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("clutter", "extra2d", "extra3d"), [(0.25, 10, 10), (1.0, 12, 20), (0.0, 0, 0), (float("inf"), 12, 20)]
 )
-def test_clutter_is_what_the_image_does_not_pair(clutter: float, extra2d: int, extra3d: int, tmp_path: Path) -> None:
+def test_clutter_is_drawn_from_keypoints_and_points_without_a_match(
+    clutter: float, extra2d: int, extra3d: int, tmp_path: Path
+) -> None:
     """12 keypoints have no point and 20 of the 60 points are not seen: no more can be had."""
     truth = plant_model(tmp_path / "m")
     problems = source(tmp_path / "m", clutter=clutter)

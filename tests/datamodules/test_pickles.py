@@ -48,7 +48,7 @@ def test_round_trip(tmp_path: Path, protocol: int) -> None:
     assert same(arrays(), load_pickle(tmp_path / "x.pkl"))
 
 
-def test_pickles_of_python_2(tmp_path: Path) -> None:
+def test_a_pickle_of_python_2_is_read(tmp_path: Path) -> None:
     """The pickle of Python 2 and its numpy for {0: np.array([1.0, 2.0])}: byte strings for names and contents."""
     raw = np.array([1.0, 200.0]).tobytes()
     text = (

@@ -128,7 +128,7 @@ def test_unusable_sources_are_named(meshes: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_again_does_nothing_and_otherwise_is_refused(meshes: Path, tmp_path: Path) -> None:
+def test_preparing_again_keeps_the_store_and_other_options_are_refused(meshes: Path, tmp_path: Path) -> None:
     run(meshes, tmp_path / "store")
     before = (tmp_path / "store" / "manifest.json").stat().st_mtime_ns
     assert len(run(meshes, tmp_path / "store")) == 12
@@ -139,7 +139,9 @@ def test_again_does_nothing_and_otherwise_is_refused(meshes: Path, tmp_path: Pat
         run(meshes, tmp_path / "ModelNet40")
 
 
-def test_no_kill_leaves_a_wrong_store(meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_kill_at_any_time_leaves_no_wrong_store(
+    meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("bpnp.datamodules.meshes.MESHES_A_PART", 2)
 
     def work(output: str = "store") -> None:

@@ -149,7 +149,7 @@ def test_poses_of_a_rig_are_those_of_the_images(tmp_path: Path) -> None:
         np.testing.assert_allclose(image.translation, pose.translation, atol=1e-12)
 
 
-def test_zlib_works_after_the_reading(tmp_path: Path) -> None:
+def test_zlib_works_after_pycolmap_was_imported(tmp_path: Path) -> None:
     """pycolmap before zlib makes both calls abort the process."""
     code = (
         "import bpnp.cameras, io, zlib, numpy\n"

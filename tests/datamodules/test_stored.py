@@ -45,7 +45,7 @@ def store(tmp_path: Path) -> Store:
     return open_store(tmp_path / "store", PROBLEMS)
 
 
-def test_pairs_come_back(store: Store) -> None:
+def test_stored_problems_are_read_as_they_were_written(store: Store) -> None:
     assert {name: rows.tolist() for name, rows in scene_rows(store).items()} == {
         f"s{s}": list(range(s, 12, 3)) for s in range(3)
     }
@@ -83,7 +83,7 @@ def test_arrays_that_do_not_fit_are_named(change: dict[str, np.ndarray], message
         create(Problem, "a/1", **({"match3d": np.arange(4), "focal": 1.0} | given | change))
 
 
-def test_small_pairs_are_left_out(store: Store) -> None:
+def test_problems_with_too_few_points_are_left_out(store: Store) -> None:
     with pytest.warns(UserWarning, match=r"skipped \d+ of 12 problems"):
         source = StoredProblems(store, np.arange(12), min_points=30)
     assert isinstance(source, ProblemSource)

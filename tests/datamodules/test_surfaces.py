@@ -25,7 +25,7 @@ FACES = "4 0 1 2 3\n3 0 1 4\n"  # a rectangle of area 2 and a triangle of area 3
         "COFF\n5 2 0\n" + VERTICES.replace("\n", " 255 0 0 255\n") + FACES,
     ],
 )
-def test_off_headers_polygons_and_colours(tmp_path: Path, text: str) -> None:
+def test_every_off_header_and_polygons_and_colours_are_read(tmp_path: Path, text: str) -> None:
     path = tmp_path / "mesh.off"
     path.write_text(text, encoding="utf-8")
     mesh = read_mesh(path)
@@ -59,7 +59,7 @@ def test_broken_off_is_one_error_that_names_the_file(tmp_path: Path, kind: str) 
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".stl", ".glb"])
-def test_other_formats(tmp_path: Path, suffix: str) -> None:
+def test_every_mesh_format_is_read_and_a_truncated_file_refused(tmp_path: Path, suffix: str) -> None:
     """Two boxes of a scene become one mesh, each where the scene puts it."""
     moved = trimesh.creation.box(transform=trimesh.transformations.translation_matrix([5, 0, 0]))
     path = tmp_path / f"boxes{suffix}"
@@ -78,7 +78,7 @@ def test_other_formats(tmp_path: Path, suffix: str) -> None:
         read_mesh(path)
 
 
-def test_real_meshes_as_trimesh_reads_them(shared_data: Path) -> None:
+def test_real_meshes_are_those_that_trimesh_reads(shared_data: Path) -> None:
     files = sorted((shared_data / "psb").glob("*/test/*.off"))[::60]
     assert files
     for path in files:

@@ -43,7 +43,7 @@ def test_matches_reproject_within_the_noise(kind: str) -> None:
 
 
 @pytest.mark.parametrize("limit", [0.0, 0.5, 0.8])
-def test_of_each_side_at_most_a_share_has_no_partner(limit: float) -> None:
+def test_at_most_the_fraction_of_outliers_has_no_match_on_either_side(limit: float) -> None:
     for problem in problems(15, num_points=120, outliers=limit):
         for count in (len(problem.points2d), len(problem.points3d)):
             assert 16 <= problem.matched <= count <= 120

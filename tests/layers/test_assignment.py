@@ -35,7 +35,7 @@ def plain_sinkhorn(cost: Tensor, mu: float, rows: Tensor, cols: Tensor, *, itera
 
 @pytest.mark.parametrize("mu", [0.1, 0.05, 0.01, 1e-3])
 @pytest.mark.parametrize("shape", [(2, 5, 5), (2, 4, 6), (2, 1, 5), (2, 4, 1)])
-def test_agrees_with_plain_scaling(mu: float, shape: tuple[int, int, int]) -> None:
+def test_the_plan_is_that_of_plain_sinkhorn_scaling(mu: float, shape: tuple[int, int, int]) -> None:
     cost = random_cost(*shape)
     rows, cols = marginals(*shape[:2], seed=1), marginals(shape[0], shape[2], seed=2)
     expected = plain_sinkhorn(cost, mu, rows, cols)
@@ -48,7 +48,7 @@ def test_agrees_with_plain_scaling(mu: float, shape: tuple[int, int, int]) -> No
     assert (plan - expected).abs().max() < 4 * torch.finfo(torch.float32).eps * 2 / mu
 
 
-def test_becomes_the_optimal_assignment_as_mu_falls() -> None:
+def test_the_plan_becomes_the_optimal_assignment_as_mu_falls() -> None:
     cost = random_cost(8, 12, 12, seed=3)
     plan, stats = sinkhorn(cost, mu=2e-4, **EXACT)
     assert stats.converged.all()
@@ -68,7 +68,7 @@ def test_a_pair_of_infinite_cost_is_never_matched() -> None:
     assert (plan - expected).abs().max() < 1e-12
 
 
-def test_dustbin_is_one_more_row_and_column() -> None:
+def test_a_dustbin_is_one_more_row_and_column() -> None:
     cost = random_cost(2, 4, 6)
     augmented = torch.full((2, 5, 7), 0.9, dtype=torch.float64)
     augmented[:, :4, :6] = cost
@@ -81,7 +81,7 @@ def test_dustbin_is_one_more_row_and_column() -> None:
 
 @pytest.mark.parametrize("level", [0.99, 0.999, 0.999999])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_almost_a_permutation_is_no_obstacle(level: float, dtype: torch.dtype) -> None:
+def test_a_plan_close_to_a_permutation_converges(level: float, dtype: torch.dtype) -> None:
     n, mu = 50, 0.05
     odds = (n - 1) * level / (1 - level)
     cost = mu * math.log(odds) * (1 - torch.eye(n, dtype=dtype)).unsqueeze(0)
@@ -91,7 +91,7 @@ def test_almost_a_permutation_is_no_obstacle(level: float, dtype: torch.dtype) -
     assert abs(float(plan.diagonal(dim1=1, dim2=2).sum()) - level) < 1e-5
 
 
-def test_reports_that_it_has_not_converged() -> None:
+def test_an_unconverged_plan_is_reported() -> None:
     cost = random_cost(3, 20, 20)
     cost[1] = 0  # converges at once
     plan, stats = sinkhorn(cost, mu=0.01, max_iterations=2)

@@ -42,7 +42,7 @@ def test_every_device_solves_the_gradient_to_its_tolerance(compiled: bool, monke
 
 
 @pytest.mark.usefixtures("too_few_iterations")
-def test_without_an_object_to_count_in_it_warns() -> None:
+def test_a_failed_backward_pass_without_counters_warns() -> None:
     plan = sinkhorn(smooth_cost(60), mu=0.02)[0]
     with pytest.warns(RuntimeWarning, match="gradient of sinkhorn did not converge for 2 of 2 samples"):
         plan.square().sum().backward()

@@ -48,7 +48,7 @@ def projected(plan: Tensor, weights: Tensor, mu: float) -> Tensor:
 
 @pytest.mark.parametrize("shape", [(1, 4, 4), (1, 3, 5), (1, 1, 4), (2, 3, 1)])
 @pytest.mark.parametrize("mu", [0.5, 0.1])
-def test_gradcheck_cost_mu_and_marginals(shape: tuple[int, int, int], mu: float) -> None:
+def test_gradients_of_cost_mu_and_marginals_are_finite_differences(shape: tuple[int, int, int], mu: float) -> None:
     b, m, n = shape
 
     def plan(cost: Tensor, mu: Tensor, rows: Tensor, cols: Tensor) -> Tensor:
@@ -58,7 +58,7 @@ def test_gradcheck_cost_mu_and_marginals(shape: tuple[int, int, int], mu: float)
     assert gradcheck(plan, tuple(x.requires_grad_() for x in inputs), atol=1e-7)
 
 
-def test_short_of_convergence_it_is_the_gradient_of_the_problem_that_was_solved() -> None:
+def test_an_unconverged_plan_has_the_gradient_of_the_problem_that_it_solves() -> None:
     cost, weights = uniform(2, 8, 6), uniform(2, 8, 6, seed=3)
     plan, stats = sinkhorn(cost, mu=0.03, max_iterations=2)
     assert not stats.converged.any()

@@ -21,7 +21,7 @@ def apart(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> float:
     return torch.maximum(rotation_angle(a[0], b[0]), (a[1] - b[1]).norm(dim=-1)).max().item()
 
 
-def test_recovers_a_planted_pose() -> None:
+def test_weighted_pnp_recovers_a_planted_pose() -> None:
     planted = plant(12, 25, outliers2d=6, outliers3d=9)
     *found, stats = solve(planted, planted.permutation(), planted.near(0.15), tolerance=1e-12)
     assert stats.converged.all()
@@ -30,7 +30,7 @@ def test_recovers_a_planted_pose() -> None:
 
 
 @pytest.mark.parametrize(("scale", "offset"), [(1.0, 0.0), (1e3, 0.0), (1e-3, 0.0), (1.0, 1e4)])
-def test_gradients_are_finite_differences(scale: float, offset: float) -> None:
+def test_the_gradients_of_weighted_pnp_are_finite_differences(scale: float, offset: float) -> None:
     """All central differences are samples of one batch, solved to 1e-13."""
     planted = plant(1, 6, outliers2d=2, seed=7)
     rotation, translation = planted.near(0.05)
@@ -78,7 +78,7 @@ ILL_POSED = "collinear, one place, one point, two points, nothing assigned, no s
 
 
 @pytest.mark.parametrize("kind", ILL_POSED.split(", "))
-def test_what_has_no_pose_is_flagged_and_spoils_nothing(kind: str) -> None:
+def test_a_sample_without_a_pose_is_flagged_and_affects_no_other(kind: str) -> None:
     planted = plant(3, 12, seed=10)
     assignment, points3d, *start = degenerate(kind, planted)
     variables = [x.clone().requires_grad_() for x in (assignment, planted.bearings, points3d)]
@@ -114,7 +114,7 @@ def test_minimal_and_flat_scenes_have_a_pose(kind: str) -> None:
     assert apart((found[0], found[1]), planted.pose) < 1e-5
 
 
-def test_from_behind_it_turns_round_or_says_so() -> None:
+def test_an_initial_pose_behind_the_points_ends_in_front_or_is_flagged() -> None:
     planted = plant(8, 30, seed=12)
     r, t, stats = solve(planted, planted.permutation(), (planted.rotation, -planted.translation))
     in_front = (transform(r, t, planted.points3d)[..., 2] > 0).all(-1)

@@ -21,7 +21,7 @@ def wrong_pairs(planted: Planted, share: float, *, seed: int = 0) -> Tensor:
 
 
 @pytest.mark.parametrize(("backend", "share"), [("poselib", 0.6), ("opencv", 0.3), ("torch", 0.3)])
-def test_finds_a_planted_pose_among_wrong_pairs(backend: str, share: float) -> None:
+def test_ransac_finds_a_planted_pose_among_outliers(backend: str, share: float) -> None:
     planted = plant(8, 80, noise=0.001, seed=1)
     assignment = wrong_pairs(planted, share)
     r, t, stats = ransac_pnp(assignment, planted.points2d, planted.points3d, backend=backend)
@@ -61,7 +61,7 @@ def test_without_four_inliers_there_is_no_pose(backend: str, kind: str) -> None:
 
 
 @pytest.mark.parametrize("backend", ["poselib", "opencv", "torch"])
-def test_points_of_one_plane_are_no_trap(backend: str) -> None:
+def test_ransac_solves_points_of_one_plane(backend: str) -> None:
     planted = plant(12, 60, seed=6)
     points3d = planted.points3d * torch.tensor([1.0, 1.0, 0.0]).double()
     seen = project(transform(planted.rotation, planted.translation, points3d))

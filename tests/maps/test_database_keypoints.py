@@ -38,7 +38,7 @@ def database(tmp_path: Path) -> Path:
     )
 
 
-def test_one_keypoint_a_place_with_its_scale(database: Path) -> None:
+def test_keypoints_of_a_database_are_one_per_position_with_their_scale(database: Path) -> None:
     found = read_database(database, "a.jpg", (100, 50))
     np.testing.assert_array_equal(found.pixels, [[0.5, 0.5], [99.25, 49.75]])
     np.testing.assert_array_equal(found.scores, [2, 4])
@@ -47,7 +47,7 @@ def test_one_keypoint_a_place_with_its_scale(database: Path) -> None:
     np.testing.assert_array_equal(read_database(database, "c.jpg").scores, [3, 3])  # a turn by 90 deg times 3; 2 and 4
 
 
-def test_what_is_wrong_is_one_clear_error(database: Path, tmp_path: Path) -> None:
+def test_an_unusable_database_is_one_clear_error(database: Path, tmp_path: Path) -> None:
     for photo, size, message in (
         ("d.jpg", None, r"expected keypoints of d\.jpg in .*database\.db, got none, but a\.jpg, b\.jpg"),
         ("none.jpg", None, r"expected keypoints of none\.jpg in .*, got none$"),

@@ -62,7 +62,7 @@ def test_keypoints_are_as_faint_as_those_of_colmap_and_the_largest(tmp_path: Pat
     np.testing.assert_array_equal(np.sort(largest.scores), np.sort(found.scores)[-len(largest.scores) :])
 
 
-def test_what_is_no_photo_is_one_clear_error(tmp_path: Path) -> None:
+def test_a_file_that_is_no_photo_is_one_clear_error(tmp_path: Path) -> None:
     (tmp_path / "a.jpg").write_text("no photo")
     for read in (detected_keypoints, focal_from_exif, photo_size):
         with pytest.raises(ValueError, match=r"expected a photo that .* got .*a\.jpg"):
@@ -72,7 +72,7 @@ def test_what_is_no_photo_is_one_clear_error(tmp_path: Path) -> None:
         detected_keypoints(tmp_path / "black.png")
 
 
-def test_features_of_hloc(tmp_path: Path) -> None:
+def test_keypoints_of_hloc_are_read_and_wrong_files_named(tmp_path: Path) -> None:
     path = tmp_path / "features.h5"
     with h5py.File(path, "w") as file:
         group = file.create_group("query/a.jpg")

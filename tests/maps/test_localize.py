@@ -49,7 +49,9 @@ def assert_right(solution: Solution, truth: Planted, number: int, ids: np.ndarra
 
 
 @pytest.mark.parametrize("views", [["photo 1.jpg"], None])
-def test_a_photo_near_a_given_view_or_somewhere(planted: tuple[SceneMap, Planted], views: list[str] | None) -> None:
+def test_a_photo_is_found_near_a_given_view_or_in_the_whole_map(
+    planted: tuple[SceneMap, Planted], views: list[str] | None
+) -> None:
     scene, truth = planted
     keypoints, ids = photo_of(truth, 1)
     solution = scene.localize(keypoints, PINHOLE, views=views)
@@ -136,7 +138,7 @@ def not_sure(*known: Any, **options: Any) -> SearchResult:
     ],
     ids=["a rival", "another pose", "another camera of a pose that is in doubt"],
 )
-def test_a_doubt_that_all_points_raise_is_kept_though_they_explain_no_more(
+def test_an_ambiguous_verdict_on_all_points_is_kept_though_the_nfa_does_not_improve(
     planted: tuple[SceneMap, Planted], monkeypatch: pytest.MonkeyPatch, stages: dict[str, Any], reason: str
 ) -> None:
     scene, truth = planted
@@ -163,7 +165,7 @@ def test_only_strong_keypoints_are_tried_and_matches_are_among_all_of_them(
     np.testing.assert_allclose(solution.points2d, (keypoints[shuffled] - [400, 300]) / 520)
 
 
-def test_a_prior_says_on_which_side_the_photo_was_taken(planted: tuple[SceneMap, Planted]) -> None:
+def test_a_prior_decides_on_which_side_the_photo_was_taken(planted: tuple[SceneMap, Planted]) -> None:
     """Points and their copies turned by 180 degrees about the axis: two poses explain a photo, the prior names one."""
     scene, truth = planted
     half = truth.points3d[:70] * [1, 1, 0.5]
@@ -214,7 +216,7 @@ def test_keypoints_of_another_place_are_never_confident(planted: tuple[SceneMap,
         assert scene.localize(noise, PINHOLE, time_limit=3).verdict != "confident"
 
 
-def test_a_view_of_too_few_points_is_passed_over(planted: tuple[SceneMap, Planted]) -> None:
+def test_a_view_with_too_few_points_is_skipped(planted: tuple[SceneMap, Planted]) -> None:
     scene, _ = planted
     poor = replace(scene.views[2], points=scene.views[2].points[:3])
     noise = np.random.default_rng(0).uniform((0, 0), (800, 600), (40, 2))

@@ -71,7 +71,7 @@ def test_exif_comes_before_the_views_of_the_map(tmp_path: Path) -> None:
     np.testing.assert_allclose(camera.matrix, [[520, 0, 400], [0, 520, 300], [0, 0, 1]])
 
 
-def test_views_with_different_focal_lengths_have_none_to_offer(tmp_path: Path) -> None:
+def test_views_with_different_focal_lengths_give_no_camera(tmp_path: Path) -> None:
     """A zoom lens: no view says at which length the photo was taken."""
     plant_model(tmp_path / "map", camera=PINHOLE)
     scene = SceneMap.from_colmap(tmp_path / "map")

@@ -23,7 +23,7 @@ def planted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Planted]:
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_the_planted_map_comes_back(tmp_path: Path, text: bool) -> None:
+def test_a_map_is_read_as_it_was_planted(tmp_path: Path, text: bool) -> None:
     truth = plant_model(tmp_path, images=4, points=60, seen=25, text=text)
     scene = SceneMap.from_colmap(tmp_path)
     seen = np.unique(np.concatenate(truth.seen))
@@ -99,7 +99,7 @@ def test_of_processes_that_open_a_large_map_together_one_computes_its_index(
     assert computed == [1]
 
 
-def test_without_a_view_its_own_points_are_gone(planted: tuple[Path, Planted]) -> None:
+def test_a_map_without_a_view_lacks_the_points_that_only_it_saw(planted: tuple[Path, Planted]) -> None:
     scene, truth = SceneMap.from_colmap(planted[0]), planted[1]
     rest = scene.without(["photo 1.jpg"])
     others = np.bincount(np.concatenate([seen for i, seen in enumerate(truth.seen) if i != 1]), minlength=60)
@@ -111,7 +111,7 @@ def test_without_a_view_its_own_points_are_gone(planted: tuple[Path, Planted]) -
     assert len(scene.views) == 4
 
 
-def test_views_of_a_retrieval(tmp_path: Path) -> None:
+def test_a_file_of_retrieved_views_is_read_and_wrong_lines_named(tmp_path: Path) -> None:
     path = tmp_path / "pairs.txt"
     path.write_text("q1.jpg db/a.jpg\nq2.jpg db/b.jpg\n\nq1.jpg db/c.jpg\n")
     assert read_views(path) == {"q1.jpg": ["db/a.jpg", "db/c.jpg"], "q2.jpg": ["db/b.jpg"]}

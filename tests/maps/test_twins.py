@@ -128,7 +128,7 @@ def test_a_place_that_is_there_twice_is_ambiguous_whatever_its_size(seed: int) -
     assert min(other) < 1
 
 
-def test_a_pose_that_leads_to_the_best_one_is_no_twin() -> None:
+def test_a_pose_that_is_refined_to_the_best_one_is_no_competitor() -> None:
     rng = np.random.default_rng(0)
     points, normals = box(rng, ())
     scene, pose = map_of(points, normals), pose_at(14.0, 4.2, -3.0)

@@ -111,7 +111,7 @@ def test_a_wrong_orientation_does_not_lose_a_photo(orientation: int) -> None:
         np.testing.assert_array_equal(solution.rotation, plain.rotation)
 
 
-def test_up_has_three_numbers() -> None:
+def test_an_up_direction_without_three_numbers_is_refused() -> None:
     scene, points = street()
     with pytest.raises(ValueError, match=r"`up_camera` is \[0.0, 0.0, 0.0\]; three numbers that are not all zero"):
         scene.localize(photo_on_its_side(points)[0], TURNED, up_camera=[0, 0, 0])

@@ -36,7 +36,7 @@ def pairs() -> list[tuple[Tensor, Tensor]]:
     return [(torch.rand(m, 2) - 0.5, torch.randn(n, 3)) for m, n in ((40, 40), (25, 61), (64, 12))]
 
 
-def test_counts_are_those_of_the_paper_code(reference: Released) -> None:
+def test_parameter_counts_are_those_of_the_paper_code(reference: Released) -> None:
     state = reference.state_dict()
     assert {key: tuple(value.shape) for key, value in state.items()} == {
         k: shape for k, (shape, _) in tensor_maps().items()
@@ -47,7 +47,9 @@ def test_counts_are_those_of_the_paper_code(reference: Released) -> None:
 
 
 @pytest.mark.parametrize("zipped", [True, False])
-def test_same_cost_and_assignment(reference: Released, tmp_path: Path, zipped: bool) -> None:
+def test_converted_weights_give_the_cost_and_assignment_of_the_released_code(
+    reference: Released, tmp_path: Path, zipped: bool
+) -> None:
     file = tmp_path / "ModelNet40.pth.tar"
     torch.save(checkpoint(reference), file, _use_new_zipfile_serialization=zipped)
     net = load_authors_weights(file).double()
@@ -112,7 +114,7 @@ def test_code_in_a_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert not Path("hacked").exists()
 
 
-def test_foreign_and_broken_files(reference: Released, tmp_path: Path) -> None:
+def test_a_file_that_holds_no_weights_is_named(reference: Released, tmp_path: Path) -> None:
     whole = tmp_path / "whole"
     torch.save(checkpoint(reference), whole)
     contents = {

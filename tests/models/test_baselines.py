@@ -57,7 +57,8 @@ def test_unit_and_origin_of_the_scene_change_only_the_translation(name: str) -> 
     scaled = 7 * problem.points3d + torch.tensor([30.0, -20.0, 50.0])
     first = QUICK[name](Batch.from_arrays(problem.points2d, problem.points3d)).poses[name]
     second = QUICK[name](Batch.from_arrays(problem.points2d, scaled)).poses[name]
-    torch.testing.assert_close(first.rotation, second.rotation, rtol=0, atol=1e-4, equal_nan=True)
+    assert first.found.all()
+    torch.testing.assert_close(first.rotation, second.rotation, rtol=0, atol=1e-4)
 
 
 def test_softposit_scales_with_the_unit_of_the_scene_and_of_its_initial_poses() -> None:
@@ -91,7 +92,7 @@ def test_softposit_converges_from_ten_degrees_on_clean_data() -> None:
     assert solved.double().mean() >= 0.95
 
 
-def test_softposit_starts_near_the_truth_as_far_as_it_says() -> None:
+def test_softposit_starts_within_the_stated_angle_of_the_truth() -> None:
     problem = plant(30, 5)
     batch = problem.batch()
     pose = SoftPOSIT(start="near_truth", max_steps=0)(batch).poses["softposit"]
@@ -111,7 +112,7 @@ def test_softposit_starts_near_the_truth_as_far_as_it_says() -> None:
         (Hungarian, {"checkpoint": "x.ckpt", "net": BPnPNet()}, "`checkpoint` and `net` are both given"),
     ],
 )
-def test_options_that_mean_nothing_are_named(solver: type, options: dict[str, object], message: str) -> None:
+def test_meaningless_options_of_a_baseline_are_named(solver: type, options: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         solver(**options)
 

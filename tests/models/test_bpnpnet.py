@@ -36,7 +36,7 @@ def overfitted() -> tuple[BPnPNet, Batch, list[float]]:
     return net.eval(), batch, losses
 
 
-def test_gives_an_assignment_and_all_poses() -> None:
+def test_bpnpnet_returns_an_assignment_and_all_poses() -> None:
     batch = different_sizes(12, 20, dtype=torch.float32)
     prediction = (net := small_net()).eval()(batch)
     assert prediction.assignment.shape == (2, 25, 20)
@@ -56,7 +56,7 @@ def test_only_evaluation_refines_and_only_if_asked() -> None:
     assert tuple(without(batch).poses) == without.estimates == ("ransac", "pnp")
 
 
-def test_refinement_always_ends_and_says_so() -> None:
+def test_refinement_of_exact_problems_converges() -> None:
     """Exact problems with the true matches: the pose is right, and a report must not call it unconverged."""
     batch = different_sizes(30, dtype=torch.float32)
     pose = small_net().eval()(batch).poses["refined"]
@@ -85,7 +85,7 @@ def test_the_cost_is_the_distance_between_unit_features() -> None:
     torch.testing.assert_close(net.cost(batch), torch.cdist(z2d, z3d), atol=1e-7, rtol=0)
 
 
-def test_learns_one_pair_by_heart(overfitted: tuple[BPnPNet, Batch, list[float]]) -> None:
+def test_bpnpnet_overfits_one_problem(overfitted: tuple[BPnPNet, Batch, list[float]]) -> None:
     net, batch, losses = overfitted
     assert losses[0] > 0.6
     assert losses[-1] < -0.8
@@ -129,7 +129,7 @@ def test_the_pose_loss_reaches_the_first_layers(overfitted: tuple[BPnPNet, Batch
     assert 0.9 < after / before.item() < 0.99
 
 
-def test_a_set_of_three_points_spoils_no_neighbour(overfitted: tuple[BPnPNet, Batch, list[float]]) -> None:
+def test_a_problem_of_three_points_affects_no_other(overfitted: tuple[BPnPNet, Batch, list[float]]) -> None:
     net, batch, _ = overfitted
     tiny = plant(1, 3, dtype=torch.float32)
     both = padded([batch, tiny])

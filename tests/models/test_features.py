@@ -107,7 +107,7 @@ def test_the_input_transform_is_pointnets(training: bool) -> None:
         torch.testing.assert_close(ours, theirs)
 
 
-def test_normalised_scenes_forget_their_unit_and_origin() -> None:
+def test_normalised_scenes_do_not_depend_on_their_unit_and_origin() -> None:
     single, padded, mask = sets(3)
     normalised = normalise_points3d(padded, mask)
     for i, x in enumerate(single):

@@ -17,7 +17,7 @@ def cluttered(*sizes: int) -> Batch:
     return padded([plant(1, n, outliers2d=n // 3, outliers3d=n // 3 + 1, seed=n) for n in sizes])
 
 
-def test_every_point_shares_its_mass_between_partners_and_its_bin() -> None:
+def test_the_mass_of_each_point_is_split_between_matches_and_its_dustbin() -> None:
     batch = cluttered(9, 21)
     prediction = small_matcher().match(batch)
     total = (batch.count2d + batch.count3d).unsqueeze(-1).double()
@@ -25,13 +25,13 @@ def test_every_point_shares_its_mass_between_partners_and_its_bin() -> None:
     torch.testing.assert_close(prediction.assignment.sum(1) + prediction.unmatched3d, batch.mask3d / total)
 
 
-def test_the_image_of_a_view_holds_what_is_before_it_and_the_rest_at_its_edge() -> None:
+def test_points_behind_a_view_lie_at_the_edge_of_its_image() -> None:
     points = torch.tensor([[1.0, -2.0, 4.0], [30.0, 40.0, 1.0], [3.0, 4.0, -5.0], [0.0, 0.0, -1.0]])
     expected = torch.tensor([[0.25, -0.5], [2.4, 3.2], [2.4, 3.2], [0.0, 0.0]])
     torch.testing.assert_close(image_of(points[None])[0], expected)
 
 
-def test_each_side_hears_of_the_other() -> None:
+def test_features_of_each_side_depend_on_the_other() -> None:
     """Unlike those of BPnPNet, the features of the image change with the scene."""
     net, batch = small_matcher(), cluttered(12)
     other = replace(batch, points3d=batch.points3d.flip(-1) ** 3)
@@ -48,7 +48,7 @@ def test_neighbourhoods_look_alike_at_every_scale_and_ignore_padding() -> None:
     torch.testing.assert_close(layer(padded, torch.arange(25)[None] < 20)[:, :20], plain)
 
 
-def test_learns_the_partners_and_the_clutter_of_one_pair() -> None:
+def test_the_matcher_overfits_matches_and_outliers_of_one_problem() -> None:
     torch.manual_seed(0)
     batch = plant(1, 12, outliers2d=4, outliers3d=4, seed=3, dtype=torch.float32).batch()
     net = Matcher(channels=32, depth=2, heads=2)
@@ -69,7 +69,7 @@ def test_learns_the_partners_and_the_clutter_of_one_pair() -> None:
     assert float(cosine) > 0.9999
 
 
-def test_says_what_is_wrong_with_its_options() -> None:
+def test_wrong_options_of_a_matcher_are_named() -> None:
     with pytest.raises(ValueError, match=r"`channels` 30 is no multiple of `heads` 4"):
         Attention(30, 4)
     with pytest.raises(ValueError, match=r"`mu` is 0.0; it must be above 0"):

@@ -31,7 +31,7 @@ def unseen(tmp_path_factory: pytest.TempPathFactory) -> Batch:
     return views_of_shapes(24, tmp_path_factory.mktemp("c"), rotation="so3")
 
 
-def test_an_unknown_name_is_refused_with_those_there_are() -> None:
+def test_an_unknown_name_of_weights_is_refused_with_the_known_ones() -> None:
     with pytest.raises(ValueError, match="there are no packaged weights '../x'; the names are .*procedural-so3"):
         BPnPNet.from_pretrained("../x")
 
@@ -53,7 +53,7 @@ def test_the_weights_find_unseen_shapes_from_every_side(unseen: Batch) -> None:
     assert found["refined"] < 1
 
 
-def test_a_learned_prior_is_the_packaged_net_and_knows_any_unit(unseen: Batch) -> None:
+def test_a_learned_prior_is_the_packaged_net_in_any_unit(unseen: Batch) -> None:
     assert unseen.rotation is not None
     x, p = unseen.points2d[0], 7 * unseen.points3d[0] + torch.tensor([5.0, -3.0, 1.0])
     solution = solve(x, p, prior="learned")
@@ -90,7 +90,7 @@ def cluttered(tmp_path_factory: pytest.TempPathFactory) -> Batch:
     return views_of_shapes(16, tmp_path_factory.mktemp("c"), test_outliers=Outliers(ratio=0.5))
 
 
-def test_the_matcher_finds_the_partners_among_clutter(cluttered: Batch) -> None:
+def test_the_matcher_finds_matches_among_outliers(cluttered: Batch) -> None:
     """The most probable match of a paired point is the true one or a near one; of 96, chance is in the middle."""
     assert cluttered.rotation is not None
     net = Matcher.from_pretrained("matcher-clutter")
@@ -115,7 +115,7 @@ def test_the_matcher_is_a_prior_and_a_solver_of_solve(cluttered: Batch) -> None:
         assert float(rotation_error(relative, cluttered.rotation[:1].double())) < 5
 
 
-def test_the_matcher_for_maps_finds_partners_in_the_axes_of_the_view() -> None:
+def test_the_matcher_for_maps_finds_matches_in_the_axes_of_the_view() -> None:
     """Use synthetic maps; a match is as improbable as any other pair if the points are rotated away."""
     data = SyntheticMapDataModule(frame="view", num_points=128, outliers=0.5, test_problems=8, seed=7)
     data.setup("test")

@@ -42,7 +42,7 @@ def save(net: nn.Module, path: Path, **more: Any) -> Path:
     return path
 
 
-def test_a_checkpoint_brings_the_network_back(tmp_path: Path) -> None:
+def test_a_checkpoint_gives_the_same_network(tmp_path: Path) -> None:
     net = small_net(transport=Sinkhorn(learn_mu=True), centre=True, normalise=True, rounds=2)
     again = BPnPNet.from_checkpoint(save(net, tmp_path / "net.ckpt", **{"other.weight": torch.ones(1)}))
     assert describe_module(again) == describe_module(net)
@@ -51,7 +51,7 @@ def test_a_checkpoint_brings_the_network_back(tmp_path: Path) -> None:
         assert torch.equal(again.match(pair()).assignment, net.eval().match(pair()).assignment)
 
 
-def test_a_network_comes_back_as_what_it_is(tmp_path: Path) -> None:
+def test_a_checkpoint_gives_the_class_of_its_network(tmp_path: Path) -> None:
     net = Matcher(channels=16, depth=1, heads=2, frame="view").eval()
     file, other = save(net, tmp_path / "matcher.ckpt"), save(small_net(8, 1), tmp_path / "other.ckpt")
     again = TrainedNet.from_checkpoint(file)
@@ -73,7 +73,7 @@ def test_a_part_of_the_users_comes_back_only_if_the_user_names_its_class(tmp_pat
 
 
 @pytest.mark.parametrize("name", ["os.system", "subprocess.Popen", "torch.nn.modules.linear.Linear", "BPnPNet.forward"])
-def test_a_checkpoint_names_no_class_that_is_not_known(name: str, tmp_path: Path) -> None:
+def test_a_checkpoint_cannot_name_an_unknown_class(name: str, tmp_path: Path) -> None:
     solver = describe_module(small_net())
     solver["settings"]["transport"] = {"class": name, "settings": {"command": "true"}}
     torch.save({"solver": solver, "state_dict": {}}, tmp_path / "evil.ckpt")
@@ -132,9 +132,7 @@ OLD_FORM = {"class": "BPnPNet", "settings": {"channels": 16, "blocks": 2, "nonse
         ("epoch,loss\n1,0.5\n", r"x\.ckpt is no checkpoint of `bpnp fit`: it cannot be read"),
     ],
 )
-def test_says_what_a_file_is_instead_of_a_checkpoint_and_runs_no_code(
-    tmp_path: Path, content: Any, message: str
-) -> None:
+def test_a_file_that_is_no_checkpoint_is_named_and_runs_no_code(tmp_path: Path, content: Any, message: str) -> None:
     file = tmp_path / "x.ckpt"
     with pytest.raises(FileNotFoundError, match=r"there is no checkpoint .*x\.ckpt; give a file"):
         BPnPNet.from_checkpoint(file)
@@ -144,7 +142,7 @@ def test_says_what_a_file_is_instead_of_a_checkpoint_and_runs_no_code(
 
 
 @pytest.mark.parametrize(("setting", "loads"), [(False, True), (True, False)])
-def test_a_setting_that_went_is_forgotten_where_it_had_no_effect(tmp_path: Path, setting: bool, loads: bool) -> None:
+def test_a_removed_setting_is_ignored_where_it_had_no_effect(tmp_path: Path, setting: bool, loads: bool) -> None:
     older = content(small_net())
     older["solver"]["settings"]["features2d"]["settings"]["batch_norm"] = setting
     torch.save(older, tmp_path / "older.ckpt")

@@ -52,7 +52,7 @@ def test_a_run_is_written_to_a_folder_with_its_tables_and_pictures(tmp_path: Pat
     assert is_written(next(run.glob("*.wandb")), b"test/pnp/rotation_q2_deg")
 
 
-def test_a_test_knows_its_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_test_is_logged_with_the_settings_of_its_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_run(tmp_path, 20, 0)
     logger = {"class_path": "lightning.pytorch.loggers.WandbLogger"}
     training = {"model": {"learning_rate": 0.25}, "data": "planted", "trainer": {"logger": [logger]}, "ckpt_path": None}

@@ -22,7 +22,7 @@ def points_of(axes: object, marker: str) -> np.ndarray:
     return np.c_[line.get_data()]
 
 
-def test_recall_curves_are_the_shares_of_pairs_within(tmp_path: Path) -> None:
+def test_recall_curves_are_the_fractions_of_problems_within_each_error(tmp_path: Path) -> None:
     results = write_run(tmp_path, 60, 0)
     figure = recall_curve({"run": results})
     assert [line.get_label() for line in figure.axes[0].get_lines()] == ["ransac", "pnp"]

@@ -25,7 +25,7 @@ def test_the_interval_of_a_median_is_scipys() -> None:
     assert (found.low, found.high) == pytest.approx((expected.low, expected.high), abs=0.15)
 
 
-def test_nineteen_of_twenty_intervals_hold_the_true_share() -> None:
+def test_nineteen_of_twenty_intervals_contain_the_true_fraction() -> None:
     rng = np.random.default_rng(0)
     held = 0
     for seed in range(200):
@@ -34,7 +34,7 @@ def test_nineteen_of_twenty_intervals_hold_the_true_share() -> None:
     assert 180 <= held <= 199
 
 
-def test_pairs_show_a_difference_that_two_separate_intervals_hide() -> None:
+def test_a_paired_interval_shows_a_difference_that_separate_intervals_hide() -> None:
     rng = np.random.default_rng(0)
     first = rng.gamma(2.0, 5.0, 300)
     second = first + 0.3 + 0.01 * rng.normal(size=300)
@@ -53,7 +53,7 @@ def test_problems_without_a_pose_are_infinite_and_leave_the_rest_alone() -> None
     assert bootstrap(values, quantile(0.25)).value == 2
 
 
-def test_numbers_that_are_not_there_are_an_error() -> None:
+def test_an_interval_of_nan_or_unequal_lists_is_refused() -> None:
     with pytest.raises(ValueError, match="there are 2, of which 1 are NaN"):
         bootstrap(np.array([1.0, np.nan]))
     with pytest.raises(ValueError, match="the same problems; there are 2 and 3"):

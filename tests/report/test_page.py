@@ -81,7 +81,8 @@ def test_the_charts_show_the_quartiles_that_the_paper_prints(tmp_path: Path) -> 
     assert (list(rings.y), rings.mode, rings.meta) == ([0.25, 0.5, 0.75], "markers", None)
     assert "paper" not in chart_text(chart)
     joint = recall_chart({"run": results}, "joint", paper="megadepth")
-    assert joint is None or len(joint.data) == 2
+    assert joint is not None
+    assert len(joint.data) == 2
 
 
 def test_the_page_opens_with_the_outcome_and_folds_the_settings(tmp_path: Path) -> None:
@@ -96,7 +97,7 @@ def test_the_page_opens_with_the_outcome_and_folds_the_settings(tmp_path: Path) 
     assert page.index("<details>") < page.index('id="quartiles"')
 
 
-def test_nothing_on_the_page_comes_from_elsewhere_or_escapes_its_place(tmp_path: Path) -> None:
+def test_the_page_loads_nothing_and_escapes_every_name(tmp_path: Path) -> None:
     write_run(tmp_path / HOSTILE[:8].replace("/", "-"), 9, 0)
     page = page_html(list(tmp_path.iterdir()))
     elements = Elements(page)
@@ -111,7 +112,7 @@ def test_nothing_on_the_page_comes_from_elsewhere_or_escapes_its_place(tmp_path:
     assert policy.startswith("default-src 'none';")
 
 
-def test_what_cannot_be_read_is_named_and_no_page_is_left(tmp_path: Path) -> None:
+def test_unreadable_results_are_named_and_no_page_is_written(tmp_path: Path) -> None:
     output = tmp_path / "report.html"
     (tmp_path / "unfinished").mkdir()
     with pytest.raises(ValueError, match=r"unfinished is no results folder: it has no summary.json"):

@@ -50,7 +50,7 @@ def test_the_page_has_the_points_and_poses_of_every_problem() -> None:
         assert line["poses"]["a"]["pnp"] is None
 
 
-def test_the_page_takes_the_worst() -> None:
+def test_the_page_keeps_the_problems_with_the_largest_errors() -> None:
     error = np.random.default_rng(0).random(PROBLEMS + 50)
     problems = [replace(own, error=float(error[own.index])) for own in planted(len(error))]
     places, lines = read(page_points({"a": results(problems)}, {"a": problems}))

@@ -62,7 +62,7 @@ def test_views_are_read_as_they_were_written(tmp_path: Path) -> None:
         write_points(tmp_path, [problems[0], replace(problems[1], estimates={})])
 
 
-def test_a_thinned_pair_knows_the_numbers_of_its_points(tmp_path: Path) -> None:
+def test_a_thinned_problem_keeps_the_numbers_of_its_points(tmp_path: Path) -> None:
     batch = planted((60, 12), clutter=4)
     whole = points_from(answered(batch), batch)
     write_points(tmp_path, [thin(whole[0], 24), whole[1]])
@@ -75,7 +75,7 @@ def test_a_thinned_pair_knows_the_numbers_of_its_points(tmp_path: Path) -> None:
     assert all_points.numbers()[0].tolist() == list(range(12))
 
 
-def test_of_a_pair_that_is_given_twice_the_first_is_kept(tmp_path: Path) -> None:
+def test_the_first_of_two_results_of_one_problem_is_kept(tmp_path: Path) -> None:
     batch = planted((60,), clutter=4)
     whole = points_from(answered(batch), batch)
     write_points(tmp_path, [*whole, *(thin(problem, 24) for problem in whole)])

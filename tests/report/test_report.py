@@ -37,7 +37,7 @@ def pose_of(batch: Batch) -> Pose:
     return Pose(batch.rotation.clone(), batch.translation.clone(), stats)
 
 
-def test_rows_of_a_planted_batch() -> None:
+def test_rows_of_a_batch_have_its_counts_errors_and_stats() -> None:
     batch = planted((6, 4), clutter=1)
     refined = pose_of(batch)
     refined.rotation[1] = math.nan
@@ -124,7 +124,7 @@ def test_the_files_are_plain_csv_and_strict_json(tmp_path: Path) -> None:
         ([row(0), row(1), row(1, "ransac")], "an estimate is missing for some of the 2 problems: "),
     ],
 )
-def test_rows_that_cannot_be_a_test_are_refused(tmp_path: Path, rows: list[ProblemRow], message: str) -> None:
+def test_rows_that_are_no_complete_test_are_refused(tmp_path: Path, rows: list[ProblemRow], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         write_results(tmp_path, rows)
     assert list(tmp_path.iterdir()) == []
@@ -190,7 +190,7 @@ def test_results_give_their_errors_and_a_data_frame(tmp_path: Path) -> None:
     assert frame[frame.cause == "solved"]["index"].tolist() == [1, 1, 2, 2]
 
 
-def test_each_row_has_the_cause_that_its_numbers_say() -> None:
+def test_each_row_names_the_cause_of_its_failure() -> None:
     good = dataclasses.replace(
         rows(1, 0)[0], rotation_error_deg=1.0, converged=True, found=True, inliers=0, m=10
     )  # fmt: skip

@@ -79,7 +79,7 @@ def test_small_problems_are_exhausted(seed: int) -> None:
 
 
 @pytest.mark.parametrize("basin_count", [1, 3])
-def test_a_better_pose_is_missed_as_rarely_as_basin_counts_claim(basin_count: int) -> None:
+def test_a_better_pose_is_missed_as_rarely_as_basin_counts_predict(basin_count: int) -> None:
     """Counted on objects of equal parts and a few unique points, without competitors: of partial enumerations that end
     when the best pose has the basin count h, at most 2^-h end at a turned pose."""
     wrong = 0

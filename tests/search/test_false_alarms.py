@@ -48,20 +48,20 @@ def alarms(problem: Problem, rotation: Array, translation: Array) -> float:
 
 
 @pytest.mark.parametrize(("count", "least"), [(7, -3), (12, -10), (100, -150)])
-def test_a_planted_pose_is_no_coincidence(count: int, least: float) -> None:
+def test_a_planted_pose_is_significant(count: int, least: float) -> None:
     rng = np.random.default_rng(count)
     for _ in range(10):
         assert evidence(*planted(rng, count)) < least
 
 
-def test_four_points_prove_nothing() -> None:
+def test_a_pose_of_four_points_is_not_significant() -> None:
     """Three of them fix the pose, and there are 2 * 24 * 24 / 6 ways to choose these: one more is to be expected."""
     rng = np.random.default_rng(0)
     assert min(evidence(*planted(rng, 4, 2e-3), 1e-3) for _ in range(20)) > -1
 
 
 @pytest.mark.parametrize("width", [0.002, 0.006])
-def test_clumps_that_meet_are_no_more_evidence_than_their_middles(width: float) -> None:
+def test_clusters_of_points_count_as_one_observation_each(width: float) -> None:
     """Six clumps of eight points, in the image and in the scene, meet under a pose. The points within them are others,
     or the same ones, seen with less noise than the clumps are wide."""
     rng, clumps, alone = np.random.default_rng(0), [], []
@@ -102,7 +102,7 @@ def test_keypoints_in_one_place_are_one_observation() -> None:
     assert evidence(np.tile(rays, (5, 1)), points, rotation) > evidence(rays, points, rotation) - 1
 
 
-def test_labels_and_normals_exclude_partners() -> None:
+def test_labels_and_normals_exclude_matches() -> None:
     rays, points, rotation = planted(np.random.default_rng(3), 12)
     free, own = evidence(rays, points, rotation), np.arange(12) % 3
     assert evidence(rays, points, rotation, labels2d=own, labels3d=own) < free < 0
@@ -114,7 +114,7 @@ def test_labels_and_normals_exclude_partners() -> None:
     assert evidence(rays, points, rotation, normals3d=away) > 0
 
 
-def test_a_prior_leaves_less_to_chance_where_the_pose_agrees_with_it() -> None:
+def test_a_prior_lowers_the_nfa_of_a_pose_that_agrees_with_it() -> None:
     rays, points, rotation = planted(np.random.default_rng(4), 6)
     free, up = evidence(rays, points, rotation), np.array([0.0, 0, 1])
     right = GravityPrior(rotation @ up, up, sigma_deg=2.0)

@@ -76,7 +76,7 @@ def test_derivatives_by_the_lens_are_finite_differences_of_undistorted_pixels(ra
             )
 
 
-def test_the_false_alarms_pay_for_each_unknown_of_the_lens() -> None:
+def test_the_nfa_counts_each_unknown_of_the_camera_model() -> None:
     points, pixels = planted(0.0, seed=5)
     problem = Problem(directions(np.c_[pixels / FOCAL, np.ones(len(pixels))]), points)
     known, focal, bent = (
@@ -117,7 +117,7 @@ def test_the_error_of_the_focal_length_allows_for_residuals_that_neighbours_shar
     assert np.median([sigma for _, sigma in off]) < 0.01  # a bound that says something
 
 
-def test_a_principal_point_that_is_not_in_the_middle_is_allowed_for() -> None:
+def test_a_principal_point_off_the_image_centre_widens_the_covariance() -> None:
     points, pixels = planted(0.0, seed=6)
     pixels = pixels + np.random.default_rng(7).normal(0, 0.3, pixels.shape)
     problem = Problem(directions(np.c_[pixels / FOCAL, np.ones(len(pixels))]), points)

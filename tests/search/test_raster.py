@@ -46,7 +46,7 @@ def test_a_rough_prior_is_certain_among_seven_outliers_a_true_pair(seed: int) ->
     assert degrees_between(found.best[0], rotation) < 0.3
 
 
-def test_noise_beyond_the_enumeration_leaves_no_doubt_near_a_prior() -> None:
+def test_noise_beyond_the_radius_of_an_enumeration_is_confident_near_a_prior() -> None:
     """A rotation known to 4 degrees lets 200 x 200 points be enumerated, with a radius narrower than this noise."""
     bearings, points, rotation, translation = cluttered(1, true=200, outliers=0, noise=0.01, frame=0.9)
     prior = off(rotation, translation, points, np.random.default_rng(1))

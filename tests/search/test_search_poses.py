@@ -32,7 +32,7 @@ def search(f, p, prior=None, **options):
 
 
 @pytest.mark.parametrize("off", [0.05, 1.0])
-def test_a_guess_from_the_same_points_is_tried_first_and_not_believed(problem, off):
+def test_a_guess_from_the_same_points_is_tried_first_and_is_no_prior(problem, off):
     """One near the true pose and one 57 degrees off: the search goes everywhere unless the matches are unique."""
     rotation, translation = (values[0].numpy() for values in problem.near(off, seed=1))
     points = Problem.of(problem.bearings[0].numpy(), problem.points3d[0].numpy())
@@ -59,7 +59,7 @@ def test_settings_without_a_meaning_are_refused(call, named):
         call()
 
 
-def test_points_at_the_end_of_the_world_do_not_matter(problem):
+def test_far_points_change_neither_the_initial_poses_nor_the_scale(problem):
     """A reconstruction's few points far away decide neither where the search starts nor its scale."""
     torch.manual_seed(5)
     points3d, rays = problem.points3d[:1].clone(), problem.bearings[:1].clone()
@@ -92,7 +92,7 @@ def test_narrow_views_are_solved_like_wide_ones(spread: float) -> None:
     assert found.residual == pytest.approx(0.002 * spread, rel=0.3)
 
 
-def test_of_points_that_have_no_label_in_common_or_lie_on_a_line_no_pose_is_found():
+def test_points_on_a_line_or_without_a_common_label_have_no_pose():
     rng = np.random.default_rng(4)
     problem = Problem.of(directions(rng.normal(size=(300, 3)) + [0, 0, 4]), rng.normal(size=(280, 3)))
     labelled = replace(problem, labels2d=np.ones(300, np.int64), labels3d=np.full(280, 2))

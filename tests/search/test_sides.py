@@ -60,7 +60,7 @@ def scored(seed: int) -> tuple[Problem, Array]:
 
 
 @pytest.mark.parametrize(("known", "seed"), [(wall, 1), (labelled, 0), (scored, 0)])
-def test_what_is_known_of_the_points_finds_a_pose_that_the_points_alone_do_not(known, seed: int) -> None:
+def test_annotations_of_the_points_find_a_pose_that_the_points_alone_do_not(known, seed: int) -> None:
     """In as many batches of starts, before any other source is asked."""
     problem, rotation = known(seed)
     informed = search_poses(problem, settings=DEFAULT.limited(9))

@@ -31,7 +31,7 @@ def sigma_of(problem: Problem, rotation: Array, translation: Array) -> float:
     return math.inf if covariance is None else math.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
 
 
-def test_a_share_may_be_without_bound() -> None:
+def test_the_bound_of_a_scale_factor_can_be_infinite() -> None:
     """With 80 degrees of freedom, Student's t is beyond 3.416 standard deviations once in a thousand."""
     bounds = [uncertainty.share_bound(np.array([[variance]]), 80.0) for variance in (1e-4, 1e9)]
     assert bounds == pytest.approx([math.expm1(0.03416), math.inf], rel=1e-3)
@@ -53,7 +53,7 @@ def test_bounds_are_exceeded_once_in_a_thousand() -> None:
     assert rotation_bound(problem, linear, 3.0) == math.inf
 
 
-def test_errors_are_within_what_a_covariance_claims_but_once_in_a_thousand() -> None:
+def test_errors_exceed_the_bound_of_a_covariance_once_in_a_thousand() -> None:
     """Drawn as before, of a covariance that was widened by Student's t."""
     rng = np.random.default_rng(1)
     root = rng.standard_normal((4, 4)) * [1e-2, 1e-2, 1e-2, 0.3]
@@ -68,7 +68,7 @@ def test_errors_are_within_what_a_covariance_claims_but_once_in_a_thousand() -> 
     assert not uncertainty.is_within(np.zeros(4), np.full((4, 4), math.nan), 10)
 
 
-def test_a_false_partner_among_few_is_allowed_for() -> None:
+def test_the_bound_allows_for_one_wrong_match_among_few() -> None:
     """One of eight points is seen 2.5 standard deviations off: least squares without it ends elsewhere."""
     rng = np.random.default_rng(3)
     points = rng.uniform(-1, 1, (8, 3))
@@ -91,7 +91,7 @@ def test_a_false_partner_among_few_is_allowed_for() -> None:
     assert 0.5 < way @ np.linalg.solve(covariance, way) < 1.05
 
 
-def test_a_prior_bounds_what_the_points_leave_loose() -> None:
+def test_a_prior_bounds_what_the_points_do_not_fix() -> None:
     rng = np.random.default_rng(1)
     points = np.column_stack([1e-4 * rng.standard_normal((5, 2)), rng.uniform(-1, 1, 5)])  # nearly on one line
     rays = noisy(directions(points + [0, 0, 6.0]), rng)

@@ -50,7 +50,7 @@ def test_a_few_exact_matches_do_not_make_a_rough_alignment_precise() -> None:
         assert ("residuals far larger" in found.reason) == (verdict == "ambiguous")
 
 
-def test_precision_is_no_ambiguity() -> None:
+def test_a_pose_with_a_large_covariance_is_confident_and_the_reason_has_the_bound() -> None:
     """40 points that fill 1 / 600 rad: their tilt has an error of about a degree for a noise of 1e-4 rad, and a tenth
     of it for 1e-5. Nothing else explains them, and the reason says how well the rotation is known."""
     rng = np.random.default_rng(1)
@@ -69,7 +69,7 @@ def test_precision_is_no_ambiguity() -> None:
     ("distance", "is_map", "verdict"),
     [(2.0, False, "confident"), (2.0, True, "ambiguous"), (20.0, False, "ambiguous")],
 )
-def test_the_focal_length_of_an_object_may_be_loose(distance: float, is_map: bool, verdict: str) -> None:
+def test_a_loose_focal_length_of_a_small_object_is_still_confident(distance: float, is_map: bool, verdict: str) -> None:
     """The bound in the reason is that of Student's t for the spread of repeated fits. Of a map it is too loose."""
     rng, noise = np.random.default_rng(2), 4e-3
     points, shift = rng.uniform(-1, 1, (12, 3)), np.array([0, 0, 3 * distance])
@@ -100,7 +100,7 @@ def test_the_focal_length_of_an_object_may_be_loose(distance: float, is_map: boo
     ("basin_count", "looks", "verdict"),
     [(0, 0, "ambiguous"), (10, 0, "ambiguous"), (10, 1, "confident"), (6, 2, "confident")],
 )
-def test_matches_that_say_little_ask_for_starts_that_end_alike(basin_count: int, looks: int, verdict: str) -> None:
+def test_weak_matches_need_repeated_basins_or_a_local_search(basin_count: int, looks: int, verdict: str) -> None:
     """400 points with residuals of their spacing: a match is worth a hundredth of a decade.
 
     Ten initial poses could as well have ended at a far better optimum, which they make unlikely. A local search
@@ -118,7 +118,7 @@ def test_matches_that_say_little_ask_for_starts_that_end_alike(basin_count: int,
 
 
 @pytest.mark.parametrize(("degrees", "verdict"), [(1.0, "confident"), (4.0, "ambiguous")])
-def test_starts_that_end_beside_a_pose_met_it(degrees: float, verdict: str) -> None:
+def test_initial_poses_that_end_near_a_pose_count_for_its_basin(degrees: float, verdict: str) -> None:
     """All ten initial poses end at another optimum, which is the same pose up to two degrees; the rest is as above."""
     rng = np.random.default_rng(1)
     points = rng.uniform(-1, 1, (400, 3))
@@ -133,7 +133,7 @@ def test_starts_that_end_beside_a_pose_met_it(degrees: float, verdict: str) -> N
 
 
 @pytest.mark.parametrize(("others", "verdict"), [(16, "ambiguous"), (2, "confident")])
-def test_two_poses_that_explain_points_of_their_own_leave_a_doubt(others: int, verdict: str) -> None:
+def test_two_poses_that_explain_different_points_are_ambiguous(others: int, verdict: str) -> None:
     """20 image points of one pose and as many others of a different one: only if the signs are 20 to 2, chance is
     less than exp(-18^2 / 2 / 22) = 1 / 1580 to have made the difference; of independent points 4 are enough."""
     rng = np.random.default_rng(2)
@@ -149,7 +149,7 @@ def test_two_poses_that_explain_points_of_their_own_leave_a_doubt(others: int, v
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.3, 0.75])
-def test_another_focal_length_is_climbed_to(factor: float) -> None:
+def test_a_focal_length_sweep_reaches_the_true_focal_length(factor: float) -> None:
     """1,500 dense points, seen with `factor` times the true focal length by a pose that is three degrees off. It is an
     alternative; so is that there was no time to look, unless Gauss-Newton steps from the pose itself had found it."""
     rng = np.random.default_rng(2)

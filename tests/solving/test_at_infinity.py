@@ -21,7 +21,7 @@ def sky(seed: int, *, field: float = 40.0, count: int = 600, false: float = 0.3)
 
 
 @pytest.mark.parametrize(("field", "count"), [(12.0, 4000), (40.0, 600), (75.0, 300), (180.0, 200), (220.0, 900)])
-def test_a_planted_rotation(field: float, count: int) -> None:
+def test_a_planted_rotation_of_stars_is_found(field: float, count: int) -> None:
     for seed in range(3):
         image, directions, rotation, star = sky(seed, field=field, count=count)
         solution = look(image, directions, lens(field).model, seed=seed)
@@ -45,7 +45,7 @@ def test_bearings_and_normalised_points_are_as_good_as_pixels() -> None:
         assert degrees_between(solution.rotation, rotation) < 0.02
 
 
-def test_what_is_no_sky_is_not_believed() -> None:
+def test_noise_and_a_mirrored_image_of_stars_are_not_confident() -> None:
     """Points that are not stars, and the image in a mirror, which has the same angles."""
     image, directions, _, _ = sky(0, count=300)
     noise = np.random.default_rng(0).uniform(0, SIZE, image.shape)
@@ -56,7 +56,7 @@ def test_what_is_no_sky_is_not_believed() -> None:
     assert look(noise, directions, lens(40.0).model, focal_error=0.03).verdict != "confident"
 
 
-def test_a_constellation_that_the_catalogue_has_twice_is_ambiguous() -> None:
+def test_a_star_pattern_that_occurs_twice_in_the_catalogue_is_ambiguous() -> None:
     for seed in range(3):
         image, directions, rotation, star = sky(seed, count=300)
         part, turn = directions[star[star >= 0]], Rotation.random(random_state=seed).as_matrix()
@@ -94,7 +94,7 @@ def test_an_unknown_focal_length_is_found_with_the_rotation(field: float, count:
 
 @pytest.mark.parametrize("error", [0.003, 0.01, 0.1])
 @pytest.mark.parametrize("factor", [1.0, 1.004])
-def test_a_rough_focal_length_decides_what_the_exact_one_decides(error: float, factor: float) -> None:
+def test_a_rough_focal_length_gives_the_verdict_of_the_exact_one(error: float, factor: float) -> None:
     """Ten stars of 9,000 in 11 degrees: chance fits as well at the rough noise that a wrong focal length leaves."""
     focal, size = 5100.0, np.array([1024, 768])
     for seed in range(3):
@@ -113,7 +113,7 @@ def test_a_rough_focal_length_decides_what_the_exact_one_decides(error: float, f
         assert solution.focal_length == pytest.approx(focal, rel=2e-3)
 
 
-def test_an_image_of_nothing_known_but_its_size() -> None:
+def test_an_image_of_stars_is_solved_from_its_size_alone() -> None:
     image, directions, rotation, _ = sky(5, field=52.0)
     solution = look(image, directions, image_size=(SIZE, SIZE))
     assert solution.verdict == "confident", solution.reason

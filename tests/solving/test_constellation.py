@@ -27,7 +27,7 @@ def pixels(points: np.ndarray, rotation: np.ndarray, translation: np.ndarray) ->
 
 
 @pytest.mark.parametrize("with_normals", [True, False])
-def test_a_device_among_background_lights(with_normals: bool) -> None:
+def test_a_device_is_found_among_background_lights(with_normals: bool) -> None:
     right = 0
     for seed in range(10):
         seen, _ = shown(seed, background=3)

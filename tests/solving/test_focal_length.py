@@ -58,7 +58,7 @@ def test_pose_and_focal_length_are_found_together(found: tuple[Solution, Array])
     assert again.focal_length == solution.focal_length
 
 
-def test_the_verdict_pays_for_the_focal_length(found: tuple[Solution, Array]) -> None:
+def test_the_nfa_and_the_covariance_count_the_focal_length(found: tuple[Solution, Array]) -> None:
     pixels, scene, _ = planted(900.0)
     known = solve(pixels, scene, found[0].camera, solver="search", time_limit=LIMIT)
     assert known.log10_false_alarms < found[0].log10_false_alarms - 1

@@ -43,7 +43,7 @@ def test_a_network_for_views_gets_the_points_in_its_coordinates_and_its_pose_is_
     np.testing.assert_allclose(solution.translation, translation - rotation @ np.full(3, far), atol=1e-5 * (1 + far))
 
 
-def test_a_view_of_unknown_place_sees_the_points_where_and_as_large_as_the_image_does() -> None:
+def test_a_prior_without_translation_places_the_points_where_the_image_shows_them() -> None:
     image, points, rotation, translation = scene()
     net = Answering(np.eye(3), np.zeros(3), "view").eval()
     solve(image, points, solver=net, prior=PosePrior(VIEW, None, 20.0))
@@ -55,7 +55,7 @@ def test_a_view_of_unknown_place_sees_the_points_where_and_as_large_as_the_image
 
 
 @pytest.mark.parametrize("place", ["solver", "prior"])
-def test_a_network_for_views_without_a_view_says_what_it_expects(place: str) -> None:
+def test_a_network_for_views_without_a_prior_is_one_clear_error(place: str) -> None:
     planted = plant(1, 30)
     net: Any = Matcher(channels=16, depth=1, heads=2, neighbours=3, frame="view").eval()
     with pytest.raises(ValueError, match=r"a view near the photo, and there is no `prior`; give prior=PosePrior"):
@@ -104,7 +104,7 @@ def test_a_matcher_solves_with_one_right_pair_in_twenty_alone_and_beside_a_pair_
         (GravityPrior(np.array([0, 1.0, 0]), np.array([0, 0, -1.0])), None),
     ],
 )
-def test_a_search_in_doubt_asks_and_a_sure_one_does_not(
+def test_an_undecided_search_asks_the_matcher_and_a_confident_one_does_not(
     prior: PosePrior | GravityPrior | None, name: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[tuple[int, str]] = []

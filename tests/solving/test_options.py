@@ -40,7 +40,7 @@ def which(solution: Solution) -> int:
 
 
 @pytest.mark.parametrize("likely", [0, 1])
-def test_scores_and_labels_say_which_of_two_it_is(likely: int) -> None:
+def test_scores_and_labels_decide_between_two_equal_objects(likely: int) -> None:
     first = np.repeat([True, False], 80)
     mine = first if likely == 0 else ~first
     by_score = solve(TWO_IN_THE_IMAGE, OBJECT, scores2d=np.where(mine, 1.0, 0.05))
@@ -62,7 +62,7 @@ def test_scores_of_scene_points_weigh_the_likelihood() -> None:
     assert weighed - plain == pytest.approx(math.log(160 / 84), abs=0.1)
 
 
-def test_twins_are_ambiguous_and_a_prior_says_which_it_is() -> None:
+def test_equal_objects_are_ambiguous_and_a_prior_decides() -> None:
     """Points that a half turn about z maps onto themselves: both poses are candidates."""
     half = RNG.uniform(-1, 1, (6, 3))
     points = np.concatenate([half, half * [-1, -1, 1]])
@@ -90,7 +90,7 @@ def prior_forms(rotation: Array, translation: Array) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("likely", [0, 1])
-def test_whatever_holds_a_pose_is_a_prior(likely: int) -> None:
+def test_every_object_that_holds_a_pose_is_a_prior(likely: int) -> None:
     rotation, translation = POSES[likely]
     for form, pose in prior_forms(rotation, translation).items():
         prior = checked_prior(pose)
@@ -122,7 +122,7 @@ def test_duplicates_are_named_where_the_verdict_is_not_confident() -> None:
     assert solution.reason.endswith("4 of the image points are duplicates; 8 of the scene points are duplicates")
 
 
-def test_normals_say_from_which_side_a_point_is_seen() -> None:
+def test_normals_decide_from_which_side_a_point_is_visible() -> None:
     normals = np.tile([0.0, 0.0, -1.0], (60, 1))  # towards a camera with R = I
     board = np.column_stack([RNG.uniform(-1, 1, (60, 2)), 0.4 * RNG.uniform(-1, 1, 60)])
     image = seen(board, np.eye(3), [0.0, 0, 6])
@@ -131,7 +131,7 @@ def test_normals_say_from_which_side_a_point_is_seen() -> None:
     assert not behind.found or degrees_between(behind.rotation, np.eye(3)) > 5
 
 
-def test_clutter_is_the_share_of_outliers_in_the_likelihood() -> None:
+def test_clutter_is_the_outlier_fraction_of_the_likelihood() -> None:
     """If all points match, and none is near another, the score has the term log (1 - w), whatever its other terms."""
     planted = plant(1, 100)
     few, many = (solve(planted.points2d[0], planted.points3d[0], clutter=w).candidates[0].score for w in (0.1, 0.6))
@@ -181,7 +181,7 @@ def test_a_module_computes_on_the_device() -> None:
     assert module.part.weight.device.type == "cpu"
 
 
-def test_what_is_warm_is_compiled_once(capsys: pytest.CaptureFixture[str]) -> None:
+def test_warm_up_compiles_once(capsys: pytest.CaptureFixture[str]) -> None:
     bpnp.warm_up()
     main(["warm-up"])
     word, _, seconds, unit = capsys.readouterr().out.split()

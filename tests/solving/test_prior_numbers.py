@@ -8,7 +8,7 @@ from bpnp.solving.arguments import checked_prior
 
 
 @pytest.mark.parametrize("kind", [int, float, np.float32, np.int64])
-def test_the_widths_of_a_prior_become_floats(kind: type) -> None:
+def test_the_standard_deviations_of_a_prior_become_floats(kind: type) -> None:
     prior = checked_prior(PosePrior(np.eye(3), np.zeros(3), kind(5), kind(2)))
     assert isinstance(prior, PosePrior)
     assert [type(value) for value in prior[2:]] == [float, float]

@@ -28,7 +28,7 @@ def planted_rig(seed: int, seen: tuple[int, ...], points: int = 20) -> Any:
     return images, scene, mounts, pose, chosen
 
 
-def test_cameras_that_are_unsure_alone_are_sure_together() -> None:
+def test_a_rig_is_confident_where_no_single_camera_is() -> None:
     alone = together = 0
     for seed in range(4):
         images, scene, mounts, pose, chosen = planted_rig(seed, (4, 5, 4))
@@ -83,7 +83,7 @@ def test_a_rig_is_judged_at_the_scale_of_its_residuals() -> None:
 
 
 @pytest.mark.parametrize("scale", [0.2, 5.0])
-def test_cameras_that_are_apart_tell_the_scale_of_the_scene(scale: float) -> None:
+def test_a_rig_with_a_baseline_finds_the_scale_of_the_scene(scale: float) -> None:
     errors = []
     for seed in range(4):
         images, scene, mounts, pose, _ = planted_rig(seed, (5, 6, 5))
@@ -107,7 +107,7 @@ def test_cameras_that_are_apart_tell_the_scale_of_the_scene(scale: float) -> Non
     assert 1 < np.mean(errors) < 20  # seven
 
 
-def test_a_scale_that_two_near_cameras_do_not_tell_is_not_claimed() -> None:
+def test_a_short_baseline_gives_no_confident_scale() -> None:
     images, scene, mounts, _, _ = planted_rig(1, (60, 60), points=120)
     turns = [turn for turn, _ in mounts]
     near = [(turns[0], np.zeros(3)), (turns[1], turns[1] @ [1e-4, 0, 0])]

@@ -31,7 +31,7 @@ def view() -> Any:
     return bearings, points, rotation, translation, labels2d, labels3d
 
 
-def test_probabilities_of_one_are_labels_and_equal_ones_say_nothing(view: Any) -> None:
+def test_probabilities_of_one_act_as_labels_and_equal_ones_as_none(view: Any) -> None:
     *sides_and_pose, labels2d, labels3d = view
 
     def judged(**labels: Any) -> tuple[float, Array]:
@@ -46,7 +46,7 @@ def test_probabilities_of_one_are_labels_and_equal_ones_say_nothing(view: Any) -
     assert certain[0] < equal[0] - 10
 
 
-def test_only_the_classes_tell_two_equal_things_apart() -> None:
+def test_class_probabilities_decide_between_two_equal_objects() -> None:
     rng = np.random.default_rng(9)
     shape, label = rng.uniform(-0.7, 0.7, (50, 3)), rng.integers(0, 4, 50)
     points = np.concatenate([shape, shape + [3.0, 0, 0]])

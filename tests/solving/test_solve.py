@@ -50,7 +50,7 @@ def test_an_exact_problem_is_solved_to_the_last_digits() -> None:
     assert all(other.score <= first.score for other in solution.candidates)
 
 
-def test_noise_and_clutter_are_borne_and_reported() -> None:
+def test_a_problem_with_noise_and_outliers_is_solved_and_reported() -> None:
     """200 true pairs with normal noise of 0.001, and a quarter of clutter on each side."""
     planted = plant(1, 200, noise=0.001, outliers2d=50, outliers3d=50, seed=3)
     solution = solve(planted.points2d[0], planted.points3d[0])
@@ -84,7 +84,7 @@ def test_pixels_of_a_lens_are_undistorted_and_lost_ones_counted(as_object: bool)
     assert solution.reprojection_error < 1e-5
 
 
-def test_bearings_may_look_anywhere() -> None:
+def test_bearings_in_all_directions_are_solved() -> None:
     """A camera in the middle of its points, which it sees all around."""
     rng = np.random.default_rng(0)
     rays = rng.normal(size=(80, 3))
@@ -107,7 +107,7 @@ def test_arrays_tensors_lists_and_precisions_are_the_same_points() -> None:
         np.testing.assert_array_equal(again.matches, expected.matches)
 
 
-def test_many_pairs_are_solved_as_each_alone() -> None:
+def test_solve_many_gives_the_solutions_of_solve() -> None:
     planted = [plant(1, size, seed=size, noise=0.001) for size in (30, 70, 50)]
     sets2d = [x.points2d[0].numpy() @ K[:2, :2].T + K[:2, 2] for x in planted]
     sets3d = [x.points3d[0].numpy() for x in planted]
@@ -186,7 +186,7 @@ def test_a_solution_is_the_same_after_its_json(tmp_path) -> None:
             assert len(again.candidates) == len(solution.candidates)
 
 
-def test_errors_are_as_large_as_the_solution_says() -> None:
+def test_errors_follow_the_covariance_of_the_solution() -> None:
     """60 planted poses, 20 to 80 points, an outlier for every third of them: errors over their standard deviations."""
     rng, whitened, turns, centres = np.random.default_rng(0), [], [], []
     for seed in range(60):
@@ -211,12 +211,12 @@ def test_errors_are_as_large_as_the_solution_says() -> None:
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": 2}', "\0"])
-def test_what_is_no_solution_is_refused(text: str) -> None:
+def test_a_text_that_is_no_solution_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="not the JSON of a solution"):
         Solution.from_json(text)
 
 
-def test_progress_names_the_pair() -> None:
+def test_progress_has_the_index_of_the_problem() -> None:
     planted = plant(1, 30)
     calls: list[tuple[int, int]] = []
     sets2d, sets3d = [planted.points2d[0]] * 2, planted.points3d[0]
@@ -240,7 +240,7 @@ def test_keypoints_of_opencv_count_from_the_centre_of_the_first_pixel() -> None:
 
 
 @pytest.mark.parametrize("form", ["opencv", "rows"])
-def test_what_detectors_return_is_taken(form: str) -> None:
+def test_arrays_of_opencv_detectors_are_accepted(form: str) -> None:
     example = load("mesh")
     given = {
         "opencv": example.points2d[:, None].astype(np.float32),

@@ -55,7 +55,7 @@ def test_labels_may_be_any_integers() -> None:
 
 
 @pytest.mark.parametrize("focal", [800.0, 8000.0])
-def test_noise_below_a_pixel_is_known_at_any_resolution(focal: float) -> None:
+def test_subpixel_noise_is_estimated_at_any_resolution(focal: float) -> None:
     points, image, rotation = view(focal, 0.3)
     solution = solve(image, points, np.diag([focal, focal, 1]), solver="search", time_limit=60)
     assert solution.inlier_threshold == pytest.approx(3 * 0.3, rel=0.35)

@@ -34,7 +34,7 @@ def test_a_right_pose_is_confident_and_refined_to_the_optimum(view: Any) -> None
         assert solution.inlier_count > 50
 
 
-def test_a_pose_as_it_is_stays_as_it_is(view: Any) -> None:
+def test_an_unrefined_pose_is_returned_unchanged(view: Any) -> None:
     bearings, points, *pose = view
     right = bpnp.verify(bearings, points, *pose, refine=False)
     assert right.verdict == "confident"
@@ -51,7 +51,7 @@ def test_a_pose_as_it_is_stays_as_it_is(view: Any) -> None:
 
 @pytest.mark.parametrize("degrees", [5.0, 20.0, 90.0, 180.0])
 @pytest.mark.parametrize("refine", [True, False])
-def test_another_pose_fails_with_a_reason_and_stays(view: Any, degrees: float, refine: bool) -> None:
+def test_a_wrong_pose_fails_with_a_reason_and_is_returned_unchanged(view: Any, degrees: float, refine: bool) -> None:
     bearings, points, *pose = view
     turned = moved(*pose, points, degrees)
     solution = bpnp.verify(bearings, points, *turned, refine=refine)
@@ -60,7 +60,7 @@ def test_another_pose_fails_with_a_reason_and_stays(view: Any, degrees: float, r
     assert np.array_equal(solution.rotation, turned[0])
 
 
-def test_the_mirror_image_of_a_plane_is_met() -> None:
+def test_the_mirror_image_of_a_plane_is_a_competing_pose() -> None:
     """Far away a plane looks nearly as tilted to the other side; with this noise only one of both is right."""
     rng = np.random.default_rng(9)
     points = np.column_stack([rng.uniform(-1, 1, (80, 2)), np.zeros(80)])
@@ -73,7 +73,7 @@ def test_the_mirror_image_of_a_plane_is_met() -> None:
     assert "fits better" in wrong.reason
 
 
-def test_a_twin_speaks_against_a_right_pose() -> None:
+def test_equal_objects_make_a_right_pose_ambiguous() -> None:
     """Three equal objects, one of them visible: each pose fits equally well."""
     motif = np.random.default_rng(9).uniform(0, 1, (80, 3))
     scene = np.concatenate([motif + [2 * k, 0, 6] for k in range(3)])
@@ -83,7 +83,7 @@ def test_a_twin_speaks_against_a_right_pose() -> None:
     assert len(solution.candidates) >= 2
 
 
-def test_a_focal_length_that_is_wrong_speaks_against_a_pose(view: Any) -> None:
+def test_a_wrong_focal_length_keeps_a_pose_from_being_confident(view: Any) -> None:
     bearings, points, *pose = view
     pixels = 500 * bearings[:60, :2] / bearings[:60, 2:] + [320, 240]
     wrong = bpnp.verify(pixels, points[:60], *pose, ("SIMPLE_PINHOLE", [400, 320, 240]))
@@ -91,7 +91,7 @@ def test_a_focal_length_that_is_wrong_speaks_against_a_pose(view: Any) -> None:
     assert bpnp.verify(pixels, points[:60], *pose, ("SIMPLE_PINHOLE", [500, 320, 240])).verdict == "confident"
 
 
-def test_few_points_that_no_search_is_sure_of_confirm_a_pose() -> None:
+def test_few_points_that_no_search_is_confident_of_confirm_a_pose() -> None:
     """One hypothesis costs less than all that eight points allow."""
     sure = {"solve": 0, "verify": 0}
     for seed in range(8):

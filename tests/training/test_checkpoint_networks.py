@@ -146,7 +146,7 @@ def test_parts_and_networks_of_a_user_come_back(tmp_path: Path) -> None:
         ({"transport": Sinkhorn(mu=0.3)}, r"transport.mu=0.3 \(saved: 0.1\)"),
     ],
 )
-def test_a_network_that_cannot_be_meant_is_refused(changed: Any, told: str, tmp_path: Path) -> None:
+def test_a_network_that_contradicts_its_checkpoint_is_refused(changed: Any, told: str, tmp_path: Path) -> None:
     own: dict[str, Any] = {"centre": True, "scale": 4.0}
     file = str(save(BlindPnPTask(small_net(**own)), tmp_path / "own.ckpt"))
     other, run = small_net(**own | changed), quiet_trainer(tmp_path)
@@ -166,7 +166,7 @@ def test_settings_that_an_evaluation_may_change_are_printed(tmp_path: Path, capl
     assert "ransac.threshold=0.02 (saved: 0.01), rounds=0 (saved: 2)" in caplog.text
 
 
-def test_the_names_in_a_checkpoint_stay(tmp_path: Path) -> None:
+def test_the_names_in_a_checkpoint_are_kept(tmp_path: Path) -> None:
     """Renaming any of these makes files of users unreadable."""
     trainer = quiet_trainer(tmp_path, max_epochs=1, limit_train_batches=1, limit_val_batches=0)
     trainer.callbacks.append(PoseLossWarmup(start_epoch=0))

@@ -145,7 +145,7 @@ def test_matching_likelihood_loss_ignores_padding_and_has_its_derivative() -> No
     assert torch.autograd.gradcheck(loss, tuple(x.clone().requires_grad_() for x in (plan, left2d, left3d)))
 
 
-def test_says_what_is_missing() -> None:
+def test_a_loss_without_its_labels_names_what_is_missing() -> None:
     batch = plant(1, 6).batch()
     with pytest.raises(ValueError, match="returns no assignment to train"):
         matching_losses(Prediction(), batch, kind="likelihood", angle=None)

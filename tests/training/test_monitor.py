@@ -75,7 +75,7 @@ def test_a_planted_collapse_is_reported(tmp_path: Path) -> None:
     assert float(trainer.callback_metrics["val/feature_spread_2d"]) > 0.1
 
 
-def test_a_training_logs_what_is_watched(tmp_path: Path) -> None:
+def test_a_training_logs_the_monitored_values(tmp_path: Path) -> None:
     fit(tmp_path, TrainingMonitor(problems=2), CSVLogger(tmp_path, name="logs"))
     rows = list(csv.DictReader((tmp_path / "logs" / "version_0" / "metrics.csv").open()))
     mass = [float(row["val/true_match_mass"]) for row in rows if row["val/true_match_mass"]]

@@ -20,7 +20,7 @@ def solved(planted: Planted, assignment: Tensor, start: tuple[Tensor, Tensor]) -
     return Prediction(assignment, poses={"pnp": Pose(rotation, translation, stats)})
 
 
-def test_it_is_the_mean_angle_of_the_assigned_points() -> None:
+def test_the_reprojection_loss_is_the_mean_angle_of_the_assigned_points() -> None:
     """The numbers with numpy: angles by arccos, the assignment as weights."""
     planted = plant(2, 10, outliers2d=3, outliers3d=2)
     assignment = 5 * planted.diffuse(0.3)
@@ -41,7 +41,7 @@ def test_true_matches_at_the_true_pose_have_none() -> None:
     assert ReprojectionLoss()(prediction, planted.batch()).max() < 1e-6
 
 
-def test_its_gradient_through_the_pose_is_finite_differences() -> None:
+def test_the_gradient_of_the_reprojection_loss_is_finite_differences() -> None:
     planted = plant(1, 6, outliers2d=2, seed=3)
     start, batch = planted.near(0.02), planted.batch().to(torch.float64)
 

@@ -172,7 +172,7 @@ def test_gradients_that_a_layer_could_not_solve_for_are_logged_as_a_share_of_the
     assert run.callback_metrics["train/backward_failed"] == 0
 
 
-def test_many_such_steps_in_a_row_end_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_skipped_steps_in_a_row_end_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bpnp.training.task, "MOST_SKIPPED", 4)
     task = BlindPnPTask(CountingSolver(broken_calls=tuple(range(100))))
     with pytest.raises(TrainingDivergedError, match="in 4 consecutive steps .* Use a lower model.learning_rate"):
@@ -228,7 +228,7 @@ def test_the_errors_of_a_pose_are_computed_once(tmp_path: Path, monkeypatch: pyt
     assert counted.call_count == 2 * 3
 
 
-def test_results_of_a_test_and_poses_of_a_prediction(tmp_path: Path) -> None:
+def test_a_test_writes_results_and_a_prediction_poses(tmp_path: Path) -> None:
     module = small_meshes(tmp_path, num_points=40, noise_px=0.0)
     task = BlindPnPTask(small_net())
     run = quiet_trainer(tmp_path, callbacks=[ResultsWriter()])
@@ -283,7 +283,7 @@ def test_problems_that_are_numbered_within_their_batch_are_all_counted(tmp_path:
         ),
     ],
 )
-def test_what_a_solver_returns_is_checked(answer: Any, estimates: Any, error: str, tmp_path: Path) -> None:
+def test_a_wrong_prediction_of_a_solver_is_named(answer: Any, estimates: Any, error: str, tmp_path: Path) -> None:
     class Answering(nn.Module):
         forward = staticmethod(answer)
 
@@ -298,7 +298,7 @@ def test_a_loader_that_gives_no_batch_is_named(tmp_path: Path) -> None:
             run(BlindPnPTask(small_net()), DataLoader([(torch.rand(5, 2), torch.rand(5, 3))] * 2, 2))
 
 
-def test_several_processes_cannot_number_anew() -> None:
+def test_repeated_numbers_are_refused_in_several_processes() -> None:
     first, second = padded(OWN[:2]), padded(OWN[2:4])
     numbers = set[int]()
     number_globally(first, numbers, processes=2)

@@ -123,7 +123,9 @@ def test_an_exponential_moving_average_is_what_is_saved(tmp_path: Path) -> None:
     ("precision", "features", "weights"),
     [("bf16-mixed", torch.bfloat16, torch.float32), ("64-true", torch.float64, torch.float64)],
 )
-def test_precision(precision: str, features: torch.dtype, weights: torch.dtype, tmp_path: Path) -> None:
+def test_each_precision_has_its_dtypes_of_features_and_weights(
+    precision: str, features: torch.dtype, weights: torch.dtype, tmp_path: Path
+) -> None:
     fit(tmp_path, *TWO_STEPS, f"--trainer.precision={precision}")
     assert Observer.dtypes == {features}
     assert state(tmp_path).dtype == weights
