@@ -2,9 +2,9 @@
 
     python examples/store_outputs.py [NOTEBOOK...]
 
-It needs `pip install nbclient ipykernel`, and `hloc.ipynb` the photos in a folder `sacre_coeur` of the working
-directory (without them its stored outputs stay). Cells with the tag `photo` are stored without their pictures, which
-would make the repository large.
+It needs `pip install nbclient ipykernel`. A notebook whose metadata name a folder of photos (`"bpnp": {"photos":
+"sacre_coeur"}`) runs only if the working directory has this folder; otherwise its stored outputs stay. Cells with the
+tag `photo` are stored without their pictures, which would make the repository large.
 """
 
 import sys
@@ -17,9 +17,20 @@ from nbclient import NotebookClient
 COMPILING = "compiling bpnp's loops"  # once an installation
 
 
-def store_outputs(path: Path) -> None:
-    """Run a notebook from the first cell to the last, and write it with its outputs."""
+def store_outputs(path: Path) -> bool:
+    """Run a notebook from the first cell to the last, and write it with its outputs.
+
+    Args:
+        path: Notebook, which is overwritten.
+
+    Returns:
+        False if the notebook was left as it is, since its folder of photos is missing.
+    """
     notebook = nbformat.read(path, as_version=4)
+    own = notebook.metadata.get("bpnp", {})
+    if "photos" in own and not Path(own["photos"]).is_dir():
+        print(f"left out {path}: there is no folder {own['photos']}")
+        return False
     NotebookClient(notebook, timeout=1200, record_timing=False).execute()
     for cell in notebook.cells:
         if cell.cell_type == "code":
@@ -30,19 +41,18 @@ def store_outputs(path: Path) -> None:
     notebook.metadata = {
         "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
         "language_info": {"name": "python"},
+        **({"bpnp": own} if own else {}),
     }
     path.write_text(nbformat.writes(notebook, indent=1) + "\n", encoding="utf-8")
+    return True
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the given notebooks, all of them by default."""
     names = sys.argv[1:] if arguments is None else arguments
     for path in [Path(name) for name in names] or sorted(Path(__file__).parent.glob("*.ipynb")):
-        if path.stem == "hloc" and not Path("sacre_coeur").is_dir():
-            print(f"{path} is left out: there is no folder sacre_coeur")
-            continue
-        store_outputs(path)
-        print(f"stored the outputs of {path}")
+        if store_outputs(path):
+            print(f"stored the outputs of {path}")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """The notebooks in examples/ run from the first cell to the last; what they assert holds."""
 
 import ast
+import importlib
 import json
 from pathlib import Path
 from typing import Any
@@ -34,10 +35,10 @@ def test_a_notebook_runs(
     notebook: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    if notebook.stem == "hloc":
-        photos = request.getfixturevalue("shared_data") / "photos" / "sacre_coeur"
-        (tmp_path / "sacre_coeur").symlink_to(photos)
-    cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+    content = json.loads(notebook.read_text(encoding="utf-8"))
+    if photos := content["metadata"].get("bpnp", {}).get("photos"):
+        (tmp_path / photos).symlink_to(request.getfixturevalue("shared_data") / "photos" / photos)
+    cells = content["cells"]
     codes = ["".join(cell["source"]).replace(*SHORTER) for cell in cells if cell["cell_type"] == "code"]
     assert codes[0].startswith("%matplotlib inline\n"), "without it a figure is shown as its name"
     codes[0] = codes[0].partition("\n")[2]
@@ -45,3 +46,30 @@ def test_a_notebook_runs(
     for code in codes:
         exec(compile(ast.parse(code, notebook.name), notebook.name, "exec"), names)
     assert any("assert " in code for code in codes)
+
+
+@pytest.mark.parametrize("has_photos", [False, True])
+def test_a_notebook_runs_only_with_its_photos(
+    has_photos: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without its folder of photos a notebook stays as it is; with it the notebook has outputs and its metadata."""
+    nbformat = pytest.importorskip("nbformat")
+    for package in ("nbclient", "ipykernel"):
+        pytest.importorskip(package)
+    monkeypatch.syspath_prepend(NOTEBOOKS[0].parent)
+    monkeypatch.chdir(tmp_path)
+    own = {"bpnp": {"photos": "some_photos"}}
+    cell = nbformat.v4.new_code_cell("from pathlib import Path\nprint(Path('some_photos').is_dir())")
+    nbformat.write(nbformat.v4.new_notebook(cells=[cell], metadata=own), "some.ipynb")
+    before = Path("some.ipynb").read_bytes()
+    if has_photos:
+        Path("some_photos").mkdir()
+    importlib.import_module("store_outputs").main(["some.ipynb"])
+    stored = nbformat.read("some.ipynb", as_version=4)
+    assert (Path("some.ipynb").read_bytes() == before) is not has_photos
+    assert stored.metadata["bpnp"] == own["bpnp"]
+    if has_photos:
+        assert [output.text for output in stored.cells[0].outputs] == ["True\n"]
+        assert "stored the outputs of some.ipynb" in capsys.readouterr().out
+    else:
+        assert "left out some.ipynb: there is no folder some_photos" in capsys.readouterr().out
