@@ -39,7 +39,7 @@ def reached(problem: Problem) -> dict[int, bool]:
     """Return, for each number of hits that a best pose reached, whether the first one that did was right."""
     points2d, points3d = problem.solve.args  # type: ignore[attr-defined]
     points, settings = problem_from(points2d, points3d, None), replace(DEFAULT, evidence=BLIND)
-    pool = Pool(Scene(points, 0, settings), points, no_pose("no pose was found"))
+    pool = Pool(Scene(points, 0, settings), points, no_pose())
     found: dict[int, bool] = {}
     plan = Plan.of(pool)
     for _ in range(TURNS):

@@ -16,8 +16,7 @@ from bpnp.poses import MIN_POINTS
 from bpnp.search.annealing import finish, polished
 from bpnp.search.competitors import other_lens, settle
 from bpnp.search.config import DEFAULT, Evidence
-from bpnp.search.evidence import reasons
-from bpnp.search.evidence.alternatives import Alternative, fits_as_well
+from bpnp.search.evidence.alternatives import competing_pose
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
 from bpnp.search.problem import Problem, UnknownFocal, faces
 from bpnp.search.raster_search import search_beside
@@ -28,7 +27,7 @@ from bpnp.solving.arguments import checked_prior
 from bpnp.solving.focal_length import AROUND, UnknownCamera, fit_camera, solved_with_focal_length
 from bpnp.solving.inputs import problem_from
 from bpnp.solving.matches import finished
-from bpnp.solving.solution import Candidate, Solution
+from bpnp.solving.solution import Candidate, Solution, add_objection
 from bpnp.solving.sources import Options, solutions_of
 
 Array = NDArray[np.float64]
@@ -233,7 +232,8 @@ def on_all_points(solution: Solution, photo: Photo, lens: Camera | UnknownCamera
     rotations, shifts = np.stack([rotation, result.best[0]]), np.stack([shift, result.best[1]])
     behind = result.log10_false_alarms - solution.log10_false_alarms
     if sure and not problem.same_pose(rotations, shifts, rule.same)[1]:
-        return solution if behind >= rule.lead else _doubted(solution, fits_as_well(rotation, result.best[0], behind))
+        other = competing_pose(rotation, result.best[0], behind)
+        return solution if behind >= rule.lead else add_objection(solution, other)
     if behind < 0 or (not sure and result.verdict == "confident"):
         found = finished(problem, result, solution.seconds, None)
         stats = replace(found.stats, iterations=solution.stats.iterations)
@@ -242,17 +242,14 @@ def on_all_points(solution: Solution, photo: Photo, lens: Camera | UnknownCamera
     if not sure:
         return solution
     if alone.verdict != "confident":  # other cameras have not been tested for it
-        other = other_lens(alone, problem, lambda: scene, rule)
-        return solution if other is None else _doubted(solution, other)
-    confident = result.verdict == "confident"
-    return solution if confident else replace(solution, verdict=result.verdict, reason=result.reason)
+        lens_objection = other_lens(alone, problem, lambda: scene, rule)
+        return solution if lens_objection is None else add_objection(solution, lens_objection)
+    if result.verdict == "confident":
+        return solution
+    return replace(solution, verdict=result.verdict, reason=result.reason, reason_code=result.code)
 
 
 def looks_for_certainty(rule: Evidence) -> int:
     """Return the number of local searches that exclude a better pose nearby, whatever its initial poses were."""
     again = (rule.missed - math.log10(rule.look_fails)) / math.log10(rule.again_fails)
     return 1 + max(math.ceil(again), 0)
-
-
-def _doubted(solution: Solution, other: Alternative) -> Solution:
-    return replace(solution, verdict="ambiguous", reason=reasons.against(other.what, solution.log10_false_alarms))

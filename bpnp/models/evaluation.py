@@ -26,7 +26,7 @@ from bpnp.search.problem import Problem
 from bpnp.search.propose.given import anneal_given
 from bpnp.search.scene import Scene, degenerate
 from bpnp.search.search import search_poses
-from bpnp.search.verdict import SearchResult, judged, no_pose
+from bpnp.search.verdict import SearchResult, degenerate_points, judged
 from bpnp.types import Batch, Pose, Prediction, SolveStats
 
 
@@ -94,7 +94,7 @@ def refine(batch: Batch, rotation: Float[Tensor, "b s 3 3"], translation: Float[
 def _refined(problem: Problem, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> SearchResult:
     """Return the annealed poses of one problem, the best one first."""
     if degenerate(problem.bearings) or degenerate(problem.points3d):
-        return no_pose("no pose fits: too few points, or all on one line")
+        return degenerate_points("too few points, or all on one line")
     poses = anneal_given(Scene(problem, 0, DEFAULT), rotation, translation)
     return judged(poses, problem, batches=int(np.isfinite(rotation).all((-2, -1)).sum()), rule=DEFAULT.evidence)
 

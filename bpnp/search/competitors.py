@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from bpnp.search.annealing import polished
 from bpnp.search.config import Evidence, OtherFocal
-from bpnp.search.evidence import reasons
-from bpnp.search.evidence.alternatives import Alternative, of_misfit
+from bpnp.search.evidence.alternatives import of_misfit
 from bpnp.search.evidence.false_alarms import alarms_of
+from bpnp.search.evidence.reasons import Objection, objection
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
 from bpnp.search.evidence.uncertainty import bends_significantly, linearised, misfit_of
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
@@ -68,9 +68,7 @@ def settle(
         if np.array_equal(result.best[1], leader):
             break
     other = other_lens(result, problem, scene_of, rule) if result.verdict == "confident" else None
-    if other is None:
-        return result
-    return replace(result, verdict="ambiguous", reason=reasons.against(other.what, result.log10_false_alarms))
+    return result if other is None else result.doubt(other)
 
 
 def repeated_competitors(
@@ -113,7 +111,7 @@ def repeated_competitors(
     return replace(refined, log10_false_alarms=alarms)
 
 
-def other_lens(result: SearchResult, problem: Problem, scene_of: SceneOf, rule: Evidence) -> Alternative | None:
+def other_lens(result: SearchResult, problem: Problem, scene_of: SceneOf, rule: Evidence) -> Objection | None:
     """Return another lens with which a different pose fits better than the best one, or None.
 
     Better means fewer false alarms by the factor `focal_chance`, with focal length and radial coefficient counted as
@@ -134,7 +132,7 @@ def other_lens(result: SearchResult, problem: Problem, scene_of: SceneOf, rule: 
     linear = linearised(problem, rotation, translation, scale)
     starts = (None, 0.0) if bends_significantly(linear, count, rule) else (None,)
 
-    def better(found: AtZoom) -> Alternative | None:
+    def better(found: AtZoom) -> Objection | None:
         least = max(float(found.pose.scale[0]), found.problem.image.scales[0])
         fits = (fit_lens(found.problem, found.pose.rotation[0], found.middle, least, start) for start in starts)
         others = [fit._replace(zoom=found.zoom * fit.zoom) for fit in fits if fit is not None]
@@ -150,7 +148,7 @@ def other_lens(result: SearchResult, problem: Problem, scene_of: SceneOf, rule: 
     scene = scene_of()
     likeliest = likeliest_zoom(leader, scene, rule.zoomed)
     if scene.deadline.passed():
-        return Alternative(-math.inf, "there was no time to try other focal lengths")
+        return objection("camera_untested")
     return better(likeliest)
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.search.annealing import multistart
-from bpnp.search.evidence.alternatives import far_missed, near_missed
+from bpnp.search.evidence.completeness import far_missed, near_missed
 from bpnp.search.hypotheses import Hypotheses, select_distinct, to_scene_frame
 from bpnp.search.loop import Step
 from bpnp.search.pool import Pool

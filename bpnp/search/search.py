@@ -31,7 +31,7 @@ from bpnp.search.raster_search import looked_up
 from bpnp.search.scene import Scene, degenerate
 from bpnp.search.schedule import Plan, Proposals
 from bpnp.search.starts import Prior
-from bpnp.search.verdict import SearchResult, judged, no_pose
+from bpnp.search.verdict import SearchResult, degenerate_points, judged, no_pose
 
 Progress = Callable[[int, float], None]  # batches so far, seconds
 WARMING = 8  # number of points of the problem that compiles the loops
@@ -83,7 +83,7 @@ def search_poses(
     """
     if clutter is not None:
         settings, problem = settings.expecting(clutter), replace(problem, clutter=clutter)
-    start, enumerated = time.monotonic(), no_pose("no pose was found")
+    start, enumerated = time.monotonic(), no_pose()
 
     def tell(batches: int) -> None:
         if progress is not None:
@@ -112,10 +112,10 @@ def search_poses(
             return enumerated
     if degenerate(problem.bearings) or degenerate(problem.points3d):
         counts = f"{len(problem.bearings)} 2D and {len(problem.points3d)} 3D points"
-        return no_pose(f"no pose fits: {counts}, too few or all on one line")
+        return degenerate_points(f"{counts}, too few or all on one line")
     scene = scene_of()
     if lacks_partners(scene):
-        return no_pose("no pose fits: too few points with a label of the other side, or all on one line")
+        return degenerate_points("too few points with a label of the other side, or all on one line")
     pool = Pool(scene, problem, enumerated)
     plan = Plan.of(pool, around, proposals if many else None, only_proposals=only_proposals)
     return run(plan, pool, most=settings.schedule.turns, deadline=deadline, tell=tell)

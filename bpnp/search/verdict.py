@@ -5,7 +5,7 @@ that fit as well if image and scene are unrelated.
 
 - "confident": log10 NFA is at most `Evidence.false_alarms`. The margin to every competing pose is at least
   `Evidence.lead` decades. log10 of the probability that the search missed a better optimum is at most
-  `Evidence.missed` (`bpnp.search.evidence.alternatives`).
+  `Evidence.missed` (`bpnp.search.evidence.completeness`).
 - "ambiguous": The best pose is significant, but one of the three conditions does not hold. Points that do not fix the
   rotation or the focal length give this verdict too.
 - "failed": No pose was found, or none is significant.
@@ -20,8 +20,10 @@ from numpy.typing import NDArray
 
 from bpnp.search.config import DEFAULT, Evidence
 from bpnp.search.evidence import reasons
-from bpnp.search.evidence.alternatives import Seen, contesting, log10_missed, misfit, other_pose, rougher
+from bpnp.search.evidence.alternatives import Seen, contesting, misfit, other_pose, rougher
+from bpnp.search.evidence.completeness import log10_missed
 from bpnp.search.evidence.false_alarms import alarms_of
+from bpnp.search.evidence.reasons import CLAUSES, CONFIDENT, Objection, objection
 from bpnp.search.evidence.repetitions import registered
 from bpnp.search.evidence.uncertainty import focal_bound, is_redundant, linearised, rotation_bound
 from bpnp.search.hypotheses import Hypotheses
@@ -42,6 +44,7 @@ class SearchResult:
         verdict: Confident, ambiguous or failed, as defined at the head of this file.
         reason: Reason of the verdict, a plain sentence.
         batches: Number of iterations of the search.
+        code: Kind of the reason, "confident" or a key of `bpnp.search.evidence.reasons.CLAUSES`.
         settled: True if more search would not change the verdict. A better optimum is then excluded without the
             evidence of the matches.
     """
@@ -50,7 +53,13 @@ class SearchResult:
     verdict: Verdict
     reason: str
     batches: int
+    code: str
     settled: bool = False
+
+    def doubt(self, one: Objection) -> "SearchResult":
+        """Return a copy that is ambiguous for a reason."""
+        reason = one.sentence(self.log10_false_alarms)
+        return replace(self, verdict="ambiguous", reason=reason, code=one.code)
 
     @property
     def best(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -217,44 +226,40 @@ def judged(
         Candidates, best first, with the verdict and its reason.
     """
     if not len(candidates):
-        return no_pose("no pose was found", batches, settled=exhaustive)
+        return no_pose(batches=batches, settled=exhaustive)
     candidates = weighed(candidates, problem, rule)
     alarms = float(candidates.log10_false_alarms[0])
     settled = exhaustive or missed(candidates, problem, looks, rule, independent=False) <= rule.missed
     if alarms > 0:
-        reason = reasons.against("no pose fits better than chance", alarms)
-        return SearchResult(candidates, "failed", reason, batches, settled)
+        one = objection("chance", what="no pose fits")
+        return SearchResult(candidates, "failed", one.sentence(alarms), batches, one.code, settled)
+    result = SearchResult(candidates, "confident", "", batches, CONFIDENT, settled)
     unseen = -math.inf if exhaustive else missed(candidates, problem, looks, rule)
     # Costly tests run only if the verdict depends on them.
     seen = rig or [(candidates, problem)]
     against = [*(other_pose(*each, rule) for each in seen), rougher(candidates)]
     certain = alarms <= rule.false_alarms and unseen <= rule.missed
-    reason = ""
-    if certain and all(one is None or one.decades >= rule.lead for one in against):
+    off = share = math.nan
+    if certain and all(one is None or one.margin >= rule.lead for one in against):
         count = match_count(candidates, problem)
         linear = linearised(problem, candidates.rotation[0], candidates.translation[0], float(candidates.scale[0]))
         off = math.degrees(rotation_bound(problem, linear, count))
         if off >= HALF_TURN or not (rig or is_redundant(problem, count)):
-            reason = reasons.against(f"its {count:.0f} matches do not fix the rotation", alarms)
-            return SearchResult(candidates, "ambiguous", reason, batches, settled)
+            return result.doubt(objection("rotation_not_fixed", count=count, what="the rotation"))
         share = 0.0 if problem.focal is None else focal_bound(problem, linear, count)
         if share > (rule.focal_few if is_object(problem, rule) else rule.focal):
             off_by = f"{100 * share:.0f} % off" if share < 10 else "anything"
-            what = f"the points do not fix the focal length: it and the distance may be {off_by}"
-            reason = reasons.against(what, alarms)
-            return SearchResult(candidates, "ambiguous", reason, batches, settled)
-        reason = reasons.confident(alarms, rule.lead, off, share)
+            return result.doubt(objection("focal_length_not_fixed", off=off_by))
         against += [misfit(linear, count, rule), contesting(seen, rule)]
-    doubts = [one for one in against if one is not None and one.decades < rule.lead]
+    doubts = [one for one in against if one is not None and one.margin < rule.lead]
     if certain and not doubts:
-        return SearchResult(candidates, "confident", reason, batches, True)
+        return replace(result, reason=reasons.confident(alarms, rule.lead, off, share), settled=True)
     if doubts:
-        reason = reasons.against(min(doubts).what, alarms)
-    elif alarms > rule.false_alarms:
+        return result.doubt(min(doubts))
+    if alarms > rule.false_alarms:
         reason = reasons.insignificant(alarms, rule.false_alarms)
-    else:
-        reason = reasons.against(reasons.incomplete(unseen), alarms)
-    return SearchResult(candidates, "ambiguous", reason, batches, settled)
+        return replace(result, verdict="ambiguous", reason=reason, code="insignificant")
+    return result.doubt(objection("incomplete", what="pose", probability=reasons.miss_probability(unseen)))
 
 
 def is_object(problem: Problem, rule: Evidence) -> bool:
@@ -273,11 +278,25 @@ def is_certain(candidates: Hypotheses, problem: Problem, rule: Evidence = DEFAUL
     if not len(candidates) or float(candidates.log10_false_alarms[0]) > rule.false_alarms:
         return False
     other = other_pose(candidates, problem, rule)
-    if (other is not None and other.decades < rule.lead) or rougher(candidates) is not None:
+    if (other is not None and other.margin < rule.lead) or rougher(candidates) is not None:
         return False
     return missed(candidates, problem, REFINED, rule) <= rule.missed
 
 
-def no_pose(reason: str, batches: int = 0, *, settled: bool = False) -> SearchResult:
-    """Return a failed result without candidates, for points that fix no pose or a search that found none."""
-    return SearchResult(Hypotheses.empty(), "failed", reason, batches, settled)
+def no_pose(
+    reason: str = CLAUSES["no_pose"], batches: int = 0, *, code: str = "no_pose", settled: bool = False
+) -> SearchResult:
+    """Return a failed result without candidates.
+
+    Args:
+        reason: Reason, a sentence.
+        batches: Number of iterations of the search.
+        code: Kind of the reason, a key of `CLAUSES`.
+        settled: True if more search would not find a pose. Default False.
+    """
+    return SearchResult(Hypotheses.empty(), "failed", reason, batches, code, settled)
+
+
+def degenerate_points(why: str) -> SearchResult:
+    """Return a failed result for points that fix no pose."""
+    return no_pose(objection("degenerate", why=why).clause, code="degenerate", settled=True)

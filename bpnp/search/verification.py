@@ -21,9 +21,9 @@ from bpnp.search.annealing import anneal_on_points, finish, polished
 from bpnp.search.competitors import settle
 from bpnp.search.config import DEFAULT, Evidence
 from bpnp.search.enumeration.search import is_enumerable
-from bpnp.search.evidence import reasons
 from bpnp.search.evidence.false_alarms import likeliest_scale
 from bpnp.search.evidence.partners import explained
+from bpnp.search.evidence.reasons import objection
 from bpnp.search.evidence.repetitions import competing_poses, registered
 from bpnp.search.evidence.uncertainty import linearised, local_covariance
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
@@ -33,7 +33,7 @@ from bpnp.search.propose.symmetries import mirror_pose
 from bpnp.search.raster_search import around_each
 from bpnp.search.scene import Scene
 from bpnp.search.starts import PosePrior
-from bpnp.search.verdict import SearchResult, judged, with_false_alarms
+from bpnp.search.verdict import SearchResult, Verdict, judged, with_false_alarms
 
 Array = NDArray[np.float64]
 ONE_POSE = "only this pose and its competitors were tested, no better one was searched for"
@@ -97,9 +97,7 @@ def judge_given_pose(
     lead = float(claim.log10_false_alarms[0] - optimum.log10_false_alarms[0]) if better else 0.0
     if not refine and result.verdict == "confident" and 2 * math.log(10) * lead > WITHIN:  # see Wilks 1938
         off = math.degrees(turned_by(rotation, optimum.rotation[0]))
-        what = f"the optimum beside it, {off:.2g} deg away, fits better (by {lead:.1f} decades)"
-        reason = reasons.against(what, float(claim.log10_false_alarms[0]))
-        result = replace(result, verdict="ambiguous", reason=reason)
+        result = result.doubt(objection("better_nearby", lead, degrees=off))
     refined = refine and result.verdict == "confident"
     return replace(result, batches=int(refined)), optimum  # 0 batches: no last fit to the matches
 
@@ -167,12 +165,13 @@ def _of_claim(result: SearchResult, claim: Hypotheses) -> SearchResult:
     ordered = candidates[np.r_[place, np.delete(np.arange(len(candidates)), place)]]
     alarms = float(claim.log10_false_alarms[0])
     if alarms > 0:
-        reason = reasons.against("the pose fits no better than chance", alarms)
-        result = replace(result, verdict="failed", reason=reason)
+        one = objection("chance", what="the pose fits no")
+        result = replace(result, verdict="failed", reason=one.sentence(alarms), code=one.code)
     elif place:
         off = math.degrees(turned_by(candidates.rotation[0], claim.rotation[0]))
         margin = alarms - float(candidates.log10_false_alarms[0])
-        reason = reasons.against(f"a pose {off:.0f} deg away fits better (by {margin:.1f} decades)", alarms)
+        one = objection("better_pose", margin, degrees=off)
         refuted = result.verdict == "confident"  # the other pose is confident and refutes the given one
-        result = replace(result, verdict="failed" if refuted else "ambiguous", reason=reason)
+        verdict: Verdict = "failed" if refuted else "ambiguous"
+        result = replace(result, verdict=verdict, reason=one.sentence(alarms), code=one.code)
     return replace(result, candidates=ordered)

@@ -30,7 +30,7 @@ from bpnp.search.annealing import polished
 from bpnp.search.config import DEFAULT as SEARCH
 from bpnp.search.config import OtherFocal
 from bpnp.search.enumeration.search import is_enumerable
-from bpnp.search.evidence.reasons import number
+from bpnp.search.evidence.reasons import objection
 from bpnp.search.evidence.uncertainty import POSE, is_within
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, UnknownFocal
@@ -38,7 +38,7 @@ from bpnp.search.propose.lens import fit_lens
 from bpnp.search.scene import Scene
 from bpnp.search.verdict import match_count, weighed
 from bpnp.solving.arguments import Array, checked_size
-from bpnp.solving.solution import Solution
+from bpnp.solving.solution import Solution, add_objection
 from bpnp.solving.sources import Options, solutions_of
 
 ProblemAt = Callable[[Camera, UnknownFocal], Problem]
@@ -321,8 +321,7 @@ class _Ladder:
                     and not is_claimed(best, other.rotation, zoom)
                 ):
                     away = math.degrees(turned_by(best.rotation, other.rotation))
-                    what = f"with {zoom:.2f} times the focal length a pose {away:.0f} deg away fits about as well"
-                    return replace(best, verdict="ambiguous", reason=f"{what} ({number(behind)} times the number)")
+                    return add_objection(best, objection("other_focal_length", behind, zoom=zoom, degrees=away))
         return best
 
 

@@ -152,6 +152,7 @@ def _seen_by(
         parameters=parameters,
         verdict=result.verdict,
         reason=result.reason,
+        reason_code=result.code,
         unit=unit_of(image, lens),
         inlier_threshold=math.nan if inlier_threshold is None else inlier_threshold,
         stats=SolutionStats(result.batches, dropped2d=len(image) - len(usable)),

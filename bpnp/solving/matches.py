@@ -41,7 +41,8 @@ def finished(problem: Problem, result: SearchResult, seconds: float, inlier_thre
     """
     start, found = time.perf_counter(), result.candidates
     if not len(found):
-        return without_pose(problem, _note_duplicates(problem, result), inlier_threshold, seconds)
+        failed = without_pose(problem, _note_duplicates(problem, result), inlier_threshold, seconds)
+        return replace(failed, reason_code=result.code)
     threshold = inlier_threshold or SCALES * result.residual * problem.per_radian
     poses = list(zip(found.rotation, found.translation, strict=True))
     if result.batches:  # an enumerated pose is a least-squares fit in float64 already

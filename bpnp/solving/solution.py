@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bpnp.cameras import Camera, CameraLike, camera_from, camera_to_json
+from bpnp.search.evidence.reasons import Objection
 from bpnp.search.evidence.uncertainty import centre_covariance
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Unit
@@ -107,6 +108,7 @@ class Solution:
         verdict: "confident"; "ambiguous" if the pose is significant but another one may fit as well; "failed" if no
             pose is significant. A pose with the verdict "failed" is a guess.
         reason: Reason of the verdict, a sentence.
+        reason_code: Kind of the reason: "confident", or one of docs/verdict.md, such as "competing_pose".
         log10_false_alarms: Expected number of poses that fit as well if image and scene were unrelated (NFA), log10;
             infinite without a pose. See docs/verdict.md.
         seconds: Run time of this problem. Problems that were solved together count equal parts of their time.
@@ -134,6 +136,7 @@ class Solution:
     candidates: tuple[Candidate, ...] = ()
     verdict: Verdict
     reason: str
+    reason_code: str = "no_pose"
     log10_false_alarms: float = math.inf
     stats: SolutionStats
     seconds: float = 0.0
@@ -312,6 +315,12 @@ class Solution:
             raise ValueError(f"this is not the JSON of a solution{name}: {error}") from error
 
 
+def add_objection(solution: Solution, one: Objection) -> Solution:
+    """Return a copy of a solution that is ambiguous for a reason."""
+    reason = one.sentence(solution.log10_false_alarms)
+    return replace(solution, verdict="ambiguous", reason=reason, reason_code=one.code)
+
+
 def candidates_of(poses: Hypotheses, counts: Sequence[int]) -> tuple[Candidate, ...]:
     """Return hypotheses as `Candidate` objects.
 
@@ -378,6 +387,7 @@ def with_pose(
         covariance=solution.covariance if covariance is None else covariance,
         candidates=candidates,
         verdict=result.verdict,
+        reason_code=result.code,
         log10_false_alarms=candidates[0].log10_false_alarms,
         stats=replace(
             solution.stats,
@@ -435,7 +445,7 @@ def _float(value: float | None, *, missing: float = math.nan) -> float:
     return missing if value is None else value
 
 
-LATER = {"covariance", "scale", "taken2d"}  # fields added after version 0.1.0
+LATER = {"covariance", "scale", "taken2d", "reason_code"}  # fields added after version 0.1.0
 READERS: dict[str, Callable[[Any], Any]] = {  # of the fields with another form in JSON
     "rotation": partial(_array, shape=(3, 3)),
     "translation": partial(_array, shape=(3,)),

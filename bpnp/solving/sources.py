@@ -72,7 +72,8 @@ def solutions_of(problems: Mapping[int, Problem], options: Options) -> dict[int,
     copies: dict[int, torch.nn.Module] = {}
     for i, problem in problems.items():
         if problem.degenerate is not None:
-            solutions[i] = without_pose(problem, problem.degenerate, options.inlier_threshold)
+            failed = without_pose(problem, problem.degenerate, options.inlier_threshold)
+            solutions[i] = replace(failed, reason_code="degenerate")
             continue
         net = problem.network
         if net is not None or options.solver is not None:

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from bpnp.argument_types import ArrayLike, PointsLike
 from bpnp.cameras import CameraLike, camera_from
 from bpnp.loops.parallel import Deadline
+from bpnp.search.evidence.reasons import objection
 from bpnp.search.evidence.uncertainty import linearised, pose_covariance
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem
@@ -141,12 +142,12 @@ def verify_problem(
     """
     begun, deadline = time.perf_counter(), Deadline.after(time_limit)
     if problem.degenerate is not None:
-        return without_pose(problem, problem.degenerate, inlier_threshold)
+        return replace(without_pose(problem, problem.degenerate, inlier_threshold), reason_code="degenerate")
     claim = problem.from_user(rotation, translation)
     result, optimum = judge_given_pose(problem, *claim, refine=refine, seed=seed, deadline=deadline)
     if result.verdict == "confident" and deadline.passed():
-        reason = f"not decided in {time_limit:.3g} s: its competitors were not tested"
-        result = replace(result, verdict="ambiguous", reason=reason)
+        one = objection("untested", seconds=time_limit)
+        result = replace(result, verdict="ambiguous", reason=one.clause, code=one.code)
     solution = finished(problem, result, time.perf_counter() - begun, inlier_threshold)
     if not refine and solution.found:  # to the last digit
         first = replace(solution.candidates[0], translation=translation)

@@ -1,7 +1,6 @@
 """A photo's pose in a map comes from its keypoints alone."""
 
 import json
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -17,8 +16,8 @@ from bpnp import PosePrior, SceneMap, Solution
 from bpnp.cameras import camera_from
 from bpnp.maps import scene_map
 from bpnp.maps.localize import BRIEF, Photo, on_all_points, problem_near
-from bpnp.search.evidence.alternatives import Alternative
 from bpnp.search.evidence.false_alarms import alarms_of
+from bpnp.search.evidence.reasons import Objection, objection
 from bpnp.search.verdict import SearchResult, judged
 
 
@@ -121,8 +120,8 @@ def elsewhere(result: SearchResult, *_: object, **__: object) -> SearchResult:
     return replace(result, candidates=replace(poses, rotation=turn @ poses.rotation, log10_false_alarms=alarms))
 
 
-def of_another_lens(*_: object, **__: object) -> Alternative:
-    return Alternative(-math.inf, "with 1.30 times the focal length they fit significantly better")
+def of_another_lens(*_: object, **__: object) -> Objection:
+    return objection("other_camera", camera="1.30 times the focal length", degrees=2.0, percent=30.0)
 
 
 def not_sure(*known: Any, **options: Any) -> SearchResult:

@@ -167,7 +167,7 @@ def test_a_focal_length_sweep_reaches_the_true_focal_length(factor: float) -> No
     other, untried = (other_lens(seen, problem, lambda one=one: one, DEFAULT.evidence) for one in scenes)
     assert untried is not None
     if other is None:
-        assert (factor, untried.what) == (1.0, "there was no time to try other focal lengths")
+        assert (factor, untried.clause) == (1.0, "there was no time to try other focal lengths")
     else:
-        zoom = float(re.search(r"with (\S+) times the focal length", other.what)[1])
+        zoom = float(re.search(r"with (\S+) times the focal length", other.clause)[1])
         assert zoom == pytest.approx(1 / factor, rel=0.03)

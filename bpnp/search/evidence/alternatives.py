@@ -15,8 +15,8 @@ from scipy.spatial import cKDTree
 
 from bpnp.poses import turned_by
 from bpnp.search.config import Evidence
-from bpnp.search.evidence import reasons
 from bpnp.search.evidence.false_alarms import directions_of, own_evidence
+from bpnp.search.evidence.reasons import Objection, objection
 from bpnp.search.evidence.uncertainty import Linearised, Misfit, systematic_misfit
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, label_groups
@@ -26,19 +26,7 @@ Array = NDArray[np.float64]
 Seen = Sequence[tuple[Hypotheses, Problem]]
 
 
-class Alternative(NamedTuple):
-    """A competing explanation.
-
-    Attributes:
-        decades: Margin by which the best pose is likelier (log10).
-        what: The explanation in words, a clause.
-    """
-
-    decades: float
-    what: str
-
-
-def other_pose(candidates: Hypotheses, problem: Problem, rule: Evidence) -> Alternative | None:
+def other_pose(candidates: Hypotheses, problem: Problem, rule: Evidence) -> Objection | None:
     """Return the competing pose with the fewest false alarms, or None.
 
     Args:
@@ -52,22 +40,21 @@ def other_pose(candidates: Hypotheses, problem: Problem, rule: Evidence) -> Alte
         return None
     k = int(others[np.argmin(candidates.log10_false_alarms[others])])
     decades = float(candidates.log10_false_alarms[k] - candidates.log10_false_alarms[0])
-    return fits_as_well(candidates.rotation[0], candidates.rotation[k], decades)
+    return competing_pose(candidates.rotation[0], candidates.rotation[k], decades)
 
 
-def fits_as_well(rotation: Array, other: Array, decades: float) -> Alternative:
-    """Return a different pose as a competing explanation.
+def competing_pose(rotation: Array, other: Array, decades: float) -> Objection:
+    """Return a different pose as an objection.
 
     Args:
         rotation: (3, 3) of the best pose.
         other: (3, 3) of the competing pose.
         decades: log10 of the ratio of their false alarms.
     """
-    off = math.degrees(turned_by(rotation, other))
-    return Alternative(decades, reasons.competing(off, decades))
+    return objection("competing_pose", decades, degrees=math.degrees(turned_by(rotation, other)))
 
 
-def rougher(candidates: Hypotheses) -> Alternative | None:
+def rougher(candidates: Hypotheses) -> Objection | None:
     """Return the best pose at far larger residuals, or None if the points agree better at its own scale.
 
     If the rough alignment has fewer false alarms, the matches add nothing significant to it.
@@ -75,10 +62,10 @@ def rougher(candidates: Hypotheses) -> Alternative | None:
     decades = float(candidates.log10_rough[0] - candidates.log10_false_alarms[0])
     if decades >= 0:
         return None
-    return Alternative(decades, "the points agree with it better at residuals far larger than those of its matches")
+    return objection("rough_residuals", decades)
 
 
-def misfit(linear: Linearised | None, count: float, rule: Evidence) -> Alternative | None:
+def misfit(linear: Linearised | None, count: float, rule: Evidence) -> Objection | None:
     """Return another focal length or other proportions of the scene that fit significantly better, or None.
 
     They compete only if the pose fitted with them is a different one (`rule.same`). If the points do not determine the
@@ -92,8 +79,8 @@ def misfit(linear: Linearised | None, count: float, rule: Evidence) -> Alternati
     return of_misfit(systematic_misfit(linear, count, rule), rule)
 
 
-def of_misfit(off: Misfit, rule: Evidence) -> Alternative | None:
-    """Return the competing explanation of a misfit, or None if its pose is the same."""
+def of_misfit(off: Misfit, rule: Evidence) -> Objection | None:
+    """Return the objection of a misfit, or None if its pose is the same."""
     limits = (rule.zoomed.bend_deg, rule.zoomed.bend_shift) if off.radial else (rule.same.degrees, rule.same.shift)
     if math.degrees(off.turn) <= limits[0] and off.shift <= limits[1]:
         return None
@@ -101,11 +88,10 @@ def of_misfit(off: Misfit, rule: Evidence) -> Alternative | None:
     if off.radial:
         zoomed = f" and {off.zoom:.2f} times the focal length" if abs(off.zoom - 1) > SAME_ZOOM else ""
         other = f"a radial distortion of {off.radial:.2g}{zoomed}"
-    away = f"{math.degrees(off.turn):.0f} deg and {100 * off.shift:.0f} % of the distance away"
-    return Alternative(-math.inf, f"with {other} the points fit significantly better, by a pose {away}")
+    return objection("other_camera", camera=other, degrees=math.degrees(off.turn), percent=100 * off.shift)
 
 
-def contesting(seen: Seen, rule: Evidence) -> Alternative | None:
+def contesting(seen: Seen, rule: Evidence) -> Objection | None:
     """Return a far candidate over which the lead of the first one is not significant, or None.
 
     The number of false alarms assumes independent image points. Points on lines or curves are dependent: a pose that
@@ -154,8 +140,7 @@ def contesting(seen: Seen, rule: Evidence) -> Alternative | None:
         decades = max(float(gap.sum()), 0.0) ** 2 / max(squared, 1e-300) / (2 * math.log(10))
         if decades < rule.lead and (apart or (same & first.near & other.near).sum() < limits.same * other.near.sum()):
             degrees = math.degrees(turned_by(candidates.rotation[0], candidates.rotation[k]))
-            what = f"a pose {degrees:.0f} deg away explains other points, as many as two unrelated poses do by chance"
-            return Alternative(decades, what)
+            return objection("other_points", decades, degrees=degrees)
     return None
 
 
@@ -206,57 +191,3 @@ def _partners(near: float, problem: Problem, rotation: Array, translation: Array
             chord[rows], nearest = cKDTree(seen[ahead]).query(bearings, distance_upper_bound=near * scale)
             points[rows] = np.r_[ahead, -1][nearest]
     return _Partners(points, problem.points3d[points] @ rotation.T + translation, np.isfinite(chord))
-
-
-def log10_missed(
-    basin_count: int, decades_a_match: float, looks: float | int, rule: Evidence, *, symmetric: bool = False
-) -> float:
-    """Return log10 of the probability that a better optimum than the best pose exists and was missed.
-
-    It lies near the best pose or far from it, and the evidence of the matches lowers the probability of both:
-
-        P = 10^(-3 e) (max(2^-h, q) F G^(l - 1) + q 2^-h)
-
-    - Basin count h. Let a better optimum attract initial poses at least as often as the best pose. If h independent
-      ones ended at one of the two, all ended at the best pose with a probability of at most 2^-h.
-    - Near. Initial poses that share a wide optimum end at the same narrow one inside it. However many they are, a
-      better one lies near it with the probability q. The first of l local searches around the best pose misses it with
-      the probability F. Each further one misses it with G, since local searches miss the same optima. With l = 0,
-      F G^(l - 1) is replaced by 1.
-    - Far. A significant pose far from a better one is a rare repetition or symmetry: q.
-    - Matches. A pose with a better one elsewhere explains part of the points by coincidence: it aligns a part of the
-      scene or slides along a surface. Each of its matches then has little evidence. A match with e decades of evidence
-      is a coincidence with a probability of 10^-e. Matches are dependent; but three fix a pose, and at least three
-      others must be independent coincidences: 10^-3e.
-
-    The term 2^-h is the posterior of unseen optima of Boender and Rinnooy Kan for two optima.
-    Source: C. G. E. Boender, A. H. G. Rinnooy Kan, Bayesian stopping rules for multistart global optimization methods,
-    Math. Programming 1987.
-
-    Args:
-        basin_count: Number h of independent initial poses that ended at the best pose or at one that is not different.
-        decades_a_match: Evidence e of a match; 0 if matches do not confirm each other, as in repeated structures.
-        looks: Number l of local searches around the best pose that found no better one.
-        rule: Constants; F is `rule.look_fails`, G is `rule.again_fails`, q is `rule.another`.
-        symmetric: Use `rule.uncompared` as q of a far optimum, since the scene's motions were tried.
-
-    >>> rule = Evidence()
-    >>> [round(log10_missed(*seen, rule), 2) for seen in ((0, 0.0, 0), (7, 0.0, 0), (7, 0.0, 1), (1, 1.0, 0))]
-    [0.0, -2.0, -3.24, -3.3]
-    """
-    unseen = near_missed(basin_count, looks, rule) + far_missed(basin_count, rule, symmetric=symmetric)
-    return min(math.log10(unseen) - rule.independent * max(decades_a_match, 0.0), 0.0)
-
-
-def near_missed(basin_count: int, looks: float | int, rule: Evidence) -> float:
-    """Return the probability that a better optimum near the best pose was missed; arguments as for `log10_missed`."""
-    overlooked = rule.look_fails * rule.again_fails ** (looks - 1) if looks else 1.0
-    return max(0.5**basin_count, rule.another) * overlooked
-
-
-def far_missed(basin_count: int, rule: Evidence, *, symmetric: bool = False) -> float:
-    """Return the probability that a better optimum far from the best pose was missed.
-
-    The prior probability is `rule.uncompared` in a symmetric scene, else `rule.another`.
-    """
-    return (rule.uncompared if symmetric else rule.another) * 0.5**basin_count

@@ -1,7 +1,73 @@
-"""Sentences that give the reason of a verdict (`Solution.reason`)."""
+"""Reasons of a verdict: their codes (`Solution.reason_code`) and sentences (`Solution.reason`), all in one table."""
+
+import math
+from typing import NamedTuple
 
 MIRRORED = "the mirror image of the scene has a significant pose: check the directions of its axes"
 LEAST_SHOWN = 0.05  # decades that are shown as 0.0
+CONFIDENT = "confident"  # code of a pose without an objection
+CLAUSES = {
+    # The pose is not significant.
+    "no_pose": "no pose was found",
+    "degenerate": "no pose fits: {why}",
+    "chance": "{what} better than chance",
+    "insignificant": "not significant",
+    # Another pose may be the right one.
+    "competing_pose": "a competing pose {degrees:.0f} deg away fits about as well (margin {margin:.1f} decades)",
+    "competing_rotation": "another rotation fits about as well (margin {margin:.1f} decades)",
+    "competing_place": "a pose {degrees:.0f} deg away, elsewhere in the map, explains the image points about as well "
+    "(margin {margin:.1f} decades)",
+    "better_pose": "a pose {degrees:.0f} deg away fits better (by {margin:.1f} decades)",
+    "better_nearby": "the optimum beside it, {degrees:.2g} deg away, fits better (by {margin:.1f} decades)",
+    "other_points": "a pose {degrees:.0f} deg away explains other points, as many as two unrelated poses do by chance",
+    "rough_residuals": "the points agree with it better at residuals far larger than those of its matches",
+    "untested": "not decided in {seconds:.3g} s: its competing poses were not tested",
+    "incomplete": "a better {what} may exist (miss probability up to {probability})",
+    # Another camera, or another scene, may be the right one.
+    "other_camera": "with {camera} the points fit significantly better, by a pose {degrees:.0f} deg and "
+    "{percent:.0f} % of the distance away",
+    "other_focal_length": "with {zoom:.2f} times the focal length a pose {degrees:.0f} deg away fits about as well "
+    "(margin {margin:.1f} decades)",
+    "other_camera_by_pixels": "a camera other than the given one, by {pixels:.2g} pixels, explains the points better",
+    "camera_untested": "there was no time to try other focal lengths",
+    # The points do not determine an unknown.
+    "rotation_not_fixed": "its {count:.0f} matches do not fix {what}",
+    "focal_length_not_fixed": "the points do not fix the focal length: it and the distance may be {off}",
+    "scale_not_fixed": "the points do not fix the scale of the scene: it may be more than {percent:.0f} % off",
+}
+
+
+class Objection(NamedTuple):
+    """Reason against a pose.
+
+    Attributes:
+        margin: Margin by which the pose is likelier than what contradicts it (log10); -inf without a comparison.
+        code: Kind of the reason, a key of `CLAUSES`.
+        clause: The reason in words.
+    """
+
+    margin: float
+    code: str
+    clause: str
+
+    def sentence(self, log10_false_alarms: float) -> str:
+        """Return the reason of a pose with this log10 NFA."""
+        return against(self.clause, log10_false_alarms)
+
+
+def objection(code: str, margin: float = -math.inf, **values: object) -> Objection:
+    """Return a reason against a pose.
+
+    Args:
+        code: Key of `CLAUSES`.
+        margin: Margin by which the pose is likelier (log10); -inf without a comparison.
+        **values: Values of the clause.
+
+    Examples:
+        >>> objection("rotation_not_fixed", count=4, what="the rotation").sentence(-5.02)
+        'Its 4 matches do not fix the rotation; log10 NFA -5.0'
+    """
+    return Objection(margin, code, CLAUSES[code].format(margin=margin, **values))
 
 
 def confident(log10_false_alarms: float, lead: float, bound_deg: float, focal: float = 0.0) -> str:
@@ -26,16 +92,7 @@ def confident(log10_false_alarms: float, lead: float, bound_deg: float, focal: f
 
 
 def against(what: str, log10_false_alarms: float) -> str:
-    """Return the reason of a pose that is not confident.
-
-    Args:
-        what: The objection, a clause.
-        log10_false_alarms: log10 NFA of the pose.
-
-    Examples:
-        >>> against("its 4 matches do not fix the rotation", -5.02)
-        'Its 4 matches do not fix the rotation; log10 NFA -5.0'
-    """
+    """Return the reason of a pose that is not confident; `what` is a clause."""
     return f"{what[0].upper()}{what[1:]}; {nfa(log10_false_alarms)}"
 
 
@@ -44,14 +101,9 @@ def insignificant(log10_false_alarms: float, most: float) -> str:
     return f"Not significant: {nfa(log10_false_alarms)}, and at most {most:g} is needed"
 
 
-def competing(degrees: float, margin: float) -> str:
-    """Return the clause of a competing pose, `degrees` away and less likely by `margin` decades (log10)."""
-    return f"a competing pose {degrees:.0f} deg away fits about as well (margin {margin:.1f} decades)"
-
-
-def incomplete(log10_missed: float) -> str:
-    """Return the clause of an incomplete search; `log10_missed` is log10 of its miss probability."""
-    return f"a better pose may exist (miss probability up to {number(min(log10_missed, 0.0))})"
+def miss_probability(log10_missed: float) -> str:
+    """Format the miss probability of a search, of which the logarithm is given."""
+    return number(min(log10_missed, 0.0))
 
 
 def undecided(reason: str, seconds: float) -> str:

@@ -22,6 +22,7 @@ from scipy.special import betaln
 from bpnp.loops.parallel import NEVER, Deadline
 from bpnp.search.config import DEFAULT as SEARCH
 from bpnp.search.evidence import reasons
+from bpnp.search.evidence.reasons import CONFIDENT, objection
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.infinity.evidence import (
     Array,
@@ -428,32 +429,29 @@ def _judged(found: Hypotheses, sight: Sight, turns: int) -> SearchResult:
     if found.matches is None or found.point_evidence is None:
         return no_pose("no rotation was found", turns)
     alarms = float(found.log10_false_alarms[0])
+    result = SearchResult(found, "confident", "", turns, CONFIDENT)
     if alarms > 0:
-        return SearchResult(found, "failed", reasons.against("no rotation fits better than chance", alarms), turns)
+        return replace(result.doubt(objection("chance", what="no rotation fits")), verdict="failed")
+    if alarms > rule.false_alarms:
+        reason = reasons.insignificant(alarms, rule.false_alarms)
+        return replace(result, verdict="ambiguous", reason=reason, code="insignificant")
+    lead = float(found.log10_false_alarms[1]) - alarms if len(found) > 1 else math.inf
+    if lead < rule.lead:
+        return result.doubt(objection("competing_rotation", lead))
     hit = np.flatnonzero(found.matches[0] >= 0)
     worth = found.point_evidence[0, hit] / math.log(10)
     most = float(worth.mean() + 2 * worth.std() / math.sqrt(len(hit)))  # largest for a competing rotation
     least = max(math.ceil((float(worth.sum()) - rule.lead) / most), FIXING_ROTATION + 1)
     count = len(sight.image.bearings)
     missed = log10_missed(turns, count, min(least, count), sight.settings.power)
-    lead = float(found.log10_false_alarms[1]) - alarms if len(found) > 1 else math.inf
-    doubt = known = None
-    if alarms > rule.false_alarms:
-        return SearchResult(found, "ambiguous", reasons.insignificant(alarms, rule.false_alarms), turns)
-    if lead < rule.lead:
-        doubt = f"another rotation fits about as well (margin {lead:.1f} decades)"
-    elif missed > rule.missed:
-        doubt = f"a better rotation may exist (miss probability up to {reasons.number(missed)})"
-    else:  # the costly tests are run only if the verdict depends on them
-        seen, bearings, pixel = _matches(sight, found)
-        some = np.linspace(0, len(hit) - 1, min(len(hit), sight.settings.strained)).astype(np.int64)
-        known = how_well_known(seen, bearings, pixel)
-        strain = strain_of(seen[some], bearings[some], pixel[some], sight.image.bearings)
-        if strain > sight.reach:
-            doubt = f"a camera other than the given one, by {strain:.2g} pixels, explains the points better"
-        elif not math.isfinite(known.bound):
-            doubt = f"its {len(hit)} matches do not fix it"
-    if doubt is not None or known is None:
-        return SearchResult(found, "ambiguous", reasons.against(doubt or "", alarms), turns)
-    reason = reasons.confident(alarms, rule.lead, math.degrees(known.bound))
-    return SearchResult(found, "confident", reason, turns)
+    if missed > rule.missed:
+        return result.doubt(objection("incomplete", what="rotation", probability=reasons.number(missed)))
+    seen, bearings, pixel = _matches(sight, found)
+    some = np.linspace(0, len(hit) - 1, min(len(hit), sight.settings.strained)).astype(np.int64)
+    strain = strain_of(seen[some], bearings[some], pixel[some], sight.image.bearings)
+    if strain > sight.reach:
+        return result.doubt(objection("other_camera_by_pixels", pixels=strain))
+    bound = how_well_known(seen, bearings, pixel).bound
+    if not math.isfinite(bound):
+        return result.doubt(objection("rotation_not_fixed", count=len(hit), what="it"))
+    return replace(result, reason=reasons.confident(alarms, rule.lead, math.degrees(bound)))

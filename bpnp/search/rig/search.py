@@ -18,6 +18,7 @@ from bpnp.loops.parallel import NEVER, Clock, Deadline, one_blas_thread
 from bpnp.poses import distinct, seen_from
 from bpnp.search.config import DEFAULT, ENUMERATION
 from bpnp.search.enumeration.search import enumerate_poses, is_enumerable
+from bpnp.search.evidence.reasons import objection
 from bpnp.search.evidence.repetitions import repeated_poses
 from bpnp.search.evidence.uncertainty import share_bound
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame, to_scene_frame
@@ -64,7 +65,7 @@ def search_rig(rig: Rig, *, clutter: float | None = None, seed: int = 0, deadlin
         poses.exhaustive = False
         scene = Scene(problem, seed + k, settings, deadline)
         if not lacks_partners(scene):
-            poses.pools[k] = Pool(scene, problem, no_pose("no pose was found"))
+            poses.pools[k] = Pool(scene, problem, no_pose())
     rig.join({k: pool.scene for k, pool in poses.pools.items()})
     poses.take(few, REFINED)
     return run(RigPlan(poses), poses, most=settings.schedule.turns, deadline=deadline)
@@ -207,7 +208,7 @@ class RigPoses:
     def result(self, *, ended: bool = True) -> SearchResult:
         """Judge the best poses; a confident one also against the competing poses of a repeated structure."""
         if not len(self.best):
-            return no_pose("no pose was found")
+            return no_pose()
         result = self._judged()
         if result.verdict == "confident":
             strongest, seen = self._strongest()
@@ -220,9 +221,7 @@ class RigPoses:
             best = self.best.rotation[0], self.best.translation[0], float(self.best.scale[0])
             covariance, free = self.rig.covariance(*best), 2 * float(self.best.match_count[0]) - 7
             if covariance is None or share_bound(covariance[6:, 6:], free) > self.rule.scale:
-                off = f"it may be more than {100 * self.rule.scale:.0f} % off"
-                reason = f"the scale of the scene cannot be told: {off}"
-                result = replace(result, verdict="ambiguous", reason=reason)
+                result = result.doubt(objection("scale_not_fixed", percent=100 * self.rule.scale))
         poses = replace(result.candidates, rotation=self.best.rotation, translation=self.best.translation)
         return replace(result, candidates=poses)
 

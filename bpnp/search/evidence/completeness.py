@@ -1,0 +1,59 @@
+"""Completeness of a search: the probability that a better pose exists and was not visited."""
+
+import math
+
+from bpnp.search.config import Evidence
+
+
+def log10_missed(
+    basin_count: int, decades_a_match: float, looks: float | int, rule: Evidence, *, symmetric: bool = False
+) -> float:
+    """Return log10 of the probability that a better optimum than the best pose exists and was missed.
+
+    It lies near the best pose or far from it, and the evidence of the matches lowers the probability of both:
+
+        P = 10^(-3 e) (max(2^-h, q) F G^(l - 1) + q 2^-h)
+
+    - Basin count h. Let a better optimum attract initial poses at least as often as the best pose. If h independent
+      ones ended at one of the two, all ended at the best pose with a probability of at most 2^-h.
+    - Near. Initial poses that share a wide optimum end at the same narrow one inside it. However many they are, a
+      better one lies near it with the probability q. The first of l local searches around the best pose misses it with
+      the probability F. Each further one misses it with G, since local searches miss the same optima. With l = 0,
+      F G^(l - 1) is replaced by 1.
+    - Far. A significant pose far from a better one is a rare repetition or symmetry: q.
+    - Matches. A pose with a better one elsewhere explains part of the points by coincidence: it aligns a part of the
+      scene or slides along a surface. Each of its matches then has little evidence. A match with e decades of evidence
+      is a coincidence with a probability of 10^-e. Matches are dependent; but three fix a pose, and at least three
+      others must be independent coincidences: 10^-3e.
+
+    The term 2^-h is the posterior of unseen optima of Boender and Rinnooy Kan for two optima.
+    Source: C. G. E. Boender, A. H. G. Rinnooy Kan, Bayesian stopping rules for multistart global optimization methods,
+    Math. Programming 1987.
+
+    Args:
+        basin_count: Number h of independent initial poses that ended at the best pose or at one that is not different.
+        decades_a_match: Evidence e of a match; 0 if matches do not confirm each other, as in repeated structures.
+        looks: Number l of local searches around the best pose that found no better one.
+        rule: Constants; F is `rule.look_fails`, G is `rule.again_fails`, q is `rule.another`.
+        symmetric: Use `rule.uncompared` as q of a far optimum, since the scene's motions were tried.
+
+    >>> rule = Evidence()
+    >>> [round(log10_missed(*seen, rule), 2) for seen in ((0, 0.0, 0), (7, 0.0, 0), (7, 0.0, 1), (1, 1.0, 0))]
+    [0.0, -2.0, -3.24, -3.3]
+    """
+    unseen = near_missed(basin_count, looks, rule) + far_missed(basin_count, rule, symmetric=symmetric)
+    return min(math.log10(unseen) - rule.independent * max(decades_a_match, 0.0), 0.0)
+
+
+def near_missed(basin_count: int, looks: float | int, rule: Evidence) -> float:
+    """Return the probability that a better optimum near the best pose was missed; arguments as for `log10_missed`."""
+    overlooked = rule.look_fails * rule.again_fails ** (looks - 1) if looks else 1.0
+    return max(0.5**basin_count, rule.another) * overlooked
+
+
+def far_missed(basin_count: int, rule: Evidence, *, symmetric: bool = False) -> float:
+    """Return the probability that a better optimum far from the best pose was missed.
+
+    The prior probability is `rule.uncompared` in a symmetric scene, else `rule.another`.
+    """
+    return (rule.uncompared if symmetric else rule.another) * 0.5**basin_count
