@@ -6,20 +6,18 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment
-from markupsafe import Markup
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bpnp.datamodules.colmap.model_files import read_records
 from bpnp.maps.localized_picture import plane_from_above
 from bpnp.maps.scene_map import SceneMap
-from bpnp.report.terminal import INKS, VERDICTS, number
+from bpnp.report.templates import render_page
+from bpnp.report.terminal import VERDICTS, number
 from bpnp.solving.verify import SECONDS
 
 UNTESTED = "untested"
@@ -160,11 +158,8 @@ def as_csv(verified: Sequence[VerifiedView]) -> str:
 
 def page_html(verified: Sequence[VerifiedView], scene: SceneMap, folder: Path) -> str:
     """Return a self-contained HTML page: the map from above with its views coloured by verdict, and the table."""
-    assets = files("bpnp.report") / "assets"
-    page = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    return page.from_string((assets / "verified_map.html").read_text(encoding="utf-8")).render(
-        style=Markup((assets / "page.css").read_text(encoding="utf-8")),
-        inks=INKS,
+    return render_page(
+        "verified_map.html",
         colours=VERDICTS,
         title=folder,
         summary=summary(verified),

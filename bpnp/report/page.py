@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jinja2 import Environment
 from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
@@ -37,6 +36,7 @@ from bpnp.report.results import (
     read_results,
 )
 from bpnp.report.tables import CAPTION, LOADING, RESULT_COLUMNS, Line, best_texts, cell, lines_of, named_runs, run_rows
+from bpnp.report.templates import render_page
 from bpnp.report.terminal import DASHES, INKS, Paper
 from bpnp.report.training_curves import training_curves, training_folder
 
@@ -105,12 +105,8 @@ def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None) -> str
         "look": json.dumps(look()),
     }
     lines = lines_of(runs)
-    # Names may contain anything: all text but Markup is escaped, and bytes that are not UTF-8 are replaced.
-    page = Environment(
-        autoescape=True, finalize=lambda it: utf8(it) if type(it) is str else it, trim_blocks=True, lstrip_blocks=True
-    )
-    return page.from_string(_asset("page.html")).render(
-        style=Markup(_asset("page.css")),
+    return render_page(
+        "page.html",
         script=Markup("\n".join(map(_asset, SCRIPTS))),
         data=compress_text(json.dumps(numbers)),
         points=page_points(runs, points),
@@ -124,7 +120,6 @@ def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None) -> str
             for name, results in runs.items()
         },
         folders=", ".join(folders),
-        inks=INKS,
         dashes=DASHES,
         lines=lines,
         heads=[column.header for column in RESULT_COLUMNS],
