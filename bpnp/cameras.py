@@ -1,7 +1,6 @@
 """Camera models: pixels to normalised image coordinates and back, distortion included.
 
-This is the only module that imports pycolmap. It does so when a camera first needs it, because the import takes half a
-second.
+Only `import_pycolmap` imports pycolmap, when a camera first needs it: the import takes half a second.
 """
 
 import signal
@@ -365,7 +364,7 @@ def colmap_camera(model: str, params: Any, size: Any = (0, 0)) -> Lens:
         width, height = -1, -1
     if min(width, height) < 0 or max(width, height) > MOST_PIXELS:
         raise ValueError(f"width and height of a {model} camera cannot be {tuple(size)} pixels")
-    lens = Lens(_pycolmap().Camera(model=model, width=width, height=height, params=values.tolist()))
+    lens = Lens(import_pycolmap().Camera(model=model, width=width, height=height, params=values.tolist()))
     return _check_focal_length(lens, f"{values.tolist()}")
 
 
@@ -381,7 +380,7 @@ def read_text_model(folder: Path) -> Any:
     Raises:
         ValueError: pycolmap cannot read the files; the message has its reason.
     """
-    model = _pycolmap().Reconstruction()
+    model = import_pycolmap().Reconstruction()
     try:
         model.read_text(str(folder))
     except (ValueError, IndexError, RuntimeError) as error:
@@ -392,7 +391,7 @@ def read_text_model(folder: Path) -> Any:
 @cache
 def camera_models() -> Mapping[int, tuple[str, int]]:
     """Return the name and the number of parameters of each COLMAP camera model, by its id."""
-    pycolmap = _pycolmap()
+    pycolmap = import_pycolmap()
     return {
         int(model): (name, len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params))
         for name, model in pycolmap.CameraModelId.__members__.items()
@@ -401,7 +400,8 @@ def camera_models() -> Mapping[int, tuple[str, int]]:
 
 
 @cache
-def _pycolmap() -> Any:
+def import_pycolmap() -> Any:
+    """Return the module pycolmap, imported after zlib and without its handler of SIGTERM."""
     handler = signal.getsignal(signal.SIGTERM)
     import pycolmap
 

@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageEnhance
 from scipy.spatial.transform import Rotation
 
+from bpnp.cameras import import_pycolmap
 from bpnp.datamodules.shapes import procedural_shape, sample_surface
 from bpnp.datamodules.synthetic_maps.maps import LONG_SIDE, MapOptions, draw_map_problem
 
@@ -196,11 +197,10 @@ def draw_map(folder: Path | str, *, seed: int = 0) -> dict[str, tuple[Array, Arr
     Raises:
         ValueError: The folder exists and is not empty.
     """
-    import pycolmap
-
     path = Path(folder)
     if path.exists() and any(path.iterdir()):
         raise ValueError(f"{path} is not empty; name a new folder for the map")
+    pycolmap = import_pycolmap()
     rng = np.random.default_rng(seed)
     house = rng.uniform((-5, -6, -1), (5, 1, 1), (90, 3))  # x to the right, y down, z away, metres
     surroundings = [rng.uniform((-9, -2, -3), (9, 1, 3), (60, 3)) for _ in range(2)]

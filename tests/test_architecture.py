@@ -99,3 +99,9 @@ def test_assertions_only_narrow_types() -> None:
             if isinstance(node, ast.Assert):
                 condition = ast.unparse(node.test)
                 assert condition.endswith("is not None") or "isinstance" in condition, named(file)
+
+
+def test_one_function_imports_pycolmap() -> None:
+    """`import_pycolmap` imports zlib first, without which Python aborts, and restores the handler of SIGTERM."""
+    for file in FILES:
+        assert "pycolmap" not in imports(file) or named(file) == "bpnp/cameras.py", named(file)

@@ -1,5 +1,10 @@
 """The problems that the package comes with are solved to their true pose, as the README shows."""
 
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -51,3 +56,14 @@ def test_the_error_of_a_failed_solution_is_not_a_number() -> None:
 def test_an_unknown_example_is_refused() -> None:
     with pytest.raises(ValueError, match="there is no example 'video'; the examples are mesh, photo, leds, stars"):
         load("video")
+
+
+def test_drawing_a_map_leaves_the_handler_of_sigterm(tmp_path: Path) -> None:
+    """pycolmap replaces it by one that prints a stack trace."""
+    code = (
+        "import os, signal, bpnp.examples\n"
+        f"bpnp.examples.draw_map({str(tmp_path / 'map')!r})\n"
+        "os.kill(os.getpid(), signal.SIGTERM)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (-signal.SIGTERM, "")

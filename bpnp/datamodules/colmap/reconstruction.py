@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.cameras import Camera, Lens, camera_from, colmap_camera
+from bpnp.cameras import Camera, Lens, camera_from, colmap_camera, import_pycolmap
 from bpnp.datamodules.colmap.model_files import ColmapError, ImageRecord, read_records
 from bpnp.files import require_new_folder, write_atomically
 
@@ -194,8 +194,7 @@ def write_image(
     if not name or name.split() != [name]:
         raise ValueError(f"`name` is {name!r}; names in COLMAP's text files have no spaces")
     require_new_folder(folder)
-    import pycolmap  # after bpnp.cameras, which imports zlib first
-
+    pycolmap = import_pycolmap()
     lens, (rotation, translation) = _colmap_lens(camera, points2d), pose
     pixels = lens.project(np.column_stack([points2d, np.ones(len(points2d))]))
     model = pycolmap.Reconstruction()
