@@ -7,15 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import maximum_bipartite_matching, min_weight_full_bipartite_matching
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from bpnp.poses import MIN_POINTS
 from bpnp.search.evidence.uncertainty import linearised, pose_covariance
+from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem
+from bpnp.search.refine.gauss_newton import Iteration, image_equations, refine
 from bpnp.search.verdict import SearchResult
 from bpnp.solving.arguments import Array, Labels
 from bpnp.solving.solution import FOCAL_LENGTH, POSE_PARAMETERS, Solution, SolutionStats, with_pose
@@ -25,7 +25,8 @@ DENSE = 4096  # largest number of possible matches that are all compared
 NEIGHBOURS = 8  # candidate matches of a point; there are more only if the radius is far too large
 SCALES = 3.0  # default inlier threshold, in scales of the residuals
 FIT_ROUNDS = 5
-DIFFERENCE = 6e-6  # step of the central differences: cube root of the machine precision
+DAMPING, MOST_STEPS = 1e-3, 50  # first damping of Levenberg and Marquardt, and steps
+EXACT = 1e-12  # relative change of a pose, and of the sum of squares, that ends the steps
 SIGNIFICANT = 22.5  # chi-squared with 6 degrees of freedom, one in a thousand
 
 
@@ -204,8 +205,7 @@ def fit_pose(
 ) -> tuple[Array, Array]:
     """Fit a pose to matches by least squares, with Levenberg-Marquardt steps from a pose nearby.
 
-    The derivatives with respect to (w, s), R = exp([w]x) rotation, t = translation + size s, are central differences.
-    So any camera model can be used.
+    Residuals are those of the image, so that any camera model can be used.
 
     Args:
         project: Returns the image points (k, d) of points (k, 3) in the camera's frame.
@@ -218,35 +218,18 @@ def fit_pose(
     Returns:
         Rotation (3, 3) and translation (3,).
     """
-    size = max(float(np.linalg.norm(translation)), 1e-12)
-    differences = DIFFERENCE * np.concatenate([np.eye(6), -np.eye(6)])
+    model = PoseModel(points.mean(0))
+    state = model.state(rotation, translation)
+    relative = np.r_[np.ones(3), np.full(3, max(float(np.linalg.norm(state.centroid)), 1e-12))]
 
-    def poses(steps: Array) -> tuple[Array, Array]:
-        return Rotation.from_rotvec(steps[:, :3]).as_matrix() @ rotation, translation + size * steps[:, 3:]
+    def settled(last: Iteration) -> bool:
+        return bool(
+            (np.abs(last.step) <= EXACT * relative).all() or np.abs(last.gain) <= EXACT * np.asarray(last.before.cost)
+        )
 
-    def residuals(steps: Array) -> Array:
-        """Return the residuals (s, k d) of steps (s, 6), all projected at once."""
-        turns, shifts = poses(steps)
-        seen = project((points @ turns.transpose(0, 2, 1) + shifts[:, None]).reshape(-1, 3))
-        off = seen.reshape(len(steps), *target.shape) - target
-        return np.nan_to_num(off, nan=1e3 * scale).reshape(len(steps), -1) / scale
-
-    def jacobian(step: Array) -> Array:
-        above, below = np.split(residuals(step + differences), 2)
-        return np.asarray((above - below).T / (2 * DIFFERENCE))
-
-    found = least_squares(
-        lambda step: residuals(step[None])[0],
-        np.zeros(6),
-        jac=jacobian,
-        method="lm",
-        xtol=1e-12,
-        ftol=1e-12,
-        gtol=1e-12,
-        max_nfev=200,
-    )
-    turns, shifts = poses(found.x[None])
-    return turns[0], shifts[0]
+    linearise = image_equations(model, project, points, target, lost=1e3 * scale)
+    end = refine(model, state, linearise, [scale] * MOST_STEPS, settled=settled, damping=DAMPING, adaptive=True)
+    return model.pose(end.state)
 
 
 def _near(image: Array, projected: Array, radius: float, allowed: Allowed | None) -> tuple[Labels, Array]:

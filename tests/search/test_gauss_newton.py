@@ -9,7 +9,7 @@ from planted import degrees_between, directions
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from bpnp.cameras import camera_from
+from bpnp.cameras import camera_from, scale_focal_length
 from bpnp.search.pose_model import PoseModel, PoseState
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.refine.gauss_newton import (
@@ -107,6 +107,33 @@ def test_residuals_of_pixels_take_any_camera_model(name: str) -> None:
     np.testing.assert_allclose(translation, TRANSLATION, atol=1e-8)
 
 
+@pytest.mark.parametrize("moves", [False, True])
+@pytest.mark.parametrize("name", ["SIMPLE_RADIAL", "OPENCV_FISHEYE"])
+def test_a_focal_length_is_found_in_the_pixels_of_any_camera_model(name: str, moves: bool) -> None:
+    """The camera with 1.1 times the focal length takes the picture; a wrong match counts less if it is `robust`."""
+    params = {
+        "SIMPLE_RADIAL": (800.0, 320.0, 240.0, -0.1),
+        "OPENCV_FISHEYE": (400.0, 410.0, 320.0, 240.0, 0.02, 0, 0, 0),
+    }
+    camera = camera_from((name, params[name]))
+    model = PoseModel(POINTS.mean(0) if moves else np.zeros(3), UnknownFocal(0.0), moves=moves)
+    points = POINTS if moves else directions(POINTS @ ROTATION.T + TRANSLATION) @ ROTATION
+    pose = (ROTATION, TRANSLATION) if moves else (ROTATION, np.zeros(3))
+    target = scale_focal_length(camera, 1.1).project(points @ pose[0].T + pose[1])
+    start = model.state(near(0.03)[0], TRANSLATION if moves else None)
+    linearise = image_equations(model, camera.project, points, target, lost=1e3)
+    end = refine(model, start, linearise, [1.0] * 60, settled=settled)
+    assert end.state.zoom == pytest.approx(1.1, rel=1e-7)
+    np.testing.assert_allclose(end.state.rotation, ROTATION, atol=1e-7)
+    target[0] += 30.0
+    off = [
+        abs(refine(model, end.state, image_equations(model, camera.project, points, target, lost=1e3, robust=robust),
+                   [1.0] * 60).state.zoom - 1.1)
+        for robust in (None, 1.0)
+    ]  # fmt: skip
+    assert off[1] < off[0] / 3
+
+
 def test_a_pose_is_refined_without_matches_at_decreasing_scales() -> None:
     order = RNG.permutation(len(POINTS))
     problem = Problem(directions(POINTS @ ROTATION.T + TRANSLATION)[order][:30], POINTS)
@@ -154,3 +181,16 @@ def test_no_step_is_larger_than_allowed() -> None:
     taken = list(steps(MODEL, MODEL.state(*near(0.5)), linearise, [1.0] * 40, largest=largest))
     assert max(np.abs(each.step).max() for each in taken) == pytest.approx(0.05)
     np.testing.assert_allclose(taken[-1].state.rotation, ROTATION, atol=1e-6)
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e9])
+def test_steps_do_not_depend_on_the_unit_of_length(unit: float) -> None:
+    bearings = directions(POINTS @ ROTATION.T + TRANSLATION)
+    ends = []
+    for u in (1.0, unit):
+        model, (rotation, translation) = PoseModel(u * POINTS.mean(0)), near(0.3)
+        linearise = match_equations(model, bearings, u * POINTS)
+        end = refine(model, model.state(rotation, u * translation), linearise, [1.0] * 3)
+        ends.append((end.state.rotation, end.state.centroid / u))
+    for one, other in zip(*ends, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-12)

@@ -22,7 +22,7 @@ from bpnp.search.problem import Problem
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
-RIDGE = 1e-12  # least damping, a fraction of the largest diagonal element: unknowns that nothing fixes do not move
+RIDGE = 1e-12  # least damping, a fraction of the diagonal: unknowns that nothing fixes do not move
 DIFFERENCE = 6e-6  # step of the central differences: cube root of the machine precision
 LONGER, SHORTER = 0.1, 10.0  # factors on the damping after a step that was taken, and one that was not
 
@@ -45,7 +45,7 @@ class Equations(NamedTuple):
     def step(self, damping: Array | float | int = 0) -> Array:
         """Return the step (..., p), damped by a fraction of the diagonal."""
         diagonal = np.einsum("...ii->...i", self.products)
-        damped = np.asarray(damping)[..., None] * diagonal + RIDGE * diagonal.max(-1, keepdims=True) + 1e-300
+        damped = np.where(diagonal > 0, (np.asarray(damping)[..., None] + RIDGE) * diagonal, 1.0)
         products = self.products + damped[..., None] * np.eye(diagonal.shape[-1])
         return np.asarray(np.linalg.solve(products, self.gradient[..., None])[..., 0])
 
@@ -222,29 +222,65 @@ def match_equations(model: PoseModel, bearings: Array, points: Array, weight: Ar
     return linearise
 
 
-def image_equations(
-    model: PoseModel, project: Callable[[Array], Array], points: Array, target: Array, *, lost: float
-) -> Linearise:
-    """Return the linearisation of given matches whose residuals are those of any camera model, in the image.
+def image_rows(
+    model: PoseModel, project: Callable[[Array], Array], points: Array, target: Array, state: PoseState
+) -> tuple[Array, Array]:
+    """Linearise given matches in the image of any camera model.
 
-    The derivatives of the camera model are central differences by the points in the camera's frame.
+    The derivatives of the camera model are central differences by the points in the camera's frame: there is one for
+    each of COLMAP's camera models. Those by the unknowns follow from them. An unknown focal length stretches the image
+    about the principal point.
 
     Args:
-        model: Unknowns of one given camera.
+        model: Unknowns of one camera, without a radial coefficient.
         project: Returns the image points (k, d) of points (k, 3) in the camera's frame; NaN outside the view.
-        points: (k, 3) scene points.
+        points: (k, 3) scene points, or directions of points at infinity.
+        target: (k, d) their image points.
+        state: State.
+
+    Returns:
+        Residuals (k, d) and derivatives (k, d, p) of the predictions; NaN outside the view.
+    """
+    sight = model.sight(state, points)
+    h = DIFFERENCE * sight.length
+    moved = sight.camera + h[:, None] * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])[:, None]
+    seen = project(moved.reshape(-1, 3)).reshape(7, *target.shape)
+    by_point = ((seen[1:4] - seen[4:]) / (2 * h[:, None])).transpose(1, 2, 0)
+    if model.lens is None:
+        return target - seen[0], model.by_pose(sight, by_point)
+    centre = project(np.array([[0.0, 0.0, 1.0]]))
+    by_focal = state.zoom * (seen[0] - centre)
+    jacobian = np.concatenate([model.by_pose(sight, state.zoom * by_point), by_focal[..., None]], -1)
+    return target - centre - by_focal, jacobian
+
+
+def image_equations(
+    model: PoseModel,
+    project: Callable[[Array], Array],
+    points: Array,
+    target: Array,
+    *,
+    lost: float | int,
+    robust: float | None = None,
+) -> Linearise:
+    """Return the linearisation of given matches in the image of any camera model; see `image_rows`.
+
+    Args:
+        model: Unknowns of one camera, without a radial coefficient.
+        project: Returns the image points (k, d) of points (k, 3) in the camera's frame; NaN outside the view.
+        points: (k, 3) scene points, or directions of points at infinity.
         target: (k, d) their image points.
         lost: Residual of a point that leaves the view.
+        robust: Residual s from which a match counts less, 2 s^2 (sqrt(1 + r^2 / s^2) - 1) for r^2; None for r^2.
     """
 
     def linearise(state: PoseState, _scale: float) -> Equations:
-        sight = model.sight(state, points)
-        h = DIFFERENCE * sight.length
-        moved = sight.camera + h[:, None] * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])[:, None]
-        seen = project(moved.reshape(-1, 3)).reshape(7, *target.shape)
-        residual = np.nan_to_num(target - seen[0], nan=lost)
-        by_point = np.nan_to_num((seen[1:4] - seen[4:]) / (2 * h[:, None]), nan=0.0).transpose(1, 2, 0)
-        return normal_equations(model.by_pose(sight, by_point), residual, np.ones(len(points)))
+        residual, jacobian = image_rows(model, project, points, target, state)
+        jacobian = np.where(np.isfinite(residual)[..., None], jacobian, 0.0)
+        residual, weight = np.nan_to_num(residual, nan=lost), np.ones(len(points))
+        if robust is not None:
+            weight = 1 / np.sqrt(1 + (residual**2).sum(-1) / robust**2)
+        return normal_equations(np.nan_to_num(jacobian, nan=0.0), residual, weight)
 
     return linearise
 
