@@ -5,14 +5,15 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from bpnp.cameras import Camera, camera_from, in_front, scale_focal_length
 from bpnp.loops.parallel import Clock, Deadline, one_blas_thread
-from bpnp.search.infinity.evidence import how_well_known, noise_of
+from bpnp.search.infinity.evidence import how_well_known, noise_of, uncertainty_of
 from bpnp.search.infinity.kernels import Image
 from bpnp.search.infinity.search import DEFAULT, InfinitySettings, search_rotation
+from bpnp.search.pose_model import PoseModel
+from bpnp.search.problem import UnknownFocal
+from bpnp.search.refine.gauss_newton import Iteration, image_equations, image_rows, refine
 from bpnp.solving.arguments import (
     Array,
     check_points,
@@ -30,6 +31,9 @@ from bpnp.solving.sources import Options
 
 FEWEST = 3  # two fix a rotation and leave no evidence
 HALF = 0.5  # pixels, step for the angle per pixel
+ROTATION_AND_FOCAL = PoseModel(np.zeros(3), UnknownFocal(math.inf), moves=False)
+ROBUST, LOST = 1.0, 1e3  # residual from which a match counts less, and that of a point that leaves the view, pixels
+MOST_STEPS, EXACT = 50, 1e-9  # steps of a fit of the focal length, and the change that ends them
 NOMINAL = 1e-3  # nominal pixel without a camera, as a fraction of the RMS angular radius of the bearings
 
 
@@ -94,26 +98,23 @@ def solve_directions(
 
 def _fitted(camera: Camera, image: Array, scene: Array, solution: Solution) -> Camera:
     """Return the camera with the focal length that fits the matches best, fitted together with a rotation."""
-    pixels, seen = image[solution.matches[:, 0]], scene[solution.matches[:, 1]] @ solution.rotation.T
-
-    def residuals(step: Array) -> Array:
-        bearings, _, pixel = _bearings(pixels, scale_focal_length(camera, math.exp(step[3])))
-        off = bearings - Rotation.from_rotvec(step[:3]).apply(seen)
-        return np.asarray((off / pixel[:, None]).ravel())
-
-    return scale_focal_length(
-        camera, math.exp(least_squares(residuals, np.zeros(4), loss="soft_l1", x_scale=0.01).x[3])
-    )
+    i, j = solution.matches.T
+    linearise = image_equations(ROTATION_AND_FOCAL, camera.project, scene[j], image[i], lost=LOST, robust=ROBUST)
+    start = ROTATION_AND_FOCAL.state(solution.rotation)
+    end = refine(ROTATION_AND_FOCAL, start, linearise, [ROBUST] * MOST_STEPS, settled=_is_settled)
+    return scale_focal_length(camera, float(end.state.zoom))
 
 
-def _with_focal_length(camera: Camera, pixels: Array, seen: Array) -> Array:
-    """Return the covariance (4, 4) of rotation and focal length, pixels, from matches with directions (k, 3)."""
-    step = 1e-5
-    bearings, _, pixel = _bearings(pixels, camera)
-    ends = [_bearings(pixels, scale_focal_length(camera, math.exp(sign * step)))[0] for sign in (1, -1)]
-    by_focal = (ends[1] - ends[0])[:, :, None] / (2 * step)
+def _is_settled(last: Iteration) -> bool:
+    return bool(np.abs(last.step).max() < EXACT)
+
+
+def _with_focal_length(camera: Camera, pixels: Array, directions: Array, rotation: Array) -> Array:
+    """Return the covariance (4, 4) of rotation and focal length, pixels, from matches of directions (k, 3)."""
+    state = ROTATION_AND_FOCAL.state(rotation)
+    residual, jacobian = image_rows(ROTATION_AND_FOCAL, camera.project, directions, pixels, state)
     unit = np.array([1, 1, 1, camera.focal])
-    return how_well_known(seen, bearings, pixel, by_focal).covariance * np.outer(unit, unit)
+    return uncertainty_of(residual, jacobian).covariance * np.outer(unit, unit)
 
 
 def _seen_by(
@@ -173,7 +174,7 @@ def _seen_by(
     matched = seen[0][j], bearings[i], pixel[i]
     covariance = how_well_known(*matched).covariance
     if unknown is not None and lens is not None:
-        covariance = _with_focal_length(lens, image[usable[i]], seen[0][j])
+        covariance = _with_focal_length(lens, image[usable[i]], scene[j], found.rotation[0])
     angles = angles_between(bearings[i], seen[0][j])
     return with_pose(
         solution,

@@ -31,10 +31,11 @@ from bpnp.search.evidence.covariance import covariance_of, of_sure_matches, stud
 from bpnp.search.evidence.false_alarms import SHARES, Terms, log10_nfa
 from bpnp.search.evidence.uncertainty import EXCEEDED, STRAINS, exceeded_once
 from bpnp.search.kernels.neighbours import sums_near
-from bpnp.search.pose_model import FIXING_ROTATION, log10_rotations
+from bpnp.search.pose_model import FIXING_ROTATION, PoseModel, log10_rotations
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
+ROTATION = PoseModel(np.zeros(3), moves=False)
 EXACT = 1e-12  # smallest noise of matches, pixels
 STEPS = 5  # number of scales s; each is half the previous one, from the largest noise on
 
@@ -119,34 +120,45 @@ def noise_of(seen: Array, bearings: Array, pixel: Array) -> float:
     return float(np.linalg.norm((bearings - seen) / pixel[:, None])) / math.sqrt(free) if free > 0 else math.nan
 
 
-def how_well_known(seen: Array, bearings: Array, pixel: Array, others: Array | None = None) -> Known:
-    """Compute the uncertainty of a rotation and of other parameters fitted to matches.
+def how_well_known(seen: Array, bearings: Array, pixel: Array) -> Known:
+    """Compute the uncertainty of a rotation that was fitted to matches.
 
     Args:
         seen: (k, 3) directions in the camera.
         bearings: (k, 3) of the image points.
         pixel: (k,) angle of a pixel, radians.
-        others: (k, 3, q) derivatives of `seen` by the other parameters; None for the rotation alone.
+
+    Returns:
+        Covariance (3, 3), NaN if the matches do not fix the rotation, and its bound.
+    """
+    unit = pixel[:, None]
+    return uncertainty_of((bearings - seen) / unit, _by_rotation(seen) / unit[:, None])
+
+
+def uncertainty_of(residual: Array, jacobian: Array) -> Known:
+    """Compute the uncertainty of a rotation and of other parameters that were fitted to k matches.
+
+    Args:
+        residual: (k, d), pixels.
+        jacobian: (k, d, 3 + q) derivatives of the predictions by rotation and other parameters, pixels.
 
     Returns:
         Covariance (3 + q, 3 + q), NaN if the matches do not fix the parameters, and the bound of the rotation.
     """
-    jacobian = _turned(seen) if others is None else np.concatenate([_turned(seen), others], -1)
     size = jacobian.shape[-1]
-    free, noise = 2 * len(seen) - size, noise_of(seen, bearings, pixel)
-    covariance = None
+    free, covariance = 2 * len(residual) - size, None
     if free > 0:
-        unit = (pixel * max(noise, EXACT))[:, None]
-        matches = of_sure_matches((bearings - seen) / unit, jacobian / unit[:, None])
-        covariance = covariance_of(matches, fitted=size)
+        noise = max(float(np.linalg.norm(residual)) / math.sqrt(free), EXACT)
+        covariance = covariance_of(of_sure_matches(residual / noise, jacobian / noise), fitted=size)
     if covariance is None:
         return Known(np.full((size, size), math.nan), math.inf)
     return Known(student_factor(free) * covariance, exceeded_once(covariance[:3, :3], float(free)))
 
 
-def _turned(seen: Array) -> Array:
-    """Return the derivatives (k, 3, 3) of directions v (k, 3) by a rotation w, w x v."""
-    return np.cross(np.eye(3)[None], seen[:, None]).swapaxes(1, 2)
+def _by_rotation(seen: Array) -> Array:
+    """Return the derivatives (k, 3, 3) of directions (k, 3) by a rotation."""
+    state = ROTATION.state(np.eye(3))
+    return ROTATION.jacobian(state, ROTATION.sight(state, seen))
 
 
 def strain_of(seen: Array, bearings: Array, pixel: Array, all_bearings: Array) -> float:
@@ -164,7 +176,7 @@ def strain_of(seen: Array, bearings: Array, pixel: Array, all_bearings: Array) -
         Shift in pixels; 0 if no strain is significant.
     """
     weight = np.repeat(1 / pixel, 3)[:, None]
-    cross = _turned(seen).reshape(-1, 3)
+    cross = _by_rotation(seen).reshape(-1, 3)
     residual = (bearings - seen).ravel() * weight[:, 0]
 
     def moved(points: Array) -> Array:
