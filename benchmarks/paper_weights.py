@@ -5,7 +5,8 @@
 
 The settings are those of configs/paper/modelnet40.yaml but for `SETTINGS` and for what each of `STAGES` has: 40,000
 fixed problems of 4,000 drawn shapes. The first stage starts from `procedural-euler`, which was trained on few points
-first (docs/model-card.md). `paper-lclp` goes on from `paper-lc` with the pose loss.
+first (docs/model-card.md). `paper-lclp` goes on from `paper-lc` with the pose loss. The learning rates were chosen by
+the errors on 100 of ModelNet10's test shapes.
 """
 
 import argparse
