@@ -73,7 +73,7 @@ def localize(
         no_pictures: write no pictures.
         solver: auto, which also runs the packaged matcher on a view if the search is not confident; search; or a
             checkpoint of a network.
-        time_limit: seconds for each photo.
+        time_limit: seconds for each photo, 60 by default; inf for no limit.
         seed: random seed of the search.
         json: print JSON instead of a table: the entries of results.json for these photos.
         quiet: print only errors, and JSON with --json.

@@ -1,158 +1,256 @@
-"""Pose of a photo from its keypoints without descriptors: search near one view of a map, and fit to all map points."""
+"""Pose of a photo in a map from its keypoints, without descriptors: a queue of views, and one loop over it.
 
-import math
-from collections.abc import Callable, Iterable
+Each step searches near one view of the map. A promising pose is refined on all map points in view, judged on them, and
+compared with poses elsewhere in the map that explain the same image points. The loop ends with a confident pose, with
+an empty queue, or at the time limit.
+"""
+
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.cameras import Camera, camera_from
-from bpnp.loops.parallel import one_blas_thread
-from bpnp.maps.views import Cones, View
-from bpnp.poses import MIN_POINTS
-from bpnp.search.annealing import finish, polished
-from bpnp.search.competitors import other_lens, settle
-from bpnp.search.config import DEFAULT, Evidence
-from bpnp.search.evidence.alternatives import competing_pose
-from bpnp.search.hypotheses import Hypotheses, to_problem_frame
-from bpnp.search.problem import Problem, UnknownFocal, faces
-from bpnp.search.raster_search import search_beside
-from bpnp.search.scene import Scene
-from bpnp.search.starts import PosePrior
-from bpnp.search.verdict import judged
+from bpnp.loops.parallel import Clock, Deadline
+from bpnp.maps.aliasing import Competitor, best_competitor, explained_keypoints, judge_against
+from bpnp.maps.all_points import judge_on_all_points, refine_on_all_points
+from bpnp.maps.photo_problem import Photo, with_ids
+from bpnp.maps.viewed_points import Place, Region, ViewedPoints
+from bpnp.search.config import DEFAULT, SearchSettings
+from bpnp.search.evidence import reasons
+from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.solving.arguments import checked_prior
-from bpnp.solving.focal_length import AROUND, UnknownCamera, fit_camera, solved_with_focal_length
-from bpnp.solving.inputs import problem_from
-from bpnp.solving.matches import finished
-from bpnp.solving.solution import Candidate, Solution, add_objection
+from bpnp.solving.focal_length import UnknownCamera, solved_with_focal_length
+from bpnp.solving.solution import Candidate, Solution
 from bpnp.solving.sources import Options, solutions_of
 
-Array = NDArray[np.float64]
+SECONDS = 60.0  # default time limit of a photo, with which the photos of cities are measured (docs/maps.md)
 MOST_KEYPOINTS = 2048  # half of the 2,000 largest SIFT keypoints have a map point, an eighth of the next ones
-VIEW_DEGREES = 15.0  # about the largest angle per axis between photos that share a third of their points
-VIEW_SHARE = 0.2  # about the largest shift of the viewed points, as a fraction of their distance
 # The search stays near the view's pose, not near the best pose of an unsuccessful earlier search.
 # A search in a fourth of the time finds four fifths as many poses, so that short searches near many views pay.
 BRIEF = replace(DEFAULT, near=(DEFAULT.everywhere,)).limited(1)
 ONCE, LONGER = DEFAULT.limited(1), DEFAULT.limited(16)
-COMPETITORS = 4  # competing poses of an ambiguous solution that are judged with it on all points
 PROMISING = 3  # views that get a longer search if none is confident
 LIKELY = -20.0  # log10 NFA below which a view gets a longer search before the next view
 RANKS = {"failed": 0, "ambiguous": 1, "confident": 2}
 
 
-@dataclass(frozen=True, eq=False)
-class Region:
-    """Map points that one view, or several, see, and the view to search near.
+class Attempt(NamedTuple):
+    """The solution of a search near a view.
 
     Attributes:
-        view: View to search near.
-        points3d: (k, 3) scene points.
-        point_ids: (k,) ids of the points in the COLMAP model.
-        cones: Cones of directions from which the points are visible.
-        distance: Median distance from the view to its own points, scene units.
+        place: View, its points and the camera of the search.
+        solution: The solution.
+        is_judged: True if it was refined and judged on all points.
     """
 
-    view: View
-    points3d: Array
-    point_ids: NDArray[np.int64]
-    cones: Cones
-    distance: float
+    place: Place
+    solution: Solution
+    is_judged: bool
 
-    def prior(self) -> PosePrior:
-        """Return a prior at the view's pose, as wide as the poses of photos of one place differ."""
-        return PosePrior(self.view.rotation, self.view.translation, VIEW_DEGREES, VIEW_SHARE * self.distance)
+    @property
+    def rank(self) -> tuple[int, float]:
+        """Sort key, see `rank`."""
+        return rank(self.solution)
 
 
-def problem_near(
-    region: Region, keypoints: Any, camera: Any, prior: Any, focal: UnknownFocal | None = None, *, views: int = 1
-) -> Problem:
-    """Return the problem of a photo's keypoints and the points of one region.
+@dataclass(frozen=True)
+class Outcome:
+    """Result of the loop.
+
+    Attributes:
+        solution: Solution of the photo.
+        is_complete: False if the time limit ended the loop without a confident pose.
+    """
+
+    solution: Solution
+    is_complete: bool
+
+
+def localize(
+    maps: Sequence[ViewedPoints], photo: Photo, views: Sequence[str] | None, options: Options, time_limit: float
+) -> Outcome:
+    """Estimate the pose of a photo in a map; see `SceneMap.localize`.
 
     Args:
-        region: Points to match.
-        keypoints: (m, 2) pixels.
-        camera: Camera of the photo.
-        prior: Prior of the pose; None for none.
-        focal: Prior of the focal length; None if it is known.
-        views: Number of views that are tried, which the NFA counts as tests. Default 1.
+        maps: The map; before it, others with rotated views that are tried first, each in half of the time that is left.
+        photo: The photo.
+        views: Names of the views to try, best first; None for all views of the map.
+        options: Options of each search; `asks` is for longer searches only.
+        time_limit: Seconds; math.inf for no limit.
+
+    Raises:
+        ValueError: No view sees 4 or more points.
     """
-    lens, (axes, cosines) = camera_from(camera), region.cones
-    known: dict[str, Any] = {"normals3d": axes, "cosines3d": cosines, "prior": prior, "focal": focal}
-    problem = problem_from(keypoints, region.points3d, lens, **known)
-    return replace(problem, log10_views=math.log10(views))
+    start, deadline, tried = Clock.now(), Deadline.after(time_limit), set[str]()
+    outcomes = list[Outcome]()
+    for k, scene in enumerate(maps):
+        half = Deadline.after((deadline.at - Clock.now()) / 2) if k + 1 < len(maps) else deadline
+        outcomes.append(_localize_in(scene, photo, views, options._replace(time_limit=time_limit, until=half), tried))
+        if outcomes[-1].solution.verdict == "confident":
+            break
+    solution = max((outcome.solution for outcome in outcomes), key=rank)
+    is_complete = solution.verdict == "confident" or all(outcome.is_complete for outcome in outcomes)
+    if not is_complete:
+        count = len(maps[-1].views if views is None else views)
+        solution = replace(solution, reason=reasons.unfinished(solution.reason, time_limit, len(tried), count))
+    return Outcome(replace(solution, seconds=Clock.now() - start), is_complete)
 
 
-def near_view(region: Region, keypoints: Any, camera: Any, prior: Any, options: Options, *, views: int = 1) -> Solution:
+def _localize_in(
+    scene: ViewedPoints, photo: Photo, views: Sequence[str] | None, options: Options, tried: set[str]
+) -> Outcome:
+    """Search near the views of a map until a pose is confident, the queue is empty, or time is over.
+
+    Each view is tried briefly, then once more. A view with a likely pose, and in the end the most promising views, get
+    a longer search.
+
+    Args:
+        scene: The map.
+        photo: The photo.
+        views: Names of the views to try, best first; None for all views of the map.
+        options: Options of each search, with the deadline of all of them.
+        tried: Names of the views that were tried; those of this call are added.
+    """
+    places = scene.places(views, photo.keypoints, photo.lens)
+    if not places:
+        raise ValueError("expected a map with views that see 4 or more points, got none")
+    photo = replace(photo, view_count=len({place.view.name for place in places}))
+    queue = deque((place, settings) for settings in (BRIEF, ONCE) for place in places)
+    earlier, best, longer = list[Solution](), list[Attempt](), set[str]()
+    while queue and not (best and options.until.passed()):
+        place, settings = queue.popleft()
+        tried.add(place.view.name)
+        own = search_near(scene.region(place.view, place.points), photo, place.lens, options, settings)
+        attempt = Attempt(place, own, False)
+        if own.verdict == "confident" or own.log10_false_alarms < 0:
+            attempt = judge_in_map(scene, photo, views, attempt, earlier)
+        if "confident" in (own.verdict, attempt.solution.verdict):
+            return Outcome(attempt.solution, True)
+        earlier.append(attempt.solution)
+        best = sorted([*best, attempt], key=lambda one: one.rank, reverse=True)[:PROMISING]
+        again = [attempt] if attempt.solution.log10_false_alarms < LIKELY and len(longer) < PROMISING else []
+        if not queue:  # not significant so far, but perhaps with all points of the map
+            best = [judge_in_map(scene, photo, views, one, earlier) for one in best]
+            best.sort(key=lambda one: one.rank, reverse=True)
+            if best[0].solution.verdict == "confident":
+                return Outcome(best[0].solution, True)
+            again = best
+        for one in reversed(again):
+            if one.place.view.name not in longer:
+                longer.add(one.place.view.name)
+                queue.appendleft((one.place._replace(lens=_lens_near(photo.lens, one.solution)), LONGER))
+    if not queue:
+        return Outcome(best[0].solution, True)
+    return Outcome(judge_in_map(scene, photo, views, best[0], earlier).solution, False)
+
+
+def search_near(
+    region: Region, photo: Photo, lens: Camera | UnknownCamera, options: Options, settings: SearchSettings
+) -> Solution:
     """Return the best pose of a photo among the points of one region.
 
     Args:
         region: Points, and the view to search near.
-        keypoints: (m, 2) pixels.
-        camera: Camera, or an `UnknownCamera`.
-        prior: Prior of the photo's pose; None for the view's pose.
+        photo: The photo.
+        lens: Camera, or its prior.
         options: Options of the search.
-        views: Number of views that are tried, which the NFA counts as tests. Default 1.
+        settings: Settings of the search.
     """
-    expected = checked_prior(region.prior() if prior is None else prior)
-    if isinstance(camera, UnknownCamera):
+    options = options._replace(settings=settings, asks=options.asks and settings is LONGER)
+    prior = checked_prior(region.prior() if photo.prior is None else photo.prior)
+    if isinstance(lens, UnknownCamera):
 
-        def problem_at(lens: Any, focal: UnknownFocal) -> Problem:
-            return problem_near(region, keypoints, lens, expected, focal, views=views)
+        def problem_at(camera: Any, focal: UnknownFocal) -> Problem:
+            return photo.problem(region, camera, prior, focal)
 
-        solution = solved_with_focal_length(problem_at, camera, options)
+        solution = solved_with_focal_length(problem_at, lens, options)
     else:
-        solution = solutions_of({0: problem_near(region, keypoints, camera, expected, views=views)}, options)[0]
+        solution = solutions_of({0: photo.problem(region, lens, prior)}, options)[0]
     return with_ids(solution, region)
 
 
-@dataclass(frozen=True, eq=False)
-class Photo:
-    """A photo to localise, and the part of the map to localise it in.
+def judge_in_map(
+    scene: ViewedPoints, photo: Photo, views: Sequence[str] | None, attempt: Attempt, earlier: Sequence[Solution]
+) -> Attempt:
+    """Refine and judge a pose on all map points in view and, if it is confident, against poses elsewhere in the map.
 
-    Attributes:
-        keypoints: (m, 2) pixels.
-        camera: Camera of the photo.
-        place: Points to match, and the view to search near.
-        regions: Returns regions of the map, ranked for keypoints (k, 2).
-        seed: Seed of the search, default 0.
+    If a pose elsewhere is more likely by the margin `lead`, it is refined and judged in the same way, and used instead
+    if it is confident. With a prior, which excludes poses elsewhere, these are not tested.
+
+    Args:
+        scene: The map.
+        photo: The photo.
+        views: Names of the views to try; None for all views of the map.
+        attempt: The pose; returned unchanged if it was judged before.
+        earlier: Solutions with the points of other views.
     """
-
-    keypoints: Array
-    camera: Any
-    place: Region
-    regions: Callable[[NDArray[np.float64]], Iterable[Region]]
-    seed: int = 0
-
-    @cached_property
-    def problem(self) -> Problem:
-        """Problem of the keypoints and all points of the place."""
-        return problem_near(self.place, self.keypoints, self.camera, None)
-
-
-def with_ids(solution: Solution, region: Region) -> Solution:
-    """Return a solution with the point ids of a region and the name of its view."""
-    return replace(solution, view=region.view.name, point_ids=region.point_ids)
+    if attempt.is_judged:
+        return attempt
+    place, own = attempt.place, attempt.solution
+    whole = scene.region(place.view)
+    solution = judge_on_all_points(own, refine_on_all_points(own, photo, whole))
+    if photo.prior is None and solution.verdict == "confident":
+        competitor = find_competitor(scene, photo, views, place, solution, [*earlier, own])
+        if competitor is not None and competitor.margin <= -DEFAULT.evidence.lead:
+            better = _judge_competitor(scene, photo, views, solution, competitor.pose)
+            if better.verdict == "confident":
+                competitor = find_competitor(scene, photo, views, place, better, [*earlier, own, solution])
+                solution = better
+        solution = judge_against(solution, competitor)
+    return Attempt(place, solution, True)
 
 
-def in_picture(problem: Problem, pose: Solution | Candidate) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the scene points visible from a pose, within the bounding box of the image points."""
-    seen, image = problem.project_scene(*problem.from_user(pose.rotation, pose.translation)), problem.image_points
-    inside = (seen >= image.min(0)) & (seen <= image.max(0))  # not NaN
-    return np.asarray(inside.all(-1))
+def find_competitor(
+    scene: ViewedPoints,
+    photo: Photo,
+    views: Sequence[str] | None,
+    place: Place,
+    solution: Solution,
+    earlier: Sequence[Solution],
+) -> Competitor | None:
+    """Return the best pose elsewhere in the map, or among the given views, that explains the same image points.
+
+    Args:
+        scene: The map.
+        photo: The photo.
+        views: Names of the views to try; None for all views of the map.
+        place: View and points of the solution.
+        solution: Confident solution.
+        earlier: Solutions with the points of other views.
+    """
+    compared = scene.region(place.view, None if views is None else place.points)
+    regions = scene.ranked_regions(views, camera_from(solution.camera), explained_keypoints(photo, solution))
+    return best_competitor(photo, compared, solution, earlier, regions)
 
 
-def points_in_view(place: Region, camera: Any, pose: Solution | View, keypoints: Array) -> NDArray[np.int64]:
-    """Return the indices of the points visible from a pose, within the bounding box of the keypoints (m, 2), pixels."""
-    in_camera = place.points3d @ pose.rotation.T + pose.translation
-    ahead = (in_camera[:, 2] > 0) & faces(place.cones.axes, place.cones.cosines, in_camera, pose.rotation)
-    indices = np.flatnonzero(ahead)
-    seen = camera_from(camera).project(in_camera[indices])
-    inside = ((seen >= keypoints.min(0)) & (seen <= keypoints.max(0))).all(-1)  # not NaN
-    return indices[inside]
+def _judge_competitor(
+    scene: ViewedPoints, photo: Photo, views: Sequence[str] | None, solution: Solution, pose: Candidate
+) -> Solution:
+    """Return the solution of a competing pose of a solution, refined and judged on all map points in view."""
+    whole, camera = scene.region(scene.views[0]), camera_from(solution.camera)
+    seen = np.zeros(len(scene.points3d), bool)
+    seen[whole.in_view(pose.rotation, pose.translation, camera, photo.keypoints)] = True
+    tried = scene.views if views is None else scene.named(views)
+    whole = replace(whole, view=max(tried, key=lambda view: int(seen[view.points].sum())))
+    proposed = replace(
+        solution,
+        rotation=pose.rotation,
+        translation=pose.translation,
+        matches=np.empty((0, 2), np.int64),
+        candidates=(pose,),
+        verdict="failed",
+        log10_false_alarms=np.inf,
+    )
+    return judge_on_all_points(proposed, refine_on_all_points(proposed, photo, whole))
+
+
+def rank(solution: Solution) -> tuple[int, float]:
+    """Sort key: confident before ambiguous before failed, then fewer false alarms."""
+    return RANKS[solution.verdict], -solution.log10_false_alarms
 
 
 def strongest_of(scores: Any, shape: tuple[int, ...]) -> NDArray[np.int64]:
@@ -169,87 +267,11 @@ def among_all(solution: Solution, used: NDArray[np.int64], keypoints: Any) -> So
     return replace(solution, matches=matches, points2d=points2d)
 
 
-def rank(solution: Solution) -> tuple[int, float]:
-    """Sort key: confident before ambiguous before failed, then fewer false alarms."""
-    return RANKS[solution.verdict], -solution.log10_false_alarms
+def _lens_near(lens: Camera | UnknownCamera, solution: Solution) -> Camera | UnknownCamera:
+    """Return the camera for a longer search near a solution.
 
-
-@one_blas_thread
-def on_all_points(solution: Solution, photo: Photo, lens: Camera | UnknownCamera, views: int) -> Solution:
-    """Refine a pose on all map points in view, and judge it on them.
-
-    An unknown focal length is fitted to them too. A pose that is not confident yet is compared with its competing
-    poses, and with those that local searches around it find. `without_twins` searches for others.
-
-    Args:
-        solution: Pose that was found with the points of one view.
-        photo: Keypoints, and all points of the map.
-        lens: Given camera, or its prior.
-        views: Number of views that are tried.
-
-    Returns:
-        The refined solution if its NFA is smaller, or if it is confident and the given one was not. Otherwise the given
-            solution, or a copy whose verdict is lowered by a competing pose among all points.
+    An unknown camera gets the focal length of a significant solution; otherwise all focal lengths are tried.
     """
-    place, camera, rule = photo.place, solution.camera, DEFAULT.evidence
-    if not solution.found:
-        return solution
-    seen = points_in_view(place, camera, solution, photo.keypoints)
-    if len(seen) < max(len(solution.matches), MIN_POINTS):
-        return solution
-    cones = Cones(place.cones.axes[seen], place.cones.cosines[seen])
-    region = replace(place, points3d=place.points3d[seen], point_ids=place.point_ids[seen], cones=cones)
-
-    def problem_at(lens: Any, focal: UnknownFocal | None = None) -> Problem:
-        return problem_near(region, photo.keypoints, lens, None, focal, views=views)
-
-    pose, scale = (solution.rotation, solution.translation), solution.stats.residual
-    if isinstance(lens, UnknownCamera):
-        lens = lens.seen_by(problem_at(lens.reference))
-        fitted = fit_camera(problem_at, lens, camera_from(camera), pose, scale, photo.seed, AROUND)
-        problem, ends = fitted.problem, fitted.poses
-        rotation, shift = ends.rotation[0], ends.translation[0]
-    else:
-        problem = problem_at(lens)
-        rotation, shift = problem.from_user(*pose)
-        least = problem.image.scales[0]
-        ends = polished(Scene(problem, photo.seed, DEFAULT), rotation[None], shift[None], max(scale, least))
-    scene, sure = Scene(problem, photo.seed, DEFAULT), solution.verdict == "confident"
-    # A coarse optimum may have a finer one nearby.
-    looks = int(ends.scale[0] > scale) if sure else looks_for_certainty(rule)
-    start = Hypotheses.from_poses(*scene.enter(rotation[None], shift[None]))
-    others = [] if sure else [one for one in solution.candidates[1:] if one.log10_false_alarms < 0][:COMPETITORS]
-    if others:
-        turns, shifts = problem.from_user(
-            np.stack([one.rotation for one in others]), np.stack([one.translation for one in others])
-        )
-        ends = Hypotheses.concatenate([ends, polished(scene, turns, shifts, max(scale, problem.image.scales[0]))])
-    for _ in range(looks):
-        beside = finish(scene, search_beside(scene, start, DEFAULT.beside), DEFAULT.finished)
-        ends = Hypotheses.concatenate([ends, to_problem_frame(beside, scene)])
-    alone = judged(ends, problem, batches=1, exhaustive=True, rule=rule)
-    result = settle(alone, problem, lambda: scene, rule, exhaustive=True)
-    rotations, shifts = np.stack([rotation, result.best[0]]), np.stack([shift, result.best[1]])
-    behind = result.log10_false_alarms - solution.log10_false_alarms
-    if sure and not problem.same_pose(rotations, shifts, rule.same)[1]:
-        other = competing_pose(rotation, result.best[0], behind)
-        return solution if behind >= rule.lead else add_objection(solution, other)
-    if behind < 0 or (not sure and result.verdict == "confident"):
-        found = finished(problem, result, solution.seconds, None)
-        stats = replace(found.stats, iterations=solution.stats.iterations)
-        candidates = (*found.candidates, *solution.candidates[1:])
-        return with_ids(replace(found, stats=stats, candidates=candidates), region)
-    if not sure:
-        return solution
-    if alone.verdict != "confident":  # other cameras have not been tested for it
-        lens_objection = other_lens(alone, problem, lambda: scene, rule)
-        return solution if lens_objection is None else add_objection(solution, lens_objection)
-    if result.verdict == "confident":
-        return solution
-    return replace(solution, verdict=result.verdict, reason=result.reason, reason_code=result.code)
-
-
-def looks_for_certainty(rule: Evidence) -> int:
-    """Return the number of local searches that exclude a better pose nearby, whatever its initial poses were."""
-    again = (rule.missed - math.log10(rule.look_fails)) / math.log10(rule.again_fails)
-    return 1 + max(math.ceil(again), 0)
+    if isinstance(lens, UnknownCamera) and solution.log10_false_alarms < 0:
+        return lens.near(camera_from(solution.camera))
+    return lens

@@ -7,6 +7,7 @@ new content under the same name is a new input.
 import contextlib
 import hashlib
 import json
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,10 +19,12 @@ from scipy.spatial.transform import Rotation
 from bpnp.cameras import camera_from, camera_to_json
 from bpnp.datamodules.colmap.model_files import FILES, model_format
 from bpnp.files import delay_interrupts, fingerprint, write_text
+from bpnp.maps.localize import SECONDS
 from bpnp.maps.localized_picture import localized_picture
 from bpnp.maps.photos import photo_keypoints
 from bpnp.maps.scene_map import UNKNOWN, SceneMap
 from bpnp.report.images import read_photo, save_figure
+from bpnp.solving.arguments import seconds_from
 from bpnp.solving.solution import Solution
 
 CHANGES = {"photo": "another photo", "map": "another map", "views": "other views", "keypoints": "other keypoints"}
@@ -97,6 +100,7 @@ def photo_task(
         keypoints = keypoints.absolute()
         points = photo_keypoints(photo, keypoints, name)
         points_content = fingerprint([points.pixels.tolist(), points.scores.tolist()])
+    limit = seconds_from(search.get("time_limit"), SECONDS)
     shared = {"views": shown, **search}
     made_with = {
         "photo": photo_content,
@@ -107,10 +111,11 @@ def photo_task(
         "solver": content_of(Path(solver)) if Path(solver).is_file() else solver,
         "leave_one_out": leave_one_out,
     }
-    arguments = {"camera": lens, "keypoints": keypoints, "name": name, "solver": solver}
-    ignore = {"ignore_orientation": bool(search.get("ignore_orientation"))}
-    arguments = {key: value for key, value in (arguments | shared | ignore).items() if value is not None}
-    return PhotoTask(name, photo.absolute(), arguments, made_with | shared)
+    made_with |= shared | ({} if math.isfinite(limit) else {"time_limit": "none"})  # JSON has no infinity
+    arguments = {"camera": lens, "keypoints": keypoints, "name": name, "solver": solver, **shared, "time_limit": limit}
+    arguments["ignore_orientation"] = bool(search.get("ignore_orientation"))
+    given = {key: value for key, value in arguments.items() if value is not None}
+    return PhotoTask(name, photo.absolute(), given, made_with)
 
 
 def attempt(scene: SceneMap, task: PhotoTask) -> Solution | str:

@@ -1,12 +1,15 @@
 """Verification of the pose of a view: against the points that other views see, and against the rest of the map."""
 
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
 
-from bpnp.maps.localize import Photo, points_in_view, problem_near, with_ids
-from bpnp.maps.twins import best_rival
-from bpnp.maps.views import Cones, View
+from bpnp.cameras import camera_from
+from bpnp.maps.aliasing import best_competitor, explained_keypoints
+from bpnp.maps.photo_problem import Photo, with_ids
+from bpnp.maps.viewed_points import Region
+from bpnp.maps.views import Array, View
 from bpnp.poses import MIN_POINTS
 from bpnp.search.config import DEFAULT
 from bpnp.search.evidence import reasons
@@ -14,15 +17,19 @@ from bpnp.solving.solution import Solution
 from bpnp.solving.verify import verify_problem
 
 
-def verify_pose(photo: Photo, view: View, *, time_limit: float) -> Solution:
+def verify_pose(
+    photo: Photo, view: View, place: Region, regions: Callable[[Array], Iterable[Region]], *, time_limit: float
+) -> Solution:
     """Verify the pose of a view with the points of a map that was built without it.
 
     The pose is judged on the points in view (`verify_problem`). It is then compared with poses elsewhere in the map
-    that explain the same image points (`bpnp.maps.twins`).
+    that explain the same image points (`bpnp.maps.aliasing`).
 
     Args:
-        photo: Keypoints of the view, its camera, and the points and views of the map without it.
+        photo: Keypoints of the view and its camera.
         view: View with the pose.
+        place: All points of the map without the view.
+        regions: Returns the regions of this map, ranked for keypoints (k, 2).
         time_limit: Seconds for `verify_problem`; math.inf for no limit.
 
     Raises:
@@ -30,29 +37,28 @@ def verify_pose(photo: Photo, view: View, *, time_limit: float) -> Solution:
     """
     if len(photo.keypoints) < MIN_POINTS:
         raise ValueError(f"{view.name} has {len(photo.keypoints)} keypoints; at least {MIN_POINTS} are needed")
-    place, lead = photo.place, DEFAULT.evidence.lead
-    seen = points_in_view(place, photo.camera, view, photo.keypoints)
+    lead = DEFAULT.evidence.lead
+    seen = place.in_view(view.rotation, view.translation, camera_from(photo.lens), photo.keypoints)
     if len(seen) < MIN_POINTS:
         raise ValueError(
             f"{view.name} can see {len(seen)} points that two other views see; at least {MIN_POINTS} are needed"
         )
-    cones = Cones(place.cones.axes[seen], place.cones.cosines[seen])
-    region = replace(place, points3d=place.points3d[seen], point_ids=place.point_ids[seen], cones=cones)
-    problem = problem_near(region, photo.keypoints, photo.camera, None)
+    region = place.part(seen)
+    problem = photo.problem(region, photo.lens)
     solution = verify_problem(problem, view.rotation, view.translation, seed=photo.seed, time_limit=time_limit)
     solution = with_ids(solution, region)
     if solution.verdict == "failed":
         return solution
-    rival = best_rival(photo, solution, [])
-    if rival is None or rival[0] >= lead:
+    competitor = best_competitor(photo, place, solution, [], regions(explained_keypoints(photo, solution)))
+    if competitor is None or competitor.margin >= lead:
         return solution
-    behind, other = rival
-    off = np.linalg.norm(other.centre - solution.centre)
+    off = np.linalg.norm(competitor.pose.centre - solution.centre)
     what = f"a pose {off:.3g} scene units away, elsewhere in the map, explains the image points "
-    what += "about as well" if behind > -lead else f"better (by {-behind:.1f} decades)"
+    what += "about as well" if competitor.margin > -lead else f"better (by {-competitor.margin:.1f} decades)"
     return replace(
         solution,
-        verdict="ambiguous" if behind > -lead else "failed",
+        verdict="ambiguous" if competitor.margin > -lead else "failed",
         reason=reasons.against(what, solution.log10_false_alarms),
-        candidates=(solution.candidates[0], other, *solution.candidates[1:]),
+        reason_code="competing_place" if competitor.margin > -lead else "better_pose",
+        candidates=(solution.candidates[0], competitor.pose, *solution.candidates[1:]),
     )

@@ -2,6 +2,7 @@
 of before; the planted poses are the answer."""
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -148,6 +149,18 @@ def test_an_edited_file_of_views_is_another_one_for_the_photos_whose_lines_chang
     assert again.changes(task("a.png", "photo 2.jpg")) == []
     assert again.changes(task("a.png", "photo 0.jpg")) == ["views"]
     assert again.changes(task("b.png", "photo 0.jpg")) == []
+
+
+@pytest.mark.parametrize(("limit", "kept", "used"), [(None, None, 60.0), (7, 7, 7.0), (math.inf, "none", math.inf)])
+def test_the_time_limit_of_a_photo_is_that_of_a_map_unless_given(
+    limit: float | None, kept: object, used: float, place: Place
+) -> None:
+    """What earlier runs without a limit wrote, null, is kept; a file is strict JSON."""
+    scene = SceneMap.from_colmap(place.folder / "map")
+    options = {"camera": PINHOLE, "keypoints": place.folder / "database.db", "time_limit": limit}
+    task = photo_task(scene, "a.png", place.folder / "a.png", **options)
+    assert (task.made_with["time_limit"], task.arguments["time_limit"]) == (kept, used)
+    json.dumps(task.made_with, allow_nan=False)
 
 
 def test_poses_are_those_of_all_runs_also_after_a_photo_that_failed(place: Place, fails: Callable[..., str]) -> None:

@@ -1,7 +1,12 @@
 """A photo's pose in a map comes from its keypoints alone."""
 
 import json
+import math
+import subprocess
+import sys
+import warnings
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,8 +19,10 @@ from scipy.spatial.transform import Rotation
 import bpnp
 from bpnp import PosePrior, SceneMap, Solution
 from bpnp.cameras import camera_from
-from bpnp.maps import scene_map
-from bpnp.maps.localize import BRIEF, Photo, on_all_points, problem_near
+from bpnp.maps import localize
+from bpnp.maps.all_points import judge_on_all_points, refine_on_all_points
+from bpnp.maps.localize import BRIEF
+from bpnp.maps.photo_problem import Photo
 from bpnp.search.evidence.false_alarms import alarms_of
 from bpnp.search.evidence.reasons import Objection, objection
 from bpnp.search.verdict import SearchResult, judged
@@ -100,6 +107,46 @@ def test_no_time_limit_is_the_default_one_and_is_said_where_it_was_none(planted:
         scene.verify_view("photo 1.jpg", pixels, time_limit=None)
 
 
+def test_what_the_time_limit_left_open_is_said(planted: tuple[SceneMap, Planted]) -> None:
+    """After a limit that has passed when the first view was tried no other one is; noise has no confident pose."""
+    scene, truth = planted
+    noise = np.random.default_rng(0).uniform((0, 0), (800, 600), (90, 2))
+    solution = scene.localize(noise, PINHOLE, solver="search", time_limit=1e-9)
+    assert solution.verdict != "confident"
+    assert solution.reason.startswith("Not decided in 1e-09 s, with 1 of 3 views tried.")
+    turned = scene.localize(noise, PINHOLE, solver="search", time_limit=1e-9, up_camera=[1, 0, 0])
+    assert " 1 of 3 views tried" in turned.reason
+    whole = scene.localize(photo_of(truth, 0)[0], PINHOLE, solver="search", time_limit=math.inf)
+    assert whole.verdict == "confident"
+    assert "views tried" not in whole.reason
+
+
+def test_the_default_time_limit_warns_where_there_was_none(
+    planted: tuple[SceneMap, Planted], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, truth = planted
+    monkeypatch.setattr("bpnp.maps.scene_map.SECONDS", 1e-9)
+    noise = np.random.default_rng(0).uniform((0, 0), (800, 600), (90, 2))
+    with pytest.warns(DeprecationWarning, match="`time_limit=math.inf` is no limit"):
+        assert "1 of 3 views" in scene.localize(noise, PINHOLE, solver="search").reason
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene.localize(noise, PINHOLE, solver="search", time_limit=1e-9)
+
+
+def test_the_warning_of_the_default_time_limit_reaches_a_script(tmp_path: Path) -> None:
+    """Python shows a DeprecationWarning where the line that causes it is in the script itself."""
+    plant_model(tmp_path / "map", camera=PINHOLE, images=3, points=140, seen=90)
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import numpy as np\nfrom bpnp import SceneMap\nfrom bpnp.maps import scene_map\nscene_map.SECONDS = 1e-9\n"
+        f"scene, noise = SceneMap.from_colmap({str(tmp_path / 'map')!r}), np.random.default_rng(0).random((90, 2))\n"
+        f"scene.localize(noise * (800, 600), {PINHOLE!r}, solver='search')\n"
+    )
+    ran = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=True)
+    assert f"{script}:6: DeprecationWarning: the search of a photo now ends after" in ran.stderr
+
+
 def test_the_pose_is_fitted_to_all_points_that_its_camera_sees(planted: tuple[SceneMap, Planted]) -> None:
     scene, truth = planted
     pixels = 520 * seen(truth.points3d, truth.rotations[1], truth.translations[1]) + [400, 300]
@@ -131,7 +178,7 @@ def not_sure(*known: Any, **options: Any) -> SearchResult:
 @pytest.mark.parametrize(
     ("stages", "reason"),
     [
-        ({"settle": lambda result, *_, **__: replace(result, verdict="ambiguous", reason="a twin")}, "a twin"),
+        ({"settle": lambda result, *_, **__: replace(result, verdict="ambiguous", reason="another")}, "another"),
         ({"settle": elsewhere}, "A competing pose 10 deg away fits about as well"),
         ({"judged": not_sure, "other_lens": of_another_lens}, "With 1.30 times the focal length"),
     ],
@@ -144,7 +191,7 @@ def test_an_ambiguous_verdict_on_all_points_is_kept_though_the_nfa_does_not_impr
     keypoints, _ = photo_of(truth, 1)
     known = scene.localize(keypoints, PINHOLE, views=["photo 1.jpg"])
     for name, stage in stages.items():
-        monkeypatch.setattr(f"bpnp.maps.localize.{name}", stage)
+        monkeypatch.setattr(f"bpnp.maps.all_points.{name}", stage)
     solution = scene.localize(keypoints, PINHOLE, views=["photo 1.jpg"])
     assert (known.verdict, solution.verdict) == ("confident", "ambiguous")
     assert reason in solution.reason
@@ -176,11 +223,11 @@ def test_a_prior_decides_on_which_side_the_photo_was_taken(planted: tuple[SceneM
         replace(scene.views[0], name=name, rotation=rotation, translation=translation, points=everything)
         for name, (rotation, translation) in zip("ab", poses, strict=True)
     )
-    twins = SceneMap(points, everything.astype(np.int64), np.full(140, 2, np.int32), views)
+    turned = SceneMap(points, everything.astype(np.int64), np.full(140, 2, np.int32), views)
     pixels = 520 * seen(points, *poses[0]) + [400, 300]
     for rotation, translation in poses:
         prior = PosePrior(rotation, translation, 5.0, 0.3)
-        found = twins.localize(pixels, PINHOLE, prior=prior, solver="search", time_limit=20)
+        found = turned.localize(pixels, PINHOLE, prior=prior, solver="search", time_limit=20)
         assert degrees_between(found.rotation, rotation) < 1
 
 
@@ -198,7 +245,7 @@ def test_the_seed_decides_where_nothing_else_does(
     planted: tuple[SceneMap, Planted], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene, _ = planted
-    monkeypatch.setattr("bpnp.maps.scene_map.LONGER", BRIEF)
+    monkeypatch.setattr("bpnp.maps.localize.LONGER", BRIEF)
     noise = np.random.default_rng(0).uniform((0, 0), (800, 600), (90, 2))
     guesses = [
         scene.localize(noise, PINHOLE, views=["photo 0.jpg"], solver="search", seed=seed, time_limit=1e5)
@@ -251,8 +298,8 @@ def test_a_pose_that_one_view_does_not_decide_is_judged_on_all_points(
     pixels = 520 * seen(truth.points3d, truth.rotations[1], truth.translations[1]) + [400, 300]
     pixels = pixels[((pixels > 0) & (pixels < [800, 600])).all(1)]
     pixels += np.random.default_rng(0).normal(0, 0.3, pixels.shape)
-    near = scene_map.near_view
-    monkeypatch.setattr(scene_map, "near_view", lambda *a, **o: found_with_few_points(near(*a, **o)))
+    near = localize.search_near
+    monkeypatch.setattr(localize, "search_near", lambda *a: found_with_few_points(near(*a)))
     solution = scene.localize(pixels, **known, views=["photo 1.jpg"], solver="search", time_limit=1e5)
     assert solution.verdict == "confident"
     assert degrees_between(solution.rotation, truth.rotations[1]) < 0.2
@@ -277,13 +324,12 @@ def test_each_view_that_is_tried_counts_once(planted: tuple[SceneMap, Planted]) 
     scene, truth = planted
     keypoints, _ = photo_of(truth, 1)
     alone = scene.localize(keypoints, PINHOLE, views=["photo 1.jpg"], solver="search")
-    region = scene._region(scene.views[1], np.arange(len(scene.points3d)))
-    place = Photo(keypoints, PINHOLE, region, lambda _: ())
-    lens = camera_from(PINHOLE)
-    counts = [on_all_points(alone, place, lens, views) for views in (1, 100)]
+    region = scene.region(scene.views[1])
+    one, hundred = (Photo(keypoints, camera_from(PINHOLE), view_count=views) for views in (1, 100))
+    counts = [judge_on_all_points(alone, refine_on_all_points(alone, photo, region)) for photo in (one, hundred)]
     # With 100 views the NFA of the refined pose is not smaller than that of the given one, which counts one.
     assert counts[1].log10_false_alarms == alone.log10_false_alarms
-    first, other = (problem_near(region, keypoints, PINHOLE, None, views=views) for views in (1, 100))
+    first, other = (photo.problem(region, PINHOLE) for photo in (one, hundred))
     pose = alone.rotation[None], alone.translation[None]
     assert alarms_of(other, *pose).own[0] - alarms_of(first, *pose).own[0] == pytest.approx(2)
 
@@ -299,8 +345,8 @@ def test_a_competing_pose_of_one_view_competes_on_all_points(planted: tuple[Scen
         right, rotation=wrong.rotation, translation=wrong.translation, verdict="ambiguous",
         log10_false_alarms=-5.0, candidates=(wrong, right.candidates[0]),
     )  # fmt: skip
-    region = scene._region(scene.views[1], np.arange(len(scene.points3d)))
-    place = Photo(keypoints, PINHOLE, region, lambda _: ())
-    solution = on_all_points(replace(given, matches=given.matches[:4]), place, camera_from(PINHOLE), 1)
+    given = replace(given, matches=given.matches[:4])
+    photo = Photo(keypoints, camera_from(PINHOLE))
+    solution = judge_on_all_points(given, refine_on_all_points(given, photo, scene.region(scene.views[1])))
     assert degrees_between(solution.rotation, right.rotation) < 0.5
     assert solution.verdict == "confident"

@@ -111,6 +111,22 @@ def undecided(reason: str, seconds: float) -> str:
     return f"{reason}; not decided in {seconds:.3g} s, a longer time limit may decide it"
 
 
+def unfinished(reason: str, seconds: float, tried: int, views: int) -> str:
+    """Return the reason of a photo whose views were not all tried, or not all long enough, within the time limit.
+
+    Args:
+        reason: Reason of the best pose so far.
+        seconds: Time limit.
+        tried: Number of views that were tried.
+        views: Number of views.
+
+    Examples:
+        >>> unfinished("no pose was found", 60.0, 213, 10000)
+        'Not decided in 60 s, with 213 of 10,000 views tried. Best pose: no pose was found'
+    """
+    return f"Not decided in {seconds:.3g} s, with {tried:,} of {views:,} views tried. Best pose: {reason}"
+
+
 def rounded(bound: float) -> str:
     """Format a bound: one digit below ten, whole numbers above."""
     return f"{bound:.1g}" if bound < 9.5 else f"{bound:.0f}"

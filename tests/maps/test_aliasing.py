@@ -7,11 +7,14 @@ import pytest
 from planted import degrees_between, seen
 from scipy.spatial.transform import Rotation
 
-from bpnp import SceneMap
+from bpnp import PosePrior, SceneMap
 from bpnp.cameras import camera_from
-from bpnp.maps.localize import Photo
-from bpnp.maps.twins import best_rival
+from bpnp.maps.aliasing import best_competitor
+from bpnp.maps.localize import ONCE, Attempt, judge_in_map, search_near
+from bpnp.maps.photo_problem import Photo
+from bpnp.maps.viewed_points import Place
 from bpnp.maps.views import View
+from bpnp.solving.sources import Options
 
 pytestmark = pytest.mark.slow
 
@@ -62,7 +65,7 @@ def map_of(points: Array, normals: Array) -> SceneMap:
     return SceneMap(points, np.arange(len(points)), np.zeros(len(points), np.int32), views).seen_by(2)
 
 
-def photo(rng: np.random.Generator, points: Array, normals: Array, rotation: Array, translation: Array) -> Array:
+def photo_of(rng: np.random.Generator, points: Array, normals: Array, rotation: Array, translation: Array) -> Array:
     """Pixels of 7 of 10 points that face the camera, half a pixel off, and of as many more that are anywhere."""
     pixels = FOCAL * seen(points[facing(points, normals, rotation, translation)], rotation, translation)
     pixels = pixels[rng.random(len(pixels)) < 0.7]
@@ -80,7 +83,7 @@ def test_a_face_that_is_printed_like_another_one_is_never_taken_for_it(turns: tu
     points, normals = box(rng, turns)
     front = {OPPOSITE: (4, 184, -16), ADJACENT: (4, 94, -10)}[turns][seed]
     pose = pose_at(front, 4.2, -3.0)
-    keypoints = photo(rng, points, normals, *pose)
+    keypoints = photo_of(rng, points, normals, *pose)
     solution = map_of(points, normals).localize(keypoints, CAMERA, seed=seed)
     assert solution.verdict == "confident"  # the 40 points that differ are enough to tell
     assert degrees_between(solution.rotation, pose[0]) < 1
@@ -99,8 +102,8 @@ def test_faces_that_are_alike_in_all_points_are_ambiguous_and_both_poses_are_can
     solution = map_of(points, normals).localize(keypoints, CAMERA)
     assert solution.verdict == "ambiguous"
     assert "elsewhere in the map, explains the image points about as well" in solution.reason
-    twin = pose[0] @ about_y(turns[1]).T
-    off = [min(degrees_between(one.rotation, truth) for one in solution.candidates[:2]) for truth in (pose[0], twin)]
+    other = pose[0] @ about_y(turns[1]).T
+    off = [min(degrees_between(one.rotation, truth) for one in solution.candidates[:2]) for truth in (pose[0], other)]
     assert max(off) < 1
     np.testing.assert_array_equal(solution.candidates[0].rotation, solution.rotation)
 
@@ -119,7 +122,7 @@ def test_a_place_that_is_there_twice_is_ambiguous_whatever_its_size(seed: int) -
     both = np.concatenate([one.points3d, size * one.points3d @ turn.T + shift])
     twice = SceneMap(both, np.arange(len(both)), np.zeros(len(both), np.int32), (*one.views, *again)).seen_by(2)
     rotation, translation = pose_at(14.0, 4.2, -3.0)
-    pixels = photo(rng, points, normals, rotation, translation)
+    pixels = photo_of(rng, points, normals, rotation, translation)
     solution = twice.localize(pixels, CAMERA, solver="search", seed=seed, time_limit=60)
     assert solution.verdict == "ambiguous"
     found = [degrees_between(one.rotation, rotation) for one in solution.candidates[:2]]
@@ -128,13 +131,30 @@ def test_a_place_that_is_there_twice_is_ambiguous_whatever_its_size(seed: int) -
     assert min(other) < 1
 
 
+def test_a_better_pose_elsewhere_takes_the_place_of_a_confident_one() -> None:
+    """A solution at the face that is printed alike but for 40 points, as a search near its views alone gives."""
+    rng = np.random.default_rng(0)
+    points, normals = box(rng, OPPOSITE)
+    scene, pose = map_of(points, normals), pose_at(4.0, 4.2, -3.0)
+    keypoints = photo_of(rng, points, normals, *pose)
+    opposite = PosePrior(pose[0] @ about_y(180.0).T, pose[1], 2.0, 0.1)
+    view, photo = scene.views[4], Photo(keypoints, camera_from(CAMERA))
+    wrong = search_near(scene.region(view, view.points), replace(photo, prior=opposite), photo.lens, Options(), ONCE)
+    assert degrees_between(wrong.rotation, opposite.rotation) < 1
+    attempt = Attempt(Place(view, view.points, photo.lens), replace(wrong, verdict="confident"), is_judged=False)
+    solution = judge_in_map(scene, photo, None, attempt, []).solution
+    assert solution.verdict == "confident"
+    assert degrees_between(solution.rotation, pose[0]) < 1
+    assert solution.view in ("0.jpg", "1.jpg", "8.jpg")  # which see the front
+
+
 def test_a_pose_that_is_refined_to_the_best_one_is_no_competitor() -> None:
     rng = np.random.default_rng(0)
     points, normals = box(rng, ())
     scene, pose = map_of(points, normals), pose_at(14.0, 4.2, -3.0)
-    keypoints = photo(rng, points, normals, *pose)
+    keypoints = photo_of(rng, points, normals, *pose)
     solution = scene.localize(keypoints, CAMERA)
     turned = Rotation.from_rotvec([0, 0, np.radians(2.3)]).as_matrix()
     beside = replace(solution.candidates[0], rotation=turned @ pose[0], translation=turned @ pose[1])
-    place = Photo(keypoints, CAMERA, scene._region(scene.views[0], np.arange(len(points))), lambda _: ())
-    assert best_rival(place, solution, [replace(solution, candidates=(beside,))]) is None
+    photo, place = Photo(keypoints, camera_from(CAMERA)), scene.region(scene.views[0])
+    assert best_competitor(photo, place, solution, [replace(solution, candidates=(beside,))], []) is None

@@ -1,0 +1,222 @@
+"""Aliasing: poses elsewhere in a map that explain the same image points, such as those of a similar building.
+
+A confident pose is compared with three kinds of proposals: poses that were found with the points of other views; its
+images under motions that map the scene onto itself (`bpnp.search.evidence.repetitions`); and poses that short searches
+near views of other points find for the image points that it explains. They are refined on all points of the map,
+scored by how well they explain the image points, and the pose is judged against the best of them.
+"""
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bpnp.loops.parallel import one_blas_thread
+from bpnp.maps.photo_problem import Photo, in_picture
+from bpnp.maps.viewed_points import Region
+from bpnp.maps.views import Array
+from bpnp.poses import same_pose, turned_by
+from bpnp.search.annealing import finish, polished
+from bpnp.search.config import DEFAULT, Draws, Narrowing, RasterSearch, RasterShape, Screens
+from bpnp.search.evidence.reasons import objection
+from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
+from bpnp.search.hypotheses import Hypotheses, to_problem_frame
+from bpnp.search.kernels.raster import Raster
+from bpnp.search.problem import Problem
+from bpnp.search.raster_search import search_beside, search_near
+from bpnp.search.scene import Scene
+from bpnp.search.starts import PosePrior
+from bpnp.search.verdict import weighed
+from bpnp.solving.matches import count_one_to_one
+from bpnp.solving.solution import Candidate, Solution, add_objection, candidates_of
+
+Pose = tuple[Array, Array]  # rotation (3, 3) and translation (3,), in the frame of a problem
+
+
+@dataclass(frozen=True)
+class AliasingSettings:
+    """Constants of the short searches near views of other points.
+
+    Attributes:
+        search: Search near each view. Few of the explained image points are outliers for a competing pose. So fewer,
+            more smoothed initial poses suffice than near a view that is tried.
+        most_views: Largest number of views.
+        least_other: Least fraction of a view's points that the pose does not see.
+        fewest: Least number of such points, and of image points that the pose explains.
+    """
+
+    search: RasterSearch = RasterSearch(
+        Draws(2**13, least_starts=2**13),
+        Screens((50, 300), (2**11, 2**8)),
+        Narrowing(0.1, 0.015, steps=6, points=300),
+        annealed=6,
+    )
+    most_views: int = 8
+    least_other: float = 0.5
+    fewest: int = 12
+
+
+ALIASING = AliasingSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class Competitor:
+    """The best competing pose elsewhere in a map.
+
+    Attributes:
+        margin: Decades by which it explains the image points worse than the pose; negative if better.
+        pose: The competing pose.
+    """
+
+    margin: float
+    pose: Candidate
+
+
+@one_blas_thread
+def best_competitor(
+    photo: Photo, place: Region, solution: Solution, earlier: Sequence[Solution], regions: Iterable[Region]
+) -> Competitor | None:
+    """Propose, refine and score the poses elsewhere in a map that explain the image points of a confident solution.
+
+    Args:
+        photo: The photo.
+        place: Points on which the poses are compared.
+        solution: Confident solution.
+        earlier: Solutions with the points of other views.
+        regions: Regions of the map, ranked for the explained image points (`explained_keypoints`).
+
+    Returns:
+        The competing pose with the smallest margin; None if there is no different pose.
+    """
+    problem = replace(photo, view_count=1).problem(place, solution.camera)
+    proposals = propose_elsewhere(photo, problem, place, solution, earlier, regions)
+    competing = refine_elsewhere(problem, solution, proposals, photo.seed)
+    if not len(competing):
+        return None
+    best, poses = _pose_of(problem, solution), (competing.rotation, competing.translation)
+    margins = decades_behind(problem, best, poses, poses, _scale_of(problem, solution))
+    k = int(np.argmin(margins))
+    return Competitor(float(margins[k]), _candidate(problem, solution, competing[k : k + 1], float(margins[k])))
+
+
+def propose_elsewhere(
+    photo: Photo,
+    problem: Problem,
+    place: Region,
+    solution: Solution,
+    earlier: Sequence[Solution],
+    regions: Iterable[Region],
+) -> list[Pose]:
+    """Return poses elsewhere in the map that may explain the image points of a solution, unrefined.
+
+    Args:
+        photo: The photo.
+        problem: Problem of its keypoints and the points of `place`.
+        place: Points on which the poses are compared.
+        solution: The solution.
+        earlier: Solutions with the points of other views; their significant candidates are proposed.
+        regions: Regions of the map, ranked for the explained image points; the first ones of other points are searched.
+    """
+    significant = [one for other in earlier for one in other.candidates if one.log10_false_alarms < 0]
+    scale = _scale_of(problem, solution)
+    repeated, _ = repeated_poses(problem, *_pose_of(problem, solution), scale, DEFAULT.evidence)
+    return [
+        *(_pose_of(problem, one) for one in significant),
+        *zip(repeated.rotation, repeated.translation, strict=True),
+        *_found_in(_other_regions(regions, place, problem, solution), photo, problem, solution),
+    ]
+
+
+def refine_elsewhere(problem: Problem, solution: Solution, proposals: Sequence[Pose], seed: int) -> Hypotheses:
+    """Return the proposals that differ from a solution before and after their refinement, refined."""
+    best = _pose_of(problem, solution)
+    middle = np.median(problem.points_from_user(solution.points3d[solution.matches[:, 1]]), 0)
+
+    def differ(rotations: Array, translations: Array) -> NDArray[np.bool_]:
+        rotations, translations = np.concatenate([best[0][None], rotations]), np.r_[best[1][None], translations]
+        return np.asarray(~same_pose(rotations, rotations @ middle + translations, 0, DEFAULT.evidence.same)[1:])
+
+    rotations = np.array([rotation for rotation, _ in proposals]).reshape(-1, 3, 3)
+    translations = np.array([translation for _, translation in proposals]).reshape(-1, 3)
+    other = differ(rotations, translations)
+    if not other.any():
+        return Hypotheses.from_poses(rotations[other], translations[other])
+    scene = Scene(problem, seed, DEFAULT)
+    refined = polished(scene, rotations[other], translations[other], _scale_of(problem, solution))
+    return refined[differ(refined.rotation, refined.translation)]
+
+
+def judge_against(solution: Solution, competitor: Competitor | None) -> Solution:
+    """Return a confident solution, or an ambiguous one if a competing pose elsewhere is within the margin `lead`.
+
+    An ambiguous solution has both poses as its first candidates.
+    """
+    if competitor is None or competitor.margin >= DEFAULT.evidence.lead:
+        return solution
+    off = math.degrees(turned_by(solution.rotation, competitor.pose.rotation))
+    doubtful = add_objection(solution, objection("competing_place", competitor.margin, degrees=off))
+    return replace(doubtful, candidates=(solution.candidates[0], competitor.pose, *solution.candidates[1:]))
+
+
+def explained_keypoints(photo: Photo, solution: Solution) -> Array:
+    """Return the keypoints (k, 2), pixels, that a solution explains."""
+    return photo.keypoints[np.sort(solution.matches[:, 0])]
+
+
+def _pose_of(problem: Problem, pose: Solution | Candidate) -> Pose:
+    return problem.from_user(pose.rotation, pose.translation)
+
+
+def _scale_of(problem: Problem, solution: Solution) -> float:
+    return max(solution.stats.residual, float(problem.image.scales[0]))
+
+
+def _candidate(problem: Problem, solution: Solution, pose: Hypotheses, margin: float) -> Candidate:
+    """Return a competing pose (1,) as a candidate in the user's frame."""
+    seen = problem.project_scene(pose.rotation[0], pose.translation[0])
+    inliers = count_one_to_one(problem.image_points, seen, solution.inlier_threshold)
+    rotation, translation = problem.to_user(pose.rotation, pose.translation)
+    alarms = np.array([solution.log10_false_alarms + margin])
+    return candidates_of(
+        replace(pose, rotation=rotation, translation=translation, log10_false_alarms=alarms), [inliers]
+    )[0]
+
+
+def _other_regions(regions: Iterable[Region], place: Region, problem: Problem, solution: Solution) -> Iterator[Region]:
+    """Yield the first regions of which a solution does not see most points."""
+    if len(solution.matches) < ALIASING.fewest:
+        return
+    seen, count = place.point_ids[in_picture(problem, solution)], 0
+    for region in regions:
+        other = ~np.isin(region.point_ids, seen)
+        if other.sum() >= ALIASING.fewest and other.mean() >= ALIASING.least_other:
+            yield region
+            count += 1
+        if count == ALIASING.most_views:
+            return
+
+
+def _found_in(regions: Iterable[Region], photo: Photo, problem: Problem, solution: Solution) -> Iterator[Pose]:
+    """Yield the poses that short searches in other regions find for the explained image points of a solution."""
+    explained = replace(photo, keypoints=explained_keypoints(photo, solution), view_count=1)
+    rasters: dict[tuple[RasterShape, float], Raster] = {}  # shared, since the image points are the same
+    for region in regions:
+        near = explained.problem(region, solution.camera, region.prior())
+        scene = Scene(near, photo.seed, DEFAULT)
+        scene.rasters = rasters
+        assert near.prior is not None
+        prior = scene.enter_prior(near.prior)
+        assert isinstance(prior, PosePrior)
+        found = _likeliest(finish(scene, search_near(scene, prior, ALIASING.search)), scene, near)
+        if len(found) and found.log10_false_alarms[0] < 0:
+            start = Hypotheses.from_poses(*scene.enter(found.rotation, found.translation))
+            beside = _likeliest(finish(scene, search_beside(scene, start, DEFAULT.beside)), scene, near)
+            for one in (found, beside):
+                yield problem.from_user(*near.to_user(one.rotation[0], one.translation[0]))
+
+
+def _likeliest(poses: Hypotheses, scene: Scene, problem: Problem) -> Hypotheses:
+    """Return the pose (1,) with the fewest false alarms, in the frame of the problem."""
+    return weighed(to_problem_frame(poses, scene), problem)[:1]

@@ -1,0 +1,144 @@
+"""Refinement of a pose that was found with the points of one view, on all map points in view, and its verdict."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bpnp.cameras import camera_from
+from bpnp.loops.parallel import one_blas_thread
+from bpnp.maps.photo_problem import Photo, with_ids
+from bpnp.maps.viewed_points import Region
+from bpnp.maps.views import Array
+from bpnp.poses import MIN_POINTS
+from bpnp.search.annealing import finish, polished
+from bpnp.search.competitors import other_lens, settle
+from bpnp.search.config import DEFAULT, Evidence
+from bpnp.search.evidence.alternatives import competing_pose
+from bpnp.search.hypotheses import Hypotheses, to_problem_frame
+from bpnp.search.problem import Problem, UnknownFocal
+from bpnp.search.raster_search import search_beside
+from bpnp.search.scene import Scene
+from bpnp.search.verdict import judged
+from bpnp.solving.focal_length import AROUND, UnknownCamera, fit_camera
+from bpnp.solving.matches import finished
+from bpnp.solving.solution import Solution, add_objection
+
+COMPETITORS = 4  # competing poses of an ambiguous solution that are judged with it on all points
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """A pose refined on all map points in view.
+
+    Attributes:
+        region: Points in view.
+        problem: Problem of the keypoints and these points, with the fitted camera.
+        pose: Refined rotation (3, 3) and translation (3,), in the frame of the problem.
+        poses: The pose, its competing poses and the optima of local searches around it, in the frame of the problem.
+        scene: Normalised points of the problem.
+    """
+
+    region: Region
+    problem: Problem
+    pose: tuple[Array, Array]
+    poses: Hypotheses
+    scene: Scene
+
+
+@one_blas_thread
+def refine_on_all_points(solution: Solution, photo: Photo, whole: Region) -> Refined | None:
+    """Refine a pose on all map points in view; an unknown focal length is fitted to them too.
+
+    The competing poses of a pose that is not confident yet are refined as well. Local searches around it propose more:
+    one for a confident pose whose residuals grow, since a coarse optimum may have a finer one nearby; for others as
+    many as exclude a better pose nearby.
+
+    Args:
+        solution: Pose that was found with the points of one view.
+        photo: The photo.
+        whole: All points of the map.
+
+    Returns:
+        The refined poses; None if there is no pose, or fewer points in view than it has matches.
+    """
+    if not solution.found:
+        return None
+    pose, scale = (solution.rotation, solution.translation), solution.stats.residual
+    camera = camera_from(solution.camera)
+    seen = whole.in_view(*pose, camera, photo.keypoints)
+    if len(seen) < max(len(solution.matches), MIN_POINTS):
+        return None
+    region, lens = whole.part(seen), photo.lens
+
+    def problem_at(camera: object, focal: UnknownFocal | None = None) -> Problem:
+        return photo.problem(region, camera, focal=focal)
+
+    if isinstance(lens, UnknownCamera):
+        lens = lens.seen_by(problem_at(lens.reference))
+        fitted = fit_camera(problem_at, lens, camera, pose, scale, photo.seed, AROUND)
+        problem, poses = fitted.problem, fitted.poses
+        rotation, shift = poses.rotation[0], poses.translation[0]
+    else:
+        problem = problem_at(lens)
+        rotation, shift = problem.from_user(*pose)
+        least = problem.image.scales[0]
+        poses = polished(Scene(problem, photo.seed, DEFAULT), rotation[None], shift[None], max(scale, least))
+    scene, confident = Scene(problem, photo.seed, DEFAULT), solution.verdict == "confident"
+    looks = int(poses.scale[0] > scale) if confident else looks_for_certainty(DEFAULT.evidence)
+    others = [] if confident else [one for one in solution.candidates[1:] if one.log10_false_alarms < 0][:COMPETITORS]
+    if others:
+        turns, shifts = problem.from_user(
+            np.stack([one.rotation for one in others]), np.stack([one.translation for one in others])
+        )
+        competing = polished(scene, turns, shifts, max(scale, problem.image.scales[0]))
+        poses = Hypotheses.concatenate([poses, competing])
+    start = Hypotheses.from_poses(*scene.enter(rotation[None], shift[None]))
+    for _ in range(looks):
+        beside = finish(scene, search_beside(scene, start, DEFAULT.beside), DEFAULT.finished)
+        poses = Hypotheses.concatenate([poses, to_problem_frame(beside, scene)])
+    return Refined(region, problem, (rotation, shift), poses, scene)
+
+
+@one_blas_thread
+def judge_on_all_points(solution: Solution, refined: Refined | None) -> Solution:
+    """Judge a refined pose on all map points in view.
+
+    Args:
+        solution: Pose that was found with the points of one view.
+        refined: The pose and its competing poses on all points in view; None if it was not refined.
+
+    Returns:
+        The refined solution if its NFA is smaller, or if it is confident and the given one was not. Otherwise the given
+            solution, or a copy whose verdict is lowered by a competing pose among all points.
+    """
+    if refined is None:
+        return solution
+    problem, rule, confident = refined.problem, DEFAULT.evidence, solution.verdict == "confident"
+
+    alone = judged(refined.poses, problem, batches=1, exhaustive=True, rule=rule)
+    result = settle(alone, problem, lambda: refined.scene, rule, exhaustive=True)
+    rotations, shifts = (np.stack(both) for both in zip(refined.pose, result.best, strict=True))
+    behind = result.log10_false_alarms - solution.log10_false_alarms
+    if confident and not problem.same_pose(rotations, shifts, rule.same)[1]:
+        other = competing_pose(rotations[0], rotations[1], behind)
+        return solution if behind >= rule.lead else add_objection(solution, other)
+    if behind < 0 or (not confident and result.verdict == "confident"):
+        found = finished(problem, result, solution.seconds, None)
+        stats = replace(found.stats, iterations=solution.stats.iterations)
+        candidates = (*found.candidates, *solution.candidates[1:])
+        return with_ids(replace(found, stats=stats, candidates=candidates), refined.region)
+    if not confident:
+        return solution
+    if alone.verdict != "confident":  # other cameras have not been tested for it
+        lens_objection = other_lens(alone, problem, lambda: refined.scene, rule)
+        return solution if lens_objection is None else add_objection(solution, lens_objection)
+    if result.verdict == "confident":
+        return solution
+    return replace(solution, verdict=result.verdict, reason=result.reason, reason_code=result.code)
+
+
+def looks_for_certainty(rule: Evidence) -> int:
+    """Return the number of local searches that exclude a better pose nearby, whatever its initial poses were."""
+    again = (rule.missed - math.log10(rule.look_fails)) / math.log10(rule.again_fails)
+    return 1 + max(math.ceil(again), 0)

@@ -1,0 +1,61 @@
+"""A photo to localise, and the problem of its keypoints and some points of a map."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bpnp.cameras import Camera, camera_from
+from bpnp.maps.viewed_points import Region
+from bpnp.maps.views import Array
+from bpnp.search.problem import Problem, UnknownFocal
+from bpnp.solving.focal_length import UnknownCamera
+from bpnp.solving.inputs import problem_from
+from bpnp.solving.solution import Candidate, Solution
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """A photo to localise.
+
+    Attributes:
+        keypoints: (m, 2) pixels.
+        lens: Camera model, or its prior if the focal length is unknown.
+        prior: Prior of the pose; None for none.
+        view_count: Number of views that are tried, which the NFA counts as tests. Default 1.
+        seed: Seed of the search, default 0.
+    """
+
+    keypoints: Array
+    lens: Camera | UnknownCamera
+    prior: Any = None
+    view_count: int = 1
+    seed: int = 0
+
+    def problem(self, region: Region, camera: Any, prior: Any = None, focal: UnknownFocal | None = None) -> Problem:
+        """Return the problem of the keypoints and the points of one region.
+
+        Args:
+            region: Points to match.
+            camera: Camera of the photo.
+            prior: Prior of the pose; None for none.
+            focal: Prior of the focal length; None if it is known.
+        """
+        axes, cosines = region.cones
+        known: dict[str, Any] = {"normals3d": axes, "cosines3d": cosines, "prior": prior, "focal": focal}
+        problem = problem_from(self.keypoints, region.points3d, camera_from(camera), **known)
+        return replace(problem, log10_views=math.log10(self.view_count))
+
+
+def with_ids(solution: Solution, region: Region) -> Solution:
+    """Return a solution with the point ids of a region and the name of its view."""
+    return replace(solution, view=region.view.name, point_ids=region.point_ids)
+
+
+def in_picture(problem: Problem, pose: Solution | Candidate) -> NDArray[np.bool_]:
+    """Return a mask (n,) of the scene points visible from a pose, within the bounding box of the image points."""
+    seen, image = problem.project_scene(*problem.from_user(pose.rotation, pose.translation)), problem.image_points
+    inside = (seen >= image.min(0)) & (seen <= image.max(0))  # not NaN
+    return np.asarray(inside.all(-1))

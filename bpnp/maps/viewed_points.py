@@ -1,0 +1,222 @@
+"""Points and views of a map: their parts, the order in which views are tried, and the points in view of a pose."""
+
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bpnp.cameras import Camera
+from bpnp.maps.upright import quarter_turns, turned_view
+from bpnp.maps.views import (
+    RUNG,
+    STEP,
+    Array,
+    Cones,
+    Pictures,
+    View,
+    pictures_of_views,
+    places_first,
+    scores_of_views,
+    viewing_cones,
+)
+from bpnp.poses import MIN_POINTS
+from bpnp.search.problem import faces
+from bpnp.search.starts import PosePrior
+from bpnp.solving.focal_length import UnknownCamera
+
+Map = TypeVar("Map", bound="ViewedPoints")
+LEAST_TRACK = 2  # least number of views of a point after a view is removed
+VIEW_DEGREES = 15.0  # about the largest angle per axis between photos that share a third of their points
+VIEW_SHARE = 0.2  # about the largest shift of the viewed points, as a fraction of their distance
+
+
+class Place(NamedTuple):
+    """A view to search near, the indices (k,) of the points to use, and the camera model or its prior."""
+
+    view: View
+    points: NDArray[np.integer]
+    lens: Camera | UnknownCamera
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """Map points that one view, or several, see, and the view to search near.
+
+    Attributes:
+        view: View to search near.
+        points3d: (k, 3) scene points.
+        point_ids: (k,) ids of the points in the COLMAP model.
+        cones: Cones of directions from which the points are visible.
+        distance: Median distance from the view to its own points, scene units.
+    """
+
+    view: View
+    points3d: Array
+    point_ids: NDArray[np.int64]
+    cones: Cones
+    distance: float
+
+    def prior(self) -> PosePrior:
+        """Return a prior at the view's pose, as wide as the poses of photos of one place differ."""
+        return PosePrior(self.view.rotation, self.view.translation, VIEW_DEGREES, VIEW_SHARE * self.distance)
+
+    def part(self, points: NDArray[np.integer]) -> "Region":
+        """Return the region with only the points of these indices (j,)."""
+        cones = Cones(self.cones.axes[points], self.cones.cosines[points])
+        return replace(self, points3d=self.points3d[points], point_ids=self.point_ids[points], cones=cones)
+
+    def in_view(self, rotation: Array, translation: Array, camera: Camera, keypoints: Array) -> NDArray[np.int64]:
+        """Return the indices of the points visible from a pose, within the bounding box of keypoints (m, 2), pixels."""
+        in_camera = self.points3d @ rotation.T + translation
+        ahead = (in_camera[:, 2] > 0) & faces(self.cones.axes, self.cones.cosines, in_camera, rotation)
+        indices = np.flatnonzero(ahead)
+        seen = camera.project(in_camera[indices])
+        inside = ((seen >= keypoints.min(0)) & (seen <= keypoints.max(0))).all(-1)  # not NaN
+        return indices[inside]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ViewedPoints:
+    """Scene points, and the views that see them.
+
+    Attributes:
+        points3d: (n, 3) scene points, in the order of their ids.
+        point_ids: (n,) ids in the COLMAP model.
+        track_lengths: (n,) number of views that see each point.
+        views: Views in the order of their names.
+    """
+
+    points3d: Array
+    point_ids: NDArray[np.int64]
+    track_lengths: NDArray[np.int32]
+    views: tuple[View, ...]
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({len(self.views):,} views, {len(self.points3d):,} points)"
+
+    @cached_property
+    def pictures(self) -> Pictures:
+        """Density images of the views, from which their ranks are computed."""
+        return pictures_of_views(self.points3d, self.views)
+
+    @cached_property
+    def cones(self) -> Cones:
+        """Cone of directions from which each point is visible."""
+        return viewing_cones(self.points3d, ((view.centre, view.points) for view in self.views))
+
+    @cached_property
+    def view_numbers(self) -> dict[str, int]:
+        """Indices in `views` by name."""
+        return {view.name: i for i, view in enumerate(self.views)}
+
+    def named(self, names: Iterable[str]) -> list[View]:
+        """Return the views with these names; raise ValueError for a name that is not in the map."""
+        wanted = list(names)
+        if unknown := [name for name in wanted if name not in self.view_numbers]:
+            some = ", ".join(view.name for view in self.views[:5])
+            raise ValueError(f"expected names of views of the map, got {', '.join(unknown[:5])}; try {some}, ...")
+        return [self.views[self.view_numbers[name]] for name in wanted]
+
+    def without(self: Map, names: Collection[str]) -> Map:
+        """Return the map without some views, and without points that fewer than two of the other views see.
+
+        Args:
+            names: Names of the views to remove.
+
+        Raises:
+            ValueError: A name is not in the map, or no view that sees a point is left.
+        """
+        left_out = {view.name for view in self.named(names)}
+        views = tuple(view for view in self.views if view.name not in left_out)
+        return replace(self, views=views).seen_by(LEAST_TRACK)
+
+    def seen_by(self: Map, least: int) -> Map:
+        """Return the map with only the points that `least` or more views see; raise ValueError if none is left."""
+        tracks = np.zeros(len(self.points3d), np.int32)
+        for view in self.views:
+            tracks[view.points] += 1
+        enough = tracks >= least
+        if not enough.any():
+            raise ValueError(f"expected points that {least} or more views see, got none in {len(self.views)} views")
+        index = np.cumsum(enough, dtype=np.int32) - 1
+        views = tuple(replace(view, points=index[view.points[enough[view.points]]]) for view in self.views)
+        return type(self)(self.points3d[enough], self.point_ids[enough], tracks[enough], views)
+
+    def places(self, views: Iterable[str] | None, keypoints: Array, lens: Camera | UnknownCamera) -> list[Place]:
+        """Return the views to search near for a photo's keypoints, in this order.
+
+        With `views` these are the given views in their order. Each gets the points that any of them sees, since they
+        show one place. Otherwise they are all views of the map by rank (`bpnp.maps.views`), each with its own points.
+        With an unknown focal length several are tried, the likeliest first: the next one follows `RUNG` views behind.
+        Views with too few points to fix a pose are skipped.
+
+        Args:
+            views: Names of views, best first; None for all views of the map.
+            keypoints: (m, 2) pixels.
+            lens: Camera model, or its prior if the focal length is unknown.
+
+        Raises:
+            ValueError: A name is unknown, or `views` is empty.
+        """
+        if views is not None:
+            named = self.named(views)
+            if not named:
+                raise ValueError("expected names of views to try, got none; try views=None for all of the map")
+            points = np.unique(np.concatenate([view.points for view in named]))
+            return [Place(view, points, lens) for view in named if len(view.points) and len(points) >= MIN_POINTS]
+        cameras: list[Camera] = lens.ladder(STEP) if isinstance(lens, UnknownCamera) else [lens]
+        scores = self.scores(cameras[0], keypoints, known_focal=isinstance(lens, Camera))
+        order = list(places_first(self.views, scores, len(self.points3d)))
+        turns = [(place + RUNG * rung, rung, k) for rung in range(len(cameras)) for place, k in enumerate(order)]
+        tried = [lens.near(one) if isinstance(lens, UnknownCamera) else lens for one in cameras]
+        return [
+            Place(view, view.points, tried[rung])
+            for _, rung, k in sorted(turns)
+            if len((view := self.views[k]).points) >= MIN_POINTS
+        ]
+
+    def scores(self, camera: Camera, keypoints: Array, *, known_focal: bool = True) -> NDArray[np.float32]:
+        """Return the scores (views,) of the views for keypoints (m, 2), pixels (`scores_of_views`)."""
+        points2d = camera.normalise(np.asarray(keypoints, np.float64))
+        return scores_of_views(points2d, self.pictures, known_focal=known_focal)
+
+    def region(self, view: View, points: NDArray[np.integer] | None = None) -> Region:
+        """Return the region of some points (k,), None for all points of the map, with the view to search near."""
+        in_camera = self.points3d[view.points] @ view.rotation.T + view.translation
+        distance = float(np.median(np.linalg.norm(in_camera, axis=-1)))
+        whole = Region(view, self.points3d, self.point_ids, self.cones, distance)
+        return whole if points is None else whole.part(points)
+
+    def ranked_regions(self, views: Iterable[str] | None, camera: Camera, keypoints: Array) -> Iterator[Region]:
+        """Yield the points seen by the given views, or by all views ranked for the keypoints of a known camera.
+
+        Several views may show the same place.
+        """
+        if views is not None:
+            order = self.named(views)
+        else:
+            order = [self.views[k] for k in np.argsort(-self.scores(camera, keypoints), kind="stable")]
+        yield from (self.region(view, view.points) for view in order if len(view.points) >= MIN_POINTS)
+
+    def turned(self: Map, up_camera: Array) -> Map:
+        """Return the map with each view rotated by quarter turns until its up direction is that of a photo (3,).
+
+        Return the map itself if no view needs a rotation.
+        """
+        turns = quarter_turns(self.views, up_camera)
+        if not turns.any():
+            return self
+        key = turns.tobytes()
+        if key not in self._turned_maps:
+            views = tuple(map(turned_view, self.views, turns.tolist()))
+            self._turned_maps[key] = turned = replace(self, views=views)
+            vars(turned).update(cones=self.cones)  # cones depend on the view centres only, which are unchanged
+        found: Map = self._turned_maps[key]
+        return found
+
+    @cached_property
+    def _turned_maps(self) -> dict[bytes, Any]:
+        return {}
