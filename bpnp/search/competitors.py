@@ -12,13 +12,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.poses import turned_by
 from bpnp.search.annealing import polished
 from bpnp.search.config import Evidence, OtherFocal
 from bpnp.search.evidence.alternatives import of_misfit
 from bpnp.search.evidence.false_alarms import alarms_of
 from bpnp.search.evidence.reasons import Objection, objection
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
-from bpnp.search.evidence.uncertainty import bends_significantly, linearised, misfit_of
+from bpnp.search.evidence.uncertainty import Misfit, bends_significantly, linearised, systematic_misfit
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
 from bpnp.search.pose_model import undistort
 from bpnp.search.problem import Problem, UnknownFocal
@@ -124,11 +125,13 @@ def other_lens(result: SearchResult, problem: Problem, scene_of: SceneOf, rule: 
         scene_of: Function that returns the scene, whose settings and deadline are used.
         rule: Constants of the verdict.
     """
-    count = match_count(result.candidates, problem)
-    if problem.focal is not None or count < rule.zoomed.fewest:
+    if problem.focal is not None:
         return None
-    (rotation, translation), scale = result.best, max(result.residual, problem.image.scales[0])
-    middle = rotation @ problem.middle + translation
+    count, (rotation, translation) = match_count(result.candidates, problem), result.best
+    other = fitted_lens(problem, rotation, translation, result.residual, count, rule)
+    if other is not None or count < rule.zoomed.fewest:
+        return other
+    middle, scale = rotation @ problem.middle + translation, max(result.residual, problem.image.scales[0])
     linear = linearised(problem, rotation, translation, scale)
     starts = (None, 0.0) if bends_significantly(linear, count, rule) else (None,)
 
@@ -150,6 +153,39 @@ def other_lens(result: SearchResult, problem: Problem, scene_of: SceneOf, rule: 
     if scene.deadline.passed():
         return objection("camera_untested")
     return better(likeliest)
+
+
+def fitted_lens(
+    problem: Problem, rotation: Array, translation: Array, scale: float, count: float, rule: Evidence
+) -> Objection | None:
+    """Return a focal length that the residuals of a pose support significantly, if its pose is a different one.
+
+    Args:
+        problem: Points of the problem.
+        rotation: (3, 3) of the pose.
+        translation: (3,) of the pose.
+        scale: Standard deviation of its residuals, radians.
+        count: Number of its matches.
+        rule: Constants of the verdict.
+    """
+    linear = linearised(problem, rotation, translation, scale)
+    if problem.focal is not None or systematic_misfit(linear, count, rule).zoom == 1:
+        return None
+    middle = rotation @ problem.middle + translation
+    fit = fit_lens(problem, rotation, middle, scale)
+    return None if fit is None else of_misfit(misfit_of(rotation, middle, fit), rule)
+
+
+def misfit_of(rotation: Array, middle: Array, other: LensFit) -> Misfit:
+    """Return the difference between a pose and the pose of another lens.
+
+    Args:
+        rotation: (3, 3) of the pose.
+        middle: (3,) scene centroid in its camera's frame.
+        other: Fitted lens with its pose.
+    """
+    shift = float(np.linalg.norm(other.middle - middle)) / max(float(np.linalg.norm(middle)), 1e-300)
+    return Misfit(turned_by(rotation, other.rotation), shift, other.zoom, other.radial or 0.0)
 
 
 class AtZoom(NamedTuple):

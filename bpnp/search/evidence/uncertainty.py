@@ -10,12 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc, fdtri
 
-from bpnp.poses import turned_by
 from bpnp.search.config import DEFAULT, Evidence
 from bpnp.search.evidence.covariance import Linearisation, covariance_of, student_factor
 from bpnp.search.pose_model import PoseModel, PoseState, Sight, centre_columns, crossed, lens_columns
 from bpnp.search.problem import Problem
-from bpnp.search.propose.lens import LensFit, fit_lens
 from bpnp.search.refine.gauss_newton import soft_matches
 
 Array = NDArray[np.float64]
@@ -349,8 +347,8 @@ def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = 
     - Five strains of the scene are fitted to the residuals together with the pose. Correspondences are weighted with
       their probabilities. The pose is eliminated, and the principal directions of the strains with a significant F
       statistic count (level 0.001).
-    - The log of the focal length is fitted and tested likewise (level `rule.focal_chance`, 0.01). If it is significant,
-      `fit_lens` fits it again with new correspondences, since those of a linear fit bias it towards the given one.
+    - The log of the focal length is fitted and tested likewise (level `rule.focal_chance`, 0.01). The correspondences
+      of the pose bias it towards the given one; `bpnp.search.competitors` fits a significant one with new ones.
 
     Args:
         linear: Pose from `linearised`, or None for no change.
@@ -382,27 +380,11 @@ def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = 
         moved, step = _moved(products, pose, fitted, free, chance)
         zoom = math.exp(float(step[0])) if len(step) == 1 else 1.0
         found.append(Misfit(float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:])), zoom))
-    rotation, middle = linear.state.rotation, linear.state.centroid
-    other = fit_lens(linear.problem, rotation, middle, linear.scale) if found[0].zoom != 1 else None
-    if other is not None:
-        found.append(misfit_of(rotation, middle, other))
     return Misfit(
         max(each.turn for each in found),
         max(each.shift for each in found),
         max((each.zoom for each in found), key=lambda zoom: abs(math.log(zoom))),
     )
-
-
-def misfit_of(rotation: Array, middle: Array, other: LensFit) -> Misfit:
-    """Return the difference between a pose and the pose of another lens.
-
-    Args:
-        rotation: (3, 3) of the pose.
-        middle: (3,) scene centroid in its camera's frame.
-        other: Fitted lens with its pose.
-    """
-    shift = float(np.linalg.norm(other.middle - middle)) / max(float(np.linalg.norm(middle)), 1e-300)
-    return Misfit(turned_by(rotation, other.rotation), shift, other.zoom, other.radial or 0.0)
 
 
 def bends_significantly(linear: Linearised | None, count: float, rule: Evidence = DEFAULT.evidence) -> bool:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from bpnp.loops.parallel import NEVER, Clock, Deadline, one_blas_thread
 from bpnp.poses import distinct, seen_from
+from bpnp.search.competitors import fitted_lens
 from bpnp.search.config import DEFAULT, ENUMERATION
 from bpnp.search.enumeration.search import enumerate_poses, is_enumerable
 from bpnp.search.evidence.reasons import objection
@@ -217,6 +218,11 @@ class RigPoses:
             turns, shifts = repeated.rotation, repeated.translation
             self._add(self.rig.candidates(*self.rig.rig_of(strongest, turns, shifts, self.best.translation[0, 3])))
             result = self._judged()
+        if result.verdict == "confident":
+            strongest, seen = self._strongest()
+            pose = seen.rotation[0], seen.translation[0], float(seen.scale[0])
+            other = fitted_lens(self.rig.problems[strongest], *pose, float(seen.match_count[0]), self.rule)
+            result = result if other is None else result.doubt(other)
         if result.verdict == "confident" and self.rig.unknowns == 7:
             best = self.best.rotation[0], self.best.translation[0], float(self.best.scale[0])
             covariance, free = self.rig.covariance(*best), 2 * float(self.best.match_count[0]) - 7
