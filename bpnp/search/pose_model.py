@@ -146,8 +146,8 @@ class PoseModel:
 
     @property
     def fixing(self) -> int:
-        """Number of matches of one camera that fix the unknowns, except the scale of a rig's scene."""
-        return (FIXING if self.moves else FIXING_ROTATION) + (self.lens is not None)
+        """Number of matches of one camera that fix the unknowns, except the scale of a rig's scene: half of them."""
+        return -(-(self.size - self.scale) // 2)
 
     def state(self, rotation: Array, translation: Array | None = None) -> PoseState:
         """Return the state of poses with the given camera.

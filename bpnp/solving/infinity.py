@@ -13,7 +13,7 @@ from bpnp.search.infinity.kernels import Image
 from bpnp.search.infinity.search import DEFAULT, InfinitySettings, search_rotation
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import UnknownFocal
-from bpnp.search.refine.gauss_newton import Iteration, image_equations, image_rows, refine
+from bpnp.search.refine.gauss_newton import ImageMatches, Iteration, image_equations, image_rows, refine
 from bpnp.solving.arguments import (
     Array,
     check_points,
@@ -99,7 +99,8 @@ def solve_directions(
 def _fitted(camera: Camera, image: Array, scene: Array, solution: Solution) -> Camera:
     """Return the camera with the focal length that fits the matches best, fitted together with a rotation."""
     i, j = solution.matches.T
-    linearise = image_equations(ROTATION_AND_FOCAL, camera.project, scene[j], image[i], lost=LOST, robust=ROBUST)
+    matches = ImageMatches(camera.project, scene[j], image[i])
+    linearise = image_equations(ROTATION_AND_FOCAL, [matches], lost=LOST, robust=ROBUST)
     start = ROTATION_AND_FOCAL.state(solution.rotation)
     end = refine(ROTATION_AND_FOCAL, start, linearise, [ROBUST] * MOST_STEPS, settled=_is_settled)
     return scale_focal_length(camera, float(end.state.zoom))
@@ -112,7 +113,7 @@ def _is_settled(last: Iteration) -> bool:
 def _with_focal_length(camera: Camera, pixels: Array, directions: Array, rotation: Array) -> Array:
     """Return the covariance (4, 4) of rotation and focal length, pixels, from matches of directions (k, 3)."""
     state = ROTATION_AND_FOCAL.state(rotation)
-    residual, jacobian = image_rows(ROTATION_AND_FOCAL, camera.project, directions, pixels, state)
+    residual, jacobian = image_rows(ROTATION_AND_FOCAL, ImageMatches(camera.project, directions, pixels), state)
     unit = np.array([1, 1, 1, camera.focal])
     return uncertainty_of(residual, jacobian).covariance * np.outer(unit, unit)
 

@@ -15,7 +15,7 @@ from bpnp.poses import MIN_POINTS
 from bpnp.search.evidence.uncertainty import linearised, pose_covariance
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem
-from bpnp.search.refine.gauss_newton import Iteration, image_equations, refine
+from bpnp.search.refine.gauss_newton import ImageMatches, Iteration, image_equations, refine
 from bpnp.search.verdict import SearchResult
 from bpnp.solving.arguments import Array, Labels
 from bpnp.solving.solution import FOCAL_LENGTH, POSE_PARAMETERS, Solution, SolutionStats, with_pose
@@ -227,7 +227,7 @@ def fit_pose(
             (np.abs(last.step) <= EXACT * relative).all() or np.abs(last.gain) <= EXACT * np.asarray(last.before.cost)
         )
 
-    linearise = image_equations(model, project, points, target, lost=1e3 * scale)
+    linearise = image_equations(model, [ImageMatches(project, points, target)], lost=1e3 * scale)
     end = refine(model, state, linearise, [scale] * MOST_STEPS, settled=settled, damping=DAMPING, adaptive=True)
     return model.pose(end.state)
 

@@ -161,11 +161,13 @@ def test_the_prior_of_a_focal_length_draws_to_the_expected_one() -> None:
     assert end.zoom * 1.1 / math.exp(0.02) == pytest.approx(1.0)
 
 
-def test_each_unknown_takes_one_more_match_and_its_tests() -> None:
+def test_each_unknown_takes_its_matches_and_its_tests() -> None:
     problem = Problem(directions(POINTS), POINTS)
     lens = UnknownFocal(2.0)
     models = [PoseModel(np.zeros(3), moves=False), PoseModel(np.zeros(3)), PoseModel(np.zeros(3), lens)]
-    assert [model.fixing for model in models] == [2, 3, 4]
+    assert [model.fixing for model in models] == [2, 3, 4]  # each match fixes two numbers
+    assert replace(models[0], lens=lens).fixing == 2
+    assert replace(models[1], lens=lens._replace(radial_sigma=math.inf)).fixing == 4
     alone = models[1].log10_tests([problem])
     assert models[1].log10_tests([problem, problem]) == pytest.approx(alone + math.log10(2))
     rig = PoseModel(np.zeros(3), mounts=MOUNTS, scale=True)
