@@ -129,9 +129,9 @@ class SceneMap(ViewedPoints):
         """Estimate the pose of a photo in the map from its keypoints, without descriptors.
 
         Short searches run near each view until a pose is confident. A significant pose is refined and judged on all map
-        points in view. If its NFA is very small, a longer search follows at once. Then each view is tried once more,
-        and the most promising ones with longer searches. If no pose is confident, the pose with the fewest false alarms
-        is returned.
+        points in view; if its NFA is very small but it is not confident, a longer search near its view follows at once.
+        If no view gives a confident pose, each is tried once more, and the most promising ones get longer searches. If
+        the pose is still not confident, the one with the fewest false alarms is returned.
 
         A confident pose is compared with poses elsewhere in the map that explain the same image points
         (`bpnp.maps.aliasing`), unless a prior is given. It is "ambiguous" if one of them is about as likely. Both are
@@ -155,8 +155,8 @@ class SceneMap(ViewedPoints):
                 EXIF orientation. Views are first rotated about their optical axes by quarter turns to match it. If no
                 pose is confident, they are tried unrotated. None for an unknown direction. It has no effect with a
                 prior.
-            solver: As for `bpnp.solve`. A network that needs the points in a camera frame gets them in that of the view
-                that is tried, or of the prior.
+            solver: As for `bpnp.solve`. A network that was trained in the frame of a view gets the points in the frame
+                of the view that is tried, or of the prior.
             seed: Seed of the search, default 0.
             time_limit: Seconds for all views together, 60 by default; math.inf for no limit. After it no search starts,
                 but competing poses of a confident pose are still tested, which takes about a second. A pose that is not

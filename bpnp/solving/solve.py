@@ -122,9 +122,9 @@ def solve(
             only.
 
     Returns:
-        Solution of the problem. The verdict is "failed" if the pose is not to be trusted. It is also "failed" if the
-            points do not determine a pose (collinear, or fewer than four distinct points). A given module is not
-            modified.
+        Solution of the problem. Its `verdict` is "confident", "ambiguous" or "failed" (docs/verdict.md). It is also
+            "failed" if the points do not determine a pose (collinear, or fewer than four distinct points). A module
+            given as `solver` is not modified.
 
     Raises:
         ValueError: The input has wrong or swapped shapes, NaN, fewer than 4 points (3 with a `GravityPrior`), a

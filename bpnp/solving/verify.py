@@ -45,10 +45,10 @@ def verify(
 ) -> Solution:
     """Verify a given pose and estimate its uncertainty.
 
-    The pose is "confident" if it is significant and no competing pose is about as likely. One pose is tested, not the
-    many of a search, so about one match beyond the three that fix a pose makes it significant. The competing poses are
-    the nearby optimum, the mirror image in front of a flat scene, repetitions of the scene, and other focal lengths.
-    No search is run: use `solve` if a better pose may exist far away.
+    The pose is "confident" if it is significant and no competing pose is about as likely. Only one pose is tested, so
+    few points are enough: about one match more than the three that determine a pose. The competing poses are the nearby
+    optimum, the mirror image if the scene is flat, repetitions of the scene, and other focal lengths. No search is run:
+    use `solve` if a better pose may exist far away.
 
     Args:
         points2d: (m, 2) pixels with a `camera`, else normalised image coordinates, or (m, 3) bearings; as for `solve`.

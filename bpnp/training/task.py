@@ -58,27 +58,30 @@ class BlindPnPTask(LightningModule):
     """Training and evaluation of any solver, with L = L_c + pose_weight * L_p (paper Eqs. 11 to 15) and Adam.
 
     Args:
-        solver: Module that maps a Batch to a Prediction; its class attribute `estimates` names its poses. The error
-            that selects checkpoints, `val/pose_error`, is that of "pnp", or of the first estimate if there is no "pnp".
-            A callback may also monitor the first estimate without its name (`val/rotation_q2_deg`). If the solver has a
-            method `match(batch)` for a prediction without poses, a training step without a pose calls it.
-        weights: Packaged weights (a name of `docs/model-card.md`) or a checkpoint that the solver starts from; none for
-            the solver's own. The optimiser and the step start from zero; `--ckpt_path` continues them.
-        learning_rate: Learning rate of Adam; 1e-5 in the paper.
-        weight_decay: Weight decay of Adam; 0 in the paper, 1e-3 in the authors' code.
-        warmup_steps: Number of optimiser steps in which the learning rate rises from zero.
-        decay_start: First step of the decay, a half cosine to a fiftieth of the learning rate; none for no decay.
-        decay_steps: Number of steps of the decay.
-        pose_weight: gamma_p of Eq. 15, for the pose "pnp". While it is 0 no pose is computed in training;
-            `PoseLossWarmup` sets it from an epoch on.
+        solver: Module that maps a Batch to a Prediction. Its class attribute `estimates` is a tuple of the names of its
+            poses. Checkpoints are selected by `val/pose_error`, the pose error of the estimate "pnp", or of the first
+            estimate if there is no "pnp". `val/rotation_q2_deg`, without a name, is that of the first estimate. If the
+            solver has a method `match(batch)` that returns a prediction without poses, training steps that need no pose
+            call it. None for a `BPnPNet` with its default options.
+        weights: Initial weights of the solver: a name of packaged weights (docs/model-card.md), or a checkpoint. The
+            optimiser and the step count start anew; `--ckpt_path` continues those of a run. None for the weights that
+            the solver has.
+        learning_rate: Learning rate of Adam, 1e-5 by default, as in the paper.
+        weight_decay: Weight decay of Adam; 0 in the paper and by default, 1e-3 in the authors' code.
+        warmup_steps: Number of optimiser steps in which the learning rate rises from zero, default 0.
+        decay_start: First step of the decay, a half cosine to a fiftieth of the learning rate; None for no decay.
+        decay_steps: Number of steps of the decay, default 1000.
+        pose_weight: gamma_p of Eq. 15, the weight of the pose loss of the estimate "pnp". While it is 0, the default,
+            no pose is computed in training. `PoseLossWarmup` sets it from an epoch on.
         matching_loss: Loss of the assignment: correspondence for the paper's L_c (Eq. 11); likelihood for the negative
             log-likelihood of each point's correspondence (`matching_likelihood_loss`).
-        correspondence_angle: With L_c, supervision by the pose alone: points within this angle (radians, at most 0.5)
-            count as correspondences; null for the true ones.
-        loss: Module in place of `matching_loss`, from (Prediction, Batch) to one value per problem (b,), NaN for a
-            problem without a loss. With its attribute `needs_pose = False` it gets a prediction without poses in
+        correspondence_angle: With L_c: an image point and a scene point correspond if the true pose projects the scene
+            point within this angle of the image point, radians, at most 0.5. None for the true correspondences.
+        loss: Module that replaces `matching_loss`, from (Prediction, Batch) to one value per problem (b,), NaN for a
+            problem without a loss. If its attribute `needs_pose` is False, it gets a prediction without poses in
             training.
-        refine_validation: Refine poses in validation as in tests, which takes most of its time.
+        refine_validation: Refine the poses in validation too, as in a test. That takes most of the time of a
+            validation. Default False.
     """
 
     def __init__(
