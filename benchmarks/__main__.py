@@ -27,7 +27,7 @@ def main() -> None:
         print("python -m benchmarks NAME [OPTION...]\n")
         print("\n".join(f"  {key:{width}}  {sentence}" for key, (_, sentence) in known.items()))
         if name and not name.startswith("-"):
-            raise SystemExit(f"\nexpected a name of this list, got {name!r}")
+            raise SystemExit(f"\n{name!r} is not in this list")
         return
     sys.path.insert(0, str(FOLDER))
     sys.argv = [f"python -m benchmarks {name}", *sys.argv[2:]]

@@ -214,7 +214,7 @@ def picture(setting: Setting, seed: int, rng: np.random.Generator) -> Frame:
     for number in range(100):
         if (shown := frame(device(setting.kind, seed + 10**6 * number), setting, rng)) is not None:
             return shown
-    raise ValueError(f"expected a device of {setting.name} whose LEDs can be seen, got none of 100")
+    raise ValueError(f"none of 100 drawn devices of {setting.name} shows enough LEDs")
 
 
 def vertical(shown: Frame, rng: np.random.Generator) -> bpnp.GravityPrior:

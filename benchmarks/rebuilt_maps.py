@@ -66,7 +66,7 @@ class PhotoScene:
             temporary.mkdir(parents=True)
             models = pycolmap.incremental_mapping(self.database, self.photos, temporary, options)
             if not models:
-                raise ValueError(f"expected a model of {len(names)} photos of {self.photos}, got none")
+                raise ValueError(f"no model was reconstructed from the {len(names)} photos of {self.photos}")
             largest = max(models, key=lambda number: models[number].num_reg_images())
             (temporary / str(largest)).rename(folder)
             shutil.rmtree(temporary)

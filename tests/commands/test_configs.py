@@ -92,11 +92,3 @@ def settings(config: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, An
             yield from settings(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", str(value)
-
-
-@pytest.mark.parametrize("file", sorted(CONFIGS.rglob("*.yaml")), ids=lambda file: file.stem)
-def test_a_configuration_begins_with_what_it_is_for_what_it_needs_and_how_long_it_takes(file: Path) -> None:
-    comments = [line for line in file.read_text().splitlines() if line.startswith("#")]
-    heads = [line[2:].split(":")[0] for line in comments if not line.startswith("#   ")]
-    assert heads == ["For", "Needs", "Takes"]
-    assert file.read_text().startswith("\n".join(comments))
