@@ -19,11 +19,11 @@ is (x', 1) with
 A step (w, s, ...) gives exp([w]x) R and y + s, multiplies z by the exponential of its third part, and so on. All
 functions are pure functions of arrays, in float64.
 
-Four compiled loops have their own step of a pose, because they spend most of the time of a search and have few unknowns
-and fixed data types: `bpnp.search.kernels.dense.move` (pose, float32, all matches at once),
-`bpnp.search.enumeration.matching.step` (pose of few matches on the stereographic plane),
-`bpnp.search.infinity.kernels.fit` (rotation to the nearest directions) and, in torch, batched on the device,
-`bpnp.robust.ransac.refine_locally`.
+Three compiled loops of proposers have steps of their own. A search spends most of its time in them, and each fixes its
+unknowns, its data types and its way to match: `bpnp.search.kernels.dense.move` (a pose in float32, to all points at
+once), `bpnp.search.enumeration.matching.step` (a pose of few one-to-one matches on the stereographic plane) and
+`bpnp.search.infinity.kernels.fit` (a rotation to the nearest directions). `bpnp.robust.ransac.refine_locally` is the
+refinement of RANSAC in the paper's half, in torch: a batch of samples and poses at once, on its device.
 """
 
 import math

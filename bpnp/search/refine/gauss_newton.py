@@ -154,7 +154,7 @@ def refine(
         model: Unknowns.
         state: Initial state, or several.
         linearise: Returns the normal equations of a state at a scale.
-        scales: Scale of the residuals of each step, radians; at most so many steps are taken.
+        scales: Scale of the residuals of each step, radians; their number is the largest number of steps.
         settled: Returns True after the last step that is needed; None to take all.
         damping: Fraction of the diagonal that is added to the normal equations.
         adaptive: Levenberg-Marquardt damping.
