@@ -1,13 +1,12 @@
-"""Track a controller with 17 LEDs for 20 seconds, 60 pictures a second; lose it behind an occluder and find it again.
+"""Track a controller with 17 LEDs for 20 seconds at 60 frames per second, and find it again behind an occluder.
 
     python examples/constellation.py [--seconds 20] [--seed 0] [--out constellation.png]
 
-It takes about two CPU seconds for each second of the run.
-
-The controller moves and turns in front of a camera with three lights in the room. From second 6 to 8 something hides
-it, from 12 to 14 most of it. Every picture is solved with `bpnp.solve`, which is told where the last two poses lead to:
-it tries that pose first and searches everywhere when it does not hold. Once in 30 pictures it is first told nothing, so
-that no wrong pose can hold itself. Prints what was found and draws the run: pictures, errors and milliseconds.
+The run is simulated and takes about two CPU seconds per second. The controller moves and rotates in front of a
+camera; three other lights are in the room. From second 6 to 8 it is hidden completely, from 12 to 14 mostly. Each frame
+is solved by `bpnp.solve` with a prior, the pose extrapolated from the last two frames. If the prior does not fit, all
+poses are searched. Every 30th frame is first solved without the prior, so that a wrong pose cannot confirm itself. The
+program prints a summary and draws some frames, the errors and the times.
 """
 
 import argparse
@@ -27,17 +26,17 @@ from scipy.spatial.transform import Rotation
 import bpnp
 
 Array = NDArray[np.float64]
-RATE = 60  # pictures a second
+RATE = 60  # frames per second
 FOCAL, SIZE = 600.0, (640, 480)
 CAMERA = np.array([[FOCAL, 0, SIZE[0] / 2], [0, FOCAL, SIZE[1] / 2], [0, 0, 1]])
 FACING = math.cos(math.radians(78.0))
 HIDDEN, HALF_HIDDEN = (6.0, 8.0), (12.0, 14.0)  # seconds
-AGAIN = 30  # pictures after which the prediction is left out once
-SIGMA_DEG, SIGMA = 3.0, 0.012  # of a prediction: degrees and metres
+AGAIN = 30  # every so many frames one is first solved without the prior
+SIGMA_DEG, SIGMA = 3.0, 0.012  # standard deviation of a predicted pose, degrees and metres
 
 
 class Seen(NamedTuple):
-    """One picture: its time, pixels, and the true pose; then what was found."""
+    """A frame: its time, seconds; pixels (m, 2); the true pose; and the number of visible LEDs."""
 
     second: float
     pixels: Array
@@ -47,7 +46,7 @@ class Seen(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """Of one picture: the rotation's error in degrees, NaN without a pose; the verdict; milliseconds; the pose."""
+    """Result for a frame: rotation error, degrees, NaN without a pose; verdict; CPU milliseconds; pose."""
 
     error: float
     verdict: str
@@ -58,7 +57,7 @@ class Answer(NamedTuple):
 
 
 def controller(seed: int) -> tuple[Array, Array]:
-    """17 LEDs on a ring of 5 cm, metres, and their outward normals."""
+    """Return 17 LEDs (17, 3) on a ring with a radius of 5 cm, metres, and their outward normals (17, 3)."""
     rng = np.random.default_rng(seed)
     angle = 2 * np.pi * (np.arange(17) + rng.uniform(-0.3, 0.3, 17)) / 17
     tilt = np.radians(rng.uniform(-35, 35, 17))
@@ -69,14 +68,14 @@ def controller(seed: int) -> tuple[Array, Array]:
 
 
 def motion(second: float) -> tuple[Array, Array]:
-    """Pose of the controller: slow turns about two axes, faster swings of the hand."""
+    """Return the pose of the controller: slow rotations about two axes, and faster movements of the hand."""
     turn = Rotation.from_euler("zxy", [0.9 * second, 1.1 + 0.7 * math.sin(0.8 * second), 0.6 * math.sin(1.3 * second)])
     place = [0.09 * math.sin(1.1 * second), 0.06 * math.sin(1.7 * second), 0.45 + 0.12 * math.sin(0.6 * second)]
     return turn.as_matrix(), np.array(place)
 
 
 def picture(second: float, points: Array, normals: Array, rng: np.random.Generator) -> Seen:
-    """What the camera sees: LEDs that face it, 0.3 pixels of noise, 5 % missing, three lights of the room."""
+    """Draw a frame: LEDs that face the camera, with 0.3 pixels of noise and 5 % missing, and three other lights."""
     rotation, translation = motion(second)
     camera = points @ rotation.T + translation
     sight = camera / np.linalg.norm(camera, axis=-1, keepdims=True)
@@ -92,9 +91,9 @@ def picture(second: float, points: Array, normals: Array, rng: np.random.Generat
 
 
 def track(frames: Sequence[Seen], points: Array, normals: Array) -> list[Answer]:
-    """Solve every picture, each with the pose that the last two lead to.
+    """Solve all frames, each with the pose extrapolated from the last two as a prior.
 
-    A pose counts if it is confident, or ambiguous but where it was expected.
+    A pose is accepted if it is confident, or if it is ambiguous and close to the prediction.
     """
     answers: list[Answer] = []
     for number, seen in enumerate(rich.progress.track(frames, "tracking", console=Console(stderr=True))):
@@ -117,7 +116,7 @@ def track(frames: Sequence[Seen], points: Array, normals: Array) -> list[Answer]
 
 
 def continues(solution: bpnp.Solution, prior: bpnp.PosePrior | None) -> bool:
-    """Whether a pose that is not certain by itself is about where it was expected."""
+    """Return True if an ambiguous pose is within three standard deviations of the prediction."""
     if prior is None or solution.verdict == "failed" or prior.translation is None:
         return False
     turn = Rotation.from_matrix(solution.rotation @ np.asarray(prior.rotation).T).magnitude()
@@ -126,7 +125,7 @@ def continues(solution: bpnp.Solution, prior: bpnp.PosePrior | None) -> bool:
 
 
 def prediction(answers: Sequence[Answer]) -> bpnp.PosePrior | None:
-    """The last pose moved on as it moved before; None if there is none."""
+    """Return the pose extrapolated from the last two at constant velocity; None without a last pose."""
     if not answers or math.isnan(answers[-1].error):
         return None
     last = answers[-1]
@@ -138,12 +137,12 @@ def prediction(answers: Sequence[Answer]) -> bpnp.PosePrior | None:
 
 
 def no_pose() -> tuple[Array, Array]:
-    """A pose that is not there."""
+    """Return a pose of NaN."""
     return np.full((3, 3), math.nan), np.full(3, math.nan)
 
 
 def longest(flags: NDArray[np.bool_]) -> int:
-    """Length of the longest run of True."""
+    """Return the length of the longest run of True."""
     most = run = 0
     for flag in flags:
         run = run + 1 if flag else 0
@@ -152,7 +151,7 @@ def longest(flags: NDArray[np.bool_]) -> int:
 
 
 def summary(frames: Sequence[Seen], answers: Sequence[Answer]) -> dict[str, float]:
-    """The run in numbers."""
+    """Return the figures of a run by name."""
     visible = np.array([seen.leds >= 5 for seen in frames])
     error = np.array([answer.error for answer in answers])
     times = np.array([answer.milliseconds for answer in answers])
@@ -173,7 +172,7 @@ def summary(frames: Sequence[Seen], answers: Sequence[Answer]) -> dict[str, floa
 
 
 def draw(frames: Sequence[Seen], answers: Sequence[Answer], points: Array, path: Path) -> None:
-    """A strip of pictures with the pose that was found, and the errors and times of the run."""
+    """Draw some frames with the estimated pose, and the errors and times of the run."""
     import matplotlib.pyplot as plt
 
     seconds = np.array([seen.second for seen in frames])
@@ -208,9 +207,9 @@ def draw(frames: Sequence[Seen], answers: Sequence[Answer], points: Array, path:
 
 
 def main(arguments: Sequence[str] | None = None) -> dict[str, float]:
-    """Simulate, track, print and draw."""
+    """Simulate, track, print the figures and draw the run."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=20.0, help="of the run; each takes about two CPU seconds")
+    parser.add_argument("--seconds", type=float, default=20.0, help="length; a second takes about two CPU seconds")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("constellation.png"))
     options = parser.parse_args(arguments)

@@ -1,11 +1,10 @@
-"""Track a device with LEDs at 60 frames a second: the last pose is the prior of the next, and a search is the fallback.
+"""Track a device with LEDs at 60 frames per second: the last poses give a prior, and a search is the fallback.
 
     python examples/led_tracker.py [--seconds 10] [--seed 0]
 
-`LedTracker` is the part to copy: give it the dots of each frame. The run is simulated (a controller that turns in front
-of a camera with three lamps; it is hidden for half a second). Prints how many frames were tracked, the errors against
-the true poses, and the median (p50) and the 99th percentile (p99) of the time a frame: on the clock, and of the
-processor, which other programs do not slow down.
+Copy `LedTracker` and call it with the detected points of each frame. The run here is simulated: a controller rotates in
+front of a camera with three other lights, and is hidden for half a second. The program prints the fraction of tracked
+frames, the errors, and the median (p50) and 99th percentile (p99) of the time per frame, both elapsed and CPU time.
 """
 
 import argparse
@@ -22,20 +21,21 @@ from scipy.spatial.transform import Rotation
 import bpnp
 
 Array = NDArray[np.float64]
-FEWEST = 4  # dots of which a pose follows
+FEWEST = 4  # points that determine a pose
 
 
 class LedTracker:
-    """The pose of a device in a stream of frames.
+    """Tracker of the pose of a device in a stream of frames.
 
     Args:
         points3d: (n, 3) LEDs, metres.
-        normals3d: (n, 3) directions in which they shine.
+        normals3d: (n, 3) outward unit normals of the LEDs.
         camera: As for `bpnp.solve`.
-        rotation_sigma_deg, translation_sigma: Standard deviation of the predicted pose, degrees and metres: how much
-            the motion may change from one frame to the next.
-        check_every: Frames after which one is solved without the prediction, so that no wrong pose can hold itself.
-        time_limit: Seconds a frame; a search that takes longer gives no pose.
+        rotation_sigma_deg: Standard deviation of the predicted rotation about each axis, degrees.
+        translation_sigma: Standard deviation of the predicted translation along each axis, metres.
+        check_every: One of this number of frames is solved without the prediction, so that a wrong pose cannot confirm
+            itself.
+        time_limit: Seconds per frame. If the search takes longer, the frame has no pose.
 
     Attributes:
         searched: True if the last frame was searched without a prediction, since the device was lost or for the check.

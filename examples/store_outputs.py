@@ -24,7 +24,7 @@ def store_outputs(path: Path) -> bool:
         path: Notebook, which is overwritten.
 
     Returns:
-        False if the notebook was left as it is, since its folder of photos is missing.
+        False if the notebook was not run, because its folder of photos is missing.
     """
     notebook = nbformat.read(path, as_version=4)
     own = notebook.metadata.get("bpnp", {})

@@ -1,5 +1,7 @@
-"""What an installed wheel has to do, away from the checkout: solve, load packaged weights, and write the files that
-`make wheel` gives to `bpnp solve`."""
+"""Try an installed wheel outside of the checkout: solve, load packaged weights, and write input for `bpnp solve`.
+
+`make wheel` runs it.
+"""
 
 import numpy as np
 
