@@ -1,7 +1,7 @@
 """The method of Campbell, Liu and Gould (ECCV 2020), written plainly from its formulas: what ours is measured against.
 
 Sinkhorn: scalings of exp(-lambda M), lambda = 1/mu, and the gradient of Lemma 2 through the inverse of the system of
-its m + n - 1 independent constraints, by blocks. PnP: L-BFGS on Eq. 7 over all m n pairs for the whole batch at once,
+its m + n - 1 independent constraints, by blocks. PnP: L-BFGS on Eq. 8 over all m n pairs for the whole batch at once,
 and the gradient of Lemma 1 with the Hessian and the 6 x m n Jacobian from automatic differentiation. Everything stays
 in the dtype of its input.
 
@@ -72,7 +72,7 @@ class PaperSinkhorn(torch.autograd.Function):
 
 
 def objective(pose: Tensor, assignment: Tensor, rays: Tensor, points3d: Tensor) -> Tensor:
-    """Eq. 7 over all m n pairs, for each sample; `pose` (b, 6) is the angle-axis vector and the translation."""
+    """Eq. 8 over all m n pairs, for each sample; `pose` (b, 6) is the angle-axis vector and the translation."""
     camera = transform(roma.rotvec_to_rotmat(pose[:, :3]), pose[:, 3:], points3d)
     return (assignment * (1 - rays @ nn.functional.normalize(camera, dim=-1).mT)).sum((-2, -1))
 
@@ -83,7 +83,7 @@ class PaperPnP(torch.autograd.Function):
         """Pose (b, 6) by one L-BFGS for the batch, 75 iterations or until the line search finds nothing lower.
 
         The tolerances are off: torch's default ones, not relative to anything, end it where it starts if that is
-        RANSAC's pose. In float32 the line search ends it soon, for the values of Eq. 7 have too few digits; in float64
+        RANSAC's pose. In float32 the line search ends it soon, for the values of Eq. 8 have too few digits; in float64
         it gets on.
         """
         pose, fixed = start.clone().requires_grad_(), assignment.detach()

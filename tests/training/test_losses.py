@@ -35,7 +35,7 @@ def angle(planted: Planted, b: int, i: int, j: int) -> float:
     return math.acos(max(-1.0, min(1.0, float(f @ y / y.norm()))))
 
 
-def test_correspondence_loss_is_equation_9_with_a_dense_matrix() -> None:
+def test_correspondence_loss_is_equation_11_with_a_dense_matrix() -> None:
     planted = plant(4, 9, outliers2d=3, outliers3d=5)
     assignment = random_assignment(planted)
     correct = (planted.permutation() > 0).double()
@@ -44,7 +44,7 @@ def test_correspondence_loss_is_equation_9_with_a_dense_matrix() -> None:
 
 
 @pytest.mark.parametrize("threshold", [0.003, 0.03, 0.3])
-def test_correspondence_loss_from_the_pose_is_equation_9_by_a_loop(threshold: float) -> None:
+def test_correspondence_loss_from_the_pose_is_equation_11_by_a_loop(threshold: float) -> None:
     planted = plant(2, 12, noise=0.01, outliers2d=3)
     assignment = random_assignment(planted)
     within = within_angle(planted.points2d, planted.points3d, *planted.pose, threshold)
