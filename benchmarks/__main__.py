@@ -1,4 +1,4 @@
-"""`python -m benchmarks` lists what can be measured; `python -m benchmarks NAME --help` tells the options of one."""
+"""List the benchmarks (`python -m benchmarks`) or run one; `python -m benchmarks NAME --help` shows its options."""
 
 import ast
 import importlib
@@ -9,7 +9,7 @@ FOLDER = Path(__file__).parent
 
 
 def programs() -> dict[str, tuple[str, str]]:
-    """Name, module and first sentence of every other module that has a `main`."""
+    """Return module and first sentence of each benchmark, a module that has a `main`, by name."""
     found = {}
     for file in sorted(FOLDER.glob("[a-z]*.py")):
         tree = ast.parse(file.read_text(encoding="utf-8"))

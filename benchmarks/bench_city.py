@@ -1,16 +1,20 @@
-"""Photos without descriptors or a view in maps merged to one city: recall, CPU seconds and memory against its views.
+"""Photos without descriptors or a given view, in maps merged to one city: recall, CPU seconds and memory by map size.
 
     python -m benchmarks city --views 477 1000 3000 10000 --limit 12
     python -m benchmarks city --twice 0.1
 
-The models of the data, or those that are named, lie at random places, rotations and scales; changed copies of them make
-up the number of views: places like real ones, mirrored or not, the points moved along a smooth field by a tenth of the
-distance from which they are seen, and a third of them dropped. Photos of the scenes of --photos are left out with all
-points that then fewer than two views see. Right is within 5 degrees, the centre within a tenth of the distance.
---twice: every place is there twice, this share of the points of the second one gone; no pose there is right. A row
-begins with what it takes to open the map as a COLMAP model, and again, with the index of a large one: CPU seconds and
-peak memory of a new process before the first photo; then the rank of the views (`bpnp.maps.views`): of how many
-photos one of the first 1, 10 and 50 views is turned by less than 30 degrees and lies within half the distance.
+The models of the data, or those that are named, are placed at random with random rotations and scales. Changed copies
+of them fill the city up to the number of views. In a copy the points are displaced along a smooth field by a tenth of
+their distance from the views, a third of them are dropped, and some copies are mirrored. Photos of the scenes of
+--photos are removed from the map, with all points that fewer than two of the remaining views see.
+
+Success: rotation within 5 degrees, and the camera centre within a tenth of the distance. With --twice every place
+exists twice, where the second copy lacks this fraction of its points; then no pose is correct.
+
+A row begins with the cost of opening the map before the first photo, in CPU seconds and peak memory of a new process:
+as a COLMAP model, and with the index of a large map. Then follows the ranking of the views (`bpnp.maps.views`): the
+number of photos for which one of the first 1, 10 and 50 views is rotated by less than 30 degrees and lies within half
+the distance.
 """
 
 import argparse
@@ -55,20 +59,20 @@ class CityPhoto(NamedTuple):
 
 
 def moved(place: SceneMap, to: Similarity) -> SceneMap:
-    """The place in another frame."""
+    """Return the place in another frame."""
     poses = (to.pose(view.rotation, view.translation) for view in place.views)
     views = (replace(view, rotation=r, translation=t) for view, (r, t) in zip(place.views, poses, strict=True))
     return replace(place, points3d=to.points(place.points3d), views=tuple(views))
 
 
 def distance_of(place: SceneMap) -> float:
-    """From a view to the points that it sees: the median of the views' medians."""
+    """Return the median, over the views, of the median distance from a view to the points that it sees."""
     seen = [(place.points3d[view.points], (view.rotation, view.translation)) for view in place.views]
     return float(np.median([median_distance(*one) for one in seen if len(one[0])]))
 
 
 def changed(place: SceneMap, rng: np.random.Generator, name: str) -> SceneMap:
-    """Another place of the same kind: points moved and dropped, or mirrored with all views."""
+    """Return another place of the same kind: points displaced and dropped, or mirrored with all views."""
     unit, points = distance_of(place), place.points3d
     field = np.zeros_like(points)
     for _ in range(WAVES):
@@ -86,14 +90,14 @@ def changed(place: SceneMap, rng: np.random.Generator, name: str) -> SceneMap:
 
 
 def anywhere(rng: np.random.Generator, places: int, unit: float) -> Similarity:
-    """To scene units of 0.5 to 2 distances of a view, any rotation, a place in the city."""
+    """Return a similarity that scales a view's distance to 0.5 to 2 units and places a scene at random in the city."""
     scale = float(np.exp(rng.uniform(-1, 1) * np.log(2))) / unit
     side = APART * (places / 10) ** (1 / 3)
     return Similarity(scale, Rotation.random(rng=rng).as_matrix(), rng.uniform(0, side, 3))
 
 
 def photos_of(scene: Reconstruction, limit: int) -> list[ImagePoints]:
-    """At most `limit` photos and a fourth of all, spread evenly over those that see enough of what others see."""
+    """Return at most `limit` photos and a quarter of all, evenly spread over those that see enough shared points."""
     tracks = np.bincount(np.concatenate([image.observed for image in scene.images]), minlength=len(scene.points3d))
     usable = [image for image in scene.images if (tracks[image.observed] >= 3).sum() >= 50]
     return spread(usable, min(limit, len(scene.images) // 4), first=0.5)
@@ -102,10 +106,10 @@ def photos_of(scene: Reconstruction, limit: int) -> list[ImagePoints]:
 def city(
     scenes: Sequence[Reconstruction], photos: dict[str, int], views: int, seed: int, *, twice: float | None = None
 ) -> tuple[SceneMap, list[CityPhoto]]:
-    """The map of all scenes, with changed copies up to a number of views, and the photos that were left out of it.
+    """Return the map of all scenes, filled with changed copies up to a number of views, and the removed photos.
 
-    photos: of each scene at most so many; points that then fewer than two views see are not in the map. twice: every
-    place is there twice instead, of the second one this share of the points gone.
+    At most `photos` of each scene are removed, and the points that fewer than two of the remaining views see. With
+    `twice` every place exists twice instead, and the second copy lacks this fraction of its points.
     """
     rng = np.random.default_rng(seed)
     left_out = {scene.name: photos_of(scene, photos.get(scene.name, 0)) for scene in scenes}
@@ -130,7 +134,7 @@ def city(
 
 
 def copies(first: Sequence[SceneMap], more: int, views: int, rng: np.random.Generator) -> Iterator[SceneMap]:
-    """Changed copies of the places, one after the other, up to so many more views."""
+    """Yield changed copies of the places in turn, with at most a number of views."""
     number = 0
     while more > 0:
         place = changed(first[number % len(first)], rng, f"copy {number // len(first) + 1}/")
@@ -140,7 +144,7 @@ def copies(first: Sequence[SceneMap], more: int, views: int, rng: np.random.Gene
 
 
 def merged(places: Sequence[SceneMap]) -> SceneMap:
-    """One map of all places, its ids in their order."""
+    """Return one map of all places, with ids in their order."""
     starts = np.cumsum([0] + [len(place.points3d) for place in places])
     views = tuple(
         replace(view, points=view.points + np.int32(start))
@@ -152,7 +156,7 @@ def merged(places: Sequence[SceneMap]) -> SceneMap:
 
 
 def written(scene: SceneMap, folder: Path) -> None:
-    """A map in COLMAP's binary files, all keypoints in a corner."""
+    """Write a map as COLMAP's binary files, with all keypoints in a corner."""
     counts = np.array([len(view.points) for view in scene.views])
     (folder / "cameras.bin").write_bytes(np.array([1, 1, 2, 2], "<u8").tobytes() + np.ones(3).tobytes())
     keypoints = np.zeros(counts.sum(), [("xy", "<f8", 2), ("id", "<u8")])
@@ -176,7 +180,7 @@ def written(scene: SceneMap, folder: Path) -> None:
 
 
 def opened(folder: Path) -> str:
-    """What this process needs for a map before the first photo."""
+    """Open a map in this process, and return the CPU seconds and the peak memory as text."""
     warm_up()
     start = time.process_time()
     scene = SceneMap.from_colmap(folder)
@@ -187,7 +191,7 @@ def opened(folder: Path) -> str:
 
 
 def ranked(scene: SceneMap, photos: Sequence[CityPhoto]) -> str:
-    """Shares of the photos that have a view near by among the first of the rank, and its milliseconds a view."""
+    """Return the fractions of the photos with a close view among the first ones, and milliseconds per view."""
     start = time.process_time()
     places = [scene.places(None, photo.points2d, CAMERA) for photo in photos]
     seconds = (time.process_time() - start) / len(photos) / len(scene.views)

@@ -1,12 +1,11 @@
-"""The miss probability 2^-h of a search, counted on symmetric objects while their motions are not used.
+"""Calibration of the miss probability 2^-h on symmetric objects, without the comparison of poses under their motions.
 
     python -m benchmarks completeness --seed 31 --limit 12
 
-Every search takes `TURNS` turns and never ends before. After each turn the best pose has h hits (its basin count). For
-each h the table has how many poses had at least h hits when they first reached that number, how many of these were
-wrong, and 2^-h, which claims to bound that fraction. Objects have eight or more unique points, so that one pose is
-right. The last line says for how many of the problems the motions of the scene, found from the matches of a pose that a
-symmetry turned, lead back to the true pose. --limit: problems of each kind.
+Every search runs `TURNS` rounds. After each round the best pose has the basin count h. For each h the table lists how
+many best poses reached it, how many of them were wrong at that moment, and the bound 2^-h. Objects have eight or more
+unique points, so that one pose is correct. The last line counts the problems in which a symmetry rotates the true pose,
+and the motions found from the matches of the rotated pose give the true pose back. --limit: problems of each kind.
 """
 
 from collections import Counter
@@ -36,7 +35,7 @@ BLIND = replace(
 
 
 def reached(problem: Problem) -> dict[int, bool]:
-    """Return, for each number of hits that a best pose reached, whether the first one that did was right."""
+    """Return, for each basin count that a best pose reached, whether the first pose that did was correct."""
     points2d, points3d = problem.solve.args  # type: ignore[attr-defined]
     points, settings = problem_from(points2d, points3d, None), replace(DEFAULT, evidence=BLIND)
     pool = Pool(Scene(points, 0, settings), points, no_pose())
@@ -59,7 +58,7 @@ def reached(problem: Problem) -> dict[int, bool]:
 
 
 def leads_back(kind: symmetric.Kind, problem: Problem) -> bool:
-    """Return whether the true pose is among the competitors of the pose that is turned by one part of the object."""
+    """Return whether the true pose is among the competitors of the pose rotated by one part of the object."""
     points2d, points3d = problem.solve.args  # type: ignore[attr-defined]
     points, (rotation, translation) = problem_from(points2d, points3d, None), problem.poses[0]
     one, other = problem.points3d[: kind.each], problem.points3d[kind.each : 2 * kind.each]
@@ -83,7 +82,7 @@ def main() -> None:
             if kind.name != "few":  # these are enumerated
                 counts.update(reached(problem).items())
             led.append(leads_back(kind, problem))
-    print("| hits | poses that had them | wrong | fraction | 2^-h |\n| --- | --- | --- | --- | --- |")
+    print("| basin count | poses that reached it | wrong | fraction | 2^-h |\n| --- | --- | --- | --- | --- |")
     for least in HITS:
         right, wrong = counts[least, True], counts[least, False]
         fraction = wrong / max(right + wrong, 1)

@@ -1,12 +1,14 @@
-"""The focal length unknown: photos in whole maps, and LEDs.
+"""Unknown focal length: photos in whole maps, and LEDs.
 
     python -m benchmarks focal maps --limit 6 --seed 42
 
-What: maps (photos left out of their map, which view is not told), lenses (the same with radial distortion from -0.3
-to 0.3, that of its own camera for sceaux_castle_txt and statue_of_liberty), leds (10 or more of them seen). Right is
-within 1.5 degrees, of LEDs within 3. A line says for how many the focal length is within 3 %, how many are confident
-and more than 3 degrees off, and how many are confident and off: the focal length by more than three standard
-deviations, or the centre by more than 3 % of the depth. --limit: problems a scene, or a setting of LEDs.
+Rows: maps (photos removed from their map, no view given), lenses (the same with a radial distortion from -0.3 to 0.3;
+for sceaux_castle_txt and statue_of_liberty that of their own camera), leds (10 or more are visible).
+
+Success: rotation within 1.5 degrees, for LEDs within 3. A line has the fraction with a focal length within 3 %, the
+number of confident poses that are more than 3 degrees off, and the number of confident poses that are off in another
+way: the focal length by more than three standard deviations, or the centre by more than 3 % of the depth. --limit:
+problems per scene, or per setting of LEDs.
 """
 
 import argparse
@@ -45,7 +47,7 @@ def of_photos(options: argparse.Namespace) -> Iterator[Problem]:
 
 
 def distorted_photos(options: argparse.Namespace) -> Iterator[Problem]:
-    """Photos in whole maps whose keypoints a lens has distorted, those that it shows in the image."""
+    """Yield photos in whole maps whose keypoints are distorted by a lens, those within the image."""
     known: dict[str, Any] = {"against": "map", "outliers": 1.0, "seed": options.seed}
     for name in options.scenes:
         scene = model_of(options.data, name)
@@ -66,8 +68,9 @@ def distorted_photos(options: argparse.Namespace) -> Iterator[Problem]:
 
 
 def image_of(photo: ViewProblem) -> tuple[Array, tuple[int, int]]:
-    """Keypoints (m, 2), pixels, and width and height of an image about the principal point that has them, of the size
-    of the map's images where they lie within it."""
+    """Return keypoints (m, 2), pixels, and the size of an image centred on the principal point that contains them; the
+    size is that of the map's images if they lie within it.
+    """
     pixels = photo.focal * photo.points2d
     sizes = [size for view in photo.scene.views if (size := image_size(view.camera))]
     width, height = np.max([2 * np.ceil(np.abs(pixels).max(0)), *sizes[:1]], 0).astype(int).tolist()

@@ -1,15 +1,15 @@
-"""The layers against the paper's method (`paper_layers.py`), on the same inputs in the same run.
+"""Layers of this package against the paper's method (`paper_layers.py`) on the same inputs.
 
     python -m benchmarks layers [--points 200 --rounds 3]
 
-Ours and the paper's take turns; processor times and ratios are medians over the rounds. A camera of the paper's
-protocol (noise 2 pixels at a focal length of 800, Euler angles up to 45 degrees, distance 4.5) sees points in the unit
-ball. Inputs are told by the kind of the points' features and the share of the assignment on the true matches:
+Both run alternately; CPU times and ratios are medians over the rounds. A camera of the paper's protocol (noise of 2
+pixels at a focal length of 800, Euler angles up to 45 degrees, distance 4.5) sees points in the unit ball. Inputs
+differ in the kind of the point features and in the fraction of the assignment on the true matches:
 
-- smooth: random waves of a point's place in the image (noisy on the 2D side, exact on the 3D side), `level` their wave
-  number. Points that lie close together look alike, as to a trained network, and share their probability.
-- independent: a random unit vector for each point, with noise of relative size `level` on the other side. A wrong match
-  is as unlikely as any other; the easy case for every iterative solver.
+- smooth: random waves over the image position (noisy on the 2D side, exact on the 3D side); `level` is their wave
+  number. Neighbouring points have similar features, as in a trained network, and share their probability.
+- independent: a random unit vector per point, with noise of relative size `level` on the other side. All wrong matches
+  are equally unlikely, the easy case for every iterative solver.
 """
 
 import time
@@ -46,7 +46,7 @@ BACKWARD: tuple[tuple[Kind, float], ...] = (("independent", 0.7), ("smooth", 10)
 
 
 def planted(batch: int, points: int, *, kind: Kind, level: float, seed: int = 0) -> tuple[Batch, Tensor]:
-    """Scenes in which 3D point j was seen as 2D point j, and the cost: distances between unit features."""
+    """Return scenes in which 3D point j was seen as 2D point j, and the cost: distances between unit features."""
     generator = torch.Generator().manual_seed(seed)
     scene = nn.functional.normalize(torch.randn(batch, points, 3, generator=generator), dim=-1)
     scene = scene * torch.rand(batch, points, 1, generator=generator) ** (1 / 3)
@@ -70,7 +70,7 @@ def planted(batch: int, points: int, *, kind: Kind, level: float, seed: int = 0)
 
 
 def diagonal_mass(assignment: Tensor) -> float:
-    """Share of the assignment on the true matches, the mean over the batch."""
+    """Return the fraction of the assignment on the true matches, averaged over the batch."""
     return float(assignment.detach().diagonal(dim1=-2, dim2=-1).sum(-1).mean())
 
 
@@ -78,8 +78,9 @@ Row = tuple[str, str, Callable[[], object], Callable[[], object]]  # what, on wh
 
 
 def race(ours: Callable[[], object], papers: Callable[[], object], rounds: int) -> tuple[float, float, float]:
-    """Processor milliseconds of both in turns, after each was called once to warm up and once to see how long it takes,
-    and how many times longer the second takes."""
+    """Return the CPU milliseconds of two functions that run alternately, and the ratio of the second to the first. Each
+    is called once to warm up and once to choose the number of calls.
+    """
     timers = [Timer(candidate, timer=time.process_time) for candidate in (ours, papers)]
     repeats = [max(1, round(SHORTEST / max(timer.repeat(2, 1)[1], 1e-6))) for timer in timers]
     turns = [[1000 * t.timeit(n) / n for t, n in zip(timers, repeats, strict=True)] for _ in range(rounds)]

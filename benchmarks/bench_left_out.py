@@ -1,11 +1,11 @@
-"""Raw photos against a map that was built without them: by keypoints alone, and with descriptors as a yardstick.
+"""Raw photos against a map that was built without them: keypoints alone, and SIFT descriptors for comparison.
 
     python -m benchmarks left_out castle-P30 fountain-P11 --limit 6
 
-Rows of a scene: views (the three views that share most points are named), map (none is); views-sift and map-sift, the
-same with SIFT descriptors, a ratio test and PoseLib; words-sift, with the ten views that a bag of visual words finds
-(Sivic and Zisserman, ICCV 2003). pycolmap builds a map for each photo on the first run and keeps it in --maps. Truth:
-the pose in the model of all photos, aligned by the views that both models have.
+Rows of a scene: views (the three views that share most points are given), map (none is given); views-sift and map-sift,
+the same with SIFT descriptors, a ratio test and PoseLib; words-sift, with the ten views that a bag of visual words
+retrieves (Sivic and Zisserman, ICCV 2003). pycolmap builds a map for each photo in the first run and keeps it in
+--maps. Ground truth: the pose in the model of all photos, aligned by the views that both models have.
 """
 
 import argparse
@@ -41,8 +41,9 @@ RETRIEVED = 10  # views
 
 
 class DescribedMap:
-    """The descriptors of a model's observations, from the database that the model was built from, and the visual words
-    of its views: their centres, the rarity of each, and of each view its words by rarity, a unit vector."""
+    """Descriptors of a model's observations, from the database that it was built from, and the visual words of its
+    views: word centres, inverse document frequencies, and a unit vector of weighted words per view.
+    """
 
     def __init__(self, model: Path, database: Path) -> None:
         records, self.features, self.views = read_records(model), features_of(database), {}
@@ -62,12 +63,14 @@ class DescribedMap:
         return np.bincount(vq(descriptors, self.centres)[0], minlength=WORDS)
 
     def retrieved(self, photo: str) -> list[str]:
-        """The views whose words are most like those of the photo."""
+        """Return the views whose words are most similar to those of the photo."""
         likeness = self.bags @ (self.rarity * self.word_counts(self.features[photo][1]))
         return [list(self.views)[i] for i in np.argsort(-likeness, kind="stable")[:RETRIEVED]]
 
     def localize(self, photo: str, camera: tuple[float, ...], views: Iterable[str] | None) -> Any:
-        """Rotation, translation and verdict of a photo of the database, against the points of these views or of all."""
+        """Return rotation, translation and verdict of a photo of the database, against the points of these views or of
+        all.
+        """
         pixels, own = self.features[photo]
         theirs, ids = zip(*(self.views[name] for name in views or self.views), strict=True)
         keypoints, points = descriptor_matches(own, np.concatenate(theirs), np.concatenate(ids))
@@ -83,7 +86,7 @@ class DescribedMap:
 
 
 def features_of(database: Path) -> dict[str, tuple[Array, NDArray[np.float32]]]:
-    """Of each photo the keypoints (m, 2), pixels, and descriptors (m, 128) of unit length."""
+    """Return the keypoints (m, 2), pixels, and the descriptors (m, 128), unit vectors, of each photo."""
     found = {}
     with pycolmap.Database.open(database) as content:
         for image in content.read_all_images():
@@ -96,7 +99,7 @@ def features_of(database: Path) -> dict[str, tuple[Array, NDArray[np.float32]]]:
 def descriptor_matches(
     own: NDArray[np.float32], theirs: NDArray[np.float32], ids: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Places in `own` and ids of points, where the nearest descriptor passes the ratio test.
+    """Return indices in `own` and ids of points whose nearest descriptor passes the ratio test.
 
     own: (m, d), theirs: (n, d), unit vectors. ids: (n,) of the points that they describe, several for each.
     """
@@ -115,7 +118,7 @@ def descriptor_matches(
 
 
 def problems_of(scene: PhotoScene, photo: str, full: SceneMap, seed: int) -> dict[str, Problem]:
-    """By method, of one photo that is left out of its map; reading and detecting is done before."""
+    """Return the problems of one photo that is removed from its map, by method."""
     model = scene.model(left_out=photo)
     place, found = SceneMap.from_colmap(model), detected_keypoints(scene.photos / photo)
     (true,) = full.named([photo])

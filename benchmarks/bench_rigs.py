@@ -1,12 +1,12 @@
-"""Rigs: several cameras fixed to each other against one of them alone; around a headset, and photos of COLMAP models.
+"""Rigs against one of their cameras alone: LEDs of a headset, and photos of COLMAP models.
 
     python -m benchmarks rigs --limit 60 --seed 54 --only LEDs
     python -m benchmarks rigs --limit 8 --only photos
 
-LEDs: each camera sees 4 to 6 of them, without normals, and a light that is not the headset's; one camera: the first of
-a rig alone. photos: three that overlap as one rig, and each of them alone, against the points of one view with all
-keypoints and points that have no partner; --limit of each scene. scale unknown: of 0.2 to 5, which is found. Right is a
-rotation within 3 degrees.
+LEDs: each camera sees 4 to 6 LEDs, without normals, and one other light. The row "one camera" has the first camera of a
+rig alone. photos: three overlapping photos as one rig, and each of them alone, against the points of one view, with all
+keypoints and points, also those without a correspondence; --limit per scene. scale unknown: the scale of the scene is
+0.2 to 5 and is estimated. Success: rotation within 3 degrees.
 """
 
 import argparse
@@ -32,9 +32,9 @@ def pose_matrix(rotation: Array, translation: Array) -> Array:
 
 
 def problems(cameras: int, used: int, limit: int, seed: int, scale: bool) -> Iterator[Problem]:
-    """A new device every fifth frame; so many cameras in random places that look at it, of which the first are used.
+    """Yield problems with a number of cameras in random places that look at a device, of which the first ones are used.
 
-    The pose is rig_from_world, that of the first camera.
+    Every fifth frame has a new device. The pose is rig_from_world, that of the first camera.
     """
     rng, number = np.random.default_rng([seed, cameras]), 0
     while number < limit:
@@ -59,7 +59,7 @@ def problems(cameras: int, used: int, limit: int, seed: int, scale: bool) -> Ite
 
 
 def of_photos(used: slice, options: argparse.Namespace) -> Iterator[Problem]:
-    """A photo and the two others that overlap with it most, or some of the three, against the points of a fourth."""
+    """Yield a photo and the two that overlap with it most, or some of the three, against the points of a fourth."""
     for name in options.scenes:
         scene = model_of(options.data, name)
         for query in images_of(scene, options.limit):
@@ -82,7 +82,7 @@ def of_photos(used: slice, options: argparse.Namespace) -> Iterator[Problem]:
 def rig_search(
     pixels: Sequence[Array], points3d: Array, cameras: Sequence[Any], poses: Sequence[Array], **known: Any
 ) -> partial[bpnp.Solution]:
-    """Of cameras with the poses camera_from_world, in the frame of the first; one alone is no rig."""
+    """Return the search for cameras with the poses camera_from_world, in the frame of the first."""
     known["time_limit"] = TIME_LIMIT
     if len(pixels) == 1:
         return partial(bpnp.solve, pixels[0], points3d, cameras[0], **known)

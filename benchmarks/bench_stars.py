@@ -1,9 +1,9 @@
-"""Stars: which way a camera looks; fields of 5 to 180 degrees, 30 % false stars, 20 % missing, 0.3 pixels of noise.
+"""Rotation of a camera from stars: fields of 5 to 180 degrees, 30 % false stars, 20 % missing, 0.3 pixels of noise.
 
     python -m benchmarks stars --limit 50 --only "2000, 20 deg" --peers
 
-Right is a rotation within 0.2 degrees. Every tenth frame has a new catalogue, so that the median is without its index.
---peers: tetra3rs too, where it is installed.
+Success: rotation within 0.2 degrees. Every tenth frame has a new catalogue, so that the median time excludes its index.
+--peers: also run tetra3rs, if it is installed.
 """
 
 import argparse
@@ -40,13 +40,13 @@ class Frame(NamedTuple):
 
 
 def lens(field: float, factor: float = 1.0) -> Camera:
-    """The camera of a field of view in degrees, with `factor` times its focal length."""
+    """Return the camera of a field of view in degrees, with `factor` times its focal length."""
     half = np.radians(field / 2)
     return Camera(float(factor * SIZE / 2 / (half if field > WIDE else np.tan(half))), SIZE, field > WIDE)
 
 
 def anywhere(rng: np.random.Generator, count: int, field: float) -> Array:
-    """Pixels, evenly in the image, which is round for a fisheye."""
+    """Draw pixels evenly over the image, which is round for a fisheye."""
     if field < WIDE:
         return rng.uniform(0, SIZE, (count, 2))
     radius, around = SIZE / 2 * np.sqrt(rng.random(count)), rng.uniform(0, 2 * np.pi, count)
@@ -55,7 +55,7 @@ def anywhere(rng: np.random.Generator, count: int, field: float) -> Array:
 
 @lru_cache(2)
 def catalogue(count: int, field: float, seed: int) -> Array:
-    """Directions (count, 3), evenly on the sphere or, for narrow fields, in a belt."""
+    """Draw directions (count, 3) evenly over the sphere or, for narrow fields, over a belt."""
     rng = np.random.default_rng([seed, count])
     area = count / (IN_VIEW / field**2) * np.radians(1) ** 2
     height = rng.uniform(-1, 1, count) * (min(1.0, area / (4 * np.pi)) if field <= NARROW else 1.0)
@@ -65,7 +65,7 @@ def catalogue(count: int, field: float, seed: int) -> Array:
 
 
 def frame(count: int, field: float, seed: int, i: int, false: float = FALSE) -> Frame:
-    """A field around a star with LEAST stars or more that are detected."""
+    """Draw a field around a star in which LEAST stars or more are detected."""
     rng = np.random.default_rng([seed, count, int(field), i])
     directions = catalogue(count, field, 1000 * seed + i // 10)
     while True:
@@ -92,7 +92,7 @@ def problems(count: int, field: float, limit: int, seed: int) -> Iterator[Proble
 
 @lru_cache(2)
 def tetra_database(count: int, field: float, seed: int) -> Any:
-    """tetra3rs's index of a catalogue, in its own file format; all stars are equally bright."""
+    """Write tetra3rs's index of a catalogue, in its own file format; all stars are equally bright."""
     tetra3rs: Any = importlib.import_module("tetra3rs")
     x, y, z = catalogue(count, field, seed).T
     records = np.zeros(count, "<i8, <f8, <f8, <f4, <f4, <f4")  # number, right ascension, declination, magnitude, motion
@@ -107,7 +107,7 @@ def tetra_database(count: int, field: float, seed: int) -> Any:
 
 
 def by_tetra(count: int, field: float, limit: int, seed: int) -> Iterator[Outcome]:
-    """tetra3rs on the same frames; it believes what it returns."""
+    """Solve the same frames with tetra3rs; every result that it returns counts as confident."""
     for i in range(limit):
         shown = frame(count, field, seed, i)
         database = tetra_database(count, field, 1000 * seed + i // 10)

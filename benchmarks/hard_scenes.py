@@ -1,7 +1,7 @@
-"""Problems with an easily wrong verdict: repeated structures, points that depend on each other, wrong models.
+"""Problems in which a wrong verdict is likely: repeated structures, dependent points, wrong models.
 
-Each function draws one: pixels, scene points, and the true poses, none where the points have none in common. Units of
-length are arbitrary; the noise of the pixels is half a pixel.
+Each function draws a problem: pixels, scene points, and the true poses; none if the points have no pose in common.
+Units of length are arbitrary; the noise is half a pixel.
 """
 
 from collections.abc import Callable
@@ -71,7 +71,7 @@ def gappy_facade(rng: np.random.Generator) -> Drawn:
 
 
 def facade_with_door(rng: np.random.Generator) -> Drawn:
-    """Two rows of six windows and eight points around a door, of which a pose can be certain."""
+    """Draw two rows of six windows, and eight points around a door that make the pose unique."""
     windows = [WINDOW[:4] + (i, 1.5 * j, 0) for i in range(6) for j in range(2)]
     points = np.concatenate([*windows, rng.uniform((0, -1, 0), (5, -0.3, 0.5), (8, 3))])
     return _in_frame(points, points, _facing(rng, 40, (6, 8), aside=0.3), rng)
@@ -93,7 +93,7 @@ def clumps(rng: np.random.Generator) -> Drawn:
 
 
 def helix(rng: np.random.Generator) -> Drawn:
-    """A curve of which the image and the scene have different points."""
+    """Draw a curve that is sampled at different points in the image and in the scene."""
     count = int(rng.choice([40, 100]))
     angles = rng.uniform(0, 12.5, (2, count))
     image, scene = (np.column_stack([np.cos(a), np.sin(a), 0.15 * a - 0.9]) for a in angles)
@@ -101,14 +101,14 @@ def helix(rng: np.random.Generator) -> Drawn:
 
 
 def stretched(rng: np.random.Generator) -> Drawn:
-    """A cloud of 8 to 100 points, in the image stretched along one axis by 10 to 30 %."""
+    """Draw a cloud of 8 to 100 points that is stretched by 10 to 30 % along one axis in the image."""
     scene = rng.standard_normal((int(rng.choice([8, 12, 30, 100])), 3))
     factors = 1, 1, 1 + rng.choice([-0.3, -0.2, 0.1, 0.2, 0.3])
     return _projected(scene * factors, scene, _any(rng), rng)
 
 
 def hinged(rng: np.random.Generator) -> Drawn:
-    """A cloud of 12 to 200 points, of which one half is turned by 4 to 12 degrees; the pose of either is true."""
+    """Draw a cloud of 12 to 200 points with one half rotated by 4 to 12 degrees; the pose of either half is correct."""
     scene = rng.uniform(-1, 1, (int(rng.choice([12, 24, 60, 200])), 3)) * (2, 1, 1)
     hinge = Rotation.from_euler("yz"[rng.integers(2)], rng.uniform(4, 12), degrees=True).as_matrix()
     image, (rotation, translation) = np.where(scene[:, :1] > 0, scene @ hinge.T, scene), _any(rng)
@@ -117,13 +117,13 @@ def hinged(rng: np.random.Generator) -> Drawn:
 
 
 def wrong_focal_cloud(rng: np.random.Generator) -> Drawn:
-    """A cloud of 8 to 100 points, seen by a camera of 0.5 to 2 times the focal length."""
+    """Draw a cloud of 8 to 100 points, seen by a camera of 0.5 to 2 times the focal length."""
     scene = rng.standard_normal((int(rng.choice([8, 15, 40, 100])), 3))
     return _projected(scene, scene, _any(rng), rng, rng.choice([0.5, 0.6, 0.8, 1.2, 1.5, 2.0]))
 
 
 def wrong_focal_plane(rng: np.random.Generator) -> Drawn:
-    """The same with a plane of 8 to 40 points."""
+    """Draw a plane of 8 to 40 points, seen by a camera of 0.5 to 2 times the focal length."""
     scene = rng.uniform(-1, 1, (int(rng.choice([8, 15, 40])), 3)) * (1, 1, 0)
     return _projected(scene, scene, _facing(rng, 60, (3, 6)), rng, rng.choice([0.5, 0.6, 0.8, 1.2, 1.5, 2.0]))
 
@@ -143,14 +143,14 @@ def _any(rng: np.random.Generator) -> Pose:
 
 
 def _facing(rng: np.random.Generator, degrees: float, distance: tuple[float, float], aside: float = 0.4) -> Pose:
-    """A camera in front of a plane, its axis turned by up to `degrees` and moved `aside`."""
+    """Return a pose in front of a plane, with the optical axis rotated by up to `degrees` and shifted by `aside`."""
     axis = rng.standard_normal(3)
     turn = Rotation.from_rotvec(np.radians(rng.uniform(5, degrees)) * axis / np.linalg.norm(axis)).as_matrix()
     return turn, np.array([*rng.uniform(-aside, aside, 2), rng.uniform(*distance)])
 
 
 def _projected(image: Array, scene: Array, pose: Pose, rng: np.random.Generator, focal: float = 1.0) -> Drawn:
-    """Pixels of the points `image` under the pose, in another order, with `focal` times the camera's focal length."""
+    """Return the shuffled pixels of the points `image` under the pose, with `focal` times the focal length."""
     camera = image @ pose[0].T + pose[1]
     pixels = camera[:, :2] / camera[:, 2:] * focal * FOCAL + (WIDTH / 2, HEIGHT / 2)
     return rng.permutation(pixels + NOISE * rng.standard_normal(pixels.shape)), scene, [pose]
@@ -159,7 +159,7 @@ def _projected(image: Array, scene: Array, pose: Pose, rng: np.random.Generator,
 def _in_frame(
     seen: Array, points: Array, pose: Pose, rng: np.random.Generator, mapped: NDArray[np.bool_] | None = None
 ) -> Drawn:  # fmt: skip
-    """Those of the seen points that lie in the frame against the points that are mapped; all about their middle."""
+    """Return the visible points that lie in the image, and the points of the map, both relative to their centroid."""
     middle = points.mean(0)
     ahead = seen[((seen - middle) @ pose[0].T + pose[1])[:, 2] > 0.05]
     pixels, _, _ = _projected(ahead - middle, points, pose, rng)

@@ -1,7 +1,8 @@
 """Few points: LEDs of rings, headsets, drones and markers among other lights.
 
-Devices are made from a kind and a seed: LEDs with outward normals at random places on a ring, a headset's shell, a
-drone's frame, or a marker's arms; metres and pixels. Every frame has a new pose, every fifth a new device.
+A device is drawn from a kind and a seed: LEDs with outward normals in random positions on a ring, on the shell of a
+headset, on the frame of a drone, or on the arms of a marker; metres and pixels. Every frame has a new pose, every fifth
+frame a new device.
 """
 
 from collections.abc import Iterator
@@ -34,14 +35,14 @@ class Device:
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole or an equidistant fisheye camera: image radius f tan(theta) or f theta, square image."""
+    """Pinhole camera or equidistant fisheye: image radius f tan(theta) or f theta, square image."""
 
     focal: float = 480.0
     size: int = 800
     fisheye: bool = False
 
     def project(self, camera: Array) -> Array:
-        """Pixels (n, 2) of points (n, 3) in the camera frame, NaN where they cannot be seen."""
+        """Project points (n, 3) in the camera frame to pixels (n, 2); NaN for points that are not visible."""
         radius, depth = np.linalg.norm(camera[:, :2], axis=-1), camera[:, 2]
         if self.fisheye:
             scale = self.focal * np.arctan2(radius, depth) / np.maximum(radius, 1e-12)
@@ -53,14 +54,15 @@ class Camera:
 
     @property
     def model(self) -> tuple[str, list[float]]:
-        """As `bpnp.solve` takes it."""
+        """Camera in a form that `bpnp.solve` accepts."""
         pinhole = [self.focal, self.focal, self.size / 2, self.size / 2]
         return ("OPENCV_FISHEYE", [*pinhole, 0.0, 0.0, 0.0, 0.0]) if self.fisheye else ("PINHOLE", pinhole)
 
 
 class Setting(NamedTuple):
-    """A row: a kind of device, lights that are not its own, share of its LEDs that are not detected, pixels of noise,
-    least and most LEDs that are seen."""
+    """Row: kind of device, number of other lights, fraction of undetected LEDs, pixels of noise, and range of the
+    number of visible LEDs.
+    """
 
     name: str
     kind: Kind
@@ -76,7 +78,9 @@ class Setting(NamedTuple):
 
 @dataclass(frozen=True)
 class Frame:
-    """One picture: pixels (m, 2) in random order, the device, camera = R p + t, and which LED each pixel is (-1)."""
+    """Frame: pixels (m, 2) in random order, the device, the pose camera = R p + t, and the LED of each pixel (-1 for
+    none).
+    """
 
     pixels: Array
     camera: Camera
@@ -87,7 +91,7 @@ class Frame:
 
 
 def device(kind: Kind, seed: int) -> Device:
-    """A random layout of a kind."""
+    """Draw the layout of a device of a kind."""
     rng = np.random.default_rng([seed, list(SIZES).index(kind)])
     count = SIZES[kind]
     if kind == "ring":
@@ -114,8 +118,9 @@ def device(kind: Kind, seed: int) -> Device:
 
 
 def frame(device: Device, setting: Setting, rng: np.random.Generator) -> Frame | None:
-    """A picture of a device in a random pose, half of the lights that are not its own around it; None of a device of
-    which as many LEDs as the setting asks for are never seen."""
+    """Draw a frame of a device in a random pose, with half of the other lights around it; None if the number of LEDs
+    that the setting needs is never visible.
+    """
     camera, background, most = setting.camera, setting.background, setting.most
     pointing = camera_from(camera.model)
     for _ in range(MOST_POSES):
@@ -142,7 +147,7 @@ def frame(device: Device, setting: Setting, rng: np.random.Generator) -> Frame |
 def seen(
     device: Device, setting: Setting, rotation: Array, translation: Array, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], Array]:
-    """The LEDs that are detected and their noisy pixels."""
+    """Return the detected LEDs and their noisy pixels."""
     points = device.points3d @ rotation.T + translation
     sight = -points / np.linalg.norm(points, axis=-1, keepdims=True)
     facing = (sight * (device.normals3d @ rotation.T)).sum(-1) > np.cos(np.radians(FACING_DEG))
@@ -153,7 +158,7 @@ def seen(
 
 
 def _spread_directions(count: int, rng: np.random.Generator) -> Array:
-    """Directions of the front three quarters of the sphere, no two very close."""
+    """Draw directions in the front three quarters of the sphere, no two of them very close."""
     chosen: list[Array] = []
     while len(chosen) < count:
         trial = rng.standard_normal((64, 3))
@@ -186,13 +191,13 @@ SETTINGS = {
 
 
 def problems(name: str, limit: int, seed: int) -> Iterator[Problem]:
-    """Frames of one of SETTINGS, whose camera is told."""
+    """Yield frames of one of SETTINGS, with the camera given."""
     setting = SETTINGS[name]
     return frames(setting, list(SETTINGS).index(name), limit, seed, camera=setting.camera.model)
 
 
 def frames(setting: Setting, number: int, limit: int, seed: int, /, **known: Any) -> Iterator[Problem]:
-    """Frames of a setting, whose number goes into the seed; every fifth has a new device."""
+    """Yield frames of a setting, whose number is part of the seed; every fifth frame has a new device."""
     rng = np.random.default_rng([seed, number])
     for i in range(limit):
         shown = picture(setting, 1000 * seed + i // 5, rng)
@@ -202,7 +207,7 @@ def frames(setting: Setting, number: int, limit: int, seed: int, /, **known: Any
 
 
 def problem(name: str, shown: Frame, **known: Any) -> Problem:
-    """A frame with what `solve` is told of it; its focal length is to be found where the camera is not told."""
+    """Return the problem of a frame with options of `solve`; without a camera the focal length is to be estimated."""
     focal = np.nan if "camera" in known else shown.camera.focal
     search = partial(bpnp.solve, shown.pixels, shown.device.points3d, **known)
     distance = float(np.linalg.norm(shown.translation))
@@ -210,7 +215,7 @@ def problem(name: str, shown: Frame, **known: Any) -> Problem:
 
 
 def picture(setting: Setting, seed: int, rng: np.random.Generator) -> Frame:
-    """A frame of the device with this seed, or of the next one whose LEDs can be seen."""
+    """Return a frame of the device with this seed, or of the next device with enough visible LEDs."""
     for number in range(100):
         if (shown := frame(device(setting.kind, seed + 10**6 * number), setting, rng)) is not None:
             return shown
@@ -218,6 +223,6 @@ def picture(setting: Setting, seed: int, rng: np.random.Generator) -> Frame:
 
 
 def vertical(shown: Frame, rng: np.random.Generator) -> bpnp.GravityPrior:
-    """Up, the device's z axis, told to a degree."""
+    """Return the device's z axis as the up direction, accurate to a degree."""
     tilt = Rotation.from_rotvec(np.radians(1.0) * rng.standard_normal(3)).as_matrix()
     return bpnp.GravityPrior(tilt @ shown.rotation[:, 2], np.array([0.0, 0.0, 1.0]), 1.5)

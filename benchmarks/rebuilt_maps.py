@@ -1,7 +1,8 @@
-"""Maps of a folder of photos built without one of them: features and matches once, then a reconstruction for each.
+"""Maps of a folder of photos, each built without one of them: features and matches once, then a reconstruction per
+photo.
 
-SIFT (the largest of each photo) and exhaustive matching by pycolmap, one thread, one known camera. Kept for another
-run: features.db, full/sparse and without-<photo>/sparse.
+SIFT (the largest features of each photo) and exhaustive matching by pycolmap, one thread, one known camera. Kept for
+the next run: features.db, full/sparse and without-<photo>/sparse.
 """
 
 import shutil
@@ -18,9 +19,9 @@ from bpnp import SceneMap
 
 @dataclass(frozen=True)
 class PhotoScene:
-    """The photos of a folder, one camera for all (COLMAP's PINHOLE: fx, fy, cx, cy), and where its maps are kept.
+    """Photos of a folder, one camera for all (COLMAP's PINHOLE: fx, fy, cx, cy), and the folder of their maps.
 
-    features: the most of a photo, of which COLMAP keeps the largest.
+    `features` is the largest number of features per photo; COLMAP keeps the largest ones.
     """
 
     photos: Path
@@ -30,7 +31,7 @@ class PhotoScene:
 
     @property
     def database(self) -> Path:
-        """Features and verified matches of all photos."""
+        """Compute features and verified matches of all photos."""
         path = self.kept / "features.db"
         if not path.is_file():
             self.kept.mkdir(parents=True, exist_ok=True)
@@ -50,11 +51,11 @@ class PhotoScene:
         return path
 
     def names(self) -> list[str]:
-        """The photos."""
+        """Names of the photos."""
         return sorted(path.name for path in self.photos.iterdir() if path.suffix.lower() in {".jpg", ".png"})
 
     def model(self, left_out: str | None = None) -> Path:
-        """The model of all photos, or of all but one."""
+        """Return the model of all photos, or of all but one."""
         names = [name for name in self.names() if name != left_out]
         folder = self.kept / (f"without-{left_out}" if left_out else "full") / "sparse"
         if not folder.is_dir():
@@ -74,8 +75,9 @@ class PhotoScene:
 
 
 def aligned(here: SceneMap, there: SceneMap) -> Similarity:
-    """The frame of `there` in that of `here`, from the poses of the views that both have: the mean rotation between
-    their cameras, then their centres."""
+    """Return the frame of `there` in that of `here`, from the poses of the views that both have: the mean rotation
+    between their cameras, then their centres.
+    """
     names = [view.name for view in here.views if view.name in there.view_numbers]
     ours, theirs = here.named(names), there.named(names)
     turns = [b.rotation.T @ a.rotation for a, b in zip(ours, theirs, strict=True)]

@@ -1,4 +1,4 @@
-"""What all benchmarks share: their options, the outcome of a problem, the summary of many, and the file of a record."""
+"""Shared parts of the benchmarks: options, the outcome of a problem, the summary of many, and the record file."""
 
 import argparse
 import json
@@ -38,7 +38,7 @@ Pose = tuple[Array, Array]  # rotation, translation: camera = R p + t
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """Another frame of a scene, in which p is at scale * turn p + shift."""
+    """Similarity transform to another frame of a scene: p is at scale * turn p + shift."""
 
     scale: float
     turn: Array
@@ -54,7 +54,7 @@ class Similarity:
 
 
 def parser(doc: str | None) -> argparse.ArgumentParser:
-    """The options that every benchmark has: data, seed, number of problems, rows, and a file for the record."""
+    """Return a parser with the options of all benchmarks: data, seed, number of problems, rows, and the record file."""
     result = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     result.add_argument("--data", type=Path, default=DATA, help="folder with colmap, photos and psb")
     result.add_argument("--seed", type=int, default=9, help="of the problems and of the search (default: %(default)s)")
@@ -65,41 +65,41 @@ def parser(doc: str | None) -> argparse.ArgumentParser:
 
 
 def spread(items: Sequence[T], limit: int, first: float = 0.0) -> list[T]:
-    """At most `limit`, spread evenly, the first one after this part of a step."""
+    """Return at most `limit` items, evenly spread; the first one after this fraction of a step."""
     return [items[k] for k in sorted({int((k + first) * len(items) / limit) for k in range(limit)})]
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Something to solve, and the poses of which any is right: none where points have no pose in common."""
+    """A problem and its true poses, any of which is correct; none for points without a common pose."""
 
     name: str
     solve: Callable[[], Solution]
     poses: Sequence[Pose]
-    points3d: Array = field(default_factory=lambda: np.zeros((1, 3)))  # whose middle tells how far a pose is off
+    points3d: Array = field(default_factory=lambda: np.zeros((1, 3)))  # the centroid is used for the errors
     distance: float = 1.0  # unit of the error of the camera's centre
-    focal: float = np.nan  # the true focal length in pixels, where it is to be found too
+    focal: float = np.nan  # true focal length in pixels, if it is estimated
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of one problem: the errors of the pose to the true one that is nearest."""
+    """Errors of the pose of a problem against the nearest true pose."""
 
     problem: str
     rotation_deg: float
-    shift: float  # of the camera's centre, in units of the problem's distance
-    verdict: str  # "" of a method that has none
+    shift: float  # of the camera centre, in units of the problem's distance
+    verdict: str  # "" for a method without one
     cpu_seconds: float
-    outside: bool = True  # whether the true poses lie beyond the bound that the solution claims (`beyond_bound`)
-    focal: float = np.nan  # the focal length that was found, of the true one; NaN where it was known
-    moved: float = 0.0  # of the middle of the scene as the camera sees it, in its distances
-    focal_sigmas: float = np.nan  # error of the focal length that was found, in its standard deviations
-    sigmas: Sequence[float] = ()  # errors in their own standard deviations (`sigmas`), of a pose that is near
+    outside: bool = True  # the true poses lie outside the 99.9 % bound (`beyond_bound`)
+    focal: float = np.nan  # estimated over true focal length; NaN if it was given
+    moved: float = 0.0  # of the scene's centroid in the camera frame, over its distance
+    focal_sigmas: float = np.nan  # error of the estimated focal length in standard deviations
+    sigmas: Sequence[float] = ()  # errors of a nearly correct pose in standard deviations (`sigmas`)
 
 
 @dataclass(frozen=True)
 class Row:
-    """A line of a benchmark: what draws its problems, and up to where a pose is right."""
+    """Row of a benchmark: the function that draws its problems, and the limits of a correct pose."""
 
     name: str
     draw: Callable[[], Iterable[Problem | Outcome]]
@@ -126,7 +126,7 @@ def solved(problem: Problem) -> Outcome:
 
 
 def nearest(problem: Problem, rotation: Array, translation: Array) -> tuple[float, float, float, Any]:
-    """Degrees to the nearest true pose, shift of the centre and of the middle as in `Outcome`, and that pose."""
+    """Return the angle in degrees to the nearest true pose, the shifts as in `Outcome`, and that pose."""
     middle, errors = np.median(problem.points3d, 0), []
     for true in problem.poses:
         at = true[0] @ middle + true[1]
@@ -137,11 +137,11 @@ def nearest(problem: Problem, rotation: Array, translation: Array) -> tuple[floa
 
 
 def beyond_bound(found: Solution, pose: Pose) -> bool:
-    """Whether the true rotation, or the true pose, lies outside the region that the solution claims to hold it with a
-    probability of 99.9 %, as the bound in `reason` does: of errors e with e^T C^-1 e / d below the quantile of F with
-    d and the degrees of freedom of the residuals, C the covariance less what widens it for few residuals.
+    """Return True if the true rotation, or the true pose, lies outside the 99.9 % region of the solution.
 
-    The promise of a confident pose is broken by one that is wrong (some degrees off) and beyond its bound.
+    As for the bound in `reason`, the region holds the errors e with e^T C^-1 e / d below the quantile of F with d and
+    the degrees of freedom of the residuals. C is the covariance without the factor that widens it for few residuals. A
+    confident pose counts as wrong if it is some degrees off and outside of this region.
     """
     squared, free = np.square(sigmas(found, pose, np.zeros(3))), max(2 * len(found.matches) - len(found.covariance), 1)
     widened = student_factor(free)
@@ -149,9 +149,11 @@ def beyond_bound(found: Solution, pose: Pose) -> bool:
 
 
 def sigmas(found: Solution, pose: Pose, middle: Array) -> list[float]:
-    """The error along three or six independent directions, first of the rotation alone, in the standard deviations that
-    its covariance claims; that of the shift at the middle of the scene (3,), since far from it a turn moves points by
-    more than the first order. Empty where nothing is claimed."""
+    """Return the errors along three or six independent directions, in their standard deviations by the covariance.
+
+    The directions of the rotation come first. The shift is that of the centroid of the scene (3,), because far from it
+    a rotation moves points by more than its first order. The list is empty for a solution without a covariance.
+    """
     (rotation, translation), seen = pose, found.rotation @ middle
     if not (np.isfinite(found.covariance).all() and np.isfinite(rotation).all()):
         return []
@@ -168,16 +170,19 @@ def sigmas(found: Solution, pose: Pose, middle: Array) -> list[float]:
 
 
 def degrees(one: Any, other: Any) -> float:
-    """Angle between two rotations (3, 3), 180 where one is not there."""
+    """Return the angle between two rotations (3, 3), degrees; 180 if one of them is NaN."""
     if not (np.isfinite(one).all() and np.isfinite(other).all()):
         return NO_POSE_DEG
     return float(np.degrees(Rotation.from_matrix(one @ other.T).magnitude()))
 
 
 def summary(found: Sequence[Outcome], row: Row) -> dict[str, Any]:
-    """Quartiles of the rotation's error, shares right and confident, how many are confident, wrong and beyond their own
-    bound, CPU seconds; which share of the errors of right poses is within 1, 2 and 3 of their standard deviations;
-    where focal lengths were not known the share that are near, and how many are confident and far.
+    """Return the figures of a row.
+
+    They are the quartiles of the rotation error; the fractions of correct and of confident poses; the number of poses
+    that are confident, wrong and outside their own bound; CPU seconds; and the fraction of the errors of correct poses
+    within 1, 2 and 3 of their standard deviations. With unknown focal lengths: the fraction that is near the true one,
+    and the number of confident poses that are far off.
     """
     turn, focal, seconds = np.array([(o.rotation_deg, o.focal, o.cpu_seconds) for o in found]).T
     right, sure = np.array([row.is_right(o) for o in found]), np.array([o.verdict == "confident" for o in found])
@@ -204,9 +209,10 @@ def summary(found: Sequence[Outcome], row: Row) -> dict[str, Any]:
 
 
 def measured(rows: Iterable[Row], only: Sequence[str] = ("",)) -> Iterator[tuple[Row, dict[str, Any], list[Outcome]]]:
-    """Rows with one of these parts in their name, their summaries and outcomes; a line is printed for each as it comes.
+    """Yield the rows that have one of these parts in their name, with summary and outcomes, and print a line for each.
 
-    The problems of a row are drawn before the first of them is solved."""
+    The problems of a row are drawn before the first of them is solved.
+    """
     warm_up()
     for row in rows:
         if not any(part in row.name for part in only):
@@ -222,7 +228,7 @@ def measured(rows: Iterable[Row], only: Sequence[str] = ("",)) -> Iterator[tuple
 
 
 def run(rows: Callable[[argparse.Namespace], Iterable[Row]], options: argparse.ArgumentParser) -> None:
-    """Measure the rows of a benchmark, and write them and their outcomes to `--output` as they come."""
+    """Measure the rows of a benchmark, and write each with its outcomes to `--output` at once."""
     chosen, results = options.parse_args(), {}
     for row, result, found in measured(rows(chosen), chosen.only):
         results[row.name] = result | {"outcomes": [asdict(outcome) for outcome in found]}
@@ -231,7 +237,7 @@ def run(rows: Callable[[argparse.Namespace], Iterable[Row]], options: argparse.A
 
 
 def write(path: Path, record: dict[str, Any]) -> None:
-    """A JSON file of what was measured, with the machine, the commit and the command that measured it."""
+    """Write a JSON file of the measurements, with the machine, the commit and the command."""
     commit = subprocess.run(
         ["git", "-C", ROOT, "describe", "--always", "--dirty"], capture_output=True, text=True, check=False
     )
@@ -242,7 +248,7 @@ def write(path: Path, record: dict[str, Any]) -> None:
 
 
 def command(words: Sequence[str]) -> str:
-    """Return a command line in which paths from the root are their last part, since they say nothing elsewhere.
+    """Return a command line in which paths below the root are shortened to their last part.
 
     >>> command(["python -m benchmarks table1", "--run", "/tmp/runs/table1", "--steps", "3"])
     'python -m benchmarks table1 --run table1 --steps 3'
@@ -251,7 +257,7 @@ def command(words: Sequence[str]) -> str:
 
 
 def machine() -> dict[str, Any]:
-    """What the figures were measured on, and how busy it was."""
+    """Return the machine on which the figures were measured, and its load."""
     information = Path("/proc/cpuinfo")
     lines = information.read_text().splitlines() if information.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

@@ -1,17 +1,27 @@
-"""How often confident poses are wrong: LEDs, shapes, photos, scenes that repeat, wrong focal lengths and labels.
+"""Reliability of the verdict: fraction of confident poses that are wrong, for LEDs, shapes, photos and hard scenes.
 
     python -m benchmarks reliability --only leds shapes photos maps hard --seed 9 --limit 100
 
-Rows: leds (the settings of `leds.py`), shapes (0, 0.25 and 0.5 outliers a match), photos (against the points of one
-view, 0 to 100 % outliers a side), maps (photos left out of their map, which view is not told), hard (`hard_scenes.py`),
-wrong focal (of photos and planes, 5 to 33 %; photos in whole maps, by each of --factors), labels (LEDs of three colours
-that a classifier of Gaussian noise sees: without labels, with its likeliest class, and with its probabilities),
-symmetric (`symmetric.py`; of exactly symmetric objects every confident pose is wrong), devices (LEDs that a half turn
-nearly maps onto each other), pitch (crossings of lines of a playing field, gravity known to 2 degrees).
---limit: problems of each row. Photos are of scenes on which no constant was chosen (`--scenes`).
+Rows:
 
-Right: within 3 degrees, the middle of the scene moved by less than a tenth of its distance; with a wrong focal length
-the camera's centre by less than a twentieth. Wrong: not right, and beyond the bound that the solution claims.
+- leds: the settings of `leds.py`
+- shapes: 0, 0.25 and 0.5 outliers per match
+- photos: against the points of one view, 0 to 100 % outliers per side
+- maps: photos removed from their map, no view given
+- hard: `hard_scenes.py`
+- wrong focal: photos and planes with a focal length that is 5 to 33 % wrong; photos in whole maps, for each of
+  --factors
+- labels: LEDs of three colours that a classifier with Gaussian noise sees: without labels, with its likeliest class,
+  and with its probabilities
+- symmetric: `symmetric.py`; every confident pose of an exactly symmetric object is wrong
+- devices: LEDs that a half turn nearly maps onto each other
+- pitch: crossings of lines of a playing field, gravity known to 2 degrees
+
+--limit: problems of each row. No constant was chosen on the scenes of the photos (`--scenes`).
+
+Success: rotation within 3 degrees, and the centroid of the scene moved by less than a tenth of its distance; with a
+wrong focal length, the camera centre within a twentieth. Wrong: no success, and outside the 99.9 % bound of the
+solution.
 """
 
 import argparse
@@ -74,8 +84,7 @@ def of_photos(
     drawn: Callable[[float, Against], Sequence[ViewProblem]], options: argparse.Namespace, outliers: float,
     against: Against, factors: Sequence[Sequence[float]],
 ) -> Iterator[Problem]:  # fmt: skip
-    """Photos with cameras of these factors of the focal length, NaN for none: those for the first photo, for the second
-    and so on, in turns."""
+    """Yield photos whose cameras have these factors of the focal length in turn; NaN for an unknown focal length."""
     solve_one, known = in_map if against == "map" else with_cones, limits(options)
     for photo, chosen in zip(drawn(outliers, against), cycle(factors)):
         for factor in chosen:
@@ -86,7 +95,9 @@ def of_photos(
 
 
 def in_turns(options: argparse.Namespace, outliers: float, against: Against) -> list[ViewProblem]:
-    """Photos of each scene in turns, so that a part of them is of all scenes; those with enough true matches."""
+    """Return photos of the scenes in turn, so that every part of the list has all scenes; only those with enough true
+    matches.
+    """
     known = {"against": against, "outliers": outliers, "seed": options.seed}
     turns = [scene_problems(options.data, [scene], options.limit, **known) for scene in options.scenes]
     return [photo for turn in zip(*turns, strict=False) for photo in turn if photo.matched.sum() >= LEAST_MATCHES]
@@ -98,7 +109,7 @@ def in_map(photo: ViewProblem, factor: float, **known: Any) -> Solution:
 
 
 def with_cones(photo: ViewProblem, factor: float, **known: Any) -> Solution:
-    """Against one view, with the cones of the points."""
+    """Solve a photo against one view, with the viewing cones of the points."""
     camera = camera_from(np.diag([factor * photo.focal, factor * photo.focal, 1.0]))
     cones: dict[str, Any] = {"normals3d": photo.scene.cones.axes, "cosines3d": photo.scene.cones.cosines}
     points = problem_from(photo.focal * photo.points2d, photo.points3d, camera, **cones)
@@ -117,7 +128,7 @@ def with_lens(draw: Callable[[Any], Drawn], seed: Any, options: argparse.Namespa
 
 
 def of_classes(kind: str, options: argparse.Namespace) -> Iterator[Problem]:
-    """LEDs of three colours, each with no label, its likeliest one, or the probabilities of all."""
+    """Yield LEDs of three colours, each without labels, with the likeliest label, or with the probabilities of all."""
     for k in range(options.limit):
         rng = np.random.default_rng([options.seed, k])
         shape: leds.Kind = ("ring", "headset", "drone", "marker")[k % 4]
@@ -133,7 +144,7 @@ def of_classes(kind: str, options: argparse.Namespace) -> Iterator[Problem]:
 
 
 def problem(name: str, run: Callable[[], Solution], poses: Sequence[Pose], points3d: Array) -> Problem:
-    """The unit of the error of the centre is the distance of the middle of the scene."""
+    """Return the problem of a frame; the error of the centre is in distances of the centroid of the scene."""
     middle = np.median(points3d, 0)
     distance = float(np.linalg.norm(poses[0][0] @ middle + poses[0][1])) if poses else 1.0
     return Problem(name, run, poses, points3d, distance)

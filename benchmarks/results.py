@@ -1,12 +1,12 @@
-"""The figures of the README and of the guides: measured, kept in results.json, filled into their tables.
+"""Figures of the README and the guides: measure them, keep them in results.json, and fill them into the tables.
 
-    python -m benchmarks results                  # measures all (hours), writes results.json and the tables
+    python -m benchmarks results                  # measure all (hours), write results.json and the tables
     python -m benchmarks results --only leds      # the rows of one table
-    python -m benchmarks results --quick --check  # few problems a row (minutes) against results.json
+    python -m benchmarks results --quick --check  # compare few problems per row (minutes) with results.json
 
-Rows are data: `ROWS`. --check draws the problems of results.json again, with the seed that it has for each row; it
-writes nothing, and the exit status is 1 where a figure lies outside the tolerance or a table is not that of
-results.json. Times are shown and not compared. Rows whose data are not there are named and left out.
+`ROWS` lists the rows. --check draws the problems of results.json again, with the seed of each row; it writes nothing,
+and the exit status is 1 if a figure is outside the tolerance or a table differs from results.json. Times are shown and
+not compared. Rows whose data are missing are named and skipped.
 """
 
 import argparse
@@ -46,7 +46,7 @@ TABLE = r"<!-- results: {} -->\n(.*?)<!-- end of results -->"
 
 @dataclass(frozen=True)
 class Row:
-    """A line of a table."""
+    """Row of a table."""
 
     table: str
     name: str
@@ -63,7 +63,7 @@ def lights(name: str, limit: int, seed: int, _: Path) -> Iterator[Problem]:
 
 
 def network(weights: str, options: dict[str, Any], limit: int, seed: int, data: Path) -> Iterator[Outcome]:
-    """Packaged weights on meshes or, without `root`, on procedural shapes."""
+    """Test packaged weights on meshes or, without `root`, on procedural shapes."""
     known = {"num_points": 1000, "test_problems": limit, "test_shapes": limit, "batch_size": 1, "seed": seed}
     module = MeshDataModule(**known | options | {"root": str(data / options["root"]) if "root" in options else None})
     module.setup("test")
@@ -81,7 +81,7 @@ def network(weights: str, options: dict[str, Any], limit: int, seed: int, data: 
 def of_benchmark(
     rows: Callable[[argparse.Namespace], Iterable[record.Row]], name: str, limit: int, seed: int, data: Path
 ) -> Iterable[Problem | Outcome]:
-    """The problems of a row of another benchmark."""
+    """Return the problems of a row of another benchmark."""
     known = argparse.Namespace(limit=limit, seed=seed, data=data, scenes=REPORTED, peers=False)
     return next(row for row in rows(known) if row.name == name).draw()
 
@@ -145,7 +145,7 @@ def key(row: Row) -> str:
 
 
 def rows(options: argparse.Namespace, seeds: Mapping[str, int]) -> Iterator[record.Row]:
-    """The chosen rows; `seeds` has those that are not of the default seed."""
+    """Return the chosen rows; `seeds` has those that differ from the default seed."""
     for row in ROWS:
         if not any(part in key(row) for part in options.only):
             continue
@@ -158,7 +158,7 @@ def rows(options: argparse.Namespace, seeds: Mapping[str, int]) -> Iterator[reco
 
 
 def differences(new: dict[str, Any], old: dict[str, Any]) -> list[str]:
-    """List the figures of a row that lie outside the tolerance."""
+    """List the figures of a row that are outside the tolerance."""
     if new["problems"] != old["problems"] or new["seed"] != old["seed"]:
         return [f"{new['problems']} problems of seed {new['seed']}, not {old['problems']} of {old['seed']}"]
     found, share = [], PROBLEMS / new["problems"] + 1e-3
@@ -174,7 +174,7 @@ def differences(new: dict[str, Any], old: dict[str, Any]) -> list[str]:
 
 
 def table(name: str, results: dict[str, Any]) -> str | None:
-    """The Markdown of a table, or of the README's rows; None unless all its rows are measured."""
+    """Return the Markdown of a table, or of the README's rows; None unless all its rows are measured."""
     rows = [row for row in ROWS if (row.in_readme if name == "readme" else row.table == name)]
     if not rows or any(key(row) not in results for row in rows):
         return None
@@ -193,7 +193,7 @@ def table(name: str, results: dict[str, Any]) -> str | None:
 
 
 def filled(text: str, results: dict[str, Any]) -> str:
-    """Return a document with the tables between its markers; a table with a row that is not measured stays."""
+    """Return a document with the tables between its markers; a table with a row that is not measured is kept."""
 
     def replaced(match: re.Match[str]) -> str:
         new = table(match[1], results)

@@ -1,8 +1,8 @@
-"""Shapes, meshes and the points that photos see, for `solve` without a prior.
+"""Shapes, meshes and points of photos, for `solve` without a prior.
 
-A set is shapes (procedural, any rotation), psb (Euler angles up to 45 degrees, the paper's protocol), psb-so3 or photos
-(as many of each of the models `REPORTED`). Outliers are random points, of photos keypoints without a point and points
-that the photo does not see; their ratio is to the matches on either side.
+The sets are shapes (procedural, any rotation), psb (Euler angles up to 45 degrees, the paper's protocol), psb-so3, and
+photos (the same number of each of the models `REPORTED`). Outliers are random points; for photos, keypoints without a
+point and points that are not visible. Their ratio is relative to the matches on either side.
 """
 
 from collections.abc import Iterator
@@ -25,8 +25,9 @@ POINTS, NOISE = 400, 2 / 800
 
 
 def shapes(ratio: float, limit: int, seed: int) -> Iterator[Points]:
-    """400 points of a shape in the unit sphere, seen from 4 to 5 units with noise of 2 pixels at a focal length of
-    800, and `ratio` times as many random points in the boxes of both sides."""
+    """Yield problems with 400 points of a shape in the unit sphere, seen from 4 to 5 units with noise of 2 pixels at a
+    focal length of 800, and `ratio` times as many random points in the bounding boxes of both sides.
+    """
     for k in range(limit):
         rng = np.random.default_rng([seed, k])
         points = normalise(sample_surface(procedural_shape(rng), POINTS, rng), "unit_sphere")
@@ -40,7 +41,7 @@ def shapes(ratio: float, limit: int, seed: int) -> Iterator[Points]:
 
 
 def of_data(name: str, ratio: float, limit: int, seed: int, data: Path) -> Iterator[Points]:
-    """Meshes, or photos of a model, spread evenly over those that there are."""
+    """Return meshes, or photos of a model, evenly spread over all of them."""
     if name.startswith("psb"):
         rotation: Literal["so3", "euler"] = "so3" if name == "psb-so3" else "euler"
         module: MeshDataModule | ColmapDataModule = MeshDataModule(
@@ -60,7 +61,7 @@ def of_data(name: str, ratio: float, limit: int, seed: int, data: Path) -> Itera
 def problems(
     chosen: str, ratio: float, limit: int, seed: int, data: Path, time_limit: float | None = None
 ) -> Iterator[Problem]:
-    """At most `limit` of a set; `time_limit` as for `solve`."""
+    """Yield at most `limit` problems of a set; `time_limit` as for `solve`."""
     if chosen == "shapes":
         drawn = shapes(ratio, limit, seed)
     else:

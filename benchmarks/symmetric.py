@@ -1,8 +1,9 @@
-"""Objects of k equal parts and some unique points: the true pose explains more points than one turned by a symmetry.
+"""Objects of k equal parts and some unique points: the true pose explains more points than its images under the
+symmetry.
 
 Kinds: cloud (random points), tower (parts around an upright axis), wheel (points of a rim and of spokes), few (a cloud
-of few points), and device (LEDs with normals, nearly symmetric under a half turn). Unique points number 0 (exactly
-symmetric: no pose can be told from its turned copies) to 12.
+of few points), and device (LEDs with normals, nearly symmetric under a half turn). Objects have 0 to 12 unique points;
+with 0 they are exactly symmetric, and no pose can be distinguished from its rotated copies.
 """
 
 from collections.abc import Iterator
@@ -20,7 +21,7 @@ JITTER = 0.004  # of a near symmetry, in extents of the device
 
 
 class Kind(NamedTuple):
-    """Points of a part, unique points, and the image's random points as a fraction of all."""
+    """Points per part, unique points, and random image points as a fraction of all."""
 
     name: str
     fold: int

@@ -27,7 +27,7 @@ LEAST_MATCHES = 10  # fewer matches count as a failure
 
 @dataclass(frozen=True, eq=False)
 class ViewProblem:
-    """A photo's keypoints and points of its map."""
+    """Keypoints of a photo and points of its map."""
 
     name: str
     points2d: Array  # (m, 2), normalised
@@ -40,27 +40,27 @@ class ViewProblem:
 
     @property
     def pixels(self) -> tuple[Array, Array]:
-        """Keypoints (m, 2) from the principal point, and the camera's matrix."""
+        """Keypoints (m, 2) relative to the principal point, and the camera matrix."""
         return self.focal * self.points2d, np.diag([self.focal, self.focal, 1.0])
 
     @property
     def distance(self) -> float:
-        """Of the median point from the photo."""
+        """Median distance of the points from the photo."""
         return median_distance(self.points3d, self.pose)
 
 
 def median_distance(points3d: Array, pose: Pose) -> float:
-    """Of the points from a camera."""
+    """Return the median distance of points from a camera."""
     return float(np.median(np.linalg.norm(points3d @ pose[0].T + pose[1], axis=-1)))
 
 
 def images_of(scene: Reconstruction, limit: int) -> list[ImagePoints]:
-    """At most `limit` photos, spread evenly over those that have a view of enough overlap."""
+    """Return at most `limit` photos, evenly spread over those that have a view with enough overlap."""
     return spread([image for image in scene.images if len(overlapping(scene, image))], limit)
 
 
 def overlapping(scene: Reconstruction, query: ImagePoints) -> list[tuple[float, ImagePoints]]:
-    """The views that see at least `LEAST_OVERLAP` of the photo's points, and this share, largest first."""
+    """Return the views that see at least `LEAST_OVERLAP` of the photo's points, and these fractions, largest first."""
     seen = np.zeros(len(scene.points3d), bool)
     seen[query.seen] = True
     shares = [
@@ -75,11 +75,11 @@ Against = Literal["map", "view", "best view"]
 def view_problem(
     scene: Reconstruction, query: ImagePoints, *, against: Against, outliers: float, seed: int = 0
 ) -> ViewProblem:  # fmt: skip
-    """One photo against the points of the whole map, or those that one view sees.
+    """Return the problem of one photo against the points of the whole map, or of one view.
 
-    against: "map", "view", drawn among those that overlap enough, or "best view", the one that overlaps most.
-    outliers: of each side at most this share of all points is without a partner; 1 for all that there are. Against a
-    view matches and outliers are thinned alike to MOST_POINTS a side, so that their ratio stays.
+    `against` is "map", "view" (drawn among the views with enough overlap) or "best view" (the one with the largest
+    overlap). `outliers` is the largest fraction of the points of each side without a correspondence; 1 keeps all
+    points. Against a view, matches and outliers are thinned alike to MOST_POINTS per side, so that their ratio is kept.
     """
     rng = np.random.default_rng([seed, query.image_id])
     view = None
@@ -115,7 +115,7 @@ def view_problem(
 
 
 def map_of(scene: Reconstruction, left_out: Collection[str] = ()) -> SceneMap:
-    """A model's points, and its views but some."""
+    """Return the points of a model, and its views without some."""
     views = []
     for image in scene.images:
         if image.name not in left_out:
@@ -125,7 +125,9 @@ def map_of(scene: Reconstruction, left_out: Collection[str] = ()) -> SceneMap:
 
 
 def part_of(place: SceneMap, points: NDArray[np.integer], name: str = "") -> SceneMap:
-    """Some points, in this order, and all views with those of them that they see; `name` begins the views' names."""
+    """Return some points, in this order, and all views with those of them that they see; `name` is prefixed to the
+    names of the views.
+    """
     number = np.full(len(place.points3d), -1, np.int32)
     number[points] = np.arange(len(points))
     seen = ((view, number[view.points]) for view in place.views)
@@ -134,7 +136,7 @@ def part_of(place: SceneMap, points: NDArray[np.integer], name: str = "") -> Sce
 
 
 def scene_problems(data: Path, names: Iterable[str], limit: int, **chosen: Any) -> Iterator[ViewProblem]:
-    """Problems of at most `limit` photos of each of these scenes. chosen: options of `view_problem`."""
+    """Yield problems of at most `limit` photos of each scene. chosen: options of `view_problem`."""
     for scene in (model_of(data, name) for name in names):
         yield from (view_problem(scene, query, **chosen) for query in images_of(scene, limit))
 
@@ -146,9 +148,11 @@ def model_of(data: Path, name: str) -> Reconstruction:
 def photos(
     against: Against, outliers: float, limit: int, seed: int, data: Path, *, in_map: bool = True, apart: bool = False
 ) -> Iterator[Problem]:
-    """At most `limit` photos of the reported scenes in their maps, told the view if it is one, or by the points alone,
-    without a prior; apart: in the map of the problem that comes half of them before. The error of a centre is in
-    distances of the median point."""
+    """Yield at most `limit` photos of the reported scenes in their maps, without a prior.
+
+    They are given a view if there is one, or only the points. With `apart`, every second photo is put into the map of
+    the previous problem. The error of a centre is in median distances of the points.
+    """
     each = -(-limit // len(REPORTED))
     drawn = list(scene_problems(data, REPORTED, each, against=against, outliers=outliers, seed=seed))
     half = len(drawn) // 2 if apart else 0
