@@ -31,14 +31,14 @@ from bpnp.search.config import DEFAULT as SEARCH
 from bpnp.search.config import OtherFocal
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.evidence.reasons import objection
-from bpnp.search.evidence.uncertainty import POSE, is_within
+from bpnp.search.evidence.uncertainty import is_within
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.propose.lens import fit_lens
 from bpnp.search.scene import Scene
 from bpnp.search.verdict import match_count, weighed
 from bpnp.solving.arguments import Array, checked_size
-from bpnp.solving.solution import Solution, add_objection
+from bpnp.solving.solution import FOCAL_LENGTH, ROTATION_PARAMETERS, Solution, add_objection
 from bpnp.solving.sources import Options, solutions_of
 
 ProblemAt = Callable[[Camera, UnknownFocal], Problem]
@@ -333,8 +333,10 @@ def is_claimed(solution: Solution, rotation: Array, zoom: float) -> bool:
     turn, rule = Rotation.from_matrix(rotation @ solution.rotation.T).as_rotvec(), SEARCH.evidence
     if math.degrees(float(np.linalg.norm(turn))) > rule.contested.far * rule.same.degrees:
         return False
-    chosen, free = [0, 1, 2, POSE], 2 * len(solution.matches) - (POSE + 1)
-    return is_within(np.r_[turn, math.log(zoom)], solution.covariance[np.ix_(chosen, chosen)], free)
+    chosen = [solution.parameters.index(name) for name in (*ROTATION_PARAMETERS, FOCAL_LENGTH)]
+    unit = np.array([1.0, 1.0, 1.0, 1 / solution.focal_length])  # covariance of the logarithm of the focal length
+    covariance = solution.covariance[np.ix_(chosen, chosen)] * np.outer(unit, unit)
+    return is_within(np.r_[turn, math.log(zoom)], covariance, 2 * len(solution.matches) - len(solution.parameters))
 
 
 class FittedCamera(NamedTuple):

@@ -1,6 +1,7 @@
 """Pose and focal length together, on planted points and cameras."""
 
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from bpnp import SceneMap, Solution, solve
 from bpnp.cameras import Camera, camera_from, camera_to_json
 from bpnp.cli import main
 from bpnp.search.problem import Problem, UnknownFocal
-from bpnp.solving.focal_length import fit_camera, unknown_camera
+from bpnp.solving.focal_length import fit_camera, is_claimed, unknown_camera
 from bpnp.solving.inputs import problem_from
 
 Array = NDArray[np.float64]
@@ -56,6 +57,16 @@ def test_pose_and_focal_length_are_found_together(found: tuple[Solution, Array])
     np.testing.assert_array_equal(again.covariance, solution.covariance)
     assert again.parameters == solution.parameters
     assert again.focal_length == solution.focal_length
+
+
+def test_the_uncertainty_of_the_focal_length_holds_those_within_its_bound(found: tuple[Solution, Array]) -> None:
+    """The bound of 99.9 % is about 3.3 standard deviations at a fixed rotation, which the information matrix has."""
+    solution, _ = found
+    names = [solution.parameters.index(name) for name in ("rotation_x", "rotation_y", "rotation_z", "focal_length")]
+    information = np.linalg.inv(solution.covariance[np.ix_(names, names)])
+    sigma = information[3, 3] ** -0.5 / solution.focal_length
+    claimed = [is_claimed(solution, solution.rotation, math.exp(k * sigma)) for k in (-10, -1, 1, 10)]
+    assert claimed == [False, True, True, False]
 
 
 def test_the_nfa_and_the_covariance_count_the_focal_length(found: tuple[Solution, Array]) -> None:
