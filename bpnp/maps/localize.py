@@ -117,7 +117,7 @@ def _localize_in(
     """
     places = scene.places(views, photo.keypoints, photo.lens)
     if not places:
-        raise ValueError("expected a map with views that see 4 or more points, got none")
+        raise ValueError("no view of the map sees 4 or more points, which a pose needs")
     photo = replace(photo, view_count=len({place.view.name for place in places}))
     queue = deque((place, settings) for settings in (BRIEF, ONCE) for place in places)
     earlier, best, longer = list[Solution](), list[Attempt](), set[str]()
@@ -256,7 +256,7 @@ def rank(solution: Solution) -> tuple[int, float]:
 def strongest_of(scores: Any, shape: tuple[int, ...]) -> NDArray[np.int64]:
     """Return the indices of the strongest keypoints, ascending; raise ValueError unless each keypoint has a score."""
     if np.shape(scores) != shape:
-        raise ValueError(f"expected `scores` of shape {shape}, one a keypoint, got {np.shape(scores)}")
+        raise ValueError(f"`scores` has the shape {np.shape(scores)}, not {shape}, one score per keypoint")
     return np.sort(np.argsort(-np.asarray(scores), kind="stable")[:MOST_KEYPOINTS])
 
 

@@ -94,7 +94,7 @@ def photo_task(
     source = "unknown focal length" if lens == UNKNOWN else source
     shown = None if views is None else list(views.get(name, ()))
     if shown is not None and not shown:
-        raise ValueError(f"expected views for {name} in the file of views, got none; try without --views")
+        raise ValueError(f"the file of views names no view for {name}; add one, or leave out --views")
     points_content = "detected"
     if keypoints is not None:
         keypoints = keypoints.absolute()
@@ -216,13 +216,13 @@ def read_views(path: str | Path) -> dict[str, list[str]]:
     try:
         lines = Path(path).read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"expected a text file of lines `photo view`, got {error}") from error
+        raise ValueError(f"--views needs a text file of lines `photo view`: {error}") from error
     views: dict[str, list[str]] = {}
     for number, line in enumerate(lines, 1):
         if not (names := line.split()):
             continue
         if len(names) != 2:
-            raise ValueError(f"expected two names, a photo's and a view's, got {line!r} at line {number} of {path}")
+            raise ValueError(f"line {number} of {path} is {line!r}; a line has two names, of a photo and of a view")
         views.setdefault(names[0], []).append(names[1])
     return views
 

@@ -64,7 +64,9 @@ def connected(cluster: str) -> Iterator[Client]:
     """Yield a client of the scheduler at an address, or of a given number of new single-threaded processes."""
     if cluster.isdecimal():
         if int(cluster) < 1:
-            raise ValueError(f"expected one or more processes, got {cluster}")
+            raise ValueError(
+                f"--cluster is {cluster}; it must be at least one process, or the address of a Dask scheduler"
+            )
         processes = LocalCluster(n_workers=int(cluster), threads_per_worker=1, dashboard_address=None)
         with processes, Client(processes) as client:
             yield client
@@ -72,7 +74,9 @@ def connected(cluster: str) -> Iterator[Client]:
     try:  # first: a client that fails to connect leaves threads that wait for each other
         asyncio.run(_answers(cluster))
     except (OSError, ValueError) as error:
-        raise ValueError(f"expected the address of a Dask scheduler or a number, got {cluster}: {error}") from error
+        raise ValueError(
+            f"--cluster is {cluster}, not a number of processes, and no Dask scheduler answers there: {error}"
+        ) from error
     with Client(cluster, timeout=PATIENCE) as client:
         yield client
 

@@ -62,14 +62,14 @@ def photo_files(paths: Iterable[Path], besides: Path | None = None) -> dict[str,
     left_out = None if besides is None else besides.resolve()
     for path in paths:
         if not path.exists():
-            raise ValueError(f"expected a photo or a folder of photos, got {path}, which does not exist")
+            raise ValueError(f"{path} does not exist; give a photo or a folder of photos")
         inside = (file for file in sorted(path.rglob("*")) if file.suffix.lower() in SUFFIXES)
         for file in (f for f in inside if left_out not in f.resolve().parents) if path.is_dir() else [path]:
             name = file.relative_to(path).as_posix() if path.is_dir() else file.name
             if files.setdefault(name, file) != file:
-                raise ValueError(f"expected photos of different names, got {files[name]} and {file}")
+                raise ValueError(f"{files[name]} and {file} have the same name; photos need different names")
     if not files:
-        raise ValueError("expected one or more photos, or folders with some, got none")
+        raise ValueError("there are no photos; give one or more photos, or folders with photos")
     return files
 
 
@@ -124,7 +124,7 @@ def _opened(photo: Path) -> tuple[Size, dict[int, Any]]:
             exif = image.getexif()
             return image.size, {ORIENTATION: exif.get(ORIENTATION), **exif.get_ifd(IFD_EXIF)}
     except OSError as error:
-        raise ValueError(f"expected a photo that can be read, got {photo}: {error}; try a JPEG or PNG file") from error
+        raise ValueError(f"cannot read the photo {photo}: {error}; give a JPEG or PNG file") from error
 
 
 def photo_keypoints(photo: Path, file: str | Path | None, name: str) -> Keypoints:
@@ -141,7 +141,7 @@ def photo_keypoints(photo: Path, file: str | Path | None, name: str) -> Keypoint
     with path.open("rb") as content:
         head = content.read(len(SQLITE))
     if not head:
-        raise ValueError(f"expected hloc's HDF5 file of keypoints or a database of COLMAP, got the empty file {path}")
+        raise ValueError(f"{path} is empty; give hloc's HDF5 file of keypoints, or a database of COLMAP")
     return (read_database if head == SQLITE else read_features)(path, name, size)
 
 
@@ -164,13 +164,13 @@ def detected_keypoints(photo: Path, *, most: int = MOST_DETECTED) -> Keypoints:
     as_stored = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION  # as COLMAP reads photos
     image = cv2.imread(str(photo), as_stored)
     if image is None:
-        raise ValueError(f"expected a photo that OpenCV can read, got {photo}")
+        raise ValueError(f"OpenCV cannot read the photo {photo}; give a JPEG or PNG file")
     points = cv2.SIFT.create(contrastThreshold=CONTRAST, enable_precise_upscale=True).detect(image)
     rows = np.array([(*point.pt, point.size) for point in points], np.float64).reshape(-1, 3)
     rows = rows[np.argsort(-rows[:, 2], kind="stable")[:most]]
     pixels, first = np.unique(rows[:, :2], axis=0, return_index=True)
     if not len(pixels):
-        raise ValueError(f"expected a photo with keypoints, got none in {photo}")
+        raise ValueError(f"no keypoints were found in {photo}")
     return Keypoints(pixels + CENTRE, rows[first, 2], (image.shape[1], image.shape[0]))
 
 
@@ -189,21 +189,21 @@ def read_features(file: Path, photo: str, size: Size | None = None) -> Keypoints
     try:
         h5py = importlib.import_module("h5py")  # optional
     except ImportError as error:
-        raise ValueError("expected the package h5py, to read HDF5 files, got none; try `pip install h5py`") from error
+        raise ValueError("HDF5 files need the package h5py; install it with `pip install h5py`") from error
     try:
         with h5py.File(file, "r") as content:
             if photo not in content or "keypoints" not in content[photo]:
                 some = ", ".join(list(content)[:5])
-                raise ValueError(f"expected keypoints of {photo} in {file}, got {some or 'an empty file'}")
+                raise ValueError(f"{file} has no keypoints of {photo}, but of {some or 'no photo'}")
             group = content[photo]
             pixels = np.asarray(group["keypoints"], np.float64)
             scores = np.asarray(group["scores"], np.float64) if "scores" in group else np.ones(len(pixels))
             stored = tuple(int(value) for value in group["image_size"]) if "image_size" in group else None
     except OSError as error:
-        raise ValueError(f"expected an HDF5 file of keypoints or a database of COLMAP, got {file}: {error}") from error
+        raise ValueError(f"{file} is neither an HDF5 file of keypoints nor a database of COLMAP: {error}") from error
     if pixels.ndim != 2 or pixels.shape[1] != 2 or scores.shape != (len(pixels),):
         raise ValueError(
-            f"expected keypoints (m, 2) and scores (m,) of {photo} in {file}, got {pixels.shape} and {scores.shape}"
+            f"{photo} in {file} has keypoints {pixels.shape} and scores {scores.shape}, not (m, 2) and (m,)"
         )
     return _checked(Keypoints(pixels + CENTRE, scores, stored), size, f"{photo} in {file}")  # type: ignore[arg-type]
 
@@ -229,18 +229,18 @@ def read_database(file: Path, photo: str, size: Size | None = None) -> Keypoints
             row = content.execute(QUERY, (photo,)).fetchone()
             names = ", ".join(str(name) for (name,) in content.execute("SELECT name FROM images LIMIT 5"))
     except sqlite3.Error as error:
-        raise ValueError(f"expected a database of COLMAP, got {file}: {error}") from error
+        raise ValueError(f"{file} is no database of COLMAP: {error}") from error
     if row is None or not row[0]:
-        others = "" if row else f", but {names}" if names else ": it has no images"
-        raise ValueError(f"expected keypoints of {photo} in {file}, got none{others}")
+        others = "" if row else f", but of {names}" if names else ": it has no images"
+        raise ValueError(f"{file} has no keypoints of {photo}{others}")
     count, columns, data, *stored = row
     length, where = len(data) if isinstance(data, bytes) else 0, f"{photo} in {file}"
     if columns not in COLUMNS or not isinstance(count, int) or length != 4 * count * columns:
-        expected = "rows of 2, 4 or 6 numbers of 4 bytes"
-        raise ValueError(f"expected {expected} for {where}, got {count} rows of {columns} in {length} bytes")
+        stated = f"{count} rows of {columns} numbers in {length} bytes"
+        raise ValueError(f"the keypoints of {where} are damaged: {stated}; they are rows of 2, 4 or 6, of 4 bytes each")
     rows = np.frombuffer(data, "<f4").reshape(count, columns).astype(np.float64)
     if not np.isfinite(rows).all():
-        raise ValueError(f"expected finite keypoints of {where}, got {(~np.isfinite(rows)).any(1).sum()} that are not")
+        raise ValueError(f"{(~np.isfinite(rows)).any(1).sum()} keypoints of {where} are NaN or infinite")
     scores = rows[:, 2] if columns == 4 else np.ones(count)
     if columns == 6:  # the mean length of the columns of the shape
         scores = np.linalg.norm(rows[:, 2:].reshape(-1, 2, 2), axis=1).mean(1)
@@ -252,11 +252,13 @@ def read_database(file: Path, photo: str, size: Size | None = None) -> Keypoints
 def _checked(keypoints: Keypoints, size: Size | None, where: str) -> Keypoints:
     """Return keypoints with the size of their photo; raise ValueError if sizes differ or keypoints lie outside it."""
     if None not in (keypoints.size, size) and keypoints.size != size:
-        raise ValueError(f"expected keypoints of {where} at the size {size} of the photo, got them at {keypoints.size}")
+        raise ValueError(
+            f"the keypoints of {where} are those of a photo of size {keypoints.size}, but the photo has {size}"
+        )
     known = size or keypoints.size
     if known is not None and (outside := outside_image(keypoints.pixels, known)).any():
         raise ValueError(
-            f"expected keypoints inside the {known[0]} x {known[1]} pixels of {where}, got {int(outside.sum())} "
-            f"outside, such as {keypoints.pixels[outside][0].round(1).tolist()}; try features of this size"
+            f"{int(outside.sum())} keypoints are outside the {known[0]} x {known[1]} pixels of {where}, such as "
+            f"{keypoints.pixels[outside][0].round(1).tolist()}; give features of a photo of this size"
         )
     return keypoints._replace(size=known)

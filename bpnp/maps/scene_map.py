@@ -93,8 +93,8 @@ class SceneMap(ViewedPoints):
         )
         if not any(len(view.points) for view in views):
             raise ColmapError(
-                f"expected a map with views that see points in {path}, got {len(views)} views and "
-                f"{len(model.point_ids)} points; try a model with registered images"
+                f"no view of {path} sees a point; it has {len(views)} views and {len(model.point_ids)} points. Give a "
+                "model with registered images"
             )
         scene = cls(model.points3d, model.point_ids, np.zeros(len(model.point_ids), np.int32), views).seen_by(1)
         if len(scene.points3d) < index.LARGE:
@@ -232,7 +232,7 @@ class SceneMap(ViewedPoints):
     ) -> Camera | UnknownCamera:
         """Return the camera model of a photo, or its prior if the focal length is unknown."""
         if camera is None and image_size is None:
-            raise ValueError("expected a `camera`, or `image_size` where the focal length is unknown, got neither")
+            raise ValueError("`camera` is missing; give it, or `image_size` if the focal length is unknown")
         if image_size is None and focal_error is None and not distortion:
             return camera_from(camera)
         unknown = unknown_camera(camera, image_size, focal_error, distortion)
@@ -292,8 +292,8 @@ class SceneMap(ViewedPoints):
         size, lens = photo_size(path), None if camera is None or isinstance(camera, str) else camera_from(camera)
         if lens is not None and (known := image_size_of(lens)) not in (None, size):
             raise ValueError(
-                f"expected photos of {known[0]} x {known[1]} pixels as the camera has, got {path.name} of {size[0]} x "
-                f"{size[1]}; try a camera with the focal length and the centre of this size, or that of the map"
+                f"{path.name} has {size[0]} x {size[1]} pixels, but its camera {known[0]} x {known[1]}; give a camera "
+                "with the focal length and the centre of this size, or that of the map"
             )
         points = photo_keypoints(path, keypoints, path.name if name is None else name)
         known_lens = lens is not None
@@ -343,13 +343,16 @@ class SceneMap(ViewedPoints):
             return fitting[len(fitting) // 2]
         if exif:
             return None, "unknown focal length"
-        wanted = f"views of the shape of {photo} of {width} x {height} pixels with one focal length"
         if fitting:
-            got = f"{len(fitting)} of {fitting[0][0].focal:.0f} to {fitting[-1][0].focal:.0f} pixels"
+            focals = f"{fitting[0][0].focal:.0f} to {fitting[-1][0].focal:.0f} pixels"
+            found = f"the {len(fitting)} cameras of this shape have focal lengths of {focals}"
         else:
             others = ", ".join(sorted({"{} x {}".format(*known) for known in sizes.values() if known})[:4])
-            got = f"none: the map's are of {others}"
-        raise ValueError(f"expected {wanted}, got {got}; try --camera with the camera of the photo, or unknown")
+            found = f"its images have {others} pixels"
+        raise ValueError(
+            f"no camera of the map fits {photo} of {width} x {height} pixels: {found}; give --camera of the photo, or "
+            "unknown"
+        )
 
 
 def _direction(up_camera: Any) -> Array:

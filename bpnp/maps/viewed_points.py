@@ -117,7 +117,7 @@ class ViewedPoints:
         wanted = list(names)
         if unknown := [name for name in wanted if name not in self.view_numbers]:
             some = ", ".join(view.name for view in self.views[:5])
-            raise ValueError(f"expected names of views of the map, got {', '.join(unknown[:5])}; try {some}, ...")
+            raise ValueError(f"the map has no views {', '.join(unknown[:5])}; its views are {some}, ...")
         return [self.views[self.view_numbers[name]] for name in wanted]
 
     def without(self: Map, names: Collection[str]) -> Map:
@@ -140,7 +140,7 @@ class ViewedPoints:
             tracks[view.points] += 1
         enough = tracks >= least
         if not enough.any():
-            raise ValueError(f"expected points that {least} or more views see, got none in {len(self.views)} views")
+            raise ValueError(f"the map has no points that {least} or more views see, among {len(self.views)} views")
         index = np.cumsum(enough, dtype=np.int32) - 1
         views = tuple(replace(view, points=index[view.points[enough[view.points]]]) for view in self.views)
         return type(self)(self.points3d[enough], self.point_ids[enough], tracks[enough], views)
@@ -164,7 +164,7 @@ class ViewedPoints:
         if views is not None:
             named = self.named(views)
             if not named:
-                raise ValueError("expected names of views to try, got none; try views=None for all of the map")
+                raise ValueError("`views` is empty; give names of views, or None for all views of the map")
             points = np.unique(np.concatenate([view.points for view in named]))
             return [Place(view, points, lens) for view in named if len(view.points) and len(points) >= MIN_POINTS]
         cameras: list[Camera] = lens.ladder(STEP) if isinstance(lens, UnknownCamera) else [lens]

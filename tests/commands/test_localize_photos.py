@@ -84,7 +84,7 @@ def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, 
     out = ("--output", str(tmp_path / "out"))
     assert "missing map, photos" in fails("localize")
     assert "missing photos" in fails("localize", str(model), *out)
-    assert "a.jpg, which does not exist" in fails("localize", str(model), "a.jpg", *out)
+    assert "a.jpg does not exist; give a photo" in fails("localize", str(model), "a.jpg", *out)
     Image.new("RGB", (64, 48)).save(tmp_path / "plain.jpg")
     plain = ("localize", str(model), str(tmp_path / "plain.jpg"))
     # What no photo can be localised with is said once, before the first photo.
@@ -94,7 +94,7 @@ def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, 
         (("--solver", "nothing"), "name of packaged weights"),
         (("--model", str(model)), "nrecognized arguments: --model"),
         (("--time_limit", "-1"), "`time_limit` is -1.0; it must be a positive number"),
-        (("--views", "nothing.txt"), "expected a text file of lines `photo view`"),
+        (("--views", "nothing.txt"), "--views needs a text file of lines `photo view`"),
         (("--output", str(tmp_path / "plain.jpg")), ": it is a file, or lies in one"),
     ):
         error = fails(*plain, *out, *given)
@@ -106,16 +106,16 @@ def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, 
         assert error.rstrip().endswith(f"MAP {swapped} is no folder of a COLMAP model; are MAP and PHOTO swapped?")
     assert f"MAP {plain[2]} is no folder of a COLMAP model\n" in fails("localize", plain[2], plain[2], *out)
     error = fails(*plain, *out)
-    assert "expected a photo with keypoints, got none" in error
-    assert "views of the shape of" in fails(*plain, "--camera", str(model), *out)
+    assert "no keypoints were found in" in error
+    assert "no camera of the map fits" in fails(*plain, "--camera", str(model), *out)
     for size, parameters in (("128 x 96", "128,96,80,64,48"), ("64 x 36", "64,36,80,32,18")):
         error = fails(*plain, "--camera", f"SIMPLE_PINHOLE,{parameters}", *out)
-        assert f"expected photos of {size} pixels as the camera has, got plain.jpg of 64 x 48" in error
+        assert f"plain.jpg has 64 x 48 pixels, but its camera {size}" in error
     pairs = tmp_path / "pairs.txt"
     known = ("--camera", CAMERA, "--views", str(pairs), "--output", str(tmp_path / "views"))
     for line, message in (
-        ("0004.jpg nowhere.jpg", "expected names of views of the map, got nowhere.jpg"),
-        ("0005.jpg 0003.jpg", "expected views for 0004.jpg"),
+        ("0004.jpg nowhere.jpg", "the map has no views nowhere.jpg"),
+        ("0005.jpg 0003.jpg", "the file of views names no view for 0004.jpg"),
     ):
         pairs.write_text(f"{line}\n")
         assert message in fails("localize", str(model), str(photos / "0004.jpg"), *known)

@@ -1,6 +1,7 @@
 """Photos on a cluster of two processes have the solutions of one process, also if a worker is killed in between."""
 
 import os
+import re
 import signal
 from collections.abc import Iterator
 from dataclasses import replace
@@ -65,7 +66,7 @@ def test_a_lost_worker_loses_nothing(place: tuple[Path, Path, Path], cluster: Lo
         assert set(client.run(os.getpid).values()) != set(workers.values())
 
     assert set(results) == set(alone) == {task.name for task in photos}
-    assert "expected a photo that can be read" in str(results.pop("lost.png"))
+    assert "cannot read the photo" in str(results.pop("lost.png"))
     for name, solution in results.items():
         assert isinstance(solution, Solution)
         assert solution.verdict == "confident"
@@ -78,7 +79,7 @@ def test_processes_started_here_are_ended(place: tuple[Path, Path, Path]) -> Non
     scene = SceneMap.from_colmap(place[0])
     lost = replace(tasks(place, scene)[0], name="lost.png", photo=place[1] / "lost.png")
     ((task, reason),) = attempts_on_cluster(scene, [lost], "1")
-    assert (task.name, "expected a photo that can be read" in str(reason)) == ("lost.png", True)
+    assert (task.name, "cannot read the photo" in str(reason)) == ("lost.png", True)
     left = [" ".join(each.cmdline()) for each in set(psutil.Process().children(recursive=True)) - before]
     # Python's own tracker of shared memory is started with the first process and lives as long as this one.
     assert [words for words in left if "multiprocessing.resource_tracker" not in words] == []
@@ -92,8 +93,8 @@ def test_the_command_takes_a_cluster(place: tuple[Path, Path, Path], cluster: Lo
     assert [line.split()[0] for line in lines if not line.startswith("#")] == list(VIEWS)
 
 
-@pytest.mark.parametrize(("cluster_name", "got"), [("0", "got 0"), ("nowhere", "got nowhere"), ("tcp://[", "got tcp")])
-def test_no_scheduler_is_one_clear_error(place: tuple[Path, Path, Path], cluster_name: str, got: str) -> None:
+@pytest.mark.parametrize("cluster_name", ["0", "nowhere", "tcp://["])
+def test_no_scheduler_is_one_clear_error(place: tuple[Path, Path, Path], cluster_name: str) -> None:
     scene = SceneMap.from_colmap(place[0])
-    with pytest.raises(ValueError, match=f"expected .*{got}".replace("[", r"\[")):
+    with pytest.raises(ValueError, match=f"--cluster is {re.escape(cluster_name)}[;,]"):
         next(attempts_on_cluster(scene, tasks(place, scene), cluster_name))

@@ -78,7 +78,9 @@ def test_views_with_different_focal_lengths_give_no_camera(tmp_path: Path) -> No
     zoomed = replace(scene.views[1], camera=camera_from(("PINHOLE", WIDTH, HEIGHT, [900, 900, 400, 300])))
     scene = replace(scene, views=(scene.views[0], zoomed))
     assert scene.camera_for(photo_with(tmp_path / "b.jpg", (WIDTH, HEIGHT))) == (None, "unknown focal length")
-    with pytest.raises(ValueError, match=r"with one focal length, got 2 of 520 to 900 pixels; try --camera"):
+    with pytest.raises(
+        ValueError, match=r"the 2 cameras of this shape have focal lengths of 520 to 900 pixels; give --camera"
+    ):
         scene.camera_for(tmp_path / "b.jpg", exif=False)
 
 
@@ -95,7 +97,5 @@ def test_a_photo_is_localised_with_any_of_its_cameras(shared_data: Path) -> None
         assert solution.verdict == "confident"
         np.testing.assert_allclose(solution.rotation, view.rotation, atol=2e-3)
         assert solution.reprojection_error < 1
-    with pytest.raises(
-        ValueError, match="expected photos of 3072 x 2048 pixels as the camera has, got 0004.jpg of 1536"
-    ):
+    with pytest.raises(ValueError, match="0004.jpg has 1536 x .* pixels, but its camera 3072 x 2048"):
         scene.localize_photo(photo, view.camera)

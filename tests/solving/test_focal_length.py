@@ -185,7 +185,7 @@ def test_a_photo_is_localised_without_its_focal_length(tmp_path: Path) -> None:
         solution = scene.localize(keypoints, **known, views=["photo 0.jpg"], solver="search")
         assert solution.focal_length == pytest.approx(520, rel=0.01)
         assert degrees_between(solution.rotation, truth.rotations[0]) < 0.1
-    with pytest.raises(ValueError, match="or `image_size` where the focal length is unknown, got neither"):
+    with pytest.raises(ValueError, match="`camera` is missing; give it, or `image_size`"):
         scene.localize(pixels)
 
 
