@@ -430,13 +430,18 @@ def log10_tests(problem: Problem) -> float:
 
 
 def _log10_choices(problem: Problem, pairs: int) -> float:
+    return math.log10(2 * max(count_choices(problem, pairs), 1.0))
+
+
+def count_choices(problem: Problem, pairs: int) -> float:
+    """Return the number of choices of `pairs` matches; labels, if given, have to agree."""
     m, n = len(problem.bearings), len(problem.points3d)
     choices = math.prod((m - i) * (n - i) / (i + 1) for i in range(pairs))
     if problem.labels2d is not None and problem.labels3d is not None:
         groups = label_groups(np.arange(m), problem.labels2d, problem.labels3d, n)
         agreeing = sum(len(rows) * len(columns) for rows, columns in groups)
         choices = min(choices, math.prod((agreeing - i) / (i + 1) for i in range(pairs)))
-    return math.log10(2 * max(choices, 1.0))
+    return choices
 
 
 def log10_lenses(problem: Problem) -> Array:

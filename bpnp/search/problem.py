@@ -293,6 +293,20 @@ class Problem:
         return np.concatenate(i), np.concatenate(j)
 
     @cached_property
+    def candidate_scores(self) -> Array | None:
+        """(m,) mean of `scores3d` over the scene points whose label fits each image point, over that of all points.
+
+        None without labels or `scores3d`, and with class probabilities.
+        """
+        if self.labels2d is None or self.labels3d is None or self.scores3d is None or self.odds2d is not None:
+            return None
+        scores = np.ones(len(self.labels2d))
+        for rows, columns in label_groups(np.arange(len(scores)), self.labels2d, self.labels3d, len(self.labels3d)):
+            if len(columns):
+                scores[rows] = self.scores3d[columns].mean() / self.scores3d.mean()
+        return scores
+
+    @cached_property
     def registered(self) -> list[tuple[Array, Array, Motions]]:
         """Poses (3, 3), (3,) with the motions of the scene that were computed from their matched points."""
         return []

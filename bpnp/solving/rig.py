@@ -1,75 +1,112 @@
 """`solve` with a `rig`: argument checks, the search for one pose of all cameras, and the `Solution`."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from bpnp.cameras import camera_from
 from bpnp.loops.parallel import Clock, Deadline
+from bpnp.search.config import DEFAULT as SEARCH
 from bpnp.search.evidence.covariance import student_factor
 from bpnp.search.pose_model import crossed
 from bpnp.search.problem import Problem
 from bpnp.search.rig.cameras import Pose, Rig
 from bpnp.search.rig.search import search_rig
+from bpnp.search.starts import GravityPrior, PosePrior
 from bpnp.search.verdict import SearchResult, no_pose
-from bpnp.solving.arguments import Array, about, checked_pose, each_camera, each_set, numbers
+from bpnp.solving.arguments import Array, Prior, about, checked_pose, numbers
+from bpnp.solving.focal_length import UnknownCamera
 from bpnp.solving.inputs import problem_from
 from bpnp.solving.matches import SCALES, one_to_one, without_pose
 from bpnp.solving.solution import POSE_PARAMETERS, SCALE, Solution, with_pose
 from bpnp.solving.sources import Options
 
 
-def solve_rig(
-    points2d: Any,
+def prepare_rig(
+    points2d: Sequence[Any],
     points3d: Any,
-    camera: Any,
-    rig: Sequence[Any],
+    cameras: Sequence[Any],
+    unknown: Sequence[UnknownCamera] | None,
+    mounts: Sequence[Pose],
     known: Mapping[str, Any],
     options: Options,
     *,
+    prior: Prior | None = None,
     scale: bool = False,
-) -> Solution:
-    """Estimate the pose rig_from_world of a rig; arguments as for `bpnp.solve`.
+) -> Callable[[], Solution]:
+    """Check the problem of a rig, and return the function that estimates its pose rig_from_world; see `bpnp.solve`.
 
     Args:
-        points2d: List of arrays (m_i, 2), one per camera.
+        points2d: Points of each camera.
         points3d: (n, 3) scene points.
-        camera: One camera for all, or a list with one each.
-        rig: Extrinsics cam_from_rig of each camera.
-        known: Normals and labels.
+        cameras: Camera of each of them; None for normalised coordinates and bearings.
+        unknown: Cameras with an unknown focal length; None if it is known.
+        mounts: Extrinsics cam_from_rig of each camera.
+        known: Lists of `labels2d` and `scores2d`, one array or None per camera; `normals3d`, `labels3d`, `scores3d`.
         options: Options of the search.
+        prior: Prior of the pose of the rig.
         scale: Estimate the scale of the scene too. Default False.
     """
-    begun, labels2d = Clock.now(), known["labels2d"]
-    mounts = [_mount(f"rig[{k}]", mount) for k, mount in enumerate(rig)]
-    images = each_set("points2d", points2d, None)
-    for name, values in (("points2d", images), ("camera", camera), ("labels2d", labels2d)):
-        if isinstance(values, list) and len(values) != len(mounts):
-            raise ValueError(f"expected {len(mounts)} of `{name}`, one a camera of the `rig`, got {len(values)}")
-    labels, problems = each_set("labels2d", labels2d, len(mounts), 1), []
-    for k, one in enumerate(each_camera(camera, len(mounts))):
+    if unknown is not None:
+        raise ValueError("expected no unknown focal length with `rig`; give the `camera` of each image")
+    if options.clutter is not None:
+        SEARCH.expecting(options.clutter)  # raises for one that is out of range
+    problems = []
+    for k, (image, one) in enumerate(zip(points2d, cameras, strict=True)):
         lens = None if one is None else camera_from(one)
+        arrays = {name: values[k] if name.endswith("2d") else values for name, values in known.items()}
         with about(f"camera {k}"):
-            problems.append(problem_from(images[k], points3d, lens, **{**known, "labels2d": labels[k]}))
-    cameras = Rig(problems, mounts, is_metric=not scale)
-    if scale and not cameras.apart:
+            problem = problem_from(image, points3d, lens, prior=_prior_of(mounts[k], prior, scale=scale), **arrays)
+            problems.append(replace(problem, clutter=options.clutter))
+    rig = Rig(problems, mounts, is_metric=not scale)
+    if scale and not rig.apart:
         raise ValueError(
             "expected cameras that are apart in `rig` with `scale=True`, got one centre for all, which tells no scale"
         )
-    reasons = [problem.degenerate for problem in problems if problem.degenerate is not None]
+    return partial(_solve, rig, options)
+
+
+def _prior_of(mount: Pose, prior: Prior | None, *, scale: bool) -> Prior | None:
+    """Return the prior of the pose of a rig as a prior of the pose of one of its cameras.
+
+    Raises:
+        ValueError: The prior restricts the translation, whose unit in the scene is unknown with `scale`.
+    """
+    turn, shift = mount
+    if isinstance(prior, GravityPrior):
+        return prior._replace(up_camera=turn @ np.asarray(prior.up_camera))
+    if not isinstance(prior, PosePrior):
+        return None
+    known, translation = turn @ np.asarray(prior.rotation), prior.translation
+    if not scale:
+        return prior._replace(
+            rotation=known, translation=None if translation is None else turn @ np.asarray(translation) + shift
+        )
+    if translation is not None and math.isfinite(prior.translation_sigma):
+        raise ValueError(
+            "`prior` has a `translation_sigma`, but with `scale=True` the unit of the scene is unknown, so that the "
+            "distance of the scene from a camera is unknown too; use PosePrior(rotation, None, rotation_sigma_deg)"
+        )
+    return prior._replace(rotation=known, translation=None, translation_sigma=math.inf)
+
+
+def _solve(rig: Rig, options: Options) -> Solution:
+    begun = Clock.now()
+    reasons = [problem.degenerate for problem in rig.problems if problem.degenerate is not None]
     if reasons:
         result = no_pose(reasons[0])
     else:
         deadline = Deadline.after(options.time_limit)
-        result = search_rig(cameras, clutter=options.clutter, seed=options.seed, deadline=deadline)
-    solution = _finished(cameras, problems, result, options.inlier_threshold)
+        result = search_rig(rig, clutter=options.clutter, seed=options.seed, deadline=deadline)
+    solution = _finished(rig, rig.problems, result, options.inlier_threshold)
     return replace(solution, seconds=Clock.now() - begun)
 
 
-def _mount(name: str, value: Any) -> Pose:
+def mount_from(name: str, value: Any) -> Pose:
     """Return rotation and translation of extrinsics cam_from_rig, given as (3, 4), (4, 4) or (R, t)."""
     if isinstance(value, tuple) and len(value) == 2:
         return checked_pose(f"{name}.", *value)

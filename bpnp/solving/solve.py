@@ -29,9 +29,8 @@ from bpnp.solving.arguments import (
     source_from,
 )
 from bpnp.solving.focal_length import solved_with_focal_length, unknown_camera
-from bpnp.solving.infinity import solve_directions
 from bpnp.solving.inputs import problem_from
-from bpnp.solving.rig import solve_rig
+from bpnp.solving.modes import prepare_mode
 from bpnp.solving.solution import Solution
 from bpnp.solving.sources import Options, Progress, solutions_of
 
@@ -140,33 +139,41 @@ def solve(
     >>> bool(np.allclose(solution.translation, [0, 0, 6], atol=1e-6))
     True
     """
-    normals_and_labels: dict[str, Any] = {"normals3d": normals3d, "labels2d": labels2d, "labels3d": labels3d}
-    scores: dict[str, Any] = {"scores2d": scores2d, "scores3d": scores3d}
-    options = Options(
-        inlier_threshold=positive("inlier_threshold", inlier_threshold, finite=True),
-        clutter=clutter,
-        seed=checked_seed(seed),
-        time_limit=seconds_from(time_limit, SECONDS),
-    )
-    beside: dict[str, Any] = {
-        "solver": None if solver in ("auto", "search") else solver,
-        "prior": prior,
-        "device": device,
+    known: dict[str, Any] = {
+        "normals3d": normals3d,
+        "labels2d": labels2d,
+        "labels3d": labels3d,
+        "scores2d": scores2d,
+        "scores3d": scores3d,
     }
-    if scale and rig is None:
+    if scale and rig is None and not at_infinity:
         raise ValueError("expected a `rig` with `scale=True`, got none: one camera does not see the unit of a scene")
-    if at_infinity:
-        beside |= {"distortion": distortion or None, "scores3d": scores3d, "clutter": clutter, "rig": rig}
-        _refuse(normals_and_labels | beside, "at_infinity")
-        rough = image_size is not None or focal_error is not None
-        unknown = unknown_camera(camera, image_size, focal_error) if rough else None
-        return solve_directions(pixels_from(points2d, camera), points3d, camera, unknown, scores2d, options)
-    if rig is not None:
-        lens = {"image_size": image_size, "focal_error": focal_error, "distortion": distortion or None}
-        _refuse(scores | beside | lens, "rig")
-        return solve_rig(points2d, points3d, camera, rig, normals_and_labels, options, scale=scale)
+    seconds = seconds_from(time_limit, SECONDS)
+    if at_infinity or rig is not None:
+        solve_one = prepare_mode(
+            points2d,
+            points3d,
+            camera,
+            known,
+            Options(
+                inlier_threshold=positive("inlier_threshold", inlier_threshold, finite=True),
+                clutter=None if clutter is None else float(clutter),
+                seed=checked_seed(seed),
+                time_limit=seconds,
+            ),
+            at_infinity=at_infinity,
+            rig=rig,
+            scale=scale,
+            image_size=image_size,
+            focal_error=focal_error,
+            distortion=distortion,
+            prior=prior,
+            solver=solver,
+            device=device,
+        )
+        return solve_one()
     points: dict[str, Any] = {"points2d": points2d, "points3d": points3d}
-    arrays: dict[str, Any] = {name: [values] for name, values in (points | normals_and_labels | scores).items()}
+    arrays: dict[str, Any] = {name: [values] for name, values in (points | known).items()}
     return solve_many(
         camera=camera,
         image_size=image_size,
@@ -177,18 +184,11 @@ def solve(
         inlier_threshold=inlier_threshold,
         clutter=clutter,
         seed=seed,
-        time_limit=options.time_limit,
+        time_limit=seconds,
         device=device,
         progress=progress,
         **arrays,
     )[0]
-
-
-def _refuse(options: Mapping[str, Any], kind: str) -> None:
-    """Raise ValueError if an option is set that this mode (`kind`) does not support."""
-    for name, value in options.items():
-        if value is not None:
-            raise ValueError(f"expected no `{name}` with `{kind}`, got {value!r:.60}; try without one of them")
 
 
 def solve_many(

@@ -29,7 +29,6 @@ CALLS: dict[str, Any] = {
     "many": partial(solve_many, points2d=[X, X], points3d=P),
     "verify": partial(verify, **SEEN, rotation=np.eye(3), translation=[0, 0, 5.0]),
 }
-NO_PRIOR = PosePrior(np.eye(3), np.zeros(3), 5.0, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -140,11 +139,11 @@ NO_PRIOR = PosePrior(np.eye(3), np.zeros(3), 5.0, 1.0)
         ("sky", {"points2d": PIXELS[:2]}, "`points2d` has 2 points; at least 3 are needed"),
         ("sky", {"points2d": X}, "which look normalised; give pixels with a `camera`"),
         ("sky", {"camera": None}, "`points2d` has values .*, not normalised image coordinates"),
-        ("sky", {"prior": NO_PRIOR}, "expected no `prior` with `at_infinity`, got Pose"),
-        ("sky", {"normals3d": P}, "expected no `normals3d` with `at_infinity`"),
-        ("sky", {"labels2d": [1], "labels3d": [1]}, "expected no `labels2d` with `at_infinity`"),
-        ("sky", {"clutter": 0.2}, "expected no `clutter` with `at_infinity`"),
-        ("sky", {"solver": "matcher-maps"}, "expected no `solver` with `at_infinity`"),
+        ("sky", {"normals3d": P}, "`normals3d` has no meaning .* no surface"),
+        ("sky", {"scale": True}, "`scale=True` has no meaning .* no unit of length"),
+        ("sky", {"labels2d": [1], "labels3d": [1]}, r"`labels2d` has the shape \(1,\), not \(20,\)"),
+        ("sky", {"clutter": 1.2}, "`clutter`"),
+        ("sky", {"solver": "matcher-maps"}, "`solver` is 'matcher-maps', but networks are trained for .* one camera"),
         ("sky", {"scores2d": np.zeros(20)}, "`scores2d` is 0.0 at point 0; scores are above 0"),
         ("sky", {"inlier_threshold": -1}, "`inlier_threshold` is .*; it must be a positive number"),
         # Several cameras.
@@ -152,10 +151,12 @@ NO_PRIOR = PosePrior(np.eye(3), np.zeros(3), 5.0, 1.0)
         ("rig", {"rig": [np.eye(4)]}, "expected 1 of `points2d`, one a camera of the `rig`, got 2"),
         ("rig", {"rig": [np.eye(4), np.eye(3)]}, r"`rig\[1\]` as cam_from_rig, \(3, 4\), \(4, 4\) or \(R, t\)"),
         ("rig", {"rig": [np.eye(4), 2 * np.eye(4)]}, r"`rig\[1\].rotation` is no rotation matrix"),
-        ("rig", {"prior": GravityPrior([0, 1, 0], [0, 1, 0])}, "expected no `prior` with `rig`"),
-        ("rig", {"scores3d": np.ones(20)}, "expected no `scores3d` with `rig`"),
-        ("rig", {"image_size": SIZE}, "expected no `image_size` with `rig`"),
-        ("rig", {"solver": "matcher-sfm"}, "expected no `solver` with `rig`"),
+        ("rig", {"prior": "learned"}, "`prior` is the network 'learned', but networks are trained for .* one camera"),
+        ("rig", {"scores3d": np.ones(19)}, r"camera 0: `scores3d` has the shape \(19,\), not \(20,\)"),
+        ("rig", {"scores2d": [np.ones(6)]}, "expected 2 of `scores2d`, one a camera of the `rig`, got 1"),
+        ("rig", {"clutter": 1.0}, "`clutter`"),
+        ("rig", {"image_size": SIZE}, "`camera` and `image_size` exclude each other"),
+        ("rig", {"solver": "matcher-sfm"}, "`solver` is 'matcher-sfm', but networks are trained for .* one camera"),
         ("rig", {"points2d": [np.zeros((3, 2)), np.zeros((5, 2))]}, "camera 0: `points2d` has 3 points"),
         ("rig", {"labels2d": [np.zeros(6, int)]}, "expected 2 of `labels2d`"),
         ("rig", {"scale": True}, "expected cameras that are apart in `rig` with `scale=True`, got one centre for all"),

@@ -234,12 +234,15 @@ def _shares(problem: Problem) -> Array:
     """Return the fractions w of image points with a correspondence that are tried.
 
     Returns:
-        (W,), or with scores (k, 1, W), in proportion to the score of each chosen point.
+        (W,), or with scores (k, 1, W), in proportion to the score of each chosen point and of the scene points that
+            its label admits.
     """
     shares = SHARES if problem.clutter is None else np.array([1 - problem.clutter])
     if problem.scores2d is not None:
         shares = shares * (problem.scores2d[problem.image.chosen] / problem.scores2d.mean())[:, None, None]
-    elif problem.clutter is None:
+    if problem.candidate_scores is not None:
+        shares = shares * problem.candidate_scores[problem.image.chosen][:, None, None]
+    elif problem.clutter is None and problem.scores2d is None:
         return shares
     return np.asarray(np.clip(shares, LEAST_SHARE, MOST_SHARE))
 

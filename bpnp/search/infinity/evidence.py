@@ -16,11 +16,16 @@ points and pair of directions. Two matches fix a rotation, so the two largest x_
 within 2 s of point i are one observation. With h the RMS angular radius of the image points, 8 pi^2 h / s^3 rotations
 are distinguishable at s; T is this number if it is smaller.
 
+With labels, T counts only pairs with equal labels, and l_i is the density of the directions with the label. Class
+probabilities and scores of the directions multiply the predicted density. A prior reduces T to the fraction of the
+rotations that it allows.
+
 Sources: A. Desolneux, L. Moisan, J.-M. Morel, Meaningful alignments, IJCV 2000; F. L. Markley, Attitude determination
 using vector observations and the singular value decomposition, J. Astronautical Sciences 1988 (covariance).
 """
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -28,10 +33,11 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from bpnp.search.evidence.covariance import covariance_of, of_sure_matches, student_factor
-from bpnp.search.evidence.false_alarms import SHARES, Terms, log10_nfa
+from bpnp.search.evidence.false_alarms import LEAST_SHARE, MOST_SHARE, SHARES, Terms, log10_nfa
 from bpnp.search.evidence.uncertainty import EXCEEDED, STRAINS, exceeded_once
 from bpnp.search.kernels.neighbours import sums_near
-from bpnp.search.pose_model import FIXING_ROTATION, PoseModel, log10_rotations
+from bpnp.search.pose_model import FIXING_ROTATION, PoseModel, count_choices, log10_rotations
+from bpnp.search.problem import Problem
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
@@ -48,51 +54,64 @@ class Background(NamedTuple):
         log_tests: (S,) natural log of the number of tests at each scale.
         together: (m, S) c_i.
         pixel: (m,) angle of a pixel, radians.
+        shares: (W,) or (m, 1, W) fractions w of image points with a match.
     """
 
     scales: Array
     log_tests: Array
     together: Array
     pixel: Array
+    shares: Array
 
 
-def background_of(bearings: Array, pixel: Array, count: int, noise: float, zooms: float = 0.0) -> Background:
+def background_of(problem: Problem, pixel: Array, noise: float) -> Background:
     """Compute the constants of the number of false alarms.
 
     Args:
-        bearings: (m, 3) of the image points.
+        problem: Image points (m) and directions; `focal` has the range of an unknown focal length and distortion.
         pixel: (m,) angle of a pixel, radians.
-        count: Number of directions.
         noise: Largest scale s, pixels.
-        zooms: Log of the largest over the smallest focal length if it is unknown; default 0.
     """
-    m, scales = len(bearings), np.asarray(noise * 0.5 ** np.arange(STEPS), np.float64)
+    bearings, scales = problem.bearings, np.asarray(noise * 0.5 ** np.arange(STEPS), np.float64)
     spread = float(np.sqrt(((bearings - bearings.mean(0)) ** 2).sum(-1).mean()))
     radians = scales * np.median(pixel)
     cells = math.log(10) * log10_rotations(spread, radians)
-    focal_lengths = np.log(np.maximum(zooms * spread / radians, 1.0))  # distinguishable
-    tests = np.minimum(cells + focal_lengths, math.log(max(m * (m - 1) / 2 * count * (count - 1), 1.0)))
+    if problem.focal is not None:  # distinguishable lenses
+        moved = problem.focal.log_range * spread, problem.focal.radial_range * spread**3
+        cells = cells + sum(np.log(np.maximum(each / radians, 1.0)) for each in moved)
+    tests = np.minimum(cells, math.log(max(count_choices(problem, FIXING_ROTATION), 1.0)))
     axes = np.linalg.svd(bearings - bearings.mean(0), full_matrices=False)[2][:2].T
     together = sums_near(bearings, bearings, axes, 2 * scales[::-1] * np.median(pixel), np.zeros(STEPS))
-    return Background(scales, tests, together[:, ::-1], pixel)
+    shares = SHARES if problem.clutter is None else np.array([1 - problem.clutter])
+    if problem.candidate_scores is not None:
+        shares = shares * problem.candidate_scores[:, None, None]
+    if problem.clutter is not None or problem.candidate_scores is not None:
+        shares = np.clip(shares, LEAST_SHARE, MOST_SHARE)
+    return Background(scales, tests, together[:, ::-1], pixel, shares)
 
 
-def log10_false_alarms(squared: Array, density: Array, known: Background) -> tuple[float, Array]:
+def log10_false_alarms(
+    squared: Array, density: Array, known: Background, log10_share: float = 0.0
+) -> tuple[float, Array]:
     """Compute the logarithm of the number of false alarms of a rotation.
 
     Args:
         squared: (m,) squared distances to the nearest directions, in squared pixels; infinite beyond reach.
         density: (m,) density around these directions, per steradian.
         known: Constants from `background_of`.
+        log10_share: log10 of the fraction of the rotations that a prior allows; default 0.
 
     Returns:
         log10 NFA, and the log x_i / c_i (m,) of each image point at the scale and fraction with the largest sum.
     """
     width = known.scales * known.pixel[:, None]
     ratio = np.exp(-0.5 * squared[:, None] / known.scales**2) / (2 * math.pi * width**2 * density[:, None])
-    logs = np.log(1 - SHARES + SHARES * ratio[:, :, None]) / known.together[:, :, None]
-    every, most = np.ones(len(known.scales), np.bool_), float(known.log_tests.max())
-    terms = Terms(logs, known.together, every, ~every, len(every) * len(SHARES), known.log_tests - most)
+    logs = np.log(1 - known.shares + known.shares * ratio[:, :, None]) / known.together[:, :, None]
+    every, tests = np.ones(len(known.scales), np.bool_), known.log_tests
+    if log10_share:  # a prior leaves at least one test
+        tests = np.maximum(tests + math.log(10) * log10_share, 0.0)
+    most = float(tests.max())
+    terms = Terms(logs, known.together, every, ~every, len(every) * known.shares.shape[-1], tests - most)
     return log10_nfa([terms], most / math.log(10), [[FIXING_ROTATION]])[0], terms.of_points()
 
 
@@ -120,27 +139,35 @@ def noise_of(seen: Array, bearings: Array, pixel: Array) -> float:
     return float(np.linalg.norm((bearings - seen) / pixel[:, None])) / math.sqrt(free) if free > 0 else math.nan
 
 
-def how_well_known(seen: Array, bearings: Array, pixel: Array) -> Known:
+def prior_information(problem: Problem) -> Array:
+    """Return the information (3, 3) of the prior on the rotation, per squared radian; 0 without a prior."""
+    model = replace(ROTATION, prior=problem.prior)
+    return model.information(model.state(np.eye(3)))
+
+
+def how_well_known(seen: Array, bearings: Array, pixel: Array, information: Array | None = None) -> Known:
     """Compute the uncertainty of a rotation that was fitted to matches.
 
     Args:
         seen: (k, 3) directions in the camera.
         bearings: (k, 3) of the image points.
         pixel: (k,) angle of a pixel, radians.
+        information: (3, 3) of a prior of the rotation; None without.
 
     Returns:
         Covariance (3, 3), NaN if the matches do not fix the rotation, and its bound.
     """
     unit = pixel[:, None]
-    return uncertainty_of((bearings - seen) / unit, _by_rotation(seen) / unit[:, None])
+    return uncertainty_of((bearings - seen) / unit, _by_rotation(seen) / unit[:, None], information)
 
 
-def uncertainty_of(residual: Array, jacobian: Array) -> Known:
+def uncertainty_of(residual: Array, jacobian: Array, information: Array | None = None) -> Known:
     """Compute the uncertainty of a rotation and of other parameters that were fitted to k matches.
 
     Args:
         residual: (k, d), pixels.
         jacobian: (k, d, 3 + q) derivatives of the predictions by rotation and other parameters, pixels.
+        information: (3 + q, 3 + q) of a prior; None without.
 
     Returns:
         Covariance (3 + q, 3 + q), NaN if the matches do not fix the parameters, and the bound of the rotation.
@@ -149,7 +176,9 @@ def uncertainty_of(residual: Array, jacobian: Array) -> Known:
     free, covariance = 2 * len(residual) - size, None
     if free > 0:
         noise = max(float(np.linalg.norm(residual)) / math.sqrt(free), EXACT)
-        covariance = covariance_of(of_sure_matches(residual / noise, jacobian / noise), fitted=size)
+        matches = of_sure_matches(residual / noise, jacobian / noise)
+        matches = matches if information is None else matches._replace(known=information)
+        covariance = covariance_of(matches, fitted=size)
     if covariance is None:
         return Known(np.full((size, size), math.nan), math.inf)
     return Known(student_factor(free) * covariance, exceeded_once(covariance[:3, :3], float(free)))

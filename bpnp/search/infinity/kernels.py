@@ -1,7 +1,8 @@
 """Look-up tables of a catalogue of directions, and the compiled loops over them.
 
 The tables hold the nearest neighbours of each direction, and the directions near a point of the sphere. One loop scores
-directions whose neighbours match those of an image point; the other fits rotations.
+directions whose neighbours match those of an image point; the other fits rotations. With labels, only points with equal
+labels match; -1 matches any.
 """
 
 import math
@@ -13,9 +14,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bpnp.loops.vectors import F, compiled, cross, part, rotated, turn
+from bpnp.search.enumeration.matching import fits
 from bpnp.search.kernels.neighbours import HashedPoints, entry
 
 Array = NDArray[np.float64]
+Labels = NDArray[np.int64]
 LOG_HALF = math.log(0.5)  # log probability of a match under the true rotation
 TURN = 1 << 16  # steps of an azimuth in a full circle
 CROWDED = 0.45  # probability of a direction in reach by chance, from which a match is no evidence
@@ -29,11 +32,13 @@ class Sky(NamedTuple):
 
     Attributes:
         table: Hash table of unit directions (n, 3).
-        density: (n,) density around each direction, per steradian.
+        density: (2, n) density around each direction, per steradian: of all directions, and of those whose label fits.
+        labels: (n,) labels; (0,) without labels.
     """
 
     table: HashedPoints
     density: Array
+    labels: Labels
 
 
 class Neighbours(NamedTuple):
@@ -55,7 +60,7 @@ class Catalogue(NamedTuple):
 
     Attributes:
         directions: (n, 3) unit vectors.
-        density: (n,) density around each, per steradian.
+        density: (2, n) density around each, per steradian: of all directions, and of those whose label fits.
         neighbours: Nearest neighbours of each.
     """
 
@@ -64,29 +69,60 @@ class Catalogue(NamedTuple):
     neighbours: Neighbours
 
 
-def catalogue_of(directions: Array) -> Catalogue:
-    """Build the catalogue of unit directions (n, 3); the last `KEPT` ones are cached."""
-    return _catalogue(directions.tobytes())
+def catalogue_of(directions: Array, labels: Labels | None = None) -> Catalogue:
+    """Build the catalogue of unit directions (n, 3) with labels (n,); the last `KEPT` ones are cached."""
+    return _catalogue(directions.tobytes(), None if labels is None else labels.tobytes())
 
 
 @lru_cache(KEPT)
-def _catalogue(content: bytes) -> Catalogue:
-    """Build the catalogue of the n directions with these bytes.
+def _catalogue(content: bytes, content_of_labels: bytes | None) -> Catalogue:
+    """Build the catalogue of the n directions and labels with these bytes."""
+    directions = np.frombuffer(content).reshape(-1, 3)
+    count = len(directions)
+    nearest = min(max(MOST // count, DENSITIES[-1]), count - 1)
+    chord, place = (x[:, 1:] for x in cKDTree(directions).query(directions, nearest + 1))
+    every = fitting = _densities(chord)
+    if content_of_labels is not None:
+        fitting = _densities_of_labels(directions, np.frombuffer(content_of_labels, np.int64), every)
+    azimuth = azimuths(directions, directions[place])
+    neighbours = Neighbours(place.astype(np.int32), chord.astype(np.float32), azimuth)
+    return Catalogue(directions, np.stack([every, fitting]), neighbours)
+
+
+def _densities(chord: Array) -> Array:
+    """Return the densities (n,) of directions from the chords (n, k) to their nearest neighbours.
 
     A cap of the sphere with the chord d has the area pi d^2. If d is the chord to the k-th neighbour, the density is
     k / (pi d^2): k - 1 neighbours lie within d, and the direction itself. The mean of its inverse is that of an even
     spread.
     """
-    directions = np.frombuffer(content).reshape(-1, 3)
-    count = len(directions)
-    nearest = min(max(MOST // count, DENSITIES[-1]), count - 1)
-    chord, place = (x[:, 1:] for x in cKDTree(directions).query(directions, nearest + 1))
+    count, nearest = chord.shape
     density = np.full(count, count / (4 * math.pi))
     for k in DENSITIES:
         k = min(k, nearest)
-        density = np.maximum(density, k / (math.pi * np.maximum(chord[:, k - 1], 1e-9) ** 2))
-    azimuth = azimuths(directions, directions[place])
-    return Catalogue(directions, density, Neighbours(place.astype(np.int32), chord.astype(np.float32), azimuth))
+        if k:
+            density = np.maximum(density, k / (math.pi * np.maximum(chord[:, k - 1], 1e-9) ** 2))
+    return density
+
+
+def _densities_of_labels(directions: Array, labels: Labels, every: Array) -> Array:
+    """Return the density (n,) around each direction of those that have its label or -1.
+
+    Args:
+        directions: (n, 3) unit vectors.
+        labels: (n,) labels; a direction with -1 has the density of all directions.
+        every: (n,) density of all directions.
+    """
+    density, values = every.copy(), np.unique(labels[labels >= 0])
+    any_label = np.flatnonzero(labels < 0)
+    order = np.argsort(labels, kind="stable")
+    first, last = (np.searchsorted(labels[order], values, side) for side in ("left", "right"))
+    for start, end in zip(first.tolist(), last.tolist(), strict=True):
+        members = np.r_[order[start:end], any_label]
+        points, nearest = directions[members], min(DENSITIES[-1], len(members) - 1)
+        chord = np.empty((1, 0)) if not nearest else cKDTree(points).query(points, nearest + 1)[0][:, 1:]
+        density[members[: end - start]] = _densities(chord)[: end - start]
+    return density
 
 
 def azimuths(centres: Array, others: Array) -> NDArray[np.int32]:
@@ -113,12 +149,14 @@ class Rays(NamedTuple):
         high: (k,) largest possible chord.
         azimuth: (k,) azimuth in `TURN` steps per circle.
         nats: (k,) log likelihood ratio of a neighbour there under the true rotation and by chance.
+        label: (k,) label of the point, -1 for any.
     """
 
     low: NDArray[np.float32]
     high: NDArray[np.float32]
     azimuth: NDArray[np.int32]
     nats: NDArray[np.float32]
+    label: Labels
 
 
 class Image(NamedTuple):
@@ -127,10 +165,12 @@ class Image(NamedTuple):
     Attributes:
         bearings: (m, 3) unit vectors.
         pixel: (m,) angle of a pixel at each, radians.
+        labels: (m,) labels, -1 for any; (0,) without labels.
     """
 
     bearings: Array
     pixel: Array
+    labels: Labels
 
 
 class Fit(NamedTuple):
@@ -150,8 +190,11 @@ class Fit(NamedTuple):
 
 
 @part
-def _nearest(sky: Any, x: Any, y: Any, z: Any, squared: Any) -> Any:
-    """Return the index of the nearest direction within a squared chord, -1 for none, and its squared chord."""
+def _nearest(sky: Any, x: Any, y: Any, z: Any, squared: Any, label: Any) -> Any:
+    """Return the index of the nearest direction within a squared chord, -1 for none, and its squared chord.
+
+    Only directions whose label fits count.
+    """
     directions, reach, heads, links = sky.table
     place, least = -1, squared
     e = heads[entry(heads, x, y, z, 2 * reach)]
@@ -159,18 +202,19 @@ def _nearest(sky: Any, x: Any, y: Any, z: Any, squared: Any) -> Any:
         j = e >> 3
         dx, dy, dz = directions[j, 0] - x, directions[j, 1] - y, directions[j, 2] - z
         distance = dx * dx + dy * dy + dz * dz
-        if distance < least:
+        if distance < least and (len(sky.labels) == 0 or fits(sky.labels[j], label)):
             place, least = j, distance
         e = links[e]
     return place, least
 
 
 @compiled
-def vote(neighbours: Any, places: Any, rays: Any, shift: int, bins: Any, value: Any, bin_of: Any) -> None:
+def vote(neighbours: Any, labels: Any, places: Any, rays: Any, shift: int, bins: Any, value: Any, bin_of: Any) -> None:
     """Score the agreement of an image point with directions: each ray votes for azimuth shifts to neighbours.
 
     Args:
         neighbours: `Neighbours` of all directions.
+        labels: (n,) labels of the directions; (0,) without labels.
         places: (p,) indices of the directions.
         rays: `Rays` of the image point.
         shift: Right shift of an azimuth that gives its bin.
@@ -178,7 +222,7 @@ def vote(neighbours: Any, places: Any, rays: Any, shift: int, bins: Any, value: 
         value: (p,) output, the largest votes, nats.
         bin_of: (p,) output, the second of the two bins with these votes.
     """
-    count, mask = neighbours.chord.shape[1], len(bins) - 1
+    count, mask, labelled = neighbours.chord.shape[1], len(bins) - 1, len(labels) > 0
     for p in range(len(places)):
         a = places[p]
         for c in range(len(bins)):
@@ -189,6 +233,9 @@ def vote(neighbours: Any, places: Any, rays: Any, shift: int, bins: Any, value: 
                 first += 1
             e = first
             while e < count and neighbours.chord[a, e] <= rays.high[k]:
+                if labelled and not fits(labels[neighbours.place[a, e]], rays.label[k]):
+                    e += 1
+                    continue
                 turned = ((neighbours.azimuth[a, e] - rays.azimuth[k]) & (TURN - 1)) >> shift
                 for c in (turned, (turned + 1) & mask):
                     bins[c] += rays.nats[k]
@@ -238,7 +285,7 @@ def fit(image: Any, chosen: Any, sky: Any, reach: float, rounds: int, result: An
         Log likelihood ratio of the matches under the rotation and by chance, nats.
     """
     covariance, step, turned, normal = scratch[:3], scratch[3], result.rotation, result.normal
-    directions, widest, total = sky.table.points, sky.table.tolerance, 0.0
+    directions, widest, total, labelled = sky.table.points, sky.table.tolerance, 0.0, len(sky.labels) > 0
     for _ in range(rounds):
         _invert(normal, covariance)
         for r in range(3):
@@ -252,6 +299,7 @@ def fit(image: Any, chosen: Any, sky: Any, reach: float, rounds: int, result: An
             cx, cy, cz = rotated(covariance, x, y, z)
             variance = image.pixel[i] ** 2 + 0.5 * (trace - x * cx - y * cy - z * cz)
             squared = reach * reach * variance
+            label = image.labels[i] if labelled else -1
             result.match[i] = -1
             if squared > widest * widest:
                 continue
@@ -261,11 +309,13 @@ def fit(image: Any, chosen: Any, sky: Any, reach: float, rounds: int, result: An
                 turned[0, 1] * x + turned[1, 1] * y + turned[2, 1] * z,
                 turned[0, 2] * x + turned[1, 2] * y + turned[2, 2] * z,
                 squared,
+                label,
             )
             if place < 0:
                 total += LOG_HALF
                 continue
-            likely = math.pi * sky.density[place] * squared
+            fitting = 1 if labelled and label >= 0 and sky.labels[place] >= 0 else 0
+            likely = math.pi * sky.density[fitting, place] * squared
             if likely > CROWDED:
                 continue
             total += LOG_HALF - math.log(likely)

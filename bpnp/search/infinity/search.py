@@ -6,6 +6,9 @@ judged.
 
 A rotation that could compete with the best one explains a minimum number of points. Each of these points, when tried,
 proposes it. If no competing rotation was found, this bounds the miss probability.
+
+With a prior, only rotations within `PRIOR_SIGMAS` standard deviations are proposed. If none of them is significant, the
+search is repeated over all rotations, whose number of tests remains that of the prior.
 """
 
 import math
@@ -20,7 +23,9 @@ from scipy.spatial import cKDTree
 from scipy.special import betaln
 
 from bpnp.loops.parallel import NEVER, Deadline
+from bpnp.poses import turned_by
 from bpnp.search.config import DEFAULT as SEARCH
+from bpnp.search.config import ENUMERATION
 from bpnp.search.evidence import reasons
 from bpnp.search.evidence.reasons import CONFIDENT, objection
 from bpnp.search.hypotheses import Hypotheses
@@ -32,6 +37,7 @@ from bpnp.search.infinity.evidence import (
     how_well_known,
     log10_false_alarms,
     noise_of,
+    prior_information,
     strain_of,
 )
 from bpnp.search.infinity.kernels import (
@@ -50,9 +56,14 @@ from bpnp.search.infinity.kernels import (
 from bpnp.search.kernels.neighbours import hashed
 from bpnp.search.loop import Step, run
 from bpnp.search.pose_model import FIXING_ROTATION
+from bpnp.search.problem import Problem
+from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import SearchResult, no_pose
 
 BINS = (6, 7)  # log2 of the smallest and largest number of azimuth bins
+PRIOR_SIGMAS = ENUMERATION.sigmas  # standard deviations of a prior beyond which no rotation is proposed
+PROPOSED_OFF, ANCHOR_OFF = 0.1, 0.01  # radians, largest error of a proposed rotation, and of the image point it is for
+NO_LABELS = np.empty(0, np.int64)
 
 
 @dataclass(frozen=True)
@@ -78,7 +89,7 @@ class InfinitySettings:
         rougher: Largest noise of the matches, in multiples of the tried one, before the next one is tried.
         strained: Largest number of matches that are tested for an error of the camera model.
         least_share: Fraction of the image points that a rotation explains. An unsuccessful search ends when it would
-            have found such a rotation.
+            have found such a rotation. With `clutter`, half of the expected fraction.
         zoom: Factor from one focal length to the next if it is unknown.
         zoom_noise: Noise of the first search at each focal length, pixels; it includes the error of the focal length
             near the edge. If it fails, `noise` is tried, since many directions are not significant at a large noise.
@@ -121,6 +132,7 @@ class Sight(NamedTuple):
     """One problem at one noise.
 
     Attributes:
+        problem: Image points and directions, with their annotations.
         image: Image points.
         catalogue: Directions with their neighbours.
         sky: Directions for look-up.
@@ -129,8 +141,10 @@ class Sight(NamedTuple):
         density: Median density of the directions, per steradian.
         sample: Indices of the sample of image points.
         settings: Constants.
+        is_near: True if only rotations near the prior are proposed.
     """
 
+    problem: Problem
     image: Image
     catalogue: Catalogue
     sky: Sky
@@ -139,6 +153,35 @@ class Sight(NamedTuple):
     density: float
     sample: Labels
     settings: InfinitySettings
+    is_near: bool
+
+    @property
+    def least_share(self) -> float:
+        """Fraction of the image points that a rotation explains, if there is one."""
+        clutter = self.problem.clutter
+        return self.settings.least_share if clutter is None else (1 - clutter) / 2
+
+    def odds(self, match: Labels) -> Array:
+        """Return how much likelier each match is by classes and scores than a mean one.
+
+        Args:
+            match: (m,) index of the direction of each image point; -1 for none, with any value.
+        """
+        odds, problem = np.ones(len(match)), self.problem
+        if problem.scores3d is not None:
+            candidates = 1.0 if problem.candidate_scores is None else problem.candidate_scores
+            odds = problem.scores3d[match] / (candidates * problem.scores3d.mean())
+        if problem.odds2d is not None and problem.classes3d is not None:
+            odds = odds * np.maximum((problem.odds2d * problem.classes3d[match]).sum(-1), 1e-12)
+        return np.asarray(odds)
+
+    def densities(self, match: Labels) -> Array:
+        """Return the density (m,) of the directions that may match each image point, around its match."""
+        labels = self.image.labels
+        if not len(labels):
+            return self.catalogue.density[0, match]
+        fitting = ((labels >= 0) & (self.sky.labels[match] >= 0)).astype(np.int64)
+        return self.catalogue.density[fitting, match]
 
 
 def log10_missed(tried: int, count: int, least: int, power: float) -> float:
@@ -168,12 +211,10 @@ def _log_choose(n: int, k: Labels) -> Array:
 
 
 def search_rotation(
-    image: Image,
-    directions: Array,
+    problem: Problem,
+    pixel: Array,
     *,
-    scores: Array | None = None,
     noise: float | None = None,
-    zooms: float = 0.0,
     seed: int = 0,
     deadline: Deadline = NEVER,
     settings: InfinitySettings = DEFAULT,
@@ -181,11 +222,10 @@ def search_rotation(
     """Search for the rotation under which image points see directions.
 
     Args:
-        image: Image points (m).
-        directions: (n, 3) unit vectors.
-        scores: (m,) scores; points with the largest ones are tried first. None: random order.
+        problem: Image points (m) and directions, unit vectors as `points3d`. Points with the largest `scores2d` are
+            tried first. A prior restricts the rotation.
+        pixel: (m,) angle of a pixel at each image point, radians.
         noise: Standard deviation of the image points, pixels; None if it is unknown.
-        zooms: Logarithm of the largest over the smallest focal length, if this is one of several; default 0.
         seed: Random seed of the order in which points are tried.
         deadline: When to stop.
         settings: Constants.
@@ -193,8 +233,35 @@ def search_rotation(
     Returns:
         Verdict and rotations, with translations of 0; `batches` is the number of image points that were tried.
     """
-    catalogue, sample = catalogue_of(directions), np.random.default_rng(seed).permutation(len(image.bearings))
-    density = float(np.median(catalogue.density))
+    result, turns = no_pose("no rotation was found"), 0
+    for is_near in (False,) if problem.prior is None else (True, False):
+        new = _at_each_noise(problem, pixel, noise, seed, deadline, settings, is_near=is_near)
+        turns += new.batches
+        result = min(new, result, key=lambda one: one.log10_false_alarms)
+        if result.log10_false_alarms <= SEARCH.evidence.false_alarms or deadline.passed():
+            break
+    return replace(result, batches=turns)
+
+
+def _at_each_noise(
+    problem: Problem,
+    pixel: Array,
+    noise: float | None,
+    seed: int,
+    deadline: Deadline,
+    settings: InfinitySettings,
+    *,
+    is_near: bool,
+) -> SearchResult:
+    """Search at one noise after the other; arguments as for `search_rotation`, with `is_near` of `Sight`."""
+    unlabelled = problem.labels2d is None or problem.labels3d is None
+    labels2d = NO_LABELS if unlabelled or problem.labels2d is None else np.array(problem.labels2d)
+    labels3d = NO_LABELS if unlabelled or problem.labels3d is None else np.array(problem.labels3d)
+    image, directions = Image(problem.bearings, pixel, labels2d), problem.points3d
+    # With class probabilities, `Sight.odds` has the evidence of the classes.
+    catalogue = catalogue_of(directions, None if unlabelled or problem.odds2d is not None else labels3d)
+    sample = np.random.default_rng(seed).permutation(len(image.bearings))
+    density = float(np.median(catalogue.density[0]))
     result, turns = no_pose("no rotation was found"), 0
     for scale in settings.noise if noise is None else (noise,):
         if turns and deadline.passed():
@@ -202,19 +269,20 @@ def search_rotation(
         reach = settings.reach * scale
         # A writable copy has the type of other look-up points, so that the loops are compiled once.
         table = hashed(directions.copy(), settings.cell * reach * float(np.median(image.pixel)))
-        background = background_of(image.bearings, image.pixel, len(directions), 2 * scale, zooms)
         sight = Sight(
+            problem,
             image,
             catalogue,
-            Sky(table, catalogue.density),
-            background,
+            Sky(table, catalogue.density, labels3d),
+            background_of(problem, pixel, 2 * scale),
             reach,
             density,
             sample[: settings.sample],
             settings,
+            is_near,
         )
         poses = RotationPoses(sight)
-        new = run(RotationPlan(poses, scores, seed), poses, most=settings.turns, deadline=deadline)
+        new = run(RotationPlan(poses, seed), poses, most=settings.turns, deadline=deadline)
         turns += new.batches
         if new.log10_false_alarms <= result.log10_false_alarms:
             result = new
@@ -261,7 +329,7 @@ class RotationPoses:
         """Compute the verdict; a failed one is settled if a rotation of enough points would have been found."""
         settings, count = self.sight.settings, len(self.sight.image.bearings)
         result = _judged(self.found, self.sight, self.turns)
-        least = max(math.ceil(settings.least_share * count), FIXING_ROTATION + 1)
+        least = min(max(math.ceil(self.sight.least_share * count), FIXING_ROTATION + 1), count)
         hopeless = log10_missed(self.turns, count, least, settings.power) <= SEARCH.evidence.missed
         return replace(result, settled=result.verdict == "failed" and hopeless)
 
@@ -271,12 +339,11 @@ class RotationPlan:
 
     Args:
         poses: Rotations found so far.
-        scores: (m,) scores of the image points, largest first; None for a random order.
-        seed: Seed of the order.
+        seed: Seed of the order; points with the largest scores come first.
     """
 
-    def __init__(self, poses: RotationPoses, scores: Array | None, seed: int) -> None:
-        bearings = poses.sight.image.bearings
+    def __init__(self, poses: RotationPoses, seed: int) -> None:
+        bearings, scores = poses.sight.image.bearings, poses.sight.problem.scores2d
         order = np.random.default_rng(seed).permutation(len(bearings))
         if scores is not None:
             order = order[np.argsort(-scores[order], kind="stable")]
@@ -316,12 +383,56 @@ def _rays(sight: Sight, i: int, tree: cKDTree) -> tuple[Labels, Rays, int]:
     usable = usable[np.argsort((chord - slack)[usable], kind="stable")]
     chord, slack, around = chord[usable], slack[usable], around[usable]
     if not len(around):
-        return around, Rays(*np.empty((4, 0))), 0
+        none = np.empty(0, np.float32)
+        return around, Rays(none, none, np.empty(0, np.int32), none, NO_LABELS), 0
     bins = 1 << int(np.clip(math.log2(2 * math.pi / float((slack / chord).max())), *BINS))
-    chance = np.minimum(sight.density * 2 * slack * 2 * chord * 2 * math.pi / bins, CROWDED)
+    label, density = np.full(len(around), -1), np.full(len(around), sight.density)
+    if len(sight.image.labels):
+        label = sight.image.labels[around]
+        density *= _shares_of_labels(sight.sky.labels, label)
+    chance = np.minimum(density * 2 * slack * 2 * chord * 2 * math.pi / bins, CROWDED)
     azimuth = azimuths(bearings[i : i + 1], bearings[around][None])[0]
     low, high, nats = (x.astype(np.float32) for x in (chord - slack, chord + slack, np.log(0.5 / chance)))
-    return around, Rays(low, high, azimuth, nats), bins
+    return around, Rays(low, high, azimuth, nats, label), bins
+
+
+def _shares_of_labels(labels3d: Labels, label: Labels) -> Array:
+    """Return the fraction (k,) of the directions that each label (k,) fits; at least one direction."""
+    values, index = np.unique(label, return_inverse=True)
+    count = np.array([len(labels3d) if each < 0 else ((labels3d == each) | (labels3d < 0)).sum() for each in values])
+    return np.asarray(np.maximum(count, 1)[index] / len(labels3d))
+
+
+def _possible(sight: Sight, i: int) -> Labels:
+    """Return the indices of the directions that an image point may be, by its label and by the prior."""
+    directions, problem = sight.catalogue.directions, sight.problem
+    possible = np.ones(len(directions), np.bool_)
+    if len(sight.image.labels) and sight.image.labels[i] >= 0:
+        possible &= (sight.sky.labels == sight.image.labels[i]) | (sight.sky.labels < 0)
+    if sight.is_near and problem.prior is not None:
+        bearing = sight.image.bearings[i]
+        if isinstance(problem.prior, PosePrior):
+            angle, sigma = 0.0, problem.prior.rotation_sigma_deg
+            axis = bearing @ np.asarray(problem.prior.rotation)
+        else:
+            camera, axis = (np.asarray(v, np.float64) / np.linalg.norm(v) for v in problem.prior[:2])
+            angle, sigma = float(np.arccos(np.clip(bearing @ camera, -1, 1))), problem.prior.sigma_deg
+        off = np.abs(np.arccos(np.clip(directions @ axis, -1, 1)) - angle)
+        possible &= off <= PRIOR_SIGMAS * math.radians(sigma) + ANCHOR_OFF
+    return np.flatnonzero(possible)
+
+
+def _is_admitted(sight: Sight, rotation: Array) -> bool:
+    """Return whether a proposed rotation (3, 3) is as near to the prior as the true one should be."""
+    prior = sight.problem.prior
+    if not sight.is_near or prior is None:
+        return True
+    if isinstance(prior, PosePrior):
+        off, sigma = turned_by(rotation, np.asarray(prior.rotation, np.float64)), prior.rotation_sigma_deg
+    else:
+        camera, scene = (np.asarray(v, np.float64) / np.linalg.norm(v) for v in prior[:2])
+        off, sigma = math.acos(float(np.clip(camera @ rotation @ scene, -1, 1))), prior.sigma_deg
+    return off <= PRIOR_SIGMAS * math.radians(sigma) + PROPOSED_OFF
 
 
 def _agreeing(sight: Sight, i: int, around: Labels, rays: Rays, bins: int) -> Iterator[tuple[Array, int]]:
@@ -332,11 +443,13 @@ def _agreeing(sight: Sight, i: int, around: Labels, rays: Rays, bins: int) -> It
     """
     settings, neighbours = sight.settings, sight.catalogue.neighbours
     shift = (TURN // bins).bit_length() - 1
-    places, bin_of = np.arange(len(neighbours.chord)), np.empty(0, np.int64)
+    places, bin_of, labels = _possible(sight, i), np.empty(0, np.int64), sight.sky.labels
+    scores = None if sight.problem.scores3d is None else np.log(sight.problem.scores3d)
     for used, most in ((settings.first, settings.promising), (len(around), settings.refined)):
         value, bin_of = np.empty(len(places), np.float32), np.empty(len(places), np.int64)
         vote(
             neighbours,
+            labels,
             places,
             Rays._make(values[:used] for values in rays),
             shift,
@@ -344,6 +457,8 @@ def _agreeing(sight: Sight, i: int, around: Labels, rays: Rays, bins: int) -> It
             value,
             bin_of,
         )
+        if scores is not None:
+            value = value + scores[places]
         best = np.argpartition(-value, most)[:most] if len(places) > most else np.arange(len(places))
         best = best[np.argsort(-value[best], kind="stable")]
         places, bin_of = places[best], bin_of[best]
@@ -351,11 +466,16 @@ def _agreeing(sight: Sight, i: int, around: Labels, rays: Rays, bins: int) -> It
     for a, c in zip(places.tolist(), bin_of.tolist(), strict=True):
         chord, turned = neighbours.chord[a], ((neighbours.azimuth[a] - azimuth) & (TURN - 1)) >> shift
         agrees = (chord >= low) & (chord <= high) & ((c - turned) & (bins - 1) < 2)
+        if len(labels):
+            label = labels[neighbours.place[a]]
+            agrees &= (rays.label[:, None] == label) | (rays.label[:, None] < 0) | (label < 0)
         if agrees.any(1).sum() >= FIXING_ROTATION:
             k, e = np.nonzero(agrees)
             seen, directions = np.r_[i, around[k]], np.r_[a, neighbours.place[a, e]]
             left, _, right = np.linalg.svd(sight.image.bearings[seen].T @ sight.catalogue.directions[directions])
-            yield left * [1, 1, np.linalg.det(left @ right)] @ right, int(seen[-1])  # least squares
+            rotation = left * [1, 1, np.linalg.det(left @ right)] @ right  # least squares
+            if _is_admitted(sight, rotation):
+                yield rotation, int(seen[-1])
 
 
 def _fitted(
@@ -389,16 +509,21 @@ def _fitted(
     if (state.match >= 0).sum() <= FIXING_ROTATION:
         return None
     left, _, right = np.linalg.svd(state.rotation)
-    squared = np.where(state.match >= 0, state.squared, np.inf)
-    alarms, nats_of_points = log10_false_alarms(squared, sight.catalogue.density[state.match], sight.known)
+    rotation, match = left @ right, state.match
+    if sight.problem.odds2d is not None:
+        match = np.where(sight.problem.may_match(np.arange(m), match), match, -1)
+    squared = np.where(match >= 0, state.squared, np.inf)
+    share = sight.problem.log10_share(rotation, np.zeros(3))
+    density = sight.densities(match) / sight.odds(match)
+    alarms, nats_of_points = log10_false_alarms(squared, density, sight.known, share)
     return Hypotheses.from_poses(
-        (left @ right)[None],
+        rotation[None],
         np.zeros((1, 3)),
         log_likelihood=nats_of_points.mean(keepdims=True),
-        match_count=(state.match >= 0).sum(keepdims=True),
+        match_count=(match >= 0).sum(keepdims=True),
         log10_false_alarms=np.array([alarms]),
         evidence=np.array([nats]),
-        matches=state.match[None],
+        matches=match[None],
         residual=(np.sqrt(squared) * image.pixel)[None],
         point_evidence=nats_of_points[None],
     )
@@ -451,7 +576,7 @@ def _judged(found: Hypotheses, sight: Sight, turns: int) -> SearchResult:
     strain = strain_of(seen[some], bearings[some], pixel[some], sight.image.bearings)
     if strain > sight.reach:
         return result.doubt(objection("other_camera_by_pixels", pixels=strain))
-    bound = how_well_known(seen, bearings, pixel).bound
+    bound = how_well_known(seen, bearings, pixel, information=prior_information(sight.problem)).bound
     if not math.isfinite(bound):
         return result.doubt(objection("rotation_not_fixed", count=len(hit), what="it"))
     return replace(result, reason=reasons.confident(alarms, rule.lead, math.degrees(bound)))

@@ -25,6 +25,7 @@ from bpnp.search.evidence.uncertainty import share_bound
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.loop import Step, run
 from bpnp.search.pool import Pool
+from bpnp.search.propose.known_matches import known_matches, poses_of_matches
 from bpnp.search.raster_search import search_beside
 from bpnp.search.rig.cameras import WIDE, Array, Pose, Rig
 from bpnp.search.scene import Scene
@@ -57,6 +58,10 @@ def search_rig(rig: Rig, *, clutter: float | None = None, seed: int = 0, deadlin
     settings = DEFAULT if clutter is None else DEFAULT.expecting(clutter)
     poses, few = RigPoses(rig), dict[int, Hypotheses]()
     for k, problem in enumerate(rig.problems):
+        matches = known_matches(problem)
+        if matches is not None:
+            few[k] = poses_of_matches(problem, *matches, seed + k)
+            continue
         if is_enumerable(problem):
             until = (Clock.now() * (len(rig.problems) - k - 1) + deadline.at) / (len(rig.problems) - k)
             found = enumerate_poses(problem, deadline=until, to_the_end=True, settings=PROPOSING)
