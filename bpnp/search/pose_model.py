@@ -275,12 +275,19 @@ class PoseModel:
             gradient[at] = -(self.lens.offset + math.log(state.zoom)) / self.lens.sigma**2
         return information, gradient
 
-    def log10_tests(self, problems: Sequence[Problem]) -> float:
+    def log10_tests(self, problems: Sequence[Problem], log10_shares: Sequence[float] = ()) -> float:
         """Return log10 of the number of tests with the points of all cameras, which propose poses independently.
 
         An unknown scale of the scene takes one match more, of any two points of a camera.
+
+        Args:
+            problems: Points of each camera.
+            log10_shares: log10 of the fraction of the poses of each camera that a prior allows; empty without a prior.
         """
-        tests = math.log10(sum(10 ** log10_tests(each) for each in problems))
+        shares = log10_shares or [0.0] * len(problems)
+        tests = math.log10(sum(10 ** (log10_tests(each) + one) for each, one in zip(problems, shares, strict=True)))
+        if any(shares):  # a prior leaves at least one test
+            tests = max(tests, 0.0)
         if self.scale:
             tests += math.log10(sum(len(each.bearings) * len(each.points3d) for each in problems))
         return tests

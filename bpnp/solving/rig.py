@@ -16,9 +16,9 @@ from bpnp.search.pose_model import crossed
 from bpnp.search.problem import Problem
 from bpnp.search.rig.cameras import Pose, Rig
 from bpnp.search.rig.search import search_rig
-from bpnp.search.starts import GravityPrior, PosePrior
+from bpnp.search.starts import GravityPrior, PosePrior, Prior
 from bpnp.search.verdict import SearchResult, no_pose
-from bpnp.solving.arguments import Array, Prior, about, checked_pose, numbers
+from bpnp.solving.arguments import Array, about, checked_pose, numbers
 from bpnp.solving.focal_length import UnknownCamera
 from bpnp.solving.inputs import problem_from
 from bpnp.solving.matches import SCALES, one_to_one, without_pose
@@ -53,6 +53,12 @@ def prepare_rig(
     """
     if unknown is not None:
         raise ValueError("expected no unknown focal length with `rig`; give the `camera` of each image")
+    sigma = prior.translation_sigma if isinstance(prior, PosePrior) else math.inf
+    if scale and math.isfinite(sigma):
+        raise ValueError(
+            "`prior` has a `translation_sigma`, but with `scale=True` the unit of the scene is unknown, and with it "
+            "the distance of the scene from a camera; use PosePrior(rotation, None, rotation_sigma_deg)"
+        )
     if options.clutter is not None:
         SEARCH.expecting(options.clutter)  # raises for one that is out of range
     problems = []
@@ -60,38 +66,16 @@ def prepare_rig(
         lens = None if one is None else camera_from(one)
         arrays = {name: values[k] if name.endswith("2d") else values for name, values in known.items()}
         with about(f"camera {k}"):
-            problem = problem_from(image, points3d, lens, prior=_prior_of(mounts[k], prior, scale=scale), **arrays)
+            vertical = prior if isinstance(prior, GravityPrior) else None  # with it, three points fix a pose
+            problem = problem_from(image, points3d, lens, prior=vertical, **arrays)
             problems.append(replace(problem, clutter=options.clutter))
-    rig = Rig(problems, mounts, is_metric=not scale)
+    known_pose = prior if prior is None else problems[0].prior_from_user(prior)
+    rig = Rig(problems, mounts, is_metric=not scale, prior=known_pose)
     if scale and not rig.apart:
         raise ValueError(
             "expected cameras that are apart in `rig` with `scale=True`, got one centre for all, which tells no scale"
         )
     return partial(_solve, rig, options)
-
-
-def _prior_of(mount: Pose, prior: Prior | None, *, scale: bool) -> Prior | None:
-    """Return the prior of the pose of a rig as a prior of the pose of one of its cameras.
-
-    Raises:
-        ValueError: The prior restricts the translation, whose unit in the scene is unknown with `scale`.
-    """
-    turn, shift = mount
-    if isinstance(prior, GravityPrior):
-        return prior._replace(up_camera=turn @ np.asarray(prior.up_camera))
-    if not isinstance(prior, PosePrior):
-        return None
-    known, translation = turn @ np.asarray(prior.rotation), prior.translation
-    if not scale:
-        return prior._replace(
-            rotation=known, translation=None if translation is None else turn @ np.asarray(translation) + shift
-        )
-    if translation is not None and math.isfinite(prior.translation_sigma):
-        raise ValueError(
-            "`prior` has a `translation_sigma`, but with `scale=True` the unit of the scene is unknown, so that the "
-            "distance of the scene from a camera is unknown too; use PosePrior(rotation, None, rotation_sigma_deg)"
-        )
-    return prior._replace(rotation=known, translation=None, translation_sigma=math.inf)
 
 
 def _solve(rig: Rig, options: Options) -> Solution:

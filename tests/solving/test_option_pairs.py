@@ -95,9 +95,10 @@ def colour_shares(device: Device, shift: int = 0) -> tuple[list[Array], Array]:
 
 def identities(device: Device, shift: int = 0) -> tuple[list[NDArray[np.int64]], NDArray[np.int64]]:
     n = len(device.scene)
-    return [np.where(i < 0, n + np.arange(len(i)), (i + swapped(len(i), shift)) % n) for i in device.truth], np.arange(
-        n
-    )
+    own = [np.where(i < 0, n + np.arange(len(i)), i) for i in device.truth]
+    for labels in own if shift else ():
+        labels[:24:3] = labels[:24:3][::-1]  # four pairs of exchanged labels
+    return own, np.arange(n)
 
 
 def normals(device: Device, sign: float = 1.0) -> Array:
@@ -206,6 +207,12 @@ REFUSED: dict[frozenset[str], str] = {
     frozenset(("classes", "known")): ONE_ARGUMENT,
     frozenset(("normals", "at_infinity")): "a direction has no surface",
     frozenset(("scale", "at_infinity")): "directions have no unit of length",
+    **{
+        frozenset((mode, lens)): "no unknown focal length"
+        for mode in ("rig", "scale")
+        for lens in ("focal", "distortion")
+    },
+    **{frozenset(("many", mode)): ONE_ARGUMENT for mode in ("rig", "scale", "at_infinity")},
 }
 PAIRS = [frozenset(pair) for pair in combinations([*EACH, *COMMON], 2)]
 PAIRS = [pair for pair in PAIRS if REFUSED.get(pair) != ONE_ARGUMENT]

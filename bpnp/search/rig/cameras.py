@@ -26,6 +26,7 @@ from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem
 from bpnp.search.refine.gauss_newton import soft_equations, steps
 from bpnp.search.scene import Scene
+from bpnp.search.starts import GravityPrior, PosePrior, Prior
 
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]
@@ -45,13 +46,26 @@ class Rig:
         problems: Points of each camera.
         mounts: Extrinsics (C_k, c_k) of each camera, camera_k = C_k rig + c_k.
         is_metric: True if the last component of the translations is 1; else it is unknown. Default True.
+        prior: Prior of the pose of the rig, in sizes of the scene; None for none. Without a metric scene its
+            translation does not restrict a camera.
     """
 
-    def __init__(self, problems: Sequence[Problem], mounts: Sequence[Pose], *, is_metric: bool = True) -> None:
-        self.problems = problems
+    def __init__(
+        self,
+        problems: Sequence[Problem],
+        mounts: Sequence[Pose],
+        *,
+        is_metric: bool = True,
+        prior: Prior | None = None,
+    ) -> None:
+        if isinstance(prior, PosePrior) and not is_metric:
+            prior = prior._replace(translation=None)
         self.mounts = [(turn, shift / problem.size) for problem, (turn, shift) in zip(problems, mounts, strict=True)]
+        self.problems = [
+            replace(each, prior=_prior_of(mount, prior)) for each, mount in zip(problems, self.mounts, strict=True)
+        ]
         self.floor = max(each.floor or float(each.image.scales[0]) for each in self.problems)
-        self.model = PoseModel(problems[0].middle, mounts=self.mounts, scale=not is_metric)
+        self.model = PoseModel(problems[0].middle, mounts=self.mounts, scale=not is_metric, prior=prior)
         self.unknowns = self.model.size
         centres = np.array([-turn.T @ shift for turn, shift in mounts])
         least = SAME_CENTRE * np.abs(centres).max()
@@ -106,11 +120,14 @@ class Rig:
     def alarms(self, rotation: Array, translation: Array, scale: float) -> tuple[float, float]:
         """Return log10 of the number of false alarms at the scale of the residuals, and at rougher ones.
 
-        Three matches of a camera fix the pose. An unknown scale needs one more, of a camera with a non-zero baseline.
+        Three matches of a camera fix the pose. An unknown scale needs one more, of a camera with a non-zero baseline. A
+        prior reduces the number of tests of each camera to the fraction of its poses that it allows.
         """
         cameras = self._terms(rotation, translation, scale)
         ways = self.model.fixing_ways(len(self.problems), self.apart)
-        return log10_nfa(cameras, self.model.log10_tests(self.problems), ways)
+        poses = (self.pose_of(k, rotation, translation) for k in range(len(self.problems)))
+        shares = [each.log10_share(*pose) for each, pose in zip(self.problems, poses, strict=True)]
+        return log10_nfa(cameras, self.model.log10_tests(self.problems, shares), ways)
 
     def _terms(self, rotation: Array, translation: Array, scale: float | None) -> list[Terms | None]:
         seen = (
@@ -171,3 +188,14 @@ class Rig:
             log10_false_alarms=own,
             log10_rough=rough,
         )
+
+
+def _prior_of(mount: Pose, prior: Prior | None) -> Prior | None:
+    """Return the prior of the pose of a rig as one of the pose of a camera with these extrinsics."""
+    turn, shift = mount
+    if isinstance(prior, GravityPrior):
+        return prior._replace(up_camera=turn @ np.asarray(prior.up_camera, np.float64))
+    if prior is None or prior.translation is None:
+        return prior if prior is None else prior._replace(rotation=turn @ np.asarray(prior.rotation, np.float64))
+    rotation, translation = (np.asarray(each, np.float64) for each in prior[:2])
+    return prior._replace(rotation=turn @ rotation, translation=turn @ translation + shift)

@@ -18,13 +18,14 @@ from bpnp.loops.parallel import NEVER, Clock, Deadline, one_blas_thread
 from bpnp.poses import distinct, seen_from
 from bpnp.search.competitors import fitted_lens
 from bpnp.search.config import DEFAULT, ENUMERATION
-from bpnp.search.enumeration.search import enumerate_poses, is_enumerable
+from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
 from bpnp.search.evidence.reasons import objection
 from bpnp.search.evidence.repetitions import repeated_poses
 from bpnp.search.evidence.uncertainty import share_bound
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.loop import Step, run
 from bpnp.search.pool import Pool
+from bpnp.search.problem import Problem
 from bpnp.search.propose.known_matches import known_matches, poses_of_matches
 from bpnp.search.raster_search import search_beside
 from bpnp.search.rig.cameras import WIDE, Array, Pose, Rig
@@ -56,25 +57,39 @@ def search_rig(rig: Rig, *, clutter: float | None = None, seed: int = 0, deadlin
         Distinct poses of the rig, best first, and the verdict on the first one.
     """
     settings = DEFAULT if clutter is None else DEFAULT.expecting(clutter)
-    poses, few = RigPoses(rig), dict[int, Hypotheses]()
+    poses = RigPoses(rig)
     for k, problem in enumerate(rig.problems):
+        if exceeds_enumeration(problem):
+            scene = Scene(problem, seed + k, settings, deadline)
+            if not lacks_partners(scene):
+                poses.pools[k] = Pool(scene, problem, no_pose("no pose was found"))
+    rig.join({k: pool.scene for k, pool in poses.pools.items()})
+    poses.take(_of_few_points(poses, rig.problems, seed, deadline), REFINED)
+    if rig.model.prior is not None and not poses.is_significant():
+        without = [replace(problem, prior=None) for problem in rig.problems]
+        poses.take(_of_few_points(poses, without, seed, deadline), REFINED)
+    if poses.may_be_decided() and (result := poses.result(ended=False)).verdict == "confident":
+        return result
+    return run(RigPlan(poses), poses, most=settings.schedule.turns, deadline=deadline)
+
+
+def _of_few_points(
+    poses: "RigPoses", problems: Sequence[Problem], seed: int, deadline: Deadline
+) -> dict[int, Hypotheses]:
+    """Return the poses of the cameras with known matches or few points, by index of the camera."""
+    few = dict[int, Hypotheses]()
+    for k, problem in enumerate(problems):
         matches = known_matches(problem)
         if matches is not None:
             few[k] = poses_of_matches(problem, *matches, seed + k)
-            continue
-        if is_enumerable(problem):
-            until = (Clock.now() * (len(rig.problems) - k - 1) + deadline.at) / (len(rig.problems) - k)
+        elif is_enumerable(problem):
+            until = (Clock.now() * (len(problems) - k - 1) + deadline.at) / (len(problems) - k)
             found = enumerate_poses(problem, deadline=until, to_the_end=True, settings=PROPOSING)
             few[k] = Hypotheses.from_poses(found.poses.rotation, found.poses.translation)
             poses.exhaustive &= found.ended == "exhausted"
-            continue
-        poses.exhaustive = False
-        scene = Scene(problem, seed + k, settings, deadline)
-        if not lacks_partners(scene):
-            poses.pools[k] = Pool(scene, problem, no_pose())
-    rig.join({k: pool.scene for k, pool in poses.pools.items()})
-    poses.take(few, REFINED)
-    return run(RigPlan(poses), poses, most=settings.schedule.turns, deadline=deadline)
+        else:
+            poses.exhaustive = False
+    return few
 
 
 class RigPlan:
@@ -199,9 +214,13 @@ class RigPoses:
         both = np.concatenate([turn, poses.rotation]), np.concatenate([shift, poses.translation])
         return self.rig.problems[k].same_pose(*both, self.rule.same)[1:]
 
+    def is_significant(self) -> bool:
+        """Return whether the number of false alarms of the best pose is small enough."""
+        return bool((self.best.log10_false_alarms[:1] <= self.rule.false_alarms).any())
+
     def may_be_decided(self) -> bool:
         """Return whether the best pose is significant and its miss probability is low enough."""
-        if not len(self.best) or self.best.log10_false_alarms[0] > self.rule.false_alarms:
+        if not self.is_significant():
             return False
         strongest, seen = self._strongest()
         return missed(seen, self.rig.problems[strongest], self._looks(), self.rule) <= self.rule.missed
