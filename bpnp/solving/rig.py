@@ -53,8 +53,8 @@ def prepare_rig(
     """
     if unknown is not None:
         raise ValueError("expected no unknown focal length with `rig`; give the `camera` of each image")
-    sigma = prior.translation_sigma if isinstance(prior, PosePrior) else math.inf
-    if scale and math.isfinite(sigma):
+    placed = isinstance(prior, PosePrior) and prior.translation is not None and math.isfinite(prior.translation_sigma)
+    if scale and placed:
         raise ValueError(
             "`prior` has a `translation_sigma`, but with `scale=True` the unit of the scene is unknown, and with it "
             "the distance of the scene from a camera; use PosePrior(rotation, None, rotation_sigma_deg)"
