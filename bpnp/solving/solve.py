@@ -105,11 +105,12 @@ def solve(
         clutter: Expected outlier fraction. None if it is unknown.
         at_infinity: `points3d` are unit directions, such as of stars. Only the rotation is estimated; the translation
             is zero. Pixels of a fisheye camera may lie 90 degrees or more off its axis. Points with the largest
-            `scores2d` are tried first. `image_size` and `focal_error` apply here too. See docs/stars.md.
-        rig: Extrinsics cam_from_rig of each camera of a rig, as (3, 4), (4, 4) or (R, t). `points2d` and `labels2d` are
-            then lists with one array per camera; `camera` is a list or one for all. The returned pose is
-            rig_from_world, in the unit of the rig and of the scene. `matches` index the 2D points of all cameras,
-            concatenated.
+            `scores2d` are tried first. The translation of a `prior` is ignored. `normals3d` and `scale` have no meaning
+            here, and networks are not trained for directions; all other options apply. See docs/stars.md.
+        rig: Extrinsics cam_from_rig of each camera of a rig, as (3, 4), (4, 4) or (R, t). `points2d`, `labels2d` and
+            `scores2d` are then lists with one array per camera; `camera` is a list or one for all. The returned pose is
+            rig_from_world, in the unit of the rig and of the scene, and a `prior` is one of this pose. `matches` index
+            the 2D points of all cameras, concatenated. Networks are not trained for rigs; all other options apply.
         scale: With `rig`: also estimate the scale of a scene whose unit differs from the rig's, such as a COLMAP model.
             `Solution.scale` satisfies rig = scale R p + t, with t in the unit of the rig. The rig needs a non-zero
             baseline.
