@@ -564,12 +564,13 @@ class SearchSettings:
     def __post_init__(self) -> None:
         if min(self.schedule.turns, self.starts, self.first_starts) < 1 or not self.recipes:
             raise ValueError(
-                "expected one or more `turns`, `starts`, `first_starts` and `recipes`, got "
-                f"{self.schedule.turns}, {self.starts}, {self.first_starts} and {len(self.recipes)}; "
-                "try SearchSettings()"
+                f"`turns` is {self.schedule.turns}, `starts` {self.starts}, `first_starts` {self.first_starts} and the "
+                f"number of `recipes` {len(self.recipes)}; each must be 1 or more"
             )
         if not all(0 < share < 1 for share in (self.outliers, *self.end_outliers)):
-            raise ValueError(f"expected shares of outliers in (0, 1), got {self.outliers} and {self.end_outliers}")
+            raise ValueError(
+                f"`outliers` is {self.outliers} and `end_outliers` {self.end_outliers}; all must be between 0 and 1"
+            )
 
     def limited(self, turns: int) -> "SearchSettings":
         """Return a copy of these settings with at most this number of iterations."""
@@ -587,7 +588,7 @@ class SearchSettings:
             ValueError: If `clutter` is outside [0, 1).
         """
         if not 0 <= clutter < 1:
-            raise ValueError(f"expected `clutter` in [0, 1), a share of the points, got {clutter}")
+            raise ValueError(f"`clutter` is {clutter}; it is a fraction of the points, 0 or more and below 1")
         return replace(self, outliers=max(clutter, self.least_outliers), end_outliers=())
 
     def batch(self, number: int) -> int:

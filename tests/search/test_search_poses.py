@@ -46,12 +46,12 @@ def test_a_guess_from_the_same_points_is_tried_first_and_is_no_prior(problem, of
     ("call", "named"),
     [
         (lambda: Search(time_limit=0.0), "`time_limit` is 0.0; it must be above 0"),
-        (lambda: DEFAULT.expecting(1.0), "expected `clutter`"),
-        (lambda: SearchSettings(Schedule(turns=0)), "expected.*`turns`"),
-        (lambda: SearchSettings(starts=0), "expected.*`starts`"),
-        (lambda: SearchSettings(first_starts=0), "expected.*`first_starts`"),
-        (lambda: SearchSettings(recipes=()), "expected.*`recipes`"),
-        (lambda: SearchSettings(outliers=1.0), "expected.*outliers"),
+        (lambda: DEFAULT.expecting(1.0), "`clutter` is 1.0; it is a fraction of the points"),
+        (lambda: SearchSettings(Schedule(turns=0)), "`turns` is 0"),
+        (lambda: SearchSettings(starts=0), "`starts` 0"),
+        (lambda: SearchSettings(first_starts=0), "`first_starts` 0"),
+        (lambda: SearchSettings(recipes=()), "number of `recipes` 0"),
+        (lambda: SearchSettings(outliers=1.0), "`outliers` is 1.0"),
     ],
 )
 def test_settings_without_a_meaning_are_refused(call, named):

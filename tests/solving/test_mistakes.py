@@ -57,7 +57,7 @@ CALLS: dict[str, Any] = {
         ("points", {"points2d": PIXELS, "camera": np.diag([500.0, 0, 1])}, "`camera` matrix is singular"),
         ("points", {"inlier_threshold": 0.0}, "`inlier_threshold` is .*; it must be a positive number"),
         ("points", {"time_limit": -1.0}, "`time_limit` is -1.0; it must be a positive number"),
-        ("points", {"clutter": 1.5}, "`clutter`"),
+        ("points", {"clutter": 1.5}, "`clutter` is 1.5; it is a fraction of the points"),
         ("points", {"solver": "serch"}, '`solver` is .serch.; it is "auto", "search"'),
         ("points", {"device": "gpu0"}, "this machine has no `device` gpu0"),
         ("points", {"prior": PosePrior(2 * np.eye(3), None, 5.0)}, "`prior.rotation` is no rotation matrix"),
