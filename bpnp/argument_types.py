@@ -80,7 +80,8 @@ if TYPE_CHECKING:
     Points: TypeAlias = HasArray | HasVertices | HasPoints
     PointsLike: TypeAlias = Points | Sequence[KeyPoint | Sequence[SupportsFloat]]
     ManyPoints: TypeAlias = Points | Sequence[PointsLike | KeyPoint | Sequence[SupportsFloat]]
-    Extrinsics: TypeAlias = HasArray | Sequence[Sequence[SupportsFloat]] | tuple[ArrayLike, ArrayLike]
+    PoseObject: TypeAlias = HasArray | tuple[ArrayLike, ArrayLike] | HasPose | HasMatrix
+    PoseLike: TypeAlias = PoseObject | Sequence[Sequence[SupportsFloat]]
     ImageSize: TypeAlias = HasArray | Sequence[int]
 else:
-    Numbers = ArrayLike = ManyArrays = PointsLike = ManyPoints = Extrinsics = ImageSize = Any
+    Numbers = ArrayLike = ManyArrays = PointsLike = ManyPoints = PoseObject = PoseLike = ImageSize = Any

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from bpnp.argument_types import ArrayLike, HasArray, HasMatrix, HasPose
+from bpnp.argument_types import PoseObject
 from bpnp.cameras import CENTRE, Camera, check_normalised, is_opencv, outside_image
 from bpnp.search.starts import GravityPrior, PosePrior
 
@@ -20,17 +20,7 @@ if TYPE_CHECKING:
 
     from bpnp.models.weights import TrainedNet
 
-    PriorObject: TypeAlias = (
-        PosePrior
-        | GravityPrior
-        | HasArray
-        | tuple[ArrayLike, ArrayLike]
-        | HasPose
-        | HasMatrix
-        | TrainedNet
-        | str
-        | Path
-    )
+    PriorObject: TypeAlias = PosePrior | GravityPrior | PoseObject | TrainedNet | str | Path
     PriorLike: TypeAlias = PriorObject | Sequence[Sequence[SupportsFloat]]
     ManyPriors: TypeAlias = PriorObject | Sequence[PriorLike | Sequence[SupportsFloat] | None]
 else:
@@ -153,12 +143,13 @@ def checked_seed(seed: Any) -> int:
     return int(seed)
 
 
-def pose_of(value: Any) -> tuple[Any, Any] | None:
+def pose_of(value: Any, name: str = "prior") -> tuple[Any, Any] | None:
     """Return rotation and translation of an object that holds a pose; None for anything else.
 
     Args:
         value: (R, t); [R | t] of shape (3, 4) or (4, 4); an object with `rotation` and `translation`, such as a
             `Solution`; or a pycolmap.Rigid3d.
+        name: Name of the argument, for messages.
     """
     if callable(getattr(value, "matrix", None)):
         value = value.matrix()
@@ -169,9 +160,9 @@ def pose_of(value: Any) -> tuple[Any, Any] | None:
     shape = np.shape(value) if isinstance(value, (list, tuple)) else getattr(value, "shape", ())
     if tuple(shape) not in ((3, 4), (4, 4)):
         return None
-    matrix = numbers("prior", value)
+    matrix = numbers(name, value)
     if len(matrix) == 4 and not np.array_equal(matrix[3], [0, 0, 0, 1]):
-        raise ValueError(f"`prior` has the last row {matrix[3].tolist()}; that of a pose is 0, 0, 0, 1")
+        raise ValueError(f"`{name}` has the last row {matrix[3].tolist()}; that of a pose is 0, 0, 0, 1")
     return matrix[:3, :3], matrix[:3, 3]
 
 

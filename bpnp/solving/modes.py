@@ -62,7 +62,9 @@ def prepare_mode(
         images = each_set("points2d", points2d, None)
         for name, values in (("points2d", images), ("camera", camera), *((name, known[name]) for name in PER_CAMERA)):
             if isinstance(values, list) and len(values) != count:
-                raise ValueError(f"expected {count} of `{name}`, one a camera of the `rig`, got {len(values)}")
+                raise ValueError(
+                    f"`{name}` has the length {len(values)}, but the `rig` has {count} cameras; give one per camera"
+                )
         each = {name: each_set(name, known[name], count, 1) for name in PER_CAMERA}
     cameras = each_camera(camera, count) if mounts is not None else [camera]
     unknown = None

@@ -18,7 +18,7 @@ from bpnp.search.rig.cameras import Pose, Rig
 from bpnp.search.rig.search import search_rig
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
 from bpnp.search.verdict import SearchResult, no_pose
-from bpnp.solving.arguments import Array, about, checked_pose, numbers
+from bpnp.solving.arguments import Array, about, checked_pose, pose_of
 from bpnp.solving.focal_length import UnknownCamera
 from bpnp.solving.inputs import problem_from
 from bpnp.solving.matches import SCALES, one_to_one, without_pose
@@ -73,7 +73,8 @@ def prepare_rig(
     rig = Rig(problems, mounts, is_metric=not scale, prior=known_pose)
     if scale and not rig.apart:
         raise ValueError(
-            "expected cameras that are apart in `rig` with `scale=True`, got one centre for all, which tells no scale"
+            "all cameras of the `rig` have one centre, which does not determine the scale of the scene; give cameras "
+            "with a baseline, or leave out `scale=True`"
         )
     return partial(_solve, rig, options)
 
@@ -91,13 +92,14 @@ def _solve(rig: Rig, options: Options) -> Solution:
 
 
 def mount_from(name: str, value: Any) -> Pose:
-    """Return rotation and translation of extrinsics cam_from_rig, given as (3, 4), (4, 4) or (R, t)."""
-    if isinstance(value, tuple) and len(value) == 2:
-        return checked_pose(f"{name}.", *value)
-    matrix = numbers(name, value)
-    if matrix.shape not in ((3, 4), (4, 4)):
-        raise ValueError(f"expected `{name}` as cam_from_rig, (3, 4), (4, 4) or (R, t), got shape {matrix.shape}")
-    return checked_pose(f"{name}.", matrix[:3, :3], matrix[:3, 3])
+    """Return rotation and translation of extrinsics cam_from_rig; see `pose_of` for the forms."""
+    pose = pose_of(value, name)
+    if pose is None or pose[1] is None:
+        wrong = f"has the shape {value.shape}" if hasattr(value, "shape") else f"is {value!r:.80}"
+        raise ValueError(
+            f"`{name}` {wrong}; give cam_from_rig as (R, t), a matrix (3, 4) or (4, 4), or a pycolmap.Rigid3d"
+        )
+    return checked_pose(f"{name}.", *pose)
 
 
 def _finished(rig: Rig, problems: Sequence[Problem], result: SearchResult, inlier_threshold: float | None) -> Solution:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bpnp.argument_types import ArrayLike, Extrinsics, ImageSize, ManyArrays, ManyPoints, PointsLike
+from bpnp.argument_types import ArrayLike, ImageSize, ManyArrays, ManyPoints, PointsLike, PoseLike
 from bpnp.cameras import Camera, ManyCameras, camera_from
 from bpnp.loops.parallel import Clock, Deadline
 from bpnp.search.enumeration.search import is_enumerable
@@ -51,14 +51,14 @@ def solve(
     normals3d: ArrayLike | None = None,
     labels2d: ManyArrays | None = None,
     labels3d: ArrayLike | None = None,
-    scores2d: ArrayLike | None = None,
+    scores2d: ManyArrays | None = None,
     scores3d: ArrayLike | None = None,
     solver: "str | Path | torch.nn.Module" = "auto",
     prior: PriorLike | None = None,
     inlier_threshold: float | int | None = None,
     clutter: float | int | None = None,
     at_infinity: bool = False,
-    rig: Sequence[Extrinsics] | None = None,
+    rig: Sequence[PoseLike] | None = None,
     scale: bool = False,
     seed: int = 0,
     time_limit: float | int | None = None,
@@ -107,10 +107,11 @@ def solve(
             is zero. Pixels of a fisheye camera may lie 90 degrees or more off its axis. Points with the largest
             `scores2d` are tried first. The translation of a `prior` is ignored. `normals3d` and `scale` have no meaning
             here, and networks are not trained for directions; all other options apply. See docs/stars.md.
-        rig: Extrinsics cam_from_rig of each camera of a rig, as (3, 4), (4, 4) or (R, t). `points2d`, `labels2d` and
-            `scores2d` are then lists with one array per camera; `camera` is a list or one for all. The returned pose is
-            rig_from_world, in the unit of the rig and of the scene, and a `prior` is one of this pose. `matches` index
-            the 2D points of all cameras, concatenated. Networks are not trained for rigs; all other options apply.
+        rig: Extrinsics cam_from_rig of each camera of a rig, as (R, t), (3, 4), (4, 4) or a pycolmap.Rigid3d.
+            `points2d`, `labels2d` and `scores2d` are then lists with one array per camera; `camera` is a list or one
+            for all. The returned pose is rig_from_world, in the unit of the rig and of the scene, and a `prior` is one
+            of this pose. `matches` index the 2D points of all cameras, concatenated. Networks are not trained for rigs;
+            all other options apply.
         scale: With `rig`: also estimate the scale of a scene whose unit differs from the rig's, such as a COLMAP model.
             `Solution.scale` satisfies rig = scale R p + t, with t in the unit of the rig. The rig needs a non-zero
             baseline.
@@ -148,7 +149,7 @@ def solve(
         "scores3d": scores3d,
     }
     if scale and rig is None and not at_infinity:
-        raise ValueError("expected a `rig` with `scale=True`, got none: one camera does not see the unit of a scene")
+        raise ValueError("`scale=True` needs a `rig`: one camera does not determine the unit of a scene")
     seconds = seconds_from(time_limit, SECONDS)
     if at_infinity or rig is not None:
         solve_one = prepare_mode(

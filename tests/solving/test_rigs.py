@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+import pycolmap
 import pytest
 from planted import degrees_between
 from scipy.spatial.transform import Rotation
@@ -47,7 +48,9 @@ def test_a_rig_is_confident_where_no_single_camera_is() -> None:
 
 def test_a_rig_of_one_camera_is_that_camera() -> None:
     images, scene, mounts, pose, _ = planted_rig(0, (10,))
-    for mount in (mounts[0], np.column_stack(mounts[0]), np.vstack([np.column_stack(mounts[0]), [0, 0, 0, 1]])):
+    matrix = np.vstack([np.column_stack(mounts[0]), [0, 0, 0, 1]])
+    rigid = pycolmap.Rigid3d(pycolmap.Rotation3d(mounts[0][0]), mounts[0][1])
+    for mount in (mounts[0], matrix[:3], matrix, matrix.tolist(), rigid):
         rig = bpnp.solve(images, scene, CAMERA, rig=[mount], time_limit=60)
         one = bpnp.solve(images[0], scene, CAMERA, solver="search")
         turn, shift = mounts[0]
