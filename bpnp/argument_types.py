@@ -1,4 +1,4 @@
-"""Types of the arguments of public functions.
+"""Types of the arguments of public functions, and how an error message shows a value.
 
 For type checkers these are unions of what a function accepts. At run time they are `Any`: the functions check the
 values themselves, and raise a ValueError that names the argument.
@@ -85,3 +85,12 @@ if TYPE_CHECKING:
     ImageSize: TypeAlias = HasArray | Sequence[int]
 else:
     Numbers = ArrayLike = ManyArrays = PointsLike = ManyPoints = PoseObject = PoseLike = ImageSize = Any
+
+
+def short_repr(value: object) -> str:
+    """Return the representation of a value in one line of at most 80 characters, for an error message.
+
+    >>> short_repr([[1.0], [2.0]])
+    '[[1.0], [2.0]]'
+    """
+    return " ".join(repr(value).split())[:80]

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, SupportsFloat, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from bpnp.argument_types import ArrayLike, HasArray, HasCameraModel, Numbers
+from bpnp.argument_types import ArrayLike, HasArray, HasCameraModel, Numbers, short_repr
 
 Array = npt.NDArray[np.float64]
 ROUND_TRIP = 0.01  # largest error of a pixel that is undistorted and distorted again, pixels
@@ -353,7 +353,7 @@ def colmap_camera(model: str, params: Any, size: Any = (0, 0)) -> Lens:
     try:
         values = np.asarray(params, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"the parameters of a {model} camera are not numbers: {params!r:.60}") from error
+        raise ValueError(f"the parameters of a {model} camera are not numbers: {short_repr(params)}") from error
     if values.shape != (counts[model],):
         raise ValueError(f"a {model} camera has {counts[model]} parameters, not {values.tolist()}")
     if not np.isfinite(values).all():
@@ -440,7 +440,7 @@ def _pinhole(values: Any) -> Pinhole:
         matrix = np.asarray(values.detach().cpu() if hasattr(values, "detach") else values, dtype=np.float64)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(
-            f"`camera` is a 3x3 matrix, (COLMAP model, parameters) or a pycolmap.Camera, not {values!r:.60}"
+            f"`camera` is a 3x3 matrix, (COLMAP model, parameters) or a pycolmap.Camera, not {short_repr(values)}"
         ) from error
     if matrix.shape != (3, 3):
         raise ValueError(f"the `camera` matrix needs the shape (3, 3), not {matrix.shape}; or give (model, parameters)")

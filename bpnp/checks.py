@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bpnp.argument_types import ManyArrays
+from bpnp.argument_types import ManyArrays, short_repr
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
@@ -174,7 +174,7 @@ def as_tensor(name: str, values: ManyArrays | float) -> Tensor:
         array = np.asarray(values)
         return torch.as_tensor(np.array(array, array.dtype.newbyteorder("=")))
     except (TypeError, ValueError) as error:
-        raise ValueError(f"`{name}` is {values!r:.80}; give an array of numbers, or a list of them") from error
+        raise ValueError(f"`{name}` is {short_repr(values)}; give an array of numbers, or a list of them") from error
 
 
 def check_points(name: str, i: int | str, points: Tensor, dim: int) -> Tensor:

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from bpnp.argument_types import PoseObject
+from bpnp.argument_types import PoseObject, short_repr
 from bpnp.cameras import CENTRE, Camera, check_normalised, is_opencv, outside_image
 from bpnp.search.starts import GravityPrior, PosePrior
 
@@ -189,7 +189,7 @@ def checked_prior(prior: Any) -> Prior | None:
     if isinstance(prior, TrainedNet):
         return prior
     raise ValueError(
-        f"`prior` is {prior!r:.60}; give a PosePrior, a GravityPrior, a pose, or a BPnPNet, a Matcher or a checkpoint"
+        f"`prior` is {short_repr(prior)}; give a PosePrior, a GravityPrior, a pose, a network or its checkpoint"
     )
 
 
@@ -212,7 +212,7 @@ def numbers(name: str, values: Any) -> Array:
             raise TypeError(f"{array.dtype}")
         return array.astype(np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"`{name}` is {values!r:.80}; an array of numbers is needed") from error
+        raise ValueError(f"`{name}` is {short_repr(values)}; an array of numbers is needed") from error
 
 
 def _on_host(values: Any) -> Any:
