@@ -118,7 +118,7 @@ def test_shapes_are_seen_where_the_pose_puts_them() -> None:
 
 
 @pytest.mark.parametrize("matches", [7, 1000])
-def test_a_true_pose_is_beyond_its_bound_as_often_as_that_says(matches: int) -> None:
+def test_a_true_pose_is_outside_its_bound_with_the_stated_probability(matches: int) -> None:
     """Draw errors from the stated distribution, with the scale estimated from the matches.
 
     One in a thousand exceeds the bound of the rotation, and one in a thousand that of the pose. The covariance is

@@ -28,7 +28,7 @@ def test_a_solution_of_the_last_release_is_read() -> None:
         Solution.from_json(json.dumps(cut))
 
 
-def test_a_store_of_the_last_release_is_refused_and_to_be_prepared_anew(tmp_path: Path) -> None:
+def test_a_store_of_the_last_release_is_refused_with_the_advice_to_prepare_it_again(tmp_path: Path) -> None:
     manifest = {"format": 3, "kind": "problems", "rows": 0, "bulk": [], "columns": {}, "checksum": 0}
     (tmp_path / "manifest.json").write_text(json.dumps(manifest))
     with pytest.raises(StoreError, match="holds problems in format 3, not problems in format 4; .*prepare it again"):

@@ -65,7 +65,7 @@ def loss_of_test(folder: Path, name: str, *options: str) -> float:
     return loss
 
 
-def test_the_checkpoint_says_which_network_is_tested(trained: Path, tmp_path: Path) -> None:
+def test_a_test_runs_the_network_of_the_checkpoint(trained: Path, tmp_path: Path) -> None:
     own = loss_of_test(trained, "own", *SMALL_NET, *OTHERS)
     task = BlindPnPTask.load_from_checkpoint(trained / "run/checkpoints/last.ckpt")
     assert task.solver.features2d.scale == 4

@@ -64,7 +64,7 @@ def place(tmp_path: Path) -> Place:
     return made
 
 
-def test_the_same_photo_is_kept_and_the_output_says_so(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unchanged_photo_is_kept_and_reported(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
     place.run("a.png", "b.png")
     assert place.is_right("a.png", 0)
     assert place.is_right("b.png", 1)

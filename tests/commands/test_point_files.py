@@ -137,7 +137,7 @@ def test_a_camera_is_read_from_a_file_or_from_a_colmap_name(tmp_path: Path) -> N
     assert read_camera("PINHOLE 640 480 500 510 320 240") == ("PINHOLE", 640.0, 480.0, params)
 
 
-def test_of_several_cameras_of_a_colmap_model_that_of_an_image_is_taken(tmp_path: Path) -> None:
+def test_the_camera_of_an_image_is_read_from_a_model_with_several(tmp_path: Path) -> None:
     (tmp_path / "cameras.txt").write_text("1 SIMPLE_PINHOLE 640 480 500 320 240\n7 PINHOLE 100 80 90 91 50 40\n")
     (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 1 1 a.jpg\n3 4 1\n2 1 0 0 0 0 0 2 7 b.jpg\n5 6 1\n")
     (tmp_path / "points3D.txt").write_text("1 0 0 5 0 0 0 0 1 0 2 0\n")

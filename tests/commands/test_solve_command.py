@@ -124,7 +124,7 @@ def test_a_mistake_is_one_line(change: Any, message: str, tmp_path: Path, fails:
     assert message in fails("solve", *change(write(tmp_path)))
 
 
-def test_an_unwritable_output_is_known_before_the_search(
+def test_an_unwritable_output_is_refused_before_the_search(
     tmp_path: Path, fails: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("bpnp.solving.solve.solve", None)
@@ -167,7 +167,7 @@ def test_an_input_is_not_overwritten(
     assert f"{replaced} is an input and would be overwritten; name another file" in message
 
 
-def test_a_folder_with_files_is_not_replaced_and_known_before_the_search(
+def test_a_folder_with_files_is_refused_before_the_search(
     tmp_path: Path, fails: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     main(["solve", *write(tmp_path), "--colmap", str(tmp_path / "out"), "--quiet"])

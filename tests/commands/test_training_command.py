@@ -163,7 +163,9 @@ def test_a_packaged_configuration_in_the_place_of_a_file_is_named(
         assert (line in capsys.readouterr().err) == told
 
 
-def test_ctrl_c_tells_how_to_go_on(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ctrl_c_prints_the_command_that_resumes(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     def interrupted(*_: Any) -> None:
         raise KeyboardInterrupt
 

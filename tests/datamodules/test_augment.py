@@ -79,7 +79,7 @@ def test_occlusion_leaves_points_without_a_match(side: str, left2d: int, left3d:
     ("clutter", "side", "extra2d", "extra3d"),
     [(0.25, "both", 5, 5), (0.25, "2d", 5, 0), (0.25, "3d", 0, 5), (2.0, "both", 12, 30), (0.0, "both", 0, 0)],
 )
-def test_subsets_and_clutter_are_as_many_as_asked_for(clutter: float, side: str, extra2d: int, extra3d: int) -> None:
+def test_subsets_and_clutter_have_the_requested_counts(clutter: float, side: str, extra2d: int, extra3d: int) -> None:
     batch = raw(planted(40, free2d=12, free3d=30))
     result = augmented(batch, max_points=20, clutter=clutter, clutter_side=side)
     assert (int(matches_of(result)), int(result.count2d), int(result.count3d)) == (20, 20 + extra2d, 20 + extra3d)
@@ -132,7 +132,7 @@ def test_wrong_options_are_named(kind: type, bad: dict[str, Any]) -> None:
         kind(**bad)
 
 
-def test_a_problem_depends_on_its_key_alone_whatever_batch_it_is_in() -> None:
+def test_a_problem_depends_on_its_key_and_not_on_its_batch() -> None:
     problems = [planted(20 + 30 * i, free2d=7 * i, free3d=40 - 9 * i, seed=i) for i in range(4)]
     together = augmented(raw(*problems), 5, **HARD)
     for i, problem in enumerate(problems):

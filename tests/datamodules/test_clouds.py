@@ -94,7 +94,7 @@ def test_a_pool_as_large_as_a_problem_gives_the_same_points_in_every_view(folder
     assert len(by_shape) == 3
 
 
-def test_a_larger_pool_is_drawn_anew_for_each_problem_from_all_points_of_the_file(folder: Path) -> None:
+def test_each_problem_draws_its_own_points_from_a_larger_pool(folder: Path) -> None:
     data = module(folder, num_points=30, pool_size=2048)
     data.setup("fit")
     data.setup("test")

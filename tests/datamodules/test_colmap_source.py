@@ -63,7 +63,7 @@ def test_clutter_is_drawn_from_keypoints_and_points_without_a_match(
     assert extra2d == 0 or distance.min() > 1e-5
 
 
-def test_a_scene_far_from_its_origin_keeps_its_digits_and_can_be_turned_back(tmp_path: Path, caplog) -> None:
+def test_a_scene_far_from_its_origin_keeps_its_digits_and_its_frame(tmp_path: Path, caplog) -> None:
     """At 5e6 units float32 steps by half a unit, as large as the scene."""
     truth = plant_model(tmp_path / "m", origin=5e6)
     problems = source(tmp_path / "m")

@@ -151,7 +151,7 @@ def train(folder: Path, **options: object) -> list[Batch]:
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("fresh", [True, False])
-def test_views_are_drawn_anew_each_epoch_or_fixed_in_any_number_of_processes(tmp_path: Path, fresh: bool) -> None:
+def test_views_are_new_in_each_epoch_or_fixed_for_any_number_of_processes(tmp_path: Path, fresh: bool) -> None:
     batches = train(tmp_path, fresh_views=fresh)
     assert [len(batch) for batch in batches] == [4] * 6
     epochs = [torch.cat([b.index for b in batches[:3]]), torch.cat([b.index for b in batches[3:]])]

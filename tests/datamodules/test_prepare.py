@@ -170,7 +170,7 @@ def test_a_kill_at_any_time_leaves_no_wrong_store(
     assert {path.name for path in tmp_path.iterdir() if "unfinished" in path.name} == set()
 
 
-def test_ctrl_c_says_that_nothing_was_written(
+def test_ctrl_c_reports_that_nothing_was_written(
     meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("bpnp.datamodules.shapes.sample_surface", Mock(side_effect=KeyboardInterrupt))
@@ -181,7 +181,7 @@ def test_ctrl_c_says_that_nothing_was_written(
     assert [path.name for path in tmp_path.iterdir()] == ["ModelNet40"]
 
 
-def test_folders_of_the_user_beside_the_store_stay(meshes: Path, tmp_path: Path) -> None:
+def test_folders_of_the_user_near_the_store_are_kept(meshes: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     mine = [out / ".store.2024-notes" / "a.txt", out / ".store.unfinished" / "b.txt", out / ".store.1" / "c.txt"]
     for file in mine:
@@ -239,7 +239,7 @@ def scenes(root: Path, count: int) -> None:
         plant_model(root / f"{i:04d}" / "sparse" / "manhattan" / "0", seen=30 + i, seed=i)
 
 
-def test_colmap_pairs_are_those_read_anew(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_stored_colmap_problems_equal_those_of_the_models(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scenes(tmp_path / "MegaDepth_v1_SfM", 6)
     broken = tmp_path / "MegaDepth_v1_SfM" / "0003" / "sparse" / "manhattan" / "0" / "points3D.bin"
     broken.write_bytes(broken.read_bytes()[:-9])

@@ -80,7 +80,7 @@ def test_keypoints_outside_the_field_of_view_are_dropped_and_counted(tmp_path: P
     assert (len(found.images[0].points2d), len(found.images[0].clutter2d)) == (39, 11)
 
 
-def test_of_repeated_keypoints_the_better_one_is_kept(tmp_path: Path, monkeypatch) -> None:
+def test_the_better_of_repeated_keypoints_is_kept(tmp_path: Path, monkeypatch) -> None:
     truth = plant_model(tmp_path, images=1)
     image = editable(tmp_path, monkeypatch).images[0]
     image.keypoints[-1], image.point_ids[-1] = image.keypoints[5], image.point_ids[5]

@@ -55,7 +55,7 @@ def as_users_run_it(monkeypatch: pytest.MonkeyPatch) -> None:
         (ransac_pnp, {"max_iterations": 0}, "`max_iterations` is 0; it must be above 0"),
     ],
 )
-def test_a_layer_says_what_is_wrong(layer: Callable[..., Any], changed: dict[str, Any], message: str) -> None:
+def test_wrong_arguments_of_a_layer_are_named(layer: Callable[..., Any], changed: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         layer(**ARGUMENTS[layer] | changed)
 
@@ -90,6 +90,6 @@ def test_a_transform_of_torch_func_is_refused_in_one_line(layer: Callable[..., A
         apply[transform]()
 
 
-def test_layers_run_beside_a_transform() -> None:
+def test_layers_run_after_a_torch_func_transform() -> None:
     assert torch.vmap(lambda x: x + 1)(torch.zeros(2)).tolist() == [1, 1]
     assert sinkhorn(torch.rand(1, 4, 5))[1].converged.all()

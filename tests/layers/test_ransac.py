@@ -33,7 +33,7 @@ def test_ransac_finds_a_planted_pose_among_outliers(backend: str, share: float) 
 
 @pytest.mark.parametrize("backend", ["poselib", "opencv", "torch"])
 @pytest.mark.parametrize("kind", ["three pairs", "one place", "collinear", "no agreement", "nothing finite"])
-def test_without_four_inliers_there_is_no_pose(backend: str, kind: str) -> None:
+def test_ransac_finds_no_pose_without_four_inliers(backend: str, kind: str) -> None:
     planted = plant(3, 12, seed=4)
     assignment, points2d, points3d = planted.permutation(), planted.points2d.clone(), planted.points3d.clone()
     mask2d = torch.ones(3, 12, dtype=torch.bool)

@@ -99,7 +99,7 @@ def test_a_loop_is_compiled_again_after_a_change_of_a_part_or_of_a_tuple_that_it
     assert (out, log) == ("8 10 True \n", "")  # the first version is still there
 
 
-def test_of_processes_that_start_together_one_compiles(package: Path, tmp_path: Path) -> None:
+def test_one_of_several_processes_compiles_a_loop(package: Path, tmp_path: Path) -> None:
     processes = [start(package, tmp_path / "cache") for _ in range(3)]
     ends = [process.communicate() for process in processes]
     assert [out for out, _ in ends] == ["8 10 True \n"] * 3
@@ -144,7 +144,7 @@ print(*signatures())
 """
 
 
-def test_after_warming_up_nothing_is_compiled_whatever_the_arrays_of_a_problem() -> None:
+def test_after_warm_up_no_problem_compiles_a_loop() -> None:
     done = subprocess.run([sys.executable, "-c", SIGNATURES], capture_output=True, text=True, check=True)
     warm, used = done.stdout.splitlines()
     versions = dict(entry.split(":") for entry in warm.split())

@@ -35,7 +35,7 @@ def test_threads_are_those_of_torch_else_of_the_environment_else_the_cpus(
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 100])
-def test_every_index_is_visited_once_and_no_share_is_empty(threads: int, count: int) -> None:
+def test_every_index_is_visited_once_and_no_part_is_empty(threads: int, count: int) -> None:
     seen, shares = np.zeros(count, int), list[int]()
 
     def work(first: int, last: int) -> None:
@@ -48,7 +48,7 @@ def test_every_index_is_visited_once_and_no_share_is_empty(threads: int, count: 
     assert count == 0 or min(shares) >= 1
 
 
-def test_an_error_in_any_share_is_raised(threads: int) -> None:
+def test_an_error_in_any_part_is_raised(threads: int) -> None:
     def fail(_first: int, last: int) -> None:
         if last == 10:
             raise ArithmeticError("last share")

@@ -109,7 +109,7 @@ def test_faces_that_are_alike_in_all_points_are_ambiguous_and_both_poses_are_can
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_place_that_is_there_twice_is_ambiguous_whatever_its_size(seed: int) -> None:
+def test_a_place_that_occurs_twice_is_ambiguous_at_any_size(seed: int) -> None:
     rng = np.random.default_rng(seed)
     points, normals = box(rng, ())
     size, turn, shift = 1.4, Rotation.random(rng=rng).as_matrix(), np.array([40.0, -10.0, 25.0])

@@ -36,7 +36,7 @@ def test_discs_are_found_at_their_centres_and_large_ones_are_stronger(blobs) -> 
     np.testing.assert_allclose(sizes / radii, np.median(sizes / radii), rtol=0.25)
 
 
-def test_keypoints_of_a_photo_to_be_shown_turned_are_where_its_pixels_are_stored(blobs, tmp_path: Path) -> None:
+def test_keypoints_of_a_photo_with_exif_orientation_are_in_stored_pixels(blobs, tmp_path: Path) -> None:
     """COLMAP, the camera of EXIF, the check of sizes and the picture over the photo use these axes too."""
     path, *_ = blobs
     tags = Image.Exif()

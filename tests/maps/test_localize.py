@@ -100,14 +100,14 @@ def test_the_ids_of_an_earlier_file_become_indices(planted: tuple[SceneMap, Plan
     assert read.parameters == solution.parameters
 
 
-def test_no_time_limit_is_the_default_one_and_is_said_where_it_was_none(planted: tuple[SceneMap, Planted]) -> None:
+def test_time_limit_none_of_verify_view_is_its_default_limit_with_a_warning(planted: tuple[SceneMap, Planted]) -> None:
     scene, truth = planted
     pixels = 520 * seen(truth.points3d, truth.rotations[1], truth.translations[1]) + [400, 300]
     with pytest.warns(DeprecationWarning, match="`time_limit=None` of `verify_view` is its default limit"):
         scene.verify_view("photo 1.jpg", pixels, time_limit=None)
 
 
-def test_what_the_time_limit_left_open_is_said(planted: tuple[SceneMap, Planted]) -> None:
+def test_the_reason_has_the_number_of_views_tried_within_the_time_limit(planted: tuple[SceneMap, Planted]) -> None:
     """After a limit that has passed when the first view was tried no other one is; noise has no confident pose."""
     scene, truth = planted
     noise = np.random.default_rng(0).uniform((0, 0), (800, 600), (90, 2))
@@ -231,7 +231,7 @@ def test_a_prior_decides_on_which_side_the_photo_was_taken(planted: tuple[SceneM
         assert degrees_between(found.rotation, rotation) < 1
 
 
-def test_the_solver_that_is_asked_for_solves(planted: tuple[SceneMap, Planted]) -> None:
+def test_localize_uses_the_given_solver(planted: tuple[SceneMap, Planted]) -> None:
     class Refuses(torch.nn.Module):
         def forward(self, batch: object) -> None:
             raise RuntimeError("was asked")

@@ -75,7 +75,7 @@ def test_a_large_map_is_indexed_once(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert len(SceneMap.from_colmap(folder).views) == 3
 
 
-def test_of_processes_that_open_a_large_map_together_one_computes_its_index(
+def test_one_of_several_processes_computes_the_index_of_a_large_map(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The other waits, and reads what the first one wrote."""

@@ -44,7 +44,7 @@ def photo_on_its_side(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_up_is_the_side_that_pillow_turns_to_the_top(orientation: int, tmp_path: Path) -> None:
+def test_up_is_the_side_that_pillow_rotates_to_the_top(orientation: int, tmp_path: Path) -> None:
     photo = Image.new("L", (40, 30))
     exif = photo.getexif()
     exif[0x0112] = orientation
@@ -81,7 +81,7 @@ def test_up_is_what_most_views_agree_on() -> None:
     np.testing.assert_allclose(turned_view(views[0], 1).centre, views[0].centre, atol=1e-12)
 
 
-def test_views_without_a_common_up_are_not_turned() -> None:
+def test_views_without_a_common_up_direction_are_not_rotated() -> None:
     scene, _ = street(4)
     views = [turned_view(view, k) for k, view in enumerate(scene.views)]
     assert up_of_views(views) is None

@@ -41,7 +41,7 @@ def photo(scene: SceneMap, k: int, seed: int, turned_deg: float = 6.0) -> Array:
     return np.concatenate([seen, rng.uniform(-0.6, 0.6, seen.shape)])
 
 
-def test_the_view_beside_a_photo_is_among_the_first() -> None:
+def test_the_nearest_view_of_a_photo_is_among_the_first() -> None:
     scene = city(0)
     ranks = []
     for k in range(0, PLACES, 5):

@@ -25,7 +25,7 @@ def whole(turn: Tensor, rotvec_half: float, place: Tensor, centre_half: float) -
     )
 
 
-def test_no_pose_of_a_box_turns_a_direction_by_more_than_its_uncertainty() -> None:
+def test_no_pose_of_a_box_rotates_a_direction_beyond_its_uncertainty() -> None:
     generator = torch.Generator().manual_seed(0)
     turn, place, points = (torch.randn(k, 3, generator=generator).double() for k in (1000, 1000, 20))
     halves = 10 ** (-2 * torch.rand(1000, 1, generator=generator).double()) * torch.tensor([[0.3, 1.0, 0.6]]).double()

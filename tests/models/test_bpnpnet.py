@@ -49,7 +49,7 @@ def test_bpnpnet_returns_an_assignment_and_all_poses() -> None:
     assert not prediction.assignment[~(batch.mask2d.unsqueeze(-1) & batch.mask3d.unsqueeze(1))].any()
 
 
-def test_only_evaluation_refines_and_only_if_asked() -> None:
+def test_refinement_runs_only_in_evaluation_and_only_if_enabled() -> None:
     batch = different_sizes(12, 20, dtype=torch.float32)
     assert tuple(small_net().train()(batch).poses) == ("ransac", "pnp")
     without = small_net(refine=False).eval()

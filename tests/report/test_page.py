@@ -58,7 +58,7 @@ def test_the_page_holds_the_numbers_of_the_results(tmp_path: Path) -> None:
     assert text.count("paper, MegaDepth: Lc Lp") == 2
 
 
-def test_recall_curves_are_the_shares_of_the_rows(tmp_path: Path) -> None:
+def test_recall_curves_of_the_page_are_fractions_of_the_rows(tmp_path: Path) -> None:
     results = write_run(tmp_path, 200, 0)
     errors = np.array([row.rotation_error_deg for row in results.of("pnp")])
     recall = recall_chart({"run": results}, "rotation_deg")

@@ -79,7 +79,7 @@ def test_inliers_are_those_of_a_brute_force_count() -> None:
     assert count_inliers(behind, batch) == [0]
 
 
-def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
+def test_results_are_read_as_they_were_written(tmp_path: Path) -> None:
     rows = [row(i, id=name) for i, name in enumerate(HOSTILE)]
     lost = {"rotation_error_deg": 180.0, "translation_error": math.inf, "centre_error": math.inf}
     rows[1] = dataclasses.replace(rows[1], **lost, found=False, converged=False, residual=math.inf)

@@ -27,7 +27,7 @@ def angles(rotations: Tensor, rotation: Tensor) -> Tensor:
     return rotation_angle(rotations, rotation.unsqueeze(-3).expand(rotations.shape)).nan_to_num(nan=torch.inf)
 
 
-def test_one_of_the_poses_is_the_planted_one_in_100000_round_trips() -> None:
+def test_p3p_finds_the_planted_pose_in_100000_round_trips() -> None:
     rays, points3d, rotation, translation = planted(100_000)
     solution = p3p(rays, points3d)
     angle = angles(solution.rotation, rotation)

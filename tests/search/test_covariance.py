@@ -60,7 +60,7 @@ def test_a_parameter_that_is_not_fitted_adds_what_it_moves() -> None:
     np.testing.assert_allclose(found, inverse_of(jacobian) + np.outer(moved, moved), rtol=1e-9)
 
 
-def test_what_the_matches_do_not_fix_has_no_covariance() -> None:
+def test_parameters_that_the_matches_do_not_fix_have_no_covariance() -> None:
     jacobian = rows(0) * [1.0, 1.0, 0.0]
     assert covariance_of(of_sure_matches(np.zeros((60, 2)), jacobian), fitted=3) is None
 

@@ -56,7 +56,7 @@ def test_without_a_radial_coefficient_only_the_focal_length_is_fitted() -> None:
 
 
 @pytest.mark.parametrize("radial", [-0.2, 0.0, 0.3])
-def test_derivatives_by_the_lens_are_finite_differences_of_undistorted_pixels(radial: float) -> None:
+def test_derivatives_by_camera_parameters_are_finite_differences_of_undistorted_pixels(radial: float) -> None:
     points, pixels = planted(radial, seed=4, count=20)
     step = 1e-5
 
@@ -100,7 +100,7 @@ def focal_sigmas(problem: Problem, lens: UnknownFocal, scale: float) -> tuple[fl
     return math.log(fit.zoom), math.sqrt(covariance[6, 6])
 
 
-def test_the_error_of_the_focal_length_allows_for_residuals_that_neighbours_share() -> None:
+def test_the_covariance_of_the_focal_length_allows_for_correlated_residuals() -> None:
     """Errors of a map are alike for neighbouring points: smooth fields of one pixel move 400 points. As independent
     residuals of one pixel they would leave half the standard deviation of the focal length."""
     off = []

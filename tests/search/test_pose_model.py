@@ -126,7 +126,7 @@ def test_a_rig_sees_what_each_of_its_cameras_sees() -> None:
         np.testing.assert_allclose(model.directions(state, POINTS, k), expected, atol=1e-14)
 
 
-def test_a_gravity_prior_has_no_information_on_the_turn_about_the_vertical() -> None:
+def test_a_gravity_prior_has_no_information_on_the_rotation_about_the_vertical() -> None:
     up = np.array([1.0, 2, -2])
     model = PoseModel(POINTS.mean(0), UnknownFocal(2.0, sigma=0.1), prior=GravityPrior(up, [0, 0, 1], 2.0))
     information = model.information(model.state(np.eye(3), np.zeros(3)))

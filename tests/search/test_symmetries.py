@@ -28,7 +28,7 @@ def angles(motions: Motions) -> list[int]:
     ("fold", "expected"), [(2, [180]), (3, [120] * 2), (5, [72, 72, 144, 144]), (6, [60, 60, 120, 120, 180])]
 )
 @pytest.mark.parametrize("axis", [(0, 0, 1), (0.3, -0.5, 0.8)])
-def test_all_turns_of_a_symmetric_object_are_found(
+def test_all_rotations_of_a_symmetric_object_are_found(
     fold: int, expected: list[int], axis: tuple[float, float, float]
 ) -> None:
     points = parts(fold, 90 // fold, 8, 1, axis)
@@ -123,7 +123,7 @@ def solved(points: Array, seed: int) -> tuple[bpnp.Solution, float]:
 
 @pytest.mark.parametrize(("fold", "each", "unique"), [(3, 30, 8), (5, 18, 8), (2, 45, 8), (3, 7, 4), (5, 6, 4)])
 @pytest.mark.parametrize("seed", range(2))
-def test_unique_points_decide_between_the_turns_of_an_object(fold: int, each: int, unique: int, seed: int) -> None:
+def test_unique_points_decide_between_the_rotations_of_an_object(fold: int, each: int, unique: int, seed: int) -> None:
     found, error = solved(parts(fold, each, unique, seed), seed)
     assert found.verdict == "confident"
     assert error < 2

@@ -69,7 +69,7 @@ def test_three_points_are_enough_with_gravity() -> None:
         solve(pixels(points, rotation, translation), points, CAMERA)
 
 
-def test_a_confident_pose_of_a_ring_is_confident_when_it_is_verified_and_its_half_turn_is_not() -> None:
+def test_verify_confirms_a_confident_pose_of_a_ring_and_rejects_its_half_turn() -> None:
     """A half turn of a ring maps many of its LEDs near others."""
     rng, checked = np.random.default_rng(45), 0
     for seed in range(12):
@@ -130,7 +130,7 @@ def test_a_predicted_pose_is_taken_without_a_search_if_it_fits_and_left_if_not()
         assert degrees_between(search(prior=prior).rotation, frame.rotation) < 1
 
 
-def test_two_devices_in_one_picture_share_no_light() -> None:
+def test_two_devices_in_one_frame_share_no_led() -> None:
     """Two controllers of one make: each pose is found once, and no light belongs to both."""
     rng = np.random.default_rng(8)
     known = device("ring", 8)
@@ -144,7 +144,7 @@ def test_two_devices_in_one_picture_share_no_light() -> None:
     assert solve(image, **search).stats.taken2d == 0
 
 
-def test_two_devices_share_no_light_where_the_focal_length_is_rough() -> None:
+def test_two_devices_share_no_led_with_a_rough_focal_length() -> None:
     rng = np.random.default_rng(8)
     points = rng.uniform(-0.1, 0.1, (14, 3))
     poses = [Rotation.random(random_state=k).as_matrix() for k in range(2)]

@@ -143,7 +143,7 @@ def test_a_strong_distortion_is_found_among_dense_points(radial: float) -> None:
     assert fitted["params"] == pytest.approx([600, 320, 240, radial], rel=0.01)
 
 
-def test_distortion_that_is_asked_for_is_always_fitted() -> None:
+def test_distortion_true_always_fits_a_coefficient() -> None:
     pixels, scene, _ = planted(600.0, points=150, distance=3.0)
     solution = solve(pixels, scene, image_size=SIZE, distortion=True, solver="search", time_limit=LIMIT)
     camera = json.loads(solution.to_json())["camera"]
@@ -201,7 +201,7 @@ def test_the_command_takes_the_size_of_the_image(tmp_path: Path, capsys: pytest.
 
 
 @pytest.mark.parametrize("radial", [-0.3, 0.3])
-def test_a_given_camera_is_never_changed_and_a_better_lens_makes_the_pose_ambiguous(radial: float) -> None:
+def test_a_given_camera_is_kept_and_a_better_camera_model_makes_the_pose_ambiguous(radial: float) -> None:
     camera = ("SIMPLE_PINHOLE", (600.0, 320.0, 240.0))
     pixels, scene, _ = planted(600.0, points=150, radial=radial, distance=3.0)
     solution = solve(pixels, scene, camera, solver="search", time_limit=LIMIT)

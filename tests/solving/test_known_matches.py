@@ -73,7 +73,7 @@ def test_some_known_matches_may_be_wrong() -> None:
         assert set(solution.matches[:, 0]) == set(range(6, 12))
 
 
-def test_known_matches_beside_a_prior_have_a_pose() -> None:
+def test_known_matches_with_a_prior_have_a_pose() -> None:
     points, image, rotation, _ = known(1, 6, 10.0)
     gravity = bpnp.GravityPrior(rotation @ [0, 0, 1.0], [0, 0, 1.0], 2.0)
     solution = bpnp.solve(image, points, CAMERA, labels2d=np.arange(6), labels3d=np.arange(6), prior=gravity)

@@ -208,7 +208,7 @@ def test_a_mistake_is_one_clear_error(call: str, change: Any, message: str) -> N
 @pytest.mark.parametrize(
     ("outside", "count", "refused"), [(1.8, 1, False), (1.8, 20, False), (30.0, 1, False), (30.0, 5, True)]
 )
-def test_the_fraction_of_points_outside_tells_a_wrong_image_size(outside: float, count: int, refused: bool) -> None:
+def test_many_points_outside_the_image_are_a_wrong_image_size(outside: float, count: int, refused: bool) -> None:
     """Detectors put keypoints slightly outside; of a hundred, one may be far outside."""
     pixels = np.random.default_rng(0).uniform(0, 100, (100, 2)) * (6.4, 4.8)
     pixels[:count, 0] = 640 + outside

@@ -80,7 +80,7 @@ class Knowing(Matcher):
 
 
 @pytest.mark.parametrize("frame", ["any", "view"])
-def test_a_matcher_solves_with_one_right_pair_in_twenty_alone_and_beside_a_pair_without_a_pose(
+def test_a_matcher_with_one_inlier_in_twenty_solves_a_problem_alone_and_in_a_batch(
     frame: Literal["any", "view"],
 ) -> None:
     image, points, rotation, translation = scene(clutter=60)

@@ -69,7 +69,7 @@ def test_a_problem_with_noise_and_outliers_is_solved_and_reported() -> None:
 
 
 @pytest.mark.parametrize("as_object", [False, True])
-def test_pixels_of_a_lens_are_undistorted_and_lost_ones_counted(as_object: bool) -> None:
+def test_pixels_are_undistorted_and_dropped_ones_counted(as_object: bool) -> None:
     """Two pixels that no ray in front of the fisheye reaches; the places in `matches` are those of the given array."""
     planted = plant(1, 60, seed=1)
     lens = pycolmap.Camera(model=FISHEYE[0], params=FISHEYE[1])
@@ -251,7 +251,7 @@ def test_arrays_of_opencv_detectors_are_accepted(form: str) -> None:
     assert solution.points2d.shape == (200, 2)
 
 
-def test_a_pose_that_the_time_limit_left_open_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_reason_names_the_time_limit_that_left_a_pose_undecided(monkeypatch: pytest.MonkeyPatch) -> None:
     """The search returns an open verdict, with its deadline passed or not."""
     planted = plant(2, 40)
     points = planted.points2d[0].numpy(), planted.points3d[0].numpy()

@@ -29,7 +29,7 @@ def alike(one: bpnp.Solution, other: bpnp.Solution) -> bool:
     return same and np.array_equal(one.matches, other.matches) and one.reason == other.reason
 
 
-def test_solutions_are_those_of_single_calls_whatever_the_number_of_threads(two_threads: None) -> None:
+def test_solve_many_equals_single_calls_for_any_number_of_threads(two_threads: None) -> None:
     shared = bpnp.solve_many(*SETS, time_limit=math.inf)
     torch.set_num_threads(1)
     single = [bpnp.solve(*pair, time_limit=math.inf) for pair in zip(*SETS, strict=True)]

@@ -150,9 +150,7 @@ def test_gradients_are_clipped_in_every_precision(precision: str, kind: str, tmp
 
 
 @pytest.mark.parametrize("kind", ["BPnPNet", "Matcher"])
-def test_gradients_that_a_layer_could_not_solve_for_are_logged_as_a_share_of_the_epoch(
-    kind: str, tmp_path: Path
-) -> None:
+def test_unconverged_gradients_of_a_layer_are_logged_as_a_fraction_of_the_epoch(kind: str, tmp_path: Path) -> None:
     solver = small_net() if kind == "BPnPNet" else Matcher(channels=8, depth=1, heads=2)
     task, shares = BlindPnPTask(solver), []
     counts = solver.transport.backward_stats if kind == "BPnPNet" else solver.backward_stats

@@ -81,7 +81,7 @@ def test_early_stopping_ends_the_training(tmp_path: Path) -> None:
     assert (Observer.trainer.current_epoch, len(Observer.problems)) == (1, 1)  # of 3 epochs
 
 
-def test_a_checkpoint_callback_of_the_user_writes_beside_ours(tmp_path: Path) -> None:
+def test_a_checkpoint_callback_of_the_user_writes_in_addition_to_ours(tmp_path: Path) -> None:
     own = ["--trainer.callbacks+=ModelCheckpoint", "--trainer.callbacks.every_n_train_steps=1"]
     own += ["--trainer.callbacks.save_top_k=-1", f"--trainer.callbacks.dirpath={tmp_path}/own"]
     fit(tmp_path, *TWO_STEPS, *own, "--trainer.callbacks.filename={step}")
