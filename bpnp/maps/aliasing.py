@@ -76,7 +76,7 @@ class Competitor:
 
 @one_blas_thread
 def best_competitor(
-    photo: Photo, place: Region, solution: Solution, earlier: Sequence[Solution], regions: Iterable[Region]
+    photo: Photo, place: Region, solution: Solution, earlier: Sequence[Candidate], regions: Iterable[Region]
 ) -> Competitor | None:
     """Propose, refine and score the poses elsewhere in a map that explain the image points of a confident solution.
 
@@ -84,7 +84,7 @@ def best_competitor(
         photo: The photo.
         place: Points on which the poses are compared.
         solution: Confident solution.
-        earlier: Solutions with the points of other views.
+        earlier: Significant poses that were found with the points of other views (`significant`).
         regions: Regions of the map, ranked for the explained image points (`explained_keypoints`).
 
     Returns:
@@ -106,7 +106,7 @@ def propose_elsewhere(
     problem: Problem,
     place: Region,
     solution: Solution,
-    earlier: Sequence[Solution],
+    earlier: Sequence[Candidate],
     regions: Iterable[Region],
 ) -> list[Pose]:
     """Return poses elsewhere in the map that may explain the image points of a solution, unrefined.
@@ -116,14 +116,13 @@ def propose_elsewhere(
         problem: Problem of its keypoints and the points of `place`.
         place: Points on which the poses are compared.
         solution: The solution.
-        earlier: Solutions with the points of other views; their significant candidates are proposed.
+        earlier: Significant poses that were found with the points of other views; they are proposed.
         regions: Regions of the map, ranked for the explained image points; the first ones of other points are searched.
     """
-    significant = [one for other in earlier for one in other.candidates if one.log10_false_alarms < 0]
     scale = _scale_of(problem, solution)
     repeated, _ = repeated_poses(problem, *_pose_of(problem, solution), scale, DEFAULT.evidence)
     return [
-        *(_pose_of(problem, one) for one in significant),
+        *(_pose_of(problem, one) for one in earlier),
         *zip(repeated.rotation, repeated.translation, strict=True),
         *_found_in(_other_regions(regions, place, problem, solution), photo, problem, solution),
     ]
@@ -160,6 +159,11 @@ def judge_against(solution: Solution, competitor: Competitor | None) -> Solution
     return replace(doubtful, candidates=(solution.candidates[0], competitor.pose, *solution.candidates[1:]))
 
 
+def significant(solution: Solution) -> list[Candidate]:
+    """Return the candidates of a solution that fit better than chance (log10 NFA below 0)."""
+    return [one for one in solution.candidates if one.log10_false_alarms < 0]
+
+
 def explained_keypoints(photo: Photo, solution: Solution) -> Array:
     """Return the keypoints (k, 2), pixels, that a solution explains."""
     return photo.keypoints[np.sort(solution.matches[:, 0])]
@@ -185,7 +189,7 @@ def _candidate(problem: Problem, solution: Solution, pose: Hypotheses, margin: f
 
 
 def _other_regions(regions: Iterable[Region], place: Region, problem: Problem, solution: Solution) -> Iterator[Region]:
-    """Yield the first regions of which a solution does not see most points."""
+    """Yield the first regions with mostly points that are not visible from the pose of a solution."""
     if len(solution.matches) < ALIASING.fewest:
         return
     seen, count = place.point_ids[in_picture(problem, solution)], 0

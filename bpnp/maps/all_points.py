@@ -65,22 +65,22 @@ def refine_on_all_points(solution: Solution, photo: Photo, whole: Region) -> Ref
     if not solution.found:
         return None
     pose, scale = (solution.rotation, solution.translation), solution.stats.residual
-    camera = camera_from(solution.camera)
-    seen = whole.in_view(*pose, camera, photo.keypoints)
+    found = camera_from(solution.camera)
+    seen = whole.in_view(*pose, found, photo.keypoints)
     if len(seen) < max(len(solution.matches), MIN_POINTS):
         return None
-    region, lens = whole.part(seen), photo.lens
+    region, camera = whole.part(seen), photo.camera
 
-    def problem_at(camera: object, focal: UnknownFocal | None = None) -> Problem:
-        return photo.problem(region, camera, focal=focal)
+    def problem_at(known: object, focal: UnknownFocal | None = None) -> Problem:
+        return photo.problem(region, known, focal=focal)
 
-    if isinstance(lens, UnknownCamera):
-        lens = lens.seen_by(problem_at(lens.reference))
-        fitted = fit_camera(problem_at, lens, camera, pose, scale, photo.seed, AROUND)
+    if isinstance(camera, UnknownCamera):
+        camera = camera.seen_by(problem_at(camera.reference))
+        fitted = fit_camera(problem_at, camera, found, pose, scale, photo.seed, AROUND)
         problem, poses = fitted.problem, fitted.poses
         rotation, shift = poses.rotation[0], poses.translation[0]
     else:
-        problem = problem_at(lens)
+        problem = problem_at(camera)
         rotation, shift = problem.from_user(*pose)
         least = problem.image.scales[0]
         poses = polished(Scene(problem, photo.seed, DEFAULT), rotation[None], shift[None], max(scale, least))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bpnp.cameras import Camera, camera_from
 from bpnp.loops.parallel import Clock, Deadline
-from bpnp.maps.aliasing import Competitor, best_competitor, explained_keypoints, judge_against
+from bpnp.maps.aliasing import Competitor, best_competitor, explained_keypoints, judge_against, significant
 from bpnp.maps.all_points import judge_on_all_points, refine_on_all_points
 from bpnp.maps.photo_problem import Photo, with_ids
 from bpnp.maps.viewed_points import Place, Region, ViewedPoints
@@ -115,22 +115,22 @@ def _localize_in(
         options: Options of each search, with the deadline of all of them.
         tried: Names of the views that were tried; those of this call are added.
     """
-    places = scene.places(views, photo.keypoints, photo.lens)
+    places = scene.places(views, photo.keypoints, photo.camera)
     if not places:
         raise ValueError("no view of the map sees 4 or more points, which a pose needs")
     photo = replace(photo, view_count=len({place.view.name for place in places}))
     queue = deque((place, settings) for settings in (BRIEF, ONCE) for place in places)
-    earlier, best, longer = list[Solution](), list[Attempt](), set[str]()
+    earlier, best, longer = list[Candidate](), list[Attempt](), set[str]()
     while queue and not (best and options.until.passed()):
         place, settings = queue.popleft()
         tried.add(place.view.name)
-        own = search_near(scene.region(place.view, place.points), photo, place.lens, options, settings)
+        own = search_near(scene.region(place.view, place.points), photo, place.camera, options, settings)
         attempt = Attempt(place, own, False)
         if own.verdict == "confident" or own.log10_false_alarms < 0:
             attempt = judge_in_map(scene, photo, views, attempt, earlier)
         if "confident" in (own.verdict, attempt.solution.verdict):
             return Outcome(attempt.solution, True)
-        earlier.append(attempt.solution)
+        earlier += significant(attempt.solution)
         best = sorted([*best, attempt], key=lambda one: one.rank, reverse=True)[:PROMISING]
         again = [attempt] if attempt.solution.log10_false_alarms < LIKELY and len(longer) < PROMISING else []
         if not queue:  # not significant so far, but perhaps with all points of the map
@@ -142,39 +142,39 @@ def _localize_in(
         for one in reversed(again):
             if one.place.view.name not in longer:
                 longer.add(one.place.view.name)
-                queue.appendleft((one.place._replace(lens=_lens_near(photo.lens, one.solution)), LONGER))
+                queue.appendleft((one.place._replace(camera=_camera_near(photo.camera, one.solution)), LONGER))
     if not queue:
         return Outcome(best[0].solution, True)
     return Outcome(judge_in_map(scene, photo, views, best[0], earlier).solution, False)
 
 
 def search_near(
-    region: Region, photo: Photo, lens: Camera | UnknownCamera, options: Options, settings: SearchSettings
+    region: Region, photo: Photo, camera: Camera | UnknownCamera, options: Options, settings: SearchSettings
 ) -> Solution:
     """Return the best pose of a photo among the points of one region.
 
     Args:
         region: Points, and the view to search near.
         photo: The photo.
-        lens: Camera, or its prior.
+        camera: Camera, or its prior.
         options: Options of the search.
         settings: Settings of the search.
     """
     options = options._replace(settings=settings, asks=options.asks and settings is LONGER)
     prior = checked_prior(region.prior() if photo.prior is None else photo.prior)
-    if isinstance(lens, UnknownCamera):
+    if isinstance(camera, UnknownCamera):
 
-        def problem_at(camera: Any, focal: UnknownFocal) -> Problem:
-            return photo.problem(region, camera, prior, focal)
+        def problem_at(known: Any, focal: UnknownFocal) -> Problem:
+            return photo.problem(region, known, prior, focal)
 
-        solution = solved_with_focal_length(problem_at, lens, options)
+        solution = solved_with_focal_length(problem_at, camera, options)
     else:
-        solution = solutions_of({0: photo.problem(region, lens, prior)}, options)[0]
+        solution = solutions_of({0: photo.problem(region, camera, prior)}, options)[0]
     return with_ids(solution, region)
 
 
 def judge_in_map(
-    scene: ViewedPoints, photo: Photo, views: Sequence[str] | None, attempt: Attempt, earlier: Sequence[Solution]
+    scene: ViewedPoints, photo: Photo, views: Sequence[str] | None, attempt: Attempt, earlier: Sequence[Candidate]
 ) -> Attempt:
     """Refine and judge a pose on all map points in view and, if it is confident, against poses elsewhere in the map.
 
@@ -186,7 +186,7 @@ def judge_in_map(
         photo: The photo.
         views: Names of the views to try; None for all views of the map.
         attempt: The pose; returned unchanged if it was judged before.
-        earlier: Solutions with the points of other views.
+        earlier: Significant poses that were found with the points of other views.
     """
     if attempt.is_judged:
         return attempt
@@ -194,11 +194,13 @@ def judge_in_map(
     whole = scene.region(place.view)
     solution = judge_on_all_points(own, refine_on_all_points(own, photo, whole))
     if photo.prior is None and solution.verdict == "confident":
-        competitor = find_competitor(scene, photo, views, place, solution, [*earlier, own])
+        earlier = [*earlier, *significant(own)]
+        competitor = find_competitor(scene, photo, views, place, solution, earlier)
         if competitor is not None and competitor.margin <= -DEFAULT.evidence.lead:
             better = _judge_competitor(scene, photo, views, solution, competitor.pose)
             if better.verdict == "confident":
-                competitor = find_competitor(scene, photo, views, place, better, [*earlier, own, solution])
+                earlier = [*earlier, *significant(solution)]
+                competitor = find_competitor(scene, photo, views, place, better, earlier)
                 solution = better
         solution = judge_against(solution, competitor)
     return Attempt(place, solution, True)
@@ -210,7 +212,7 @@ def find_competitor(
     views: Sequence[str] | None,
     place: Place,
     solution: Solution,
-    earlier: Sequence[Solution],
+    earlier: Sequence[Candidate],
 ) -> Competitor | None:
     """Return the best pose elsewhere in the map, or among the given views, that explains the same image points.
 
@@ -220,7 +222,7 @@ def find_competitor(
         views: Names of the views to try; None for all views of the map.
         place: View and points of the solution.
         solution: Confident solution.
-        earlier: Solutions with the points of other views.
+        earlier: Significant poses that were found with the points of other views.
     """
     compared = scene.region(place.view, None if views is None else place.points)
     regions = scene.ranked_regions(views, camera_from(solution.camera), explained_keypoints(photo, solution))
@@ -267,11 +269,11 @@ def among_all(solution: Solution, used: NDArray[np.int64], keypoints: Any) -> So
     return replace(solution, matches=matches, points2d=points2d)
 
 
-def _lens_near(lens: Camera | UnknownCamera, solution: Solution) -> Camera | UnknownCamera:
+def _camera_near(camera: Camera | UnknownCamera, solution: Solution) -> Camera | UnknownCamera:
     """Return the camera for a longer search near a solution.
 
     An unknown camera gets the focal length of a significant solution; otherwise all focal lengths are tried.
     """
-    if isinstance(lens, UnknownCamera) and solution.log10_false_alarms < 0:
-        return lens.near(camera_from(solution.camera))
-    return lens
+    if isinstance(camera, UnknownCamera) and solution.log10_false_alarms < 0:
+        return camera.near(camera_from(solution.camera))
+    return camera

@@ -22,14 +22,14 @@ class Photo:
 
     Attributes:
         keypoints: (m, 2) pixels.
-        lens: Camera model, or its prior if the focal length is unknown.
+        camera: Camera model, or its prior if the focal length is unknown.
         prior: Prior of the pose; None for none.
         view_count: Number of views that are tried, which the NFA counts as tests. Default 1.
         seed: Seed of the search, default 0.
     """
 
     keypoints: Array
-    lens: Camera | UnknownCamera
+    camera: Camera | UnknownCamera
     prior: Any = None
     view_count: int = 1
     seed: int = 0

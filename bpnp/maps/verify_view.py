@@ -38,13 +38,13 @@ def verify_pose(
     if len(photo.keypoints) < MIN_POINTS:
         raise ValueError(f"{view.name} has {len(photo.keypoints)} keypoints; at least {MIN_POINTS} are needed")
     lead = DEFAULT.evidence.lead
-    seen = place.in_view(view.rotation, view.translation, camera_from(photo.lens), photo.keypoints)
+    seen = place.in_view(view.rotation, view.translation, camera_from(photo.camera), photo.keypoints)
     if len(seen) < MIN_POINTS:
         raise ValueError(
             f"{view.name} can see {len(seen)} points that two other views see; at least {MIN_POINTS} are needed"
         )
     region = place.part(seen)
-    problem = photo.problem(region, photo.lens)
+    problem = photo.problem(region, photo.camera)
     solution = verify_problem(problem, view.rotation, view.translation, seed=photo.seed, time_limit=time_limit)
     solution = with_ids(solution, region)
     if solution.verdict == "failed":

@@ -38,7 +38,7 @@ class Place(NamedTuple):
 
     view: View
     points: NDArray[np.integer]
-    lens: Camera | UnknownCamera
+    camera: Camera | UnknownCamera
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +145,7 @@ class ViewedPoints:
         views = tuple(replace(view, points=index[view.points[enough[view.points]]]) for view in self.views)
         return type(self)(self.points3d[enough], self.point_ids[enough], tracks[enough], views)
 
-    def places(self, views: Iterable[str] | None, keypoints: Array, lens: Camera | UnknownCamera) -> list[Place]:
+    def places(self, views: Iterable[str] | None, keypoints: Array, camera: Camera | UnknownCamera) -> list[Place]:
         """Return the views to search near for a photo's keypoints, in this order.
 
         With `views` these are the given views in their order. Each gets the points that any of them sees, since they
@@ -156,7 +156,7 @@ class ViewedPoints:
         Args:
             views: Names of views, best first; None for all views of the map.
             keypoints: (m, 2) pixels.
-            lens: Camera model, or its prior if the focal length is unknown.
+            camera: Camera model, or its prior if the focal length is unknown.
 
         Raises:
             ValueError: A name is unknown, or `views` is empty.
@@ -166,12 +166,12 @@ class ViewedPoints:
             if not named:
                 raise ValueError("`views` is empty; give names of views, or None for all views of the map")
             points = np.unique(np.concatenate([view.points for view in named]))
-            return [Place(view, points, lens) for view in named if len(view.points) and len(points) >= MIN_POINTS]
-        cameras: list[Camera] = lens.ladder(STEP) if isinstance(lens, UnknownCamera) else [lens]
-        scores = self.scores(cameras[0], keypoints, known_focal=isinstance(lens, Camera))
+            return [Place(view, points, camera) for view in named if len(view.points) and len(points) >= MIN_POINTS]
+        cameras: list[Camera] = camera.ladder(STEP) if isinstance(camera, UnknownCamera) else [camera]
+        scores = self.scores(cameras[0], keypoints, known_focal=isinstance(camera, Camera))
         order = list(places_first(self.views, scores, len(self.points3d)))
         turns = [(place + RUNG * rung, rung, k) for rung in range(len(cameras)) for place, k in enumerate(order)]
-        tried = [lens.near(one) if isinstance(lens, UnknownCamera) else lens for one in cameras]
+        tried = [camera.near(one) if isinstance(camera, UnknownCamera) else camera for one in cameras]
         return [
             Place(view, view.points, tried[rung])
             for _, rung, k in sorted(turns)

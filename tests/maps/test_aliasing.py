@@ -139,9 +139,9 @@ def test_a_better_pose_elsewhere_takes_the_place_of_a_confident_one() -> None:
     keypoints = photo_of(rng, points, normals, *pose)
     opposite = PosePrior(pose[0] @ about_y(180.0).T, pose[1], 2.0, 0.1)
     view, photo = scene.views[4], Photo(keypoints, camera_from(CAMERA))
-    wrong = search_near(scene.region(view, view.points), replace(photo, prior=opposite), photo.lens, Options(), ONCE)
+    wrong = search_near(scene.region(view, view.points), replace(photo, prior=opposite), photo.camera, Options(), ONCE)
     assert degrees_between(wrong.rotation, opposite.rotation) < 1
-    attempt = Attempt(Place(view, view.points, photo.lens), replace(wrong, verdict="confident"), is_judged=False)
+    attempt = Attempt(Place(view, view.points, photo.camera), replace(wrong, verdict="confident"), is_judged=False)
     solution = judge_in_map(scene, photo, None, attempt, []).solution
     assert solution.verdict == "confident"
     assert degrees_between(solution.rotation, pose[0]) < 1
@@ -157,4 +157,4 @@ def test_a_pose_that_is_refined_to_the_best_one_is_no_competitor() -> None:
     turned = Rotation.from_rotvec([0, 0, np.radians(2.3)]).as_matrix()
     beside = replace(solution.candidates[0], rotation=turned @ pose[0], translation=turned @ pose[1])
     photo, place = Photo(keypoints, camera_from(CAMERA)), scene.region(scene.views[0])
-    assert best_competitor(photo, place, solution, [replace(solution, candidates=(beside,))], []) is None
+    assert best_competitor(photo, place, solution, [beside], []) is None
