@@ -201,3 +201,14 @@ def test_coordinates_have_fixed_decimals_and_the_points_are_counted() -> None:
         assert "e+" not in text
     console.print(solution_table(east, normals))
     assert "40 image points, 40 scene points with normals" in console.export_text()
+
+
+def test_with_the_size_of_the_image_the_focal_length_is_estimated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    example = load("mesh")
+    files = write(tmp_path, example.points2d, example.points3d)
+    main(["solve", *files, "--image_size", "1280,960", "--time_limit", "300", "--solver", "search", "--json"])
+    solution = Solution.from_json(capsys.readouterr().out)
+    assert example.rotation_error_deg(solution.rotation) < 0.5
+    assert solution.focal_length == pytest.approx(example.camera[0, 0], rel=0.05)

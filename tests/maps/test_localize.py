@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from planted import degrees_between, seen
-from planted_model import PINHOLE, Planted, plant_model
+from planted_model import HEIGHT, PINHOLE, WIDTH, Planted, plant_model
 from scipy.spatial.transform import Rotation
 
 import bpnp
@@ -350,3 +350,23 @@ def test_a_competing_pose_of_one_view_competes_on_all_points(planted: tuple[Scen
     solution = judge_on_all_points(given, refine_on_all_points(given, photo, scene.region(scene.views[1])))
     assert degrees_between(solution.rotation, right.rotation) < 0.5
     assert solution.verdict == "confident"
+
+
+def test_a_photo_is_localised_without_its_focal_length(tmp_path: Path) -> None:
+    pinhole = ("PINHOLE", [520.0, 520.0, WIDTH / 2, HEIGHT / 2])
+    truth = plant_model(tmp_path, camera=pinhole, images=2, points=140, seen=90, clutter=0)
+    scene, pixels = SceneMap.from_colmap(tmp_path), 520 * truth.points2d[0] + [WIDTH / 2, HEIGHT / 2]
+    bent = camera_from(("SIMPLE_RADIAL", (520.0, WIDTH / 2, HEIGHT / 2, -0.3))).project(
+        np.c_[truth.points2d[0], np.ones(90)]
+    )
+    size, rough = {"image_size": (WIDTH, HEIGHT)}, ("SIMPLE_PINHOLE", (560.0, WIDTH / 2, HEIGHT / 2))
+    for keypoints, known in (
+        (pixels, size),
+        (pixels, {"camera": rough, "focal_error": 0.1}),
+        (bent, size | {"distortion": True}),
+    ):
+        solution = scene.localize(keypoints, **known, views=["photo 0.jpg"], solver="search")
+        assert solution.focal_length == pytest.approx(520, rel=0.01)
+        assert degrees_between(solution.rotation, truth.rotations[0]) < 0.1
+    with pytest.raises(ValueError, match="`camera` is missing; give it, or `image_size`"):
+        scene.localize(pixels)

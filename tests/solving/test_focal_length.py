@@ -3,19 +3,16 @@
 import json
 import math
 import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from planted import degrees_between
-from planted_model import HEIGHT, WIDTH, plant_model
 from scipy.spatial.transform import Rotation
 
-from bpnp import SceneMap, Solution, solve
+from bpnp import Solution, solve
 from bpnp.cameras import Camera, camera_from, camera_to_json
-from bpnp.cli import main
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.solving.focal_length import fit_camera, is_claimed, unknown_camera
 from bpnp.solving.inputs import problem_from
@@ -167,37 +164,6 @@ def test_a_rough_pinhole_camera_may_be_distorted_and_one_with_distortion_keeps_i
         solve(pixels, scene, ("SIMPLE_RADIAL", (630.0, 320.0, 240.0, -0.3)), distortion=True, **known)
     with pytest.raises(ValueError, match="`distortion=True` needs an `image_size`, or a `focal_error`"):
         solve(pixels, scene, ("SIMPLE_PINHOLE", (630.0, 320.0, 240.0)), distortion=True)
-
-
-def test_a_photo_is_localised_without_its_focal_length(tmp_path: Path) -> None:
-    pinhole = ("PINHOLE", [520.0, 520.0, WIDTH / 2, HEIGHT / 2])
-    truth = plant_model(tmp_path, camera=pinhole, images=2, points=140, seen=90, clutter=0)
-    scene, pixels = SceneMap.from_colmap(tmp_path), 520 * truth.points2d[0] + [WIDTH / 2, HEIGHT / 2]
-    bent = camera_from(("SIMPLE_RADIAL", (520.0, WIDTH / 2, HEIGHT / 2, -0.3))).project(
-        np.c_[truth.points2d[0], np.ones(90)]
-    )
-    size, rough = {"image_size": (WIDTH, HEIGHT)}, ("SIMPLE_PINHOLE", (560.0, WIDTH / 2, HEIGHT / 2))
-    for keypoints, known in (
-        (pixels, size),
-        (pixels, {"camera": rough, "focal_error": 0.1}),
-        (bent, size | {"distortion": True}),
-    ):
-        solution = scene.localize(keypoints, **known, views=["photo 0.jpg"], solver="search")
-        assert solution.focal_length == pytest.approx(520, rel=0.01)
-        assert degrees_between(solution.rotation, truth.rotations[0]) < 0.1
-    with pytest.raises(ValueError, match="`camera` is missing; give it, or `image_size`"):
-        scene.localize(pixels)
-
-
-def test_the_command_takes_the_size_of_the_image(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pixels, scene, rotation = planted(900.0)
-    np.savetxt(tmp_path / "image.csv", pixels, delimiter=",", header="x,y", comments="")
-    np.savetxt(tmp_path / "scene.csv", scene, delimiter=",", header="x,y,z", comments="")
-    files = [str(tmp_path / "image.csv"), str(tmp_path / "scene.csv")]
-    main(["solve", *files, "--image_size", "640,480", "--time_limit", str(LIMIT), "--solver", "search", "--json"])
-    solution = Solution.from_json(capsys.readouterr().out)
-    assert degrees_between(solution.rotation, rotation) < 0.5
-    assert solution.focal_length == pytest.approx(900, rel=0.05)
 
 
 @pytest.mark.parametrize("radial", [-0.3, 0.3])
