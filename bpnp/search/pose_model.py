@@ -28,7 +28,7 @@ refinement of RANSAC in the paper's half, in torch: a batch of samples and poses
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -36,7 +36,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.search.image_statistics import ImageStatistics
 from bpnp.search.problem import Problem, UnknownFocal, label_groups
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
 
@@ -45,7 +44,6 @@ Labels = NDArray[np.int64]
 Extrinsics = tuple[Array, Array]
 LEAST_SLOPE = 0.2  # smallest derivative of the seen by the true radius at which a point is visible
 UNDISTORTED = 20  # Newton steps
-FIXING = 3  # matches that fix a pose; one more also fixes a focal length or the scale of a rig's scene
 FIXING_ROTATION = 2  # matches that fix a rotation
 
 
@@ -146,8 +144,12 @@ class PoseModel:
 
     @property
     def fixing(self) -> int:
-        """Number of matches of one camera that fix the unknowns, except the scale of a rig's scene: half of them."""
-        return -(-(self.size - self.scale) // 2)
+        """Number of matches of one camera that fix the unknowns: each match fixes two.
+
+        The scale of a rig's scene, and a radial coefficient that is known from elsewhere, do not count.
+        """
+        known = "radial" in self.columns and self.lens is not None and math.isfinite(self.lens.radial_sigma)
+        return -(-(self.size - self.scale - known) // 2)
 
     def state(self, rotation: Array, translation: Array | None = None) -> PoseState:
         """Return the state of poses with the given camera.
@@ -276,21 +278,70 @@ class PoseModel:
         return information, gradient
 
     def log10_tests(self, problems: Sequence[Problem], log10_shares: Sequence[float] = ()) -> float:
-        """Return log10 of the number of tests with the points of all cameras, which propose poses independently.
+        """Return log10 of the number T of tests with the points of all cameras, which propose poses independently.
 
-        An unknown scale of the scene takes one match more, of any two points of a camera.
+        The tests of a camera are the choices of as many matches as fix the unknowns, or those of a given lens for each
+        distinguishable lens if they are fewer. `Problem.log10_tried` replaces their number if it is set. An unknown
+        scale of the scene takes one match more, of any two points of a camera.
 
         Args:
             problems: Points of each camera.
             log10_shares: log10 of the fraction of the poses of each camera that a prior allows; empty without a prior.
         """
         shares = log10_shares or [0.0] * len(problems)
-        tests = math.log10(sum(10 ** (log10_tests(each) + one) for each, one in zip(problems, shares, strict=True)))
+        alone = [self._log10_tests_of(problem) + share for problem, share in zip(problems, shares, strict=True)]
+        tests = alone[0] if len(alone) == 1 else math.log10(sum(10**one for one in alone))
         if any(shares):  # a prior leaves at least one test
             tests = max(tests, 0.0)
         if self.scale:
             tests += math.log10(sum(len(each.bearings) * len(each.points3d) for each in problems))
         return tests
+
+    def _log10_tests_of(self, problem: Problem) -> float:
+        if problem.log10_tried is not None:
+            return problem.log10_tried
+        tests = self.log10_choices(problem)
+        if self.lens is None:
+            return tests
+        image, given = problem.image, replace(self, lens=None)
+        return min(tests, given.log10_choices(problem) + float(log10_lenses(self.lens, image.spread, image.scales)[0]))
+
+    def log10_choices(self, problem: Problem) -> float:
+        """Return log10 of the number of states that fit as many matches as fix the unknowns, for all choices of them.
+
+        It is 2 (m)_k (n)_k / k! with k = `fixing` for poses, about two for each choice of three or four matches, and
+        half of that for rotations. Labels, if given, have to agree.
+        """
+        m, n = len(problem.bearings), len(problem.points3d)
+        choices = math.prod((m - i) * (n - i) / (i + 1) for i in range(self.fixing))
+        if problem.labels2d is not None and problem.labels3d is not None:
+            groups = label_groups(np.arange(m), problem.labels2d, problem.labels3d, n)
+            agreeing = sum(len(rows) * len(columns) for rows, columns in groups)
+            choices = min(choices, math.prod((agreeing - i) / (i + 1) for i in range(self.fixing)))
+        return math.log10((1 + self.moves) * max(choices, 1.0))
+
+    def log10_cells(self, spread: float, scales: Array, solid_angle: float = 4 * math.pi) -> Array:
+        """Return log10 (S,) of the number of distinguishable states, cells of width s, at each scale s of an image.
+
+        With the RMS angular radius h of the image points, the number for points at infinity is 8 pi^2 h / s^3. It is
+        the product of 4 pi / s^2 directions of an axis and 2 pi h / s rotations about it. For a pose it is that of:
+
+        - 8 pi^2 (h / s)^3 rotations about the scene centroid, which move points at h from it by s,
+        - A / s^2 positions of the centroid in the view,
+        - log(30) h / s distances of it, up to a factor of 30.
+
+        Each is multiplied by the number of distinguishable lenses (`log10_lenses`).
+
+        Args:
+            spread: RMS angular radius h, radians.
+            scales: (S,) scales s, radians.
+            solid_angle: Solid angle A of the view, steradians.
+        """
+        relative = spread / scales
+        cells = 8 * math.pi**2 * relative / scales**2
+        if self.moves:
+            cells = 8 * math.pi**2 * relative**4 * (solid_angle / scales**2) * math.log(30)
+        return np.asarray(np.log10(np.maximum(cells, 1.0)) + log10_lenses(self.lens, spread, scales))
 
     def fixing_ways(self, cameras: int = 1, apart: Iterable[tuple[int, int]] = ()) -> list[list[int]]:
         """Return the ways to choose matches that fix the unknowns, each as their number in each camera.
@@ -424,67 +475,21 @@ def _lens_columns(seen: Array, reference: float, squared: Array | None, radial: 
 
 
 def log10_tests(problem: Problem) -> float:
-    """Return log10 of the number of tests, 2 (m)_3 (n)_3 / 3!: choices of three matches with about two poses each.
-
-    Labels, if given, have to agree. `Problem.log10_tried` replaces the number if it is set.
-    """
-    if problem.log10_tried is not None:
-        return problem.log10_tried
-    tests = _log10_choices(problem, FIXING)
-    if problem.focal is None:
-        return tests
-    return min(_log10_choices(problem, PoseModel.of(problem).fixing), tests + float(log10_lenses(problem)[0]))
+    """Return log10 of the number of tests with the points of one camera; see `PoseModel.log10_tests`."""
+    return PoseModel.of(problem).log10_tests([problem])
 
 
-def _log10_choices(problem: Problem, pairs: int) -> float:
-    return math.log10(2 * max(count_choices(problem, pairs), 1.0))
-
-
-def count_choices(problem: Problem, pairs: int) -> float:
-    """Return the number of choices of `pairs` matches; labels, if given, have to agree."""
-    m, n = len(problem.bearings), len(problem.points3d)
-    choices = math.prod((m - i) * (n - i) / (i + 1) for i in range(pairs))
-    if problem.labels2d is not None and problem.labels3d is not None:
-        groups = label_groups(np.arange(m), problem.labels2d, problem.labels3d, n)
-        agreeing = sum(len(rows) * len(columns) for rows, columns in groups)
-        choices = min(choices, math.prod((agreeing - i) / (i + 1) for i in range(pairs)))
-    return choices
-
-
-def log10_lenses(problem: Problem) -> Array:
-    """Return log10 (S,) of the number of distinguishable lenses at each scale s of the image, 0 for a given lens.
+def log10_lenses(lens: UnknownFocal | None, spread: float, scales: Array) -> Array:
+    """Return log10 (S,) of the number of distinguishable lenses at each scale s of an image, 0 for a given lens.
 
     A focal length moves points at the RMS angular radius h by h d log f, a radial coefficient by h^3 dk.
-    """
-    if problem.focal is None:
-        return np.zeros(len(problem.image.scales))
-    h, scales = problem.image.spread, problem.image.scales
-    moved = problem.focal.log_range * h, problem.focal.radial_range * h**3
-    return np.asarray(sum(np.log10(np.maximum(each / scales, 1.0)) for each in moved))
-
-
-def log10_cells(image: ImageStatistics) -> Array:
-    """Return log10 (S,) of the number of distinguishable poses, cells of width s, at each scale s of an image.
-
-    Let h be the RMS angular radius of the bearings. The number is the product of:
-
-    - 8 pi^2 (h / s)^3 rotations about the scene centroid, which move points at h from it by s,
-    - A / s^2 positions of the centroid in the view,
-    - log(30) h / s distances of it, up to a factor of 30.
-    """
-    relative = image.spread / image.scales
-    cells = 8 * math.pi**2 * relative**4 * (image.solid_angle / image.scales**2) * math.log(30)
-    return np.asarray(np.log10(np.maximum(cells, 1.0)))
-
-
-def log10_rotations(spread: float, scales: Array) -> Array:
-    """Return log10 (S,) of the number of distinguishable rotations at each scale s of an image, 8 pi^2 h / s^3.
-
-    It is the product of 4 pi / s^2 directions of the axis and 2 pi h / s rotations about it. Each rotation moves points
-    at h from the axis by s.
 
     Args:
-        spread: RMS angular radius h of the image points, radians.
+        lens: Prior of the lens; None for a given one.
+        spread: RMS angular radius h, radians.
         scales: (S,) scales s, radians.
     """
-    return np.asarray(np.log10(np.maximum(8 * math.pi**2 * spread / scales**3, 1.0)))
+    if lens is None:
+        return np.zeros(len(scales))
+    moved = lens.log_range * spread, lens.radial_range * spread**3
+    return np.asarray(sum(np.log10(np.maximum(each / scales, 1.0)) for each in moved))

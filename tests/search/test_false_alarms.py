@@ -15,12 +15,12 @@ from bpnp.search.evidence.false_alarms import (
     alarms_of,
     camera_terms,
     directions_of,
-    log10_cells,
     log10_nfa,
     point_evidence,
 )
 from bpnp.search.infinity.evidence import background_of, log10_false_alarms
 from bpnp.search.infinity.kernels import catalogue_of
+from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem
 from bpnp.search.starts import GravityPrior, PosePrior
 
@@ -92,7 +92,9 @@ def test_the_bound_of_markov_holds_for_unrelated_points(count: int) -> None:
         seen = scattered(rng, count, 0.4) * rng.uniform(4, 8, (count, 1))
         turn = Rotation.random(random_state=rng).as_matrix()
         problem = Problem(scattered(rng, count, 0.25), seen @ turn)
-        tests = np.minimum(log10_cells(problem.image), matches)
+        image = problem.image
+        cells = PoseModel.of(problem).log10_cells(image.spread, image.scales, image.solid_angle)
+        tests = np.minimum(cells, matches)
         products.append(-np.log10(np.mean(10.0**-tests)) - alarms(problem, turn, np.zeros(3)))
     for bound in (0.5, 1, 2):
         assert np.mean(np.array(products) > bound) <= 10**-bound

@@ -80,7 +80,7 @@ def test_the_nfa_counts_each_unknown_of_the_camera_model() -> None:
     points, pixels = planted(0.0, seed=5)
     problem = Problem(directions(np.c_[pixels / FOCAL, np.ones(len(pixels))]), points)
     known, focal, bent = (
-        log10_lenses(replace(problem, focal=lens))[0]
+        log10_lenses(lens, problem.image.spread, problem.image.scales)[0]
         for lens in (None, UnknownFocal(1.0), UnknownFocal(1.0, radial_sigma=math.inf, radial_range=4.0))
     )
     assert known == 0

@@ -167,7 +167,9 @@ def test_each_unknown_takes_its_matches_and_its_tests() -> None:
     models = [PoseModel(np.zeros(3), moves=False), PoseModel(np.zeros(3)), PoseModel(np.zeros(3), lens)]
     assert [model.fixing for model in models] == [2, 3, 4]  # each match fixes two numbers
     assert replace(models[0], lens=lens).fixing == 2
-    assert replace(models[1], lens=lens._replace(radial_sigma=math.inf)).fixing == 4
+    for sigma, matches in ((0.1, 2), (math.inf, 3)):  # a coefficient that is known from elsewhere takes none
+        assert replace(models[0], lens=lens._replace(radial_sigma=sigma)).fixing == matches
+        assert replace(models[1], lens=lens._replace(radial_sigma=sigma)).fixing == 4
     alone = models[1].log10_tests([problem])
     assert models[1].log10_tests([problem, problem]) == pytest.approx(alone + math.log10(2))
     rig = PoseModel(np.zeros(3), mounts=MOUNTS, scale=True)
@@ -175,3 +177,19 @@ def test_each_unknown_takes_its_matches_and_its_tests() -> None:
     assert models[2].log10_tests([replace(problem, focal=lens)]) > alone + 1
     assert rig.fixing_ways(2, [(0, 1)]) == [[3, 1], [1, 3]]
     assert replace(rig, scale=False).fixing_ways(2) == [[3, 0], [0, 3]]
+
+
+def test_tests_are_choices_of_matches_or_distinguishable_states() -> None:
+    problem = Problem(directions(POINTS), POINTS)
+    pose, turn = PoseModel(np.zeros(3)), PoseModel(np.zeros(3), moves=False)
+    pairs, triples = math.comb(30, 2) ** 2 * 2, math.comb(30, 3) ** 2 * 6
+    assert turn.log10_choices(problem) == pytest.approx(math.log10(pairs))
+    assert pose.log10_choices(problem) == pytest.approx(math.log10(2 * triples))
+    labelled = replace(problem, labels2d=np.arange(30), labels3d=np.arange(30))
+    assert pose.log10_choices(labelled) == pytest.approx(math.log10(2 * math.comb(30, 3)))
+    scales = np.array([1e-3, 2e-3])
+    for model, power in ((turn, 3), (pose, 6), (replace(turn, lens=UnknownFocal(0.5)), 4)):
+        cells = model.log10_cells(0.2, scales, 0.1)
+        assert cells[0] - cells[1] == pytest.approx(power * math.log10(2))
+    few = replace(turn, lens=UnknownFocal(0.5)).log10_cells(0.2, scales) - turn.log10_cells(0.2, scales)
+    np.testing.assert_allclose(10**few, 0.5 * 0.2 / scales)

@@ -15,9 +15,9 @@ a probability of at most 1 / b (Markov), so that
     log10 NFA = log10 T - log10 mean_{s, w} prod_i x_i^(1 / c_i),
 
 T = 2 (m)_3 (n)_3 / 6 is the number of poses that fit three matches exactly, (m)_3 = m (m - 1) (m - 2). At a scale s
-with fewer distinguishable poses, T is their number (`log10_cells`). The three largest x_i are left out, for any c_i:
-three matches fix the six degrees of freedom and are no evidence. c_i is the number of image points within 2 s of
-point i: keypoints that lie together are one observation.
+with fewer distinguishable poses, T is their number (`PoseModel.log10_cells`). The three largest x_i are left out, for
+any c_i: three matches fix the six degrees of freedom and are no evidence. c_i is the number of image points within 2 s
+of point i: keypoints that lie together are one observation.
 
 The location of a clump is one observation as well. A clump has more points within 2 s' than an even spread explains.
 There, the gain of log x_i from one scale to the next finer one s' counts with 1 / c_i(s'), over its expected value
@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 
 from bpnp.search.image_statistics import ImageStatistics
 from bpnp.search.kernels.neighbours import sums_near
-from bpnp.search.pose_model import PoseModel, log10_cells, log10_lenses, log10_tests
+from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem, faces, label_groups
 
 Array = NDArray[np.float64]
@@ -148,8 +148,9 @@ def alarms_of(problem: Problem, rotations: Array, translations: Array, scales: A
     >>> bool(alarms[0] < -10), bool(alarms[1] > 0)
     (True, True)
     """
-    tests = log10_tests(problem)
-    cells = np.minimum(log10_cells(problem.image) + log10_lenses(problem), tests)
+    model, image = PoseModel.of(problem), problem.image
+    tests = model.log10_tests([problem])
+    cells = np.minimum(model.log10_cells(image.spread, image.scales, image.solid_angle), tests)
     share = [problem.log10_share(r, t) for r, t in zip(rotations, translations, strict=True)]
     none = np.array([max(tests + one, 0.0) for one in share])
     result = Alarms(none, none.copy())
@@ -159,7 +160,7 @@ def alarms_of(problem: Problem, rotations: Array, translations: Array, scales: A
         fewer = math.log(10) * (np.maximum(cells + share[k], 0.0) - none[k])
         scale = None if scales is None else float(scales[k])
         terms = camera_terms(problem, seen, scale, fewer=fewer)
-        result.own[k], result.rough[k] = log10_nfa([terms], float(none[k]), [[PoseModel.of(problem).fixing]])
+        result.own[k], result.rough[k] = log10_nfa([terms], float(none[k]), model.fixing_ways())
     return Alarms(result.own + problem.log10_views, result.rough + problem.log10_views)
 
 

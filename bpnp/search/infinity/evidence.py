@@ -36,7 +36,7 @@ from bpnp.search.evidence.covariance import covariance_of, of_sure_matches, stud
 from bpnp.search.evidence.false_alarms import LEAST_SHARE, MOST_SHARE, SHARES, Terms, log10_nfa
 from bpnp.search.evidence.uncertainty import EXCEEDED, STRAINS, exceeded_once
 from bpnp.search.kernels.neighbours import sums_near
-from bpnp.search.pose_model import FIXING_ROTATION, PoseModel, count_choices, log10_rotations
+from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem
 
 Array = NDArray[np.float64]
@@ -55,6 +55,7 @@ class Background(NamedTuple):
         together: (m, S) c_i.
         pixel: (m,) angle of a pixel, radians.
         shares: (W,) or (m, 1, W) fractions w of image points with a match.
+        fixing: Number of matches that fix the rotation and the lens; they are no evidence.
     """
 
     scales: Array
@@ -62,6 +63,7 @@ class Background(NamedTuple):
     together: Array
     pixel: Array
     shares: Array
+    fixing: int
 
 
 def background_of(problem: Problem, pixel: Array, noise: float) -> Background:
@@ -75,11 +77,8 @@ def background_of(problem: Problem, pixel: Array, noise: float) -> Background:
     bearings, scales = problem.bearings, np.asarray(noise * 0.5 ** np.arange(STEPS), np.float64)
     spread = float(np.sqrt(((bearings - bearings.mean(0)) ** 2).sum(-1).mean()))
     radians = scales * np.median(pixel)
-    cells = math.log(10) * log10_rotations(spread, radians)
-    if problem.focal is not None:  # distinguishable lenses
-        moved = problem.focal.log_range * spread, problem.focal.radial_range * spread**3
-        cells = cells + sum(np.log(np.maximum(each / radians, 1.0)) for each in moved)
-    tests = np.minimum(cells, math.log(max(count_choices(problem, FIXING_ROTATION), 1.0)))
+    model = PoseModel(np.zeros(3), problem.focal, moves=False)
+    tests = math.log(10) * np.minimum(model.log10_cells(spread, radians), model.log10_choices(problem))
     axes = np.linalg.svd(bearings - bearings.mean(0), full_matrices=False)[2][:2].T
     together = sums_near(bearings, bearings, axes, 2 * scales[::-1] * np.median(pixel), np.zeros(STEPS))
     shares = SHARES if problem.clutter is None else np.array([1 - problem.clutter])
@@ -87,7 +86,7 @@ def background_of(problem: Problem, pixel: Array, noise: float) -> Background:
         shares = shares * problem.candidate_scores[:, None, None]
     if problem.clutter is not None or problem.candidate_scores is not None:
         shares = np.clip(shares, LEAST_SHARE, MOST_SHARE)
-    return Background(scales, tests, together[:, ::-1], pixel, shares)
+    return Background(scales, tests, together[:, ::-1], pixel, shares, model.fixing)
 
 
 def log10_false_alarms(
@@ -112,7 +111,7 @@ def log10_false_alarms(
         tests = np.maximum(tests + math.log(10) * log10_share, 0.0)
     most = float(tests.max())
     terms = Terms(logs, known.together, every, ~every, len(every) * known.shares.shape[-1], tests - most)
-    return log10_nfa([terms], most / math.log(10), [[FIXING_ROTATION]])[0], terms.of_points()
+    return log10_nfa([terms], most / math.log(10), [[known.fixing]])[0], terms.of_points()
 
 
 class Known(NamedTuple):
