@@ -86,9 +86,9 @@ def test_equal_objects_make_a_right_pose_ambiguous() -> None:
 def test_a_wrong_focal_length_keeps_a_pose_from_being_confident(view: Any) -> None:
     bearings, points, *pose = view
     pixels = 500 * bearings[:60, :2] / bearings[:60, 2:] + [320, 240]
-    wrong = bpnp.verify(pixels, points[:60], *pose, ("SIMPLE_PINHOLE", [400, 320, 240]))
+    wrong = bpnp.verify(pixels, points[:60], *pose, camera=("SIMPLE_PINHOLE", [400, 320, 240]))
     assert wrong.verdict != "confident"
-    assert bpnp.verify(pixels, points[:60], *pose, ("SIMPLE_PINHOLE", [500, 320, 240])).verdict == "confident"
+    assert bpnp.verify(pixels, points[:60], *pose, camera=("SIMPLE_PINHOLE", [500, 320, 240])).verdict == "confident"
 
 
 def test_few_points_that_no_search_is_confident_of_confirm_a_pose() -> None:
@@ -182,8 +182,8 @@ def test_a_pose_that_solve_is_confident_of_is_confident() -> None:
 def test_four_matches_without_redundancy_do_not_fix_a_pose() -> None:
     """Without one of four coplanar matches the others fix several poses. Their spread is that of simulated noise."""
     rng = np.random.default_rng(0)
-    board, camera = 0.176 * np.array([[0, 0, 0], [0, 1, 0], [1, 1, 0], [1, 0, 0.0]]), [[600.0, 0, 640], [0, 600, 360]]
-    camera = np.array([*camera, [0, 0, 1.0]])
+    board = 0.176 * np.array([[0, 0, 0], [0, 1, 0], [1, 1, 0], [1, 0, 0.0]])
+    camera = np.array([[600.0, 0, 640], [0, 600, 360], [0, 0, 1]])
     rotation = Rotation.from_euler("xyz", [150, 20, 80], degrees=True).as_matrix()
     translation = np.array([0.1, -0.05, 0.4])
     exact = seen(board, rotation, translation) @ camera[:2, :2].T + camera[:2, 2]
