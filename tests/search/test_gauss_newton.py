@@ -189,6 +189,20 @@ def test_a_rig_finds_its_pose_and_the_scale_of_the_scene() -> None:
     np.testing.assert_allclose(end.state.rotation, ROTATION, atol=1e-6)
 
 
+def test_a_rig_finds_the_focal_length_of_its_cameras_without_matches() -> None:
+    """The cameras have 1.05 times the focal length with which the bearings were computed, in another order."""
+    mounts = [(np.eye(3), np.zeros(3)), (Rotation.from_rotvec([0, 0.3, 0]).as_matrix(), np.array([-0.8, 0.1, 0.2]))]
+    model = PoseModel(POINTS.mean(0), UnknownFocal(2.0), mounts=mounts)
+    true = model.state(ROTATION, np.r_[TRANSLATION, 1.0])._replace(zoom=1.05)
+    seen = [model.directions(true, POINTS, k)[RNG.permutation(len(POINTS))] for k in range(2)]
+    start = model.moved(true, np.array([0.01, -0.01, 0.01, 0.02, 0.01, 0.03, -math.log(1.05)]))
+    linearise = soft_equations(model, [Problem(each, POINTS) for each in seen], fewest=3)
+    end = refine(model, start, linearise, np.geomspace(0.03, 1e-4, 20).tolist())
+    assert start.zoom == pytest.approx(1.0)
+    assert end.state.zoom == pytest.approx(1.05, rel=1e-6)
+    np.testing.assert_allclose(end.state.rotation, ROTATION, atol=1e-6)
+
+
 def test_a_prior_of_the_focal_length_decides_what_the_points_leave_open() -> None:
     """Points of a plane that faces the camera: focal length and distance cannot be told apart."""
     flat = np.c_[POINTS[:, :2], np.zeros(len(POINTS))]
