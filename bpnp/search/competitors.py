@@ -16,7 +16,7 @@ from bpnp.poses import turned_by
 from bpnp.search.annealing import polished
 from bpnp.search.config import Evidence, OtherFocal
 from bpnp.search.evidence.alternatives import of_misfit
-from bpnp.search.evidence.false_alarms import alarms_of
+from bpnp.search.evidence.false_alarms import alarms_of, likeliest_scale
 from bpnp.search.evidence.reasons import Objection, objection
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
 from bpnp.search.evidence.uncertainty import Misfit, bends_significantly, linearised, systematic_misfit
@@ -93,7 +93,10 @@ def repeated_competitors(
     """
     if enumerated and not is_symmetric(result.candidates, problem, rule):
         return Hypotheses.empty()
-    best, scale = result.best, max(result.residual, problem.image.scales[0])
+    best = result.best
+    # The scale at which the annealing ended may be coarser than that of the residuals.
+    scale = result.residual if enumerated else min(result.residual, likeliest_scale(problem, *best))
+    scale = max(scale, problem.image.scales[0])
     least = rule.repetitions.symmetric if enumerated else 0.0
     repeated, motions = repeated_poses(problem, *best, scale, rule, least=least)
     if not len(repeated):
