@@ -152,11 +152,18 @@ def judge_against(solution: Solution, competitor: Competitor | None) -> Solution
 
     An ambiguous solution has both poses as its first candidates.
     """
-    if competitor is None or competitor.margin >= DEFAULT.evidence.lead:
+    lead = DEFAULT.evidence.lead
+    if competitor is None or competitor.margin >= lead:
         return solution
-    off = math.degrees(turned_by(solution.rotation, competitor.pose.rotation))
-    doubtful = add_objection(solution, objection("competing_place", competitor.margin, degrees=off))
-    return replace(doubtful, candidates=(solution.candidates[0], competitor.pose, *solution.candidates[1:]))
+    other, margin = competitor.pose, competitor.margin
+    values = {
+        "distance": float(np.linalg.norm(other.centre - solution.centre)),
+        "degrees": math.degrees(turned_by(solution.rotation, other.rotation)),
+        "better": -margin,
+    }
+    code = "better_place" if margin <= -lead else "competing_place"
+    doubtful = add_objection(solution, objection(code, margin, **values))
+    return replace(doubtful, candidates=(solution.candidates[0], other, *solution.candidates[1:]))
 
 
 def significant(solution: Solution) -> list[Candidate]:

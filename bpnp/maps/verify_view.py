@@ -3,16 +3,13 @@
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
-import numpy as np
-
 from bpnp.cameras import camera_from
-from bpnp.maps.aliasing import best_competitor, explained_keypoints
+from bpnp.maps.aliasing import best_competitor, explained_keypoints, judge_against
 from bpnp.maps.photo_problem import Photo, with_ids
 from bpnp.maps.viewed_points import Region
 from bpnp.maps.views import Array, View
 from bpnp.poses import MIN_POINTS
 from bpnp.search.config import DEFAULT
-from bpnp.search.evidence import reasons
 from bpnp.solving.solution import Solution
 from bpnp.solving.verify import verify_problem
 
@@ -37,7 +34,6 @@ def verify_pose(
     """
     if len(photo.keypoints) < MIN_POINTS:
         raise ValueError(f"{view.name} has {len(photo.keypoints)} keypoints; at least {MIN_POINTS} are needed")
-    lead = DEFAULT.evidence.lead
     seen = place.in_view(view.rotation, view.translation, camera_from(photo.camera), photo.keypoints)
     if len(seen) < MIN_POINTS:
         raise ValueError(
@@ -50,15 +46,6 @@ def verify_pose(
     if solution.verdict == "failed":
         return solution
     competitor = best_competitor(photo, place, solution, [], regions(explained_keypoints(photo, solution)))
-    if competitor is None or competitor.margin >= lead:
-        return solution
-    off = np.linalg.norm(competitor.pose.centre - solution.centre)
-    what = f"a pose {off:.3g} scene units away, elsewhere in the map, explains the image points "
-    what += "about as well" if competitor.margin > -lead else f"better (by {-competitor.margin:.1f} decades)"
-    return replace(
-        solution,
-        verdict="ambiguous" if competitor.margin > -lead else "failed",
-        reason=reasons.against(what, solution.log10_false_alarms),
-        reason_code="competing_place" if competitor.margin > -lead else "better_pose",
-        candidates=(solution.candidates[0], competitor.pose, *solution.candidates[1:]),
-    )
+    judged = judge_against(solution, competitor)
+    refuted = competitor is not None and competitor.margin <= -DEFAULT.evidence.lead
+    return replace(judged, verdict="failed") if refuted else judged

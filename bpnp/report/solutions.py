@@ -1,7 +1,10 @@
 """Pictures of a `bpnp.Solution`: its points ready to draw, and the figure of `Solution.plot`."""
 
+import base64
+import io
 import textwrap
 from dataclasses import replace
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -83,3 +86,14 @@ def draw_solution(solution: Solution, *, title: str | None = None, photo: Any = 
     """
     points, colour = solution_points(solution, title=title), VERDICTS[solution.verdict]
     return plot_matches(points, colour=colour, photo=photo, competing=competing_points(solution, points))
+
+
+def solution_html(solution: Solution) -> str:
+    """Return the text of a solution as HTML, followed by its picture if it has an image point."""
+    text = f"<pre style='white-space: pre-wrap'>{escape(repr(solution))}</pre>"
+    if not np.isfinite(solution.points2d).all(-1).any():
+        return text
+    content = io.BytesIO()
+    draw_solution(solution).savefig(content, format="png", dpi=80)
+    picture = base64.b64encode(content.getvalue()).decode()
+    return f'{text}<img style="max-width: 100%" alt="the matches" src="data:image/png;base64,{picture}">'

@@ -1,14 +1,11 @@
 """Result of `bpnp.solve`, and its JSON file."""
 
-import base64
-import io
 import json
 import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -246,13 +243,9 @@ class Solution:
 
     def _repr_html_(self) -> str:
         """Return `repr` as HTML, followed by the picture if a point is in front of the camera."""
-        text = f"<pre style='white-space: pre-wrap'>{escape(repr(self))}</pre>"
-        if not np.isfinite(self.points2d).all(-1).any():
-            return text
-        content = io.BytesIO()
-        self.plot().savefig(content, format="png", dpi=80)
-        picture = base64.b64encode(content.getvalue()).decode()
-        return f'{text}<img style="max-width: 100%" alt="the matches" src="data:image/png;base64,{picture}">'
+        from bpnp.report.solutions import solution_html
+
+        return solution_html(self)
 
     def to_colmap(
         self,

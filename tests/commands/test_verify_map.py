@@ -51,7 +51,7 @@ def test_the_image_at_the_copy_of_its_building_is_the_only_doubtful_one(
     centre = [float(rows[0][f"other_{axis}"]) for axis in "xyz"]
     rotation, translation = poses[WRONG_IMAGE]
     np.testing.assert_allclose(centre, -rotation.T @ translation, atol=0.2)  # where it was taken
-    assert f"{WRONG_IMAGE}: A pose {HOUSES_APART:.0f} scene units away" in printed
+    assert f"{WRONG_IMAGE}: A pose {HOUSES_APART:.0f} scene units and 0 deg away" in printed
     first, *others = re.findall(
         r'<th scope="row">(\S+)</th><td class="verdict"><span [^>]*></span>(\w+)', page.read_text()
     )

@@ -15,8 +15,10 @@ CLAUSES = {
     # Another pose may be the right one.
     "competing_pose": "a competing pose {degrees:.0f} deg away fits about as well (margin {margin:.1f} decades)",
     "competing_rotation": "another rotation fits about as well (margin {margin:.1f} decades)",
-    "competing_place": "a pose {degrees:.0f} deg away, elsewhere in the map, explains the image points about as well "
-    "(margin {margin:.1f} decades)",
+    "competing_place": "a pose {distance:.3g} scene units and {degrees:.0f} deg away, elsewhere in the map, explains "
+    "the image points about as well (margin {margin:.1f} decades)",
+    "better_place": "a pose {distance:.3g} scene units and {degrees:.0f} deg away, elsewhere in the map, explains "
+    "the image points better (by {better:.1f} decades)",
     "better_pose": "a pose {degrees:.0f} deg away fits better (by {margin:.1f} decades)",
     "better_nearby": "the optimum beside it, {degrees:.2g} deg away, fits better (by {margin:.1f} decades)",
     "other_points": "a pose {degrees:.0f} deg away explains other points, as many as two unrelated poses do by chance",
