@@ -8,6 +8,7 @@ sweep are competing poses.
 """
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -238,30 +239,36 @@ def solved_with_focal_length(problem_at: ProblemAt, unknown: UnknownCamera, opti
     problem = problem_at(unknown.reference, unknown.focal(unknown.reference))
     if problem.degenerate is not None:
         return solutions_of({0: problem}, options)[0]
-    unknown = unknown.seen_by(problem)
-    search = _Ladder(problem_at, unknown, options)
-    few, most = is_enumerable(problem), options.settings.schedule.turns
-    for camera in (ladder := unknown.ladder(RULE.step_few if few else RULE.step)):
-        search.climb(camera, min(RULE.turns, most), len(ladder))
-        if search.best.verdict == "confident" and not few:
-            break
-    if search.best.verdict != "confident" and not few and most > RULE.turns and search.best.camera is not None:
-        search.climb(search.best.camera, most, 1)
-    return replace(search.contested(), seconds=Clock.now() - search.begun)
+    return _OneCamera(unknown.seen_by(problem), options, problem_at=problem_at).sweep(few=is_enumerable(problem))
 
 
 @dataclass
-class _Ladder:
+class FocalSweep(ABC):
     """Searches with several focal lengths, and their final solutions `ends`."""
 
-    problem_at: ProblemAt
     unknown: UnknownCamera
     options: Options
     begun: float = field(default_factory=Clock.now)
     ends: list[Solution] = field(default_factory=list)
 
-    def problem(self, camera: Camera) -> Problem:
-        return self.problem_at(camera, self.unknown.focal(camera))
+    @abstractmethod
+    def solve_with(self, camera: Camera, options: Options) -> Solution:
+        """Return the solution with a given camera."""
+
+    @abstractmethod
+    def refine(self, solution: Solution, camera: Camera, zooms: Sequence[float] = (1.0,)) -> Camera:
+        """Return the camera that fits best near a pose, from some factors of the focal length of a camera."""
+
+    def sweep(self, *, few: bool) -> Solution:
+        """Return the solution with the fewest false alarms; `few` is True for points that are enumerated."""
+        most = self.options.settings.schedule.turns
+        for camera in (ladder := self.unknown.ladder(RULE.step_few if few else RULE.step)):
+            self.climb(camera, min(RULE.turns, most), len(ladder))
+            if self.best.verdict == "confident" and not few:
+                break
+        if self.best.verdict != "confident" and not few and most > RULE.turns and self.best.camera is not None:
+            self.climb(self.best.camera, most, 1)
+        return replace(self.contested(), seconds=Clock.now() - self.begun)
 
     @property
     def best(self) -> Solution:
@@ -290,15 +297,14 @@ class _Ladder:
             left = max(limit - (Clock.now() - self.begun), 1e-3)
             limit = left / max(rungs - len(self.ends), 1)
         options = self.options._replace(settings=self.options.settings.limited(turns), time_limit=limit)
-        return solutions_of({0: self.problem(camera)}, options)[0]
+        return self.solve_with(camera, options)
 
     def _refined(self, solution: Solution, camera: Camera, zooms: Sequence[float] = (1.0,)) -> tuple[Camera, bool]:
         """Return the camera that fits best near a pose, and True if it equals the given one."""
-        pose, scale = (solution.rotation, solution.translation), solution.stats.residual
-        fitted = fit_camera(self.problem_at, self.unknown, camera, pose, scale, self.options.seed, zooms)
-        (zoom, radial), (before, old) = self.unknown.parts(fitted.camera), self.unknown.parts(camera)
+        fitted = self.refine(solution, camera, zooms)
+        (zoom, radial), (before, old) = self.unknown.parts(fitted), self.unknown.parts(camera)
         bend = abs((radial or 0.0) - (old or 0.0)) * self.unknown.outermost(zoom) ** 2
-        return fitted.camera, max(abs(math.log(zoom / before)), bend) < RULE.same
+        return fitted, max(abs(math.log(zoom / before)), bend) < RULE.same
 
     def contested(self) -> Solution:
         """Return the best solution, "ambiguous" if another focal length has a different pose that fits about as well.
@@ -323,6 +329,20 @@ class _Ladder:
                     away = math.degrees(turned_by(best.rotation, other.rotation))
                     return add_objection(best, objection("other_focal_length", behind, zoom=zoom, degrees=away))
         return best
+
+
+@dataclass
+class _OneCamera(FocalSweep):
+    """Focal lengths of one camera."""
+
+    problem_at: ProblemAt = field(kw_only=True)
+
+    def solve_with(self, camera: Camera, options: Options) -> Solution:
+        return solutions_of({0: self.problem_at(camera, self.unknown.focal(camera))}, options)[0]
+
+    def refine(self, solution: Solution, camera: Camera, zooms: Sequence[float] = (1.0,)) -> Camera:
+        pose, scale = (solution.rotation, solution.translation), solution.stats.residual
+        return fit_camera(self.problem_at, self.unknown, camera, pose, scale, self.options.seed, zooms).camera
 
 
 def is_claimed(solution: Solution, rotation: Array, zoom: float) -> bool:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from bpnp.search.starts import GravityPrior, PosePrior
 from bpnp.solving.arguments import check_inside, checked_prior, each_camera, each_set, is_network, pixels_from
@@ -15,22 +15,21 @@ from bpnp.solving.sources import Options
 PER_CAMERA = "labels2d", "scores2d"
 
 
+class Mode(NamedTuple):
+    """Arguments that are common to all problems; as for `bpnp.solve`."""
+
+    at_infinity: bool
+    rig: Sequence[Any] | None
+    scale: bool
+    image_size: Any
+    focal_error: float | int | None
+    distortion: bool
+    solver: Any
+    device: Any
+
+
 def prepare_mode(
-    points2d: Any,
-    points3d: Any,
-    camera: Any,
-    known: Mapping[str, Any],
-    options: Options,
-    *,
-    at_infinity: bool,
-    rig: Sequence[Any] | None,
-    scale: bool,
-    image_size: Any,
-    focal_error: float | int | None,
-    distortion: bool,
-    prior: Any,
-    solver: Any,
-    device: Any,
+    points2d: Any, points3d: Any, camera: Any, known: Mapping[str, Any], options: Options, mode: Mode, prior: Any
 ) -> Callable[[], Solution]:
     """Check the arguments of one problem with a rig or with directions, and return the function that solves it.
 
@@ -41,19 +40,13 @@ def prepare_mode(
         known: `normals3d`, `labels2d`, `labels3d`, `scores2d` and `scores3d`; with a `rig` those of the image points
             are lists with one array per camera.
         options: Options of the search.
-        at_infinity: `points3d` are directions.
-        rig: Extrinsics of the cameras; None for one camera.
-        scale: Estimate the scale of the scene.
-        image_size: As for `bpnp.solve`, and so are the other arguments.
-        focal_error: As for `bpnp.solve`.
-        distortion: As for `bpnp.solve`.
+        mode: Arguments that are common to all problems.
         prior: As for `bpnp.solve`.
-        solver: As for `bpnp.solve`.
-        device: As for `bpnp.solve`.
 
     Raises:
         ValueError: An argument is invalid, or has no meaning in this mode.
     """
+    at_infinity, rig, scale, image_size, focal_error, distortion, solver, device = mode
     _refuse(known, at_infinity=at_infinity, scale=scale, prior=prior, solver=solver, device=device)
     mounts = None if rig is None else [mount_from(f"rig[{k}]", mount) for k, mount in enumerate(rig)]
     count = 1 if mounts is None else len(mounts)

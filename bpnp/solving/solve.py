@@ -30,13 +30,14 @@ from bpnp.solving.arguments import (
 )
 from bpnp.solving.focal_length import solved_with_focal_length, unknown_camera
 from bpnp.solving.inputs import problem_from
-from bpnp.solving.modes import prepare_mode
+from bpnp.solving.modes import Mode, prepare_mode
 from bpnp.solving.solution import Solution
 from bpnp.solving.sources import Options, Progress, solutions_of
 
 if TYPE_CHECKING:
     import torch
 
+NO_RIG = "`scale=True` needs a `rig`: one camera does not determine the unit of a scene"
 SECONDS, SECONDS_OF_MANY = 10.0, 5.0  # default time limits per problem of `solve` and `solve_many`
 
 
@@ -110,7 +111,8 @@ def solve(
         rig: Extrinsics cam_from_rig of each camera of a rig, as (R, t), (3, 4), (4, 4) or a pycolmap.Rigid3d.
             `points2d`, `labels2d` and `scores2d` are then lists with one array per camera; `camera` is a list or one
             for all. The returned pose is rig_from_world, in the unit of the rig and of the scene, and a `prior` is one
-            of this pose. `matches` index the 2D points of all cameras, concatenated. Networks are not trained for rigs;
+            of this pose. `matches` index the 2D points of all cameras, concatenated. An unknown focal length is one
+            factor for all cameras, and `Solution.camera` is then the first camera. Networks are not trained for rigs;
             all other options apply.
         scale: With `rig`: also estimate the scale of a scene whose unit differs from the rig's, such as a COLMAP model.
             `Solution.scale` satisfies rig = scale R p + t, with t in the unit of the rig. The rig needs a non-zero
@@ -149,7 +151,7 @@ def solve(
         "scores3d": scores3d,
     }
     if scale and rig is None and not at_infinity:
-        raise ValueError("`scale=True` needs a `rig`: one camera does not determine the unit of a scene")
+        raise ValueError(NO_RIG)
     seconds = seconds_from(time_limit, SECONDS)
     if at_infinity or rig is not None:
         solve_one = prepare_mode(
@@ -163,15 +165,8 @@ def solve(
                 seed=checked_seed(seed),
                 time_limit=seconds,
             ),
-            at_infinity=at_infinity,
-            rig=rig,
-            scale=scale,
-            image_size=image_size,
-            focal_error=focal_error,
-            distortion=distortion,
-            prior=prior,
-            solver=solver,
-            device=device,
+            Mode(at_infinity, rig, scale, image_size, focal_error, distortion, solver, device),
+            prior,
         )
         return solve_one()
     points: dict[str, Any] = {"points2d": points2d, "points3d": points3d}
@@ -210,6 +205,9 @@ def solve_many(
     prior: ManyPriors | None = None,
     inlier_threshold: float | int | None = None,
     clutter: float | int | None = None,
+    at_infinity: bool = False,
+    rig: Sequence[Extrinsics] | None = None,
+    scale: bool = False,
     seed: int = 0,
     time_limit: float | int | None = None,
     device: "str | torch.device | None" = None,
@@ -237,6 +235,11 @@ def solve_many(
         prior: One prior for all problems, or a list of k priors.
         inlier_threshold: Largest reprojection error of a match, for all problems; as for `solve`.
         clutter: Expected outlier fraction, for all problems. None if it is unknown.
+        at_infinity: `points3d` are unit directions; as for `solve`. The problems are then independent.
+        rig: Extrinsics of the cameras of a rig that sees all problems; as for `solve`. The image points of a problem,
+            `labels2d` and `scores2d` are then lists with one array per camera, and `camera` is one for all or a list
+            with one per camera. The problems are then independent.
+        scale: With `rig`: also estimate the scale of each scene; as for `solve`.
         seed: Seed of the search, default 0.
         time_limit: Seconds per problem, 5 by default; math.inf for no limit.
         device: Device on which a copy of a module runs; as for `solve`.
@@ -258,7 +261,7 @@ def solve_many(
     count = len(images)
     seconds = seconds_from(time_limit, SECONDS_OF_MANY)
     options = Options(
-        source_from(solver),
+        None if at_infinity or rig is not None else source_from(solver),
         solver == "auto",
         positive("inlier_threshold", inlier_threshold, finite=True),
         None if clutter is None else float(clutter),
@@ -268,6 +271,8 @@ def solve_many(
         progress,
         until=Deadline(begun + seconds) if count == 1 else Deadline(),
     )
+    if scale and rig is None and not at_infinity:
+        raise ValueError(NO_RIG)
     known = {
         "normals3d": each_set("normals3d", normals3d, count),
         "labels2d": each_set("labels2d", labels2d, count, _axes_of_labels(labels2d)),
@@ -275,7 +280,17 @@ def solve_many(
         "scores2d": each_set("scores2d", scores2d, count, 1),
         "scores3d": each_set("scores3d", scores3d, count, 1),
     }
-    scenes, cameras = each_set("points3d", points3d, count), each_camera(camera, count)
+    scenes = each_set("points3d", points3d, count)
+    if at_infinity or rig is not None:
+        mode = Mode(at_infinity, rig, scale, image_size, focal_error, distortion, solver, device)
+        one_each = [camera] * count if rig is not None else each_camera(camera, count)
+        ready = []
+        for i, each in enumerate(each_of("prior", prior, count)):
+            arrays = {name: values[i] for name, values in known.items()}
+            with about(f"problem {i}" if count > 1 else None):
+                ready.append(prepare_mode(images[i], scenes[i], one_each[i], arrays, options, mode, each))
+        return [solve_one() for solve_one in ready]
+    cameras = each_camera(camera, count)
     priors = [checked_prior(each) for each in each_of("prior", prior, count)]
     pixels = [pixels_from(points, image_size or one) for points, one in zip(images, cameras, strict=True)]
 

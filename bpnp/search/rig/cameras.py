@@ -23,8 +23,8 @@ from bpnp.search.evidence.false_alarms import Terms, camera_terms, directions_of
 from bpnp.search.evidence.uncertainty import linearise, matches_of
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.pose_model import PoseModel
-from bpnp.search.problem import Problem
-from bpnp.search.refine.gauss_newton import soft_equations, steps
+from bpnp.search.problem import Problem, UnknownFocal
+from bpnp.search.refine.gauss_newton import refine, soft_equations, steps
 from bpnp.search.scene import Scene
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
 
@@ -33,6 +33,7 @@ Pose = tuple[Array, Array]
 WIDE = 60.0  # scale at which proposals are compared, in smallest scales: a pose of one camera is inaccurate in another
 STEPS, AGAIN = 9, 2  # number of decreasing scales, and Gauss-Newton steps at each
 MOST_SCALE = 1.0  # largest step of the log scale
+LENS_WIDE, MOST_LENS = 8.0, 0.1  # first scale of a fit of the lens, in scales of the residuals; largest step of a lens
 WEIGHED = 7  # number of the last scales at which the false alarms of poses are computed
 SAME_CENTRE = 1e-6  # fraction of the largest coordinate of a camera centre in the rig; nearer centres coincide
 
@@ -48,6 +49,8 @@ class Rig:
         is_metric: True if the last component of the translations is 1; else it is unknown. Default True.
         prior: Prior of the pose of the rig, in sizes of the scene; None for none. Without a metric scene its
             translation does not restrict a camera.
+        lens: Prior of the focal length of all cameras, which has one unknown factor; None if it is known. Poses are
+            refined with the given cameras; the number of tests and the covariance count the unknowns.
     """
 
     def __init__(
@@ -57,6 +60,7 @@ class Rig:
         *,
         is_metric: bool = True,
         prior: Prior | None = None,
+        lens: UnknownFocal | None = None,
     ) -> None:
         if isinstance(prior, PosePrior) and not is_metric:
             prior = prior._replace(translation=None)
@@ -65,7 +69,7 @@ class Rig:
             replace(each, prior=_prior_of(mount, prior)) for each, mount in zip(problems, self.mounts, strict=True)
         ]
         self.floor = max(each.floor or float(each.image.scales[0]) for each in self.problems)
-        self.model = PoseModel(problems[0].middle, mounts=self.mounts, scale=not is_metric, prior=prior)
+        self.model = PoseModel(problems[0].middle, lens, mounts=self.mounts, scale=not is_metric, prior=prior)
         self.unknowns = self.model.size
         centres = np.array([-turn.T @ shift for turn, shift in mounts])
         least = SAME_CENTRE * np.abs(centres).max()
@@ -95,7 +99,7 @@ class Rig:
 
     def join(self, scenes: Mapping[int, Scene]) -> None:
         """Register the scenes of the cameras with each other for common searches, if the unit is known."""
-        for k, other in permutations(scenes, 2) if self.unknowns == 6 else ():
+        for k, other in () if self.model.scale else permutations(scenes, 2):
             (turn, shift), (others, moved) = self.mounts[k], self.mounts[other]
             scenes[k].join(scenes[other], others @ turn.T, moved - others @ turn.T @ shift)
 
@@ -111,11 +115,29 @@ class Rig:
             Rotation, translation, scale (radians) and expected number of matches after each step.
         """
         scales = (np.geomspace(WIDE, 1.0, STEPS).repeat(AGAIN) * self.floor).tolist()
-        linearise = soft_equations(self.model, self.problems, fewest=self.unknowns - 3)
-        largest = np.full(self.unknowns, math.inf)
+        model = replace(self.model, lens=None)
+        linearise = soft_equations(model, self.problems, fewest=model.size - 3)
+        largest = np.full(model.size, math.inf)
         largest[6:] = MOST_SCALE
-        for last in steps(self.model, self.model.state(rotation, translation), linearise, scales, largest=largest):
-            yield (*self.model.pose(last.state), last.scale, float(last.before.matched))
+        for last in steps(model, model.state(rotation, translation), linearise, scales, largest=largest):
+            yield (*model.pose(last.state), last.scale, float(last.before.matched))
+
+    def fit_lens(self, rotation: Array, translation: Array, scale: float) -> tuple[float, float]:
+        """Fit the focal length of all cameras, and a radial coefficient if it is unknown, together with a pose.
+
+        Args:
+            rotation: (3, 3) of the rig.
+            translation: (4,) of the rig, homogeneous.
+            scale: Scale of the residuals, radians.
+
+        Returns:
+            Factor of the focal length, and the radial coefficient.
+        """
+        linearise = soft_equations(self.model, self.problems, fewest=self.model.size - 3)
+        scales = (max(scale, self.floor) * np.geomspace(LENS_WIDE, 1.0, STEPS).repeat(AGAIN)).tolist()
+        largest = np.where(np.arange(self.model.size) < 6, math.inf, MOST_LENS)
+        end = refine(self.model, self.model.state(rotation, translation), linearise, scales, largest=largest)
+        return float(end.state.zoom), float(end.state.radial)
 
     def alarms(self, rotation: Array, translation: Array, scale: float) -> tuple[float, float]:
         """Return log10 of the number of false alarms at the scale of the residuals, and at rougher ones.
@@ -127,7 +149,8 @@ class Rig:
         ways = self.model.fixing_ways(len(self.problems), self.apart)
         poses = (self.pose_of(k, rotation, translation) for k in range(len(self.problems)))
         shares = [each.log10_share(*pose) for each, pose in zip(self.problems, poses, strict=True)]
-        return log10_nfa(cameras, self.model.log10_tests(self.problems, shares), ways)
+        problems = [replace(each, focal=self.model.lens) for each in self.problems]
+        return log10_nfa(cameras, self.model.log10_tests(problems, shares), ways)
 
     def _terms(self, rotation: Array, translation: Array, scale: float | None) -> list[Terms | None]:
         seen = (
@@ -155,7 +178,8 @@ class Rig:
             scale: Standard deviation of the residuals, radians.
 
         Returns:
-            (6, 6) of the rotation and the shift of the scene centroid; (7, 7) with the logarithm of an unknown scale.
+            (6, 6) of the rotation and the shift of the scene centroid; then the logarithms of an unknown focal length
+            and of an unknown scale.
         """
         state = self.model.state(rotation, translation)
         for sharper in (1.0, 1 / math.sqrt(2)):  # as `local_covariance`
@@ -166,7 +190,9 @@ class Rig:
             matches = join(parts)._replace(known=self.model.information(state))
             covariance = covariance_of(matches, fitted=self.unknowns)
             if covariance is not None:
-                return covariance / sharper**2
+                names = [name for name in self.model.columns if name != "radial"]
+                kept = np.concatenate([np.arange(self.model.size)[self.model.columns[name]] for name in names])
+                return np.asarray(covariance[np.ix_(kept, kept)] / sharper**2)
         return None
 
     def candidates(self, rotations: Array, translations: Array) -> Hypotheses:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from bpnp.loops.parallel import NEVER, Clock, Deadline, one_blas_thread
 from bpnp.poses import distinct, seen_from
 from bpnp.search.competitors import fitted_lens
-from bpnp.search.config import DEFAULT, ENUMERATION
+from bpnp.search.config import DEFAULT, ENUMERATION, SearchSettings
 from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
 from bpnp.search.evidence.reasons import objection
 from bpnp.search.evidence.repetitions import repeated_poses
@@ -32,7 +32,7 @@ from bpnp.search.rig.cameras import WIDE, Array, Pose, Rig
 from bpnp.search.scene import Scene
 from bpnp.search.schedule import Plan
 from bpnp.search.search import lacks_partners
-from bpnp.search.verdict import SearchResult, judged, missed, no_pose
+from bpnp.search.verdict import SearchResult, is_object, judged, missed, no_pose
 
 PROPOSING = replace(ENUMERATION, kept=4000)  # number of poses that a camera with few points proposes
 REFINED = 16  # number of enumerated poses that are refined, and of distinct poses that are kept
@@ -44,7 +44,14 @@ LEAST_APART = 0.01  # smallest baseline of two cameras, in distances of the scen
 
 
 @one_blas_thread
-def search_rig(rig: Rig, *, clutter: float | None = None, seed: int = 0, deadline: Deadline = NEVER) -> SearchResult:
+def search_rig(
+    rig: Rig,
+    *,
+    clutter: float | None = None,
+    seed: int = 0,
+    deadline: Deadline = NEVER,
+    settings: SearchSettings = DEFAULT,
+) -> SearchResult:
     """Search for the pose of a rig.
 
     Args:
@@ -52,11 +59,12 @@ def search_rig(rig: Rig, *, clutter: float | None = None, seed: int = 0, deadlin
         clutter: Expected outlier fraction; None if it is unknown.
         seed: Random seed.
         deadline: When to stop.
+        settings: Constants of the search.
 
     Returns:
         Distinct poses of the rig, best first, and the verdict on the first one.
     """
-    settings = DEFAULT if clutter is None else DEFAULT.expecting(clutter)
+    settings = settings if clutter is None else settings.expecting(clutter)
     poses = RigPoses(rig)
     for k, problem in enumerate(rig.problems):
         if exceeds_enumeration(problem):
@@ -242,16 +250,25 @@ class RigPoses:
             turns, shifts = repeated.rotation, repeated.translation
             self._add(self.rig.candidates(*self.rig.rig_of(strongest, turns, shifts, self.best.translation[0, 3])))
             result = self._judged()
-        if result.verdict == "confident":
+        if result.verdict == "confident" and self.rig.model.lens is None:
             strongest, seen = self._strongest()
             pose = seen.rotation[0], seen.translation[0], float(seen.scale[0])
             other = fitted_lens(self.rig.problems[strongest], *pose, float(seen.match_count[0]), self.rule)
             result = result if other is None else result.doubt(other)
-        if result.verdict == "confident" and self.rig.unknowns == 7:
+        if result.verdict == "confident" and self.rig.unknowns > 6:
             best = self.best.rotation[0], self.best.translation[0], float(self.best.scale[0])
-            covariance, free = self.rig.covariance(*best), 2 * float(self.best.match_count[0]) - 7
-            if covariance is None or share_bound(covariance[6:, 6:], free) > self.rule.scale:
-                result = result.doubt(objection("scale_not_fixed", percent=100 * self.rule.scale))
+            covariance = self.rig.covariance(*best)
+            free = 2 * float(self.best.match_count[0]) - self.rig.unknowns
+            few = is_object(self.rig.problems[0], self.rule)
+            limits = {"focal": self.rule.focal_few if few else self.rule.focal} if self.rig.model.lens else {}
+            limits |= {"scale": self.rule.scale} if self.rig.model.scale else {}
+            for k, (name, limit) in enumerate(limits.items(), 6):
+                bound = math.inf if covariance is None else share_bound(covariance[k : k + 1, k : k + 1], free)
+                if bound > limit and name == "scale":
+                    result = result.doubt(objection("scale_not_fixed", percent=100 * limit))
+                elif bound > limit:
+                    off = f"{100 * bound:.0f} % off" if bound < 10 else "anything"
+                    result = result.doubt(objection("focal_length_not_fixed", off=off))
         poses = replace(result.candidates, rotation=self.best.rotation, translation=self.best.translation)
         return replace(result, candidates=poses)
 
@@ -274,7 +291,7 @@ def _proposals(rig: Rig, new: Mapping[int, Hypotheses], met: Sequence[Hypotheses
     If the scale is unknown, they are those in which two cameras with a non-zero baseline agree. The poses of the second
     camera include those it had `met` before.
     """
-    if rig.unknowns == 6:
+    if not rig.model.scale:
         parts = [rig.rig_of(k, poses.rotation, poses.translation) for k, poses in new.items()]
     else:
         pairs = [(k, other, poses) for k, poses in new.items() for other in range(len(met))]
