@@ -206,7 +206,7 @@ def solve_many(
     inlier_threshold: float | int | None = None,
     clutter: float | int | None = None,
     at_infinity: bool = False,
-    rig: Sequence[Extrinsics] | None = None,
+    rig: Sequence[PoseLike] | None = None,
     scale: bool = False,
     seed: int = 0,
     time_limit: float | int | None = None,
