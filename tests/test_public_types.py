@@ -44,7 +44,7 @@ solve([x, x], p, K, rig=[np.eye(4)] * 2, labels2d=[[1, 2], np.arange(2)], labels
 solve_many([x, torch.zeros(5, 2)], p, [K, pinhole, None], prior=[PosePrior(K, None, 3.0), solution, None])
 solve_many(np.stack([x, x]), [p, p.tolist()], K, labels2d=[[1, 2], None], labels3d=p)
 solve_many([x, x], p, sized, prior=(K, p[0]))
-solve_many([[x, x], [x, x]], p, [pinhole, K], rig=[K, K], labels2d=[[[1, 2], np.arange(2)]] * 2, labels3d=[1, 2])
+solve_many([[x, x], [x, x]], p, [pinhole, K], rig=[np.eye(4)] * 2, scores2d=[[np.ones(5), [0.5] * 5]] * 2)
 verify(x, p, solution.rotation, solution.translation, solution.camera, matches=solution.matches)
 verify(x, p, torch.eye(3), [0, 0, 5], matches=[(0, 1), (2, 3)])
 Batch.from_arrays(x, p, focal=800.0)
