@@ -38,7 +38,7 @@ LIKELY = -20.0  # log10 NFA below which a view gets a longer search before the n
 RANKS = {"failed": 0, "ambiguous": 1, "confident": 2}
 
 
-class Attempt(NamedTuple):
+class ViewSolution(NamedTuple):
     """The solution of a search near a view.
 
     Attributes:
@@ -58,7 +58,7 @@ class Attempt(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Outcome:
+class LoopResult:
     """Result of the loop.
 
     Attributes:
@@ -72,7 +72,7 @@ class Outcome:
 
 def localize(
     maps: Sequence[ViewedPoints], photo: Photo, views: Sequence[str] | None, options: Options, time_limit: float
-) -> Outcome:
+) -> LoopResult:
     """Estimate the pose of a photo in a map; see `SceneMap.localize`.
 
     Args:
@@ -86,23 +86,23 @@ def localize(
         ValueError: No view sees 4 or more points.
     """
     start, deadline, tried = Clock.now(), Deadline.after(time_limit), set[str]()
-    outcomes = list[Outcome]()
+    results = list[LoopResult]()
     for k, scene in enumerate(maps):
         half = Deadline.after((deadline.at - Clock.now()) / 2) if k + 1 < len(maps) else deadline
-        outcomes.append(_localize_in(scene, photo, views, options._replace(time_limit=time_limit, until=half), tried))
-        if outcomes[-1].solution.verdict == "confident":
+        results.append(_localize_in(scene, photo, views, options._replace(time_limit=time_limit, until=half), tried))
+        if results[-1].solution.verdict == "confident":
             break
-    solution = max((outcome.solution for outcome in outcomes), key=rank)
-    is_complete = solution.verdict == "confident" or all(outcome.is_complete for outcome in outcomes)
+    solution = max((result.solution for result in results), key=rank)
+    is_complete = solution.verdict == "confident" or all(result.is_complete for result in results)
     if not is_complete:
         count = len(maps[-1].views if views is None else views)
         solution = replace(solution, reason=reasons.unfinished(solution.reason, time_limit, len(tried), count))
-    return Outcome(replace(solution, seconds=Clock.now() - start), is_complete)
+    return LoopResult(replace(solution, seconds=Clock.now() - start), is_complete)
 
 
 def _localize_in(
     scene: ViewedPoints, photo: Photo, views: Sequence[str] | None, options: Options, tried: set[str]
-) -> Outcome:
+) -> LoopResult:
     """Search near the views of a map until a pose is confident, the queue is empty, or time is over.
 
     Each view is tried briefly, then once more. A view with a likely pose, and in the end the most promising views, get
@@ -120,32 +120,32 @@ def _localize_in(
         raise ValueError("no view of the map sees 4 or more points, which a pose needs")
     photo = replace(photo, view_count=len({place.view.name for place in places}))
     queue = deque((place, settings) for settings in (BRIEF, ONCE) for place in places)
-    earlier, best, longer = list[Candidate](), list[Attempt](), set[str]()
+    earlier, best, longer = list[Candidate](), list[ViewSolution](), set[str]()
     while queue and not (best and options.until.passed()):
         place, settings = queue.popleft()
         tried.add(place.view.name)
         own = search_near(scene.region(place.view, place.points), photo, place.camera, options, settings)
-        attempt = Attempt(place, own, False)
+        found = ViewSolution(place, own, False)
         if own.verdict == "confident" or own.log10_false_alarms < 0:
-            attempt = judge_in_map(scene, photo, views, attempt, earlier)
-        if "confident" in (own.verdict, attempt.solution.verdict):
-            return Outcome(attempt.solution, True)
-        earlier += significant(attempt.solution)
-        best = sorted([*best, attempt], key=lambda one: one.rank, reverse=True)[:PROMISING]
-        again = [attempt] if attempt.solution.log10_false_alarms < LIKELY and len(longer) < PROMISING else []
+            found = judge_in_map(scene, photo, views, found, earlier)
+        if "confident" in (own.verdict, found.solution.verdict):
+            return LoopResult(found.solution, True)
+        earlier += significant(found.solution)
+        best = sorted([*best, found], key=lambda one: one.rank, reverse=True)[:PROMISING]
+        again = [found] if found.solution.log10_false_alarms < LIKELY and len(longer) < PROMISING else []
         if not queue:  # not significant so far, but perhaps with all points of the map
             best = [judge_in_map(scene, photo, views, one, earlier) for one in best]
             best.sort(key=lambda one: one.rank, reverse=True)
             if best[0].solution.verdict == "confident":
-                return Outcome(best[0].solution, True)
+                return LoopResult(best[0].solution, True)
             again = best
         for one in reversed(again):
             if one.place.view.name not in longer:
                 longer.add(one.place.view.name)
                 queue.appendleft((one.place._replace(camera=_camera_near(photo.camera, one.solution)), LONGER))
     if not queue:
-        return Outcome(best[0].solution, True)
-    return Outcome(judge_in_map(scene, photo, views, best[0], earlier).solution, False)
+        return LoopResult(best[0].solution, True)
+    return LoopResult(judge_in_map(scene, photo, views, best[0], earlier).solution, False)
 
 
 def search_near(
@@ -174,8 +174,8 @@ def search_near(
 
 
 def judge_in_map(
-    scene: ViewedPoints, photo: Photo, views: Sequence[str] | None, attempt: Attempt, earlier: Sequence[Candidate]
-) -> Attempt:
+    scene: ViewedPoints, photo: Photo, views: Sequence[str] | None, found: ViewSolution, earlier: Sequence[Candidate]
+) -> ViewSolution:
     """Refine and judge a pose on all map points in view and, if it is confident, against poses elsewhere in the map.
 
     If a pose elsewhere is more likely by the margin `lead`, it is refined and judged in the same way, and used instead
@@ -185,12 +185,12 @@ def judge_in_map(
         scene: The map.
         photo: The photo.
         views: Names of the views to try; None for all views of the map.
-        attempt: The pose; returned unchanged if it was judged before.
+        found: The pose; returned unchanged if it was judged before.
         earlier: Significant poses that were found with the points of other views.
     """
-    if attempt.is_judged:
-        return attempt
-    place, own = attempt.place, attempt.solution
+    if found.is_judged:
+        return found
+    place, own = found.place, found.solution
     whole = scene.region(place.view)
     solution = judge_on_all_points(own, refine_on_all_points(own, photo, whole))
     if photo.prior is None and solution.verdict == "confident":
@@ -203,7 +203,7 @@ def judge_in_map(
                 competitor = find_competitor(scene, photo, views, place, better, earlier)
                 solution = better
         solution = judge_against(solution, competitor)
-    return Attempt(place, solution, True)
+    return ViewSolution(place, solution, True)
 
 
 def find_competitor(

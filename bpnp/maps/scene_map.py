@@ -182,10 +182,10 @@ class SceneMap(ViewedPoints):
         maps = [self]
         if up_camera is not None and prior is None and (turned := self.turned(_direction(up_camera))) is not self:
             maps = [turned, self]
-        outcome = localize(maps, photo, None if views is None else list(views), options, limit)
-        if time_limit is None and not outcome.is_complete:
+        result = localize(maps, photo, None if views is None else list(views), options, limit)
+        if time_limit is None and not result.is_complete:
             warnings.warn(DEFAULT_LIMIT, DeprecationWarning, stacklevel=_level_of_user())
-        solution = outcome.solution
+        solution = result.solution
         return solution if strongest is None else among_all(solution, strongest, pixels)
 
     def verify_view(

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from bpnp import PosePrior, SceneMap
 from bpnp.cameras import camera_from
 from bpnp.maps.aliasing import best_competitor
-from bpnp.maps.localize import ONCE, Attempt, judge_in_map, search_near
+from bpnp.maps.localize import ONCE, ViewSolution, judge_in_map, search_near
 from bpnp.maps.photo_problem import Photo
 from bpnp.maps.viewed_points import Place
 from bpnp.maps.views import View
@@ -141,7 +141,7 @@ def test_a_better_pose_elsewhere_takes_the_place_of_a_confident_one() -> None:
     view, photo = scene.views[4], Photo(keypoints, camera_from(CAMERA))
     wrong = search_near(scene.region(view, view.points), replace(photo, prior=opposite), photo.camera, Options(), ONCE)
     assert degrees_between(wrong.rotation, opposite.rotation) < 1
-    attempt = Attempt(Place(view, view.points, photo.camera), replace(wrong, verdict="confident"), is_judged=False)
+    attempt = ViewSolution(Place(view, view.points, photo.camera), replace(wrong, verdict="confident"), is_judged=False)
     solution = judge_in_map(scene, photo, None, attempt, []).solution
     assert solution.verdict == "confident"
     assert degrees_between(solution.rotation, pose[0]) < 1
