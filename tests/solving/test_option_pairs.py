@@ -54,7 +54,9 @@ def plant(options: Options) -> Planted:
     devices = []
     for _ in range(2 if "many" in options else 1):
         rotation, translation = Rotation.random(rng=rng).as_matrix(), np.array([0.1, -0.1, 4.0])
-        scene = rng.standard_normal((220, 3)) if sky else rng.uniform(-1.2, 1.2, (36, 3))
+        # A radial coefficient is fitted to 24 matches or more.
+        count, most = (36, 28) if "distortion" in options else (28, 20)
+        scene = rng.standard_normal((220, 3)) if sky else rng.uniform(-1.2, 1.2, (count, 3))
         if sky:
             scene /= np.linalg.norm(scene, axis=1, keepdims=True)
             translation = np.zeros(3)
@@ -65,8 +67,8 @@ def plant(options: Options) -> Planted:
             image = FOCAL * plane * (1 + radial * (plane**2).sum(1, keepdims=True)) + np.array(SIZE) / 2
             ahead = (camera[:, 2] > 0) & ((plane**2).sum(1) < 1.5)
             inside = np.flatnonzero(ahead & (image > 0).all(1) & (image < SIZE).all(1))
-            seen = rng.permutation(inside)[:28]
-            false = rng.uniform((20, 20), (620, 460), (6, 2))
+            seen = rng.permutation(inside)[: 28 if sky else most]
+            false = rng.uniform((20, 20), (620, 460), (5, 2))
             pixels.append(np.concatenate([image[seen] + NOISE * rng.standard_normal((len(seen), 2)), false]))
             truth.append(np.r_[seen, np.full(len(false), -1)])
         unit = SCALE if "scale" in options else 1.0

@@ -120,3 +120,26 @@ def test_a_short_baseline_gives_no_confident_scale() -> None:
     solution = bpnp.solve(images, scene, [CAMERA] * 2, rig=near, scale=True, time_limit=60)
     assert solution.verdict == "ambiguous"
     assert "scale" in solution.reason
+
+
+def test_a_rig_with_a_prior_returns_what_it_has_when_the_time_is_over() -> None:
+    """The deadline is over from the start: the pose of the prior is refined on all cameras, and nothing else is."""
+    images, scene, mounts, pose, _ = planted_rig(1, (80, 80), points=120)
+    near = Rotation.from_rotvec([0.01, -0.02, 0.01]).as_matrix() @ pose[0]
+    rough = bpnp.PosePrior(near, pose[1] + 0.03, rotation_sigma_deg=2.0, translation_sigma=0.05)
+    late = bpnp.solve(images, scene, [CAMERA] * 2, rig=mounts, prior=rough, time_limit=1e-9)
+    assert late.log10_false_alarms < -100
+    assert degrees_between(late.rotation, pose[0]) < 0.3
+    without = bpnp.solve(images, scene, [CAMERA] * 2, rig=mounts, time_limit=1e-9)
+    assert without.verdict == "failed"
+
+
+def test_the_prior_of_a_rig_counts_once() -> None:
+    """A rig of two equal cameras: the rotation is as accurate as one prior, which is better than the image."""
+    images, scene, mounts, pose, _ = planted_rig(3, (10,))
+    sigma = 1e-3
+    prior = bpnp.PosePrior(pose[0], None, sigma)
+    twice = bpnp.solve([images[0]] * 2, scene, CAMERA, rig=[mounts[0]] * 2, prior=prior, time_limit=60)
+    assert twice.rotation_std_deg == pytest.approx(sigma, rel=0.05)
+    rough = bpnp.solve([images[0]] * 2, scene, CAMERA, rig=[mounts[0]] * 2, time_limit=60)
+    assert rough.rotation_std_deg > 10 * sigma

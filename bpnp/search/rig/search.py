@@ -18,6 +18,7 @@ from bpnp.loops.parallel import NEVER, Clock, Deadline, one_blas_thread
 from bpnp.poses import distinct, seen_from
 from bpnp.search.competitors import fitted_lens
 from bpnp.search.config import DEFAULT, ENUMERATION, SearchSettings
+from bpnp.search.enumeration.points import predicted_pose
 from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
 from bpnp.search.evidence.reasons import objection
 from bpnp.search.evidence.repetitions import repeated_poses
@@ -72,6 +73,8 @@ def search_rig(
             if not lacks_partners(scene):
                 poses.pools[k] = Pool(scene, problem, no_pose("no pose was found"))
     rig.join({k: pool.scene for k, pool in poses.pools.items()})
+    if (predicted := predicted_pose(rig.model.prior)) is not None:
+        poses.add_refined(rig.candidates(predicted[0][None], np.r_[predicted[1], 1.0][None]))
     poses.take(_of_few_points(poses, rig.problems, seed, deadline), REFINED)
     if rig.model.prior is not None and not poses.is_significant():
         without = [replace(problem, prior=None) for problem in rig.problems]
@@ -173,7 +176,7 @@ class RigPoses:
         every = Hypotheses.concatenate([self.starts, poses])
         order = self._distinct(every, np.r_[np.full(known, BEFORE), score], known + most)[known:]
         self.starts = every[np.r_[:known, order]]
-        self._add(self.rig.candidates(every.rotation[order], every.translation[order]))
+        self.add_refined(self.rig.candidates(every.rotation[order], every.translation[order]))
 
     def next_look(self) -> Step | None:
         """Return a local search around the best unused initial pose; None if a pose is significant."""
@@ -193,7 +196,7 @@ class RigPoses:
         pose = to_scene_frame(Hypotheses.from_poses(turn, shift), scene)
         return Step(partial(search_beside, scene, pose, scene.settings.beside), camera=k, counts=False)
 
-    def _add(self, refined: Hypotheses) -> None:
+    def add_refined(self, refined: Hypotheses) -> None:
         """Add refined poses; the basin count of the best one is the sum over all cameras."""
         every = Hypotheses.concatenate([self.best, refined])
         self.best = every[self._distinct(every, -every.log10_false_alarms, REFINED)]
@@ -247,8 +250,9 @@ class RigPoses:
             strongest, seen = self._strongest()
             known = seen.rotation[0], seen.translation[0], float(seen.scale[0])
             repeated, _ = repeated_poses(self.rig.problems[strongest], *known, self.rule)
-            turns, shifts = repeated.rotation, repeated.translation
-            self._add(self.rig.candidates(*self.rig.rig_of(strongest, turns, shifts, self.best.translation[0, 3])))
+            unit = self.best.translation[0, 3]
+            copies = self.rig.rig_of(strongest, repeated.rotation, repeated.translation, unit)
+            self.add_refined(self.rig.candidates(*copies))
             result = self._judged()
         if result.verdict == "confident" and self.rig.model.lens is None:
             strongest, seen = self._strongest()
