@@ -155,16 +155,15 @@ class RigPoses:
         """Add the poses of one camera, in the frame of its scene."""
         if step.counts:
             self.pools[step.camera].add(step, found)
-        self.take({step.camera: found}, A_TURN)
+        self.take({step.camera: to_problem_frame(found, self.pools[step.camera].scene)}, A_TURN)
 
     def take(self, new: Mapping[int, Hypotheses], most: int) -> None:
         """Refine those proposals of the cameras that have the most evidence in all cameras.
 
         Args:
-            new: Poses of each camera, by index; in the normalised frame for cameras that search.
+            new: Poses of each camera, by index, in the frame of its problem.
             most: Largest number of poses that are refined.
         """
-        new = {k: to_problem_frame(p, self.pools[k].scene) if k in self.pools else p for k, p in new.items()}
         rotation, translation = _proposals(self.rig, new, self.met)
         for k, poses in new.items():
             self.met[k] = Hypotheses.concatenate([self.met[k], poses])
