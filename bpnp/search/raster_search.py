@@ -22,6 +22,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
+from scipy.special import ndtr, ndtri
 
 from bpnp.loops.parallel import in_time
 from bpnp.search.annealing import anneal_on_points, turned_about_middle
@@ -48,7 +49,9 @@ def search_near(scene: Scene, prior: PosePrior, rule: RasterSearch | None = None
         Distinct annealed poses of all searches.
     """
     rules = scene.settings.near if rule is None else (rule,)
-    starts = (drawn_around(scene, prior, starts_of(scene, prior, one)) for one in rules)
+    starts = (
+        drawn_around(scene, prior, starts_of(scene, prior, one), reach_across(scene, prior, one)) for one in rules
+    )
     return Hypotheses.concatenate([raster_search(scene, *each) for each in zip(starts, rules, strict=True)])
 
 
@@ -130,18 +133,60 @@ def starts_of(scene: Scene, prior: PosePrior, rule: RasterSearch) -> int:
 
 
 def _volume(scene: Scene, prior: PosePrior, rule: RasterSearch) -> float:
-    """Return the volume of the poses that a prior allows, in multiples of the wide prior of the rule."""
-    wide = math.radians(rule.draws.wide_deg), rule.draws.wide_shift * distance_of(scene, prior)
-    return (math.radians(prior.rotation_sigma_deg) / wide[0]) ** 3 * (prior.translation_sigma / wide[1]) ** 3
+    """Return the volume of the poses that a prior allows in this view, in multiples of the wide prior of the rule."""
+    distance, draws = distance_of(scene, prior), rule.draws
+    turn = math.radians(prior.rotation_sigma_deg) / math.radians(draws.wide_deg)
+    across = min(
+        prior.translation_sigma, reach_across(scene, prior, rule) / math.sqrt(3)
+    )  # of a uniform distribution, where cut
+    across /= draws.wide_across * scene.spread * distance
+    return turn**3 * across**2 * prior.translation_sigma / (draws.wide_shift * distance)
 
 
-def drawn_around(scene: Scene, prior: PosePrior, count: int) -> Hypotheses:
-    """Draw `count` poses from the prior; the first is its mean."""
+def reach_across(scene: Scene, prior: PosePrior, rule: RasterSearch) -> float:
+    """Return how far from the centre of the view the centroid of the points may lie, across the view.
+
+    Farther away, most of the points are outside the view. A telephoto view is much narrower than most priors.
+
+    Returns:
+        Distance along each axis, scene units; infinite for a rig, whose other cameras see the points too.
+    """
+    if scene.companions:
+        return math.inf
+    covariance, axis = np.cov(scene.bulk3d.T, bias=True), np.asarray(prior.rotation)[2]
+    width = math.sqrt(max(float(np.trace(covariance) - axis @ covariance @ axis), 0.0))
+    return rule.draws.reach * math.hypot(scene.spread * distance_of(scene, prior), width)
+
+
+def drawn_around(scene: Scene, prior: PosePrior, count: int, reach: float = math.inf) -> Hypotheses:
+    """Draw poses from a prior, with the centroid of the points at most `reach` from the centre of the view.
+
+    Args:
+        scene: Points and random generator.
+        prior: Prior with a translation, in the frame of the scene.
+        count: Number of poses; the first is the mean of the prior.
+        reach: Largest distance along each axis across the view, scene units; extended to the mean of the prior.
+
+    Returns:
+        (count,) hypotheses with basin counts of 1.
+    """
     mean = np.asarray(prior.rotation, np.float32)[None], np.asarray(prior.translation, np.float32)[None]
     vectors = math.radians(prior.rotation_sigma_deg) * scene.rng.standard_normal((count, 3), np.float32)
-    shifts = np.float32(prior.translation_sigma) * scene.rng.standard_normal((count, 3), np.float32)
+    shifts = scene.rng.standard_normal((count, 3), np.float32)
+    middle = np.asarray(prior.rotation) @ scene.bulk3d.mean(0) + np.asarray(prior.translation)
+    for k in range(2):
+        offset, sigma = float(middle[k]), float(prior.translation_sigma)
+        low, high = min(-reach, offset) - offset, max(reach, offset) - offset
+        shifts[:, k] = _truncated(shifts[:, k], low / sigma, high / sigma)
+    shifts *= np.float32(prior.translation_sigma)
     vectors[0], shifts[0] = 0, 0
     return turned_about_middle(scene, *mean, vectors, shifts, basin_count=1)
+
+
+def _truncated(normal: NDArray[np.float32], low: float, high: float) -> NDArray[np.float32]:
+    """Map standard normal values to the normal distribution between two bounds, by their quantiles."""
+    first, last = ndtr(low), ndtr(high)
+    return np.asarray(ndtri(first + (last - first) * ndtr(normal.astype(np.float64))), np.float32)
 
 
 def admitted(scene: Scene, poses: Hypotheses, prior: Prior | None) -> Hypotheses:

@@ -10,8 +10,12 @@ import pytest
 from numpy.typing import NDArray
 from planted import degrees_between, view_with_outliers
 from scipy.spatial.transform import Rotation
+from scipy.stats import kstest, truncnorm
 
+from bpnp.search.config import DEFAULT
 from bpnp.search.problem import Problem
+from bpnp.search.raster_search import drawn_around, search_near
+from bpnp.search.scene import Scene
 from bpnp.search.search import search_poses
 from bpnp.search.starts import PosePrior
 
@@ -79,3 +83,48 @@ def test_a_pose_among_six_outliers_a_match_is_found_without_a_prior() -> None:
     best = problem.to_user(*found.best)
     np.testing.assert_allclose(best[0], rotation, atol=5e-3)
     np.testing.assert_allclose(best[1], translation, atol=0.05)
+
+
+def telephoto(rng: np.random.Generator) -> tuple[Problem, Array]:
+    """A facade in a view of 5 degrees, with a prior from another photo of it, and its true rotation."""
+    size, true, outliers = 5.0, 80, 320
+    half = np.array([0.04, 0.03])
+    plane = rng.uniform(-half, half, (true + 2 * outliers, 2))
+    depth = size * rng.uniform(0.98, 1.02, (len(plane), 1))
+    seen = np.column_stack([plane, np.ones(len(plane))])
+    rotation, translation = Rotation.random(rng=rng).as_matrix(), np.array([0.0, 0.0, size])
+    points = (seen * depth - translation) @ rotation
+    noise = 1e-4 * rng.standard_normal(plane.shape)
+    bearings = seen + np.column_stack([noise, np.zeros(len(plane))])
+    bearings /= np.linalg.norm(bearings, axis=-1, keepdims=True)
+    image, scene = np.r_[:true, true : true + outliers], np.r_[:true, true + outliers : len(points)]
+    off = Rotation.from_rotvec(np.radians(4) * rng.standard_normal(3)).as_matrix() @ rotation
+    shift = translation + size * np.array([0.01, 0.01, 0.1]) * rng.standard_normal(3)
+    prior = PosePrior(off, shift, 15.0, 0.2 * size)
+    return Problem.of(rng.permutation(bearings[image]), rng.permutation(points[scene]), prior=prior), rotation
+
+
+def test_one_search_near_a_prior_finds_a_telephoto_view() -> None:
+    """The prior is as wide as for an ordinary lens, many times the view: from most of its poses no point is in view."""
+    for seed in range(10):
+        problem, rotation = telephoto(np.random.default_rng(seed))
+        scene = Scene(problem, seed, DEFAULT)
+        found = search_near(scene, scene.enter_prior(problem.prior))
+        ends, _ = scene.leave(found.rotation, found.translation)
+        assert min(degrees_between(end, rotation) for end in ends) < 0.5, seed
+
+
+@pytest.mark.parametrize("reach", [2.0, math.inf])
+def test_poses_drawn_from_a_prior_are_normal_and_cut_to_the_view(reach: float) -> None:
+    """The position of the centroid across the view is distributed like `scipy.stats.truncnorm`."""
+    problem, _ = telephoto(np.random.default_rng(3))
+    scene = Scene(problem, 0, DEFAULT)
+    prior = scene.enter_prior(problem.prior)
+    assert isinstance(prior, PosePrior)
+    drawn = drawn_around(scene, prior, 4000, reach)
+    middle, sigma = scene.bulk3d.mean(0), prior.translation_sigma
+    centroids = (drawn.rotation @ middle + drawn.translation)[1:]
+    mean = np.asarray(prior.rotation) @ middle + np.asarray(prior.translation)
+    for k, bound in enumerate((reach, reach, math.inf)):
+        expected = truncnorm((-bound - mean[k]) / sigma, (bound - mean[k]) / sigma, loc=mean[k], scale=sigma)
+        assert kstest(centroids[:, k], expected.cdf).pvalue > 1e-3
