@@ -170,8 +170,10 @@ class Solution:
         """Standard deviation of `centre` along its least certain axis, scene units; NaN for points at infinity."""
         if "translation_x" not in self.parameters:
             return math.nan
-        scale = self.scale if SCALE in self.parameters else None
-        return _largest(centre_covariance(self.covariance, self.translation, scale))
+        chosen, scale = list(range(len(POSE_PARAMETERS))), None
+        if SCALE in self.parameters:
+            chosen, scale = [*chosen, self.parameters.index(SCALE)], self.scale
+        return _largest(centre_covariance(self.covariance[np.ix_(chosen, chosen)], self.translation, scale))
 
     @property
     def focal_length(self) -> float:

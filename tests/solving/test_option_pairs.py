@@ -228,6 +228,9 @@ def test_a_pair_recovers_the_pose_and_uses_both_options(pair: Options) -> None:
         if "scale" in pair:
             assert solution.scale == pytest.approx(SCALE, rel=0.05)
         np.testing.assert_allclose(solution.translation, device.translation, atol=0.15)
+        if "at_infinity" not in pair:
+            centre = -device.rotation.T @ device.translation / (SCALE if "scale" in pair else 1.0)
+            assert np.linalg.norm(solution.centre - centre) < 5 * solution.centre_std < 0.2
         if pair & {"focal", "distortion"}:
             assert abs(solution.focal_length - FOCAL) < 4 * solution.focal_length_std < 0.04 * FOCAL
     for name in sorted(pair.difference(MODES)):
