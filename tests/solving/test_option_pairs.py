@@ -68,7 +68,7 @@ def plant(options: Options) -> Planted:
             ahead = (camera[:, 2] > 0) & ((plane**2).sum(1) < 1.5)
             inside = np.flatnonzero(ahead & (image > 0).all(1) & (image < SIZE).all(1))
             seen = rng.permutation(inside)[: 28 if sky else most]
-            false = rng.uniform((20, 20), (620, 460), (5, 2))
+            false = rng.uniform((20, 20), (620, 460), (14 if sky else 5, 2))
             pixels.append(np.concatenate([image[seen] + NOISE * rng.standard_normal((len(seen), 2)), false]))
             truth.append(np.r_[seen, np.full(len(false), -1)])
         unit = SCALE if "scale" in options else 1.0
