@@ -526,8 +526,9 @@ class SearchSettings:
     )
     fine: FineStage = FineStage()
     near: tuple[RasterSearch, ...] = tuple(
-        RasterSearch(screens=Screens((100, 1000)), narrowing=Narrowing(first, points=600), annealed=12)
-        for first in (0.06, 0.03)  # the finer one for dense keypoints and few visible points
+        RasterSearch(screens=Screens((100, 1000), kept), narrowing=Narrowing(first, points=600), annealed=12)
+        # The finer one is for dense keypoints and few visible points; in its narrower basins, ranks are less certain.
+        for first, kept in ((0.06, (2**13, 2**10)), (0.03, (2**13, 2**11)))
     )
     beside: RasterSearch = RasterSearch(
         Draws(2**13, 10.0, 0.1, 2**13),
