@@ -55,7 +55,7 @@ def plant(options: Options) -> Planted:
     for _ in range(2 if "many" in options else 1):
         rotation, translation = Rotation.random(rng=rng).as_matrix(), np.array([0.1, -0.1, 4.0])
         # A radial coefficient is fitted to 24 matches or more.
-        count, most = (36, 28) if "distortion" in options else (28, 20)
+        count, most = (36, 28) if "distortion" in options else (20, 15)
         scene = rng.standard_normal((220, 3)) if sky else rng.uniform(-1.2, 1.2, (count, 3))
         if sky:
             scene /= np.linalg.norm(scene, axis=1, keepdims=True)
@@ -115,8 +115,10 @@ def is_true(device: Device, right: bool) -> list[Array]:
 
 
 def is_seen(device: Device, right: bool) -> Array:
-    seen = np.isin(np.arange(len(device.scene)), np.concatenate(device.truth))
-    return np.where(seen == right, 0.9, 0.3)
+    """Scores of the scene points; wrong ones also prefer some of those that are seen to others."""
+    index = np.arange(len(device.scene))
+    seen = np.isin(index, np.concatenate(device.truth))
+    return np.where(seen, 0.9, 0.3) if right else np.where(seen & (index % 2 > 0), 0.2, 0.8)
 
 
 def arguments(name: str, device: Device, options: Options, right: bool) -> dict[str, Any]:
@@ -230,7 +232,7 @@ def test_a_pair_recovers_the_pose_and_uses_both_options(pair: Options) -> None:
         np.testing.assert_allclose(solution.translation, device.translation, atol=0.15)
         if "at_infinity" not in pair:
             centre = -device.rotation.T @ device.translation / (SCALE if "scale" in pair else 1.0)
-            assert np.linalg.norm(solution.centre - centre) < 5 * solution.centre_std < 0.2
+            assert np.linalg.norm(solution.centre - centre) < 5 * solution.centre_std < 0.3
         if pair & {"focal", "distortion"}:
             assert abs(solution.focal_length - FOCAL) < 4 * solution.focal_length_std < 0.04 * FOCAL
     for name in sorted(pair.difference(MODES)):
