@@ -18,12 +18,12 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.poses import Tolerance
 from bpnp.search.config import DEFAULT
-from bpnp.search.evidence.repetitions import competing_poses, registered
+from bpnp.search.propose.repetitions import competing_poses, registered
 from bpnp.search.pool import Pool
 from bpnp.search.scene import Scene
 from bpnp.search.schedule import Plan
-from bpnp.search.verdict import no_pose, starts_met
-from bpnp.solving.inputs import problem_from
+from bpnp.search.verdict.decide import no_pose, starts_met
+from bpnp.search.inputs import problem_from
 
 TURNS = 8
 HITS = (1, 2, 3, 4, 6, 8, 10)

@@ -20,7 +20,7 @@ from scipy.special import fdtri
 
 from bpnp import Solution, warm_up
 from bpnp.files import write_atomically
-from bpnp.search.evidence.covariance import student_factor
+from bpnp.search.verdict.covariance import student_factor
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("BPNP_SHARED_DATA", ROOT.parent / "shared" / "data"))

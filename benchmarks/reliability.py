@@ -41,8 +41,8 @@ from view_problems import LEAST_MATCHES, REPORTED, Against, ViewProblem, scene_p
 
 from bpnp import Solution, solve
 from bpnp.cameras import camera_from
-from bpnp.solving.inputs import problem_from
-from bpnp.solving.sources import Options, solutions_of
+from bpnp.search.inputs import problem_from
+from bpnp.search.sources import Options, solutions_of
 
 FACTORS = (0.67, 0.8, 0.9, 0.95, 1.05, 1.1, 1.2, 1.33)
 RIGHT_DEG, RIGHT_MOVED, RIGHT_CENTRE = 3.0, 0.1, 0.05

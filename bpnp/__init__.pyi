@@ -4,10 +4,10 @@ from .models.matcher import Matcher as Matcher
 from .search.search import warm_up as warm_up
 from .search.starts import GravityPrior as GravityPrior
 from .search.starts import PosePrior as PosePrior
-from .solving.solution import Solution as Solution
-from .solving.solve import solve as solve
-from .solving.solve import solve_many as solve_many
-from .solving.verify import verify as verify
+from .search.solution import Solution as Solution
+from .search.api import solve as solve
+from .search.api import solve_many as solve_many
+from .search.verify import verify as verify
 from .types import Batch as Batch
 from .types import Pose as Pose
 from .types import Prediction as Prediction

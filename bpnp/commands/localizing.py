@@ -82,7 +82,7 @@ def localize(
     from bpnp.maps.many_photos import SolutionFolder, content_of_map, localize_photos, read_views
     from bpnp.maps.photos import photo_files
     from bpnp.maps.scene_map import SceneMap
-    from bpnp.solving.arguments import positive, source_from
+    from bpnp.search.arguments import positive, source_from
 
     swapped = any(model_format(photo) for photo in photos)
     if map.is_file() or (swapped and not model_format(map)):

@@ -129,7 +129,7 @@ def _camera_of(text: str, photo: Path) -> "Camera":
 def _solution(path: Path) -> "ProblemPoints":
     """Return the points of a solution's file; a ValueError names the file."""
     from bpnp.report.solutions import solution_points
-    from bpnp.solving.solution import Solution
+    from bpnp.search.solution import Solution
 
     try:
         return solution_points(Solution.from_json(path.read_bytes()), title=path.stem)

@@ -15,7 +15,7 @@ from bpnp.files import require_new_folder, write_text
 from bpnp.report.terminal import console, fixed, number, progress, say
 
 if TYPE_CHECKING:
-    from bpnp.solving.solution import Solution
+    from bpnp.search.solution import Solution
 
 
 def solve(
@@ -117,7 +117,7 @@ def solve(
     pose_prior: Any = None if prior is None else read_prior(prior, prior_degrees, prior_distance)
 
     # All files have been read: only now import the search.
-    from bpnp.solving.solve import solve as find_pose
+    from bpnp.search.api import solve as find_pose
 
     if up_camera is not None and up_scene is not None:
         from bpnp.search.starts import GravityPrior
@@ -233,7 +233,7 @@ def verify(
     pairs = None if matches is None else read_pairs(matches)
 
     # All files have been read: only now import the search.
-    from bpnp.solving.verify import verify as judge_pose
+    from bpnp.search.verify import verify as judge_pose
 
     with progress(items=False, quiet=quiet) as shown:
         shown.add_task("verifying the pose", total=None)

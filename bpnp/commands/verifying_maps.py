@@ -48,7 +48,7 @@ def verify_images(
 
     from bpnp.maps.scene_map import SceneMap
     from bpnp.maps.verified_map import SECONDS, as_csv, as_json, page_html, summary, verify_map
-    from bpnp.solving.arguments import seconds_from
+    from bpnp.search.arguments import seconds_from
 
     limit = seconds_from(time_limit, SECONDS)
     scene = SceneMap.from_colmap(map)

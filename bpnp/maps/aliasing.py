@@ -1,7 +1,7 @@
 """Aliasing: poses elsewhere in a map that explain the same image points, such as those of a similar building.
 
 A confident pose is compared with three kinds of proposals: poses that were found with the points of other views; its
-images under motions that map the scene onto itself (`bpnp.search.evidence.repetitions`); and poses that short searches
+images under motions that map the scene onto itself (`bpnp.search.propose.repetitions`); and poses that short searches
 near views of other points find for the image points that it explains. They are refined on all points of the map,
 scored by how well they explain the image points, and the pose is judged against the best of them.
 """
@@ -13,24 +13,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.loops.parallel import one_blas_thread
+from bpnp.runtime import one_blas_thread
 from bpnp.maps.photo_problem import Photo, in_picture
 from bpnp.maps.viewed_points import Region
 from bpnp.maps.views import Array
 from bpnp.poses import same_pose, turned_by
-from bpnp.search.annealing import finish, polished
+from bpnp.search.refine.annealing import finish, polished
 from bpnp.search.config import DEFAULT, Draws, Narrowing, RasterSearch, RasterShape, Screens
-from bpnp.search.evidence.reasons import objection
-from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
+from bpnp.search.verdict.reasons import objection
+from bpnp.search.propose.repetitions import decades_behind, repeated_poses
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
 from bpnp.search.kernels.raster import Raster
 from bpnp.search.problem import Problem
-from bpnp.search.raster_search import search_beside, search_near
+from bpnp.search.propose.density_map import search_beside, search_near
 from bpnp.search.scene import Scene
 from bpnp.search.starts import PosePrior
-from bpnp.search.verdict import weighed
-from bpnp.solving.matches import count_one_to_one
-from bpnp.solving.solution import Candidate, Solution, add_objection, candidates_of
+from bpnp.search.verdict.decide import weighed
+from bpnp.search.matching import count_one_to_one
+from bpnp.search.solution import Candidate, Solution, add_objection, candidates_of
 
 Pose = tuple[Array, Array]  # rotation (3, 3) and translation (3,), in the frame of a problem
 

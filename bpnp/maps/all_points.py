@@ -6,23 +6,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bpnp.cameras import camera_from
-from bpnp.loops.parallel import one_blas_thread
+from bpnp.runtime import one_blas_thread
 from bpnp.maps.photo_problem import Photo, with_ids
 from bpnp.maps.viewed_points import Region
 from bpnp.maps.views import Array
 from bpnp.poses import MIN_POINTS
-from bpnp.search.annealing import finish, polished
-from bpnp.search.competitors import other_lens, settle
+from bpnp.search.refine.annealing import finish, polished
+from bpnp.search.settle import other_lens, settle
 from bpnp.search.config import DEFAULT, Evidence
-from bpnp.search.evidence.alternatives import competing_pose
+from bpnp.search.verdict.competitors import competing_pose
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
 from bpnp.search.problem import Problem, UnknownFocal
-from bpnp.search.raster_search import search_beside
+from bpnp.search.propose.density_map import search_beside
 from bpnp.search.scene import Scene
-from bpnp.search.verdict import judged
-from bpnp.solving.focal_length import AROUND, UnknownCamera, fit_camera
-from bpnp.solving.matches import finished
-from bpnp.solving.solution import Solution, add_objection
+from bpnp.search.verdict.decide import judged
+from bpnp.search.focal_length import AROUND, UnknownCamera, fit_camera
+from bpnp.search.matching import finished
+from bpnp.search.solution import Solution, add_objection
 
 COMPETITORS = 4  # competing poses of an ambiguous solution that are judged with it on all points
 

@@ -9,8 +9,8 @@ import numpy.typing as npt
 from bpnp.cameras import camera_from
 from bpnp.report.images import size_in_camera
 from bpnp.report.terminal import LIGHT, QUIET, VERDICTS, number
-from bpnp.search.evidence.uncertainty import centre_covariance
-from bpnp.solving.solution import Solution
+from bpnp.search.verdict.uncertainty import centre_covariance
+from bpnp.search.solution import Solution
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

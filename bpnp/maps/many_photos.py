@@ -24,8 +24,8 @@ from bpnp.maps.localized_picture import localized_picture
 from bpnp.maps.photos import photo_keypoints
 from bpnp.maps.scene_map import UNKNOWN, SceneMap
 from bpnp.report.images import read_photo, save_figure
-from bpnp.solving.arguments import seconds_from
-from bpnp.solving.solution import Solution
+from bpnp.search.arguments import seconds_from
+from bpnp.search.solution import Solution
 
 CHANGES = {"photo": "another photo", "map": "another map", "views": "other views", "keypoints": "other keypoints"}
 MADE_WITH = "made_with"  # key in a solution's file, added to the fields of the solution

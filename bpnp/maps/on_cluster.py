@@ -11,7 +11,7 @@ from distributed.comm import connect
 
 from bpnp.maps.many_photos import Attempt, PhotoTask, attempt
 from bpnp.maps.scene_map import SceneMap
-from bpnp.solving.solution import Solution
+from bpnp.search.solution import Solution
 
 QUEUED = 4  # photos per worker thread: no thread waits, and the scheduler holds few
 PATIENCE = 10  # seconds until a scheduler answers

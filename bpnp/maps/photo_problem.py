@@ -11,9 +11,9 @@ from bpnp.cameras import Camera, camera_from
 from bpnp.maps.viewed_points import Region
 from bpnp.maps.views import Array
 from bpnp.search.problem import Problem, UnknownFocal
-from bpnp.solving.focal_length import UnknownCamera
-from bpnp.solving.inputs import problem_from
-from bpnp.solving.solution import Candidate, Solution
+from bpnp.search.focal_length import UnknownCamera
+from bpnp.search.inputs import problem_from
+from bpnp.search.solution import Candidate, Solution
 
 
 @dataclass(frozen=True, eq=False)

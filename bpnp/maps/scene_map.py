@@ -23,7 +23,7 @@ from bpnp.maps.photos import focal_from_exif, photo_keypoints, photo_size, up_fr
 from bpnp.maps.verify_view import verify_pose
 from bpnp.maps.viewed_points import ViewedPoints
 from bpnp.maps.views import Array, View
-from bpnp.solving.arguments import (
+from bpnp.search.arguments import (
     PriorLike,
     check_inside,
     checked_prior,
@@ -33,10 +33,10 @@ from bpnp.solving.arguments import (
     seconds_from,
     source_from,
 )
-from bpnp.solving.focal_length import UnknownCamera, unknown_camera
-from bpnp.solving.solution import Solution
-from bpnp.solving.sources import Options
-from bpnp.solving.verify import SECONDS as SECONDS_OF_VERIFICATION
+from bpnp.search.focal_length import UnknownCamera, unknown_camera
+from bpnp.search.solution import Solution
+from bpnp.search.sources import Options
+from bpnp.search.verify import SECONDS as SECONDS_OF_VERIFICATION
 
 if TYPE_CHECKING:
     import torch

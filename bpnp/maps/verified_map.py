@@ -18,7 +18,7 @@ from bpnp.maps.localized_picture import plane_from_above
 from bpnp.maps.scene_map import SceneMap
 from bpnp.report.templates import render_page
 from bpnp.report.terminal import VERDICTS, number
-from bpnp.solving.verify import SECONDS
+from bpnp.search.verify import SECONDS
 
 UNTESTED = "untested"
 MATCHED_ONLY = "Significant on the matched keypoints alone, log10 NFA {0:.1f}, but not on all {2} keypoints, {1:.1f}"

@@ -10,8 +10,8 @@ from bpnp.maps.viewed_points import Region
 from bpnp.maps.views import Array, View
 from bpnp.poses import MIN_POINTS
 from bpnp.search.config import DEFAULT
-from bpnp.solving.solution import Solution
-from bpnp.solving.verify import verify_problem
+from bpnp.search.solution import Solution
+from bpnp.search.verify import verify_problem
 
 
 def verify_pose(

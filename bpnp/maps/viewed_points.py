@@ -25,7 +25,7 @@ from bpnp.maps.views import (
 from bpnp.poses import MIN_POINTS
 from bpnp.search.problem import faces
 from bpnp.search.starts import PosePrior
-from bpnp.solving.focal_length import UnknownCamera
+from bpnp.search.focal_length import UnknownCamera
 
 Map = TypeVar("Map", bound="ViewedPoints")
 LEAST_TRACK = 2  # least number of views of a point after a view is removed

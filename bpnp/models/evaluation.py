@@ -19,14 +19,14 @@ from torch import Tensor, nn
 
 from bpnp.checks import check_positive, check_within
 from bpnp.geometry import bearings, choose, chords
-from bpnp.loops.parallel import Deadline
+from bpnp.runtime import Deadline
 from bpnp.robust.proposals import pose_hypotheses
 from bpnp.search.config import DEFAULT, SearchSettings
 from bpnp.search.problem import Problem
 from bpnp.search.propose.given import anneal_given
 from bpnp.search.scene import Scene, degenerate
 from bpnp.search.search import search_poses
-from bpnp.search.verdict import SearchResult, degenerate_points, judged
+from bpnp.search.verdict.decide import SearchResult, degenerate_points, judged
 from bpnp.types import Batch, Pose, Prediction, SolveStats
 
 

@@ -34,7 +34,7 @@ class ImageSettings:
 
 @dataclass(frozen=True)
 class Contested:
-    """Conditions under which a far pose competes with the best one (`bpnp.search.evidence.alternatives.contesting`).
+    """Conditions under which a far pose competes with the best one (`bpnp.search.verdict.competitors.contesting`).
 
     Attributes:
         near: Distance, in scales of the residuals, within which an image point has a match and two matches coincide.
@@ -54,7 +54,7 @@ class Contested:
 
 @dataclass(frozen=True)
 class Repetitions:
-    """Motions that map a scene onto itself (`bpnp.search.evidence.repetitions`).
+    """Motions that map a scene onto itself (`bpnp.search.propose.repetitions`).
 
     Attributes:
         near: Distance, in scales of the residuals, within which an image point has a match.
@@ -91,7 +91,7 @@ class Repetitions:
 
 @dataclass(frozen=True)
 class OtherFocal:
-    """Search for another focal length near a confident pose (`bpnp.search.competitors`).
+    """Search for another focal length near a confident pose (`bpnp.search.settle`).
 
     Attributes:
         step: Factor from one focal length to the next.
@@ -114,14 +114,14 @@ class OtherFocal:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Conditions of a confident pose (`bpnp.search.verdict`). Logarithms have base 10.
+    """Conditions of a confident pose (`bpnp.search.verdict.decide`). Logarithms have base 10.
 
     Attributes:
         false_alarms: Largest log of the number of false alarms (NFA). The NFA is an upper bound: on unrelated points,
             an exhaustive search stayed above 1 in 999 of 1000 cases and never fell below 0.1.
         lead: Smallest margin to every competing pose; by chance a wrong pose has it once in a thousand cases.
         same: Tolerance within which two poses are the same.
-        missed: Largest log of the miss probability of a better optimum (`bpnp.search.evidence.alternatives`).
+        missed: Largest log of the miss probability of a better optimum (`bpnp.search.verdict.competitors`).
         independent: Number of matches that must be coincidences for a better optimum to exist, as many as fix a pose.
         another: Probability of a better optimum although several initial poses ended at a significant one.
         uncompared: Probability that a better pose of a symmetric scene is not among those of its motions.
@@ -402,7 +402,7 @@ class RasterShape:
 
 @dataclass(frozen=True)
 class RasterSearch:
-    """One density-map search (`bpnp.search.raster_search`): draw, preselect, narrow, anneal.
+    """One density-map search (`bpnp.search.propose.density_map`): draw, preselect, narrow, anneal.
 
     Attributes:
         draws: Number of initial poses.

@@ -28,7 +28,7 @@ class Hypotheses:
         scale: (c,) standard deviation of the residuals per axis, radians, at which the two previous columns are
             computed.
         basin_count: (c,) number of independent starts that ended at this pose.
-        log10_false_alarms: (c,) log10 NFA at the scale of the residuals (`bpnp.search.evidence.false_alarms`); NaN
+        log10_false_alarms: (c,) log10 NFA at the scale of the residuals (`bpnp.search.verdict.false_alarms`); NaN
             before it is computed.
         log10_rough: (c,) log10 NFA at scales far beyond those of the residuals; NaN likewise.
         evidence: (c,) of a proposer, nats by which the matches exceed chance; None where it computes none.

@@ -9,9 +9,9 @@ Searches differ in their plan and pool only: one camera (`bpnp.search.schedule`)
 from collections.abc import Callable
 from typing import NamedTuple, Protocol, runtime_checkable
 
-from bpnp.loops.parallel import Deadline
+from bpnp.runtime import Deadline
 from bpnp.search.hypotheses import Hypotheses
-from bpnp.search.verdict import SearchResult
+from bpnp.search.verdict.decide import SearchResult
 
 
 class Step(NamedTuple):

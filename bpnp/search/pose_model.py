@@ -3,7 +3,7 @@
 The unknowns are the rotation of the scene and, as needed, the shift of its centroid, the logarithm of the focal length,
 a radial coefficient and the logarithm of the scale of the scene of a rig. A model has the directions in which cameras
 see scene points, their derivatives by the unknowns, steps, the information of priors, and the number of tests of the
-NFA (`bpnp.search.evidence.false_alarms`).
+NFA (`bpnp.search.verdict.false_alarms`).
 
 Camera k of a rig, camera_k = C_k rig + c_k, has the scene point p at
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.loops.parallel import NEVER, Deadline
+from bpnp.runtime import NEVER, Deadline
 from bpnp.poses import MIN_POINTS
 from bpnp.search.config import RasterShape, SearchSettings
 from bpnp.search.kernels.raster import Raster

@@ -19,12 +19,12 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.annealing import multistart
-from bpnp.search.evidence.completeness import far_missed, near_missed
+from bpnp.search.refine.annealing import multistart
+from bpnp.search.verdict.completeness import far_missed, near_missed
 from bpnp.search.hypotheses import Hypotheses, select_distinct, to_scene_frame
 from bpnp.search.loop import Step
 from bpnp.search.pool import Pool
-from bpnp.search.raster_search import (
+from bpnp.search.propose.density_map import (
     admitted,
     is_near,
     raster_search,
@@ -33,7 +33,7 @@ from bpnp.search.raster_search import (
     search_near,
 )
 from bpnp.search.starts import PosePrior, Prior
-from bpnp.search.verdict import is_symmetric, starts_met
+from bpnp.search.verdict.decide import is_symmetric, starts_met
 
 Proposals = Callable[[], tuple[NDArray[np.float64], NDArray[np.float64]]]  # rotations (s, 3, 3), translations (s, 3)
 PROPOSED_AFTER = 4  # steps near a prior after which proposals are requested

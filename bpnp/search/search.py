@@ -12,9 +12,9 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
-from bpnp.search.annealing import run_batch
-from bpnp.search.competitors import SceneOf, settle
+from bpnp.runtime import NEVER, Deadline, one_blas_thread
+from bpnp.search.refine.annealing import run_batch
+from bpnp.search.settle import SceneOf, settle
 from bpnp.search.config import DEFAULT, SearchSettings
 from bpnp.search.enumeration.plan import EnumeratedPoses, EnumerationPlan
 from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
@@ -26,11 +26,11 @@ from bpnp.search.problem import Problem
 from bpnp.search.propose.known_matches import known_matches, poses_of_matches
 from bpnp.search.propose.minimal_solvers import p3p_poses
 from bpnp.search.propose.symmetries import self_motions
-from bpnp.search.raster_search import looked_up
+from bpnp.search.propose.density_map import looked_up
 from bpnp.search.scene import Scene, degenerate
 from bpnp.search.schedule import Plan, Proposals
 from bpnp.search.starts import Prior
-from bpnp.search.verdict import SearchResult, degenerate_points, judged, no_pose
+from bpnp.search.verdict.decide import SearchResult, degenerate_points, judged, no_pose
 
 Progress = Callable[[int, float], None]  # batches so far, seconds
 WARMING = 8  # number of points of the problem that compiles the loops

@@ -15,25 +15,25 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
+from bpnp.runtime import NEVER, Deadline, one_blas_thread
 from bpnp.poses import turned_by
-from bpnp.search.annealing import anneal_on_points, finish, polished
-from bpnp.search.competitors import settle
+from bpnp.search.refine.annealing import anneal_on_points, finish, polished
+from bpnp.search.settle import settle
 from bpnp.search.config import DEFAULT, Evidence
 from bpnp.search.enumeration.search import is_enumerable
-from bpnp.search.evidence.false_alarms import likeliest_scale
-from bpnp.search.evidence.partners import explained
-from bpnp.search.evidence.reasons import objection
-from bpnp.search.evidence.repetitions import competing_poses, registered
-from bpnp.search.evidence.uncertainty import linearised, local_covariance
+from bpnp.search.verdict.false_alarms import likeliest_scale
+from bpnp.search.correspondences import explained
+from bpnp.search.verdict.reasons import objection
+from bpnp.search.propose.repetitions import competing_poses, registered
+from bpnp.search.verdict.uncertainty import linearised, local_covariance
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.pose_model import log10_tests
 from bpnp.search.problem import SIGMAS, Problem, in_bulk
 from bpnp.search.propose.symmetries import mirror_pose
-from bpnp.search.raster_search import around_each
+from bpnp.search.propose.density_map import around_each
 from bpnp.search.scene import Scene
 from bpnp.search.starts import PosePrior
-from bpnp.search.verdict import SearchResult, Verdict, judged, with_false_alarms
+from bpnp.search.verdict.decide import SearchResult, Verdict, judged, with_false_alarms
 
 Array = NDArray[np.float64]
 ONE_POSE = "only this pose and its competitors were tested, no better one was searched for"

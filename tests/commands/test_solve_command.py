@@ -58,7 +58,7 @@ def test_json_is_all_that_is_printed(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 def test_options_and_columns_reach_the_search_as_they_are_written(tmp_path: Path) -> None:
-    """Pass all options to `solve`; their effects are tested in tests/solving/test_options.py."""
+    """Pass all options to `solve`; their effects are tested in tests/search/test_options.py."""
     rng = np.random.default_rng(9)
     sides = np.column_stack([P, np.tile([0.0, 0, 1], (40, 1)), rng.integers(0, 2, 40)])
     colours = np.empty((40, 1))
@@ -76,7 +76,7 @@ def test_options_and_columns_reach_the_search_as_they_are_written(tmp_path: Path
             asked.append(options)
             return solution
 
-        patch.setattr("bpnp.solving.solve.solve", noted)
+        patch.setattr("bpnp.search.api.solve", noted)
         words = "--clutter 0.25 --seed 7 --solver search --time_limit 3 --inlier_threshold 0.1 --focal_error 0.2"
         words += f" --distortion --at_infinity --device cpu --prior {rough} --prior-degrees 6 --prior_distance 0.5"
         files = [str(tmp_path / "x.csv"), str(tmp_path / "p.csv")]
@@ -127,7 +127,7 @@ def test_a_mistake_is_one_line(change: Any, message: str, tmp_path: Path, fails:
 def test_an_unwritable_output_is_refused_before_the_search(
     tmp_path: Path, fails: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("bpnp.solving.solve.solve", None)
+    monkeypatch.setattr("bpnp.search.api.solve", None)
     (tmp_path / "file").write_text("")
     assert "file" in fails("solve", *write(tmp_path), "--output", str(tmp_path / "file" / "r.json"))
 
@@ -158,7 +158,7 @@ def test_a_colmap_model_is_scene_and_camera_and_the_photo_lies_under_the_picture
 def test_an_input_is_not_overwritten(
     option: str, tmp_path: Path, fails: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("bpnp.solving.solve.solve", None)
+    monkeypatch.setattr("bpnp.search.api.solve", None)
     files = write(tmp_path)
     Image.new("RGB", (640, 480)).save(tmp_path / "photo.png")
     replaced = files[0] if option == "--output" else str(tmp_path / "photo.png")
@@ -172,7 +172,7 @@ def test_a_folder_with_files_is_refused_before_the_search(
 ) -> None:
     main(["solve", *write(tmp_path), "--colmap", str(tmp_path / "out"), "--quiet"])
     before = (tmp_path / "out/images.txt").read_text()
-    monkeypatch.setattr("bpnp.solving.solve.solve", None)
+    monkeypatch.setattr("bpnp.search.api.solve", None)
     message = fails("solve", *write(tmp_path), "--colmap", str(tmp_path / "out"))
     assert message == f"bpnp: error: {tmp_path / 'out'} exists and would be replaced; name a new folder\n"
     assert (tmp_path / "out/images.txt").read_text() == before

@@ -18,7 +18,7 @@ from bpnp import BPnPNet, Matcher
 from bpnp.cli import main
 from bpnp.files import CONFIGS
 from bpnp.models.weights import TrainedNet
-from bpnp.solving.arguments import checked_prior, source_from
+from bpnp.search.arguments import checked_prior, source_from
 from bpnp.training import PoseLossWarmup
 
 pytestmark = pytest.mark.slow

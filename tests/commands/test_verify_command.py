@@ -52,14 +52,14 @@ def test_a_pose_in_numbers_with_matches_is_judged(
 
 
 def test_options_reach_the_verdict_as_they_are_written(files: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pass all options to `verify`; their effects are tested in tests/solving/test_verify.py."""
+    """Pass all options to `verify`; their effects are tested in tests/search/test_verify.py."""
     asked, solution = list[dict[str, Any]](), bpnp.solve(X, P)
 
     def noted(*given: Any, **options: Any) -> Solution:
         asked.append(options)
         return solution
 
-    monkeypatch.setattr("bpnp.solving.verify.verify", noted)
+    monkeypatch.setattr("bpnp.search.verify.verify", noted)
     main(["verify", *files, *NUMBERS, "--seed", "3", "--time_limit", "7", "--as_it_is"])
     assert [asked[0][name] for name in ("seed", "time_limit", "refine")] == [3, 7, False]
 

@@ -23,9 +23,9 @@ from bpnp.maps import localize
 from bpnp.maps.all_points import judge_on_all_points, refine_on_all_points
 from bpnp.maps.localize import BRIEF
 from bpnp.maps.photo_problem import Photo
-from bpnp.search.evidence.false_alarms import alarms_of
-from bpnp.search.evidence.reasons import Objection, objection
-from bpnp.search.verdict import SearchResult, judged
+from bpnp.search.verdict.false_alarms import alarms_of
+from bpnp.search.verdict.reasons import Objection, objection
+from bpnp.search.verdict.decide import SearchResult, judged
 
 
 @pytest.fixture(scope="module")

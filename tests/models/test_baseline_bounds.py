@@ -8,7 +8,7 @@ from planted import plant
 from torch import Tensor
 
 from bpnp.geometry import angle_between, camera_centre
-from bpnp.loops.parallel import NEVER
+from bpnp.runtime import NEVER
 from bpnp.models.baselines.branch_and_bound import (
     GOPAC,
     Boxes,

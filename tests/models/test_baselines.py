@@ -11,7 +11,7 @@ from planted import padded, plant
 from scipy.optimize import linear_sum_assignment
 
 from bpnp import Batch, BPnPNet
-from bpnp.loops.parallel import NEVER
+from bpnp.runtime import NEVER
 from bpnp.metrics import rotation_error, translation_error
 from bpnp.models.baselines import GOPAC, GOSMA, Hungarian, RandomRansac, SoftPOSIT
 from bpnp.models.baselines.blind_p3p import probability_of_true_triple

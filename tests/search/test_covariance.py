@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bpnp.search.evidence.covariance import covariance_of, join, of_sure_matches
+from bpnp.search.verdict.covariance import covariance_of, join, of_sure_matches
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from planted import degrees_between, directions
 from scipy.spatial.transform import Rotation
 
-from bpnp.loops.parallel import Clock
+from bpnp.runtime import Clock
 from bpnp.robust.minimal_solvers import p3p
 from bpnp.search.enumeration.search import Enumerated, Enumeration, enumerate_poses
 from bpnp.search.problem import Problem

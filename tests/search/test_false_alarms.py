@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from bpnp.search import problem as problem_module
-from bpnp.search.evidence.false_alarms import (
+from bpnp.search.verdict.false_alarms import (
     alarms_of,
     camera_terms,
     directions_of,

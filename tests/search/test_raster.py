@@ -14,7 +14,7 @@ from scipy.stats import kstest, truncnorm
 
 from bpnp.search.config import DEFAULT
 from bpnp.search.problem import Problem
-from bpnp.search.raster_search import drawn_around, search_near
+from bpnp.search.propose.density_map import drawn_around, search_near
 from bpnp.search.scene import Scene
 from bpnp.search.search import search_poses
 from bpnp.search.starts import PosePrior

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, norm, t
 
 from bpnp import solve
-from bpnp.search.evidence import uncertainty
-from bpnp.search.evidence.uncertainty import linearised, local_covariance, pose_covariance, rotation_bound
+from bpnp.search.verdict import uncertainty
+from bpnp.search.verdict.uncertainty import linearised, local_covariance, pose_covariance, rotation_bound
 from bpnp.search.problem import Problem
 from bpnp.search.starts import GravityPrior, PosePrior
 

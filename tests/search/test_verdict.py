@@ -12,13 +12,13 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.special import stdtrit
 
-from bpnp.loops.parallel import NEVER, Deadline
-from bpnp.search.competitors import AtZoom, likeliest_zoom, other_lens
+from bpnp.runtime import NEVER, Deadline
+from bpnp.search.settle import AtZoom, likeliest_zoom, other_lens
 from bpnp.search.config import DEFAULT
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.scene import Scene
-from bpnp.search.verdict import SearchResult, judged
+from bpnp.search.verdict.decide import SearchResult, judged
 
 Array = NDArray[np.float64]
 SHIFT = np.array([0.0, 0.0, 6.0])

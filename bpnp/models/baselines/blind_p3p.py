@@ -3,7 +3,7 @@
 import math
 
 from bpnp.geometry import bearings
-from bpnp.loops.parallel import Deadline
+from bpnp.runtime import Deadline
 from bpnp.models.baselines.single_problem import Answer, SingleProblem, SingleSolver, agreement
 from bpnp.poses import MIN_POINTS
 from bpnp.robust.matches import distinct_triples

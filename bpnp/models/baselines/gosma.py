@@ -17,7 +17,7 @@ from torch.nn.functional import normalize, one_hot
 
 from bpnp.checks import check_positive
 from bpnp.geometry import angle_between, retract
-from bpnp.loops.parallel import NEVER, Deadline
+from bpnp.runtime import NEVER, Deadline
 from bpnp.models.baselines.branch_and_bound import (
     BestPose,
     Boxes,

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from bpnp.checks import check_positive
 from bpnp.geometry import project, transform
-from bpnp.loops.parallel import Deadline
+from bpnp.runtime import Deadline
 from bpnp.poses import MIN_POINTS
 from bpnp.types import Batch, Pose, Prediction, SolveStats
 

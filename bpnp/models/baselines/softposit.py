@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bpnp.geometry import random_rotations, retract
-from bpnp.loops.parallel import Deadline
+from bpnp.runtime import Deadline
 from bpnp.models.baselines.single_problem import (
     Answer,
     SingleProblem,

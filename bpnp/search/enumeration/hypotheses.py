@@ -3,7 +3,7 @@
 import math
 from typing import Any, NamedTuple
 
-from bpnp.loops.vectors import copy_pose, rotated
+from bpnp.search.kernels.vectors import copy_pose, rotated
 from bpnp.search.config import RULES
 from bpnp.search.enumeration.matching import Matches, cell_of, evidence, fits, match, nearest, sight, step
 from bpnp.search.enumeration.points import Array, Places

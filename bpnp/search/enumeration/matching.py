@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bpnp.loops.vectors import rotated, turn
+from bpnp.search.kernels.vectors import rotated, turn
 from bpnp.search.config import RULES
 from bpnp.search.enumeration.points import Array, Heading, ImageArrays, Places, PriorArrays, SceneArrays
 from bpnp.search.kernels.dense import solve_normal_equations

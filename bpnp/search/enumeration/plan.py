@@ -11,18 +11,18 @@ from functools import partial
 
 import numpy as np
 
-from bpnp.loops.parallel import Deadline
-from bpnp.search.competitors import SceneOf, settle
+from bpnp.runtime import Deadline
+from bpnp.search.settle import SceneOf, settle
 from bpnp.search.config import ENUMERATION, SearchSettings
 from bpnp.search.enumeration.points import predicted_pose
 from bpnp.search.enumeration.search import Enumeration, margin
-from bpnp.search.evidence.partners import explained
-from bpnp.search.evidence.repetitions import competing_poses, registered
+from bpnp.search.correspondences import explained
+from bpnp.search.propose.repetitions import competing_poses, registered
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.loop import Step
 from bpnp.search.problem import Problem
 from bpnp.search.starts import GravityPrior
-from bpnp.search.verdict import REFINED, SearchResult, is_certain, judged, weighed, with_false_alarms
+from bpnp.search.verdict.decide import REFINED, SearchResult, is_certain, judged, weighed, with_false_alarms
 
 SMALLEST = 1e-5  # smallest scale of the residuals if the pixel size is unknown, radians
 

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from bpnp.loops.parallel import Clock
+from bpnp.runtime import Clock
 from bpnp.search.config import ENUMERATION, RULES, EnumerationSettings, Stage
 from bpnp.search.enumeration.hypotheses import Block, Kept, Work, explore
 from bpnp.search.enumeration.matching import EnumerationTables, Matches

@@ -1,6 +1,6 @@
 """Significance and uncertainty of a rotation, and a test for a wrong camera model.
 
-The number of false alarms is that of `bpnp.search.evidence.false_alarms` (`log10_nfa`) for three unknowns: an unrelated
+The number of false alarms is that of `bpnp.search.verdict.false_alarms` (`log10_nfa`) for three unknowns: an unrelated
 image point f_i falls with the density l_i of the directions around it; a rotation that explains a fraction w of the
 points with residuals of s predicts
 
@@ -32,9 +32,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc
 
-from bpnp.search.evidence.covariance import covariance_of, of_sure_matches, student_factor
-from bpnp.search.evidence.false_alarms import LEAST_SHARE, MOST_SHARE, SHARES, Terms, log10_nfa
-from bpnp.search.evidence.uncertainty import EXCEEDED, STRAINS, exceeded_once
+from bpnp.search.verdict.covariance import covariance_of, of_sure_matches, student_factor
+from bpnp.search.verdict.false_alarms import LEAST_SHARE, MOST_SHARE, SHARES, Terms, log10_nfa
+from bpnp.search.verdict.uncertainty import EXCEEDED, STRAINS, exceeded_once
 from bpnp.search.kernels.neighbours import sums_near
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.loops.vectors import F, compiled, cross, part, rotated, turn
+from bpnp.search.kernels.vectors import F, compiled, cross, part, rotated, turn
 from bpnp.search.enumeration.matching import fits
 from bpnp.search.kernels.neighbours import HashedPoints, entry
 

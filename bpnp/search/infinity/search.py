@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import betaln
 
-from bpnp.loops.parallel import NEVER, Deadline
+from bpnp.runtime import NEVER, Deadline
 from bpnp.poses import turned_by
 from bpnp.search.config import DEFAULT as SEARCH
 from bpnp.search.config import ENUMERATION
-from bpnp.search.evidence import reasons
-from bpnp.search.evidence.reasons import CONFIDENT, objection
+from bpnp.search.verdict import reasons
+from bpnp.search.verdict.reasons import CONFIDENT, objection
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.infinity.evidence import (
     Array,
@@ -58,7 +58,7 @@ from bpnp.search.loop import Step, run
 from bpnp.search.pose_model import FIXING_ROTATION
 from bpnp.search.problem import Problem
 from bpnp.search.starts import PosePrior
-from bpnp.search.verdict import SearchResult, no_pose
+from bpnp.search.verdict.decide import SearchResult, no_pose
 
 BINS = (6, 7)  # log2 of the smallest and largest number of azimuth bins
 PRIOR_SIGMAS = ENUMERATION.sigmas  # standard deviations of a prior beyond which no rotation is proposed
@@ -549,7 +549,7 @@ def _merge(found: Hypotheses, new: Hypotheses, sight: Sight) -> Hypotheses:
 
 
 def _judged(found: Hypotheses, sight: Sight, turns: int) -> SearchResult:
-    """Judge rotations, best first, by the rules of `bpnp.search.verdict`."""
+    """Judge rotations, best first, by the rules of `bpnp.search.verdict.decide`."""
     rule = SEARCH.evidence
     if found.matches is None or found.point_evidence is None:
         return no_pose("no rotation was found", turns)

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bpnp.loops.vectors import F, compiled, cross, direction, part, rotated, sum_of, turn
+from bpnp.search.kernels.vectors import F, compiled, cross, direction, part, rotated, sum_of, turn
 from bpnp.search.kernels.sides import Array, visible_weights
 
 RELAXATION = 1.7  # times the Gauss-Newton step on clusters: alternating expectation and maximisation take short steps

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.loops.vectors import compiled, part
+from bpnp.search.kernels.vectors import compiled, part
 
 Array = NDArray[np.float64]
 CELLS = 64  # along a side of the grid, at most

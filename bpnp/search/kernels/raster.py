@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bpnp.loops.vectors import F, compiled, part, rotated
+from bpnp.search.kernels.vectors import F, compiled, part, rotated
 from bpnp.search.kernels.sides import Array, visible_weights
 
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.loops.vectors import F, part
+from bpnp.search.kernels.vectors import F, part
 from bpnp.search.config import Facing, SearchSettings
 
 Array = NDArray[np.float32]

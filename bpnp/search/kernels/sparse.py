@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.loops.vectors import F, compiled, copy_pose, part, sum_of
+from bpnp.search.kernels.vectors import F, compiled, copy_pose, part, sum_of
 from bpnp.search.kernels.dense import move, see
 from bpnp.search.kernels.sides import Array, WeightedBearings, visible_weights
 

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.loops.parallel import one_blas_thread
-from bpnp.search.annealing import anneal_on_clusters, anneal_on_points, finish
+from bpnp.runtime import one_blas_thread
+from bpnp.search.refine.annealing import anneal_on_clusters, anneal_on_points, finish
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame
 from bpnp.search.kernels.sides import FORWARD
-from bpnp.search.raster_search import around_each
+from bpnp.search.propose.density_map import around_each
 from bpnp.search.scene import Scene
 
 Array = NDArray[np.float64]

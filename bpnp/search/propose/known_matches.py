@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.poses import SAME, distinct, seen_from
-from bpnp.search.evidence.partners import explained
+from bpnp.search.correspondences import explained
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem

@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.loops.compilation import compiler
-from bpnp.loops.parallel import in_threads
-from bpnp.loops.vectors import cross, rotated
+from bpnp.runtime import compiler
+from bpnp.runtime import in_threads
+from bpnp.search.kernels.vectors import cross, rotated
 
 compiled = compiler()
-part = compiler(part=True, forceinline=True)  # called by compiled functions alone; see `bpnp.loops.vectors.part`
+part = compiler(part=True, forceinline=True)  # called by compiled functions alone
 FLAT = 1e-12  # squared height of a triangle over its squared longest side
 TOLERANCE = 1e-6  # of the squared sides, in units of the longest
 ROUNDING = 1e-12  # of a discriminant: what is smaller than this counts as zero

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from bpnp.loops.parallel import Deadline
+from bpnp.runtime import Deadline
 from bpnp.search.config import ENUMERATION
 from bpnp.search.enumeration.search import enumerate_poses, is_enumerable
-from bpnp.search.evidence.false_alarms import alarms_of
+from bpnp.search.verdict.false_alarms import alarms_of
 from bpnp.search.problem import Problem
 
 HYPOTHESES = 20_000  # tried, in some 10 ms: a correct pose of clean points is among the first thousands

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.loops.vectors import compiled, part
+from bpnp.search.kernels.vectors import compiled, part
 from bpnp.poses import distinct
 from bpnp.search.kernels.neighbours import HashedPoints, hashed, lies_on
 

@@ -16,7 +16,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.evidence.partners import NEIGHBOURS, facing, partners
+from bpnp.search.correspondences import NEIGHBOURS, facing, partners
 from bpnp.search.pose_model import PoseModel, PoseState, Sight
 from bpnp.search.problem import Problem
 

@@ -18,9 +18,9 @@ from itertools import combinations, permutations
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.evidence.covariance import covariance_of, join
-from bpnp.search.evidence.false_alarms import Terms, camera_terms, directions_of, log10_nfa
-from bpnp.search.evidence.uncertainty import linearise, matches_of
+from bpnp.search.verdict.covariance import covariance_of, join
+from bpnp.search.verdict.false_alarms import Terms, camera_terms, directions_of, log10_nfa
+from bpnp.search.verdict.uncertainty import linearise, matches_of
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem, UnknownFocal

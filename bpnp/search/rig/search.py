@@ -14,26 +14,26 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.loops.parallel import NEVER, Clock, Deadline, one_blas_thread
+from bpnp.runtime import NEVER, Clock, Deadline, one_blas_thread
 from bpnp.poses import distinct, seen_from
-from bpnp.search.competitors import fitted_lens
+from bpnp.search.settle import fitted_lens
 from bpnp.search.config import DEFAULT, ENUMERATION, SearchSettings
 from bpnp.search.enumeration.points import predicted_pose
 from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
-from bpnp.search.evidence.reasons import objection
-from bpnp.search.evidence.repetitions import repeated_poses
-from bpnp.search.evidence.uncertainty import share_bound
+from bpnp.search.verdict.reasons import objection
+from bpnp.search.propose.repetitions import repeated_poses
+from bpnp.search.verdict.uncertainty import share_bound
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.loop import Step, run
 from bpnp.search.pool import Pool
 from bpnp.search.problem import Problem
 from bpnp.search.propose.known_matches import known_matches, poses_of_matches
-from bpnp.search.raster_search import search_beside
+from bpnp.search.propose.density_map import search_beside
 from bpnp.search.rig.cameras import WIDE, Array, Pose, Rig
 from bpnp.search.scene import Scene
 from bpnp.search.schedule import Plan
 from bpnp.search.search import lacks_partners
-from bpnp.search.verdict import SearchResult, is_object, judged, missed, no_pose
+from bpnp.search.verdict.decide import SearchResult, is_object, judged, missed, no_pose
 
 PROPOSING = replace(ENUMERATION, kept=4000)  # number of poses that a camera with few points proposes
 REFINED = 16  # number of enumerated poses that are refined, and of distinct poses that are kept

@@ -1,1 +1,0 @@
-"""Loops on the CPU: compilation, threads and time limits."""

@@ -1,0 +1,314 @@
+"""Threads, time limits and compiled loops on the CPU."""
+
+import math
+import os
+import sys
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ContextDecorator
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+from threadpoolctl import ThreadpoolController
+
+import gc
+import hashlib
+import inspect
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import cache, update_wrapper
+from pathlib import Path
+from typing import Any
+
+import numba
+
+from bpnp.files import cache_folder, lock_folder
+
+
+
+def thread_count() -> int:
+    """Return the number of threads that the compiled loops use.
+
+    It is torch's number if torch is loaded (`torch.set_num_threads`), else OMP_NUM_THREADS, else the number of CPUs
+    that this process may use. Results do not depend on it.
+    """
+    of_torch = getattr(sys.modules.get("torch"), "get_num_threads", None)
+    if of_torch is not None:
+        return int(of_torch())
+    wanted = os.environ.get("OMP_NUM_THREADS", "").split(",")[0].strip()
+    if wanted.isdecimal() and int(wanted):
+        return int(wanted)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def in_threads(work: Callable[[int, int], object], count: int) -> None:
+    """Call work(first, last) on consecutive parts of range(count), one a thread, and wait for all of them.
+
+    Only work that releases the GIL gains, such as numba's `nogil` functions. Each call writes to its own part of an
+    array. Python's threads are used because numba's pool does not survive the fork of a data loader's workers.
+
+    Args:
+        work: Called with the first index and the index after the last.
+        count: Number of items; at most `thread_count` parts are formed, none of them empty.
+    """
+    shares = max(1, min(thread_count(), count))
+    if shares == 1:
+        work(0, count)
+        return
+    edges = [count * k // shares for k in range(shares + 1)]
+    others = [_pool(os.getpid()).submit(work, *edge) for edge in zip(edges[1:-1], edges[2:], strict=True)]
+    work(*edges[:2])
+    for other in others:
+        other.result()
+
+
+@lru_cache(1)
+def _pool(process: int) -> ThreadPoolExecutor:
+    """Return the threads of a process; a fork does not inherit those of its parent."""
+    return ThreadPoolExecutor(os.cpu_count(), f"bpnp-{process}")
+
+
+class _OneBlasThread(ContextDecorator):
+    """Context that limits BLAS to one thread, and restores the limit when its last concurrent user leaves.
+
+    The products of a search are small: threads waiting for the next one would take several times as long as the search.
+    """
+
+    lock, users = threading.Lock(), 0
+    limit: Any = None
+
+    def __enter__(self) -> None:
+        with self.lock:
+            if not self.users:
+                self.limit = _blas().limit(limits=1)
+            self.users += 1
+
+    def __exit__(self, *exception: object) -> None:
+        with self.lock:
+            self.users -= 1
+            if not self.users:
+                self.limit.restore_original_limits()
+
+
+@lru_cache(1)
+def _blas() -> ThreadpoolController:
+    """Return the controller of the loaded BLAS libraries."""
+    return ThreadpoolController().select(user_api="blas")
+
+
+one_blas_thread = _OneBlasThread()
+
+
+class Clock:
+    """Clock of `time.monotonic` without the seconds in which loops were compiled.
+
+    Compilation happens once an installation and does not count towards a user's time limit. `bpnp.warm_up` compiles in
+    advance.
+    """
+
+    compiling = 0.0
+
+    @classmethod
+    def now(cls) -> float:
+        """Return the current time, seconds."""
+        return time.monotonic() - cls.compiling
+
+
+@dataclass(frozen=True)
+class Deadline:
+    """Time to stop.
+
+    A stage that has begun completes its current item and drops the rest.
+
+    Attributes:
+        at: Seconds of `Clock`; infinite for no deadline.
+    """
+
+    at: float = math.inf
+
+    @classmethod
+    def after(cls, seconds: float | None) -> "Deadline":
+        """Return the deadline after a number of seconds; None for no deadline."""
+        return cls() if seconds is None else cls(Clock.now() + seconds)
+
+    def passed(self) -> bool:
+        """Return whether the deadline is over."""
+        return Clock.now() >= self.at
+
+
+def in_time(work: Callable[[int, int], None], count: int, deadline: Deadline, at_once: int) -> int:
+    """Run work(first, last) on parts of range(count) in threads until a deadline.
+
+    Args:
+        work: Called with the first index and the index after the last.
+        count: Number of items.
+        deadline: When to stop.
+        at_once: Items between checks of the deadline; the first `at_once` are always done.
+
+    Returns:
+        The number of items done.
+    """
+    step = count if math.isinf(deadline.at) else at_once
+    done = 0
+    while done < count and not (done and deadline.passed()):
+        last = min(done + step, count)
+        in_threads(lambda i, j, first=done: work(first + i, first + j), last - done)  # type: ignore[misc]
+        done = last
+    return done
+
+
+NEVER = Deadline()
+
+
+# Options of `fastmath`: sums in any order. NaN and infinity keep their meaning: they mark a lost pose or sample.
+FAST = {"reassoc", "contract", "arcp", "nsz"}
+_SETTINGS: Any = numba.config  # NUMBA_CACHE_DIR and others, as attributes
+
+
+def compiler(*, part: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Return a decorator that compiles a function with `numba.njit`.
+
+    Divisions by zero are infinite, as in C, and the GIL is released. A type checker's wrapper around the function is
+    removed.
+
+    Args:
+        part: True for a function that only compiled functions call, and that is cached with them.
+        options: Options of `numba.njit`.
+
+    Returns:
+        A decorator that returns a `Loop`, or for a part numba's function.
+    """
+    options |= {"nogil": True, "error_model": "numpy"}
+    if part:
+        return lambda function: numba.njit(inspect.unwrap(function), **options)
+    return lambda function: Loop(inspect.unwrap(function), options)
+
+
+class Loop:
+    """Function that numba compiles at its first call, once an installation.
+
+    The machine code is kept in ``loops`` in `cache_folder`, or in NUMBA_CACHE_DIR. Each version of the source has its
+    own folder there. The source includes the files of the parts that the function calls and of the named tuples that it
+    takes; numba itself only checks the function's file. One process compiles; others that need the same loop wait for
+    it. If the folder is not writable, each process compiles.
+    """
+
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        self.function, self.options = function, options
+        self.compiled: Any = None
+        update_wrapper(self, function)
+
+    def __call__(self, *arguments: Any) -> Any:
+        if self.compiled is None:
+            self._compile(arguments)
+        return self.compiled(*arguments)
+
+    def _compile(self, arguments: tuple[Any, ...]) -> None:
+        """Compile the function for the types of the arguments, or load it from the cache."""
+        with _ONE_AT_A_TIME, ExitStack() as stack:
+            if self.compiled is not None:  # by another thread
+                return
+            stack.enter_context(_clock_stopped())
+            folder = _folder_of(self.function, arguments)
+            try:
+                stack.enter_context(lock_folder(folder, wait=True))
+                compiled = _njit_into(folder, self.function, self.options)
+            except (OSError, ValueError, RuntimeError):  # not a folder, read-only, or too full for numba
+                compiled = numba.njit(self.function, **self.options)
+            if not any(folder.glob("*/*.nbc")):
+                _announce(folder.parent)
+                stack.enter_context(_collection_paused())
+            compiled.compile(tuple(map(numba.typeof, arguments)))
+            self.compiled = compiled
+
+
+_ONE_AT_A_TIME = threading.RLock()
+
+
+def _njit_into(folder: Path, function: Callable[..., Any], options: dict[str, Any]) -> Any:
+    """Return a function that numba caches in a folder; numba reads the setting while it creates the function."""
+    before = _SETTINGS.CACHE_DIR
+    _SETTINGS.CACHE_DIR = str(folder)
+    try:
+        return numba.njit(function, cache=True, **options)
+    finally:
+        _SETTINGS.CACHE_DIR = before
+
+
+def _folder_of(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Path:
+    """Return the folder for this version of a function's source."""
+    types = {type(value) for value in _flattened(arguments) if hasattr(value, "_fields")}
+    files = sorted({__file__, *_files_of(function), *map(inspect.getfile, types)})
+    content = hashlib.blake2b(numba.__version__.encode(), digest_size=8)
+    for file in files:
+        content.update(_digest(file))
+    root = Path(_SETTINGS.CACHE_DIR) if _SETTINGS.CACHE_DIR else cache_folder() / "loops"
+    return root / f"{function.__module__}.{function.__name__}-{content.hexdigest()}"
+
+
+def _flattened(values: tuple[Any, ...]) -> Iterator[Any]:
+    """Yield tuples within tuples, the outer ones first."""
+    for value in values:
+        if isinstance(value, tuple):
+            yield value
+            yield from _flattened(value)
+
+
+@cache
+def _files_of(function: Callable[..., Any]) -> frozenset[str]:
+    """Return the files of a function and, recursively, of the parts and named tuples in its module."""
+    files, modules, waiting = set[str](), set[str](), [function]
+    while waiting:
+        part = waiting.pop()
+        files.add(inspect.getfile(part))
+        if part.__module__ in modules:
+            continue
+        modules.add(part.__module__)
+        for value in part.__globals__.values():
+            if hasattr(value, "py_func"):  # numba's
+                waiting.append(value.py_func)
+            elif isinstance(value, tuple) and hasattr(value, "_fields"):
+                files.add(inspect.getfile(type(value)))
+    return frozenset(files)
+
+
+@cache
+def _digest(file: str) -> bytes:
+    """Return the hash of a file's content."""
+    return hashlib.blake2b(Path(file).read_bytes(), digest_size=8).digest()
+
+
+@contextmanager
+def _clock_stopped() -> Iterator[None]:
+    """Exclude the time within the context from time limits."""
+    begun = time.monotonic()
+    try:
+        yield
+    finally:
+        Clock.compiling += time.monotonic() - begun
+
+
+@contextmanager
+def _collection_paused() -> Iterator[None]:
+    """Pause the garbage collector, which would find nothing and take a tenth of the time."""
+    collected = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collected:
+            gc.enable()
+
+
+@cache
+def _announce(root: Path) -> None:
+    """Log once a process that a loop is compiled: that takes seconds."""
+    logging.getLogger(__name__).warning(
+        "compiling bpnp's loops, which takes some seconds once an installation; they are kept in %s", root
+    )

@@ -1,0 +1,355 @@
+"""Camera pose from unmatched 2D and 3D points: `solve` for one problem, `solve_many` for many."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bpnp.argument_types import ArrayLike, ImageSize, ManyArrays, ManyPoints, PointsLike, PoseLike
+from bpnp.cameras import Camera, ManyCameras, camera_from
+from bpnp.runtime import Clock, Deadline
+from bpnp.search.enumeration.search import is_enumerable
+from bpnp.search.problem import Problem, UnknownFocal
+from bpnp.search.arguments import (
+    Labels,
+    ManyPriors,
+    PriorLike,
+    about,
+    check_inside,
+    checked_prior,
+    checked_seed,
+    device_from,
+    each_camera,
+    each_of,
+    each_set,
+    pixels_from,
+    positive,
+    seconds_from,
+    source_from,
+)
+from bpnp.search.focal_length import solved_with_focal_length, unknown_camera
+from bpnp.search.inputs import problem_from
+from bpnp.search.modes import Mode, prepare_mode
+from bpnp.search.solution import Solution
+from bpnp.search.sources import Options, Progress, solutions_of
+
+if TYPE_CHECKING:
+    import torch
+
+NO_RIG = "`scale=True` needs a `rig`: one camera does not determine the unit of a scene"
+SECONDS, SECONDS_OF_MANY = 10.0, 5.0  # default time limits per problem of `solve` and `solve_many`
+
+
+def solve(
+    points2d: ManyPoints,
+    points3d: PointsLike,
+    camera: ManyCameras | None = None,
+    *,
+    image_size: ImageSize | None = None,
+    focal_error: float | int | None = None,
+    distortion: bool = False,
+    normals3d: ArrayLike | None = None,
+    labels2d: ManyArrays | None = None,
+    labels3d: ArrayLike | None = None,
+    scores2d: ManyArrays | None = None,
+    scores3d: ArrayLike | None = None,
+    solver: "str | Path | torch.nn.Module" = "auto",
+    prior: PriorLike | None = None,
+    inlier_threshold: float | int | None = None,
+    clutter: float | int | None = None,
+    at_infinity: bool = False,
+    rig: Sequence[PoseLike] | None = None,
+    scale: bool = False,
+    seed: int = 0,
+    time_limit: float | int | None = None,
+    device: "str | torch.device | None" = None,
+    progress: Progress | None = None,
+) -> Solution:
+    """Estimate the camera pose from 2D and 3D points without correspondences.
+
+    Args:
+        points2d: (m, 2) pixels with a `camera`; without one (m, 2) normalised image coordinates or (m, 3) unit
+            bearings. NumPy or torch arrays, OpenCV's (m, 1, 2) arrays, and rows of four or more numbers that begin with
+            x and y are accepted. The centre of the first pixel is (0.5, 0.5), as in COLMAP. A list of cv2.KeyPoint is
+            shifted by half a pixel, except with OpenCV's (K, distortion).
+        points3d: (n, 3) scene points in any unit; also a point cloud or mesh of trimesh or Open3D.
+        camera: 3x3 matrix K; OpenCV's (K, distortion); (COLMAP model, parameters); (model, width, height, parameters);
+            or a pycolmap.Camera. Points are undistorted. Pixels that cannot be undistorted are dropped and counted in
+            `stats.dropped2d`. None for normalised coordinates and bearings.
+        image_size: (width, height) of the image, pixels, if the focal length is unknown. The focal length is estimated
+            with the pose and returned in `Solution.camera`. The principal point is assumed at the image centre.
+        focal_error: Standard deviation of the focal length of `camera`, as a fraction of it, such as 0.1. The focal
+            length is then estimated too. None if the focal length is exact.
+        distortion: With `image_size` or `focal_error`: always fit a radial distortion coefficient. By default a
+            coefficient is kept only if it is significantly better, and none is fitted if `camera` has distortion.
+        normals3d: (n, 3) outward unit normals. A point that faces away from the camera is not visible. None: all points
+            are visible from all sides.
+        labels2d: (m,) integers, such as colours, classes or identities; only points with equal labels match, and -1
+            matches any. Or (m, c) class probabilities whose rows sum to 1, such as those of a network: a match then
+            weighs more, the better its classes agree.
+        labels3d: (n,) integers or (n, c) class probabilities, as `labels2d`.
+        scores2d: (m,) probabilities in (0, 1] that a point has a correspondence, such as from keypoint strength. They
+            weight the points in the search and the verdict. Only their ratios matter.
+        scores3d: (n,) probabilities in (0, 1], as `scores2d`, such as from the number of views that see a point.
+        solver: "search" runs the search, which needs no training. "auto", the default, also starts it from poses of a
+            packaged matcher if the search is undecided: "matcher-maps" with a `PosePrior`, and "matcher-sfm" without a
+            prior and with m n at most four million. Or a module from `Batch` to `Prediction`, or a checkpoint of a
+            BPnPNet or a Matcher. With a Matcher and too many points to enumerate, the search starts only from P3P poses
+            of match triples sampled from the assignment.
+        prior: A `PosePrior`; a pose with an uncertainty of 10 degrees, as a `Solution`, (R, t), [R | t] of shape (3, 4)
+            or (4, 4), or a pycolmap.Rigid3d; a `GravityPrior`; or a BPnPNet or Matcher, or its checkpoint, whose pose
+            is tried first. None for no prior.
+        inlier_threshold: Largest reprojection error of a match, in pixels with a camera, else in normalised image units
+            (radians for bearings). Default: three times the scale of the residuals. Small problems also use it as
+            search radius, by default 3 pixels. Labels that pair each point with one other need no radius.
+        clutter: Expected outlier fraction. None if it is unknown.
+        at_infinity: `points3d` are unit directions, such as of stars. Only the rotation is estimated; the translation
+            is zero. Pixels of a fisheye camera may lie 90 degrees or more off its axis. Points with the largest
+            `scores2d` are tried first. The translation of a `prior` is ignored. `normals3d` and `scale` have no meaning
+            here, and networks are not trained for directions; all other options apply. See docs/stars.md.
+        rig: Extrinsics cam_from_rig of each camera of a rig, as (R, t), (3, 4), (4, 4) or a pycolmap.Rigid3d.
+            `points2d`, `labels2d` and `scores2d` are then lists with one array per camera; `camera` is a list or one
+            for all. The returned pose is rig_from_world, in the unit of the rig and of the scene, and a `prior` is one
+            of this pose. `matches` index the 2D points of all cameras, concatenated. An unknown focal length is one
+            factor for all cameras, and `Solution.camera` is then the first camera. Networks are not trained for rigs;
+            all other options apply.
+        scale: With `rig`: also estimate the scale of a scene whose unit differs from the rig's, such as a COLMAP model.
+            `Solution.scale` satisfies rig = scale R p + t, with t in the unit of the rig. The rig needs a non-zero
+            baseline.
+        seed: Seed of the search, default 0.
+        time_limit: Seconds in total, 10 by default; math.inf for no limit. At the limit each stage of the search ends
+            with its current poses, and the best pose is returned.
+        device: Device on which a copy of a module runs; None for the module's own device. The search runs on the CPU.
+        progress: Callback with (problem index, batches of initial poses, seconds). Problems then run in this process
+            only.
+
+    Returns:
+        Solution of the problem. Its `verdict` is "confident", "ambiguous" or "failed" (docs/verdict.md). It is also
+            "failed" if the points do not determine a pose (collinear, or fewer than four distinct points). A module
+            given as `solver` is not modified.
+
+    Raises:
+        ValueError: The input has wrong or swapped shapes, NaN, fewer than 4 points (3 with a `GravityPrior`), a
+            singular camera matrix or an unknown option.
+
+    >>> rng = np.random.default_rng(0)
+    >>> scene = rng.normal(size=(60, 3))
+    >>> camera = scene + [0, 0, 6]  # R = I, t = (0, 0, 6)
+    >>> image = rng.permutation(camera[:, :2] / camera[:, 2:])
+    >>> solution = solve(image, scene)
+    >>> solution.verdict, solution.inlier_count
+    ('confident', 60)
+    >>> bool(np.allclose(solution.translation, [0, 0, 6], atol=1e-6))
+    True
+    """
+    known: dict[str, Any] = {
+        "normals3d": normals3d,
+        "labels2d": labels2d,
+        "labels3d": labels3d,
+        "scores2d": scores2d,
+        "scores3d": scores3d,
+    }
+    if scale and rig is None and not at_infinity:
+        raise ValueError(NO_RIG)
+    seconds = seconds_from(time_limit, SECONDS)
+    if at_infinity or rig is not None:
+        solve_one = prepare_mode(
+            points2d,
+            points3d,
+            camera,
+            known,
+            Options(
+                inlier_threshold=positive("inlier_threshold", inlier_threshold, finite=True),
+                clutter=None if clutter is None else float(clutter),
+                seed=checked_seed(seed),
+                time_limit=seconds,
+            ),
+            Mode(at_infinity, rig, scale, image_size, focal_error, distortion, solver, device),
+            prior,
+        )
+        return solve_one()
+    points: dict[str, Any] = {"points2d": points2d, "points3d": points3d}
+    arrays: dict[str, Any] = {name: [values] for name, values in (points | known).items()}
+    return solve_many(
+        camera=camera,
+        image_size=image_size,
+        focal_error=focal_error,
+        distortion=distortion,
+        solver=solver,
+        prior=prior,
+        inlier_threshold=inlier_threshold,
+        clutter=clutter,
+        seed=seed,
+        time_limit=seconds,
+        device=device,
+        progress=progress,
+        **arrays,
+    )[0]
+
+
+def solve_many(
+    points2d: ManyPoints,
+    points3d: ManyPoints,
+    camera: ManyCameras | None = None,
+    *,
+    image_size: ImageSize | None = None,
+    focal_error: float | int | None = None,
+    distortion: bool = False,
+    normals3d: ManyArrays | None = None,
+    labels2d: ManyArrays | None = None,
+    labels3d: ManyArrays | None = None,
+    scores2d: ManyArrays | None = None,
+    scores3d: ManyArrays | None = None,
+    solver: "str | Path | torch.nn.Module" = "auto",
+    prior: ManyPriors | None = None,
+    inlier_threshold: float | int | None = None,
+    clutter: float | int | None = None,
+    at_infinity: bool = False,
+    rig: Sequence[PoseLike] | None = None,
+    scale: bool = False,
+    seed: int = 0,
+    time_limit: float | int | None = None,
+    device: "str | torch.device | None" = None,
+    progress: Progress | None = None,
+) -> list[Solution]:
+    """Solve many problems, each as `solve` does.
+
+    Problems are independent, except that small problems with the same image points never share a match. The problem
+    with the fewest false alarms keeps its matches. A later one that used some of them is solved again without these
+    points, which `stats.taken2d` counts.
+
+    Args:
+        points2d: Sequence of k arrays (m_i, 2) or (m_i, 3), one per problem.
+        points3d: Sequence of k arrays (n_i, 3), or one array for all problems.
+        camera: One camera for all problems, or a list of k cameras. None for normalised coordinates and bearings.
+        image_size: (width, height) of the images, pixels, for all problems; as for `solve`.
+        focal_error: Relative standard deviation of the focal length, for all problems; as for `solve`.
+        distortion: Always fit a radial distortion coefficient; as for `solve`.
+        normals3d: Sequence of k arrays (n_i, 3), or one array for all problems.
+        labels2d: Sequence of k arrays (m_i,) or (m_i, c), or one array for all problems.
+        labels3d: Sequence of k arrays (n_i,) or (n_i, c), or one array for all problems.
+        scores2d: Sequence of k arrays (m_i,), or one array for all problems.
+        scores3d: Sequence of k arrays (n_i,), or one array for all problems.
+        solver: As for `solve`. On a GPU a module solves problems of similar size in one batch.
+        prior: One prior for all problems, or a list of k priors.
+        inlier_threshold: Largest reprojection error of a match, for all problems; as for `solve`.
+        clutter: Expected outlier fraction, for all problems. None if it is unknown.
+        at_infinity: `points3d` are unit directions; as for `solve`. The problems are then independent.
+        rig: Extrinsics of the cameras of a rig that sees all problems; as for `solve`. The image points of a problem,
+            `labels2d` and `scores2d` are then lists with one array per camera, and `camera` is one for all or a list
+            with one per camera. The problems are then independent.
+        scale: With `rig`: also estimate the scale of each scene; as for `solve`.
+        seed: Seed of the search, default 0.
+        time_limit: Seconds per problem, 5 by default; math.inf for no limit.
+        device: Device on which a copy of a module runs; as for `solve`.
+        progress: Callback with (problem index, batches of initial poses, seconds).
+
+    Returns:
+        List of k solutions, in the order of the problems.
+
+    Raises:
+        ValueError: The input is invalid, as for `solve`. The message names the problem; nothing has been solved then.
+
+    >>> scene = np.random.default_rng(0).normal(size=(60, 3))
+    >>> images = [(scene + [x, 0, 6])[:, :2] / (scene + [x, 0, 6])[:, 2:] for x in (0, 1)]
+    >>> [round(float(solution.translation[0]), 3) + 0.0 for solution in solve_many(images, scene)]
+    [0.0, 1.0]
+    """
+    begun = Clock.now()
+    images = each_set("points2d", points2d, None)
+    count = len(images)
+    seconds = seconds_from(time_limit, SECONDS_OF_MANY)
+    options = Options(
+        None if at_infinity or rig is not None else source_from(solver),
+        solver == "auto",
+        positive("inlier_threshold", inlier_threshold, finite=True),
+        None if clutter is None else float(clutter),
+        checked_seed(seed),
+        seconds,
+        device_from(device),
+        progress,
+        until=Deadline(begun + seconds) if count == 1 else Deadline(),
+    )
+    if scale and rig is None and not at_infinity:
+        raise ValueError(NO_RIG)
+    known = {
+        "normals3d": each_set("normals3d", normals3d, count),
+        "labels2d": each_set("labels2d", labels2d, count, _axes_of_labels(labels2d)),
+        "labels3d": each_set("labels3d", labels3d, count, _axes_of_labels(labels3d)),
+        "scores2d": each_set("scores2d", scores2d, count, 1),
+        "scores3d": each_set("scores3d", scores3d, count, 1),
+    }
+    scenes = each_set("points3d", points3d, count)
+    if at_infinity or rig is not None:
+        mode = Mode(at_infinity, rig, scale, image_size, focal_error, distortion, solver, device)
+        one_each = [camera] * count if rig is not None else each_camera(camera, count)
+        ready = []
+        for i, each in enumerate(each_of("prior", prior, count)):
+            arrays = {name: values[i] for name, values in known.items()}
+            with about(f"problem {i}" if count > 1 else None):
+                ready.append(prepare_mode(images[i], scenes[i], one_each[i], arrays, options, mode, each))
+        return [solve_one() for solve_one in ready]
+    cameras = each_camera(camera, count)
+    priors = [checked_prior(each) for each in each_of("prior", prior, count)]
+    pixels = [pixels_from(points, image_size or one) for points, one in zip(images, cameras, strict=True)]
+
+    def problem(i: int, lens: Camera | None, focal: UnknownFocal | None = None) -> Problem:
+        arrays = {name: values[i] for name, values in known.items()}
+        with about(f"problem {i}" if count > 1 else None):
+            return problem_from(pixels[i], scenes[i], lens, prior=priors[i], focal=focal, **arrays)
+
+    if distortion or (image_size or focal_error) is not None:
+        unknown = [unknown_camera(one, image_size, focal_error, distortion) for one in cameras]
+        for points in pixels if image_size is not None else ():
+            check_inside(points, image_size)
+        problems = {i: problem(i, one.reference, one.focal(one.reference)) for i, one in enumerate(unknown)}
+
+        def again(i: int, taken: Labels | None = None) -> Solution:
+            def at(lens: Camera, focal: UnknownFocal) -> Problem:
+                whole = problem(i, lens, focal)
+                return whole if taken is None else whole.without(taken)
+
+            return solved_with_focal_length(at, unknown[i], options)
+
+        solutions = {i: again(i) for i in problems}
+    else:
+        problems = {i: problem(i, None if one is None else camera_from(one)) for i, one in enumerate(cameras)}
+
+        def again(i: int, taken: Labels | None = None) -> Solution:
+            return solutions_of({i: problems[i] if taken is None else problems[i].without(taken)}, options)[i]
+
+        solutions = solutions_of(problems, options)
+    share_points(problems, solutions, again)
+    return [solutions[i] for i in range(count)]
+
+
+def _axes_of_labels(labels: Any) -> int:
+    """Return the number of axes of one problem's labels: 2 for one array of class probabilities, else 1."""
+    return 2 if getattr(labels, "ndim", 1) == 2 and "float" in str(labels.dtype) else 1
+
+
+def share_points(
+    problems: Mapping[int, Problem], solutions: dict[int, Solution], again: Callable[[int, Labels], Solution]
+) -> None:
+    """Assign each image point to at most one of the small problems that have the same image points.
+
+    The problem with the fewest false alarms keeps its matches. A later one that used one of their points is solved
+    again without these; its `stats.taken2d` counts them. The points of a failed pose stay free.
+
+    Args:
+        problems: Problems by index.
+        solutions: Solutions by index of the problem; changed in place.
+        again: Solves the problem of an index without the 2D points of some indices (k,).
+    """
+    groups: dict[bytes, list[int]] = {}
+    for i, problem in problems.items():
+        if len(problems) > 1 and problem.degenerate is None and is_enumerable(problem):
+            groups.setdefault(problem.image_points.tobytes() + repr(problem.camera).encode(), []).append(i)
+    for members in groups.values():
+        taken: set[int] = set()
+        for i in sorted(members, key=lambda i: (solutions[i].log10_false_alarms, i)):
+            if taken.intersection(solutions[i].matches[:, 0].tolist()):
+                solutions[i] = again(i, np.array(sorted(taken)))
+            if solutions[i].verdict != "failed":
+                taken.update(solutions[i].matches[:, 0].tolist())

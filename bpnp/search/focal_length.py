@@ -1,0 +1,465 @@
+"""Joint estimation of the pose and the focal length of a camera.
+
+The search tries a sweep of focal lengths. With many points it still ends near the pose if the focal length is a quarter
+off. From there, Gauss-Newton steps of pose and focal length alternate with annealing of the pose. The search then runs
+again at the optimum. Its NFA counts the focal length as a seventh unknown (`bpnp.search.verdict.false_alarms`), and a
+confident pose needs a well-determined focal length (`Evidence.focal`). The solutions of the other focal lengths of the
+sweep are competing poses.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from bpnp.cameras import (
+    Camera,
+    Lens,
+    camera_from,
+    camera_to_json,
+    is_pinhole,
+    scale_focal_length,
+    with_radial_distortion,
+)
+from bpnp.runtime import Clock, one_blas_thread
+from bpnp.poses import same_pose, turned_by
+from bpnp.search.refine.annealing import polished
+from bpnp.search.config import DEFAULT as SEARCH
+from bpnp.search.config import OtherFocal
+from bpnp.search.enumeration.search import is_enumerable
+from bpnp.search.verdict.reasons import objection
+from bpnp.search.verdict.uncertainty import is_within
+from bpnp.search.hypotheses import Hypotheses
+from bpnp.search.problem import Problem, UnknownFocal
+from bpnp.search.propose.lens import fit_lens
+from bpnp.search.scene import Scene
+from bpnp.search.verdict.decide import match_count, weighed
+from bpnp.search.arguments import Array, checked_size
+from bpnp.search.solution import FOCAL_LENGTH, ROTATION_PARAMETERS, Solution, add_objection
+from bpnp.search.sources import Options, solutions_of
+
+ProblemAt = Callable[[Camera, UnknownFocal], Problem]
+RADIAL_PLACES = {"SIMPLE_RADIAL": 3, "OPENCV": 4}  # index of the radial coefficient in the parameters of a camera model
+LEAST_REACH = 1e-3  # focal lengths
+AROUND = (1.0, OtherFocal.step, 1 / OtherFocal.step)  # focal lengths around one that has converged
+
+
+@dataclass(frozen=True)
+class FocalSettings:
+    """Constants of the search for a focal length.
+
+    Lengths in the image are relative to the larger image side, distortions to the distance from the principal point.
+
+    Attributes:
+        smallest: Least focal length that is tried: a field of view of 90 degrees.
+        largest: Largest focal length that is tried: a field of view of 19 degrees.
+        usual: Focal length that is tried first.
+        step: Factor between successive focal lengths, for many points.
+        step_few: Factor between successive focal lengths, for few points.
+        sigmas: Half width of the range of an approximate focal length, standard deviations.
+        turns: Iterations of the first search with each focal length.
+        alternations: Largest number of alternations of search and refinement from each focal length.
+        rounds: Largest number of iterations of a refinement.
+        same: Change of the logarithm of the focal length below which a refinement stops.
+        bends: Radial displacements at the image corner from which a fit of the distortion also starts. Started at zero
+            distortion, too few points match to reach a large one.
+        bend_sigma: Standard deviation of the radial displacement at the image corner by an unknown distortion.
+        most_bend: Largest radial displacement at the image corner.
+        fewest_bent: Least number of matches for a fit of the distortion.
+        centre_sigma: Standard deviation of the principal point, as a fraction of the distance to the image corner:
+            about a quarter of a per cent of the larger image side.
+    """
+
+    smallest: float = 0.5
+    largest: float = 3.0
+    usual: float = 1.0
+    step: float = 1.57
+    step_few: float = 1.25
+    sigmas: float = 3.0
+    turns: int = 8
+    alternations: int = 3
+    rounds: int = 12
+    same: float = 5e-4
+    bends: tuple[float, ...] = (-0.2, 0.2)
+    bend_sigma: float = 0.05
+    most_bend: float = OtherFocal.bend
+    fewest_bent: int = 24
+    centre_sigma: float = 0.004
+
+
+RULE = FocalSettings()
+
+
+class UnknownCamera(NamedTuple):
+    """A camera with an unknown focal length, and an unknown distortion if the reference has none.
+
+    Attributes:
+        reference: Camera that the others are variants of.
+        smallest: Least focal length, over that of the reference.
+        largest: Largest focal length, over that of the reference.
+        usual: Focal length to try first, over that of the reference.
+        sigma: Standard deviation of the logarithm of the focal length; infinite without a prior.
+        bends: Fit a radial distortion as an alternative. The reference is then a pinhole camera.
+        distorted: Fit a radial coefficient even if it is not significantly better.
+        radial: Radial coefficient to start with; None to start without distortion.
+        alone: Start with the usual focal length only.
+        reach: Distance from the principal point to the image corner, in focal lengths of the reference. Without an
+            image size it is that of the outermost image point.
+    """
+
+    reference: Camera
+    smallest: float
+    largest: float
+    usual: float
+    sigma: float = math.inf
+    bends: bool = False
+    distorted: bool = False
+    radial: float | None = None
+    alone: bool = False
+    reach: float = 0.0
+
+    def at(self, zoom: float, radial: float | None = None) -> Camera:
+        """Return the camera with `zoom` times the focal length of the reference and a radial coefficient."""
+        camera = scale_focal_length(self.reference, zoom)
+        return camera if radial is None else with_radial_distortion(camera, radial)
+
+    def parts(self, camera: Camera) -> tuple[float, float | None]:
+        """Return the zoom and the radial coefficient of one of these cameras; None without distortion."""
+        zoom = camera.focal / self.reference.focal
+        if not self.bends or is_pinhole(camera) or not isinstance(camera, Lens):
+            return zoom, None
+        return zoom, float(camera.camera.params[RADIAL_PLACES[camera.camera.model.name]])
+
+    def outermost(self, zoom: float) -> float:
+        """Return the reach in focal lengths of the camera with `zoom` times that of the reference."""
+        return max(self.reach / zoom, LEAST_REACH)
+
+    def focal(self, camera: Camera) -> UnknownFocal:
+        """Return the prior of the focal length and distortion of one of these cameras."""
+        zoom, radial = self.parts(camera)
+        sigma = math.inf if radial is not None else RULE.bend_sigma if self.bends else 0.0
+        return UnknownFocal(
+            math.log(self.largest / self.smallest),
+            self.sigma,
+            math.log(zoom),
+            radial or 0.0,
+            radial_sigma=sigma / self.outermost(zoom) ** 2,
+            radial_range=0.0 if radial is None else 2 * RULE.most_bend / self.outermost(zoom) ** 2,
+            centre_sigma=RULE.centre_sigma * self.outermost(zoom),
+        )
+
+    def ladder(self, step: float) -> list[Camera]:
+        """Return cameras with focal lengths at most a factor `step` apart that cover the range, the usual one first."""
+        below, above = (math.log(end / self.usual) / math.log(step) for end in (self.smallest, self.largest))
+        steps = [0] if self.alone else sorted(range(math.ceil(below - 0.51), math.floor(above + 0.51) + 1), key=abs)
+        return [self.at(self.usual * step**k, self.radial) for k in steps]
+
+    def near(self, camera: Camera) -> "UnknownCamera":
+        """Return a copy that starts with one of these cameras only."""
+        zoom, radial = self.parts(camera)
+        return self._replace(usual=zoom, radial=radial, alone=True)
+
+    def seen_by(self, problem: Problem) -> "UnknownCamera":
+        """Return a copy with the reach of the image points of a problem whose camera is the reference."""
+        outermost = float(np.linalg.norm(problem.all2d[problem.usable], axis=-1).max())
+        return self._replace(reach=max(self.reach, outermost))
+
+
+def unknown_camera(
+    camera: Any, image_size: Any, focal_error: float | int | None, distortion: bool = False
+) -> UnknownCamera:
+    """Return the unknown camera of images of a given size, or one with approximately the focal length of `camera`.
+
+    Radial distortion is unknown too, unless `camera` has a model with distortion.
+
+    Args:
+        camera: Camera with an approximate focal length; None with `image_size`.
+        image_size: (width, height) of the images, pixels; None with `camera`.
+        focal_error: Relative standard deviation of the focal length of `camera`, between 0 and 1.
+        distortion: Always fit a radial coefficient. Default False.
+
+    Raises:
+        ValueError: The size is invalid, there are both a camera and a size, an error without a camera, or `distortion`
+            for a known lens.
+    """
+    if distortion and image_size is None and focal_error is None:
+        raise ValueError(
+            "`distortion=True` needs an `image_size`, or a `focal_error` beside the `camera`; a camera that is known "
+            "has its distortion"
+        )
+    if image_size is not None:
+        if camera is not None:
+            raise ValueError(
+                "`camera` and `image_size` exclude each other: `image_size` is for an unknown focal length. For one "
+                "that is known to a tenth give `camera` and focal_error=0.1"
+            )
+        if focal_error is not None:
+            raise ValueError(
+                "`focal_error` needs a `camera` and has no meaning with `image_size`; leave one of them out"
+            )
+        width, height = checked_size(image_size)
+        reference = camera_from(("SIMPLE_PINHOLE", width, height, (max(width, height), width / 2, height / 2)))
+        return UnknownCamera(
+            reference,
+            RULE.smallest,
+            RULE.largest,
+            RULE.usual,
+            bends=True,
+            distorted=bool(distortion),
+            reach=math.hypot(width, height) / 2 / max(width, height),
+        )
+    if camera is None:
+        raise ValueError(
+            "`focal_error` needs the `camera` whose focal length it is about; without one give `image_size`"
+        )
+    if focal_error is None or not 0 < focal_error < 1:
+        raise ValueError(f"`focal_error` is {focal_error}; it is a fraction of the focal length, above 0 and below 1")
+    widest, lens = math.exp(RULE.sigmas * focal_error), camera_from(camera)
+    if distortion and not is_pinhole(lens):
+        raise ValueError(
+            f"`distortion=True` needs a pinhole `camera`; the distortion of {camera_to_json(lens)} is known"
+        )
+    bends = is_pinhole(lens)
+    return UnknownCamera(lens, 1 / widest, widest, 1.0, focal_error, bends=bends, distorted=bool(distortion))
+
+
+@one_blas_thread
+def solved_with_focal_length(problem_at: ProblemAt, unknown: UnknownCamera, options: Options) -> Solution:
+    """Return the solution with the fewest false alarms over pose and focal length.
+
+    Args:
+        problem_at: Returns the problem of a camera.
+        unknown: Unknown camera.
+        options: Options of the search.
+    """
+    problem = problem_at(unknown.reference, unknown.focal(unknown.reference))
+    if problem.degenerate is not None:
+        return solutions_of({0: problem}, options)[0]
+    return _OneCamera(unknown.seen_by(problem), options, problem_at=problem_at).sweep(few=is_enumerable(problem))
+
+
+@dataclass
+class FocalSweep(ABC):
+    """Searches with several focal lengths, and their final solutions `ends`."""
+
+    unknown: UnknownCamera
+    options: Options
+    begun: float = field(default_factory=Clock.now)
+    ends: list[Solution] = field(default_factory=list)
+
+    @abstractmethod
+    def solve_with(self, camera: Camera, options: Options) -> Solution:
+        """Return the solution with a given camera."""
+
+    @abstractmethod
+    def refine(self, solution: Solution, camera: Camera, zooms: Sequence[float] = (1.0,)) -> Camera:
+        """Return the camera that fits best near a pose, from some factors of the focal length of a camera."""
+
+    def sweep(self, *, few: bool) -> Solution:
+        """Return the solution with the fewest false alarms; `few` is True for points that are enumerated."""
+        most = self.options.settings.schedule.turns
+        for camera in (ladder := self.unknown.ladder(RULE.step_few if few else RULE.step)):
+            self.climb(camera, min(RULE.turns, most), len(ladder))
+            if self.best.verdict == "confident" and not few:
+                break
+        if self.best.verdict != "confident" and not few and most > RULE.turns and self.best.camera is not None:
+            self.climb(self.best.camera, most, 1)
+        return replace(self.contested(), seconds=Clock.now() - self.begun)
+
+    @property
+    def best(self) -> Solution:
+        return min(self.ends, key=lambda end: end.log10_false_alarms)
+
+    def climb(self, camera: Camera, turns: int, rungs: int) -> None:
+        """Search with a camera, then with cameras that fit the found poses better."""
+        found = self._search(camera, turns, rungs)
+        for _ in range(RULE.alternations):
+            if found.verdict == "failed":
+                break
+            better, settled = self._refined(found, camera)
+            if settled:  # a better optimum may lie at a slightly different focal length
+                better, settled = self._refined(found, camera, AROUND)
+            if settled:
+                break
+            again = self._search(better, turns, rungs)
+            if again.log10_false_alarms >= found.log10_false_alarms:
+                break
+            found, camera = again, better
+        self.ends.append(found)
+
+    def _search(self, camera: Camera, turns: int, rungs: int) -> Solution:
+        limit = self.options.time_limit
+        if limit is not None:
+            left = max(limit - (Clock.now() - self.begun), 1e-3)
+            limit = left / max(rungs - len(self.ends), 1)
+        options = self.options._replace(settings=self.options.settings.limited(turns), time_limit=limit)
+        return self.solve_with(camera, options)
+
+    def _refined(self, solution: Solution, camera: Camera, zooms: Sequence[float] = (1.0,)) -> tuple[Camera, bool]:
+        """Return the camera that fits best near a pose, and True if it equals the given one."""
+        fitted = self.refine(solution, camera, zooms)
+        (zoom, radial), (before, old) = self.unknown.parts(fitted), self.unknown.parts(camera)
+        bend = abs((radial or 0.0) - (old or 0.0)) * self.unknown.outermost(zoom) ** 2
+        return fitted, max(abs(math.log(zoom / before)), bend) < RULE.same
+
+    def contested(self) -> Solution:
+        """Return the best solution, "ambiguous" if another focal length has a different pose that fits about as well.
+
+        A pose within the uncertainty of the best solution does not count as different.
+        """
+        best, rule = self.best, SEARCH.evidence
+        if best.verdict != "confident":
+            return best
+        middle = np.median(best.points3d, 0)
+        for end in self.ends:
+            for other in end.candidates if end is not best else ():
+                behind = other.log10_false_alarms - best.log10_false_alarms
+                rotations = np.stack([best.rotation, other.rotation])
+                moved = rotations @ middle + np.stack([best.translation, other.translation])
+                zoom = end.focal_length / best.focal_length
+                if (
+                    behind < rule.lead
+                    and not same_pose(rotations, moved, 0, rule.same)[1]
+                    and not is_claimed(best, other.rotation, zoom)
+                ):
+                    away = math.degrees(turned_by(best.rotation, other.rotation))
+                    return add_objection(best, objection("other_focal_length", behind, zoom=zoom, degrees=away))
+        return best
+
+
+@dataclass
+class _OneCamera(FocalSweep):
+    """Focal lengths of one camera."""
+
+    problem_at: ProblemAt = field(kw_only=True)
+
+    def solve_with(self, camera: Camera, options: Options) -> Solution:
+        return solutions_of({0: self.problem_at(camera, self.unknown.focal(camera))}, options)[0]
+
+    def refine(self, solution: Solution, camera: Camera, zooms: Sequence[float] = (1.0,)) -> Camera:
+        pose, scale = (solution.rotation, solution.translation), solution.stats.residual
+        return fit_camera(self.problem_at, self.unknown, camera, pose, scale, self.options.seed, zooms).camera
+
+
+def is_claimed(solution: Solution, rotation: Array, zoom: float) -> bool:
+    """Return True if a rotation and `zoom` times the focal length are within the 99.9 % bound of a solution.
+
+    A rotation difference of more than `Contested.far` times the limit of the same pose is outside, whatever the bound.
+    """
+    turn, rule = Rotation.from_matrix(rotation @ solution.rotation.T).as_rotvec(), SEARCH.evidence
+    if math.degrees(float(np.linalg.norm(turn))) > rule.contested.far * rule.same.degrees:
+        return False
+    chosen = [solution.parameters.index(name) for name in (*ROTATION_PARAMETERS, FOCAL_LENGTH)]
+    unit = np.array([1.0, 1.0, 1.0, 1 / solution.focal_length])  # covariance of the logarithm of the focal length
+    covariance = solution.covariance[np.ix_(chosen, chosen)] * np.outer(unit, unit)
+    return is_within(np.r_[turn, math.log(zoom)], covariance, 2 * len(solution.matches) - len(solution.parameters))
+
+
+class FittedCamera(NamedTuple):
+    """A camera fitted to a pose, its problem, and the pose (1,) in the frame of the problem."""
+
+    camera: Camera
+    problem: Problem
+    poses: Hypotheses
+
+    @property
+    def log10_false_alarms(self) -> float:
+        return float(self.poses.log10_false_alarms[0])
+
+
+def fit_camera(
+    problem_at: ProblemAt,
+    unknown: UnknownCamera,
+    camera: Camera,
+    pose: tuple[Array, Array],
+    scale: float,
+    seed: int,
+    zooms: Sequence[float] = (1.0,),
+) -> FittedCamera:
+    """Fit focal length, distortion and pose to the points, starting from a pose and a camera.
+
+    The camera with radial distortion competes with the one without. It is used if its NFA, which counts the additional
+    unknown, is smaller by the factor `Evidence.focal_chance`.
+
+    Args:
+        problem_at: Returns the problem of a camera.
+        unknown: Prior of the camera.
+        camera: Initial camera.
+        pose: Initial rotation (3, 3) and translation (3,), in the user's frame.
+        scale: Scale of the residuals, radians.
+        seed: Seed of the refinement.
+        zooms: Factors of the focal length and of the distance to start from; the fit with the fewest false alarms is
+            used.
+    """
+    zoom, radial = unknown.parts(camera)
+
+    def fit(starts: list[tuple[float, float | None]]) -> FittedCamera:
+        fits = (_fit_track(problem_at, unknown, (zoom * z, k), pose, scale, seed, z) for z, k in starts)
+        return min(fits, key=lambda one: one.log10_false_alarms)
+
+    plain = fit([(each, None) for each in zooms])
+    if unknown.bends and min(len(plain.problem.bearings), len(plain.problem.points3d)) >= RULE.fewest_bent:
+        others = [] if radial is not None else [each / unknown.outermost(zoom) ** 2 for each in RULE.bends]
+        bent = fit([*((each, radial or 0.0) for each in zooms), *((1.0, each) for each in others)])
+        matches = match_count(bent.poses, bent.problem)
+        lead = math.inf if unknown.distorted else math.log10(SEARCH.evidence.focal_chance)
+        if matches >= RULE.fewest_bent and bent.log10_false_alarms < plain.log10_false_alarms + lead:
+            return bent
+    return plain
+
+
+def _fit_track(
+    problem_at: ProblemAt,
+    unknown: UnknownCamera,
+    start: tuple[float, float | None],
+    pose: tuple[Array, Array],
+    scale: float,
+    seed: int,
+    farther: float,
+) -> FittedCamera:
+    """Alternate fits of the lens and annealing of the pose, with or without a radial coefficient.
+
+    Args:
+        problem_at: Returns the problem of a camera.
+        unknown: Prior of the camera.
+        start: Initial zoom and radial coefficient; None for a fit without distortion.
+        pose: Initial rotation (3, 3) and translation (3,), in the user's frame.
+        scale: Scale of the residuals, radians.
+        seed: Seed of the annealing.
+        farther: Factor of the initial distance of the scene.
+    """
+    first, radial = start
+    zoom, camera = first, unknown.at(*start)
+    problem = problem_at(camera, unknown.focal(camera))
+    rotation, translation = problem.from_user(*pose)
+    middle = (rotation @ problem.middle + translation) * (1, 1, farther)
+    translation = middle - rotation @ problem.middle
+    end = _anneal_pose(problem, rotation, translation, scale, seed)
+    for _ in range(RULE.rounds):
+        pinhole = unknown.at(zoom)
+        flat = problem if radial is None else problem_at(pinhole, unknown.focal(pinhole))
+        middle = rotation @ flat.middle + translation
+        fitted = fit_lens(flat, rotation, middle, scale, radial)
+        if fitted is None or not 1 / RULE.step < zoom * fitted.zoom / first < RULE.step:
+            break
+        bend = abs((fitted.radial or 0.0) - (radial or 0.0)) * unknown.outermost(zoom) ** 2
+        if bend > RULE.most_bend:
+            break
+        zoom, radial, camera = zoom * fitted.zoom, fitted.radial, unknown.at(zoom * fitted.zoom, fitted.radial)
+        problem = problem_at(camera, unknown.focal(camera))
+        rotation = fitted.rotation
+        end = _anneal_pose(problem, rotation, fitted.middle - rotation @ problem.middle, scale, seed)
+        rotation, scale = end.rotation[0], min(scale, float(end.scale[0]))
+        translation = end.translation[0]
+        if max(abs(math.log(fitted.zoom)), bend) < RULE.same:
+            break
+    return FittedCamera(camera, problem, end)
+
+
+def _anneal_pose(problem: Problem, rotation: Array, translation: Array, scale: float, seed: int) -> Hypotheses:
+    scene = Scene(problem, seed, SEARCH)
+    return weighed(polished(scene, rotation[None], translation[None], scale), problem)[:1]

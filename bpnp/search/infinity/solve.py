@@ -1,0 +1,351 @@
+"""`solve` for scene points that are directions: argument checks, the search for the rotation, and the `Solution`.
+
+The cameras of a rig see directions from one point, since their distances are negligible. Their bearings, turned into
+the axes of the rig, are therefore the bearings of one image.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bpnp.cameras import Camera, camera_from, in_front
+from bpnp.runtime import Clock, Deadline, one_blas_thread
+from bpnp.search.config import DEFAULT as SEARCH
+from bpnp.search.infinity.evidence import how_well_known, noise_of, prior_information, uncertainty_of
+from bpnp.search.infinity.search import DEFAULT, InfinitySettings, search_rotation
+from bpnp.search.pose_model import PoseModel
+from bpnp.search.problem import Problem, UnknownFocal
+from bpnp.search.refine.gauss_newton import ImageMatches, Iteration, image_equations, image_rows, refine
+from bpnp.search.starts import PosePrior, Prior
+from bpnp.search.arguments import (
+    Array,
+    Labels,
+    about,
+    check_points,
+    check_unit,
+    checked_labels,
+    checked_scores,
+    image_points,
+    scene_points,
+    unit_vectors,
+)
+from bpnp.search.focal_length import UnknownCamera
+from bpnp.search.inputs import bearings_of, check_seen, unit_of
+from bpnp.search.matching import SCALES, angles_between, count_one_to_one, one_to_one
+from bpnp.search.solution import FOCAL_LENGTH, ROTATION_PARAMETERS, Solution, SolutionStats, with_pose
+from bpnp.search.sources import Options
+
+FEWEST = 3  # two fix a rotation and leave no evidence
+HALF = 0.5  # pixels, step for the angle per pixel
+ROBUST, LOST = 1.0, 1e3  # residual from which a match counts less, and that of a point that leaves the view, pixels
+MOST_STEPS, EXACT = 50, 1e-9  # steps of a fit of the focal length, and the change that ends them
+NOMINAL = 1e-3  # nominal pixel without a camera, as a fraction of the RMS angular radius of the bearings
+
+
+class Sky(NamedTuple):
+    """Directions and the images of one or more cameras that see them.
+
+    Attributes:
+        images: Pixels (m_k, 2), normalised coordinates or bearings (m_k, 3) of each camera.
+        turns: (3, 3) rotations rig = C^T camera of the cameras, as C; None for a single camera.
+        lenses: Cameras; None for normalised coordinates and bearings.
+        unknown: Cameras with an unknown focal length; None if it is known.
+        problem: Annotations and prior of all points, with empty bearings.
+        is_distorted: Fit a radial coefficient with the focal length.
+    """
+
+    images: list[Array]
+    turns: list[Array] | None
+    lenses: list[Camera | None]
+    unknown: list[UnknownCamera] | None
+    problem: Problem
+    is_distorted: bool
+
+    def at(self, zoom: float, radial: float | None) -> "Sky":
+        """Return the cameras with `zoom` times the focal lengths of the references and a radial coefficient."""
+        return self._replace(lenses=[one.at(zoom, radial) for one in self.unknown or ()])
+
+    @property
+    def lens(self) -> tuple[float, float | None]:
+        """Zoom and radial coefficient of the cameras with an unknown focal length."""
+        assert self.unknown is not None
+        assert self.lenses[0] is not None
+        return self.unknown[0].parts(self.lenses[0])
+
+
+def prepare_directions(
+    points2d: Sequence[Any],
+    directions: Any,
+    cameras: Sequence[Any],
+    unknown: list[UnknownCamera] | None,
+    known: Mapping[str, Any],
+    options: Options,
+    *,
+    turns: list[Array] | None = None,
+    prior: Prior | None = None,
+    distortion: bool = False,
+) -> Callable[[], Solution]:
+    """Check a problem of directions, and return the function that estimates the rotation; see `bpnp.solve`.
+
+    Args:
+        points2d: Points of each camera.
+        directions: (n, 3) unit directions.
+        cameras: Camera of each of them; None without one.
+        unknown: Cameras with an unknown focal length; None if it is known. All have the same factor of the focal length
+            of their reference.
+        known: Lists of `labels2d` and `scores2d`, one array or None per camera; `labels3d` and `scores3d`.
+        options: Options of the search.
+        turns: (3, 3) rotations cam_from_rig of the cameras of a rig; None for one camera.
+        prior: Prior of the rotation. Its translation is ignored.
+        distortion: Fit a radial coefficient with an unknown focal length. Default False.
+
+    Raises:
+        ValueError: The shapes are wrong, there are fewer than 3 points, the directions are not unit vectors, or there
+            are pixels without a camera or the reverse.
+    """
+    scene = scene_points(directions)
+    lenses: list[Camera | None] = [None if camera is None else camera_from(camera) for camera in cameras]
+    if unknown is not None:
+        lenses = [one.reference for one in unknown]
+    if options.clutter is not None:
+        SEARCH.expecting(options.clutter)  # raises for one that is out of range
+    images, annotations = [], []
+    for k, (points, lens) in enumerate(zip(points2d, lenses, strict=True)):
+        with about(None if turns is None else f"camera {k}"):
+            image = image_points(points)
+            check_points("points2d", image, (2, 3) if lens is None else (2,), FEWEST if turns is None else 1)
+            images.append(image)
+            annotations.append(
+                checked_labels(known["labels2d"][k], known["labels3d"], (len(image), len(scene)))
+                | {"scores2d": checked_scores("scores2d", known["scores2d"][k], len(image))}
+            )
+    check_points("points3d", scene, (3,), FEWEST)
+    hint = "divide by the lengths, or leave out `at_infinity` for points of a scene"
+    scene = np.ascontiguousarray(unit_vectors("points3d", scene, hint))
+    arrays = {name: [each[name] for each in annotations] for name in annotations[0]}
+    joined: dict[str, Any] = {
+        name: np.concatenate(each) for name, each in arrays.items() if name.endswith("2d") and each[0] is not None
+    }
+    problem = Problem(
+        np.empty((0, 3)),
+        scene,
+        labels3d=annotations[0].get("labels3d"),
+        classes3d=annotations[0].get("classes3d"),
+        scores3d=checked_scores("scores3d", known["scores3d"], len(scene)),
+        clutter=options.clutter,
+        prior=prior._replace(translation=None) if isinstance(prior, PosePrior) else prior,
+        **joined,
+    )
+    return partial(_solve, Sky(images, turns, lenses, unknown, problem, distortion), options)
+
+
+def _solve(sky: Sky, options: Options) -> Solution:
+    """Estimate the rotation.
+
+    With an unknown focal length a sweep of focal lengths is searched at a coarse noise. Its steps are so small that
+    points half an image from the image centre still match. The focal length is then fitted to the matches, and the
+    search repeated.
+    """
+    begun, deadline, unknown = Clock.now(), Deadline.after(options.time_limit), sky.unknown
+
+    def seen_by(sky: Sky, settings: InfinitySettings = DEFAULT) -> Solution:
+        return replace(_seen_by(sky, options, deadline, settings), seconds=Clock.now() - begun)
+
+    if unknown is None:
+        return seen_by(sky)
+    ends = list[Solution]()
+    rough = replace(DEFAULT, noise=(DEFAULT.zoom_noise,), least_share=DEFAULT.zoom_share)
+    exact = replace(rough, noise=DEFAULT.noise)
+    for rung in unknown[0].ladder(DEFAULT.zoom):
+        trial = sky.at(*unknown[0].parts(rung))
+        found = seen_by(trial, rough)
+        if found.verdict == "failed":  # among many directions unrelated ones fit as well at the coarse noise
+            found = seen_by(trial, exact if ends else DEFAULT)
+        promising = found.log10_false_alarms <= DEFAULT.zoom_alarms
+        for _ in range(DEFAULT.zoom_rounds if promising else 0):
+            (zoom, radial), trial = trial.lens, _fitted(trial, found)
+            again = seen_by(trial)
+            if again.log10_false_alarms > found.log10_false_alarms and again.verdict == "failed":
+                break
+            found, (new_zoom, new_radial) = again, trial.lens
+            bend = abs((new_radial or 0.0) - (radial or 0.0))
+            if max(abs(new_zoom / zoom - 1), bend) < DEFAULT.zoom_same:
+                break
+        ends.append(found)
+        best = min(ends, key=lambda end: end.log10_false_alarms)
+        if best.verdict == "confident" or deadline.passed():
+            break
+    return best
+
+
+def _parts(sky: Sky, matches: Labels) -> list[tuple[int, Array, Array]]:
+    """Return the index of each camera with matches, its matched image points and their directions."""
+    first = np.cumsum([0, *map(len, sky.images)])
+    parts = []
+    for k, (start, end) in enumerate(pairwise(first.tolist())):
+        i, j = matches[(matches[:, 0] >= start) & (matches[:, 0] < end)].T
+        if len(i):
+            parts.append((k, sky.images[k][i - start], sky.problem.points3d[j]))
+    return parts
+
+
+def _to_rig(sky: Sky, k: int, bearings: Array) -> Array:
+    """Return bearings (m, 3) of camera k in the axes of the rig."""
+    return bearings if sky.turns is None else bearings @ sky.turns[k]
+
+
+def _model(sky: Sky) -> PoseModel:
+    """Return the unknowns of the fit to given matches: the rotation, the focal length and a radial coefficient."""
+    assert sky.unknown is not None
+    zoom, radial = sky.lens
+    lens = UnknownFocal(
+        math.inf, sky.unknown[0].sigma, math.log(zoom), radial or 0.0, math.inf if sky.is_distorted else 0.0
+    )
+    mounts = None if sky.turns is None else [(turn, np.zeros(3)) for turn in sky.turns]
+    return PoseModel(np.zeros(3), lens, moves=False, mounts=mounts, prior=sky.problem.prior)
+
+
+def _in_image(sky: Sky, matches: Labels) -> list[ImageMatches]:
+    """Return matches (k, 2) as those of each camera."""
+    lenses = [lens for lens in sky.lenses if lens is not None]
+    return [ImageMatches(lenses[k].project, points, pixels, k) for k, pixels, points in _parts(sky, matches)]
+
+
+def _fitted(sky: Sky, solution: Solution) -> Sky:
+    """Return the cameras with the focal length that fits the matches best, fitted together with a rotation.
+
+    With `Sky.is_distorted` a radial coefficient is fitted too.
+    """
+    (zoom, radial), model = sky.lens, _model(sky)
+    linearise = image_equations(model, _in_image(sky, solution.matches), lost=LOST, robust=ROBUST)
+    start = model.state(solution.rotation)
+    end = refine(model, start, linearise, [ROBUST] * MOST_STEPS, settled=_is_settled).state
+    return sky.at(zoom * float(end.zoom), float(end.radial) if sky.is_distorted else radial)
+
+
+def _is_settled(last: Iteration) -> bool:
+    return bool(np.abs(last.step).max() < EXACT)
+
+
+def _with_focal_length(sky: Sky, rotation: Array, matches: Labels) -> Array:
+    """Return the covariance (4, 4) of rotation and focal length, pixels, from matches (k, 2)."""
+    model = _model(sky)
+    state = model.state(rotation)
+    rows = [image_rows(model, each, state) for each in _in_image(sky, matches)]
+    residual, jacobian = map(np.concatenate, zip(*rows, strict=True))
+    assert sky.lenses[0] is not None
+    unit = np.array([1, 1, 1, sky.lenses[0].focal])
+    covariance = uncertainty_of(residual, jacobian, model.information(state)).covariance[:4, :4]
+    return np.asarray(covariance * np.outer(unit, unit))
+
+
+def _seen_by(sky: Sky, options: Options, deadline: Deadline, settings: InfinitySettings) -> Solution:
+    """Return the solution for given cameras, which are some of the sweep if the focal length is unknown."""
+    inlier_threshold, scene, lens = options.inlier_threshold, sky.problem.points3d, sky.lenses[0]
+    parts = [_bearings(image, own) for image, own in zip(sky.images, sky.lenses, strict=True)]
+    planes = [plane for _, plane, _ in parts]
+    every = np.concatenate([_to_rig(sky, k, rays) for k, (rays, _, _) in enumerate(parts)])
+    pixel = np.concatenate([pixel for _, _, pixel in parts])
+    usable = np.flatnonzero(np.isfinite(every).all(-1) & np.isfinite(pixel))
+    check_seen(usable, np.concatenate(planes), FEWEST)
+    problem = replace(sky.problem, bearings=every, focal=_focal(sky, planes)).choose(usable)
+    every, pixel = np.ascontiguousarray(problem.bearings), np.ascontiguousarray(pixel[usable])
+    owner = np.concatenate([np.full(len(image), k) for k, image in enumerate(sky.images)])[usable]
+    if lens is None:
+        spread = math.sqrt(((every - every.mean(0)) ** 2).sum(-1).mean())
+        pixel = np.full(len(every), max(NOMINAL * spread, 1e-12))
+    middle = np.array([np.median(pixel[owner == k]) if (owner == k).any() else np.nan for k in range(len(parts))])
+    per_radian = np.ones(len(parts)) if lens is None else 1 / middle
+    one = int(np.nanargmin(middle))  # camera in whose pixels the noise is
+    noise = None if inlier_threshold is None else inlier_threshold / per_radian[one] / middle[one] / settings.reach
+    with one_blas_thread:
+        result = search_rotation(
+            replace(problem, bearings=every),
+            pixel,
+            noise=noise if settings is DEFAULT else None,
+            seed=options.seed,
+            deadline=deadline,
+            settings=settings,
+        )
+    parameters = ROTATION_PARAMETERS if sky.unknown is None else (*ROTATION_PARAMETERS, FOCAL_LENGTH)
+    solution = Solution(
+        covariance=np.full((len(parameters), len(parameters)), math.nan),
+        parameters=parameters,
+        verdict=result.verdict,
+        reason=result.reason,
+        reason_code=result.code,
+        unit=unit_of(sky.images[0], lens),
+        inlier_threshold=math.nan if inlier_threshold is None else inlier_threshold,
+        stats=SolutionStats(result.batches, dropped2d=problem.dropped2d),
+        points2d=np.concatenate(planes),
+        points3d=scene,
+        camera=lens if sky.turns is None or sky.unknown is not None else None,
+    )
+    found = result.candidates
+    if found.matches is None:
+        return solution
+    seen = [scene @ rotation.T for rotation in found.rotation]
+    hit = np.flatnonzero(found.matches[0] >= 0)
+    residual = noise_of(seen[0][found.matches[0, hit]], every[hit], pixel[hit])
+    threshold = inlier_threshold or SCALES * residual * float(middle[one] * per_radian[one])
+    pairs, counts = [], np.zeros(len(seen), np.int64)
+    for k in np.unique(owner).tolist():
+        own = np.flatnonzero(owner == k)
+
+        def may_match(i: Any, j: Any, own: Any = own) -> Any:
+            return problem.may_match(own[i], j)
+
+        radius = threshold / float(per_radian[k])
+        i, j = one_to_one(every[own], seen[0], radius, may_match).T
+        pairs.append(np.stack([own[i], j], -1))
+        counts += [len(i), *(count_one_to_one(every[own], each, radius, may_match) for each in seen[1:])]
+    i, j = np.concatenate(pairs).T
+    matches = np.stack([usable[i], j], -1)
+    if sky.unknown is None:
+        information = prior_information(problem)
+        covariance = how_well_known(seen[0][j], every[i], pixel[i], information=information).covariance
+    else:
+        covariance = _with_focal_length(sky, found.rotation[0], matches)
+    angles = angles_between(every[i], seen[0][j])
+    return with_pose(
+        solution,
+        result,
+        found,
+        counts.tolist(),
+        matches,
+        angles * per_radian[owner[i]],
+        angles,
+        most=sum(min(len(image), len(scene)) for image in sky.images),
+        threshold=threshold,
+        residual=residual * float(middle[one]),
+        covariance=np.full_like(covariance, math.nan) if result.verdict == "failed" else covariance,
+    )
+
+
+def _focal(sky: Sky, planes: list[Array]) -> UnknownFocal | None:
+    """Return the prior of an unknown focal length, from the normalised image points (m_k, 2) of each camera."""
+    if sky.unknown is None or sky.lenses[0] is None:
+        return None
+    reach = sky.lens[0] * float(np.nanmax(np.linalg.norm(np.concatenate(planes), axis=-1)))
+    unknown = sky.unknown[0]
+    return unknown._replace(reach=max(unknown.reach, reach)).focal(sky.lenses[0])
+
+
+def _bearings(image: Array, camera: Camera | None) -> tuple[Array, Array, Array]:
+    """Return unit bearings (m, 3), normalised coordinates (m, 2), NaN if undefined, and radians per pixel (m,).
+
+    Without a camera a pixel is one radian.
+    """
+    if camera is None:
+        bearings, plane = bearings_of(image, None)
+        return bearings, plane, np.ones(len(bearings))
+    check_unit(image, camera)
+    bearings = camera.bearings(image)
+    steps = ((camera.bearings(image + step) - bearings) / HALF for step in ([HALF, 0.0], [0.0, HALF]))
+    pixel = np.sqrt(sum((step**2).sum(-1) for step in steps) / 2)
+    return bearings, in_front(bearings)[:, :2], pixel

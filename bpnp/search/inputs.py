@@ -1,0 +1,108 @@
+"""Construction of a `Problem` from a user's arrays: checks and undistortion."""
+
+from typing import Any
+
+import numpy as np
+
+from bpnp.cameras import Camera, in_front
+from bpnp.poses import MIN_POINTS
+from bpnp.search.problem import Problem, Unit, UnknownFocal, units_per_radian
+from bpnp.search.starts import GravityPrior, PosePrior
+from bpnp.search.arguments import (
+    Array,
+    Labels,
+    Prior,
+    check_points,
+    check_unit,
+    checked_labels,
+    checked_normals,
+    checked_scores,
+    image_points,
+    scene_points,
+    unit_bearings,
+)
+
+FLOOR_PIXELS = 0.1  # no point detector is more accurate
+
+
+def problem_from(
+    points2d: Any,
+    points3d: Any,
+    camera: Camera | None,
+    *,
+    normals3d: Any = None,
+    labels2d: Any = None,
+    labels3d: Any = None,
+    scores2d: Any = None,
+    scores3d: Any = None,
+    cosines3d: Array | None = None,
+    prior: Prior | None = None,
+    focal: UnknownFocal | None = None,
+) -> Problem:
+    """Check the arrays of one problem, undistort its pixels, and build it.
+
+    The arrays are as for `bpnp.solve`; camera and prior are already checked. `cosines3d` and `focal` are fields of
+    `Problem` and not checked. Pixels that cannot be undistorted are dropped.
+
+    Raises:
+        ValueError: The arrays have a wrong or swapped shape, too few points (3 with a known gravity, else 4) or NaN;
+            there are pixels without a camera or the reverse; or normals, labels or scores do not fit the points. The
+            message names the argument.
+    """
+    fewest = MIN_POINTS - isinstance(prior, GravityPrior)
+    image, scene = image_points(points2d), scene_points(points3d)
+    if image.ndim == 2 and image.shape[1] == 3 and (camera is not None or scene.shape[-1:] == (2,)):
+        wrong = f"`points3d` has the shape {scene.shape}, not (n, 3)"
+        if camera is not None:
+            wrong = f"`points2d` has the shape {image.shape}; with a `camera` it holds pixels of shape (m, 2)"
+        raise ValueError(f"{wrong} (are points2d and points3d swapped?)")
+    check_points("points2d", image, (2, 3) if camera is None else (2,), fewest)
+    check_points("points3d", scene, (3,), fewest)
+    unit, (bearings, plane) = unit_of(image, camera), bearings_of(image, camera)
+    image = bearings if unit == "rad" else image
+    usable = np.flatnonzero(np.isfinite(bearings).all(-1))
+    check_seen(usable, image, fewest)
+    known = prior if isinstance(prior, (PosePrior, GravityPrior)) else None
+    problem = Problem.of(
+        bearings,
+        scene,
+        prior=known,
+        network=prior if known is None else None,
+        normals3d=checked_normals(normals3d, len(scene)),
+        cosines3d=cosines3d,
+        scores2d=checked_scores("scores2d", scores2d, len(image)),
+        scores3d=checked_scores("scores3d", scores3d, len(scene)),
+        floor=None if camera is None else FLOOR_PIXELS / units_per_radian(plane[usable], unit, camera),
+        focal=focal,
+        points2d=None if unit == "rad" else image,
+        camera=camera,
+        given2d=plane,
+        **checked_labels(labels2d, labels3d, (len(image), len(scene))),
+    )
+    return problem.choose(usable)
+
+
+def bearings_of(image: Array, camera: Camera | None) -> tuple[Array, Array]:
+    """Return unit bearings (m, 3) of image points and their normalised coordinates (m, 2), NaN for points not in front.
+
+    Raises:
+        ValueError: There are pixels without a camera, or the reverse.
+    """
+    if image.shape[1] == 3:
+        bearings = unit_bearings(image)
+        return bearings, in_front(bearings)[:, :2]
+    check_unit(image, camera)
+    plane = image if camera is None else camera.normalise(image)
+    rays = np.column_stack([plane, np.ones(len(plane))])
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True), plane
+
+
+def unit_of(image: Array, camera: Camera | None) -> Unit:
+    """Return the unit in which the residuals of such image points are measured."""
+    return "rad" if image.shape[1] == 3 else "normalised" if camera is None else "px"
+
+
+def check_seen(usable: Labels, image: Array, fewest: int) -> None:
+    """Raise ValueError if too few of the 2D points are usable."""
+    if len(usable) < fewest:
+        raise ValueError(f"the camera can see {len(usable)} of {len(image)} 2D points; at least {fewest} are needed")

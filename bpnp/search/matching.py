@@ -1,0 +1,257 @@
+"""One-to-one matches of two point sets in the image, the pose that fits them best, and the `Solution` of both."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import maximum_bipartite_matching, min_weight_full_bipartite_matching
+from scipy.spatial import cKDTree
+
+from bpnp.poses import MIN_POINTS
+from bpnp.search.verdict.uncertainty import linearised, pose_covariance
+from bpnp.search.pose_model import PoseModel
+from bpnp.search.problem import Problem
+from bpnp.search.refine.gauss_newton import ImageMatches, Iteration, image_equations, refine
+from bpnp.search.verdict.decide import SearchResult
+from bpnp.search.arguments import Array, Labels
+from bpnp.search.solution import FOCAL_LENGTH, POSE_PARAMETERS, Solution, SolutionStats, with_pose
+
+Allowed = Callable[[Labels, Labels], NDArray[np.bool_]]
+DENSE = 4096  # largest number of possible matches that are all compared
+NEIGHBOURS = 8  # candidate matches of a point; there are more only if the radius is far too large
+SCALES = 3.0  # default inlier threshold, in scales of the residuals
+FIT_ROUNDS = 5
+DAMPING, MOST_STEPS = 1e-3, 50  # first damping of Levenberg and Marquardt, and steps
+EXACT = 1e-12  # relative change of a pose, and of the sum of squares, that ends the steps
+SIGNIFICANT = 22.5  # chi-squared with 6 degrees of freedom, one in a thousand
+
+
+def finished(problem: Problem, result: SearchResult, seconds: float, inlier_threshold: float | None) -> Solution:
+    """Build a `Solution` of a search result: refine the best pose, match points, count the inliers of each candidate.
+
+    Args:
+        problem: The problem.
+        result: Result of the search.
+        seconds: Run time of the search; the run time of this function is added.
+        inlier_threshold: Largest error of an inlier, in the unit of the problem; None for three times the residual
+            scale.
+    """
+    start, found = time.perf_counter(), result.candidates
+    if not len(found):
+        failed = without_pose(problem, _note_duplicates(problem, result), inlier_threshold, seconds)
+        return replace(failed, reason_code=result.code)
+    threshold = inlier_threshold or SCALES * result.residual * problem.per_radian
+    poses = list(zip(found.rotation, found.translation, strict=True))
+    if result.batches:  # an enumerated pose is a least-squares fit in float64 already
+        poses[0] = _fitted(problem, *poses[0], threshold)
+    projected, *others = (problem.project_scene(*pose) for pose in poses)
+    matches = one_to_one(problem.image_points, projected, threshold, problem.may_match)
+    image, may_match = problem.image_points, problem.may_match
+    counts = [len(matches), *(count_one_to_one(image, seen, threshold, may_match) for seen in others)]
+    rotation, translation = problem.to_user(*map(np.stack, zip(*poses, strict=True)))
+    i, j = matches.T
+    camera = problem.points3d[j] @ poses[0][0].T + poses[0][1]
+    matched = float(found.match_count[0])
+    linear = None if result.verdict == "failed" else linearised(problem, *poses[0], result.residual)
+    solution = with_pose(
+        without_pose(problem, _note_duplicates(problem, result), None),
+        result,
+        replace(found, rotation=rotation, translation=translation),
+        counts,
+        np.stack([problem.usable[i], j], -1),
+        np.linalg.norm(image[i] - projected[j], axis=-1),
+        angles_between(problem.bearings[i], camera),
+        most=min(len(problem.all2d), len(problem.points3d)),
+        threshold=threshold,
+        residual=result.residual,
+        covariance=_of_pixels(problem, pose_covariance(problem, linear, matched)),
+    )
+    return replace(solution, seconds=seconds + time.perf_counter() - start)
+
+
+def _note_duplicates(problem: Problem, result: SearchResult) -> str:
+    """Return the reason of a verdict, with the number of duplicate points unless the verdict is "confident"."""
+    if result.verdict == "confident" or len(problem.points3d) > DENSE:
+        return result.reason
+    sides = {"image": problem.image_points, "scene": problem.points3d}
+    counts = {side: len(points) - len(np.unique(points, axis=0)) for side, points in sides.items()}
+    notes = [f"{count} of the {side} points are duplicates" for side, count in counts.items() if count]
+    return "; ".join([result.reason, *notes])
+
+
+def angles_between(bearings: Array, directions: Array) -> Array:
+    """Return the angles (k,) between vectors (k, 3), radians, accurate also for small angles."""
+    sine = np.linalg.norm(np.cross(bearings, directions), axis=-1)
+    return np.arctan2(sine, (bearings * directions).sum(-1))
+
+
+def without_pose(problem: Problem, reason: str, inlier_threshold: float | None, seconds: float = 0.0) -> Solution:
+    """Return a failed solution of a problem, without a pose."""
+    return Solution(
+        inlier_threshold=math.nan if inlier_threshold is None else inlier_threshold,
+        unit=problem.unit,
+        covariance=_of_pixels(problem, None),
+        parameters=POSE_PARAMETERS if problem.focal is None else (*POSE_PARAMETERS, FOCAL_LENGTH),
+        verdict="failed",
+        reason=reason,
+        stats=SolutionStats(dropped2d=problem.dropped2d, taken2d=problem.taken2d),
+        seconds=seconds,
+        points2d=problem.all2d,
+        points3d=problem.all3d,
+        normals3d=problem.normals3d if problem.cosines3d is None else None,
+        camera=problem.camera,
+    )
+
+
+def _of_pixels(problem: Problem, covariance: Array | None) -> Array:
+    """Return a covariance with the focal length in pixels instead of its logarithm; NaN for None."""
+    size = 6 if problem.focal is None else 7
+    if covariance is None or problem.camera is None:
+        return np.full((size, size), math.nan) if covariance is None else covariance
+    unit = np.where(np.arange(size) < 6, 1.0, problem.camera.focal)
+    return np.asarray(covariance * np.outer(unit, unit))
+
+
+def _fitted(problem: Problem, rotation: Array, translation: Array, threshold: float) -> tuple[Array, Array]:
+    """Fit the pose to mutual nearest neighbours by least squares; keep the search's pose unless the fit is better.
+
+    The difference must be significant. The search weights all matches by their probability. This is the better estimate
+    unless its float32 steps were too coarse for the data. At an optimum of the same precision n log(S / S_min), S the
+    sum of n squared residuals, is distributed as chi-squared with 6 degrees of freedom.
+    """
+    image = problem.image_points
+    for _ in range(FIT_ROUNDS):
+        seen = problem.project_scene(rotation, translation)
+        i, j = mutual_nearest(image, seen, threshold, problem.may_match).T
+        if len(i) < MIN_POINTS:
+            break
+        target, points = image[i], problem.points3d[j]
+        trial = fit_pose(problem.project, points, target, rotation, translation, scale=threshold)
+        after = problem.project(points @ trial[0].T + trial[1])
+        squares = [float(((each - target) ** 2).sum()) for each in (seen[j], after)]
+        if not squares[0] > squares[1] * math.exp(SIGNIFICANT / target.size):
+            break
+        rotation, translation = trial
+    return rotation, translation
+
+
+def one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed | None = None) -> Labels:
+    """Return a maximum one-to-one matching of image points and projected points within a radius (paper Eq. 1).
+
+    The matches (i, j) satisfy |image_i - projected_j| <= radius, and no point is in two of them. Among the maximum
+    matchings it has the least sum of squared distances. It is a minimum-weight matching in which an unmatched image
+    point costs more than all distances together. With many points only the `NEIGHBOURS` nearest neighbours of each are
+    edges.
+
+    Args:
+        image: (m, 2) image points.
+        projected: (n, 2) projected points; a NaN point has no match.
+        radius: Largest distance of a match.
+        allowed: Returns which indices i and j may match; None for all.
+
+    Returns:
+        Indices (k, 2), ordered by i.
+    """
+    matches, distance = _near(image, projected, radius, allowed)
+    alone = np.logical_and(*(np.bincount(side)[side] == 1 for side in matches.T)) if len(matches) else np.ones(0, bool)
+    if alone.all():
+        return matches
+    # Only points with several candidates take part. Column `count + i` leaves row i unmatched.
+    sure, matches, distance = matches[alone], matches[~alone], distance[~alone]
+    rows, row = np.unique(matches[:, 0], return_inverse=True)
+    columns, column = np.unique(matches[:, 1], return_inverse=True)
+    count, every = len(columns), np.arange(len(rows))
+    cost = (distance / radius) ** 2 + 1e-9  # a zero would be no edge
+    out = np.full(len(rows), float(min(len(rows), count) + 2))
+    graph = csr_array((np.r_[cost, out], (np.r_[row, every], np.r_[column, count + every])))
+    i, j = min_weight_full_bipartite_matching(graph)
+    real = j < count
+    chosen = np.concatenate([sure, np.stack([rows[i[real]], columns[j[real]]], -1)])
+    return np.asarray(chosen[np.argsort(chosen[:, 0])])
+
+
+def count_one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed | None = None) -> int:
+    """Return the number of matches of `one_to_one`, by a maximum matching, which is faster than one of least cost."""
+    matches, _ = _near(image, projected, radius, allowed)
+    if all(np.bincount(side).max(initial=0) <= 1 for side in matches.T):
+        return len(matches)  # no point has several candidates
+    graph = csr_array((np.ones(len(matches)), tuple(matches.T)), shape=(len(image), len(projected)))
+    return int((maximum_bipartite_matching(graph, perm_type="column") >= 0).sum())
+
+
+def mutual_nearest(image: Array, projected: Array, radius: float, allowed: Allowed | None = None) -> Labels:
+    """Return the mutual nearest neighbours within `radius`: fewer matches than `one_to_one`, and fewer wrong ones."""
+    matches, distance = _near(image, projected, radius, allowed)
+    nearest = np.ones(len(matches), np.bool_)
+    for side, size in zip(matches.T, (len(image), len(projected)), strict=True):
+        least = np.full(size, np.inf)
+        np.minimum.at(least, side, distance)
+        nearest &= distance == least[side]
+    return matches[nearest]
+
+
+def fit_pose(
+    project: Callable[[Array], Array],
+    points: Array,
+    target: Array,
+    rotation: Array,
+    translation: Array,
+    *,
+    scale: float,
+) -> tuple[Array, Array]:
+    """Fit a pose to matches by least squares, with Levenberg-Marquardt steps from a pose nearby.
+
+    Residuals are those of the image, so that any camera model can be used.
+
+    Args:
+        project: Returns the image points (k, d) of points (k, 3) in the camera's frame.
+        points: (k, 3) scene points.
+        target: (k, d) their image points.
+        rotation: (3, 3) initial rotation.
+        translation: (3,) initial translation.
+        scale: Scale of the residuals; a point that leaves the view has a residual of a thousand times the scale.
+
+    Returns:
+        Rotation (3, 3) and translation (3,).
+    """
+    model = PoseModel(points.mean(0))
+    state = model.state(rotation, translation)
+    relative = np.r_[np.ones(3), np.full(3, max(float(np.linalg.norm(state.centroid)), 1e-12))]
+
+    def settled(last: Iteration) -> bool:
+        return bool(
+            (np.abs(last.step) <= EXACT * relative).all() or np.abs(last.gain) <= EXACT * np.asarray(last.before.cost)
+        )
+
+    linearise = image_equations(model, [ImageMatches(project, points, target)], lost=1e3 * scale)
+    end = refine(model, state, linearise, [scale] * MOST_STEPS, settled=settled, damping=DAMPING, adaptive=True)
+    return model.pose(end.state)
+
+
+def _near(image: Array, projected: Array, radius: float, allowed: Allowed | None) -> tuple[Labels, Array]:
+    """Return the allowed matches (e, 2) within `radius`, ordered, and their distances; nearest neighbours if many."""
+    seen = np.flatnonzero(np.isfinite(projected).all(-1))
+    if len(image) * len(seen) <= DENSE:
+        distance = np.sqrt(((image[:, None] - projected[seen]) ** 2).sum(-1))
+        matches = np.argwhere(distance <= radius)
+    else:
+        both = _neighbours(image, projected[seen], radius)
+        if np.bincount(both[:, 0]).max(initial=0) == NEIGHBOURS:  # there may be more
+            both = np.concatenate([both, _neighbours(projected[seen], image, radius)[:, ::-1]])
+        # One number per match: sorting unique rows as records takes ten times as long.
+        matches = np.stack(np.divmod(np.unique(both[:, 0] * len(seen) + both[:, 1]), len(seen)), -1)
+    matches[:, 1] = seen[matches[:, 1]]
+    matches = matches if allowed is None else matches[allowed(*matches.T)]
+    return matches, np.linalg.norm(image[matches[:, 0]] - projected[matches[:, 1]], axis=-1)
+
+
+def _neighbours(points: Array, others: Array, radius: float) -> Labels:
+    """Return the indices (e, 2) of each point and of its nearest neighbours within `radius`."""
+    count = min(NEIGHBOURS, len(others))
+    distance, index = cKDTree(others).query(points, range(1, count + 1), distance_upper_bound=radius)
+    point, nth = np.nonzero(np.isfinite(distance))
+    return np.stack([point, index[point, nth]], -1)

@@ -1,0 +1,217 @@
+"""Competing poses of symmetric and repeated structures, such as a facade shifted by a window."""
+
+import math
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+
+from bpnp.search.config import Evidence, Repetitions
+from bpnp.search.verdict.false_alarms import SHARES, alarms_of, directions_of, point_evidence
+from bpnp.search.hypotheses import Hypotheses
+from bpnp.search.problem import Problem
+from bpnp.search.propose.symmetries import Motions, matching_tolerance, mirror_pose, self_motions
+
+Array = NDArray[np.float64]
+Pose = tuple[Array, Array]
+DEFAULT = Repetitions()
+
+
+def registered(problem: Problem, rotation: Array, translation: Array, scale: float, rule: Evidence) -> Motions:
+    """Return the rigid motions that map the matched points of a pose onto other scene points.
+
+    If a pose is wrong because of a symmetry or a repetition, one of these motions maps nearly all of its matched points
+    onto those of the correct pose. They may be any fraction of the scene.
+
+    Args:
+        problem: Points of the problem.
+        rotation: (3, 3) of the pose.
+        translation: (3,) of the pose.
+        scale: Standard deviation of its residuals, radians.
+        rule: Constants of the verdict.
+
+    Returns:
+        Motions with the fraction of the matched points that each maps, the largest first; none if there are too few
+        matched points.
+    """
+    limits, points = rule.repetitions, problem.points3d
+    camera = points @ rotation.T + translation
+    depth = np.linalg.norm(camera, axis=-1)
+    away, nearest = cKDTree(camera / np.maximum(depth, 1e-300)[:, None]).query(problem.bearings)
+    matched = np.unique(nearest[away < limits.near * scale])
+    if len(matched) < limits.fewest:
+        return Motions.none()
+    noise = scale * float(np.median(depth[matched]))
+    labels, normals = problem.labels3d, problem.normals3d if problem.cosines3d is None else None
+    if len(points) <= limits.whole:
+        tolerance = matching_tolerance(points, np.arange(len(points)), noise)
+        motions = _of_scene(*(_frozen(x) for x in (points, labels, normals)), tolerance)
+        return motions.of(points, matched, tolerance, limits.share)
+    middle = np.median(points[matched], 0)
+    near = np.sort(np.argsort(np.linalg.norm(points - middle, axis=-1), kind="stable")[: limits.around])
+    sources = np.flatnonzero(np.isin(near, matched))
+    if len(sources) < limits.fewest:
+        return Motions.none()
+    part = points[near]
+    return self_motions(
+        part,
+        matching_tolerance(part, sources, noise),
+        sources=sources,
+        labels3d=None if labels is None else labels[near],
+        normals3d=None if normals is None else normals[near],
+        least=limits.share,
+        bases=limits.bases if len(part) <= limits.many else limits.fewer_bases,
+    )
+
+
+Frozen = tuple[bytes, str, tuple[int, ...]] | None
+
+
+def _frozen(array: NDArray[Any] | None) -> Frozen:
+    """Convert an array to a key of a cache."""
+    return None if array is None else (np.ascontiguousarray(array).tobytes(), array.dtype.str, array.shape)
+
+
+@lru_cache(maxsize=64)
+def _of_scene(points: Frozen, labels: Frozen, normals: Frozen, tolerance: float) -> Motions:
+    """Return the motions of a whole scene, cached for all problems of it."""
+    arrays = [None if x is None else np.frombuffer(x[0], x[1]).reshape(x[2]).copy() for x in (points, labels, normals)]
+    assert arrays[0] is not None
+    return self_motions(
+        arrays[0],
+        tolerance,
+        labels3d=arrays[1],
+        normals3d=arrays[2],
+        least=DEFAULT.share_of_scene,
+        bases=DEFAULT.bases_of_scene,
+    )
+
+
+def competing_poses(problem: Problem, rotation: Array, translation: Array, motions: Motions, rule: Evidence) -> Pose:
+    """Return the competing poses of a pose due to motions and to the mirror image of a flat scene.
+
+    Args:
+        problem: Points of the problem.
+        rotation: (3, 3) of the pose.
+        translation: (3,) of the pose.
+        motions: Motions that map the scene onto itself.
+        rule: Constants of the verdict.
+
+    Returns:
+        Rotations (c, 3, 3) and translations (c, 3) of poses that differ from the given one by over `rule.same`.
+    """
+    poses = motions.competitors(rotation, translation)
+    every = [rotation[None], poses[0]], [translation[None], poses[1]]
+    if (mirrored := mirror_pose(problem.points3d, rotation, translation)) is not None:
+        for parts, one in zip(every, mirrored, strict=True):
+            parts.append(one[None])
+    rotations, translations = (np.concatenate(parts) for parts in every)
+    other = np.flatnonzero(~problem.same_pose(rotations, translations, rule.same))
+    return rotations[other], translations[other]
+
+
+def repeated_poses(
+    problem: Problem, rotation: Array, translation: Array, scale: float, rule: Evidence, *, least: float = 0.0
+) -> tuple[Hypotheses, Motions]:
+    """Return the competing poses of a pose due to the motions of the scene, and these motions.
+
+    Args:
+        problem: Points of the problem.
+        rotation: (3, 3) of the pose.
+        translation: (3,) of the pose.
+        scale: Standard deviation of its residuals, radians.
+        rule: Constants of the verdict.
+        least: Smallest fraction of the matched points that a motion maps, default 0.
+
+    Returns:
+        Unrefined poses that differ from the given one (`Evidence.same`), at most `Repetitions.kept`, the fewest false
+        alarms first. A flat scene adds the mirror image.
+
+    Examples:
+        >>> import numpy as np
+        >>> motif = np.random.default_rng(0).uniform(0, 1, (12, 3))
+        >>> scene = np.concatenate([motif + [2 * k, 0, 6] for k in range(3)])
+        >>> image = motif + [0, 0, 6]  # the first of three equal things
+        >>> problem = Problem(image / np.linalg.norm(image, axis=1, keepdims=True), scene)
+        >>> repeated, _ = repeated_poses(problem, np.eye(3), np.zeros(3), 1e-3, Evidence())
+        >>> sorted(repeated.translation[:2, 0].round(6).tolist())
+        [-4.0, -2.0]
+    """
+    motions = registered(problem, rotation, translation, scale, rule).mapping(least)
+    rotations, translations = competing_poses(problem, rotation, translation, motions, rule)
+    scales = np.full(len(rotations), scale)
+    alarms = alarms_of(problem, rotations, translations, scales).own
+    poses = Hypotheses.from_poses(
+        rotations, translations, scale=scales, log10_false_alarms=alarms, log10_rough=alarms.copy()
+    )
+    return poses[np.argsort(alarms, kind="stable")[: rule.repetitions.kept]], motions
+
+
+def decades_behind(
+    problem: Problem,
+    best: Pose,
+    repeated: Pose,
+    rivals: Pose,
+    scale: float,
+    limits: Repetitions = DEFAULT,
+    *,
+    fraction: float = 0.0,
+) -> Array:
+    """Return the margins (c,), in decades, by which competing poses explain the image points worse than the best one.
+
+    All poses are compared at one scale and against an even density of scene points, since their actual density does not
+    distinguish between copies of a structure. An image point does not count against a competing pose if the map may end
+    there. It then lies outside the projected points of that pose, and a motion of the `repeated` poses maps its scene
+    point onto another one. Any point may be missing in the map. With q the fraction of image points that the best
+    pose does not explain, no point counts for more than (1 - q) / q.
+
+    Args:
+        problem: Points of the problem.
+        best: Rotation (3, 3) and translation (3,) of the best pose.
+        repeated: Rotations and translations of the unrefined poses that the motions give.
+        rivals: Rotations (c, 3, 3) and translations (c, 3) of the competing poses.
+        scale: Scale of the residuals, radians.
+        limits: Constants.
+        fraction: Fraction of the matched points that every motion maps; it limits q to 1 - `fraction`. Default 0.
+    """
+    seen = [directions_of(problem, *best), *(directions_of(problem, r, t) for r, t in zip(*rivals, strict=True))]
+    logs = np.stack([point_evidence(problem, one, np.array([scale]), SHARES[-1:], even=True)[:, 0, 0] for one in seen])
+    count = logs.shape[1]
+    missing = min((int((logs[0] < 0).sum()) + 1) / (count + 2), (count * (1 - fraction) + 1) / (count + 2))
+    missing = min(missing, limits.most_missing)
+    most = math.log((1 - missing) / missing)
+    is_repeated = _is_repeated(problem, best, repeated, limits.near * scale)
+    counted = np.stack([_among(problem, one) for one in seen[1:]]) | ~is_repeated
+    return np.asarray(np.where(counted, np.clip(logs[0] - logs[1:], -most, most), 0).sum(-1) / math.log(10))
+
+
+def _is_repeated(problem: Problem, best: Pose, repeated: Pose, reach: float) -> NDArray[np.bool_]:
+    """Return for each chosen image point (k,) if a motion, or its inverse, maps its scene point onto another one.
+
+    A motion is p -> Q p + d. A repeated pose sees the point Q p + d where the best pose sees p.
+    """
+    points, (rotation, translation) = problem.points3d, best
+    camera = points @ rotation.T + translation
+    depth = np.linalg.norm(camera, axis=-1)
+    _, nearest = cKDTree(camera / np.maximum(depth, 1e-300)[:, None]).query(problem.bearings[problem.image.chosen])
+    own, reach = points[nearest], reach * float(np.median(depth[nearest]))
+    moved = [
+        target
+        for r, t in zip(*repeated, strict=True)
+        for target in ((own @ rotation.T + translation - t) @ r, (own @ r.T + t - translation) @ rotation)
+    ]
+    return np.asarray(np.isfinite(cKDTree(points).query(moved, distance_upper_bound=reach)[0]).any(0))
+
+
+def _among(problem: Problem, seen: Array) -> NDArray[np.bool_]:
+    """Return which chosen image points lie in the convex hull of the directions (n, 3) of the scene points."""
+    image = problem.image
+    ahead = seen[seen @ image.centre > 0]  # leaves out NaN
+    plane, points = (x @ image.axes / (x @ image.centre)[:, None] for x in (ahead, problem.bearings[image.chosen]))
+    try:
+        sides = ConvexHull(plane).equations
+    except (QhullError, ValueError):  # collinear or too few points
+        return np.zeros(len(points), bool)
+    return np.asarray((points @ sides[:, :2].T + sides[:, 2] <= 0).all(-1))

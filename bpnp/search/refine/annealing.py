@@ -1,0 +1,193 @@
+"""Stages of the search: anneal starts on coarse clusters, the best on finer ones, and few on all points."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from bpnp.runtime import in_time, thread_count
+from bpnp.search.config import Stages
+from bpnp.search.hypotheses import Hypotheses, select_distinct, to_problem_frame
+from bpnp.search.kernels.dense import dense_scratch, descend
+from bpnp.search.kernels.sparse import descend_sparse, sparse_scratch
+from bpnp.search.scene import Scene, Sides
+from bpnp.search.starts import Array, Prior, draw_poses
+
+
+def multistart(scene: Scene, number: int, prior: Prior | None) -> Hypotheses:
+    """Run one batch of starts over all rotations, or over those that a prior allows.
+
+    Args:
+        scene: Points, settings and deadline.
+        number: Index of the batch, from 0.
+        prior: Prior in the frame of the scene; None for all rotations.
+
+    Returns:
+        Distinct poses with their basin counts.
+    """
+    settings = scene.settings
+    recipe = settings.recipes[number % len(settings.recipes)]
+    drawn = draw_poses(scene.spread, scene.bulk3d, settings.batch(number), recipe, prior, scene.rng)
+    return run_batch(scene, Hypotheses.from_poses(*drawn, basin_count=1))
+
+
+def run_batch(scene: Scene, starts: Hypotheses) -> Hypotheses:
+    """Anneal one batch of starts, from clusters to all points."""
+    stages = *scene.settings.coarse, *scene.settings.middle
+    poses = anneal_on_clusters(scene, starts, stages, len(starts))
+    return anneal_on_points(scene, poses, stages[-1].last_scale * scene.spread)
+
+
+def anneal_on_clusters(scene: Scene, poses: Hypotheses, stages: Stages, starts: int) -> Hypotheses:
+    """Anneal poses on clusters, stage by stage.
+
+    Args:
+        scene: Points, settings and deadline.
+        poses: Initial poses.
+        stages: Stages, coarse to fine.
+        starts: Number of starts of the batch, which determines how many poses each stage keeps.
+
+    Returns:
+        Poses with different rotations, best first.
+    """
+    outlier = scene.outlier_density(scene.settings.outliers)
+    for stage, clusters in zip(stages, scene.clusters([stage.clusters for stage in stages]), strict=True):
+        kept = scene.settings.kept_by(stage, starts)
+        scales = (scene.spread * np.geomspace(stage.first_scale, stage.last_scale, stage.iterations)).astype(np.float32)
+        for k, part in enumerate(np.split(scales, stage.halvings)):
+            if k:  # best first, since only the first ones are annealed after the deadline
+                poses = poses[np.argsort(-poses.log_likelihood, kind="stable")[: max(len(poses) // 2, 2 * kept)]]
+            poses = _annealed(scene, poses, clusters, part, outlier)
+        poses = select_distinct(poses, scene, kept, stage.apart_deg)
+    return poses
+
+
+def _annealed(scene: Scene, starts: Hypotheses, sides: Sides, scales: Array, outlier: np.float32) -> Hypotheses:
+    """Take one step at each scale (k,), radians; return the poses that were annealed before the deadline."""
+    rotation, translation, score = starts.rotation.copy(), starts.translation.copy(), starts.log_likelihood.copy()
+
+    def anneal(i: int, j: int) -> None:
+        scratch = dense_scratch(*(len(side.label) for side in sides))
+        descend(*sides, rotation[i:j], translation[i:j], scales, outlier, score[i:j], scratch)
+
+    done = in_time(anneal, len(starts), scene.deadline, scene.settings.starts_a_check)
+    return replace(starts, rotation=rotation, translation=translation, log_likelihood=score)[:done]
+
+
+def anneal_on_points(
+    scene: Scene, starts: Hypotheses, first_scale: float, *, outliers: float | None = None, every: bool = False
+) -> Hypotheses:
+    """Anneal poses on all 3D points.
+
+    Args:
+        scene: Points, settings and deadline.
+        starts: Initial poses.
+        first_scale: Scale of the first step, radians.
+        outliers: Expected outlier fraction; None for that of the settings.
+        every: True to use all bearings; False for the number of the fine stage.
+
+    Returns:
+        Distinct poses, without an NFA.
+    """
+    fine, bearings = scene.settings.fine, None if every else scene.settings.fine.bearings
+    outliers = scene.settings.outliers if outliers is None else outliers
+    rounds = max(4, math.ceil(math.log(scene.smallest_scale / first_scale) / math.log(fine.cooling)))
+    scales = (first_scale * fine.cooling ** np.arange(rounds)).astype(np.float32)
+    tiles, points = scene.tiles(bearings)
+    tiles, outlier = tiles.with_margin(first_scale), scene.outlier_density(outliers)
+    rotation, translation = starts.rotation.copy(), starts.translation.copy()
+    result = np.zeros((len(starts), 3), np.float32)
+
+    def anneal(i: int, j: int) -> None:
+        pairs = 0
+        while i < j:
+            scratch = sparse_scratch(tiles, len(points.b), pairs)
+            poses = rotation[i:j], translation[i:j]
+            i += descend_sparse(tiles, points, *poses, scales, outlier, fine.patience, result[i:j], scratch)
+            pairs = 2 * len(scratch.near.point)  # the buffer was too small for the number of close points
+
+    done = in_time(anneal, len(starts), scene.deadline, thread_count())
+    score = result[:, 0] + np.float32(math.log(1 - outliers))  # mixture factor: makes outlier fractions comparable
+    ends = replace(
+        starts.unweighed(),
+        rotation=rotation,
+        translation=translation,
+        log_likelihood=score,
+        match_count=result[:, 1].astype(np.float64) * min(len(scene.offsets), len(scene.points3d)),
+        scale=result[:, 2],
+    )
+    return select_distinct(ends[:done], scene, done)
+
+
+def turned_about_middle(
+    scene: Scene, rotation: Array, translation: Array, vectors: Array, shifts: Array, *, basin_count: int = 0
+) -> Hypotheses:
+    """Return perturbed copies of poses, rotated about the centroid of the points.
+
+    With this centre, an error of the rotation moves the camera and leaves the points in view.
+
+    Args:
+        scene: Points.
+        rotation: (k, 3, 3) poses.
+        translation: (k, 3) poses.
+        vectors: (s, 3) rotation vectors, s a multiple of k.
+        shifts: (s, 3) translations.
+        basin_count: Basin count of all copies.
+
+    Returns:
+        (s,) hypotheses; the copies of a pose are adjacent.
+    """
+    middle, copies = scene.bulk3d.mean(0), len(vectors) // max(len(rotation), 1)
+    turns = Rotation.from_rotvec(vectors).as_matrix().astype(np.float32)
+    turned = (turns.reshape(len(rotation), 3 * copies, 3) @ rotation).reshape(-1, 3)
+    seen = np.repeat(rotation @ middle + translation, copies, 0)
+    shifted = seen + shifts - (turned @ middle).reshape(-1, 3)
+    return Hypotheses.from_poses(turned.reshape(-1, 3, 3), shifted.astype(np.float32), basin_count=basin_count)
+
+
+def finish(scene: Scene, poses: Hypotheses, annealed: int | None = None) -> Hypotheses:
+    """Anneal the best poses again on every bearing.
+
+    The best two are also annealed with each of `settings.end_outliers`.
+
+    Args:
+        scene: Points, settings and deadline.
+        poses: Distinct poses in the frame of the scene, best first.
+        annealed: Number of poses to anneal; None for all.
+
+    Returns:
+        Distinct poses, best first. Poses that are not annealed are kept.
+    """
+    settings, count = scene.settings, len(poses) if annealed is None else min(annealed, len(poses))
+    runs = [(i, settings.outliers) for i in range(count)]
+    runs += [(i, share) for i in range(min(2, count)) for share in settings.end_outliers]
+    ends: list[Hypotheses] = []
+    for i, share in runs:
+        if scene.deadline.passed():
+            break
+        first_scale = settings.end_scale * float(poses.scale[i])
+        end = anneal_on_points(scene, poses[i : i + 1], first_scale, outliers=share, every=True)
+        ends.append(end if len(ends) < count else end.as_dependent())
+    return select_distinct(Hypotheses.concatenate([*ends, poses[min(len(ends), count) :]]), scene, settings.kept)
+
+
+def polished(
+    scene: Scene, rotations: NDArray[np.float64], translations: NDArray[np.float64], scale: float
+) -> Hypotheses:
+    """Anneal poses of a problem to the end on all points; after the deadline they are returned unchanged.
+
+    Args:
+        scene: Points, settings and deadline.
+        rotations: (c, 3, 3).
+        translations: (c, 3).
+        scale: Standard deviation of their residuals, radians.
+
+    Returns:
+        Distinct hypotheses in the frame of the problem.
+    """
+    starts = Hypotheses.from_poses(*scene.enter(rotations, translations))
+    starts = replace(starts, scale=np.full(len(starts), scale, np.float32))
+    ends = finish(scene, starts)  # none after the deadline
+    return to_problem_frame(ends if len(ends) else starts, scene)

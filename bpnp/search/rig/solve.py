@@ -1,0 +1,241 @@
+"""`solve` with a `rig`: argument checks, the search for one pose of all cameras, and the `Solution`."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from bpnp.cameras import Camera, camera_from
+from bpnp.runtime import Clock, Deadline
+from bpnp.search.config import DEFAULT as SEARCH
+from bpnp.search.enumeration.search import is_enumerable
+from bpnp.search.verdict.covariance import student_factor
+from bpnp.search.pose_model import crossed
+from bpnp.search.problem import Problem, UnknownFocal
+from bpnp.search.rig.cameras import Pose, Rig
+from bpnp.search.rig.search import search_rig
+from bpnp.search.starts import GravityPrior, PosePrior, Prior
+from bpnp.search.verdict.decide import SearchResult, no_pose
+from bpnp.search.arguments import Array, about, checked_pose, pose_of
+from bpnp.search.focal_length import FocalSweep, UnknownCamera
+from bpnp.search.inputs import problem_from
+from bpnp.search.matching import SCALES, one_to_one, without_pose
+from bpnp.search.solution import FOCAL_LENGTH, POSE_PARAMETERS, SCALE, Solution, with_pose
+from bpnp.search.sources import Options
+
+
+def prepare_rig(
+    points2d: Sequence[Any],
+    points3d: Any,
+    cameras: Sequence[Any],
+    unknown: Sequence[UnknownCamera] | None,
+    mounts: Sequence[Pose],
+    known: Mapping[str, Any],
+    options: Options,
+    *,
+    prior: Prior | None = None,
+    scale: bool = False,
+) -> Callable[[], Solution]:
+    """Check the problem of a rig, and return the function that estimates its pose rig_from_world; see `bpnp.solve`.
+
+    Args:
+        points2d: Points of each camera.
+        points3d: (n, 3) scene points.
+        cameras: Camera of each of them; None for normalised coordinates and bearings.
+        unknown: Cameras with an unknown focal length; None if it is known.
+        mounts: Extrinsics cam_from_rig of each camera.
+        known: Lists of `labels2d` and `scores2d`, one array or None per camera; `normals3d`, `labels3d`, `scores3d`.
+        options: Options of the search.
+        prior: Prior of the pose of the rig.
+        scale: Estimate the scale of the scene too. Default False.
+    """
+    placed = isinstance(prior, PosePrior) and prior.translation is not None and math.isfinite(prior.translation_sigma)
+    if scale and placed:
+        raise ValueError(
+            "`prior` has a `translation_sigma`, but with `scale=True` the unit of the scene is unknown, and with it "
+            "the distance of the scene from a camera; use PosePrior(rotation, None, rotation_sigma_deg)"
+        )
+    if options.clutter is not None:
+        SEARCH.expecting(options.clutter)  # raises for one that is out of range
+    points = RigPoints(list(points2d), points3d, list(mounts), dict(known), options.clutter, prior, is_metric=not scale)
+    lenses = [None if camera is None else camera_from(camera) for camera in cameras]
+    if unknown is None:
+        return partial(_solve, points.rig(lenses), options)
+    rig = points.rig([one.reference for one in unknown])
+    if any(problem.degenerate is not None for problem in rig.problems):
+        return partial(_solve, rig, options)
+    return _RigSweep(list(unknown), points, options).solve
+
+
+@dataclass
+class RigPoints:
+    """Points of the cameras of a rig, before the camera models are known; arguments as for `prepare_rig`."""
+
+    points2d: list[Any]
+    points3d: Any
+    mounts: list[Pose]
+    known: dict[str, Any]
+    clutter: float | None
+    prior: Prior | None
+    is_metric: bool
+
+    def rig(self, lenses: Sequence[Camera | None], focal: UnknownFocal | None = None) -> Rig:
+        """Return the rig with these cameras, and with the prior of a focal length that is fitted."""
+        problems = []
+        for k, (image, lens) in enumerate(zip(self.points2d, lenses, strict=True)):
+            arrays = {name: values[k] if name.endswith("2d") else values for name, values in self.known.items()}
+            vertical = self.prior if isinstance(self.prior, GravityPrior) else None  # with it, three points fix a pose
+            with about(f"camera {k}"):
+                problem = problem_from(image, self.points3d, lens, prior=vertical, **arrays)
+            problems.append(replace(problem, clutter=self.clutter))
+        prior = self.prior if self.prior is None else problems[0].prior_from_user(self.prior)
+        rig = Rig(problems, self.mounts, is_metric=self.is_metric, prior=prior, lens=focal)
+        if not (self.is_metric or rig.apart):
+            raise ValueError(
+                "all cameras of the `rig` have one centre, which does not determine the scale of the scene; give "
+                "cameras with a baseline, or leave out `scale=True`"
+            )
+        return rig
+
+
+class _RigSweep(FocalSweep):
+    """Focal lengths of the cameras of a rig, which have one factor of those of their references.
+
+    Args:
+        unknown: Cameras with an unknown focal length.
+        points: Points of the cameras.
+        options: Options of the search.
+    """
+
+    def __init__(self, unknown: list[UnknownCamera], points: RigPoints, options: Options) -> None:
+        self.points, self.every = points, unknown
+        problems = points.rig([one.reference for one in unknown]).problems
+        first = unknown[0]
+        for problem in problems:
+            first = first.seen_by(problem)
+        # A radial coefficient is fitted only if it is asked for.
+        first = first._replace(radial=0.0) if first.distorted else first._replace(bends=False)
+        self.few = all(is_enumerable(problem) for problem in problems)
+        super().__init__(first, options)
+
+    def solve(self) -> Solution:
+        self.begun = Clock.now()
+        return self.sweep(few=self.few)
+
+    def rig(self, camera: Camera) -> Rig:
+        """Return the rig whose first camera is one of the sweep."""
+        zoom, radial = self.unknown.parts(camera)
+        return self.points.rig([one.at(zoom, radial) for one in self.every], self.unknown.focal(camera))
+
+    def solve_with(self, camera: Camera, options: Options) -> Solution:
+        return replace(_solve(self.rig(camera), options), camera=camera)
+
+    def refine(self, solution: Solution, camera: Camera, zooms: Sequence[float] = (1.0,)) -> Camera:
+        if zooms != (1.0,):  # the fit of the lens has started at wide scales
+            return camera
+        rig, first = self.rig(camera), self.unknown.parts(camera)
+        unit = 1 / solution.scale
+        rotation, shift = rig.problems[0].from_user(solution.rotation, unit * solution.translation)
+        zoom, radial = rig.fit_lens(rotation, np.r_[shift, unit], solution.stats.residual)
+        return self.unknown.at(first[0] * zoom, radial if self.unknown.bends else None)
+
+
+def _solve(rig: Rig, options: Options) -> Solution:
+    begun = Clock.now()
+    reasons = [problem.degenerate for problem in rig.problems if problem.degenerate is not None]
+    if reasons:
+        result = no_pose(reasons[0])
+    else:
+        deadline = Deadline.after(options.time_limit)
+        result = search_rig(
+            rig, clutter=options.clutter, seed=options.seed, deadline=deadline, settings=options.settings
+        )
+    solution = _finished(rig, rig.problems, result, options.inlier_threshold)
+    return replace(solution, seconds=Clock.now() - begun)
+
+
+def mount_from(name: str, value: Any) -> Pose:
+    """Return rotation and translation of extrinsics cam_from_rig; see `pose_of` for the forms."""
+    pose = pose_of(value, name)
+    if pose is None or pose[1] is None:
+        wrong = f"has the shape {value.shape}" if hasattr(value, "shape") else f"is {value!r:.80}"
+        raise ValueError(
+            f"`{name}` {wrong}; give cam_from_rig as (R, t), a matrix (3, 4) or (4, 4), or a pycolmap.Rigid3d"
+        )
+    return checked_pose(f"{name}.", *pose)
+
+
+def _finished(rig: Rig, problems: Sequence[Problem], result: SearchResult, inlier_threshold: float | None) -> Solution:
+    """Build the solution with the matches of all cameras; 2D points are indexed over all cameras, concatenated."""
+    found, first = result.candidates, problems[0]
+    solution = replace(without_pose(first, result.reason, inlier_threshold), camera=None)
+    parameters: tuple[str, ...] = POSE_PARAMETERS
+    if rig.model.lens is not None:
+        parameters = (*parameters, FOCAL_LENGTH)
+    if rig.model.scale:
+        parameters = (*parameters, SCALE)
+        solution = replace(solution, scale=math.nan)
+    solution = replace(solution, covariance=np.full((len(parameters),) * 2, math.nan), parameters=parameters)
+    if not len(found):
+        return solution
+    rotation, translation = found.rotation[0], found.translation[0]
+    matches, errors, angles, count = [], [], [], 0
+    for k, problem in enumerate(problems):
+        threshold = inlier_threshold or SCALES * result.residual * problem.per_radian
+        seen = problem.project_scene(*rig.pose_of(k, rotation, translation))
+        i, j = one_to_one(problem.image_points, seen, threshold, problem.may_match).T
+        errors.append(np.linalg.norm(problem.image_points[i] - seen[j], axis=-1))
+        angles.append(errors[-1] / problem.per_radian)
+        matches.append(np.stack([problem.usable[i] + count, j], -1))
+        count += len(problem.all2d)
+    matched = sum(map(len, matches))
+    covariance = None if result.verdict == "failed" else rig.covariance(rotation, translation, result.residual)
+    if covariance is not None:
+        middle = rotation @ first.middle_of_user
+        _, shift = first.to_user(rotation, translation[:3])
+        free = max(2 * matched - rig.unknowns, 1)
+        moved_by = _about_origin(rig, first.size, middle, shift, 1 / translation[3])
+        covariance = student_factor(free) * moved_by @ covariance @ moved_by.T
+    _, moved = first.to_user(found.rotation, found.translation[:, :3])
+    points2d = np.concatenate([problem.all2d for problem in problems])
+    dropped = sum(problem.dropped2d for problem in problems)
+    return with_pose(
+        replace(solution, points2d=points2d, stats=replace(solution.stats, dropped2d=dropped)),
+        result,
+        replace(found, translation=np.column_stack([moved, found.translation[:, 3]])),
+        [matched, *[0] * (len(found) - 1)],
+        np.concatenate(matches),
+        np.concatenate(errors),
+        np.concatenate(angles),
+        most=sum(min(len(problem.all2d), len(problem.points3d)) for problem in problems),
+        threshold=inlier_threshold or SCALES * result.residual * first.per_radian,
+        residual=result.residual,
+        covariance=covariance,
+    )
+
+
+def _about_origin(rig: Rig, size: float, middle: Array, shift: Array, scale: float) -> Array:
+    """Return the matrix that converts an error about the centroid, in unit size, to one of the user's parameters.
+
+    These are the rotation, the translation in units of the rig, the focal length in pixels and the scale.
+
+    Args:
+        rig: Cameras; the covariance is that of `Rig.covariance`.
+        size: Size of the scene, user's unit.
+        middle: (3,) centroid of the scene from its origin, in the axes of the rig, user's unit.
+        shift: (3,) translation, unit of the scene.
+        scale: Units of the rig in one unit of the scene.
+    """
+    has_focal, camera = rig.model.lens is not None, rig.problems[0].camera
+    moved = np.eye(6 + has_focal + rig.model.scale)
+    moved[3:6, 3:6] *= scale * size
+    moved[3:6, :3] = scale * crossed(middle)
+    if has_focal and camera is not None:
+        moved[6, 6] = camera.focal
+    if rig.model.scale:
+        moved[-1, -1] = scale
+        moved[3:6, -1] = scale * shift
+    return moved

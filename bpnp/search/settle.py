@@ -1,0 +1,272 @@
+"""Competing poses of a confident pose: those of a repeated structure, and those of other lenses.
+
+They are proposed from the leader and from the scene, refined and scored like any other pose, and the verdict is then
+computed again with them among the candidates (`settle`).
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bpnp.poses import turned_by
+from bpnp.search.refine.annealing import polished
+from bpnp.search.config import Evidence, OtherFocal
+from bpnp.search.verdict.competitors import of_misfit
+from bpnp.search.verdict.false_alarms import alarms_of, likeliest_scale
+from bpnp.search.verdict.reasons import Objection, objection
+from bpnp.search.propose.repetitions import decades_behind, repeated_poses
+from bpnp.search.verdict.uncertainty import Misfit, bends_significantly, linearised, systematic_misfit
+from bpnp.search.hypotheses import Hypotheses, to_problem_frame
+from bpnp.search.pose_model import undistort
+from bpnp.search.problem import Problem, UnknownFocal
+from bpnp.search.propose.lens import LensFit, fit_lens
+from bpnp.search.propose.density_map import search_beside
+from bpnp.search.scene import Scene
+from bpnp.search.verdict.decide import SearchResult, is_symmetric, judged, match_count, with_false_alarms
+
+Array = NDArray[np.float64]
+SceneOf = Callable[[], Scene]
+
+
+def settle(
+    result: SearchResult,
+    problem: Problem,
+    scene_of: SceneOf,
+    rule: Evidence,
+    *,
+    looks: float | int = 0,
+    exhaustive: bool = False,
+    enumerated: bool = False,
+) -> SearchResult:
+    """Judge a confident pose again with its competing poses among the candidates.
+
+    A better pose of a repeated structure becomes the best one, and its competing poses are proposed in turn. The given
+    camera is accepted unless another lens, whose parameters count as unknowns, has fewer false alarms by the factor
+    `rule.focal_chance`.
+
+    Args:
+        result: Verdict; returned unchanged unless it is confident.
+        problem: Points of the problem.
+        scene_of: Function that returns the scene for refinements; it is called only if one is needed.
+        rule: Constants of the verdict.
+        looks: Number of local searches around the best pose that found no better one.
+        exhaustive: True if every pose was tried.
+        enumerated: True if the competing poses of a repeated structure are among the candidates already.
+
+    Returns:
+        The verdict, with the competing poses among its candidates.
+    """
+    while result.verdict == "confident":
+        competitors = repeated_competitors(result, problem, scene_of, rule, enumerated=enumerated)
+        if not len(competitors):
+            break
+        candidates, leader = Hypotheses.concatenate([result.candidates, competitors]), result.best[1]
+        result = judged(candidates, problem, batches=result.batches, looks=looks, exhaustive=exhaustive, rule=rule)
+        if np.array_equal(result.best[1], leader):
+            break
+    other = other_lens(result, problem, scene_of, rule) if result.verdict == "confident" else None
+    return result if other is None else result.doubt(other)
+
+
+def repeated_competitors(
+    result: SearchResult, problem: Problem, scene_of: SceneOf, rule: Evidence, *, enumerated: bool = False
+) -> Hypotheses:
+    """Return the competing poses of a repeated structure, refined, with their NFA.
+
+    Their NFA is at most that of the leader times the factor by which they explain the image points worse
+    (`decades_behind`). Poses that were enumerated are refined already. They are scored again under the assumption that
+    the map may end anywhere, which makes them likelier.
+
+    Args:
+        result: Confident verdict.
+        problem: Points of the problem.
+        scene_of: Function that returns the scene for the refinement.
+        rule: Constants of the verdict.
+        enumerated: True if they are among the candidates already.
+
+    Returns:
+        Competing poses; none if the verdict does not depend on them.
+    """
+    if enumerated and not is_symmetric(result.candidates, problem, rule):
+        return Hypotheses.empty()
+    best = result.best
+    # The scale at which the annealing ended may be coarser than that of the residuals.
+    scale = result.residual if enumerated else min(result.residual, likeliest_scale(problem, *best))
+    scale = max(scale, problem.image.scales[0])
+    least = rule.repetitions.symmetric if enumerated else 0.0
+    repeated, motions = repeated_poses(problem, *best, scale, rule, least=least)
+    if not len(repeated):
+        return repeated
+    poses, limits = (repeated.rotation, repeated.translation), rule.repetitions
+    if enumerated:
+        refined, limits = repeated, replace(limits, most_missing=1e-12)
+    else:
+        refined = with_false_alarms(polished(scene_of(), *poses, scale), problem)
+    others, fraction = (refined.rotation, refined.translation), float(motions.fraction.min(initial=1.0))
+    behind = decades_behind(problem, best, poses, others, scale, limits, fraction=fraction)
+    behind = np.maximum(behind, 0) if motions.complete else np.zeros(len(refined))
+    if enumerated and (behind >= rule.lead).all():
+        return Hypotheses.empty()
+    alarms = np.minimum(refined.log10_false_alarms, result.log10_false_alarms + behind)
+    return replace(refined, log10_false_alarms=alarms)
+
+
+def other_lens(result: SearchResult, problem: Problem, scene_of: SceneOf, rule: Evidence) -> Objection | None:
+    """Return another lens with which a different pose fits better than the best one, or None.
+
+    Better means fewer false alarms by the factor `focal_chance`, with focal length and radial coefficient counted as
+    unknowns. The lens is fitted from the best pose. If three matches may be coincidences, it is also fitted from the
+    likeliest pose at other focal lengths. If the time limit prevents this, the result reports it.
+
+    Args:
+        result: Confident verdict on the best pose.
+        problem: Points of the problem.
+        scene_of: Function that returns the scene, whose settings and deadline are used.
+        rule: Constants of the verdict.
+    """
+    if problem.focal is not None:
+        return None
+    count, (rotation, translation) = match_count(result.candidates, problem), result.best
+    other = fitted_lens(problem, rotation, translation, result.residual, count, rule)
+    if other is not None or count < rule.zoomed.fewest:
+        return other
+    middle, scale = rotation @ problem.middle + translation, max(result.residual, problem.image.scales[0])
+    linear = linearised(problem, rotation, translation, scale)
+    starts = (None, 0.0) if bends_significantly(linear, count, rule) else (None,)
+
+    def better(found: AtZoom) -> Objection | None:
+        least = max(float(found.pose.scale[0]), found.problem.image.scales[0])
+        fits = (fit_lens(found.problem, found.pose.rotation[0], found.middle, least, start) for start in starts)
+        others = [fit._replace(zoom=found.zoom * fit.zoom) for fit in fits if fit is not None]
+        alarms = [_alarms(problem, other, rule) for other in others]
+        if min(alarms, default=math.inf) >= result.log10_false_alarms + math.log10(rule.focal_chance):
+            return None
+        return of_misfit(misfit_of(rotation, middle, others[int(np.argmin(alarms))]), rule)
+
+    leader = AtZoom(1.0, problem, result.candidates[:1])
+    other = better(leader)
+    if other is not None or rule.independent * result.log10_false_alarms / count <= rule.missed:
+        return other
+    scene = scene_of()
+    likeliest = likeliest_zoom(leader, scene, rule.zoomed)
+    if scene.deadline.passed():
+        return objection("camera_untested")
+    return better(likeliest)
+
+
+def fitted_lens(
+    problem: Problem, rotation: Array, translation: Array, scale: float, count: float, rule: Evidence
+) -> Objection | None:
+    """Return a focal length that the residuals of a pose support significantly, if its pose is a different one.
+
+    Args:
+        problem: Points of the problem.
+        rotation: (3, 3) of the pose.
+        translation: (3,) of the pose.
+        scale: Standard deviation of its residuals, radians.
+        count: Number of its matches.
+        rule: Constants of the verdict.
+    """
+    linear = linearised(problem, rotation, translation, scale)
+    if problem.focal is not None or systematic_misfit(linear, count, rule).zoom == 1:
+        return None
+    middle = rotation @ problem.middle + translation
+    fit = fit_lens(problem, rotation, middle, scale)
+    return None if fit is None else of_misfit(misfit_of(rotation, middle, fit), rule)
+
+
+def misfit_of(rotation: Array, middle: Array, other: LensFit) -> Misfit:
+    """Return the difference between a pose and the pose of another lens.
+
+    Args:
+        rotation: (3, 3) of the pose.
+        middle: (3,) scene centroid in its camera's frame.
+        other: Fitted lens with its pose.
+    """
+    shift = float(np.linalg.norm(other.middle - middle)) / max(float(np.linalg.norm(middle)), 1e-300)
+    return Misfit(turned_by(rotation, other.rotation), shift, other.zoom, other.radial or 0.0)
+
+
+class AtZoom(NamedTuple):
+    """A hypothesis at another focal length.
+
+    Attributes:
+        zoom: Focal length over the given one.
+        problem: Points of the problem at this focal length.
+        pose: One hypothesis.
+    """
+
+    zoom: float
+    problem: Problem
+    pose: Hypotheses
+
+    @property
+    def middle(self) -> Array:
+        """Scene centroid (3,) in the camera's frame."""
+        return np.asarray(self.pose.rotation[0] @ self.problem.middle + self.pose.translation[0])
+
+    @property
+    def likelihood(self) -> float:
+        """Mean log-likelihood of the bearings, nats, relative to an even density over the view."""
+        return float(self.pose.log_likelihood[0]) + math.log(self.problem.image.solid_angle)
+
+
+def likeliest_zoom(start: AtZoom, scene: Scene, rule: OtherFocal) -> AtZoom:
+    """Return the likeliest pose at other focal lengths.
+
+    One step is tried to either side. The likelier side is followed while the likelihood grows.
+
+    Args:
+        start: Pose at the given focal length.
+        scene: Scene whose settings and deadline are used.
+        rule: Constants of the steps.
+    """
+    steps = [(step, search_at_zoom(start, step, scene)) for step in (1 / rule.step, rule.step)]
+    step, best = max(steps, key=lambda one: one[1].likelihood)
+    while 1 / rule.widest < best.zoom * step < rule.widest:
+        further = search_at_zoom(best, step, scene)
+        if further.likelihood <= best.likelihood:
+            break
+        best = further
+    return best
+
+
+def search_at_zoom(found: AtZoom, zoom: float, scene: Scene) -> AtZoom:
+    """Return the likeliest pose at `zoom` times the focal length of a given one, or the given one after the deadline.
+
+    The search starts from the pose that shows the scene at the same size.
+
+    Args:
+        found: Pose at its focal length.
+        zoom: Factor on this focal length.
+        scene: Scene whose settings and deadline are used.
+    """
+    problem = at_focal_length(found.problem, zoom)
+    there = Scene(problem, 0, scene.settings, scene.deadline)
+    shift = found.middle * (1, 1, zoom) - found.pose.rotation[0] @ problem.middle
+    start = Hypotheses.from_poses(*there.enter(found.pose.rotation, shift[None]))
+    poses = to_problem_frame(search_beside(there, start, scene.settings.zoomed)[:1], there)
+    return AtZoom(zoom * found.zoom, problem, poses) if len(poses) else found
+
+
+def _alarms(problem: Problem, other: LensFit, rule: Evidence) -> float:
+    """Return log10 NFA of a pose with its lens counted as unknown."""
+    lens = UnknownFocal(2 * math.log(rule.zoomed.widest))
+    zoomed = replace(at_focal_length(problem, other.zoom), focal=lens)
+    if other.radial is not None:
+        bearings = undistort(problem.bearings, other.zoom, other.radial)
+        outermost = float(((bearings[:, :2] / bearings[:, 2:]) ** 2).sum(-1).max())
+        lens = lens._replace(radial_sigma=math.inf, radial_range=2 * rule.zoomed.bend / outermost)
+        zoomed = replace(problem, bearings=bearings, focal=lens)
+    translation = other.middle - other.rotation @ problem.middle
+    return float(alarms_of(zoomed, other.rotation[None], translation[None]).own[0])
+
+
+def at_focal_length(problem: Problem, zoom: float) -> Problem:
+    """Return the problem with its image points at `zoom` times the focal length."""
+    bearings = problem.bearings * (1 / zoom, 1 / zoom, 1)
+    return replace(problem, bearings=bearings / np.linalg.norm(bearings, axis=-1, keepdims=True))

@@ -1,0 +1,472 @@
+"""Result of `bpnp.solve`, and its JSON file."""
+
+import json
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from bpnp.cameras import Camera, CameraLike, camera_from, camera_to_json
+from bpnp.search.verdict.reasons import Objection
+from bpnp.search.verdict.uncertainty import centre_covariance
+from bpnp.search.hypotheses import Hypotheses
+from bpnp.search.problem import Unit
+from bpnp.search.verdict.decide import SearchResult, Verdict
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Array = npt.NDArray[np.float64]
+ROTATION_PARAMETERS = ("rotation_x", "rotation_y", "rotation_z")  # rotation vector in the camera axes, radians
+POSE_PARAMETERS = (*ROTATION_PARAMETERS, "translation_x", "translation_y", "translation_z")
+FOCAL_LENGTH, SCALE = "focal_length", "scale"
+FORMAT = 3  # 2: with false alarms; 3: matches of a photo in a map are indices, names of the parameters
+MATCHES_ARE_IDS = 2  # format in which the matches of a photo in a map held the ids of points
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A distinct pose that the search found, camera = R p + t.
+
+    Attributes:
+        rotation: (3, 3) rotation matrix.
+        translation: (3,) translation, scene units.
+        score: Mean log-likelihood of the bearings, nats; larger is better.
+        inlier_count: Number of one-to-one inliers (paper Eq. 1).
+        log10_false_alarms: Expected number of equally good poses for unrelated points, log10; see `Solution`.
+        scale: Scale of the scene, rig = scale R p + t; 1 unless it was estimated.
+    """
+
+    rotation: Array
+    translation: Array
+    score: float
+    inlier_count: int
+    log10_false_alarms: float
+    scale: float = 1.0
+
+    @property
+    def centre(self) -> Array:
+        """Camera centre in the scene, -R^T t / scale."""
+        return -self.rotation.T @ self.translation / self.scale
+
+
+@dataclass(frozen=True)
+class SolutionStats:
+    """Statistics of the search.
+
+    Attributes:
+        iterations: Number of batches of initial poses.
+        residual: Scale of the residuals, radians.
+        converged: True if the verdict is "confident", so that the search stopped by itself.
+        dropped2d: Number of 2D points that could not be undistorted and were dropped.
+        taken2d: Number of 2D points that other problems of the same image use (`solve_many`).
+    """
+
+    iterations: int = 0
+    residual: float = math.nan
+    converged: bool = False
+    dropped2d: int = 0
+    taken2d: int = 0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Solution:
+    """Pose of one problem, camera = R p + t. Without a pose it is NaN, with no matches and the verdict "failed".
+
+    Attributes:
+        rotation: (3, 3) rotation matrix.
+        translation: (3,) translation, scene units.
+        matches: (k, 2) indices into `points2d` and `points3d`; no point is in two matches.
+        inlier_count: Number of matches within `inlier_threshold` (paper Eq. 1).
+        inlier_ratio: `inlier_count` as a fraction of min(m, n).
+        inlier_threshold: Largest reprojection error of a match, in `unit`.
+        reprojection_error: Mean reprojection error of the matches, in `unit`.
+        reprojection_error_deg: Mean angle between the bearings of the matches, degrees.
+        unit: Pixels with a camera, else normalised image units, or radians for bearings.
+        covariance: (p, p) covariance of the errors of `parameters`, which for a pose are (w, v) with R' = exp([w]x) R
+            and t' = t + v. Here w is in radians in the camera axes, and v in scene units. It is the first-order
+            estimate
+
+                C = max(H^-1, sum_i d_i d_i^T),  H = -d2 log p(image points | pose) / d(w, v)^2 + prior,
+
+            where d_i is the step to the optimum without image point i, with unknown correspondences (docs/verdict.md).
+            NaN if the verdict is "failed" or the points do not fix the pose.
+        parameters: Names of the p estimated parameters, in the order of the covariance: "rotation_x", "rotation_y",
+            "rotation_z"; then "translation_x", "translation_y", "translation_z", except for points at infinity; then
+            "focal_length" (pixels) or "scale" if it was estimated.
+        scale: Scale of the scene, rig = scale R p + t, with t in the unit of the rig; 1 unless `scale=True`.
+        candidates: Distinct poses that the search found, best first; the first is this pose.
+        verdict: "confident"; "ambiguous" if the pose is significant but another one may fit as well; "failed" if no
+            pose is significant. A pose with the verdict "failed" is a guess.
+        reason: Reason of the verdict, a sentence.
+        reason_code: Kind of the reason: "confident", or one of docs/verdict.md, such as "competing_pose".
+        log10_false_alarms: Expected number of poses that fit as well if image and scene were unrelated (NFA), log10;
+            infinite without a pose. See docs/verdict.md.
+        seconds: Run time of this problem. Problems that were solved together count equal parts of their time.
+        view: Name of the view of a `SceneMap` near which the pose was found; None without a map.
+        point_ids: (n,) ids of `points3d` in the map; None without a map. See `matched_point_ids`.
+        points2d: (m, 2) normalised image coordinates; NaN for an input point that has none.
+        points3d: (n, 3) input points.
+        normals3d: (n, 3) input normals; None without.
+        camera: Input or estimated camera; None for normalised coordinates and bearings.
+        stats: Statistics of the search.
+    """
+
+    rotation: Array = field(default_factory=lambda: np.full((3, 3), math.nan))
+    translation: Array = field(default_factory=lambda: np.full(3, math.nan))
+    matches: npt.NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 2), np.int64))
+    inlier_count: int = 0
+    inlier_ratio: float = 0.0
+    inlier_threshold: float = math.nan
+    reprojection_error: float = math.nan
+    reprojection_error_deg: float = math.nan
+    unit: Unit
+    covariance: Array = field(default_factory=lambda: np.full((6, 6), math.nan), repr=False)
+    parameters: tuple[str, ...] = POSE_PARAMETERS
+    scale: float = 1.0
+    candidates: tuple[Candidate, ...] = ()
+    verdict: Verdict
+    reason: str
+    reason_code: str = "no_pose"
+    log10_false_alarms: float = math.inf
+    stats: SolutionStats
+    seconds: float = 0.0
+    points2d: Array = field(repr=False)
+    points3d: Array = field(repr=False)
+    normals3d: Array | None = field(default=None, repr=False)
+    camera: Camera | None = field(default=None, repr=False)
+    view: str | None = None
+    point_ids: npt.NDArray[np.int64] | None = field(default=None, repr=False)
+
+    @property
+    def matched_point_ids(self) -> npt.NDArray[np.int64] | None:
+        """Ids (k,) in the map of the 3D points of the matches; None without a map."""
+        return None if self.point_ids is None else self.point_ids[self.matches[:, 1]]
+
+    @property
+    def match_places(self) -> npt.NDArray[np.int64]:
+        """Deprecated name of `matches`."""
+        warnings.warn("`match_places` is now `matches`, and will be removed", DeprecationWarning, stacklevel=2)
+        return self.matches
+
+    @property
+    def centre(self) -> Array:
+        """Camera centre in the scene, -R^T t / scale."""
+        return -self.rotation.T @ self.translation / self.scale
+
+    @property
+    def rotation_std_deg(self) -> float:
+        """Standard deviation of the rotation about its least certain axis, degrees."""
+        return math.degrees(_largest(self.covariance[:3, :3]))
+
+    @property
+    def centre_std(self) -> float:
+        """Standard deviation of `centre` along its least certain axis, scene units; NaN for points at infinity."""
+        if "translation_x" not in self.parameters:
+            return math.nan
+        chosen, scale = list(range(len(POSE_PARAMETERS))), None
+        if SCALE in self.parameters:
+            chosen, scale = [*chosen, self.parameters.index(SCALE)], self.scale
+        return _largest(centre_covariance(self.covariance[np.ix_(chosen, chosen)], self.translation, scale))
+
+    @property
+    def focal_length(self) -> float:
+        """Focal length of the camera, pixels, given or estimated; NaN without a camera."""
+        return math.nan if self.camera is None else self.camera.focal
+
+    @property
+    def focal_length_std(self) -> float:
+        """Standard deviation of an estimated focal length, pixels; 0 for a given one."""
+        return self._std(FOCAL_LENGTH)
+
+    @property
+    def scale_std(self) -> float:
+        """Standard deviation of an estimated scale; 0 if the scale was not estimated."""
+        return self._std(SCALE)
+
+    def _std(self, parameter: str) -> float:
+        """Return the standard deviation of a parameter; 0 if it was not estimated."""
+        if parameter not in self.parameters:
+            return 0.0
+        k = self.parameters.index(parameter)
+        return math.sqrt(self.covariance[k, k])
+
+    @property
+    def found(self) -> bool:
+        """True if there is a pose, which is a guess if the verdict is "failed". `bool(solution)` is the same."""
+        return bool(np.isfinite(self.rotation).all() and np.isfinite(self.translation).all())
+
+    def __bool__(self) -> bool:
+        """Return `found`."""
+        return self.found
+
+    def __repr__(self) -> str:
+        from bpnp.report.terminal import fixed
+
+        rows = "\n            ".join("  ".join(f"{value: .6f}" for value in row) for row in self.rotation)
+        return (
+            f"Solution({self.verdict}: {self.reason}\n  rotation: {rows}\n"
+            f"  translation: {'  '.join(fixed(self.translation.tolist()))}\n"
+            f"  centre: {'  '.join(fixed(self.centre.tolist()))}\n"
+            f"  matches: {self.inlier_count} of {min(len(self.points2d), len(self.points3d))}, "
+            f"mean error {self.reprojection_error:.3g} {self.unit}\n"
+            f"  candidates: {len(self.candidates)}, seconds: {self.seconds:.2f})"
+        )
+
+    def plot(
+        self, *, photo: Path | str | npt.NDArray[np.uint8] | None = None, camera: CameraLike | None = None
+    ) -> "Figure":
+        """Draw the image points and the projected scene points as a matplotlib figure.
+
+        Args:
+            photo: File or (h, w, 3) uint8 image to draw under the points; not undistorted. It needs a camera. None for
+                none.
+            camera: Camera whose pixels are the axes, as for `bpnp.solve`. Default: `self.camera`; without a camera the
+                axes are normalised coordinates.
+
+        Returns:
+            The figure.
+
+        Raises:
+            ValueError: A photo was given without a camera, or no image point is in front of the camera.
+        """
+        from bpnp.report.images import read_photo
+        from bpnp.report.solutions import draw_solution
+
+        picture = read_photo(photo) if isinstance(photo, (Path, str)) else photo
+        drawn = self if camera is None else replace(self, camera=camera_from(camera))
+        return draw_solution(drawn, photo=picture)
+
+    def _repr_html_(self) -> str:
+        """Return `repr` as HTML, followed by the picture if a point is in front of the camera."""
+        from bpnp.report.solutions import solution_html
+
+        return solution_html(self)
+
+    def to_colmap(
+        self,
+        folder: Path | str,
+        *,
+        camera: CameraLike | None = None,
+        name: str = "image.jpg",
+        size: tuple[int, int] | None = None,
+    ) -> Path:
+        """Write a COLMAP text model with this image, its matches as tracks, and all 3D points.
+
+        Args:
+            folder: Folder to write to.
+            camera: Camera to write, as for `bpnp.solve`. Default: `self.camera`, else a pinhole camera of 1000 pixels.
+            name: Name of the image file, default "image.jpg".
+            size: (width, height) of the image, pixels. Default: the size of the camera, else one that holds the points.
+
+        Returns:
+            The folder.
+
+        Raises:
+            ValueError: The solution has no pose.
+        """
+        from bpnp.datamodules.colmap.reconstruction import write_image
+
+        if not self.found:
+            raise ValueError(f"a solution without a pose cannot be exported: {self.reason}")
+        pose = self.rotation, self.translation / self.scale  # in the unit of the scene
+        lens = self.camera if camera is None else camera
+        points = self.points2d, self.points3d, self.matches
+        return write_image(Path(folder), *points, pose, camera=lens, name=name, size=size)
+
+    def to_json(self) -> str:
+        """Return all fields as strict JSON, with null for NaN and all digits. `bpnp view` draws such a file."""
+        pose = {name: getattr(self, name) if self.found else None for name in ("rotation", "translation", "centre")}
+        derived = "rotation_std_deg", "centre_std", "focal_length", "focal_length_std", "scale_std"
+        content = {"format": FORMAT} | vars(self) | pose | {name: getattr(self, name) for name in derived}
+        content |= {"candidates": [vars(candidate) for candidate in self.candidates], "stats": vars(self.stats)}
+        return json.dumps(_plain(content), allow_nan=False)
+
+    @classmethod
+    def from_json(cls, text: str | bytes | Path) -> "Solution":
+        """Read a solution from the text of `to_json`, or from a file with it.
+
+        Args:
+            text: JSON text, or the path of a JSON file as a `Path`.
+
+        Raises:
+            ValueError: The text is not the JSON of a solution.
+        """
+        name = f" in {text}" if isinstance(text, Path) else ""
+        try:
+            content = json.loads(text.read_bytes() if isinstance(text, Path) else text)
+            if content["format"] not in (MATCHES_ARE_IDS, FORMAT):
+                raise ValueError(f"format {content['format']}, try the bpnp that wrote it")
+            if content["verdict"] not in get_args(Verdict):
+                raise ValueError(f"verdict {content['verdict']!r}")
+            return _read(cls, content if content["format"] == FORMAT else _converted(content))
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"this is not the JSON of a solution{name}: {error}") from error
+
+
+def add_objection(solution: Solution, one: Objection) -> Solution:
+    """Return a copy of a solution that is ambiguous for a reason."""
+    reason = one.sentence(solution.log10_false_alarms)
+    return replace(solution, verdict="ambiguous", reason=reason, reason_code=one.code)
+
+
+def candidates_of(poses: Hypotheses, counts: Sequence[int]) -> tuple[Candidate, ...]:
+    """Return hypotheses as `Candidate` objects.
+
+    Args:
+        poses: Poses in the user's frame; translations (c, 3), or homogeneous (c, 4) with the unit of the scene last.
+        counts: Number of inliers of each pose.
+    """
+    unit = poses.translation[:, 3:] if poses.translation.shape[1] == 4 else np.ones((len(poses), 1))
+    return tuple(
+        Candidate(rotation, translation, score, count, alarms, scale)
+        for rotation, translation, score, count, alarms, scale in zip(
+            poses.rotation,
+            poses.translation[:, :3] / unit,
+            poses.log_likelihood.tolist(),
+            counts,
+            poses.log10_false_alarms.tolist(),
+            (1 / unit[:, 0]).tolist(),
+            strict=True,
+        )
+    )
+
+
+def with_pose(
+    solution: Solution,
+    result: SearchResult,
+    poses: Hypotheses,
+    counts: Sequence[int],
+    matches: npt.NDArray[np.int64],
+    errors: Array,
+    angles: Array,
+    *,
+    most: int,
+    threshold: float,
+    residual: float,
+    covariance: Array | None,
+) -> Solution:
+    """Return a solution with the pose, the verdict and the candidates of a search.
+
+    Args:
+        solution: Solution without a pose.
+        result: Search result with the verdict.
+        poses: Hypotheses in the user's frame, best first; see `candidates_of`.
+        counts: Number of inliers of each hypothesis.
+        matches: (k, 2) matches of the first pose.
+        errors: (k,) reprojection errors of the matches, in the unit of the solution.
+        angles: (k,) angular errors of the matches, radians.
+        most: Largest possible number of matches.
+        threshold: Largest error of an inlier, in the unit of the solution.
+        residual: Scale of the residuals, radians.
+        covariance: Covariance of the first pose; None keeps that of the solution.
+    """
+    candidates = candidates_of(poses, counts)
+    return replace(
+        solution,
+        rotation=candidates[0].rotation,
+        translation=candidates[0].translation,
+        scale=candidates[0].scale,
+        matches=matches,
+        inlier_count=len(matches),
+        inlier_ratio=len(matches) / most,
+        inlier_threshold=threshold,
+        reprojection_error=float(errors.mean()) if len(matches) else math.nan,
+        reprojection_error_deg=float(np.degrees(angles).mean()) if len(matches) else math.nan,
+        covariance=solution.covariance if covariance is None else covariance,
+        candidates=candidates,
+        verdict=result.verdict,
+        reason_code=result.code,
+        log10_false_alarms=candidates[0].log10_false_alarms,
+        stats=replace(
+            solution.stats,
+            iterations=result.batches,
+            residual=residual,
+            converged=result.verdict == "confident",
+        ),
+    )
+
+
+def _largest(covariance: Array) -> float:
+    """Return the root of the largest eigenvalue; NaN if the covariance is not finite."""
+    known = np.isfinite(covariance).all()
+    return math.sqrt(float(np.linalg.eigvalsh(covariance)[-1])) if known else math.nan
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, Camera):
+        return camera_to_json(value)
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _read(kind: type, content: dict[str, Any]) -> Any:
+    """Build a dataclass from its JSON; fields in `LATER` and fields that default to None may be missing."""
+    missing = [field for field in fields(kind) if field.name not in content]
+    optional = [field.name for field in missing if field.default is None or field.name in LATER]
+    values = {field.name: content[field.name] for field in fields(kind) if field.name not in optional}
+    return kind(**{name: READERS[name](value) if name in READERS else value for name, value in values.items()})
+
+
+def _converted(content: dict[str, Any]) -> dict[str, Any]:
+    """Return the content of a file of format `MATCHES_ARE_IDS` with matches as indices and the names of parameters."""
+    matches, size = content["matches"], len(content.get("covariance", POSE_PARAMETERS))
+    if content.get("point_ids") is not None:
+        index = {point_id: j for j, point_id in enumerate(content["point_ids"])}
+        matches = [(i, index[point_id]) for i, point_id in matches]
+    pose = ROTATION_PARAMETERS if size in (3, 4) else POSE_PARAMETERS
+    other = FOCAL_LENGTH if content.get("camera") is not None else SCALE
+    return content | {"matches": matches, "parameters": (*pose, other)[:size]}
+
+
+def _array(values: Any, *, shape: tuple[int, ...]) -> Array:
+    return np.full(shape, math.nan) if values is None else np.array(values, np.float64).reshape(shape)
+
+
+def _float(value: float | None, *, missing: float = math.nan) -> float:
+    return missing if value is None else value
+
+
+LATER = {"covariance", "scale", "taken2d", "reason_code"}  # fields added after version 0.1.0
+READERS: dict[str, Callable[[Any], Any]] = {  # of the fields with another form in JSON
+    "rotation": partial(_array, shape=(3, 3)),
+    "translation": partial(_array, shape=(3,)),
+    "covariance": lambda values: np.array([[_float(x) for x in row] for row in values], np.float64),
+    "points2d": partial(_array, shape=(-1, 2)),
+    "points3d": partial(_array, shape=(-1, 3)),
+    "normals3d": lambda values: None if values is None else _array(values, shape=(-1, 3)),
+    "parameters": tuple,
+    "matches": lambda values: np.array(values, np.int64).reshape(-1, 2),
+    "camera": lambda value: None if value is None else camera_from(value),
+    "point_ids": lambda values: None if values is None else np.array(values, np.int64),
+    "log10_false_alarms": partial(_float, missing=math.inf),
+    **dict.fromkeys(("inlier_threshold", "reprojection_error", "reprojection_error_deg", "residual", "scale"), _float),
+    "candidates": lambda values: tuple(_read(Candidate, value) for value in values),
+    "stats": lambda value: _read(SolutionStats, value),
+}
+
+MOVED = {"solution_points": "solution_points", "solution_picture": "draw_solution"}  # now in bpnp.report.solutions
+
+
+def __getattr__(name: str) -> Any:
+    """Return a function that moved to `bpnp.report.solutions`, with a DeprecationWarning."""
+    if name not in MOVED:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from bpnp.report import solutions
+
+    successor = f"bpnp.report.solutions.{MOVED[name]}"
+    warnings.warn(f"`{__name__}.{name}` is now `{successor}`, and will be removed", DeprecationWarning, stacklevel=2)
+    return getattr(solutions, MOVED[name])

@@ -1,0 +1,179 @@
+"""Solutions of problems: by the search, or by a trained module."""
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, NamedTuple
+
+from bpnp.runtime import Clock, Deadline
+from bpnp.search.config import DEFAULT, SearchSettings
+from bpnp.search.enumeration.search import exceeds_enumeration
+from bpnp.search.verdict import reasons
+from bpnp.search.problem import Problem
+from bpnp.search.propose.mirror import mirrored_alarms
+from bpnp.search.schedule import Proposals
+from bpnp.search.search import search_poses
+from bpnp.search.starts import PosePrior
+from bpnp.search.arguments import Array
+from bpnp.search.matching import finished, without_pose
+from bpnp.search.solution import Solution
+
+if TYPE_CHECKING:
+    import torch
+
+Progress = Callable[[int, int, float], None]  # problem index, batches of initial poses so far, seconds
+TOGETHER = 2**26  # largest assignment matrix, 2D points x 3D points, of a batch on a GPU
+VIEW_MATCHER, SCENE_MATCHER = "matcher-maps", "matcher-sfm"  # packaged weights for the frames "view" and "any"
+MOST_CELLS = 2**22  # largest assignment matrix of a packaged matcher, 2D points x 3D points: seconds
+# Seconds, and seconds per 2D or 3D point, of verdict and matching after the search; at most half of a limit.
+ENDING, ENDING_A_POINT = 4e-3, 8e-6
+
+
+class Options(NamedTuple):
+    """Options for all problems; see `bpnp.solve`.
+
+    Attributes:
+        solver: Module that solves the problems; None for the search.
+        asks: Let an undecided search start from poses of the packaged matchers.
+        inlier_threshold: Largest reprojection error of a match; None for the default.
+        clutter: Expected outlier fraction; None if it is unknown.
+        seed: Seed of the search, default 0.
+        time_limit: Seconds per problem; None for no limit.
+        device: Device of the modules; None for that of each module.
+        progress: Callback with (problem index, batches of initial poses, seconds).
+        settings: Settings of the search.
+        until: Deadline for all problems together.
+    """
+
+    solver: "torch.nn.Module | None" = None
+    asks: bool = True
+    inlier_threshold: float | None = None
+    clutter: float | None = None
+    seed: int = 0
+    time_limit: float | None = None
+    device: "torch.device | None" = None
+    progress: Progress | None = None
+    settings: SearchSettings = DEFAULT
+    until: Deadline = Deadline()
+
+    def deadline(self, problem: Problem) -> Deadline:
+        """Return when the search of a problem that starts now has to stop, so that verdict and matching end in time."""
+        begun = Clock.now()
+        end = min(self.until.at, Deadline.after(self.time_limit).at)
+        ending = ENDING + ENDING_A_POINT * (len(problem.bearings) + len(problem.points3d))
+        return Deadline(max(end - ending, (begun + end) / 2))
+
+
+def solutions_of(problems: Mapping[int, Problem], options: Options) -> dict[int, Solution]:
+    """Return the solution of each problem, by the index of the problem."""
+    solutions: dict[int, Solution] = {}
+    solvable: dict[int, Problem] = {}
+    copies: dict[int, torch.nn.Module] = {}
+    for i, problem in problems.items():
+        if problem.degenerate is not None:
+            failed = without_pose(problem, problem.degenerate, options.inlier_threshold)
+            solutions[i] = replace(failed, reason_code="degenerate")
+            continue
+        net = problem.network
+        if net is not None or options.solver is not None:
+            from bpnp.search.propose.networks import evaluation_copy, view_for
+
+            for module in (options.solver, net):
+                if module is not None:
+                    view_for(module, problem)  # raises before anything is solved
+            if net is not None:
+                copies[id(net)] = copies.get(id(net)) or evaluation_copy(net, options.device)
+                problem = replace(problem, network=copies[id(net)])
+        solvable[i] = problem
+    if options.solver is not None and solvable:
+        return solutions | dict(_by_module(evaluation_copy(options.solver, options.device), solvable, options))
+    return solutions | {i: _by_search(i, problem, options) for i, problem in solvable.items()}
+
+
+def _by_search(i: int, problem: Problem, options: Options) -> Solution:
+    start, deadline = time.perf_counter(), options.deadline(problem)
+    radius = None if options.inlier_threshold is None else options.inlier_threshold / problem.per_radian
+    result = search_poses(
+        replace(problem, radius=radius),
+        around=None if problem.network is None else _pose_of_network(problem.network, problem, deadline),
+        clutter=options.clutter,
+        proposals=_proposals_of_matcher(problem, options.seed) if options.asks else None,
+        seed=options.seed,
+        deadline=deadline,
+        settings=options.settings,
+        progress=None if options.progress is None else partial(options.progress, i),
+    )
+    seconds = time.perf_counter() - start
+    if not len(result.candidates) and deadline.passed():
+        limit = options.time_limit or seconds
+        result = replace(result, reason=f"no pose was found in {limit:.3g} s; try a longer time limit")
+    elif result.verdict == "ambiguous" and not result.settled and deadline.passed():
+        result = replace(result, reason=reasons.undecided(result.reason, options.time_limit or seconds))
+    if result.verdict == "failed" and mirrored_alarms(problem, deadline) <= options.settings.evidence.false_alarms:
+        result = replace(result, reason=f"{result.reason}; {reasons.MIRRORED}")
+    return finished(problem, result, seconds, options.inlier_threshold)
+
+
+def _pose_of_network(net: "torch.nn.Module", problem: Problem, deadline: Deadline) -> PosePrior | None:
+    from bpnp.search.propose.networks import pose_prior
+
+    return pose_prior(net, problem, deadline)
+
+
+def _proposals_of_matcher(problem: Problem, seed: int) -> Proposals | None:
+    """Return a function that proposes poses of the packaged matcher for a problem; None if no matcher applies.
+
+    The matcher for views near a known pose applies with a `PosePrior`. The matcher for scenes in any axes applies
+    without a prior and with few enough points. Networks are imported only when the function is called, if the search is
+    undecided.
+    """
+    weights = VIEW_MATCHER if isinstance(problem.prior, PosePrior) else SCENE_MATCHER
+    too_many = len(problem.bearings) * len(problem.points3d) > MOST_CELLS
+    if weights == SCENE_MATCHER and (too_many or problem.prior is not None or problem.network is not None):
+        return None
+
+    def propose() -> tuple[Array, Array]:
+        from bpnp.search.propose.networks import packaged_matcher, proposed
+
+        return proposed(packaged_matcher(weights), problem, seed)
+
+    return propose
+
+
+def _by_module(
+    net: "torch.nn.Module", problems: Mapping[int, Problem], options: Options
+) -> Iterator[tuple[int, Solution]]:
+    """Yield the solutions of a module, by the index of the problem.
+
+    With a Matcher and too many points to enumerate, a search starts from poses sampled from its assignment. Otherwise
+    the poses of the module are the result. On a GPU the module gets problems of similar size together.
+    """
+    from bpnp.models.matcher import Matcher
+    from bpnp.search.propose.networks import device_of, predicted, proposed
+
+    groups: list[list[int]] = []
+    cells = {i: len(problem.bearings) * len(problem.points3d) for i, problem in problems.items()}
+    for i in sorted(problems, key=cells.__getitem__):
+        start, problem = time.perf_counter(), problems[i]
+        if isinstance(net, Matcher) and exceeds_enumeration(problem):
+            result = search_poses(
+                problem,
+                proposals=partial(proposed, net, problem, options.seed),
+                only_proposals=True,
+                clutter=options.clutter,
+                seed=options.seed,
+                deadline=options.deadline(problem),
+                settings=options.settings,
+            )
+            yield i, finished(problem, result, time.perf_counter() - start, options.inlier_threshold)
+        elif groups and device_of(net).type != "cpu" and cells[i] * (len(groups[-1]) + 1) <= TOGETHER:
+            groups[-1].append(i)
+        else:
+            groups.append([i])
+    for group in groups:
+        start, members = time.perf_counter(), [problems[i] for i in group]
+        results = predicted(net, members, options.deadline(members[-1]))
+        seconds = (time.perf_counter() - start) / len(group)
+        for i, result in zip(group, results, strict=True):
+            yield i, finished(problems[i], result, seconds, options.inlier_threshold)

@@ -1,0 +1,193 @@
+"""Competing explanations of the points with their margins, and the miss probability of a better pose.
+
+A competing explanation is another pose, the same pose at far larger residuals, another focal length, or other
+proportions of the scene. Competing poses of a repeated structure are proposed by `bpnp.search.propose.repetitions`
+and are judged like any other pose.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from bpnp.poses import turned_by
+from bpnp.search.config import Evidence
+from bpnp.search.verdict.false_alarms import directions_of, own_evidence
+from bpnp.search.verdict.reasons import Objection, objection
+from bpnp.search.verdict.uncertainty import Linearised, Misfit, systematic_misfit
+from bpnp.search.hypotheses import Hypotheses
+from bpnp.search.problem import Problem, label_groups
+
+SAME_ZOOM = 0.005  # relative change of the focal length that a reason omits
+Array = NDArray[np.float64]
+Seen = Sequence[tuple[Hypotheses, Problem]]
+
+
+def other_pose(candidates: Hypotheses, problem: Problem, rule: Evidence) -> Objection | None:
+    """Return the competing pose with the fewest false alarms, or None.
+
+    Args:
+        candidates: Poses, best first.
+        problem: Points of the problem.
+        rule: Constants of the verdict; a competing pose differs from the best one by more than `rule.same`.
+    """
+    same = problem.same_pose(candidates.rotation, candidates.translation, rule.same)
+    others = np.flatnonzero(~same)
+    if not len(others):
+        return None
+    k = int(others[np.argmin(candidates.log10_false_alarms[others])])
+    decades = float(candidates.log10_false_alarms[k] - candidates.log10_false_alarms[0])
+    return competing_pose(candidates.rotation[0], candidates.rotation[k], decades)
+
+
+def competing_pose(rotation: Array, other: Array, decades: float) -> Objection:
+    """Return a different pose as an objection.
+
+    Args:
+        rotation: (3, 3) of the best pose.
+        other: (3, 3) of the competing pose.
+        decades: log10 of the ratio of their false alarms.
+    """
+    return objection("competing_pose", decades, degrees=math.degrees(turned_by(rotation, other)))
+
+
+def rougher(candidates: Hypotheses) -> Objection | None:
+    """Return the best pose at far larger residuals, or None if the points agree better at its own scale.
+
+    If the rough alignment has fewer false alarms, the matches add nothing significant to it.
+    """
+    decades = float(candidates.log10_rough[0] - candidates.log10_false_alarms[0])
+    if decades >= 0:
+        return None
+    return objection("rough_residuals", decades)
+
+
+def misfit(linear: Linearised | None, count: float, rule: Evidence) -> Objection | None:
+    """Return another focal length or other proportions of the scene that fit significantly better, or None.
+
+    They compete only if the pose fitted with them is a different one (`rule.same`). If the points do not determine the
+    focal length, the given one is accepted.
+
+    Args:
+        linear: Pose from `linearised`, or None.
+        count: Number of matches.
+        rule: Constants of the verdict.
+    """
+    return of_misfit(systematic_misfit(linear, count, rule), rule)
+
+
+def of_misfit(off: Misfit, rule: Evidence) -> Objection | None:
+    """Return the objection of a misfit, or None if its pose is the same."""
+    limits = (rule.zoomed.bend_deg, rule.zoomed.bend_shift) if off.radial else (rule.same.degrees, rule.same.shift)
+    if math.degrees(off.turn) <= limits[0] and off.shift <= limits[1]:
+        return None
+    other = f"{off.zoom:.2f} times the focal length" if off.zoom != 1 else "other proportions of the scene"
+    if off.radial:
+        zoomed = f" and {off.zoom:.2f} times the focal length" if abs(off.zoom - 1) > SAME_ZOOM else ""
+        other = f"a radial distortion of {off.radial:.2g}{zoomed}"
+    return objection("other_camera", camera=other, degrees=math.degrees(off.turn), percent=100 * off.shift)
+
+
+def contesting(seen: Seen, rule: Evidence) -> Objection | None:
+    """Return a far candidate over which the lead of the first one is not significant, or None.
+
+    The number of false alarms assumes independent image points. Points on lines or curves are dependent: a pose that
+    aligns one line with another explains all its points. A pose may then explain more points than another one by
+    chance. Let d_i be the evidence of image point i for the one pose less that for the other. If either sign of each
+    d_i is equally likely (Hoeffding 1963),
+
+        P(sum_i d_i >= z sqrt(sum_i d_i^2)) <= exp(-z^2 / 2).
+
+    If even equal signs of all d_i would not reach the required lead, the points are too few for this test.
+
+    A pose is compared by its false alarms alone if half of its correspondences coincide with those of the first pose.
+    It is then that pose, its mirror image, or a repetition of it. The exception is a pose that explains other points as
+    well, at least half as many as it leaves unexplained: both poses then slide along a curve.
+
+    Args:
+        seen: Candidates, best first, and points of each camera of a rig; cameras with too few points are left out.
+        rule: Constants of the verdict.
+
+    Source: W. Hoeffding, Probability inequalities for sums of bounded random variables, JASA 1963.
+    """
+    limits, least = rule.contested, 2 * math.log(10) * rule.lead
+    seen = [(candidates, problem) for candidates, problem in seen if len(problem.image.chosen) >= least]
+    if not seen:
+        return None
+    candidates, problem = seen[0]
+    poses, chosen = (candidates.rotation, candidates.translation), sum(len(each.image.chosen) for _, each in seen)
+    others = np.flatnonzero(~problem.same_pose(*poses, rule.same.times(limits.far)))
+    # A lead that is significant even with the largest possible gaps needs no test.
+    decisive = limits.most * math.sqrt(least * chosen) / math.log(10)
+    others = others[candidates.log10_false_alarms[others] - candidates.log10_false_alarms[0] < decisive]
+    if not len(others):
+        return None
+    scales = np.maximum(candidates.scale, problem.image.scales[0])
+    best, first = _explained(seen, 0, scales[0], limits.near)
+    for k in others.tolist():
+        evidence, other = _explained(seen, k, scales[k], limits.near)
+        gap = best - evidence
+        squared = float((gap**2).sum())
+        if float(np.abs(gap).sum()) ** 2 < least * squared:
+            continue
+        reach = limits.near * max(scales[0], scales[k]) * np.linalg.norm(first.places, axis=-1)
+        same = (first.points == other.points) | (np.linalg.norm(first.places - other.places, axis=-1) < reach)
+        alone, others_alone = int((first.near & ~other.near).sum()), int((other.near & ~first.near).sum())
+        apart = others_alone >= limits.alone * alone and alone + others_alone >= least
+        decades = max(float(gap.sum()), 0.0) ** 2 / max(squared, 1e-300) / (2 * math.log(10))
+        if decades < rule.lead and (apart or (same & first.near & other.near).sum() < limits.same * other.near.sum()):
+            degrees = math.degrees(turned_by(candidates.rotation[0], candidates.rotation[k]))
+            return objection("other_points", decades, degrees=degrees)
+    return None
+
+
+class _Partners(NamedTuple):
+    """Nearest scene points of k image points under a pose.
+
+    Attributes:
+        points: (k,) indices of the scene points, -1 if none is near.
+        places: (k, 3) these points in the camera's frame.
+        near: (k,) True if the point is near enough to be the correspondence.
+    """
+
+    points: NDArray[np.int64]
+    places: Array
+    near: NDArray[np.bool_]
+
+
+def _explained(seen: Seen, k: int, scale: float, near: float) -> tuple[Array, _Partners]:
+    """Return the evidence of the image points of all cameras for candidate k, and their correspondences.
+
+    Args:
+        seen: Candidates and points of each camera.
+        k: Index of the candidate.
+        scale: Scale of the residuals, radians.
+        near: Reach of a correspondence, in scales.
+    """
+    poses = [(problem, candidates.rotation[k], candidates.translation[k], scale) for candidates, problem in seen]
+    parts = zip(*(_partners(near, *pose) for pose in poses), strict=True)
+    return np.concatenate([own_evidence(*pose) for pose in poses]), _Partners(*map(np.concatenate, parts))
+
+
+def _partners(near: float, problem: Problem, rotation: Array, translation: Array, scale: float) -> _Partners:
+    seen, chosen = directions_of(problem, rotation, translation), problem.image.chosen
+    chord, points = np.full(len(chosen), np.inf), np.full(len(chosen), -1)
+    if problem.labelled_pairs is not None:
+        i, j = problem.labelled_pairs
+        distance = np.linalg.norm(problem.bearings[chosen[i]] - seen[j], axis=-1)
+        distance = np.where(distance < near * scale, distance, np.inf)  # infinite for unseen points too
+        order = np.lexsort((distance, i))
+        rows, first = np.unique(i[order], return_index=True)
+        chord[rows] = distance[order][first]
+        points[rows] = np.where(np.isfinite(chord[rows]), j[order][first], -1)
+        return _Partners(points, problem.points3d[points] @ rotation.T + translation, np.isfinite(chord))
+    for rows, columns in label_groups(chosen, problem.labels2d, problem.labels3d, len(seen)):
+        ahead = columns[np.isfinite(seen[columns, 0])]
+        if len(ahead):
+            bearings = problem.bearings[chosen[rows]]
+            chord[rows], nearest = cKDTree(seen[ahead]).query(bearings, distance_upper_bound=near * scale)
+            points[rows] = np.r_[ahead, -1][nearest]
+    return _Partners(points, problem.points3d[points] @ rotation.T + translation, np.isfinite(chord))

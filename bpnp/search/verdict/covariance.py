@@ -1,0 +1,138 @@
+"""Covariance of parameters fitted to matches: a rotation, a pose, a focal length or a rig.
+
+The matches may be certain or only probable. All functions are pure functions of arrays. The matches are
+linearised about the estimate, in standard deviations of their residuals.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.special import stdtrit
+
+Array = NDArray[np.float64]
+Labels = NDArray[np.int64]
+SLIGHT = 0.01  # fraction of the information; image points below it hardly move the estimate
+FIXED = 1e-9  # smallest eigenvalue of the normalised information if the points fix the estimate
+ONE_SIGMA = 0.8413447460685429  # probability of a normal variable below one standard deviation
+
+
+class Linearisation(NamedTuple):
+    """k possible matches, linearised in p fitted parameters.
+
+    Attributes:
+        residual: (k, d) of each match, in standard deviations.
+        jacobian: (k, d, p) derivative of the predicted image point, in the same unit.
+        probability: (k,) of the match.
+        point: (k,) index of its image point.
+        weight: (g,) number of image points that each image point stands for.
+        known: (p, p) information from elsewhere, such as a prior.
+    """
+
+    residual: Array
+    jacobian: Array
+    probability: Array
+    point: Labels
+    weight: Array
+    known: Array
+
+
+def join(parts: list[Linearisation]) -> Linearisation:
+    """Concatenate the matches of independent cameras and add up their `known`."""
+    first = np.cumsum([0, *(len(part.weight) for part in parts[:-1])])
+    return Linearisation(
+        np.concatenate([part.residual for part in parts]),
+        np.concatenate([part.jacobian for part in parts]),
+        np.concatenate([part.probability for part in parts]),
+        np.concatenate([part.point + start for part, start in zip(parts, first, strict=True)]),
+        np.concatenate([part.weight for part in parts]),
+        np.sum([part.known for part in parts], 0),
+    )
+
+
+def of_sure_matches(residual: Array, jacobian: Array) -> Linearisation:
+    """Return the linearisation of k certain matches, one per image point.
+
+    Args:
+        residual: (k, d), in standard deviations.
+        jacobian: (k, d, p), in the same unit.
+    """
+    count, size = len(residual), jacobian.shape[-1]
+    return Linearisation(residual, jacobian, np.ones(count), np.arange(count), np.ones(count), np.zeros((size, size)))
+
+
+def covariance_of(
+    matches: Linearisation, *, fitted: int, blocks: Labels | None = None, considered: Array | None = None
+) -> Array | None:
+    """Compute the covariance of the fitted parameters.
+
+    It is the larger of two matrices along each of their common axes. One is the inverse of the observed information H,
+    which excludes the information lost to uncertain matches (Louis). The other is the jackknife
+
+        sum_i d_i d_i^T,  d_i = (H - H_i)^-1 g_i,
+
+    with g_i the gradient and H_i the information of image point i. d_i is the step to the optimum without it. See
+    `bpnp.search.verdict.uncertainty.local_covariance`.
+
+    Args:
+        matches: Linearised about the optimum.
+        fitted: Number of parameters that the matches have to fix. The jackknife leaves a point out only if they stay
+            overdetermined without it.
+        blocks: (g,) block of each image point; the jackknife leaves out one block at a time. None: one point.
+        considered: (k, d, c) derivative of the predicted image points by parameters that are not fitted, times their
+            standard deviations. With S = H^-1 sum_k p_k J_k^T J_c,k, S S^T is added.
+
+    Returns:
+        (p, p), or None where the information is not positive definite.
+
+    Examples:
+        >>> rng = np.random.default_rng(0)
+        >>> jacobian = rng.normal(size=(400, 1, 2))
+        >>> covariance = covariance_of(of_sure_matches(rng.normal(size=(400, 1)), jacobian), fitted=2)
+        >>> bool(np.allclose(400 * covariance, np.eye(2), atol=0.3))
+        True
+    """
+    score = np.einsum("kab,ka->kb", matches.jacobian, matches.residual)
+    count, size = score.shape
+    of_point = csr_array((matches.probability, (matches.point, np.arange(count))), (len(matches.weight), count))
+    expected = of_point @ score
+    each = matches.jacobian.transpose(0, 2, 1) @ matches.jacobian - score[:, :, None] * score[:, None]
+    own = (of_point @ each.reshape(count, -1)).reshape(-1, size, size) + expected[:, :, None] * expected[:, None]
+    weight = matches.weight
+    observed = np.tensordot(weight, own, 1) + matches.known
+    if blocks is not None:
+        _, block = np.unique(blocks, return_inverse=True)
+        of_block = csr_array((np.ones(len(block)), (block, np.arange(len(block)))))
+        expected, own = of_block @ expected, (of_block @ own.reshape(-1, size * size)).reshape(-1, size, size)
+        weight = np.bincount(block, weight) / np.bincount(block)
+    counted = matches.probability * matches.weight[matches.point]
+    complete = np.einsum("k,kab,kab->b", counted, matches.jacobian, matches.jacobian)
+    # The complete information has a unit diagonal in these units, so that the rank can be determined.
+    unit = 1 / np.sqrt(np.maximum(complete + np.diag(matches.known), 1e-300))
+    values, vectors = np.linalg.eigh(observed * np.outer(unit, unit))
+    if values[0] <= FIXED:
+        return None
+    root = unit[:, None] * vectors / np.sqrt(values)
+    steps = expected @ root
+    matters = np.flatnonzero(own.reshape(-1, size * size) @ (root @ root.T).ravel() > SLIGHT)
+    if 2 * (round(float(counted.sum())) - 1) <= fitted:
+        matters = matters[:0]  # without one of these matches, the others fix several estimates or none
+    without = np.eye(size) - root.T @ own[matters] @ root
+    fixed = np.linalg.eigvalsh(without)[:, 0] > FIXED  # the estimate is fixed without the point too
+    steps[matters[fixed]] = np.linalg.solve(without[fixed], steps[matters[fixed], :, None])[..., 0]
+    ratio, axes = np.linalg.eigh((weight[:, None] * steps).T @ steps + root.T @ matches.known @ root)
+    along = root @ axes
+    covariance = np.asarray(along * np.maximum(ratio, 1.0) @ along.T)
+    if considered is None:
+        return covariance
+    moved = root @ root.T @ np.einsum("k,kia,kib->ab", counted, matches.jacobian, considered)
+    return np.asarray(covariance + moved @ moved.T)
+
+
+def student_factor(free: float | int) -> float:
+    """Return the factor that widens a covariance whose scale was estimated from few residuals.
+
+    It is the square of the one-sigma quantile of Student's t with `free` degrees of freedom.
+    """
+    return float(stdtrit(free, ONE_SIGMA)) ** 2

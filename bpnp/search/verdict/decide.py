@@ -1,0 +1,302 @@
+"""Verdict on the best pose of a search.
+
+The criterion is the number of false alarms (NFA, `bpnp.search.verdict.false_alarms`): the expected number of poses
+that fit as well if image and scene are unrelated.
+
+- "confident": log10 NFA is at most `Evidence.false_alarms`. The margin to every competing pose is at least
+  `Evidence.lead` decades. log10 of the probability that the search missed a better optimum is at most
+  `Evidence.missed` (`bpnp.search.verdict.completeness`).
+- "ambiguous": The best pose is significant, but one of the three conditions does not hold. Points that do not fix the
+  rotation or the focal length give this verdict too.
+- "failed": No pose was found, or none is significant.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bpnp.search.config import DEFAULT, Evidence
+from bpnp.search.verdict import reasons
+from bpnp.search.verdict.competitors import Seen, contesting, misfit, other_pose, rougher
+from bpnp.search.verdict.completeness import log10_missed
+from bpnp.search.verdict.false_alarms import alarms_of
+from bpnp.search.verdict.reasons import CLAUSES, CONFIDENT, Objection, objection
+from bpnp.search.propose.repetitions import registered
+from bpnp.search.verdict.uncertainty import focal_bound, is_redundant, linearised, rotation_bound
+from bpnp.search.hypotheses import Hypotheses
+from bpnp.search.problem import Problem
+from bpnp.search.propose.symmetries import Motions
+
+Verdict = Literal["confident", "ambiguous", "failed"]
+HALF_TURN = 180.0  # degrees; a larger bound does not constrain a rotation
+REFINED = math.inf  # number of local searches that the exact refinement of an enumeration replaces
+
+
+@dataclass(frozen=True, eq=False)
+class SearchResult:
+    """Result of the search for the pose of one problem.
+
+    Attributes:
+        candidates: Distinct poses in the frame of the problem, float64, best first.
+        verdict: Confident, ambiguous or failed, as defined at the head of this file.
+        reason: Reason of the verdict, a plain sentence.
+        batches: Number of iterations of the search.
+        code: Kind of the reason, "confident" or a key of `bpnp.search.verdict.reasons.CLAUSES`.
+        settled: True if more search would not change the verdict. A better optimum is then excluded without the
+            evidence of the matches.
+    """
+
+    candidates: Hypotheses
+    verdict: Verdict
+    reason: str
+    batches: int
+    code: str
+    settled: bool = False
+
+    def doubt(self, one: Objection) -> "SearchResult":
+        """Return a copy that is ambiguous for a reason."""
+        reason = one.sentence(self.log10_false_alarms)
+        return replace(self, verdict="ambiguous", reason=reason, code=one.code)
+
+    @property
+    def best(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Rotation (3, 3) and translation (3,) of the best pose; NaN if there is none."""
+        if not len(self.candidates):
+            return np.full((3, 3), math.nan), np.full(3, math.nan)
+        return self.candidates.rotation[0], self.candidates.translation[0]
+
+    @property
+    def residual(self) -> float:
+        """Scale of the residuals of the best pose, radians; infinite if there is none."""
+        return float(self.candidates.scale[0]) if len(self.candidates) else math.inf
+
+    @property
+    def log10_false_alarms(self) -> float:
+        """log10 NFA of the best pose; infinite if there is none."""
+        return float(self.candidates.log10_false_alarms[0]) if len(self.candidates) else math.inf
+
+
+def with_false_alarms(candidates: Hypotheses, problem: Problem) -> Hypotheses:
+    """Compute the NFA of the candidates that lack it.
+
+    Args:
+        candidates: Poses in the frame of the problem.
+        problem: Points of the problem.
+
+    Returns:
+        Candidates in the same order.
+    """
+    alarms, rough = candidates.log10_false_alarms.copy(), candidates.log10_rough.copy()
+    new = np.isnan(alarms)
+    if not new.any():
+        return candidates
+    unknown = candidates[new]
+    alarms[new], rough[new] = alarms_of(problem, unknown.rotation, unknown.translation, unknown.scale)
+    return replace(candidates, log10_false_alarms=alarms, log10_rough=rough)
+
+
+def weighed(candidates: Hypotheses, problem: Problem, rule: Evidence = DEFAULT.evidence) -> Hypotheses:
+    """Compute the NFA of the candidates and move the best one to the front.
+
+    The best is the first one in the order of the search whose log10 NFA is within `Evidence.lead` of the smallest. The
+    order of the search is that of the likelihood. It decides among poses that the NFA cannot separate.
+
+    Args:
+        candidates: Poses in the frame of the problem, best first.
+        problem: Points of the problem.
+        rule: Constants of the verdict.
+
+    Returns:
+        Candidates with their NFA; the others keep their order.
+    """
+    if not len(candidates):
+        return candidates
+    candidates = with_false_alarms(candidates, problem)
+    alarms = candidates.log10_false_alarms
+    first = int(np.flatnonzero(alarms <= alarms.min() + rule.lead)[0])
+    order = np.r_[first, np.delete(np.arange(len(alarms)), first)]
+    return candidates[order]
+
+
+def match_count(candidates: Hypotheses, problem: Problem) -> float:
+    """Return the expected number of matches of the best pose."""
+    return float(candidates.match_count[0])
+
+
+def missed(
+    candidates: Hypotheses, problem: Problem, looks: float | int, rule: Evidence, *, independent: bool = True
+) -> float:
+    """Return log10 of the probability that the search missed a better optimum.
+
+    Args:
+        candidates: Poses in the frame of the problem with their NFA, best first.
+        problem: Points of the problem.
+        looks: Number of local searches around the first candidate that found nothing better. `REFINED` for an
+            enumeration, whose exact refinement leaves no better pose nearby.
+        rule: Constants of the verdict.
+        independent: False to leave out the evidence of the matches.
+
+    Returns:
+        The logarithm; 0 if the first candidate is not significant. If a motion maps the matched points onto others,
+        matches of a wrong pose are not independent coincidences. Only basin counts reduce the value then.
+    """
+    alarms = float(candidates.log10_false_alarms[0]) if len(candidates) else math.inf
+    if alarms > 0:
+        return 0.0
+    decades = -alarms / max(match_count(candidates, problem), 1.0) if independent else 0.0
+    value = log10_missed(starts_met(candidates, problem, rule), decades, looks, rule)
+    if value > rule.missed or not is_symmetric(candidates, problem, rule):
+        return value
+    basin_count, share = starts_met(candidates, problem, rule, symmetric=True), 0.0
+    if problem.prior is not None:  # the prior reduces the probability of a better pose elsewhere
+        share = problem.log10_share(candidates.rotation[0], candidates.translation[0])
+    return min(log10_missed(basin_count, 0.0, looks, rule, symmetric=True) + share, 0.0)
+
+
+def motions_of(candidates: Hypotheses, problem: Problem, rule: Evidence) -> Motions:
+    """Return the motions that map the matched points of the first candidate onto other scene points.
+
+    The result is stored in `Problem.registered` and reused for equal poses.
+    """
+    pose = candidates.rotation[:1], candidates.translation[:1]
+    for rotation, translation, motions in problem.registered:
+        poses = np.concatenate([pose[0], rotation[None]]), np.vstack([pose[1], translation])
+        if problem.same_pose(*poses, rule.same)[1]:
+            return motions
+    scale = max(float(candidates.scale[0]), float(problem.image.scales[0]))
+    motions = registered(problem, pose[0][0], pose[1][0], scale, rule)
+    problem.registered.append((pose[0][0], pose[1][0], motions))
+    return motions
+
+
+def is_symmetric(candidates: Hypotheses, problem: Problem, rule: Evidence) -> bool:
+    """Return True if a motion maps a large part of the matched points onto other scene points.
+
+    The motion could by itself explain a better pose. The fraction is compared with `Evidence.repetitions`.
+    """
+    return float(motions_of(candidates, problem, rule).fraction.max(initial=0)) >= rule.repetitions.symmetric
+
+
+def starts_met(candidates: Hypotheses, problem: Problem, rule: Evidence, *, symmetric: bool = False) -> int:
+    """Return the basin count of the first candidate and of all poses equal to it.
+
+    Args:
+        candidates: Poses in the frame of the problem, best first.
+        problem: Points of the problem.
+        rule: Constants of the verdict.
+        symmetric: Also count the poses that the motions of the scene confuse with the first one. Each is compared with
+            it separately; a better pose elsewhere has the same number of copies.
+    """
+    first = candidates.rotation[:1], candidates.translation[:1]
+    if symmetric:
+        copies = motions_of(candidates, problem, rule).competitors(first[0][0], first[1][0])
+        first = np.concatenate([first[0], copies[0]]), np.concatenate([first[1], copies[1]])
+    counted = np.zeros(len(candidates), bool)
+    for rotation, translation in zip(*first, strict=True):
+        poses = np.concatenate([rotation[None], candidates.rotation]), np.vstack([translation, candidates.translation])
+        counted |= problem.same_pose(*poses, rule.same)[1:]
+    return int(candidates.basin_count[counted].sum())
+
+
+def judged(
+    candidates: Hypotheses,
+    problem: Problem,
+    *,
+    batches: int,
+    looks: float | int = 0,
+    exhaustive: bool = False,
+    rule: Evidence = DEFAULT.evidence,
+    rig: Seen = (),
+) -> SearchResult:
+    """Compute the verdict on the candidates.
+
+    Args:
+        candidates: Poses in the frame of the problem, best first.
+        problem: Points of the problem.
+        batches: Number of iterations of the search.
+        looks: Number of local searches around the best pose that found nothing better.
+        exhaustive: True if every pose that fits some points was examined; the miss probability is then 0.
+        rule: Constants of the verdict.
+        rig: Candidates, best first, and points of every camera of a rig; empty for a single camera.
+
+    Returns:
+        Candidates, best first, with the verdict and its reason.
+    """
+    if not len(candidates):
+        return no_pose(batches=batches, settled=exhaustive)
+    candidates = weighed(candidates, problem, rule)
+    alarms = float(candidates.log10_false_alarms[0])
+    settled = exhaustive or missed(candidates, problem, looks, rule, independent=False) <= rule.missed
+    if alarms > 0:
+        one = objection("chance", what="no pose fits")
+        return SearchResult(candidates, "failed", one.sentence(alarms), batches, one.code, settled)
+    result = SearchResult(candidates, "confident", "", batches, CONFIDENT, settled)
+    unseen = -math.inf if exhaustive else missed(candidates, problem, looks, rule)
+    # Costly tests run only if the verdict depends on them.
+    seen = rig or [(candidates, problem)]
+    against = [*(other_pose(*each, rule) for each in seen), rougher(candidates)]
+    certain = alarms <= rule.false_alarms and unseen <= rule.missed
+    off = share = math.nan
+    if certain and all(one is None or one.margin >= rule.lead for one in against):
+        count = match_count(candidates, problem)
+        linear = linearised(problem, candidates.rotation[0], candidates.translation[0], float(candidates.scale[0]))
+        off = math.degrees(rotation_bound(problem, linear, count))
+        if off >= HALF_TURN or not (rig or is_redundant(problem, count)):
+            return result.doubt(objection("rotation_not_fixed", count=count, what="the rotation"))
+        share = 0.0 if problem.focal is None else focal_bound(problem, linear, count)
+        if share > (rule.focal_few if is_object(problem, rule) else rule.focal):
+            off_by = f"{100 * share:.0f} % off" if share < 10 else "anything"
+            return result.doubt(objection("focal_length_not_fixed", off=off_by))
+        against += [misfit(linear, count, rule), contesting(seen, rule)]
+    doubts = [one for one in against if one is not None and one.margin < rule.lead]
+    if certain and not doubts:
+        return replace(result, reason=reasons.confident(alarms, rule.lead, off, share), settled=True)
+    if doubts:
+        return result.doubt(min(doubts))
+    if alarms > rule.false_alarms:
+        reason = reasons.insignificant(alarms, rule.false_alarms)
+        return replace(result, verdict="ambiguous", reason=reason, code="insignificant")
+    return result.doubt(objection("incomplete", what="pose", probability=reasons.miss_probability(unseen)))
+
+
+def is_object(problem: Problem, rule: Evidence) -> bool:
+    """Return True if the scene points are those of an object.
+
+    An object has few points, and they have no viewing cones, unlike those of a map.
+    """
+    return problem.cosines3d is None and len(problem.points3d) <= rule.repetitions.whole
+
+
+def is_certain(candidates: Hypotheses, problem: Problem, rule: Evidence = DEFAULT.evidence) -> bool:
+    """Return True if the first candidate of an enumeration passes the cheap tests of the verdict.
+
+    The tests are the NFA, the margin to the best different pose, rough residuals and the miss probability.
+    """
+    if not len(candidates) or float(candidates.log10_false_alarms[0]) > rule.false_alarms:
+        return False
+    other = other_pose(candidates, problem, rule)
+    if (other is not None and other.margin < rule.lead) or rougher(candidates) is not None:
+        return False
+    return missed(candidates, problem, REFINED, rule) <= rule.missed
+
+
+def no_pose(
+    reason: str = CLAUSES["no_pose"], batches: int = 0, *, code: str = "no_pose", settled: bool = False
+) -> SearchResult:
+    """Return a failed result without candidates.
+
+    Args:
+        reason: Reason, a sentence.
+        batches: Number of iterations of the search.
+        code: Kind of the reason, a key of `CLAUSES`.
+        settled: True if more search would not find a pose. Default False.
+    """
+    return SearchResult(Hypotheses.empty(), "failed", reason, batches, code, settled)
+
+
+def degenerate_points(why: str) -> SearchResult:
+    """Return a failed result for points that fix no pose."""
+    return no_pose(objection("degenerate", why=why).clause, code="degenerate", settled=True)

@@ -1,0 +1,438 @@
+"""Uncertainty of a pose: its covariance, and 99.9 % bounds of its rotation and focal length.
+
+Also tests for systematic residuals, which another focal length or other proportions of the scene would explain.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import fdtrc, fdtri
+
+from bpnp.search.config import DEFAULT, Evidence
+from bpnp.search.verdict.covariance import Linearisation, covariance_of, student_factor
+from bpnp.search.pose_model import PoseModel, PoseState, Sight, centre_columns, crossed, lens_columns
+from bpnp.search.problem import Problem
+from bpnp.search.refine.gauss_newton import soft_matches
+
+Array = NDArray[np.float64]
+Labels = NDArray[np.int64]
+MANY = 1e9  # degrees of freedom of a number that does not vary
+EXCEEDED = 1e-3  # probability that an error exceeds its bound, and significance level of a test
+
+# Basis of the strains that preserve the volume; the sixth is the unit of length, which no image shows.
+STRAINS = np.array(
+    [
+        [[1, 0, 0], [0, -1, 0], [0, 0, 0]],
+        [[1, 0, 0], [0, 1, 0], [0, 0, -2]],
+        [[0, 1, 0], [1, 0, 0], [0, 0, 0]],
+        [[0, 0, 1], [0, 0, 0], [1, 0, 0]],
+        [[0, 0, 0], [0, 0, 1], [0, 1, 0]],
+    ],
+    np.float64,
+)
+POSE = 6  # parameters of a pose
+BLOCKS = 4  # number of blocks of image points along each axis of the image
+
+
+def rotation_bound(problem: Problem, linear: "Linearised | None", count: float) -> float:
+    """Return the 99.9 % bound of the rotation error, radians; see `exceeded_once`.
+
+    Args:
+        problem: Points of the problem.
+        linear: Pose from `linearised` with the standard deviation of the residuals; None gives an infinite bound.
+        count: Number of matches that the standard deviation was estimated from.
+
+    >>> import numpy as np
+    >>> rng = np.random.default_rng(0)
+    >>> points = rng.uniform(-1, 1, (12, 3))
+    >>> seen = points + [0, 0, 6]
+    >>> problem = Problem(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
+    >>> linear = linearised(problem, np.eye(3), np.array([0.0, 0, 6]), 1e-3)
+    >>> bounds = [rotation_bound(problem, linear, count) for count in (4.0, 12.0)]
+    >>> [round(math.degrees(bound), 1) for bound in bounds]
+    [7.8, 0.7]
+    """
+    covariance = local_covariance(linear)
+    return math.inf if covariance is None else exceeded_once(covariance[:3, :3], 2 * count - problem.fitted)
+
+
+def is_redundant(problem: Problem, count: float) -> bool:
+    """Return whether a pose stays overdetermined without one of its matches.
+
+    Args:
+        problem: Points of the problem; `problem.fitted` is the number of unknowns.
+        count: Expected number of matches. Each one gives two equations.
+
+    >>> problem = Problem(np.eye(3), np.eye(3))
+    >>> [is_redundant(problem, count) for count in (4.0, 4.9)]
+    [False, True]
+    """
+    return 2 * (round(count) - 1) > problem.fitted
+
+
+def focal_bound(problem: Problem, linear: "Linearised | None", count: float) -> float:
+    """Return the 99.9 % bound of the focal length, as a fraction; arguments as for `rotation_bound`."""
+    covariance = local_covariance(linear)
+    return math.inf if covariance is None else share_bound(covariance[POSE:, POSE:], 2 * count - problem.fitted)
+
+
+def share_bound(covariance: Array, free: float) -> float:
+    """Return the 99.9 % bound of the relative error of a positive number.
+
+    Args:
+        covariance: (1, 1) variance of the logarithm of the number.
+        free: Degrees of freedom with which the scale of the residuals was estimated.
+
+    Returns:
+        Bound as a fraction; infinite if the number is not determined.
+    """
+    with np.errstate(over="ignore"):
+        return float(np.expm1(exceeded_once(covariance, free)))
+
+
+def exceeded_once(covariance: Array, free: float) -> float:
+    """Return the length that a vector of this covariance exceeds once in a thousand.
+
+    Args:
+        covariance: (3, 3), or (1, 1) for a number.
+        free: Degrees of freedom with which the scale of the residuals was estimated; infinite length if none.
+
+    The square of its length has the cumulants tr C, 2 tr C^2 and 8 tr C^3. The variable a + (b / d) x has the same:
+    x is chi-squared with d = (tr C^2)^3 / (tr C^3)^2 degrees of freedom, b^2 = d tr C^2 and a = tr C - b (Buckley and
+    Eagleson 1988). A single loose axis gives d = 1, equal ones d = 3. As the scale of the residuals was estimated with
+    `free` degrees of freedom, the bound of the square is a and b times the quantiles of F with them.
+
+    Source: M. J. Buckley, G. K. Eagleson, An approximation to the distribution of quadratic forms in normal random
+    variables, Australian J. Statistics 1988.
+    """
+    if free <= 0:
+        return math.inf
+    total = float(np.trace(covariance))
+    squared, cubed = (float(np.trace(np.linalg.matrix_power(covariance / total, k))) for k in (2, 3))
+    d = squared * (squared / cubed) ** 2
+    b = math.sqrt(d * squared)
+    quantiles = fdtri(np.array([MANY, d]), free, 1 - EXCEEDED)
+    return math.sqrt(total * float(max(1 - b, 0.0) * quantiles[0] + b * quantiles[1]))
+
+
+def is_within(error: Array, covariance: Array, free: float | int) -> bool:
+    """Return whether an error lies in the 99.9 % region of a covariance.
+
+    Args:
+        error: (d,) error of some of the fitted parameters.
+        covariance: (d, d) of `pose_covariance`, widened for few residuals. The widening is undone: F allows for it.
+        free: Degrees of freedom with which the scale of the residuals was estimated.
+
+    >>> is_within(np.array([3.0]), np.eye(1), MANY), is_within(np.array([3.4]), np.eye(1), MANY)
+    (True, False)
+    """
+    if not np.isfinite(covariance).all():
+        return False
+    free, size = max(float(free), 1.0), len(error)
+    squared = float(error @ np.linalg.pinv(covariance, hermitian=True) @ error) * student_factor(free)
+    return bool(squared < size * fdtri(size, free, 1 - EXCEEDED))
+
+
+def pose_covariance(problem: Problem, linear: "Linearised | None", count: float) -> Array | None:
+    """Return the covariance of a pose in the user's coordinates.
+
+    It is the covariance of (w, v). The true pose is R' = exp([w]x) R, t' = t + v, with w in radians in the camera's
+    axes and v in the user's unit. It is `local_covariance`, widened by `student_factor` because the scale is estimated.
+
+    Args:
+        problem: Points of the problem.
+        linear: Pose from `linearised`, or None.
+        count: Number of matches that the scale of the residuals was estimated from.
+
+    Returns:
+        (6, 6), or (7, 7) with the logarithm of a fitted focal length; None if the points do not fix the pose.
+    """
+    covariance = local_covariance(linear)
+    if covariance is None or linear is None:
+        return None
+    free = max(2 * count - problem.fitted, 1.0)
+    moved = np.eye(len(covariance))  # from the shift s of the centroid to that of the origin: v = s + (R m) x w
+    moved[3:POSE, 3:POSE] *= problem.size
+    moved[3:POSE, :3] = crossed(linear.state.rotation @ problem.middle_of_user)
+    return np.asarray(student_factor(free) * moved @ covariance @ moved.T)
+
+
+def centre_covariance(covariance: Array, translation: Array, scale: float | None = None) -> Array:
+    """Return the covariance (3, 3) of the camera centre in the camera's axes: of v + t x w for a pose's (w, v).
+
+    Args:
+        covariance: Covariance of the pose; parameters beyond those used here are ignored.
+        translation: (3,) of the point about which the pose rotates: t for the scene's origin.
+        scale: Scale of a centre -R^T t / scale; `covariance` has its error as the seventh parameter. None: no scale.
+    """
+    moved = np.concatenate([crossed(translation), np.eye(3)], 1)
+    if scale is not None:
+        moved = np.column_stack([moved, -translation / scale]) / scale
+    known = covariance[: moved.shape[1], : moved.shape[1]]
+    return np.asarray(moved @ known @ moved.T)
+
+
+def local_covariance(linear: "Linearised | None") -> Array | None:
+    """Return the covariance of the rotation w and the shift of the scene centroid, for noise of `linear.scale`.
+
+    Image point i corresponds to scene point j with the probability p_ij. J_ij is the derivative of the direction u_j
+    by the rotation and the shift. With the scores g_ij = J_ij^T (f_i - u_j) / s^2 and g_i = sum_j p_ij g_ij, the
+    observed information is (Louis 1982)
+
+        H = sum_ij p_ij (J_ij^T J_ij / s^2 - g_ij g_ij^T) + sum_i g_i g_i^T + that of the prior:
+
+    where scene points lie as close as the residuals, the information lost to uncertain correspondences is subtracted.
+    A prior of the pose counts as a further measurement. The jackknife
+
+        sum_i d_i d_i^T,  d_i = (H - H_i)^-1 g_i,  H_i the part of image point i in H,
+
+    allows for residuals that deviate from the model, and for false correspondences: d_i is the step to the optimum
+    without image point i. Let H^-1 = L L^T. The larger of both matrices is taken along each of the common axes, the
+    eigenvectors of L^-1 (sum_i d_i d_i^T) L^-T.
+
+    H is not positive definite if image points between two correspondences outweigh the others. Half the variance s^2
+    is then used, at which fewer points have two, and the result is doubled.
+
+    Sources: T. A. Louis, Finding the observed information matrix when using the EM algorithm, J. R. Stat. Soc. B 1982;
+    J. G. MacKinnon, H. White, Some heteroskedasticity-consistent covariance matrix estimators with improved finite
+    sample properties, J. Econometrics 1985; B. Efron, C. Stein, The jackknife estimate of variance, Annals of
+    Statistics 1981; S. F. Schmidt, Application of state-space methods to navigation problems, 1966.
+
+    With an unknown focal length, the jackknife leaves out blocks of neighbouring image points. Errors of the lens
+    model and of the map are similar for neighbours, and they add up in the focal length. The radial coefficient
+    is eliminated. Its expected standard deviation counts as a prior unless it was fitted. The principal point is a
+    considered parameter: with c its standard deviation and J_c the derivatives by it, C becomes C + c^2 S S^T,
+    S = H^-1 sum_ij p_ij J_ij^T J_c / s^2.
+
+    Returns:
+        (6, 6), or (7, 7) with the logarithm of a fitted focal length; None if the points do not fix the pose.
+    """
+    if linear is None:
+        return None
+    covariance = _of_louis(linear)
+    if covariance is not None:
+        return covariance
+    sharper = linearise(linear.model, linear.problem, linear.state, linear.scale / math.sqrt(2))
+    covariance = None if sharper is None else _of_louis(sharper)
+    return None if covariance is None else 2 * covariance
+
+
+def matches_of(linear: "Linearised") -> Linearisation:
+    """Convert the matches of a pose to the input of `covariance_of`."""
+    chosen = linear.problem.image.chosen
+    weight = np.full(len(chosen), len(linear.problem.bearings) / len(chosen))
+    known = linear.model.information(linear.state)
+    return Linearisation(linear.residual, linear.jacobian, linear.probability, linear.image, weight, known)
+
+
+def _of_louis(linear: "Linearised") -> Array | None:
+    """Compute `local_covariance` at one scale; None if the information is not positive definite."""
+    problem, matches = linear.problem, matches_of(linear)
+    if problem.focal is None:
+        return covariance_of(matches, fitted=problem.fitted)
+    matched = np.asarray(np.bincount(linear.image, linear.probability, len(problem.image.chosen)), np.float64)
+    blocks = _blocks(problem, matched)
+    centre = problem.focal.centre_sigma / linear.scale * centre_columns(linear.sight.directions)
+    covariance = covariance_of(matches, fitted=problem.fitted, blocks=blocks, considered=centre)
+    return None if covariance is None else covariance[: POSE + 1, : POSE + 1]
+
+
+def _blocks(problem: Problem, matched: Array) -> Labels:
+    """Return the block (k,) of each chosen image point; the at most `BLOCKS`^2 blocks have equal expected matches.
+
+    Args:
+        problem: Points.
+        matched: (k,) probability that an image point has a match.
+    """
+    x, y = ((problem.bearings[problem.image.chosen] - problem.image.centre) @ problem.image.axes).T
+    column, row = _quantile(x, matched), np.zeros(len(x), np.int64)
+    for k in range(BLOCKS):
+        row[column == k] = _quantile(y[column == k], matched[column == k])
+    return column * BLOCKS + row
+
+
+def _quantile(values: Array, weights: Array) -> Labels:
+    """Return the index of each value among `BLOCKS` intervals of equal weight."""
+    order = np.argsort(values, kind="stable")
+    below = np.empty(len(values))
+    below[order] = np.cumsum(weights[order]) - weights[order] / 2
+    return np.minimum(below * BLOCKS / max(float(weights.sum()), 1e-300), BLOCKS - 1).astype(np.int64)
+
+
+class Linearised(NamedTuple):
+    """A pose and its k possible matches in one camera, linearised in the unknowns.
+
+    Attributes:
+        problem: Points of the camera.
+        model: The p unknowns.
+        state: The pose.
+        image: (k,) indices into the chosen image points.
+        probability: (k,) of each match.
+        sight: The k scene points as the camera sees them.
+        residual: (k, 3) of the image points, in units of `scale`.
+        jacobian: (k, 3, p) derivatives of the directions by the unknowns, in units of `scale`.
+        scale: Standard deviation of the residuals, radians.
+    """
+
+    problem: Problem
+    model: PoseModel
+    state: PoseState
+    image: Labels
+    probability: Array
+    sight: Sight
+    residual: Array
+    jacobian: Array
+    scale: float
+
+
+def linearised(problem: Problem, rotation: Array, translation: Array, scale: float) -> Linearised | None:
+    """Linearise a pose of one camera and its possible matches.
+
+    Args:
+        problem: Points of the problem.
+        rotation: (3, 3) of the pose.
+        translation: (3,) of the pose.
+        scale: Standard deviation of the residuals, radians; the points of a match are within a few of it.
+
+    Returns:
+        The linearised pose, or None if there is no match.
+    """
+    model = PoseModel.of(problem)
+    return linearise(model, problem, model.state(rotation, translation), scale)
+
+
+def linearise(model: PoseModel, problem: Problem, state: PoseState, scale: float, camera: int = 0) -> Linearised | None:
+    """Linearise the possible matches of one camera in the unknowns of a model.
+
+    Args:
+        model: Unknowns.
+        problem: Points of the camera.
+        state: The pose.
+        scale: Standard deviation of the residuals, radians.
+        camera: Index of the camera in a rig.
+
+    Returns:
+        The linearised pose, or None if there is no match.
+    """
+    found = soft_matches(model, problem, state, scale, camera=camera)
+    if found is None:
+        return None
+    sight = found.sight.choose(found.point)
+    residual = (problem.bearings[problem.image.chosen[found.image]] - sight.directions) / scale
+    jacobian = model.jacobian(state, sight, camera) / scale
+    return Linearised(problem, model, state, found.image, found.probability, sight, residual, jacobian, scale)
+
+
+class Misfit(NamedTuple):
+    """Change of a pose when parameters of the camera or the scene are fitted with it.
+
+    Attributes:
+        turn: Rotation of the pose, radians.
+        shift: Shift of the scene centroid, in distances from the camera.
+        zoom: Fitted focal length over the given one; 1 if the given one fits.
+        radial: Radial coefficient; 0 without radial distortion.
+    """
+
+    turn: float
+    shift: float
+    zoom: float = 1.0
+    radial: float = 0.0
+
+
+def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = DEFAULT.evidence) -> Misfit:
+    """Return the largest change of a pose that its residuals support significantly.
+
+    - Five strains of the scene are fitted to the residuals together with the pose. Correspondences are weighted with
+      their probabilities. The pose is eliminated, and the principal directions of the strains with a significant F
+      statistic count (level 0.001).
+    - The log of the focal length is fitted and tested likewise (level `rule.focal_chance`, 0.01). The correspondences
+      of the pose bias it towards the given one; `bpnp.search.settle` fits a significant one with new ones.
+
+    Args:
+        linear: Pose from `linearised`, or None for no change.
+        count: Number of matches.
+        rule: Constants of the verdict.
+
+    >>> import numpy as np
+    >>> rng = np.random.default_rng(0)
+    >>> points = rng.uniform(-1, 1, (40, 3))
+    >>> seen = points + [0, 0, 5] + 1e-3 * rng.standard_normal((40, 3))
+    >>> problem = Problem(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
+    >>> systematic_misfit(linearised(problem, np.eye(3), np.array([0, 0, 5.0]), 2e-4), 40.0)
+    Misfit(turn=0.0, shift=0.0, zoom=1.0, radial=0.0)
+    """
+    if linear is None:
+        return Misfit(0.0, 0.0)
+    free = 2 * min(count, float(linear.probability.sum())) - POSE
+    zoomed = lens_columns(linear.sight.directions, 0.0)[..., :1] / linear.scale
+    strained = linear.jacobian[:, :, 3:POSE] @ (linear.sight.turned @ STRAINS).transpose(1, 2, 0)
+    distance = max(float(np.linalg.norm(linear.state.centroid)), 1e-300)  # unit of the shift, like a radian of rotation
+    posed = linear.jacobian[:, :, :POSE] * np.repeat([1.0, distance], 3)
+    columns = np.concatenate([posed, zoomed, strained, linear.residual[..., None]], -1)
+    weighed = (np.sqrt(linear.probability)[:, None, None] * columns).reshape(-1, columns.shape[-1])
+    products = weighed.T @ weighed
+    pose = np.linalg.pinv(products[:POSE, :POSE], hermitian=True)
+    found = []
+    strains = slice(POSE + 1, POSE + 1 + len(STRAINS))
+    for fitted, chance in ((slice(POSE, POSE + 1), rule.focal_chance), (strains, EXCEEDED)):
+        moved, step = _moved(products, pose, fitted, free, chance)
+        zoom = math.exp(float(step[0])) if len(step) == 1 else 1.0
+        found.append(Misfit(float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:])), zoom))
+    return Misfit(
+        max(each.turn for each in found),
+        max(each.shift for each in found),
+        max((each.zoom for each in found), key=lambda zoom: abs(math.log(zoom))),
+    )
+
+
+def bends_significantly(linear: Linearised | None, count: float, rule: Evidence = DEFAULT.evidence) -> bool:
+    """Return whether radial distortion explains the residuals of a pose significantly better than a focal length.
+
+    An F test of the radial coefficient at the level `focal_chance`, with pose and focal length eliminated.
+
+    Args:
+        linear: The pose and its possible matches.
+        count: Number of matches.
+        rule: Constants of the verdict.
+    """
+    if linear is None or not (linear.problem.bearings[:, 2] > 0).all():
+        return False
+    free = 2 * min(count, float(linear.probability.sum())) - POSE - 2
+    lens = lens_columns(linear.sight.directions, 0.0) / linear.scale
+    columns = [linear.jacobian[:, :, :POSE], lens, linear.residual[..., None]]
+    rows = (np.sqrt(linear.probability)[:, None, None] * np.concatenate(columns, -1)).reshape(-1, POSE + 3)
+    # The last column of R ends with the gain of the radial coefficient and the remaining residual.
+    triangle = np.asarray(np.linalg.qr(rows, mode="r"))
+    gain, rest = float(triangle[-2, -1] ** 2), float(triangle[-1, -1] ** 2)
+    return bool(free > 0 and fdtrc(1, free, gain * free / max(rest, free, 1.0)) < rule.focal_chance)
+
+
+def _moved(products: Array, pose: Array, fitted: slice, free: float, chance: float) -> tuple[Array, Array]:
+    """Fit parameters to the residuals together with the pose, and keep the significant directions.
+
+    Args:
+        products: Inner products of the columns; the first six are the pose's, the last one holds the residuals.
+        pose: (6, 6) inverse of the products of the pose.
+        fitted: Columns of the fitted parameters.
+        free: Number of measurements less the six of the pose.
+        chance: Significance level.
+
+    Returns:
+        Step (6,) of the pose and step of the fitted parameters.
+    """
+    across = pose @ products[:POSE, fitted]
+    values, directions = np.linalg.eigh(products[fitted, fitted] - products[fitted, :POSE] @ across)
+    known = values > 1e-9 * float(np.diag(products)[fitted].max())
+    if not 0 < known.sum() < free:
+        return np.zeros(POSE), np.zeros(len(values))
+    values, directions = values[known], directions[:, known]
+    free -= len(values)
+    step = (products[fitted, -1] - across.T @ products[:POSE, -1]) @ directions / values
+    gain = step**2 * values
+    rest = products[-1, -1] - float(products[-1, :POSE] @ pose @ products[:POSE, -1]) - float(gain.sum())
+    # A value above `free` comes from points with several possible correspondences, not from the scale of the residuals.
+    significant = fdtrc(1, free, gain * free / np.clip(rest, 1e-300, free)) < chance / len(values)
+    step = directions @ np.where(significant, step, 0.0)
+    return np.asarray(across @ step), step

@@ -1,0 +1,206 @@
+"""Verification of a given pose: `verify`."""
+
+import math
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from bpnp.argument_types import ArrayLike, PointsLike
+from bpnp.cameras import CameraLike, camera_from
+from bpnp.runtime import Deadline
+from bpnp.search.verdict.reasons import objection
+from bpnp.search.verdict.uncertainty import linearised, pose_covariance
+from bpnp.search.hypotheses import Hypotheses
+from bpnp.search.problem import Problem
+from bpnp.search.verdict.decide import match_count
+from bpnp.search.verification import judge_given_pose
+from bpnp.search.arguments import Array, Labels, checked_pose, checked_seed, numbers, positive, seconds_from
+from bpnp.search.inputs import problem_from
+from bpnp.search.matching import finished, without_pose
+from bpnp.search.solution import Solution
+
+SECONDS = 10.0
+
+
+def verify(
+    points2d: PointsLike,
+    points3d: PointsLike,
+    rotation: ArrayLike,
+    translation: ArrayLike,
+    camera: CameraLike | None = None,
+    *,
+    normals3d: ArrayLike | None = None,
+    labels2d: ArrayLike | None = None,
+    labels3d: ArrayLike | None = None,
+    scores2d: ArrayLike | None = None,
+    scores3d: ArrayLike | None = None,
+    matches: ArrayLike | None = None,
+    refine: bool = True,
+    inlier_threshold: float | int | None = None,
+    seed: int = 0,
+    time_limit: float | int | None = None,
+) -> Solution:
+    """Verify a given pose and estimate its uncertainty.
+
+    The pose is "confident" if it is significant and no competing pose is about as likely. Only one pose is tested, so
+    few points are enough: about one match more than the three that determine a pose. The competing poses are the nearby
+    optimum, the mirror image if the scene is flat, repetitions of the scene, and other focal lengths. No search is run:
+    use `solve` if a better pose may exist far away.
+
+    Args:
+        points2d: (m, 2) pixels with a `camera`, else normalised image coordinates, or (m, 3) bearings; as for `solve`.
+        points3d: (n, 3) scene points in any unit; as for `solve`.
+        rotation: (3, 3) rotation matrix of the pose, camera = R p + t.
+        translation: (3,) translation of the pose, in the unit of the scene.
+        camera: Camera of the pixels, as for `solve`; None for normalised coordinates and bearings.
+        normals3d: (n, 3) outward unit normals; None if all points are visible from all sides.
+        labels2d: (m,) integers or (m, c) class probabilities, as for `solve`.
+        labels3d: (n,) integers or (n, c) class probabilities, as for `solve`.
+        scores2d: (m,) probabilities in (0, 1] that a point has a correspondence, as for `solve`.
+        scores3d: (n,) probabilities in (0, 1], as `scores2d`.
+        matches: (k, 2) indices into points2d and points3d, each point in one match at most. The pose is judged on these
+            matches alone; some of them may be wrong. None if the matches are unknown.
+        refine: Return and judge the nearby optimum. It counts as the same pose if it is rotated by at most 2 degrees
+            and shifts the centroid of the scene by at most a twentieth of its distance, or is within the pose's
+            uncertainty. With False the pose is kept. It is "ambiguous" if the nearby optimum fits significantly better,
+            and `covariance` is that of the optimum plus the outer product of the step to it.
+        inlier_threshold: Largest reprojection error of a match, as for `solve`.
+        seed: Seed of the perturbed copies of the pose from which it is refined, default 0.
+        time_limit: Seconds, 10 by default; math.inf for no limit.
+
+    Returns:
+        Solution with this pose, and with its competing poses in `candidates`. It is "failed" if the pose is not
+            significant, or if a competing pose is more likely by three decades; `matches` may then be empty.
+
+    Raises:
+        ValueError: The input is invalid, as for `solve`, or `rotation` is not a rotation matrix.
+
+    >>> import bpnp
+    >>> rng = np.random.default_rng(0)
+    >>> scene = rng.normal(size=(60, 3))
+    >>> camera = scene + [0, 0, 6]  # R = I, t = (0, 0, 6)
+    >>> image = rng.permutation(camera[:, :2] / camera[:, 2:])
+    >>> bpnp.verify(image, scene, np.eye(3), [0.02, 0, 6.1]).verdict
+    'confident'
+    >>> bpnp.verify(image, scene, np.eye(3), [0, 1, 6]).verdict
+    'failed'
+    """
+    limit = seconds_from(time_limit, SECONDS)
+    threshold = positive("inlier_threshold", inlier_threshold, finite=True)
+    pose = checked_pose("", rotation, translation)
+    problem = problem_from(
+        points2d,
+        points3d,
+        None if camera is None else camera_from(camera),
+        normals3d=normals3d,
+        labels2d=labels2d,
+        labels3d=labels3d,
+        scores2d=scores2d,
+        scores3d=scores3d,
+    )
+    given = None if matches is None else _checked_matches(matches, problem)
+    judged = problem if given is None else _of_matches(problem, given)
+    limits: dict[str, Any] = {"inlier_threshold": threshold, "seed": checked_seed(seed), "time_limit": limit}
+    solution = verify_problem(judged, *pose, refine=refine, **limits)
+    if given is None or judged.degenerate is not None:
+        return solution
+    return replace(
+        solution,
+        matches=given[solution.matches[:, 0]],
+        inlier_ratio=solution.inlier_count / len(given),
+        points2d=problem.all2d,
+        points3d=problem.all3d,
+    )
+
+
+def verify_problem(
+    problem: Problem,
+    rotation: Array,
+    translation: Array,
+    *,
+    refine: bool = True,
+    inlier_threshold: float | None = None,
+    seed: int = 0,
+    time_limit: float = SECONDS,
+) -> Solution:
+    """Verify a pose of a problem whose points have been checked; see `verify`.
+
+    Args:
+        problem: Points and their measured properties.
+        rotation: (3, 3) rotation matrix of the pose.
+        translation: (3,) translation of the pose, scene units.
+        refine: Return and judge the nearby optimum, as for `verify`.
+        inlier_threshold: Largest reprojection error of a match, as for `verify`.
+        seed: Seed of the refinement, default 0.
+        time_limit: Seconds, 10 by default; math.inf for no limit.
+
+    Returns:
+        Solution with this pose, as of `verify`.
+    """
+    begun, deadline = time.perf_counter(), Deadline.after(time_limit)
+    if problem.degenerate is not None:
+        return replace(without_pose(problem, problem.degenerate, inlier_threshold), reason_code="degenerate")
+    claim = problem.from_user(rotation, translation)
+    result, optimum = judge_given_pose(problem, *claim, refine=refine, seed=seed, deadline=deadline)
+    if result.verdict == "confident" and deadline.passed():
+        one = objection("untested", seconds=time_limit)
+        result = replace(result, verdict="ambiguous", reason=one.clause, code=one.code)
+    solution = finished(problem, result, time.perf_counter() - begun, inlier_threshold)
+    if not refine and solution.found:  # to the last digit
+        first = replace(solution.candidates[0], translation=translation)
+        solution = replace(solution, translation=translation, candidates=(first, *solution.candidates[1:]))
+    if not refine and solution.verdict != "failed" and len(optimum):
+        solution = replace(solution, covariance=_of_unrefined(problem, optimum, rotation, translation))
+    return solution
+
+
+def _checked_matches(values: Any, problem: Problem) -> Labels:
+    """Return the (k, 2) indices of matches whose 2D point is usable; raise ValueError if a point is in two matches."""
+    matches, counts = numbers("matches", values), (len(problem.all2d), len(problem.points3d))
+    if matches.ndim != 2 or matches.shape[1] != 2 or (matches != np.round(matches)).any():
+        raise ValueError(
+            f"`matches` has the shape {matches.shape}; pairs of indices are needed, integers of shape (k, 2)"
+        )
+    if (matches < 0).any() or (matches >= counts).any():
+        low, high = matches.min(0).astype(int).tolist(), matches.max(0).astype(int).tolist()
+        raise ValueError(
+            f"`matches` has indices from {low} to {high}; there are {counts[0]} 2D and {counts[1]} 3D points"
+        )
+    for name, side in zip(("2D", "3D"), matches.T.astype(np.int64), strict=True):
+        times = np.bincount(side)
+        if times.max(initial=0) > 1:
+            raise ValueError(
+                f"{name} point {times.argmax()} is in {times.max()} of the `matches`; a point has one at most"
+            )
+    places = matches.astype(np.int64)
+    return np.asarray(places[np.isin(places[:, 0], problem.usable)])
+
+
+def _of_matches(problem: Problem, matches: Labels) -> Problem:
+    """Return a problem of the matched points alone, with a unique label for each match."""
+    (i, j), own = matches.T, np.arange(len(matches))
+    matched = problem.choose(np.searchsorted(problem.usable, i), j)
+    return replace(
+        matched,
+        labels2d=own,
+        labels3d=own,
+        odds2d=None,
+        classes3d=None,
+        indices2d=None,
+        given2d=problem.all2d[i],
+    )
+
+
+def _of_unrefined(problem: Problem, optimum: Hypotheses, rotation: Array, translation: Array) -> Array:
+    """Return the covariance (6, 6) of an unrefined pose: that of the optimum, plus the step to it squared."""
+    best, scale = optimum.rotation[0], float(optimum.scale[0])
+    linear = linearised(problem, best, optimum.translation[0], scale)
+    covariance = pose_covariance(problem, linear, match_count(optimum, problem))
+    if covariance is None:
+        return np.full((6, 6), math.nan)
+    _, shift = problem.to_user(best, optimum.translation[0])
+    way = np.r_[Rotation.from_matrix(best @ rotation.T).as_rotvec(), shift - translation]
+    return np.asarray(covariance + np.outer(way, way))

@@ -1,1 +1,0 @@
-"""Parts of `bpnp.solve`: checked arguments, candidates, matches and the solution."""
