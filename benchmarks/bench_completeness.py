@@ -18,12 +18,12 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.poses import Tolerance
 from bpnp.search.config import DEFAULT
-from bpnp.search.propose.repetitions import competing_poses, registered
+from bpnp.search.inputs import problem_from
 from bpnp.search.pool import Pool
+from bpnp.search.propose.repetitions import competing_poses, registered
 from bpnp.search.scene import Scene
 from bpnp.search.schedule import Plan
-from bpnp.search.verdict.decide import no_pose, starts_met
-from bpnp.search.inputs import problem_from
+from bpnp.search.verdict.decide import count_starts, no_pose
 
 TURNS = 8
 HITS = (1, 2, 3, 4, 6, 8, 10)
@@ -48,7 +48,7 @@ def reached(problem: Problem) -> dict[int, bool]:
         leaders = pool.leaders()
         if not len(leaders) or leaders.log10_false_alarms[0] > BLIND.false_alarms:
             continue
-        hits = starts_met(leaders, points, BLIND)
+        hits = count_starts(leaders, points, BLIND)
         turn = leaders.rotation[0].T @ problem.poses[0][0]
         right = np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))) < RIGHT_DEG
         for least in HITS:

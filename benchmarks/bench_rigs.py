@@ -64,14 +64,14 @@ def of_photos(used: slice, options: argparse.Namespace) -> Iterator[Problem]:
         scene = model_of(options.data, name)
         for query in images_of(scene, options.limit):
             shown = view_problem(scene, query, against="view", outliers=1.0, seed=options.seed)
-            beside = [view for _, view in overlapping(scene, query) if f"{name}/{view.name}" != shown.view][:2]
-            if len(beside) < 2 or shown.matched.sum() < LEAST_MATCHES:
+            local = [view for _, view in overlapping(scene, query) if f"{name}/{view.name}" != shown.view][:2]
+            if len(local) < 2 or shown.matched.sum() < LEAST_MATCHES:
                 continue
             rng, pixels = np.random.default_rng([options.seed, query.image_id]), [shown.pixels[0]]
-            for view in beside:
+            for view in local:
                 keypoints = rng.permutation(np.concatenate([view.points2d, view.clutter2d]))[:MOST_POINTS]
                 pixels.append(view.camera.focal * keypoints.astype(np.float64))
-            rig = [query, *beside][used]
+            rig = [query, *local][used]
             poses = [pose_matrix(each.rotation, each.translation) for each in rig]
             matrices = [np.diag([each.camera.focal] * 2 + [1.0]) for each in rig]
             search = rig_search(pixels[used], shown.points3d, matrices, poses, seed=options.seed)

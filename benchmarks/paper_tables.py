@@ -284,9 +284,9 @@ def markdown(table: Table, record: Mapping[str, Any]) -> dict[str, str]:
             lines.setdefault(title, []).append((place, row_text(label + ESTIMATES.get(estimate, ""), found)))
     printed = list(printed_rows(table.paper))
     for title, rows in lines.items():
-        beside = printed[3:] if title.endswith("-paper") else printed[:3] if title.endswith("-baselines") else []
+        local = printed[3:] if title.endswith("-paper") else printed[:3] if title.endswith("-baselines") else []
         ours = [text for _, text in sorted(rows, key=lambda row: row[0])]
-        result[title] = "".join([head(table.recall), *ours, *beside])
+        result[title] = "".join([head(table.recall), *ours, *local])
     named = {"pnp": "", "ransac": " R"}
     for name, (group, (first, second)) in product(table.sets, PAIRS.items()):
         texts = []

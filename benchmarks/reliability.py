@@ -42,7 +42,7 @@ from view_problems import LEAST_MATCHES, REPORTED, Against, ViewProblem, scene_p
 from bpnp import Solution, solve
 from bpnp.cameras import camera_from
 from bpnp.search.inputs import problem_from
-from bpnp.search.sources import Options, solutions_of
+from bpnp.search.sources import Options, solve_problems
 
 FACTORS = (0.67, 0.8, 0.9, 0.95, 1.05, 1.1, 1.2, 1.33)
 RIGHT_DEG, RIGHT_MOVED, RIGHT_CENTRE = 3.0, 0.1, 0.05
@@ -113,7 +113,7 @@ def with_cones(photo: ViewProblem, factor: float, **known: Any) -> Solution:
     camera = camera_from(np.diag([factor * photo.focal, factor * photo.focal, 1.0]))
     cones: dict[str, Any] = {"normals3d": photo.scene.cones.axes, "cosines3d": photo.scene.cones.cosines}
     points = problem_from(photo.focal * photo.points2d, photo.points3d, camera, **cones)
-    return solutions_of({0: points}, Options(asks=False, **known))[0]
+    return solve_problems({0: points}, Options(asks=False, **known))[0]
 
 
 def limits(options: argparse.Namespace) -> dict[str, Any]:

@@ -11,7 +11,7 @@ MIN_POINTS = 4  # matches that fix a pose; three fit up to four poses exactly
 Array = NDArray[np.floating[Any]]
 
 
-def turned_by(one: Array, other: Array) -> float:
+def rotation_angle(one: Array, other: Array) -> float:
     """Return the angle between two rotations (3, 3), radians, in [0, pi]."""
     cosine = (float((one * other).sum()) - 1) / 2
     return math.acos(min(max(cosine, -1.0), 1.0))

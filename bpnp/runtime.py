@@ -1,35 +1,26 @@
 """Threads, time limits and compiled loops on the CPU."""
 
+import gc
+import hashlib
+import inspect
+import logging
 import math
 import os
 import sys
 import threading
 import time
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ContextDecorator
-from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any
-
-from threadpoolctl import ThreadpoolController
-
-import gc
-import hashlib
-import inspect
-import logging
-import threading
-import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from functools import cache, update_wrapper
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ContextDecorator, ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import cache, lru_cache, update_wrapper
 from pathlib import Path
 from typing import Any
 
 import numba
+from threadpoolctl import ThreadpoolController
 
 from bpnp.files import cache_folder, lock_folder
-
 
 
 def thread_count() -> int:

@@ -6,7 +6,18 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "bpnp"
 FILES = sorted(PACKAGE.rglob("*.py"))
-GROUND = {"argument_types", "types", "geometry", "poses", "cameras", "files", "metrics", "runtime", "precision", "checks"}
+GROUND = {
+    "argument_types",
+    "types",
+    "geometry",
+    "poses",
+    "cameras",
+    "files",
+    "metrics",
+    "runtime",
+    "precision",
+    "checks",
+}
 # Parts that each part may import, in addition to itself and the ground floor.
 MAY_IMPORT = {
     **dict.fromkeys(GROUND, set()),

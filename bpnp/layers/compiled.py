@@ -12,8 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bpnp.layers.plan import SHORT_SUM, Plan
-from bpnp.runtime import FAST, compiler
-from bpnp.runtime import in_threads
+from bpnp.runtime import FAST, compiler, in_threads
 
 compiled = compiler(fastmath=FAST)
 part = compiler(fastmath=FAST, part=True, forceinline=True)  # for functions called by compiled code only

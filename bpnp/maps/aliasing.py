@@ -13,24 +13,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.runtime import one_blas_thread
 from bpnp.maps.photo_problem import Photo, in_picture
 from bpnp.maps.viewed_points import Region
 from bpnp.maps.views import Array
-from bpnp.poses import same_pose, turned_by
-from bpnp.search.refine.annealing import finish, polished
-from bpnp.search.config import DEFAULT, Draws, Narrowing, RasterSearch, RasterShape, Screens
-from bpnp.search.verdict.reasons import objection
-from bpnp.search.propose.repetitions import decades_behind, repeated_poses
+from bpnp.poses import rotation_angle, same_pose
+from bpnp.runtime import one_blas_thread
+from bpnp.search.config import DEFAULT, DensitySearch, DensityShape, Draws, Narrowing, Preselection
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
-from bpnp.search.kernels.raster import Raster
-from bpnp.search.problem import Problem
-from bpnp.search.propose.density_map import search_beside, search_near
-from bpnp.search.scene import Scene
-from bpnp.search.starts import PosePrior
-from bpnp.search.verdict.decide import weighed
+from bpnp.search.kernels.density_map import DensityMap
 from bpnp.search.matching import count_one_to_one
+from bpnp.search.problem import Problem
+from bpnp.search.propose.density_map import search_around, search_near
+from bpnp.search.propose.repetitions import repeated_poses, repetition_margins
+from bpnp.search.refine.annealing import anneal_to_end, finish
+from bpnp.search.scene import Scene
 from bpnp.search.solution import Candidate, Solution, add_objection, candidates_of
+from bpnp.search.starts import PosePrior
+from bpnp.search.verdict.decide import rank_poses
+from bpnp.search.verdict.reasons import objection
 
 Pose = tuple[Array, Array]  # rotation (3, 3) and translation (3,), in the frame of a problem
 
@@ -47,9 +47,9 @@ class AliasingSettings:
         fewest: Least number of such points, and of image points that the pose explains.
     """
 
-    search: RasterSearch = RasterSearch(
+    search: DensitySearch = DensitySearch(
         Draws(2**13, least_starts=2**13),
-        Screens((50, 300), (2**11, 2**8)),
+        Preselection((50, 300), (2**11, 2**8)),
         Narrowing(0.1, 0.015, steps=6, points=300),
         annealed=6,
     )
@@ -96,7 +96,7 @@ def best_competitor(
     if not len(competing):
         return None
     best, poses = _pose_of(problem, solution), (competing.rotation, competing.translation)
-    margins = decades_behind(problem, best, poses, poses, _scale_of(problem, solution))
+    margins = repetition_margins(problem, best, poses, poses, _scale_of(problem, solution))
     k = int(np.argmin(margins))
     return Competitor(float(margins[k]), _candidate(problem, solution, competing[k : k + 1], float(margins[k])))
 
@@ -143,7 +143,7 @@ def refine_elsewhere(problem: Problem, solution: Solution, proposals: Sequence[P
     if not other.any():
         return Hypotheses.from_poses(rotations[other], translations[other])
     scene = Scene(problem, seed, DEFAULT)
-    refined = polished(scene, rotations[other], translations[other], _scale_of(problem, solution))
+    refined = anneal_to_end(scene, rotations[other], translations[other], _scale_of(problem, solution))
     return refined[differ(refined.rotation, refined.translation)]
 
 
@@ -158,7 +158,7 @@ def judge_against(solution: Solution, competitor: Competitor | None) -> Solution
     other, margin = competitor.pose, competitor.margin
     values = {
         "distance": float(np.linalg.norm(other.centre - solution.centre)),
-        "degrees": math.degrees(turned_by(solution.rotation, other.rotation)),
+        "degrees": math.degrees(rotation_angle(solution.rotation, other.rotation)),
         "better": -margin,
     }
     code = "better_place" if margin <= -lead else "competing_place"
@@ -212,22 +212,22 @@ def _other_regions(regions: Iterable[Region], place: Region, problem: Problem, s
 def _found_in(regions: Iterable[Region], photo: Photo, problem: Problem, solution: Solution) -> Iterator[Pose]:
     """Yield the poses that short searches in other regions find for the explained image points of a solution."""
     explained = replace(photo, keypoints=explained_keypoints(photo, solution), view_count=1)
-    rasters: dict[tuple[RasterShape, float], Raster] = {}  # shared, since the image points are the same
+    density_maps: dict[tuple[DensityShape, float], DensityMap] = {}  # shared, since the image points are the same
     for region in regions:
         near = explained.problem(region, solution.camera, region.prior())
         scene = Scene(near, photo.seed, DEFAULT)
-        scene.rasters = rasters
+        scene.density_maps = density_maps
         assert near.prior is not None
         prior = scene.enter_prior(near.prior)
         assert isinstance(prior, PosePrior)
         found = _likeliest(finish(scene, search_near(scene, prior, ALIASING.search)), scene, near)
         if len(found) and found.log10_false_alarms[0] < 0:
             start = Hypotheses.from_poses(*scene.enter(found.rotation, found.translation))
-            beside = _likeliest(finish(scene, search_beside(scene, start, DEFAULT.beside)), scene, near)
-            for one in (found, beside):
+            local = _likeliest(finish(scene, search_around(scene, start, DEFAULT.local)), scene, near)
+            for one in (found, local):
                 yield problem.from_user(*near.to_user(one.rotation[0], one.translation[0]))
 
 
 def _likeliest(poses: Hypotheses, scene: Scene, problem: Problem) -> Hypotheses:
     """Return the pose (1,) with the fewest false alarms, in the frame of the problem."""
-    return weighed(to_problem_frame(poses, scene), problem)[:1]
+    return rank_poses(to_problem_frame(poses, scene), problem)[:1]

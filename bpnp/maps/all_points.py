@@ -6,23 +6,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bpnp.cameras import camera_from
-from bpnp.runtime import one_blas_thread
 from bpnp.maps.photo_problem import Photo, with_ids
 from bpnp.maps.viewed_points import Region
 from bpnp.maps.views import Array
 from bpnp.poses import MIN_POINTS
-from bpnp.search.refine.annealing import finish, polished
-from bpnp.search.settle import other_lens, settle
+from bpnp.runtime import one_blas_thread
 from bpnp.search.config import DEFAULT, Evidence
-from bpnp.search.verdict.competitors import competing_pose
-from bpnp.search.hypotheses import Hypotheses, to_problem_frame
-from bpnp.search.problem import Problem, UnknownFocal
-from bpnp.search.propose.density_map import search_beside
-from bpnp.search.scene import Scene
-from bpnp.search.verdict.decide import judged
 from bpnp.search.focal_length import AROUND, UnknownCamera, fit_camera
+from bpnp.search.hypotheses import Hypotheses, to_problem_frame
 from bpnp.search.matching import finished
+from bpnp.search.problem import Problem, UnknownFocal
+from bpnp.search.propose.density_map import search_around
+from bpnp.search.refine.annealing import anneal_to_end, finish
+from bpnp.search.scene import Scene
+from bpnp.search.settle import other_lens, settle
 from bpnp.search.solution import Solution, add_objection
+from bpnp.search.verdict.competitors import competing_pose
+from bpnp.search.verdict.decide import judge
 
 COMPETITORS = 4  # competing poses of an ambiguous solution that are judged with it on all points
 
@@ -83,20 +83,20 @@ def refine_on_all_points(solution: Solution, photo: Photo, whole: Region) -> Ref
         problem = problem_at(camera)
         rotation, shift = problem.from_user(*pose)
         least = problem.image.scales[0]
-        poses = polished(Scene(problem, photo.seed, DEFAULT), rotation[None], shift[None], max(scale, least))
+        poses = anneal_to_end(Scene(problem, photo.seed, DEFAULT), rotation[None], shift[None], max(scale, least))
     scene, confident = Scene(problem, photo.seed, DEFAULT), solution.verdict == "confident"
-    looks = int(poses.scale[0] > scale) if confident else looks_for_certainty(DEFAULT.evidence)
+    local_searches = int(poses.scale[0] > scale) if confident else looks_for_certainty(DEFAULT.evidence)
     others = [] if confident else [one for one in solution.candidates[1:] if one.log10_false_alarms < 0][:COMPETITORS]
     if others:
         turns, shifts = problem.from_user(
             np.stack([one.rotation for one in others]), np.stack([one.translation for one in others])
         )
-        competing = polished(scene, turns, shifts, max(scale, problem.image.scales[0]))
+        competing = anneal_to_end(scene, turns, shifts, max(scale, problem.image.scales[0]))
         poses = Hypotheses.concatenate([poses, competing])
     start = Hypotheses.from_poses(*scene.enter(rotation[None], shift[None]))
-    for _ in range(looks):
-        beside = finish(scene, search_beside(scene, start, DEFAULT.beside), DEFAULT.finished)
-        poses = Hypotheses.concatenate([poses, to_problem_frame(beside, scene)])
+    for _ in range(local_searches):
+        local = finish(scene, search_around(scene, start, DEFAULT.local), DEFAULT.finished)
+        poses = Hypotheses.concatenate([poses, to_problem_frame(local, scene)])
     return Refined(region, problem, (rotation, shift), poses, scene)
 
 
@@ -116,7 +116,7 @@ def judge_on_all_points(solution: Solution, refined: Refined | None) -> Solution
         return solution
     problem, rule, confident = refined.problem, DEFAULT.evidence, solution.verdict == "confident"
 
-    alone = judged(refined.poses, problem, batches=1, exhaustive=True, rule=rule)
+    alone = judge(refined.poses, problem, batches=1, exhaustive=True, rule=rule)
     result = settle(alone, problem, lambda: refined.scene, rule, exhaustive=True)
     rotations, shifts = (np.stack(both) for both in zip(refined.pose, result.best, strict=True))
     behind = result.log10_false_alarms - solution.log10_false_alarms

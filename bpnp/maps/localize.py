@@ -14,18 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.cameras import Camera, camera_from
-from bpnp.runtime import Clock, Deadline
 from bpnp.maps.aliasing import Competitor, best_competitor, explained_keypoints, judge_against, significant
 from bpnp.maps.all_points import judge_on_all_points, refine_on_all_points
 from bpnp.maps.photo_problem import Photo, with_ids
 from bpnp.maps.viewed_points import Place, Region, ViewedPoints
-from bpnp.search.config import DEFAULT, SearchSettings
-from bpnp.search.verdict import reasons
-from bpnp.search.problem import Problem, UnknownFocal
+from bpnp.runtime import Clock, Deadline
 from bpnp.search.arguments import checked_prior
-from bpnp.search.focal_length import UnknownCamera, solved_with_focal_length
+from bpnp.search.config import DEFAULT, SearchSettings
+from bpnp.search.focal_length import UnknownCamera, solve_with_focal_length
+from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.solution import Candidate, Solution
-from bpnp.search.sources import Options, solutions_of
+from bpnp.search.sources import Options, solve_problems
+from bpnp.search.verdict import reasons
 
 SECONDS = 60.0  # default time limit of a photo, with which the photos of cities are measured (docs/maps.md)
 MOST_KEYPOINTS = 2048  # half of the 2,000 largest SIFT keypoints have a map point, an eighth of the next ones
@@ -167,9 +167,9 @@ def search_near(
         def problem_at(known: Any, focal: UnknownFocal) -> Problem:
             return photo.problem(region, known, prior, focal)
 
-        solution = solved_with_focal_length(problem_at, camera, options)
+        solution = solve_with_focal_length(problem_at, camera, options)
     else:
-        solution = solutions_of({0: photo.problem(region, camera, prior)}, options)[0]
+        solution = solve_problems({0: photo.problem(region, camera, prior)}, options)[0]
     return with_ids(solution, region)
 
 

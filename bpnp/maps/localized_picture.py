@@ -9,8 +9,8 @@ import numpy.typing as npt
 from bpnp.cameras import camera_from
 from bpnp.report.images import size_in_camera
 from bpnp.report.terminal import LIGHT, QUIET, VERDICTS, number
-from bpnp.search.verdict.uncertainty import centre_covariance
 from bpnp.search.solution import Solution
+from bpnp.search.verdict.uncertainty import centre_covariance
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -115,7 +115,7 @@ def draw_from_above(axes: "Axes", scene: "SceneMap", solution: Solution) -> None
     step = -(-len(scene.points3d) // MOST_POINTS)
     points, centres = scene.points3d[::step] @ plane.T, np.array([view.centre for view in scene.views]) @ plane.T
     axes.plot(*points.T, ".", color=QUIET, ms=1, alpha=0.35, zorder=1)
-    looks = np.array([view.rotation[2] for view in scene.views]) @ plane.T
+    local_searches = np.array([view.rotation[2] for view in scene.views]) @ plane.T
     drawn = [("the photo", solution.centre, solution.rotation)] if found else []
     if solution.verdict == "ambiguous" and len(solution.candidates) > 1:
         drawn.append(("or here", solution.candidates[1].centre, solution.candidates[1].rotation))
@@ -125,7 +125,7 @@ def draw_from_above(axes: "Axes", scene: "SceneMap", solution: Solution) -> None
     placed = np.clip(np.concatenate([centres, stars]), low - farthest, high + farthest)
     low, high = np.minimum(low, placed.min(0)), np.maximum(high, placed.max(0))
     middle, reach = (low + high) / 2, 0.5 * 1.15 * float((high - low).max())
-    axes.quiver(*centres.T, *looks.T, color=LIGHT[0], width=0.004, scale=25, zorder=2)
+    axes.quiver(*centres.T, *local_searches.T, color=LIGHT[0], width=0.004, scale=25, zorder=2)
     axes.plot(*centres.T, ".", color=LIGHT[0], ms=4, label=f"{len(centres)} views", zorder=2)
     colour, half = VERDICTS[solution.verdict], np.tan(np.nanmax(np.abs(np.arctan(solution.points2d[:, 0]))))
     for (label, _, rotation), star, inside in zip(drawn, stars, placed[len(centres) :], strict=True):

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from bpnp.cameras import Camera, camera_from
 from bpnp.maps.viewed_points import Region
 from bpnp.maps.views import Array
-from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.focal_length import UnknownCamera
 from bpnp.search.inputs import problem_from
+from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.solution import Candidate, Solution
 
 

@@ -192,11 +192,11 @@ def _drawing(verified: Sequence[VerifiedView], scene: SceneMap) -> dict[str, Any
         return np.round((np.asarray(values) - low) * scale + 0.04 * SIDE, 1).tolist()
 
     inside = ((points >= low) & (points <= high)).all(-1)
-    looks = np.array([view.rotation[2] for view in views]) @ plane.T
-    looks /= np.maximum(np.linalg.norm(looks, axis=-1, keepdims=True), 1e-9)
+    local_searches = np.array([view.rotation[2] for view in views]) @ plane.T
+    local_searches /= np.maximum(np.linalg.norm(local_searches, axis=-1, keepdims=True), 1e-9)
     others = [
         placed(np.clip(plane @ np.array(one.other_centre), low, high)) if one.other_centre is not None else None
         for one in verified
     ]
-    drawn = zip(verified, placed(centres), np.round(24 * looks, 1).tolist(), others, strict=True)
+    drawn = zip(verified, placed(centres), np.round(24 * local_searches, 1).tolist(), others, strict=True)
     return {"size": size.round().tolist(), "points": placed(points[inside]), "views": list(drawn)[::-1]}

@@ -23,9 +23,9 @@ from bpnp.maps.views import (
     viewing_cones,
 )
 from bpnp.poses import MIN_POINTS
+from bpnp.search.focal_length import UnknownCamera
 from bpnp.search.problem import faces
 from bpnp.search.starts import PosePrior
-from bpnp.search.focal_length import UnknownCamera
 
 Map = TypeVar("Map", bound="ViewedPoints")
 LEAST_TRACK = 2  # least number of views of a point after a view is removed
@@ -167,7 +167,7 @@ class ViewedPoints:
                 raise ValueError("`views` is empty; give names of views, or None for all views of the map")
             points = np.unique(np.concatenate([view.points for view in named]))
             return [Place(view, points, camera) for view in named if len(view.points) and len(points) >= MIN_POINTS]
-        cameras: list[Camera] = camera.ladder(STEP) if isinstance(camera, UnknownCamera) else [camera]
+        cameras: list[Camera] = camera.focal_steps(STEP) if isinstance(camera, UnknownCamera) else [camera]
         scores = self.scores(cameras[0], keypoints, known_focal=isinstance(camera, Camera))
         order = list(places_first(self.views, scores, len(self.points3d)))
         turns = [(place + RUNG * rung, rung, k) for rung in range(len(cameras)) for place, k in enumerate(order)]

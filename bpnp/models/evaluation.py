@@ -19,14 +19,14 @@ from torch import Tensor, nn
 
 from bpnp.checks import check_positive, check_within
 from bpnp.geometry import bearings, choose, chords
-from bpnp.runtime import Deadline
 from bpnp.robust.proposals import pose_hypotheses
+from bpnp.runtime import Deadline
 from bpnp.search.config import DEFAULT, SearchSettings
 from bpnp.search.problem import Problem
 from bpnp.search.propose.given import anneal_given
 from bpnp.search.scene import Scene, degenerate
 from bpnp.search.search import search_poses
-from bpnp.search.verdict.decide import SearchResult, degenerate_points, judged
+from bpnp.search.verdict.decide import SearchResult, degenerate_points, judge
 from bpnp.types import Batch, Pose, Prediction, SolveStats
 
 
@@ -96,7 +96,7 @@ def _refined(problem: Problem, rotation: NDArray[np.float64], translation: NDArr
     if degenerate(problem.bearings) or degenerate(problem.points3d):
         return degenerate_points("too few points, or all on one line")
     poses = anneal_given(Scene(problem, 0, DEFAULT), rotation, translation)
-    return judged(poses, problem, batches=int(np.isfinite(rotation).all((-2, -1)).sum()), rule=DEFAULT.evidence)
+    return judge(poses, problem, batches=int(np.isfinite(rotation).all((-2, -1)).sum()), rule=DEFAULT.evidence)
 
 
 def problems_of(batch: Batch) -> list[Problem]:

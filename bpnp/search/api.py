@@ -9,8 +9,6 @@ import numpy as np
 from bpnp.argument_types import ArrayLike, ImageSize, ManyArrays, ManyPoints, PointsLike, PoseLike
 from bpnp.cameras import Camera, ManyCameras, camera_from
 from bpnp.runtime import Clock, Deadline
-from bpnp.search.enumeration.search import is_enumerable
-from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.arguments import (
     Labels,
     ManyPriors,
@@ -28,11 +26,13 @@ from bpnp.search.arguments import (
     seconds_from,
     source_from,
 )
-from bpnp.search.focal_length import solved_with_focal_length, unknown_camera
+from bpnp.search.enumeration.search import is_enumerable
+from bpnp.search.focal_length import solve_with_focal_length, unknown_camera
 from bpnp.search.inputs import problem_from
 from bpnp.search.modes import Mode, prepare_mode
+from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.solution import Solution
-from bpnp.search.sources import Options, Progress, solutions_of
+from bpnp.search.sources import Options, Progress, solve_problems
 
 if TYPE_CHECKING:
     import torch
@@ -310,16 +310,16 @@ def solve_many(
                 whole = problem(i, lens, focal)
                 return whole if taken is None else whole.without(taken)
 
-            return solved_with_focal_length(at, unknown[i], options)
+            return solve_with_focal_length(at, unknown[i], options)
 
         solutions = {i: again(i) for i in problems}
     else:
         problems = {i: problem(i, None if one is None else camera_from(one)) for i, one in enumerate(cameras)}
 
         def again(i: int, taken: Labels | None = None) -> Solution:
-            return solutions_of({i: problems[i] if taken is None else problems[i].without(taken)}, options)[i]
+            return solve_problems({i: problems[i] if taken is None else problems[i].without(taken)}, options)[i]
 
-        solutions = solutions_of(problems, options)
+        solutions = solve_problems(problems, options)
     share_points(problems, solutions, again)
     return [solutions[i] for i in range(count)]
 

@@ -34,7 +34,7 @@ class ImageSettings:
 
 @dataclass(frozen=True)
 class Contested:
-    """Conditions under which a far pose competes with the best one (`bpnp.search.verdict.competitors.contesting`).
+    """Conditions under which a far pose competes with the best one (`unrelated_competitor`).
 
     Attributes:
         near: Distance, in scales of the residuals, within which an image point has a match and two matches coincide.
@@ -348,7 +348,7 @@ class Draws:
 
 
 @dataclass(frozen=True)
-class Screens:
+class Preselection:
     """Preselection of initial poses on the density map, in steps.
 
     Attributes:
@@ -382,7 +382,7 @@ class Narrowing:
 
 
 @dataclass(frozen=True)
-class RasterShape:
+class DensityShape:
     """Density map of the view.
 
     Attributes:
@@ -401,21 +401,21 @@ class RasterShape:
 
 
 @dataclass(frozen=True)
-class RasterSearch:
+class DensitySearch:
     """One density-map search (`bpnp.search.propose.density_map`): draw, preselect, narrow, anneal.
 
     Attributes:
         draws: Number of initial poses.
-        screens: Preselection of the initial poses.
+        preselection: Preselection of the initial poses.
         narrowing: Scales from the preselection to the annealing.
-        raster: Density map of the view.
+        density_map: Density map of the view.
         annealed: Number of poses that are annealed at the end.
     """
 
     draws: Draws = Draws()
-    screens: Screens = Screens()
+    preselection: Preselection = Preselection()
     narrowing: Narrowing = Narrowing()
-    raster: RasterShape = RasterShape()
+    density_map: DensityShape = DensityShape()
     annealed: int = 40
 
 
@@ -435,7 +435,7 @@ class Schedule:
         apart_deg: Least angle between the rotations of these poses, degrees.
         in_vain: Number of consecutive searches without a better pose after which the other poses of the source are
             skipped.
-        looks: Number of local searches around a significant pose that find nothing better, at most.
+        local_searches: Number of local searches around a significant pose that find nothing better, at most.
     """
 
     turns: int = 400
@@ -447,7 +447,7 @@ class Schedule:
     around_each: int = 6
     apart_deg: float = 10.0
     in_vain: int = 3
-    looks: int = 3
+    local_searches: int = 3
 
 
 @dataclass(frozen=True)
@@ -482,7 +482,7 @@ class SearchSettings:
         middle: Stages on finer clusters.
         fine: Annealing on all points.
         near: Density-map searches around a prior.
-        beside: Density-map search around a pose that the search has found.
+        local: Density-map search around a pose that the search has found.
         zoomed: Density-map search around a pose at the next step of the focal length.
         proposed: Density-map search from proposed poses.
         everywhere: Density-map search over all rotations.
@@ -525,26 +525,26 @@ class SearchSettings:
         ClusterStage(256, 0.062, 0.04, iterations=7, kept=10, apart_deg=1.0),
     )
     fine: FineStage = FineStage()
-    near: tuple[RasterSearch, ...] = tuple(
-        RasterSearch(screens=Screens((100, 1000), kept), narrowing=Narrowing(first, points=600), annealed=12)
+    near: tuple[DensitySearch, ...] = tuple(
+        DensitySearch(preselection=Preselection((100, 1000), kept), narrowing=Narrowing(first, points=600), annealed=12)
         # The finer one is for dense keypoints and few visible points; in its narrower basins, ranks are less certain.
         for first, kept in ((0.06, (2**13, 2**10)), (0.03, (2**13, 2**11)))
     )
-    beside: RasterSearch = RasterSearch(
+    local: DensitySearch = DensitySearch(
         Draws(2**13, 10.0, 0.1, 2**13),
-        Screens((50, 300), (2**11, 2**8)),
+        Preselection((50, 300), (2**11, 2**8)),
         Narrowing(0.08, 0.015, points=600),
         annealed=12,
     )
-    zoomed: RasterSearch = RasterSearch(
+    zoomed: DensitySearch = DensitySearch(
         Draws(2**10, 3.0, 0.04, 2**10),
-        Screens((300,), (2**5,)),
+        Preselection((300,), (2**5,)),
         Narrowing(0.04, 0.015, steps=3, points=600),
         annealed=3,
     )
-    proposed: RasterSearch = RasterSearch()
-    everywhere: RasterSearch = RasterSearch(
-        Draws(2**15), Screens((50, 300), (2**12, 2**9)), Narrowing(0.08, 0.015, points=600), annealed=12
+    proposed: DensitySearch = DensitySearch()
+    everywhere: DensitySearch = DensitySearch(
+        Draws(2**15), Preselection((50, 300), (2**12, 2**9)), Narrowing(0.08, 0.015, points=600), annealed=12
     )
     facing: Facing = Facing()
     evidence: Evidence = Evidence()

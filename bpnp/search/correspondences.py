@@ -31,7 +31,7 @@ def facing(problem: Problem, camera: Array, rotation: Array) -> Labels:
     return np.flatnonzero(used)
 
 
-def partners(
+def possible_matches(
     problem: Problem, seen: Array, places: Labels, chosen: Labels, scale: float, most: int = NEIGHBOURS
 ) -> tuple[Any, Any, Array, Array]:
     """Return the possible matches of chosen image points and scene points near them.
@@ -78,7 +78,7 @@ def partners(
     return i, j, np.asarray(density, np.float64), np.asarray(every, np.float64)
 
 
-def explained(problem: Problem, rotation: Array, translation: Array, scale: float) -> tuple[float, float]:
+def score_pose(problem: Problem, rotation: Array, translation: Array, scale: float) -> tuple[float, float]:
     """Return the mean log-likelihood of the bearings under a pose and the expected number of matches.
 
     Args:
@@ -96,7 +96,7 @@ def explained(problem: Problem, rotation: Array, translation: Array, scale: floa
     if not len(places):
         return -math.inf, 0.0
     seen = camera[places] / np.linalg.norm(camera[places], axis=-1, keepdims=True)
-    i, _, density, every = partners(problem, seen, places, chosen, scale)
+    i, _, density, every = possible_matches(problem, seen, places, chosen, scale)
     matched = float((density / every[i]).sum()) * len(problem.bearings) / len(chosen)
     return float(np.log(2 * math.pi * every).mean()), min(
         matched, float(min(len(problem.bearings), len(problem.points3d)))

@@ -25,22 +25,22 @@ from bpnp.cameras import (
     scale_focal_length,
     with_radial_distortion,
 )
+from bpnp.poses import rotation_angle, same_pose
 from bpnp.runtime import Clock, one_blas_thread
-from bpnp.poses import same_pose, turned_by
-from bpnp.search.refine.annealing import polished
+from bpnp.search.arguments import Array, checked_size
 from bpnp.search.config import DEFAULT as SEARCH
 from bpnp.search.config import OtherFocal
 from bpnp.search.enumeration.search import is_enumerable
-from bpnp.search.verdict.reasons import objection
-from bpnp.search.verdict.uncertainty import is_within
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.propose.lens import fit_lens
+from bpnp.search.refine.annealing import anneal_to_end
 from bpnp.search.scene import Scene
-from bpnp.search.verdict.decide import match_count, weighed
-from bpnp.search.arguments import Array, checked_size
 from bpnp.search.solution import FOCAL_LENGTH, ROTATION_PARAMETERS, Solution, add_objection
-from bpnp.search.sources import Options, solutions_of
+from bpnp.search.sources import Options, solve_problems
+from bpnp.search.verdict.decide import match_count, rank_poses
+from bpnp.search.verdict.reasons import objection
+from bpnp.search.verdict.uncertainty import is_within
 
 ProblemAt = Callable[[Camera, UnknownFocal], Problem]
 RADIAL_PLACES = {"SIMPLE_RADIAL": 3, "OPENCV": 4}  # index of the radial coefficient in the parameters of a camera model
@@ -152,7 +152,7 @@ class UnknownCamera(NamedTuple):
             centre_sigma=RULE.centre_sigma * self.outermost(zoom),
         )
 
-    def ladder(self, step: float) -> list[Camera]:
+    def focal_steps(self, step: float) -> list[Camera]:
         """Return cameras with focal lengths at most a factor `step` apart that cover the range, the usual one first."""
         below, above = (math.log(end / self.usual) / math.log(step) for end in (self.smallest, self.largest))
         steps = [0] if self.alone else sorted(range(math.ceil(below - 0.51), math.floor(above + 0.51) + 1), key=abs)
@@ -228,7 +228,7 @@ def unknown_camera(
 
 
 @one_blas_thread
-def solved_with_focal_length(problem_at: ProblemAt, unknown: UnknownCamera, options: Options) -> Solution:
+def solve_with_focal_length(problem_at: ProblemAt, unknown: UnknownCamera, options: Options) -> Solution:
     """Return the solution with the fewest false alarms over pose and focal length.
 
     Args:
@@ -238,7 +238,7 @@ def solved_with_focal_length(problem_at: ProblemAt, unknown: UnknownCamera, opti
     """
     problem = problem_at(unknown.reference, unknown.focal(unknown.reference))
     if problem.degenerate is not None:
-        return solutions_of({0: problem}, options)[0]
+        return solve_problems({0: problem}, options)[0]
     return _OneCamera(unknown.seen_by(problem), options, problem_at=problem_at).sweep(few=is_enumerable(problem))
 
 
@@ -262,19 +262,19 @@ class FocalSweep(ABC):
     def sweep(self, *, few: bool) -> Solution:
         """Return the solution with the fewest false alarms; `few` is True for points that are enumerated."""
         most = self.options.settings.schedule.turns
-        for camera in (ladder := self.unknown.ladder(RULE.step_few if few else RULE.step)):
-            self.climb(camera, min(RULE.turns, most), len(ladder))
+        for camera in (focal_steps := self.unknown.focal_steps(RULE.step_few if few else RULE.step)):
+            self.search_from(camera, min(RULE.turns, most), len(focal_steps))
             if self.best.verdict == "confident" and not few:
                 break
         if self.best.verdict != "confident" and not few and most > RULE.turns and self.best.camera is not None:
-            self.climb(self.best.camera, most, 1)
+            self.search_from(self.best.camera, most, 1)
         return replace(self.contested(), seconds=Clock.now() - self.begun)
 
     @property
     def best(self) -> Solution:
         return min(self.ends, key=lambda end: end.log10_false_alarms)
 
-    def climb(self, camera: Camera, turns: int, rungs: int) -> None:
+    def search_from(self, camera: Camera, turns: int, rungs: int) -> None:
         """Search with a camera, then with cameras that fit the found poses better."""
         found = self._search(camera, turns, rungs)
         for _ in range(RULE.alternations):
@@ -324,9 +324,9 @@ class FocalSweep(ABC):
                 if (
                     behind < rule.lead
                     and not same_pose(rotations, moved, 0, rule.same)[1]
-                    and not is_claimed(best, other.rotation, zoom)
+                    and not is_within_bound(best, other.rotation, zoom)
                 ):
-                    away = math.degrees(turned_by(best.rotation, other.rotation))
+                    away = math.degrees(rotation_angle(best.rotation, other.rotation))
                     return add_objection(best, objection("other_focal_length", behind, zoom=zoom, degrees=away))
         return best
 
@@ -338,14 +338,14 @@ class _OneCamera(FocalSweep):
     problem_at: ProblemAt = field(kw_only=True)
 
     def solve_with(self, camera: Camera, options: Options) -> Solution:
-        return solutions_of({0: self.problem_at(camera, self.unknown.focal(camera))}, options)[0]
+        return solve_problems({0: self.problem_at(camera, self.unknown.focal(camera))}, options)[0]
 
     def refine(self, solution: Solution, camera: Camera, zooms: Sequence[float] = (1.0,)) -> Camera:
         pose, scale = (solution.rotation, solution.translation), solution.stats.residual
         return fit_camera(self.problem_at, self.unknown, camera, pose, scale, self.options.seed, zooms).camera
 
 
-def is_claimed(solution: Solution, rotation: Array, zoom: float) -> bool:
+def is_within_bound(solution: Solution, rotation: Array, zoom: float) -> bool:
     """Return True if a rotation and `zoom` times the focal length are within the 99.9 % bound of a solution.
 
     A rotation difference of more than `Contested.far` times the limit of the same pose is outside, whatever the bound.
@@ -462,4 +462,4 @@ def _fit_track(
 
 def _anneal_pose(problem: Problem, rotation: Array, translation: Array, scale: float, seed: int) -> Hypotheses:
     scene = Scene(problem, seed, SEARCH)
-    return weighed(polished(scene, rotation[None], translation[None], scale), problem)[:1]
+    return rank_poses(anneal_to_end(scene, rotation[None], translation[None], scale), problem)[:1]

@@ -6,8 +6,6 @@ import numpy as np
 
 from bpnp.cameras import Camera, in_front
 from bpnp.poses import MIN_POINTS
-from bpnp.search.problem import Problem, Unit, UnknownFocal, units_per_radian
-from bpnp.search.starts import GravityPrior, PosePrior
 from bpnp.search.arguments import (
     Array,
     Labels,
@@ -21,6 +19,8 @@ from bpnp.search.arguments import (
     scene_points,
     unit_bearings,
 )
+from bpnp.search.problem import Problem, Unit, UnknownFocal, units_per_radian
+from bpnp.search.starts import GravityPrior, PosePrior
 
 FLOOR_PIXELS = 0.1  # no point detector is more accurate
 

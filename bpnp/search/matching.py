@@ -12,13 +12,13 @@ from scipy.sparse.csgraph import maximum_bipartite_matching, min_weight_full_bip
 from scipy.spatial import cKDTree
 
 from bpnp.poses import MIN_POINTS
-from bpnp.search.verdict.uncertainty import linearised, pose_covariance
+from bpnp.search.arguments import Array, Labels
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem
 from bpnp.search.refine.gauss_newton import ImageMatches, Iteration, image_equations, refine
+from bpnp.search.solution import FOCAL_LENGTH, POSE_PARAMETERS, Solution, SolutionStats, add_pose
 from bpnp.search.verdict.decide import SearchResult
-from bpnp.search.arguments import Array, Labels
-from bpnp.search.solution import FOCAL_LENGTH, POSE_PARAMETERS, Solution, SolutionStats, with_pose
+from bpnp.search.verdict.uncertainty import linearised, pose_covariance
 
 Allowed = Callable[[Labels, Labels], NDArray[np.bool_]]
 DENSE = 4096  # largest number of possible matches that are all compared
@@ -42,7 +42,7 @@ def finished(problem: Problem, result: SearchResult, seconds: float, inlier_thre
     """
     start, found = time.perf_counter(), result.candidates
     if not len(found):
-        failed = without_pose(problem, _note_duplicates(problem, result), inlier_threshold, seconds)
+        failed = failed_solution(problem, _note_duplicates(problem, result), inlier_threshold, seconds)
         return replace(failed, reason_code=result.code)
     threshold = inlier_threshold or SCALES * result.residual * problem.per_radian
     poses = list(zip(found.rotation, found.translation, strict=True))
@@ -57,8 +57,8 @@ def finished(problem: Problem, result: SearchResult, seconds: float, inlier_thre
     camera = problem.points3d[j] @ poses[0][0].T + poses[0][1]
     matched = float(found.match_count[0])
     linear = None if result.verdict == "failed" else linearised(problem, *poses[0], result.residual)
-    solution = with_pose(
-        without_pose(problem, _note_duplicates(problem, result), None),
+    solution = add_pose(
+        failed_solution(problem, _note_duplicates(problem, result), None),
         result,
         replace(found, rotation=rotation, translation=translation),
         counts,
@@ -89,7 +89,7 @@ def angles_between(bearings: Array, directions: Array) -> Array:
     return np.arctan2(sine, (bearings * directions).sum(-1))
 
 
-def without_pose(problem: Problem, reason: str, inlier_threshold: float | None, seconds: float = 0.0) -> Solution:
+def failed_solution(problem: Problem, reason: str, inlier_threshold: float | None, seconds: float = 0.0) -> Solution:
     """Return a failed solution of a problem, without a pose."""
     return Solution(
         inlier_threshold=math.nan if inlier_threshold is None else inlier_threshold,

@@ -4,13 +4,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from bpnp.search.starts import GravityPrior, PosePrior
 from bpnp.search.arguments import check_inside, checked_prior, each_camera, each_set, is_network, pixels_from
 from bpnp.search.focal_length import unknown_camera
 from bpnp.search.infinity.solve import prepare_directions
 from bpnp.search.rig.solve import mount_from, prepare_rig
 from bpnp.search.solution import Solution
 from bpnp.search.sources import Options
+from bpnp.search.starts import GravityPrior, PosePrior
 
 PER_CAMERA = "labels2d", "scores2d"
 

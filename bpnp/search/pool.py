@@ -7,14 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.poses import close_poses
-from bpnp.search.refine.annealing import finish
-from bpnp.search.settle import settle
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.loop import Step
 from bpnp.search.pose_model import log10_tests
 from bpnp.search.problem import Problem
+from bpnp.search.refine.annealing import finish
 from bpnp.search.scene import Scene
-from bpnp.search.verdict.decide import SearchResult, judged, missed, weighed, with_false_alarms
+from bpnp.search.settle import settle
+from bpnp.search.verdict.decide import SearchResult, add_false_alarms, judge, missed, rank_poses
 
 
 class Pool:
@@ -33,7 +33,7 @@ class Pool:
 
     def __init__(self, scene: Scene, problem: Problem, enumerated: SearchResult) -> None:
         self.scene, self.problem, self.enumerated = scene, problem, enumerated
-        self.turns, self._judged = 0, 0.0
+        self.turns, self._judge = 0, 0.0
         self._is_thinned = len(problem.bearings) > scene.settings.fine.bearings
         self._tests = log10_tests(problem)
         self.forget()
@@ -69,7 +69,7 @@ class Pool:
 
     def may_be_decided(self) -> bool:
         """Return True if the verdict on the best pose may be final, or more points may be matched by it."""
-        bettered = self._is_thinned and self.alarms < self._judged - self.scene.settings.evidence.lead
+        bettered = self._is_thinned and self.alarms < self._judge - self.scene.settings.evidence.lead
         return bettered or self.missed <= self.scene.settings.evidence.missed
 
     def _weighed(self, candidates: Hypotheses, count: int | None = None) -> Hypotheses:
@@ -80,7 +80,7 @@ class Pool:
         if count is None:
             count = self.scene.settings.finished if self.problem.prior is None else self.scene.settings.kept
         places = np.flatnonzero(self._promising(candidates[:count]))
-        first = with_false_alarms(to_problem_frame(candidates[places], self.scene), self.problem)
+        first = add_false_alarms(to_problem_frame(candidates[places], self.scene), self.problem)
         alarms, rough = candidates.log10_false_alarms.copy(), candidates.log10_rough.copy()
         alarms[places], rough[places] = first.log10_false_alarms, first.log10_rough
         return replace(candidates, log10_false_alarms=alarms, log10_rough=rough)
@@ -97,7 +97,7 @@ class Pool:
     def leaders(self) -> Hypotheses:
         """Return the candidates with an NFA, in the frame of the problem, the best one first."""
         known = self.candidates[~np.isnan(self.candidates.log10_false_alarms)]
-        return weighed(to_problem_frame(known, self.scene), self.problem, self.scene.settings.evidence)
+        return rank_poses(to_problem_frame(known, self.scene), self.problem, self.scene.settings.evidence)
 
     @property
     def best_key(self) -> float:
@@ -109,7 +109,7 @@ class Pool:
         """log10 of the smallest NFA of the candidates; infinite if none has one."""
         return float(np.nanmin(self.candidates.log10_false_alarms, initial=np.inf))
 
-    def looks(self, leaders: Hypotheses) -> int:
+    def local_searches(self, leaders: Hypotheses) -> int:
         """Return the number of local searches around the first of these poses that found nothing better.
 
         Args:
@@ -131,7 +131,7 @@ class Pool:
     def _missed(self) -> float:
         """Compute `missed` from the current candidates."""
         leaders = self.leaders()
-        return missed(leaders, self.problem, self.looks(leaders), self.scene.settings.evidence)
+        return missed(leaders, self.problem, self.local_searches(leaders), self.scene.settings.evidence)
 
     def result(self, *, ended: bool = True) -> SearchResult:
         """Compute the verdict on the best candidates.
@@ -141,15 +141,15 @@ class Pool:
                 points; False to anneal only the best one.
         """
         scene, problem, rule = self.scene, self.problem, self.scene.settings.evidence
-        self._judged = min(self._judged, self.alarms)
+        self._judge = min(self._judge, self.alarms)
         annealed = scene.settings.finished if ended else 1
         ends = finish(scene, self.candidates, annealed) if len(self.candidates) else self.candidates
         if len(ends) and problem.prior is not None:  # keep the version of each pose with the smaller NFA
             ends = self._weighed(ends)
             ends = merge_hypotheses([ends, self.candidates.as_dependent()], scene)
-        leaders = weighed(to_problem_frame(ends, scene), problem, rule)
-        looks = self.looks(leaders)
-        result = judged(leaders, problem, batches=self.turns, looks=looks, rule=rule)
+        leaders = rank_poses(to_problem_frame(ends, scene), problem, rule)
+        local_searches = self.local_searches(leaders)
+        result = judge(leaders, problem, batches=self.turns, local_searches=local_searches, rule=rule)
         if self.enumerated.log10_false_alarms < result.log10_false_alarms:
             return replace(self.enumerated, batches=self.turns)
-        return settle(result, problem, lambda: scene, rule, looks=looks)
+        return settle(result, problem, lambda: scene, rule, local_searches=local_searches)

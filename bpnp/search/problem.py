@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.cameras import Camera, in_front
-from bpnp.poses import MIN_POINTS, SAME, Tolerance, same_pose, turned_by
+from bpnp.poses import MIN_POINTS, SAME, Tolerance, rotation_angle, same_pose
 from bpnp.search.image_statistics import ImageStatistics
 from bpnp.search.propose.symmetries import Motions
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
@@ -379,7 +379,7 @@ class Problem:
             off = min(max(off, math.radians(SIGMAS * self.prior.sigma_deg)), math.pi)
             return math.log10(max((1 - math.cos(off)) / 2, 1e-12))
         known = np.asarray(self.prior.rotation, np.float64)
-        off = min(max(turned_by(rotation, known), math.radians(SIGMAS * self.prior.rotation_sigma_deg)), math.pi)
+        off = min(max(rotation_angle(rotation, known), math.radians(SIGMAS * self.prior.rotation_sigma_deg)), math.pi)
         share = max((off - math.sin(off)) / math.pi, 1e-15)
         if self.prior.translation is not None and math.isfinite(self.prior.translation_sigma):
             expected = known @ self.middle + np.asarray(self.prior.translation)

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.runtime import NEVER, Deadline
 from bpnp.poses import MIN_POINTS
-from bpnp.search.config import RasterShape, SearchSettings
-from bpnp.search.kernels.raster import Raster
+from bpnp.runtime import NEVER, Deadline
+from bpnp.search.config import DensityShape, SearchSettings
+from bpnp.search.kernels.density_map import DensityMap
 from bpnp.search.kernels.sides import (
     FORWARD,
     WeightedBearings,
@@ -64,13 +64,13 @@ class Scene:
         settings: Settings of the search.
         deadline: Deadline of the search.
         companions: Other rig cameras with the same points.
-        rasters: Density maps of the bearings that were computed so far.
+        density_maps: Density maps of the bearings that were computed so far.
     """
 
     def __init__(self, problem: Problem, seed: int, settings: SearchSettings, deadline: Deadline = NEVER) -> None:
         bearings, points3d = problem.bearings, problem.points3d
         self.settings, self.deadline = settings, deadline
-        self.rasters: dict[tuple[RasterShape, float], Raster] = {}
+        self.density_maps: dict[tuple[DensityShape, float], DensityMap] = {}
         self.companions: list[Companion] = []
         self._tiles: dict[int, tuple[Tiles, WeightedPoints]] = {}
         self._points: dict[int, WeightedPoints] = {}

@@ -19,21 +19,21 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.refine.annealing import multistart
-from bpnp.search.verdict.completeness import far_missed, near_missed
 from bpnp.search.hypotheses import Hypotheses, select_distinct, to_scene_frame
 from bpnp.search.loop import Step
 from bpnp.search.pool import Pool
 from bpnp.search.propose.density_map import (
-    admitted,
     is_near,
-    raster_search,
-    search_beside,
+    search_around,
+    search_density,
     search_everywhere,
     search_near,
+    select_admitted,
 )
+from bpnp.search.refine.annealing import multistart
 from bpnp.search.starts import PosePrior, Prior
-from bpnp.search.verdict.decide import is_symmetric, starts_met
+from bpnp.search.verdict.completeness import far_missed, near_missed
+from bpnp.search.verdict.decide import count_starts, is_symmetric
 
 Proposals = Callable[[], tuple[NDArray[np.float64], NDArray[np.float64]]]  # rotations (s, 3, 3), translations (s, 3)
 PROPOSED_AFTER = 4  # steps near a prior after which proposals are requested
@@ -99,7 +99,7 @@ class Surroundings:
             if not pool.is_searched(pose):
                 self.best = pool.best_key
                 pool.searched.append(pose)
-                return Step(partial(search_beside, pool.scene, pose, settings.beside))
+                return Step(partial(search_around, pool.scene, pose, settings.local))
         return None
 
 
@@ -203,7 +203,7 @@ class Plan:
         if (step := self._next_in_surroundings()) is not None:
             return step
         pool = self.pool
-        enough = pool.alarms >= 0 or pool.looks(pool.leaders()) >= pool.scene.settings.schedule.looks
+        enough = pool.alarms >= 0 or pool.local_searches(pool.leaders()) >= pool.scene.settings.schedule.local_searches
         return None if enough else self._look()
 
     def _take_proposals(self) -> Callable[[], Hypotheses]:
@@ -236,11 +236,11 @@ class Plan:
         """Return the step that reduces the larger miss probability: a local search around the best pose, or a start."""
         pool = self.pool
         leaders, settings = pool.leaders(), pool.scene.settings
-        looks, rule = pool.looks(leaders), settings.evidence
+        local_searches, rule = pool.local_searches(leaders), settings.evidence
         symmetric = bool(pool.problem.registered) and is_symmetric(leaders, pool.problem, rule)
-        basin_count = starts_met(leaders, pool.problem, rule, symmetric=symmetric)
+        basin_count = count_starts(leaders, pool.problem, rule, symmetric=symmetric)
         far = far_missed(basin_count, rule, symmetric=symmetric)
-        if looks < settings.schedule.looks and near_missed(basin_count, looks, rule) > far:
+        if local_searches < settings.schedule.local_searches and near_missed(basin_count, local_searches, rule) > far:
             return self._look()
         return next_start()
 
@@ -248,7 +248,7 @@ class Plan:
         """Return a local search around the best pose."""
         scene = self.pool.scene
         leader = to_scene_frame(self.pool.leaders()[:1], scene)
-        return Step(partial(search_beside, scene, leader, scene.settings.beside), leader)
+        return Step(partial(search_around, scene, leader, scene.settings.local), leader)
 
 
 def _dependent_batch(pool: Pool, number: int, guess: Prior) -> Hypotheses:
@@ -265,5 +265,5 @@ def search_proposed(pool: Pool, proposals: Proposals) -> Hypotheses:
     Returns:
         Distinct poses in the frame of the scene. Their basin counts are 0, since proposals are dependent.
     """
-    poses = admitted(pool.scene, Hypotheses.from_poses(*pool.scene.enter(*proposals())), pool.problem.prior)
-    return raster_search(pool.scene, poses, pool.scene.settings.proposed)
+    poses = select_admitted(pool.scene, Hypotheses.from_poses(*pool.scene.enter(*proposals())), pool.problem.prior)
+    return search_density(pool.scene, poses, pool.scene.settings.proposed)

@@ -13,8 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
-from bpnp.search.refine.annealing import run_batch
-from bpnp.search.settle import SceneOf, settle
 from bpnp.search.config import DEFAULT, SearchSettings
 from bpnp.search.enumeration.plan import EnumeratedPoses, EnumerationPlan
 from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
@@ -23,14 +21,16 @@ from bpnp.search.infinity.search import search_rotation
 from bpnp.search.loop import run
 from bpnp.search.pool import Pool
 from bpnp.search.problem import Problem
+from bpnp.search.propose.density_map import preselect
 from bpnp.search.propose.known_matches import known_matches, poses_of_matches
 from bpnp.search.propose.minimal_solvers import p3p_poses
 from bpnp.search.propose.symmetries import self_motions
-from bpnp.search.propose.density_map import looked_up
+from bpnp.search.refine.annealing import run_batch
 from bpnp.search.scene import Scene, degenerate
 from bpnp.search.schedule import Plan, Proposals
+from bpnp.search.settle import SceneOf, settle
 from bpnp.search.starts import Prior
-from bpnp.search.verdict.decide import SearchResult, degenerate_points, judged, no_pose
+from bpnp.search.verdict.decide import SearchResult, degenerate_points, judge, no_pose
 
 Progress = Callable[[int, float], None]  # batches so far, seconds
 WARMING = 8  # number of points of the problem that compiles the loops
@@ -130,7 +130,7 @@ def _of_known_matches(
 ) -> SearchResult:
     """Compute the verdict on the poses that known matches, indices (k,) of image and of scene points, fit best."""
     found, rule = poses_of_matches(problem, i, j, seed), settings.evidence
-    result = judged(found, problem, batches=0, exhaustive=True, rule=rule)
+    result = judge(found, problem, batches=0, exhaustive=True, rule=rule)
     return settle(result, problem, scene_of, rule, exhaustive=True)
 
 
@@ -157,5 +157,5 @@ def warm_up() -> None:
     scene = Scene(problem, 0, DEFAULT)
     start = Hypotheses.from_poses(*scene.enter(np.eye(3)[None], np.array([[0, 0, 6.0]])))
     run_batch(scene, start)
-    looks = DEFAULT.beside.raster, DEFAULT.beside.narrowing.first_scale
-    looked_up(scene, start, *looks, WARMING, 1)
+    local_searches = DEFAULT.local.density_map, DEFAULT.local.narrowing.first_scale
+    preselect(scene, start, *local_searches, WARMING, 1)

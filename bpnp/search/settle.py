@@ -12,21 +12,21 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.poses import turned_by
-from bpnp.search.refine.annealing import polished
+from bpnp.poses import rotation_angle
 from bpnp.search.config import Evidence, OtherFocal
-from bpnp.search.verdict.competitors import of_misfit
-from bpnp.search.verdict.false_alarms import alarms_of, likeliest_scale
-from bpnp.search.verdict.reasons import Objection, objection
-from bpnp.search.propose.repetitions import decades_behind, repeated_poses
-from bpnp.search.verdict.uncertainty import Misfit, bends_significantly, linearised, systematic_misfit
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
 from bpnp.search.pose_model import undistort
 from bpnp.search.problem import Problem, UnknownFocal
+from bpnp.search.propose.density_map import search_around
 from bpnp.search.propose.lens import LensFit, fit_lens
-from bpnp.search.propose.density_map import search_beside
+from bpnp.search.propose.repetitions import repeated_poses, repetition_margins
+from bpnp.search.refine.annealing import anneal_to_end
 from bpnp.search.scene import Scene
-from bpnp.search.verdict.decide import SearchResult, is_symmetric, judged, match_count, with_false_alarms
+from bpnp.search.verdict.competitors import of_misfit
+from bpnp.search.verdict.decide import SearchResult, add_false_alarms, is_symmetric, judge, match_count
+from bpnp.search.verdict.false_alarms import alarms_of, likeliest_scale
+from bpnp.search.verdict.reasons import Objection, objection
+from bpnp.search.verdict.uncertainty import Misfit, bends_significantly, linearised, systematic_misfit
 
 Array = NDArray[np.float64]
 SceneOf = Callable[[], Scene]
@@ -38,7 +38,7 @@ def settle(
     scene_of: SceneOf,
     rule: Evidence,
     *,
-    looks: float | int = 0,
+    local_searches: float | int = 0,
     exhaustive: bool = False,
     enumerated: bool = False,
 ) -> SearchResult:
@@ -65,7 +65,9 @@ def settle(
         if not len(competitors):
             break
         candidates, leader = Hypotheses.concatenate([result.candidates, competitors]), result.best[1]
-        result = judged(candidates, problem, batches=result.batches, looks=looks, exhaustive=exhaustive, rule=rule)
+        result = judge(
+            candidates, problem, batches=result.batches, local_searches=local_searches, exhaustive=exhaustive, rule=rule
+        )
         if np.array_equal(result.best[1], leader):
             break
     other = other_lens(result, problem, scene_of, rule) if result.verdict == "confident" else None
@@ -78,8 +80,8 @@ def repeated_competitors(
     """Return the competing poses of a repeated structure, refined, with their NFA.
 
     Their NFA is at most that of the leader times the factor by which they explain the image points worse
-    (`decades_behind`). Poses that were enumerated are refined already. They are scored again under the assumption that
-    the map may end anywhere, which makes them likelier.
+    (`repetition_margins`). Poses that were enumerated are refined already. They are scored again under the assumption
+    that the map may end anywhere, which makes them likelier.
 
     Args:
         result: Confident verdict.
@@ -105,9 +107,9 @@ def repeated_competitors(
     if enumerated:
         refined, limits = repeated, replace(limits, most_missing=1e-12)
     else:
-        refined = with_false_alarms(polished(scene_of(), *poses, scale), problem)
+        refined = add_false_alarms(anneal_to_end(scene_of(), *poses, scale), problem)
     others, fraction = (refined.rotation, refined.translation), float(motions.fraction.min(initial=1.0))
-    behind = decades_behind(problem, best, poses, others, scale, limits, fraction=fraction)
+    behind = repetition_margins(problem, best, poses, others, scale, limits, fraction=fraction)
     behind = np.maximum(behind, 0) if motions.complete else np.zeros(len(refined))
     if enumerated and (behind >= rule.lead).all():
         return Hypotheses.empty()
@@ -188,7 +190,7 @@ def misfit_of(rotation: Array, middle: Array, other: LensFit) -> Misfit:
         other: Fitted lens with its pose.
     """
     shift = float(np.linalg.norm(other.middle - middle)) / max(float(np.linalg.norm(middle)), 1e-300)
-    return Misfit(turned_by(rotation, other.rotation), shift, other.zoom, other.radial or 0.0)
+    return Misfit(rotation_angle(rotation, other.rotation), shift, other.zoom, other.radial or 0.0)
 
 
 class AtZoom(NamedTuple):
@@ -249,7 +251,7 @@ def search_at_zoom(found: AtZoom, zoom: float, scene: Scene) -> AtZoom:
     there = Scene(problem, 0, scene.settings, scene.deadline)
     shift = found.middle * (1, 1, zoom) - found.pose.rotation[0] @ problem.middle
     start = Hypotheses.from_poses(*there.enter(found.pose.rotation, shift[None]))
-    poses = to_problem_frame(search_beside(there, start, scene.settings.zoomed)[:1], there)
+    poses = to_problem_frame(search_around(there, start, scene.settings.zoomed)[:1], there)
     return AtZoom(zoom * found.zoom, problem, poses) if len(poses) else found
 
 

@@ -13,11 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from bpnp.cameras import Camera, CameraLike, camera_from, camera_to_json
-from bpnp.search.verdict.reasons import Objection
-from bpnp.search.verdict.uncertainty import centre_covariance
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Unit
 from bpnp.search.verdict.decide import SearchResult, Verdict
+from bpnp.search.verdict.reasons import Objection
+from bpnp.search.verdict.uncertainty import centre_covariance
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -338,7 +338,7 @@ def candidates_of(poses: Hypotheses, counts: Sequence[int]) -> tuple[Candidate, 
     )
 
 
-def with_pose(
+def add_pose(
     solution: Solution,
     result: SearchResult,
     poses: Hypotheses,

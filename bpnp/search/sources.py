@@ -7,17 +7,17 @@ from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 from bpnp.runtime import Clock, Deadline
+from bpnp.search.arguments import Array
 from bpnp.search.config import DEFAULT, SearchSettings
 from bpnp.search.enumeration.search import exceeds_enumeration
-from bpnp.search.verdict import reasons
+from bpnp.search.matching import failed_solution, finished
 from bpnp.search.problem import Problem
 from bpnp.search.propose.mirror import mirrored_alarms
 from bpnp.search.schedule import Proposals
 from bpnp.search.search import search_poses
-from bpnp.search.starts import PosePrior
-from bpnp.search.arguments import Array
-from bpnp.search.matching import finished, without_pose
 from bpnp.search.solution import Solution
+from bpnp.search.starts import PosePrior
+from bpnp.search.verdict import reasons
 
 if TYPE_CHECKING:
     import torch
@@ -65,14 +65,14 @@ class Options(NamedTuple):
         return Deadline(max(end - ending, (begun + end) / 2))
 
 
-def solutions_of(problems: Mapping[int, Problem], options: Options) -> dict[int, Solution]:
+def solve_problems(problems: Mapping[int, Problem], options: Options) -> dict[int, Solution]:
     """Return the solution of each problem, by the index of the problem."""
     solutions: dict[int, Solution] = {}
     solvable: dict[int, Problem] = {}
     copies: dict[int, torch.nn.Module] = {}
     for i, problem in problems.items():
         if problem.degenerate is not None:
-            failed = without_pose(problem, problem.degenerate, options.inlier_threshold)
+            failed = failed_solution(problem, problem.degenerate, options.inlier_threshold)
             solutions[i] = replace(failed, reason_code="degenerate")
             continue
         net = problem.network

@@ -15,25 +15,25 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.poses import rotation_angle
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
-from bpnp.poses import turned_by
-from bpnp.search.refine.annealing import anneal_on_points, finish, polished
-from bpnp.search.settle import settle
 from bpnp.search.config import DEFAULT, Evidence
+from bpnp.search.correspondences import score_pose
 from bpnp.search.enumeration.search import is_enumerable
-from bpnp.search.verdict.false_alarms import likeliest_scale
-from bpnp.search.correspondences import explained
-from bpnp.search.verdict.reasons import objection
-from bpnp.search.propose.repetitions import competing_poses, registered
-from bpnp.search.verdict.uncertainty import linearised, local_covariance
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.pose_model import log10_tests
 from bpnp.search.problem import SIGMAS, Problem, in_bulk
+from bpnp.search.propose.density_map import perturb_each
+from bpnp.search.propose.repetitions import competing_poses, registered
 from bpnp.search.propose.symmetries import mirror_pose
-from bpnp.search.propose.density_map import around_each
+from bpnp.search.refine.annealing import anneal_on_points, anneal_to_end, finish
 from bpnp.search.scene import Scene
+from bpnp.search.settle import settle
 from bpnp.search.starts import PosePrior
-from bpnp.search.verdict.decide import SearchResult, Verdict, judged, with_false_alarms
+from bpnp.search.verdict.decide import SearchResult, Verdict, add_false_alarms, judge
+from bpnp.search.verdict.false_alarms import likeliest_scale
+from bpnp.search.verdict.reasons import objection
+from bpnp.search.verdict.uncertainty import linearised, local_covariance
 
 Array = NDArray[np.float64]
 ONE_POSE = "only this pose and its competitors were tested, no better one was searched for"
@@ -74,7 +74,7 @@ def judge_given_pose(
         motions = registered(one, rotation, translation, float(claim.scale[0]), rule)
         copies = competing_poses(one, rotation, translation, motions, rule)
         if len(copies[0]):
-            others = Hypotheses.concatenate([others, polished(scene, *copies, float(claim.scale[0]))])
+            others = Hypotheses.concatenate([others, anneal_to_end(scene, *copies, float(claim.scale[0]))])
     others = _weighed_anew(others, one)
     others = others[np.argsort(others.log10_false_alarms, kind="stable")]
     same = np.array([_is_same(one, claim, others[k : k + 1], rule) for k in range(len(others))], np.bool_)
@@ -89,14 +89,14 @@ def judge_given_pose(
         claim = optimum
     competing = others[~same & (others.log10_false_alarms <= 0)]  # insignificant poses do not compete
     candidates = _weighed_anew(Hypotheses.concatenate([claim, competing]), one)
-    result = judged(candidates, one, batches=0, exhaustive=True, rule=rule)
+    result = judge(candidates, one, batches=0, exhaustive=True, rule=rule)
     result = settle(result, one, lambda: scene, rule, exhaustive=True, enumerated=few)
     result = _of_claim(result, candidates[:1])
     if result.verdict == "confident":
         result = replace(result, reason=f"{result.reason}; {ONE_POSE}")
     lead = float(claim.log10_false_alarms[0] - optimum.log10_false_alarms[0]) if better else 0.0
     if not refine and result.verdict == "confident" and 2 * math.log(10) * lead > WITHIN:  # see Wilks 1938
-        off = math.degrees(turned_by(rotation, optimum.rotation[0]))
+        off = math.degrees(rotation_angle(rotation, optimum.rotation[0]))
         result = result.doubt(objection("better_nearby", lead, degrees=off))
     refined = refine and result.verdict == "confident"
     return replace(result, batches=int(refined)), optimum  # 0 batches: no last fit to the matches
@@ -111,7 +111,7 @@ def _proposed(problem: Problem, claim: Hypotheses, scene: Scene) -> Hypotheses:
     wide = scene.settings.middle[-1].last_scale * scene.spread
     bulk = problem.points3d[in_bulk(problem.points3d)]
     mirrored = mirror_pose(bulk, claim.rotation[0], claim.translation[0])
-    starts = [start, around_each(scene, start)]
+    starts = [start, perturb_each(scene, start)]
     if mirrored is not None:
         starts.append(to_scene_frame(Hypotheses.from_poses(mirrored[0][None], mirrored[1][None]), scene))
     around = Hypotheses.concatenate(starts)
@@ -122,13 +122,13 @@ def _proposed(problem: Problem, claim: Hypotheses, scene: Scene) -> Hypotheses:
 
 def _weighed_anew(candidates: Hypotheses, problem: Problem) -> Hypotheses:
     """Return the candidates with their false alarms recomputed for the number of tests of the problem."""
-    return with_false_alarms(candidates.unweighed(), problem)
+    return add_false_alarms(candidates.unweighed(), problem)
 
 
 def _unrefined(problem: Problem, rotation: Array, translation: Array) -> Hypotheses:
     """Return a pose (1,) without refinement, at the scale of residuals with the most evidence."""
     scale = likeliest_scale(problem, rotation, translation)
-    score, count = explained(problem, rotation, translation, scale)
+    score, count = score_pose(problem, rotation, translation, scale)
     pose = Hypotheses.from_poses(
         rotation[None],
         translation[None],
@@ -136,7 +136,7 @@ def _unrefined(problem: Problem, rotation: Array, translation: Array) -> Hypothe
         match_count=np.array([count]),
         scale=np.array([scale]),
     )
-    return with_false_alarms(pose, problem)
+    return add_false_alarms(pose, problem)
 
 
 def _is_same(problem: Problem, claim: Hypotheses, pose: Hypotheses, rule: Evidence) -> bool:
@@ -168,7 +168,7 @@ def _of_claim(result: SearchResult, claim: Hypotheses) -> SearchResult:
         one = objection("chance", what="the pose fits no")
         result = replace(result, verdict="failed", reason=one.sentence(alarms), code=one.code)
     elif place:
-        off = math.degrees(turned_by(candidates.rotation[0], claim.rotation[0]))
+        off = math.degrees(rotation_angle(candidates.rotation[0], claim.rotation[0]))
         margin = alarms - float(candidates.log10_false_alarms[0])
         one = objection("better_pose", margin, degrees=off)
         refuted = result.verdict == "confident"  # the other pose is confident and refutes the given one

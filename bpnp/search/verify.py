@@ -11,16 +11,16 @@ from scipy.spatial.transform import Rotation
 from bpnp.argument_types import ArrayLike, PointsLike
 from bpnp.cameras import CameraLike, camera_from
 from bpnp.runtime import Deadline
+from bpnp.search.arguments import Array, Labels, checked_pose, checked_seed, numbers, positive, seconds_from
+from bpnp.search.hypotheses import Hypotheses
+from bpnp.search.inputs import problem_from
+from bpnp.search.matching import failed_solution, finished
+from bpnp.search.problem import Problem
+from bpnp.search.solution import Solution
+from bpnp.search.verdict.decide import match_count
 from bpnp.search.verdict.reasons import objection
 from bpnp.search.verdict.uncertainty import linearised, pose_covariance
-from bpnp.search.hypotheses import Hypotheses
-from bpnp.search.problem import Problem
-from bpnp.search.verdict.decide import match_count
 from bpnp.search.verification import judge_given_pose
-from bpnp.search.arguments import Array, Labels, checked_pose, checked_seed, numbers, positive, seconds_from
-from bpnp.search.inputs import problem_from
-from bpnp.search.matching import finished, without_pose
-from bpnp.search.solution import Solution
 
 SECONDS = 10.0
 
@@ -102,10 +102,10 @@ def verify(
         scores3d=scores3d,
     )
     given = None if matches is None else _checked_matches(matches, problem)
-    judged = problem if given is None else _of_matches(problem, given)
+    judge = problem if given is None else _of_matches(problem, given)
     limits: dict[str, Any] = {"inlier_threshold": threshold, "seed": checked_seed(seed), "time_limit": limit}
-    solution = verify_problem(judged, *pose, refine=refine, **limits)
-    if given is None or judged.degenerate is not None:
+    solution = verify_problem(judge, *pose, refine=refine, **limits)
+    if given is None or judge.degenerate is not None:
         return solution
     return replace(
         solution,
@@ -142,7 +142,7 @@ def verify_problem(
     """
     begun, deadline = time.perf_counter(), Deadline.after(time_limit)
     if problem.degenerate is not None:
-        return replace(without_pose(problem, problem.degenerate, inlier_threshold), reason_code="degenerate")
+        return replace(failed_solution(problem, problem.degenerate, inlier_threshold), reason_code="degenerate")
     claim = problem.from_user(rotation, translation)
     result, optimum = judge_given_pose(problem, *claim, refine=refine, seed=seed, deadline=deadline)
     if result.verdict == "confident" and deadline.passed():

@@ -155,6 +155,6 @@ def test_a_pose_that_is_refined_to_the_best_one_is_no_competitor() -> None:
     keypoints = photo_of(rng, points, normals, *pose)
     solution = scene.localize(keypoints, CAMERA)
     turned = Rotation.from_rotvec([0, 0, np.radians(2.3)]).as_matrix()
-    beside = replace(solution.candidates[0], rotation=turned @ pose[0], translation=turned @ pose[1])
+    local = replace(solution.candidates[0], rotation=turned @ pose[0], translation=turned @ pose[1])
     photo, place = Photo(keypoints, camera_from(CAMERA)), scene.region(scene.views[0])
-    assert best_competitor(photo, place, solution, [beside], []) is None
+    assert best_competitor(photo, place, solution, [local], []) is None

@@ -23,9 +23,9 @@ from bpnp.maps import localize
 from bpnp.maps.all_points import judge_on_all_points, refine_on_all_points
 from bpnp.maps.localize import BRIEF
 from bpnp.maps.photo_problem import Photo
+from bpnp.search.verdict.decide import SearchResult, judge
 from bpnp.search.verdict.false_alarms import alarms_of
 from bpnp.search.verdict.reasons import Objection, objection
-from bpnp.search.verdict.decide import SearchResult, judged
 
 
 @pytest.fixture(scope="module")
@@ -172,7 +172,7 @@ def of_another_lens(*_: object, **__: object) -> Objection:
 
 
 def not_sure(*known: Any, **options: Any) -> SearchResult:
-    return replace(judged(*known, **options), verdict="ambiguous")
+    return replace(judge(*known, **options), verdict="ambiguous")
 
 
 @pytest.mark.parametrize(
@@ -180,7 +180,7 @@ def not_sure(*known: Any, **options: Any) -> SearchResult:
     [
         ({"settle": lambda result, *_, **__: replace(result, verdict="ambiguous", reason="another")}, "another"),
         ({"settle": elsewhere}, "A competing pose 10 deg away fits about as well"),
-        ({"judged": not_sure, "other_lens": of_another_lens}, "With 1.30 times the focal length"),
+        ({"judge": not_sure, "other_lens": of_another_lens}, "With 1.30 times the focal length"),
     ],
     ids=["a rival", "another pose", "another camera of a pose that is in doubt"],
 )

@@ -8,7 +8,6 @@ from planted import plant
 from torch import Tensor
 
 from bpnp.geometry import angle_between, camera_centre
-from bpnp.runtime import NEVER
 from bpnp.models.baselines.branch_and_bound import (
     GOPAC,
     Boxes,
@@ -17,6 +16,7 @@ from bpnp.models.baselines.branch_and_bound import (
     within,
 )
 from bpnp.models.baselines.gosma import GOSMA, RayMixture, SceneMixture, distance, squared_norm
+from bpnp.runtime import NEVER
 
 
 def whole(turn: Tensor, rotvec_half: float, place: Tensor, centre_half: float) -> Boxes:

@@ -11,7 +11,6 @@ from planted import padded, plant
 from scipy.optimize import linear_sum_assignment
 
 from bpnp import Batch, BPnPNet
-from bpnp.runtime import NEVER
 from bpnp.metrics import rotation_error, translation_error
 from bpnp.models.baselines import GOPAC, GOSMA, Hungarian, RandomRansac, SoftPOSIT
 from bpnp.models.baselines.blind_p3p import probability_of_true_triple
@@ -19,6 +18,7 @@ from bpnp.models.baselines.hungarian import hungarian
 from bpnp.models.baselines.single_problem import SingleSolver
 from bpnp.models.baselines.softposit import softposit
 from bpnp.models.nets import ImageFeatures, SceneFeatures
+from bpnp.runtime import NEVER
 
 QUICK: dict[str, SingleSolver] = {
     "softposit": SoftPOSIT(max_steps=25, time_limit=None),

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from planted import degrees_between, directions
 from scipy.spatial.transform import Rotation
 
-from bpnp.runtime import Clock
 from bpnp.robust.minimal_solvers import p3p
+from bpnp.runtime import Clock
 from bpnp.search.enumeration.search import Enumerated, Enumeration, enumerate_poses
 from bpnp.search.problem import Problem
 

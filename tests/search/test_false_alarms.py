@@ -11,6 +11,11 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from bpnp.search import problem as problem_module
+from bpnp.search.infinity.evidence import background_of, log10_false_alarms
+from bpnp.search.infinity.kernels import catalogue_of
+from bpnp.search.pose_model import PoseModel
+from bpnp.search.problem import Problem
+from bpnp.search.starts import GravityPrior, PosePrior
 from bpnp.search.verdict.false_alarms import (
     alarms_of,
     camera_terms,
@@ -18,11 +23,6 @@ from bpnp.search.verdict.false_alarms import (
     log10_nfa,
     point_evidence,
 )
-from bpnp.search.infinity.evidence import background_of, log10_false_alarms
-from bpnp.search.infinity.kernels import catalogue_of
-from bpnp.search.pose_model import PoseModel
-from bpnp.search.problem import Problem
-from bpnp.search.starts import GravityPrior, PosePrior
 
 Array = NDArray[np.float64]
 SHIFT = np.array([0.1, -0.2, 6.0])

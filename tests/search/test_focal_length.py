@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from bpnp import Solution, solve
 from bpnp.cameras import Camera, camera_from, camera_to_json
-from bpnp.search.problem import Problem, UnknownFocal
-from bpnp.search.focal_length import fit_camera, is_claimed, unknown_camera
+from bpnp.search.focal_length import fit_camera, is_within_bound, unknown_camera
 from bpnp.search.inputs import problem_from
+from bpnp.search.problem import Problem, UnknownFocal
 
 Array = NDArray[np.float64]
 SIZE = (640, 480)
@@ -62,7 +62,7 @@ def test_the_uncertainty_of_the_focal_length_holds_those_within_its_bound(found:
     names = [solution.parameters.index(name) for name in ("rotation_x", "rotation_y", "rotation_z", "focal_length")]
     information = np.linalg.inv(solution.covariance[np.ix_(names, names)])
     sigma = information[3, 3] ** -0.5 / solution.focal_length
-    claimed = [is_claimed(solution, solution.rotation, math.exp(k * sigma)) for k in (-10, -1, 1, 10)]
+    claimed = [is_within_bound(solution, solution.rotation, math.exp(k * sigma)) for k in (-10, -1, 1, 10)]
     assert claimed == [False, True, True, False]
 
 

@@ -10,10 +10,10 @@ from planted import degrees_between, directions
 from scipy.spatial.transform import Rotation
 
 from bpnp.cameras import camera_from
-from bpnp.search.verdict.uncertainty import linearised, local_covariance
 from bpnp.search.pose_model import centre_columns, lens_columns, log10_lenses
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.propose.lens import fit_lens, lens_model
+from bpnp.search.verdict.uncertainty import linearised, local_covariance
 
 Array = NDArray[np.float64]
 FOCAL = 1000.0

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from bpnp import GravityPrior, PosePrior, solve, solve_many
 from bpnp.models import Matcher
 from bpnp.search.config import DEFAULT
-from bpnp.search.propose import networks
 from bpnp.search.inputs import problem_from
-from bpnp.search.sources import Options, solutions_of
+from bpnp.search.propose import networks
+from bpnp.search.sources import Options, solve_problems
 from bpnp.types import Batch, Prediction
 
 VIEW = Rotation.from_euler("xyz", [100, -35, 60], degrees=True).as_matrix()
@@ -124,7 +124,7 @@ def test_an_undecided_search_asks_the_matcher_and_a_confident_one_does_not(
     problem = problem_from(noise2d, noise3d, None, prior=prior)
     brief = replace(DEFAULT, schedule=replace(DEFAULT.schedule, turns=24, unaided=4))
     alone, helped = (
-        solutions_of({0: problem}, Options(asks=asks, seed=3, settings=brief))[0] for asks in (False, True)
+        solve_problems({0: problem}, Options(asks=asks, seed=3, settings=brief))[0] for asks in (False, True)
     )
     assert asked == ([] if name is None else [(3, name)])
     assert alone.verdict == helped.verdict != "confident"

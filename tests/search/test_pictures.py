@@ -23,7 +23,7 @@ from bpnp.examples import load
 from bpnp.report.images import save_figure
 from bpnp.search import solution as module
 from bpnp.search.inputs import problem_from
-from bpnp.search.matching import without_pose
+from bpnp.search.matching import failed_solution
 
 EXAMPLE = load("mesh")
 SOLUTION = bpnp.solve(EXAMPLE.points2d, EXAMPLE.points3d, EXAMPLE.camera)
@@ -71,7 +71,7 @@ def test_functions_that_moved_to_the_report_warn(name: str, successor: str) -> N
 def test_a_solution_without_a_pose_cannot_be_exported(tmp_path: Path) -> None:
     problem = problem_from(np.random.default_rng(0).normal(size=(8, 2)), EXAMPLE.points3d, None)
     with pytest.raises(ValueError, match="a solution without a pose cannot be exported: a reason"):
-        without_pose(problem, "a reason", None).to_colmap(tmp_path / "model")
+        failed_solution(problem, "a reason", None).to_colmap(tmp_path / "model")
     assert not (tmp_path / "model").exists()
 
 

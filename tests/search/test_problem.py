@@ -83,8 +83,8 @@ def test_a_search_gives_the_same_digits_in_any_unit(count: int) -> None:
 def test_far_points_decide_neither_the_origin_nor_the_size() -> None:
     rays, points, *_ = scene()
     far = np.concatenate([points, [[1e7, 0, 0], [0, -1e6, 1e6]]])
-    alone, beside = Problem.of(rays, points), Problem.of(rays, far)
-    assert (beside.size, beside.origin.tolist()) == (alone.size, alone.origin.tolist())
+    alone, local = Problem.of(rays, points), Problem.of(rays, far)
+    assert (local.size, local.origin.tolist()) == (alone.size, alone.origin.tolist())
 
 
 def test_points_in_one_place_have_a_size() -> None:

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import bpnp
-from bpnp.search.verdict.reasons import CLAUSES, CONFIDENT
 from bpnp.search.solution import Solution
+from bpnp.search.verdict.reasons import CLAUSES, CONFIDENT
 
 PAGE = Path(__file__).parents[2] / "docs" / "verdict.md"
 

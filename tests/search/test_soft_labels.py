@@ -34,13 +34,13 @@ def view() -> Any:
 def test_probabilities_of_one_act_as_labels_and_equal_ones_as_none(view: Any) -> None:
     *sides_and_pose, labels2d, labels3d = view
 
-    def judged(**labels: Any) -> tuple[float, Array]:
+    def judge(**labels: Any) -> tuple[float, Array]:
         found = bpnp.verify(*sides_and_pose, refine=False, **labels)
         return found.log10_false_alarms, found.covariance
 
-    certain = judged(labels2d=np.eye(4)[labels2d], labels3d=np.eye(4)[labels3d])
-    equal = judged(labels2d=np.full((100, 4), 0.25), labels3d=np.full((100, 4), 0.25))
-    for soft, hard in ((certain, judged(labels2d=labels2d, labels3d=labels3d)), (equal, judged())):
+    certain = judge(labels2d=np.eye(4)[labels2d], labels3d=np.eye(4)[labels3d])
+    equal = judge(labels2d=np.full((100, 4), 0.25), labels3d=np.full((100, 4), 0.25))
+    for soft, hard in ((certain, judge(labels2d=labels2d, labels3d=labels3d)), (equal, judge())):
         assert soft[0] == pytest.approx(hard[0], abs=1e-3)
         np.testing.assert_allclose(soft[1], hard[1], rtol=1e-4)
     assert certain[0] < equal[0] - 10

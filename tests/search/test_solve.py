@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from bpnp import PosePrior, Solution, solve, solve_many
 from bpnp.examples import load
-from bpnp.runtime import Deadline
 from bpnp.models import Search
-from bpnp.search.search import search_poses
+from bpnp.runtime import Deadline
 from bpnp.search import sources
 from bpnp.search.inputs import problem_from
+from bpnp.search.search import search_poses
 
 FISHEYE = ("OPENCV_FISHEYE", [300.0, 310.0, 400.0, 300.0, 0.05, -0.02, 0.01, 0.001])
 K = np.array([[520.0, 1.5, 405.0], [0.0, 500.0, 290.0], [0.0, 0.0, 1.0]])

@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, norm, t
 
 from bpnp import solve
-from bpnp.search.verdict import uncertainty
-from bpnp.search.verdict.uncertainty import linearised, local_covariance, pose_covariance, rotation_bound
 from bpnp.search.problem import Problem
 from bpnp.search.starts import GravityPrior, PosePrior
+from bpnp.search.verdict import uncertainty
+from bpnp.search.verdict.uncertainty import linearised, local_covariance, pose_covariance, rotation_bound
 
 Array = NDArray[np.float64]
 SHIFT = np.array([0.1, -0.2, 6.0])

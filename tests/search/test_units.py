@@ -8,8 +8,8 @@ from planted import degrees_between
 from scipy.spatial.transform import Rotation
 
 from bpnp import solve
-from bpnp.search.verdict.uncertainty import linearised, systematic_misfit
 from bpnp.search.problem import Problem
+from bpnp.search.verdict.uncertainty import linearised, systematic_misfit
 
 
 def view(focal: float, noise: float, count: int = 90) -> Any:

@@ -13,12 +13,12 @@ from scipy.spatial.transform import Rotation
 from scipy.special import stdtrit
 
 from bpnp.runtime import NEVER, Deadline
-from bpnp.search.settle import AtZoom, likeliest_zoom, other_lens
 from bpnp.search.config import DEFAULT
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.scene import Scene
-from bpnp.search.verdict.decide import SearchResult, judged
+from bpnp.search.settle import AtZoom, likeliest_zoom, other_lens
+from bpnp.search.verdict.decide import SearchResult, judge
 
 Array = NDArray[np.float64]
 SHIFT = np.array([0.0, 0.0, 6.0])
@@ -33,7 +33,7 @@ def verdict_on(problem: Problem, rotations: Array, translations: Array, scale: f
         match_count=np.full(c, matched * min(len(problem.bearings), len(problem.points3d))),
         scale=np.full(c, scale),
     )
-    return judged(poses, problem, batches=0, exhaustive=True)
+    return judge(poses, problem, batches=0, exhaustive=True)
 
 
 def test_a_few_exact_matches_do_not_make_a_rough_alignment_precise() -> None:
@@ -97,10 +97,12 @@ def test_a_loose_focal_length_of_a_small_object_is_still_confident(distance: flo
 
 
 @pytest.mark.parametrize(
-    ("basin_count", "looks", "verdict"),
+    ("basin_count", "local_searches", "verdict"),
     [(0, 0, "ambiguous"), (10, 0, "ambiguous"), (10, 1, "confident"), (6, 2, "confident")],
 )
-def test_weak_matches_need_repeated_basins_or_a_local_search(basin_count: int, looks: int, verdict: str) -> None:
+def test_weak_matches_need_repeated_basins_or_a_local_search(
+    basin_count: int, local_searches: int, verdict: str
+) -> None:
     """400 points with residuals of their spacing: a match is worth a hundredth of a decade.
 
     Ten initial poses could as well have ended at a far better optimum, which they make unlikely. A local search
@@ -111,7 +113,7 @@ def test_weak_matches_need_repeated_basins_or_a_local_search(basin_count: int, l
     rays = directions(directions(points + SHIFT) + 5e-3 * rng.standard_normal((400, 3)))
     columns = {"match_count": np.array([320.0]), "scale": np.array([5e-3])}
     pose = Hypotheses.from_poses(np.eye(3)[None], SHIFT[None], basin_count=basin_count, **columns)
-    found = judged(pose, Problem(rays, points), batches=1, looks=looks)
+    found = judge(pose, Problem(rays, points), batches=1, local_searches=local_searches)
     assert -10 > found.log10_false_alarms > -60
     assert found.verdict == verdict
     assert ("miss probability" in found.reason) == (verdict == "ambiguous")
@@ -127,7 +129,7 @@ def test_initial_poses_that_end_near_a_pose_count_for_its_basin(degrees: float, 
     columns = {"match_count": np.array([320.0, 200.0]), "scale": np.array([5e-3, 5e-3])}
     poses = Hypotheses.from_poses(rotations, np.stack([SHIFT, SHIFT]), **columns)
     poses = replace(poses, basin_count=np.array([0, 10]))
-    found = judged(poses, Problem(rays, points), batches=1, looks=1)
+    found = judge(poses, Problem(rays, points), batches=1, local_searches=1)
     assert found.verdict == verdict
     assert ("miss probability" in found.reason) == (verdict == "ambiguous")
 

@@ -202,8 +202,8 @@ def test_four_matches_without_redundancy_do_not_fix_a_pose() -> None:
 def test_thousands_of_matches_are_judged_as_labels_of_one_pair_each(monkeypatch: pytest.MonkeyPatch) -> None:
     """The pairs of a label in one sum, and one label after the other, are the same number."""
     from bpnp.search import problem
-    from bpnp.search.verdict.false_alarms import alarms_of
     from bpnp.search.problem import Problem
+    from bpnp.search.verdict.false_alarms import alarms_of
 
     bearings, points, rotation, translation = view_with_outliers(np.random.default_rng(2), 40, 20)
     labels2d, labels3d = np.arange(60) % 7 - 1, np.arange(60) % 9 - 1

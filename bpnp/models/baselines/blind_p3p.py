@@ -3,11 +3,11 @@
 import math
 
 from bpnp.geometry import bearings
-from bpnp.runtime import Deadline
 from bpnp.models.baselines.single_problem import Answer, SingleProblem, SingleSolver, agreement
 from bpnp.poses import MIN_POINTS
 from bpnp.robust.matches import distinct_triples
 from bpnp.robust.minimal_solvers import p3p
+from bpnp.runtime import Deadline
 
 TRIPLES = 256  # random triples solved at a time
 PREVIEW = 32  # 2D points that give the first score of a hypothesis

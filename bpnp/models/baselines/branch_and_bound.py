@@ -19,8 +19,8 @@ from torch.nn.functional import normalize
 from bpnp.checks import check_positive
 from bpnp.geometry import bearings
 from bpnp.layers.pnp import weighted_pnp
-from bpnp.runtime import Deadline
 from bpnp.models.baselines.single_problem import Answer, SingleProblem, SingleSolver, weak_perspective_distance
+from bpnp.runtime import Deadline
 
 DOMAIN = 1.5  # half side of the cube of camera centres, weak-perspective distances
 CHUNK = 2**22  # angles computed at a time

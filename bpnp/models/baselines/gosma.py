@@ -17,7 +17,6 @@ from torch.nn.functional import normalize, one_hot
 
 from bpnp.checks import check_positive
 from bpnp.geometry import angle_between, retract
-from bpnp.runtime import NEVER, Deadline
 from bpnp.models.baselines.branch_and_bound import (
     BestPose,
     Boxes,
@@ -29,6 +28,7 @@ from bpnp.models.baselines.branch_and_bound import (
     split,
     translation_uncertainty,
 )
+from bpnp.runtime import NEVER, Deadline
 
 CLOSEST = 0.5  # least distance of a camera centre from the scene's centre, weak-perspective distances
 GAP = 0.1  # distance from the optimum that is allowed, as a fraction of the image mixture's squared norm

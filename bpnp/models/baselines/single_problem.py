@@ -9,8 +9,8 @@ from torch import Tensor, nn
 
 from bpnp.checks import check_positive
 from bpnp.geometry import project, transform
-from bpnp.runtime import Deadline
 from bpnp.poses import MIN_POINTS
+from bpnp.runtime import Deadline
 from bpnp.types import Batch, Pose, Prediction, SolveStats
 
 CHUNK = 2**22  # distances computed at a time, in float32

@@ -9,7 +9,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bpnp.geometry import random_rotations, retract
-from bpnp.runtime import Deadline
 from bpnp.models.baselines.single_problem import (
     Answer,
     SingleProblem,
@@ -17,6 +16,7 @@ from bpnp.models.baselines.single_problem import (
     agreement,
     weak_perspective_distance,
 )
+from bpnp.runtime import Deadline
 
 Start = Literal["mean", "near_truth", "random"]
 CHUNK = 2**22  # largest product of image points, scene points and initial poses annealed together

@@ -3,10 +3,10 @@
 import math
 from typing import Any, NamedTuple
 
-from bpnp.search.kernels.vectors import copy_pose, rotated
 from bpnp.search.config import RULES
 from bpnp.search.enumeration.matching import Matches, cell_of, evidence, fits, match, nearest, sight, step
 from bpnp.search.enumeration.points import Array, Places
+from bpnp.search.kernels.vectors import copy_pose, rotated
 from bpnp.search.propose.minimal_solvers import Triangles, chords_between, compiled, part, solve_p2p, solve_p3p
 
 

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bpnp.search.kernels.vectors import rotated, turn
 from bpnp.search.config import RULES
 from bpnp.search.enumeration.points import Array, Heading, ImageArrays, Places, PriorArrays, SceneArrays
 from bpnp.search.kernels.dense import solve_normal_equations
+from bpnp.search.kernels.vectors import rotated, turn
 from bpnp.search.propose.minimal_solvers import part
 
 

@@ -12,17 +12,17 @@ from functools import partial
 import numpy as np
 
 from bpnp.runtime import Deadline
-from bpnp.search.settle import SceneOf, settle
 from bpnp.search.config import ENUMERATION, SearchSettings
+from bpnp.search.correspondences import score_pose
 from bpnp.search.enumeration.points import predicted_pose
 from bpnp.search.enumeration.search import Enumeration, margin
-from bpnp.search.correspondences import explained
-from bpnp.search.propose.repetitions import competing_poses, registered
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.loop import Step
 from bpnp.search.problem import Problem
+from bpnp.search.propose.repetitions import competing_poses, registered
+from bpnp.search.settle import SceneOf, settle
 from bpnp.search.starts import GravityPrior
-from bpnp.search.verdict.decide import REFINED, SearchResult, is_certain, judged, weighed, with_false_alarms
+from bpnp.search.verdict.decide import REFINED, SearchResult, add_false_alarms, is_certain, judge, rank_poses
 
 SMALLEST = 1e-5  # smallest scale of the residuals if the pixel size is unknown, radians
 
@@ -92,7 +92,7 @@ class EnumeratedPoses:
         run, rule = self.run, self.settings.evidence
         if not (run.is_significant and self.has_competitors and margin(self.found, run.problem) >= run.safe_margin):
             return False
-        candidates = weighed(self._candidates(), self.enumerated, rule)
+        candidates = rank_poses(self._candidates(), self.enumerated, rule)
         self.is_certain = is_certain(candidates, self.enumerated, rule)
         if self.is_certain:
             self._keep(candidates)
@@ -110,7 +110,7 @@ class EnumeratedPoses:
             return
         every = Hypotheses.concatenate([self.candidates, candidates])
         if isinstance(self.problem.prior, GravityPrior):
-            every = with_false_alarms(every, self.enumerated)
+            every = add_false_alarms(every, self.enumerated)
             order = np.argsort(every.log10_false_alarms, kind="stable")
         else:
             order = np.argsort(-every.log_likelihood, kind="stable")
@@ -124,14 +124,14 @@ class EnumeratedPoses:
         poses = poses[poses.evidence >= poses.evidence.max() - ENUMERATION.near_nats][: self.settings.kept]
         scale = np.maximum(poses.scale, self.problem.floor or SMALLEST)
         each = zip(poses.rotation, poses.translation, scale, strict=True)
-        likelihood = np.array([explained(self.problem, *one)[0] for one in each])
+        likelihood = np.array([score_pose(self.problem, *one)[0] for one in each])
         return replace(poses, scale=scale, log_likelihood=likelihood)
 
     def is_better_without_prior(self) -> bool:
         """Return True if the enumeration that has ended shall be repeated without the prior."""
         prior, rule = self.problem.prior, self.settings.evidence
         if isinstance(prior, GravityPrior):
-            self.candidates = with_false_alarms(self.candidates, self.enumerated)
+            self.candidates = add_false_alarms(self.candidates, self.enumerated)
             return float(self.candidates.log10_false_alarms.min(initial=math.inf)) > rule.false_alarms
         if predicted_pose(prior) is None:
             return False
@@ -142,9 +142,15 @@ class EnumeratedPoses:
         if self._result is None:
             rule, exhaustive = self.settings.evidence, self.is_exhausted
             poses, problem = self.candidates, self.problem
-            result = judged(poses, problem, batches=0, looks=REFINED, exhaustive=exhaustive, rule=rule)
+            result = judge(poses, problem, batches=0, local_searches=REFINED, exhaustive=exhaustive, rule=rule)
             self._result = settle(
-                result, self.problem, self._scene_of, rule, looks=REFINED, exhaustive=exhaustive, enumerated=True
+                result,
+                self.problem,
+                self._scene_of,
+                rule,
+                local_searches=REFINED,
+                exhaustive=exhaustive,
+                enumerated=True,
             )
         return self._result
 

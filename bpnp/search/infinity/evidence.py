@@ -32,12 +32,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc
 
-from bpnp.search.verdict.covariance import covariance_of, of_sure_matches, student_factor
-from bpnp.search.verdict.false_alarms import LEAST_SHARE, MOST_SHARE, SHARES, Terms, log10_nfa
-from bpnp.search.verdict.uncertainty import EXCEEDED, STRAINS, exceeded_once
 from bpnp.search.kernels.neighbours import sums_near
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem
+from bpnp.search.verdict.covariance import covariance_of, of_sure_matches, student_factor
+from bpnp.search.verdict.false_alarms import LEAST_SHARE, MOST_SHARE, SHARES, Terms, log10_nfa
+from bpnp.search.verdict.uncertainty import EXCEEDED, STRAINS, exceeded_once
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.search.kernels.vectors import F, compiled, cross, part, rotated, turn
 from bpnp.search.enumeration.matching import fits
 from bpnp.search.kernels.neighbours import HashedPoints, entry
+from bpnp.search.kernels.vectors import F, compiled, cross, part, rotated, turn
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]

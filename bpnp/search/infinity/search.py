@@ -22,12 +22,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import betaln
 
+from bpnp.poses import rotation_angle
 from bpnp.runtime import NEVER, Deadline
-from bpnp.poses import turned_by
 from bpnp.search.config import DEFAULT as SEARCH
 from bpnp.search.config import ENUMERATION
-from bpnp.search.verdict import reasons
-from bpnp.search.verdict.reasons import CONFIDENT, objection
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.infinity.evidence import (
     Array,
@@ -58,7 +56,9 @@ from bpnp.search.loop import Step, run
 from bpnp.search.pose_model import FIXING_ROTATION
 from bpnp.search.problem import Problem
 from bpnp.search.starts import PosePrior
+from bpnp.search.verdict import reasons
 from bpnp.search.verdict.decide import SearchResult, no_pose
+from bpnp.search.verdict.reasons import CONFIDENT, objection
 
 BINS = (6, 7)  # log2 of the smallest and largest number of azimuth bins
 PRIOR_SIGMAS = ENUMERATION.sigmas  # standard deviations of a prior beyond which no rotation is proposed
@@ -328,7 +328,7 @@ class RotationPoses:
     def result(self, *, ended: bool = True) -> SearchResult:
         """Compute the verdict; a failed one is settled if a rotation of enough points would have been found."""
         settings, count = self.sight.settings, len(self.sight.image.bearings)
-        result = _judged(self.found, self.sight, self.turns)
+        result = _judge(self.found, self.sight, self.turns)
         least = min(max(math.ceil(self.sight.least_share * count), FIXING_ROTATION + 1), count)
         hopeless = log10_missed(self.turns, count, least, settings.power) <= SEARCH.evidence.missed
         return replace(result, settled=result.verdict == "failed" and hopeless)
@@ -428,7 +428,7 @@ def _is_admitted(sight: Sight, rotation: Array) -> bool:
     if not sight.is_near or prior is None:
         return True
     if isinstance(prior, PosePrior):
-        off, sigma = turned_by(rotation, np.asarray(prior.rotation, np.float64)), prior.rotation_sigma_deg
+        off, sigma = rotation_angle(rotation, np.asarray(prior.rotation, np.float64)), prior.rotation_sigma_deg
     else:
         camera, scene = (np.asarray(v, np.float64) / np.linalg.norm(v) for v in prior[:2])
         off, sigma = math.acos(float(np.clip(camera @ rotation @ scene, -1, 1))), prior.sigma_deg
@@ -548,7 +548,7 @@ def _merge(found: Hypotheses, new: Hypotheses, sight: Sight) -> Hypotheses:
     return every[(every.log10_false_alarms <= 0) | (np.arange(len(every)) == 0)][: SEARCH.kept]
 
 
-def _judged(found: Hypotheses, sight: Sight, turns: int) -> SearchResult:
+def _judge(found: Hypotheses, sight: Sight, turns: int) -> SearchResult:
     """Judge rotations, best first, by the rules of `bpnp.search.verdict.decide`."""
     rule = SEARCH.evidence
     if found.matches is None or found.point_evidence is None:

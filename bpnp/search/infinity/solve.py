@@ -15,13 +15,6 @@ import numpy as np
 
 from bpnp.cameras import Camera, camera_from, in_front
 from bpnp.runtime import Clock, Deadline, one_blas_thread
-from bpnp.search.config import DEFAULT as SEARCH
-from bpnp.search.infinity.evidence import how_well_known, noise_of, prior_information, uncertainty_of
-from bpnp.search.infinity.search import DEFAULT, InfinitySettings, search_rotation
-from bpnp.search.pose_model import PoseModel
-from bpnp.search.problem import Problem, UnknownFocal
-from bpnp.search.refine.gauss_newton import ImageMatches, Iteration, image_equations, image_rows, refine
-from bpnp.search.starts import PosePrior, Prior
 from bpnp.search.arguments import (
     Array,
     Labels,
@@ -34,11 +27,18 @@ from bpnp.search.arguments import (
     scene_points,
     unit_vectors,
 )
+from bpnp.search.config import DEFAULT as SEARCH
 from bpnp.search.focal_length import UnknownCamera
+from bpnp.search.infinity.evidence import how_well_known, noise_of, prior_information, uncertainty_of
+from bpnp.search.infinity.search import DEFAULT, InfinitySettings, search_rotation
 from bpnp.search.inputs import bearings_of, check_seen, unit_of
 from bpnp.search.matching import SCALES, angles_between, count_one_to_one, one_to_one
-from bpnp.search.solution import FOCAL_LENGTH, ROTATION_PARAMETERS, Solution, SolutionStats, with_pose
+from bpnp.search.pose_model import PoseModel
+from bpnp.search.problem import Problem, UnknownFocal
+from bpnp.search.refine.gauss_newton import ImageMatches, Iteration, image_equations, image_rows, refine
+from bpnp.search.solution import FOCAL_LENGTH, ROTATION_PARAMETERS, Solution, SolutionStats, add_pose
 from bpnp.search.sources import Options
+from bpnp.search.starts import PosePrior, Prior
 
 FEWEST = 3  # two fix a rotation and leave no evidence
 HALF = 0.5  # pixels, step for the angle per pixel
@@ -161,7 +161,7 @@ def _solve(sky: Sky, options: Options) -> Solution:
     ends = list[Solution]()
     rough = replace(DEFAULT, noise=(DEFAULT.zoom_noise,), least_share=DEFAULT.zoom_share)
     exact = replace(rough, noise=DEFAULT.noise)
-    for rung in unknown[0].ladder(DEFAULT.zoom):
+    for rung in unknown[0].focal_steps(DEFAULT.zoom):
         trial = sky.at(*unknown[0].parts(rung))
         found = seen_by(trial, rough)
         if found.verdict == "failed":  # among many directions unrelated ones fit as well at the coarse noise
@@ -312,7 +312,7 @@ def _seen_by(sky: Sky, options: Options, deadline: Deadline, settings: InfinityS
     else:
         covariance = _with_focal_length(sky, found.rotation[0], matches)
     angles = angles_between(every[i], seen[0][j])
-    return with_pose(
+    return add_pose(
         solution,
         result,
         found,

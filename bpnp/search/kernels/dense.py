@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bpnp.search.kernels.vectors import F, compiled, cross, direction, part, rotated, sum_of, turn
 from bpnp.search.kernels.sides import Array, visible_weights
+from bpnp.search.kernels.vectors import F, compiled, cross, direction, part, rotated, sum_of, turn
 
 RELAXATION = 1.7  # times the Gauss-Newton step on clusters: alternating expectation and maximisation take short steps
 DAMPING = 1e-3  # of each diagonal entry of the Hessian: a direction that the points do not fix is left unchanged

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.kernels.vectors import F, part
 from bpnp.search.config import Facing, SearchSettings
+from bpnp.search.kernels.vectors import F, part
 
 Array = NDArray[np.float32]
 FORWARD = np.array([0.0, 0.0, 1.0])

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.kernels.vectors import F, compiled, copy_pose, part, sum_of
 from bpnp.search.kernels.dense import move, see
 from bpnp.search.kernels.sides import Array, WeightedBearings, visible_weights
+from bpnp.search.kernels.vectors import F, compiled, copy_pose, part, sum_of
 
 SWEEPS = 2
 TILES = 12  # mean number of tiles near a point that the first buffer holds

@@ -25,10 +25,10 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr, ndtri
 
 from bpnp.runtime import in_time
-from bpnp.search.refine.annealing import anneal_on_points, turned_about_middle
-from bpnp.search.config import RasterSearch, RasterShape
+from bpnp.search.config import DensitySearch, DensityShape
 from bpnp.search.hypotheses import Hypotheses
-from bpnp.search.kernels.raster import Raster, add_up
+from bpnp.search.kernels.density_map import DensityMap, add_up
+from bpnp.search.refine.annealing import anneal_on_points, perturb_about_centroid
 from bpnp.search.scene import Scene
 from bpnp.search.starts import PosePrior, Prior, aim_of, draw_poses
 
@@ -37,7 +37,7 @@ WIDEST = 2 * math.tan(math.radians(60))  # half side of the largest density map:
 NARROW = 4.0  # standard deviation, in cells, below which a smoothing is computed cell by cell
 
 
-def search_near(scene: Scene, prior: PosePrior, rule: RasterSearch | None = None) -> Hypotheses:
+def search_near(scene: Scene, prior: PosePrior, rule: DensitySearch | None = None) -> Hypotheses:
     """Run density-map searches from initial poses drawn from a prior.
 
     Args:
@@ -49,13 +49,11 @@ def search_near(scene: Scene, prior: PosePrior, rule: RasterSearch | None = None
         Distinct annealed poses of all searches.
     """
     rules = scene.settings.near if rule is None else (rule,)
-    starts = (
-        drawn_around(scene, prior, starts_of(scene, prior, one), reach_across(scene, prior, one)) for one in rules
-    )
-    return Hypotheses.concatenate([raster_search(scene, *each) for each in zip(starts, rules, strict=True)])
+    starts = (draw_around(scene, prior, starts_of(scene, prior, one), reach_across(scene, prior, one)) for one in rules)
+    return Hypotheses.concatenate([search_density(scene, *each) for each in zip(starts, rules, strict=True)])
 
 
-def raster_search(scene: Scene, poses: Hypotheses, rule: RasterSearch) -> Hypotheses:
+def search_density(scene: Scene, poses: Hypotheses, rule: DensitySearch) -> Hypotheses:
     """Preselect initial poses on a density map, narrow the scale, and anneal the best.
 
     Args:
@@ -66,21 +64,21 @@ def raster_search(scene: Scene, poses: Hypotheses, rule: RasterSearch) -> Hypoth
     Returns:
         Distinct annealed poses. Copies of one initial pose count once for the basin counts.
     """
-    for points, kept in zip(rule.screens.points, rule.screens.kept, strict=True):
-        poses, _ = looked_up(scene, poses, rule.raster, rule.narrowing.first_scale, points, kept)
+    for points, kept in zip(rule.preselection.points, rule.preselection.kept, strict=True):
+        poses, _ = preselect(scene, poses, rule.density_map, rule.narrowing.first_scale, points, kept)
     steps, scale = rule.narrowing, rule.narrowing.first_scale
     origin = np.arange(len(poses))  # the start that each pose is a copy of
     for step in range(1, steps.steps + 1):
         if scene.deadline.passed():
             break
         scale = steps.first_scale * (steps.last_scale / steps.first_scale) ** (step / steps.steps)
-        copies = moved(scene, poses, scale, steps.copies)
-        poses, chosen = looked_up(scene, copies, rule.raster, scale, steps.points, rule.screens.kept[-1])
+        copies = perturb(scene, poses, scale, steps.copies)
+        poses, chosen = preselect(scene, copies, rule.density_map, scale, steps.points, rule.preselection.kept[-1])
         origin = origin[chosen // steps.copies]
     poses, origin = poses[: rule.annealed], origin[: rule.annealed]
     once = np.isin(np.arange(len(poses)), np.unique(origin, return_index=True)[1])
     poses = replace(poses, basin_count=np.where(once, poses.basin_count, 0))
-    outliers = max(scene.settings.outliers, rule.raster.outliers)
+    outliers = max(scene.settings.outliers, rule.density_map.outliers)
     return anneal_on_points(scene, poses, scale * scene.spread, outliers=outliers)
 
 
@@ -100,10 +98,10 @@ def search_everywhere(scene: Scene, number: int, prior: Prior | None) -> Hypothe
     settings = scene.settings
     rule, aim = settings.everywhere, aim_of(number)
     drawn = draw_poses(scene.spread, scene.bulk3d, rule.draws.starts, settings.recipes[0], prior, scene.rng, aim)
-    return raster_search(scene, Hypotheses.from_poses(*drawn, basin_count=1), rule)
+    return search_density(scene, Hypotheses.from_poses(*drawn, basin_count=1), rule)
 
 
-def search_beside(scene: Scene, pose: Hypotheses, rule: RasterSearch) -> Hypotheses:
+def search_around(scene: Scene, pose: Hypotheses, rule: DensitySearch) -> Hypotheses:
     """Run a local search around a pose.
 
     Args:
@@ -126,13 +124,13 @@ def is_near(scene: Scene, prior: PosePrior) -> bool:
     )
 
 
-def starts_of(scene: Scene, prior: PosePrior, rule: RasterSearch) -> int:
+def starts_of(scene: Scene, prior: PosePrior, rule: DensitySearch) -> int:
     """Return the number of starts that covers a narrow prior as densely as `Draws.starts` cover a wide one."""
     share = min(_volume(scene, prior, rule), 1.0)
     return int(np.clip(rule.draws.starts * share, rule.draws.least_starts, rule.draws.starts))
 
 
-def _volume(scene: Scene, prior: PosePrior, rule: RasterSearch) -> float:
+def _volume(scene: Scene, prior: PosePrior, rule: DensitySearch) -> float:
     """Return the volume of the poses that a prior allows in this view, in multiples of the wide prior of the rule."""
     distance, draws = distance_of(scene, prior), rule.draws
     turn = math.radians(prior.rotation_sigma_deg) / math.radians(draws.wide_deg)
@@ -143,7 +141,7 @@ def _volume(scene: Scene, prior: PosePrior, rule: RasterSearch) -> float:
     return turn**3 * across**2 * prior.translation_sigma / (draws.wide_shift * distance)
 
 
-def reach_across(scene: Scene, prior: PosePrior, rule: RasterSearch) -> float:
+def reach_across(scene: Scene, prior: PosePrior, rule: DensitySearch) -> float:
     """Return how far from the centre of the view the centroid of the points may lie, across the view.
 
     Farther away, most of the points are outside the view. A telephoto view is much narrower than most priors.
@@ -158,7 +156,7 @@ def reach_across(scene: Scene, prior: PosePrior, rule: RasterSearch) -> float:
     return rule.draws.reach * math.hypot(scene.spread * distance_of(scene, prior), width)
 
 
-def drawn_around(scene: Scene, prior: PosePrior, count: int, reach: float = math.inf) -> Hypotheses:
+def draw_around(scene: Scene, prior: PosePrior, count: int, reach: float = math.inf) -> Hypotheses:
     """Draw poses from a prior, with the centroid of the points at most `reach` from the centre of the view.
 
     Args:
@@ -180,7 +178,7 @@ def drawn_around(scene: Scene, prior: PosePrior, count: int, reach: float = math
         shifts[:, k] = _truncated(shifts[:, k], low / sigma, high / sigma)
     shifts *= np.float32(prior.translation_sigma)
     vectors[0], shifts[0] = 0, 0
-    return turned_about_middle(scene, *mean, vectors, shifts, basin_count=1)
+    return perturb_about_centroid(scene, *mean, vectors, shifts, basin_count=1)
 
 
 def _truncated(normal: NDArray[np.float32], low: float, high: float) -> NDArray[np.float32]:
@@ -189,7 +187,7 @@ def _truncated(normal: NDArray[np.float32], low: float, high: float) -> NDArray[
     return np.asarray(ndtri(first + (last - first) * ndtr(normal.astype(np.float64))), np.float32)
 
 
-def admitted(scene: Scene, poses: Hypotheses, prior: Prior | None) -> Hypotheses:
+def select_admitted(scene: Scene, poses: Hypotheses, prior: Prior | None) -> Hypotheses:
     """Select the poses within `settings.admitted` standard deviations of a prior.
 
     Args:
@@ -210,7 +208,7 @@ def admitted(scene: Scene, poses: Hypotheses, prior: Prior | None) -> Hypotheses
     return poses[off <= scene.settings.admitted**2]
 
 
-def moved(scene: Scene, poses: Hypotheses, scale: float, copies: int) -> Hypotheses:
+def perturb(scene: Scene, poses: Hypotheses, scale: float, copies: int) -> Hypotheses:
     """Return the poses and randomly perturbed copies of them.
 
     Args:
@@ -226,17 +224,17 @@ def moved(scene: Scene, poses: Hypotheses, scale: float, copies: int) -> Hypothe
     depth = np.linalg.norm(poses.rotation @ scene.bulk3d.mean(0) + poses.translation, axis=-1)
     shifts *= np.repeat(depth, copies)[:, None] * np.array([scene.spread, scene.spread, 1], np.float32)
     vectors[::copies], shifts[::copies] = 0, 0
-    copied = turned_about_middle(scene, poses.rotation, poses.translation, vectors, shifts)
+    copied = perturb_about_centroid(scene, poses.rotation, poses.translation, vectors, shifts)
     return replace(copied, basin_count=poses.basin_count.repeat(copies))
 
 
-def around_each(scene: Scene, poses: Hypotheses) -> Hypotheses:
+def perturb_each(scene: Scene, poses: Hypotheses) -> Hypotheses:
     """Return poses from other sources with perturbed copies; basin counts are 0, since copies are dependent."""
-    return moved(scene, poses, scene.settings.copied_scale, scene.settings.copies).as_dependent()
+    return perturb(scene, poses, scene.settings.copied_scale, scene.settings.copies).as_dependent()
 
 
-def looked_up(
-    scene: Scene, poses: Hypotheses, shape: RasterShape, scale: float, points: int, kept: int
+def preselect(
+    scene: Scene, poses: Hypotheses, shape: DensityShape, scale: float, points: int, kept: int
 ) -> tuple[Hypotheses, NDArray[np.int64]]:
     """Score poses on the density maps of all rig cameras and select the best.
 
@@ -254,12 +252,12 @@ def looked_up(
     score = np.zeros(len(poses), np.float32)
     cameras = [(scene, poses.rotation, poses.translation)]
     cameras += [(x.scene, x.turn @ poses.rotation, poses.translation @ x.turn.T + x.shift) for x in scene.companions]
-    views = [(raster_of(one, shape, scale), one.seen_points(points), r, t) for one, r, t in cameras]
+    views = [(density_map_of(one, shape, scale), one.seen_points(points), r, t) for one, r, t in cameras]
 
     def look_up(i: int, j: int) -> None:
-        for raster, seen, rotation, translation in views:
+        for density_map, seen, rotation, translation in views:
             weight, cell, own = np.empty_like(seen.b), np.empty(len(seen.b), np.int32), np.empty(j - i, np.float32)
-            add_up(raster, seen, rotation[i:j], translation[i:j], own, weight, cell)
+            add_up(density_map, seen, rotation[i:j], translation[i:j], own, weight, cell)
             score[i:j] += own
 
     done = in_time(look_up, len(poses), scene.deadline, scene.settings.lookups_a_check)
@@ -270,7 +268,7 @@ def looked_up(
     return poses[best], best
 
 
-def raster_of(scene: Scene, shape: RasterShape, scale: float) -> Raster:
+def density_map_of(scene: Scene, shape: DensityShape, scale: float) -> DensityMap:
     """Return the density map of the bearings of a scene; the scene stores it.
 
     Args:
@@ -278,13 +276,13 @@ def raster_of(scene: Scene, shape: RasterShape, scale: float) -> Raster:
         shape: Shape of the map.
         scale: Smoothing, in units of the RMS angular radius of the bearings.
     """
-    if (shape, scale) not in scene.rasters:
-        scene.rasters[shape, scale] = _drawn_raster(scene, shape, scale)
-    return scene.rasters[shape, scale]
+    if (shape, scale) not in scene.density_maps:
+        scene.density_maps[shape, scale] = _draw_density_map(scene, shape, scale)
+    return scene.density_maps[shape, scale]
 
 
-def _drawn_raster(scene: Scene, shape: RasterShape, scale: float) -> Raster:
-    """Compute the density map that `raster_of` stores."""
+def _draw_density_map(scene: Scene, shape: DensityShape, scale: float) -> DensityMap:
+    """Compute the density map that `density_map_of` stores."""
     d = scene.offsets.astype(np.float64)
     at = 2 * d[:, :2] / np.maximum(2 + d[:, 2:], 1e-9)
     scale *= scene.spread
@@ -302,7 +300,7 @@ def _drawn_raster(scene: Scene, shape: RasterShape, scale: float) -> Raster:
     gain = np.log(shape.outliers + (1 - shape.outliers) * near / np.where(inside, around, 1))
     seen = inside.astype(np.float32)
     mean = _smoothed(seen * gain, wide) / np.maximum(_smoothed(seen, wide), 1e-6)
-    return Raster(np.where(inside, gain - mean, 0).astype(np.float32), np.float32(half), np.float32(per_cell))
+    return DensityMap(np.where(inside, gain - mean, 0).astype(np.float32), np.float32(half), np.float32(per_cell))
 
 
 def distance_of(scene: Scene, prior: PosePrior) -> float:

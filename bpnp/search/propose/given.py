@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bpnp.runtime import one_blas_thread
-from bpnp.search.refine.annealing import anneal_on_clusters, anneal_on_points, finish
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame
 from bpnp.search.kernels.sides import FORWARD
-from bpnp.search.propose.density_map import around_each
+from bpnp.search.propose.density_map import perturb_each
+from bpnp.search.refine.annealing import anneal_on_clusters, anneal_on_points, finish
 from bpnp.search.scene import Scene
 
 Array = NDArray[np.float64]
@@ -37,7 +37,7 @@ def anneal_given(scene: Scene, rotation: Array, translation: Array) -> Hypothese
         return Hypotheses.empty()
     if len(starts) > settings.refined_directly:
         starts = anneal_on_clusters(scene, starts, (*settings.coarse, *settings.middle), settings.starts)
-    around = Hypotheses.concatenate([starts, around_each(scene, starts[: settings.copied])])
+    around = Hypotheses.concatenate([starts, perturb_each(scene, starts[: settings.copied])])
     first_scale = settings.middle[-1].last_scale * scene.spread
     clustered = anneal_on_clusters(scene, around, settings.middle, settings.starts)
     clustered = anneal_on_points(scene, clustered, first_scale)

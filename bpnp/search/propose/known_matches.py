@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.poses import SAME, distinct, seen_from
-from bpnp.search.correspondences import explained
+from bpnp.search.correspondences import score_pose
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem
@@ -167,7 +167,7 @@ def _scored(problem: Problem, i: Labels, j: Labels, rotation: Array, translation
     weight = _inlier_probability(squared, own[:, None], density)
     free = np.maximum(2 * weight.sum(1) - 2 * FIXING, 1.0)
     scale = np.clip(np.sqrt((weight * squared).sum(1) / free), scales[0], scales[-1])
-    found = [explained(problem, *each) for each in zip(rotation, translation, scale, strict=True)]
+    found = [score_pose(problem, *each) for each in zip(rotation, translation, scale, strict=True)]
     score, count = (np.array([one[k] for one in found]) for k in (0, 1))
     hypotheses = Hypotheses.from_poses(rotation, translation, log_likelihood=score, match_count=count, scale=scale)
     seen, order = seen_from(rotation @ problem.middle + translation), -np.arange(float(len(score)))

@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.runtime import compiler
-from bpnp.runtime import in_threads
+from bpnp.runtime import compiler, in_threads
 from bpnp.search.kernels.vectors import cross, rotated
 
 compiled = compiler()
@@ -284,7 +283,7 @@ def _meet(line: Any, conics: Any, chords: Any, a: float, b: float, poses: Any, c
         if not (x > 0 and y > 0 and x < math.inf and y < math.inf):
             continue
         d2 = 1 / math.sqrt((1 - y) * (1 - y) + y * chords[1])
-        if polished(x * d2, y * d2, d2, chords, a, b, poses[count, 3]):
+        if anneal_to_end(x * d2, y * d2, d2, chords, a, b, poses[count, 3]):
             count += 1
     return count
 
@@ -300,7 +299,7 @@ def _restricted(conic: Any, steep: bool, slope: float, offset: float) -> tuple[f
 
 
 @part
-def polished(d0: float, d1: float, d2: float, chords: Any, a: float, b: float, depths: Any) -> bool:
+def anneal_to_end(d0: float, d1: float, d2: float, chords: Any, a: float, b: float, depths: Any) -> bool:
     """Refine depths by Newton steps on the three equations, written to `depths` (3,).
 
     Returns:

@@ -7,8 +7,8 @@ import numpy as np
 from bpnp.runtime import Deadline
 from bpnp.search.config import ENUMERATION
 from bpnp.search.enumeration.search import enumerate_poses, is_enumerable
-from bpnp.search.verdict.false_alarms import alarms_of
 from bpnp.search.problem import Problem
+from bpnp.search.verdict.false_alarms import alarms_of
 
 HYPOTHESES = 20_000  # tried, in some 10 ms: a correct pose of clean points is among the first thousands
 MIRROR = np.array([1.0, 1.0, -1.0])

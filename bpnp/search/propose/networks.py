@@ -9,14 +9,14 @@ import torch
 from torch import Tensor, nn
 
 from bpnp.runtime import Deadline
-from bpnp.search.settle import settle
+from bpnp.search.arguments import Array
 from bpnp.search.config import DEFAULT
 from bpnp.search.problem import Problem
 from bpnp.search.propose.given import score_given
 from bpnp.search.scene import Scene
+from bpnp.search.settle import settle
 from bpnp.search.starts import PosePrior
-from bpnp.search.verdict.decide import SearchResult, judged, no_pose
-from bpnp.search.arguments import Array
+from bpnp.search.verdict.decide import SearchResult, judge, no_pose
 from bpnp.types import Batch
 
 if TYPE_CHECKING:
@@ -70,16 +70,16 @@ def predicted(net: nn.Module, members: list[Problem], deadline: Deadline) -> lis
     rotation = _host(torch.stack([poses[name].rotation for name in order], 1))
     translation = _host(torch.stack([poses[name].translation for name in order], 1))
     given = zip(members, views, rotation, translation, strict=True)
-    return [_judged(problem, *view.before(r, t), deadline) for problem, view, r, t in given]
+    return [_judge(problem, *view.before(r, t), deadline) for problem, view, r, t in given]
 
 
-def _judged(problem: Problem, rotation: Array, translation: Array, deadline: Deadline) -> SearchResult:
+def _judge(problem: Problem, rotation: Array, translation: Array, deadline: Deadline) -> SearchResult:
     """Compute the verdict on poses of a network and their competing poses."""
     scene = Scene(problem, 0, DEFAULT, deadline)
     poses = score_given(scene, rotation, translation)
     if not len(poses):
         return no_pose("the module found no pose")
-    result = judged(poses, problem, batches=len(rotation), rule=DEFAULT.evidence)
+    result = judge(poses, problem, batches=len(rotation), rule=DEFAULT.evidence)
     return settle(result, problem, lambda: scene, DEFAULT.evidence)
 
 

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from bpnp.search.config import Evidence, Repetitions
-from bpnp.search.verdict.false_alarms import SHARES, alarms_of, directions_of, point_evidence
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem
 from bpnp.search.propose.symmetries import Motions, matching_tolerance, mirror_pose, self_motions
+from bpnp.search.verdict.false_alarms import SHARES, alarms_of, directions_of, point_evidence
 
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]
@@ -149,7 +149,7 @@ def repeated_poses(
     return poses[np.argsort(alarms, kind="stable")[: rule.repetitions.kept]], motions
 
 
-def decades_behind(
+def repetition_margins(
     problem: Problem,
     best: Pose,
     repeated: Pose,

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.search.kernels.vectors import compiled, part
 from bpnp.poses import distinct
 from bpnp.search.kernels.neighbours import HashedPoints, hashed, lies_on
+from bpnp.search.kernels.vectors import compiled, part
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]

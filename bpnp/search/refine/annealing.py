@@ -121,7 +121,7 @@ def anneal_on_points(
     return select_distinct(ends[:done], scene, done)
 
 
-def turned_about_middle(
+def perturb_about_centroid(
     scene: Scene, rotation: Array, translation: Array, vectors: Array, shifts: Array, *, basin_count: int = 0
 ) -> Hypotheses:
     """Return perturbed copies of poses, rotated about the centroid of the points.
@@ -173,7 +173,7 @@ def finish(scene: Scene, poses: Hypotheses, annealed: int | None = None) -> Hypo
     return select_distinct(Hypotheses.concatenate([*ends, poses[min(len(ends), count) :]]), scene, settings.kept)
 
 
-def polished(
+def anneal_to_end(
     scene: Scene, rotations: NDArray[np.float64], translations: NDArray[np.float64], scale: float
 ) -> Hypotheses:
     """Anneal poses of a problem to the end on all points; after the deadline they are returned unchanged.

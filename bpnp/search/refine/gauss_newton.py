@@ -16,7 +16,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.correspondences import NEIGHBOURS, facing, partners
+from bpnp.search.correspondences import NEIGHBOURS, facing, possible_matches
 from bpnp.search.pose_model import PoseModel, PoseState, Sight
 from bpnp.search.problem import Problem
 
@@ -195,10 +195,10 @@ def normal_equations(jacobian: Array, residual: Array, weight: Array) -> Equatio
     each = weight[..., None] if per_match else weight
     shape, size = (*residual.shape[:-2], -1), jacobian.shape[-1]
     rows = jacobian.reshape(*shape, size)
-    weighed = np.swapaxes((jacobian * each[..., None]).reshape(*shape, size), -1, -2)
+    rank_poses = np.swapaxes((jacobian * each[..., None]).reshape(*shape, size), -1, -2)
     return Equations(
-        weighed @ rows,
-        (weighed @ residual.reshape(*shape, 1))[..., 0],
+        rank_poses @ rows,
+        (rank_poses @ residual.reshape(*shape, 1))[..., 0],
         np.asarray((each * residual**2).sum((-2, -1))),
         np.asarray(weight.sum(-1) if per_match else weight.mean(-1).sum(-1)),
     )
@@ -350,7 +350,7 @@ def soft_matches(
         return None
     sight = sight.choose(places) if len(places) < len(sight.length) else sight
     chosen = problem.image.chosen if chosen is None else chosen
-    i, j, density, every = partners(problem, sight.directions, places, chosen, scale, most)
+    i, j, density, every = possible_matches(problem, sight.directions, places, chosen, scale, most)
     return SoftMatches(sight, i, j, density / every[i]) if len(i) else None
 
 

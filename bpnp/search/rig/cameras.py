@@ -18,15 +18,15 @@ from itertools import combinations, permutations
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.verdict.covariance import covariance_of, join
-from bpnp.search.verdict.false_alarms import Terms, camera_terms, directions_of, log10_nfa
-from bpnp.search.verdict.uncertainty import linearise, matches_of
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.refine.gauss_newton import refine, soft_equations, steps
 from bpnp.search.scene import Scene
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
+from bpnp.search.verdict.covariance import covariance_of, join
+from bpnp.search.verdict.false_alarms import Terms, camera_terms, directions_of, log10_nfa
+from bpnp.search.verdict.uncertainty import linearise, matches_of
 
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]
@@ -201,7 +201,7 @@ class Rig:
         for rotation, translation in zip(rotations, translations, strict=True):
             last = list(self.refined(rotation, translation))[AGAIN - 1 :: AGAIN][-WEIGHED:]
             if last:
-                ends.append(min(((*self.alarms(*end[:3]), *end) for end in last), key=lambda weighed: weighed[0]))
+                ends.append(min(((*self.alarms(*end[:3]), *end) for end in last), key=lambda rank_poses: rank_poses[0]))
         if not ends:
             return Hypotheses.from_poses(rotations[:0], translations[:0])
         own, rough, rotations, translations, scales, counts = map(np.array, zip(*ends, strict=True))

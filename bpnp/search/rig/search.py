@@ -14,26 +14,26 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.runtime import NEVER, Clock, Deadline, one_blas_thread
 from bpnp.poses import distinct, seen_from
-from bpnp.search.settle import fitted_lens
+from bpnp.runtime import NEVER, Clock, Deadline, one_blas_thread
 from bpnp.search.config import DEFAULT, ENUMERATION, SearchSettings
 from bpnp.search.enumeration.points import predicted_pose
 from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
-from bpnp.search.verdict.reasons import objection
-from bpnp.search.propose.repetitions import repeated_poses
-from bpnp.search.verdict.uncertainty import share_bound
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.loop import Step, run
 from bpnp.search.pool import Pool
 from bpnp.search.problem import Problem
+from bpnp.search.propose.density_map import search_around
 from bpnp.search.propose.known_matches import known_matches, poses_of_matches
-from bpnp.search.propose.density_map import search_beside
+from bpnp.search.propose.repetitions import repeated_poses
 from bpnp.search.rig.cameras import WIDE, Array, Pose, Rig
 from bpnp.search.scene import Scene
 from bpnp.search.schedule import Plan
 from bpnp.search.search import lacks_partners
-from bpnp.search.verdict.decide import SearchResult, is_object, judged, missed, no_pose
+from bpnp.search.settle import fitted_lens
+from bpnp.search.verdict.decide import SearchResult, is_object, judge, missed, no_pose
+from bpnp.search.verdict.reasons import objection
+from bpnp.search.verdict.uncertainty import share_bound
 
 PROPOSING = replace(ENUMERATION, kept=4000)  # number of poses that a camera with few points proposes
 REFINED = 16  # number of enumerated poses that are refined, and of distinct poses that are kept
@@ -193,7 +193,7 @@ class RigPoses:
         turn, shift = self.rig.pose_of(k, new.rotation, new.translation)
         scene = self.pools[k].scene
         pose = to_scene_frame(Hypotheses.from_poses(turn, shift), scene)
-        return Step(partial(search_beside, scene, pose, scene.settings.beside), camera=k, counts=False)
+        return Step(partial(search_around, scene, pose, scene.settings.local), camera=k, counts=False)
 
     def add_refined(self, refined: Hypotheses) -> None:
         """Add refined poses; the basin count of the best one is the sum over all cameras."""
@@ -244,7 +244,7 @@ class RigPoses:
         """Judge the best poses; a confident one also against the competing poses of a repeated structure."""
         if not len(self.best):
             return no_pose()
-        result = self._judged()
+        result = self._judge()
         if result.verdict == "confident":
             strongest, seen = self._strongest()
             known = seen.rotation[0], seen.translation[0], float(seen.scale[0])
@@ -252,7 +252,7 @@ class RigPoses:
             unit = self.best.translation[0, 3]
             copies = self.rig.rig_of(strongest, repeated.rotation, repeated.translation, unit)
             self.add_refined(self.rig.candidates(*copies))
-            result = self._judged()
+            result = self._judge()
         if result.verdict == "confident" and self.rig.model.lens is None:
             strongest, seen = self._strongest()
             pose = seen.rotation[0], seen.translation[0], float(seen.scale[0])
@@ -275,13 +275,13 @@ class RigPoses:
         poses = replace(result.candidates, rotation=self.best.rotation, translation=self.best.translation)
         return replace(result, candidates=poses)
 
-    def _judged(self) -> SearchResult:
+    def _judge(self) -> SearchResult:
         strongest, seen = self._strongest()
-        return judged(
+        return judge(
             seen,
             self.rig.problems[strongest],
             batches=self.turns,
-            looks=self._looks(),
+            local_searches=self._looks(),
             exhaustive=self.exhaustive,
             rule=self.rule,
             rig=[(self.rig.seen(k, self.best), problem) for k, problem in enumerate(self.rig.problems)],

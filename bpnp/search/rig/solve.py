@@ -10,21 +10,21 @@ import numpy as np
 
 from bpnp.cameras import Camera, camera_from
 from bpnp.runtime import Clock, Deadline
+from bpnp.search.arguments import Array, about, checked_pose, pose_of
 from bpnp.search.config import DEFAULT as SEARCH
 from bpnp.search.enumeration.search import is_enumerable
-from bpnp.search.verdict.covariance import student_factor
+from bpnp.search.focal_length import FocalSweep, UnknownCamera
+from bpnp.search.inputs import problem_from
+from bpnp.search.matching import SCALES, failed_solution, one_to_one
 from bpnp.search.pose_model import crossed
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.rig.cameras import Pose, Rig
 from bpnp.search.rig.search import search_rig
-from bpnp.search.starts import GravityPrior, PosePrior, Prior
-from bpnp.search.verdict.decide import SearchResult, no_pose
-from bpnp.search.arguments import Array, about, checked_pose, pose_of
-from bpnp.search.focal_length import FocalSweep, UnknownCamera
-from bpnp.search.inputs import problem_from
-from bpnp.search.matching import SCALES, one_to_one, without_pose
-from bpnp.search.solution import FOCAL_LENGTH, POSE_PARAMETERS, SCALE, Solution, with_pose
+from bpnp.search.solution import FOCAL_LENGTH, POSE_PARAMETERS, SCALE, Solution, add_pose
 from bpnp.search.sources import Options
+from bpnp.search.starts import GravityPrior, PosePrior, Prior
+from bpnp.search.verdict.covariance import student_factor
+from bpnp.search.verdict.decide import SearchResult, no_pose
 
 
 def prepare_rig(
@@ -171,7 +171,7 @@ def mount_from(name: str, value: Any) -> Pose:
 def _finished(rig: Rig, problems: Sequence[Problem], result: SearchResult, inlier_threshold: float | None) -> Solution:
     """Build the solution with the matches of all cameras; 2D points are indexed over all cameras, concatenated."""
     found, first = result.candidates, problems[0]
-    solution = replace(without_pose(first, result.reason, inlier_threshold), camera=None)
+    solution = replace(failed_solution(first, result.reason, inlier_threshold), camera=None)
     parameters: tuple[str, ...] = POSE_PARAMETERS
     if rig.model.lens is not None:
         parameters = (*parameters, FOCAL_LENGTH)
@@ -202,7 +202,7 @@ def _finished(rig: Rig, problems: Sequence[Problem], result: SearchResult, inlie
     _, moved = first.to_user(found.rotation, found.translation[:, :3])
     points2d = np.concatenate([problem.all2d for problem in problems])
     dropped = sum(problem.dropped2d for problem in problems)
-    return with_pose(
+    return add_pose(
         replace(solution, points2d=points2d, stats=replace(solution.stats, dropped2d=dropped)),
         result,
         replace(found, translation=np.column_stack([moved, found.translation[:, 3]])),

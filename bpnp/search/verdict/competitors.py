@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.poses import turned_by
+from bpnp.poses import rotation_angle
 from bpnp.search.config import Evidence
+from bpnp.search.hypotheses import Hypotheses
+from bpnp.search.problem import Problem, label_groups
 from bpnp.search.verdict.false_alarms import directions_of, own_evidence
 from bpnp.search.verdict.reasons import Objection, objection
 from bpnp.search.verdict.uncertainty import Linearised, Misfit, systematic_misfit
-from bpnp.search.hypotheses import Hypotheses
-from bpnp.search.problem import Problem, label_groups
 
 SAME_ZOOM = 0.005  # relative change of the focal length that a reason omits
 Array = NDArray[np.float64]
@@ -51,10 +51,10 @@ def competing_pose(rotation: Array, other: Array, decades: float) -> Objection:
         other: (3, 3) of the competing pose.
         decades: log10 of the ratio of their false alarms.
     """
-    return objection("competing_pose", decades, degrees=math.degrees(turned_by(rotation, other)))
+    return objection("competing_pose", decades, degrees=math.degrees(rotation_angle(rotation, other)))
 
 
-def rougher(candidates: Hypotheses) -> Objection | None:
+def rough_residuals(candidates: Hypotheses) -> Objection | None:
     """Return the best pose at far larger residuals, or None if the points agree better at its own scale.
 
     If the rough alignment has fewer false alarms, the matches add nothing significant to it.
@@ -91,7 +91,7 @@ def of_misfit(off: Misfit, rule: Evidence) -> Objection | None:
     return objection("other_camera", camera=other, degrees=math.degrees(off.turn), percent=100 * off.shift)
 
 
-def contesting(seen: Seen, rule: Evidence) -> Objection | None:
+def unrelated_competitor(seen: Seen, rule: Evidence) -> Objection | None:
     """Return a far candidate over which the lead of the first one is not significant, or None.
 
     The number of false alarms assumes independent image points. Points on lines or curves are dependent: a pose that
@@ -139,7 +139,7 @@ def contesting(seen: Seen, rule: Evidence) -> Objection | None:
         apart = others_alone >= limits.alone * alone and alone + others_alone >= least
         decades = max(float(gap.sum()), 0.0) ** 2 / max(squared, 1e-300) / (2 * math.log(10))
         if decades < rule.lead and (apart or (same & first.near & other.near).sum() < limits.same * other.near.sum()):
-            degrees = math.degrees(turned_by(candidates.rotation[0], candidates.rotation[k]))
+            degrees = math.degrees(rotation_angle(candidates.rotation[0], candidates.rotation[k]))
             return objection("other_points", decades, degrees=degrees)
     return None
 

@@ -6,7 +6,7 @@ from bpnp.search.config import Evidence
 
 
 def log10_missed(
-    basin_count: int, decades_a_match: float, looks: float | int, rule: Evidence, *, symmetric: bool = False
+    basin_count: int, decades_a_match: float, local_searches: float | int, rule: Evidence, *, symmetric: bool = False
 ) -> float:
     """Return log10 of the probability that a better optimum than the best pose exists and was missed.
 
@@ -41,13 +41,13 @@ def log10_missed(
     >>> [round(log10_missed(*seen, rule), 2) for seen in ((0, 0.0, 0), (7, 0.0, 0), (7, 0.0, 1), (1, 1.0, 0))]
     [0.0, -2.0, -3.24, -3.3]
     """
-    unseen = near_missed(basin_count, looks, rule) + far_missed(basin_count, rule, symmetric=symmetric)
+    unseen = near_missed(basin_count, local_searches, rule) + far_missed(basin_count, rule, symmetric=symmetric)
     return min(math.log10(unseen) - rule.independent * max(decades_a_match, 0.0), 0.0)
 
 
-def near_missed(basin_count: int, looks: float | int, rule: Evidence) -> float:
+def near_missed(basin_count: int, local_searches: float | int, rule: Evidence) -> float:
     """Return the probability that a better optimum near the best pose was missed; arguments as for `log10_missed`."""
-    overlooked = rule.look_fails * rule.again_fails ** (looks - 1) if looks else 1.0
+    overlooked = rule.look_fails * rule.again_fails ** (local_searches - 1) if local_searches else 1.0
     return max(0.5**basin_count, rule.another) * overlooked
 
 

@@ -19,16 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.search.config import DEFAULT, Evidence
+from bpnp.search.hypotheses import Hypotheses
+from bpnp.search.problem import Problem
+from bpnp.search.propose.repetitions import registered
+from bpnp.search.propose.symmetries import Motions
 from bpnp.search.verdict import reasons
-from bpnp.search.verdict.competitors import Seen, contesting, misfit, other_pose, rougher
+from bpnp.search.verdict.competitors import Seen, misfit, other_pose, rough_residuals, unrelated_competitor
 from bpnp.search.verdict.completeness import log10_missed
 from bpnp.search.verdict.false_alarms import alarms_of
 from bpnp.search.verdict.reasons import CLAUSES, CONFIDENT, Objection, objection
-from bpnp.search.propose.repetitions import registered
 from bpnp.search.verdict.uncertainty import focal_bound, is_redundant, linearised, rotation_bound
-from bpnp.search.hypotheses import Hypotheses
-from bpnp.search.problem import Problem
-from bpnp.search.propose.symmetries import Motions
 
 Verdict = Literal["confident", "ambiguous", "failed"]
 HALF_TURN = 180.0  # degrees; a larger bound does not constrain a rotation
@@ -79,7 +79,7 @@ class SearchResult:
         return float(self.candidates.log10_false_alarms[0]) if len(self.candidates) else math.inf
 
 
-def with_false_alarms(candidates: Hypotheses, problem: Problem) -> Hypotheses:
+def add_false_alarms(candidates: Hypotheses, problem: Problem) -> Hypotheses:
     """Compute the NFA of the candidates that lack it.
 
     Args:
@@ -98,7 +98,7 @@ def with_false_alarms(candidates: Hypotheses, problem: Problem) -> Hypotheses:
     return replace(candidates, log10_false_alarms=alarms, log10_rough=rough)
 
 
-def weighed(candidates: Hypotheses, problem: Problem, rule: Evidence = DEFAULT.evidence) -> Hypotheses:
+def rank_poses(candidates: Hypotheses, problem: Problem, rule: Evidence = DEFAULT.evidence) -> Hypotheses:
     """Compute the NFA of the candidates and move the best one to the front.
 
     The best is the first one in the order of the search whose log10 NFA is within `Evidence.lead` of the smallest. The
@@ -114,7 +114,7 @@ def weighed(candidates: Hypotheses, problem: Problem, rule: Evidence = DEFAULT.e
     """
     if not len(candidates):
         return candidates
-    candidates = with_false_alarms(candidates, problem)
+    candidates = add_false_alarms(candidates, problem)
     alarms = candidates.log10_false_alarms
     first = int(np.flatnonzero(alarms <= alarms.min() + rule.lead)[0])
     order = np.r_[first, np.delete(np.arange(len(alarms)), first)]
@@ -127,7 +127,7 @@ def match_count(candidates: Hypotheses, problem: Problem) -> float:
 
 
 def missed(
-    candidates: Hypotheses, problem: Problem, looks: float | int, rule: Evidence, *, independent: bool = True
+    candidates: Hypotheses, problem: Problem, local_searches: float | int, rule: Evidence, *, independent: bool = True
 ) -> float:
     """Return log10 of the probability that the search missed a better optimum.
 
@@ -147,13 +147,13 @@ def missed(
     if alarms > 0:
         return 0.0
     decades = -alarms / max(match_count(candidates, problem), 1.0) if independent else 0.0
-    value = log10_missed(starts_met(candidates, problem, rule), decades, looks, rule)
+    value = log10_missed(count_starts(candidates, problem, rule), decades, local_searches, rule)
     if value > rule.missed or not is_symmetric(candidates, problem, rule):
         return value
-    basin_count, share = starts_met(candidates, problem, rule, symmetric=True), 0.0
+    basin_count, share = count_starts(candidates, problem, rule, symmetric=True), 0.0
     if problem.prior is not None:  # the prior reduces the probability of a better pose elsewhere
         share = problem.log10_share(candidates.rotation[0], candidates.translation[0])
-    return min(log10_missed(basin_count, 0.0, looks, rule, symmetric=True) + share, 0.0)
+    return min(log10_missed(basin_count, 0.0, local_searches, rule, symmetric=True) + share, 0.0)
 
 
 def motions_of(candidates: Hypotheses, problem: Problem, rule: Evidence) -> Motions:
@@ -180,7 +180,7 @@ def is_symmetric(candidates: Hypotheses, problem: Problem, rule: Evidence) -> bo
     return float(motions_of(candidates, problem, rule).fraction.max(initial=0)) >= rule.repetitions.symmetric
 
 
-def starts_met(candidates: Hypotheses, problem: Problem, rule: Evidence, *, symmetric: bool = False) -> int:
+def count_starts(candidates: Hypotheses, problem: Problem, rule: Evidence, *, symmetric: bool = False) -> int:
     """Return the basin count of the first candidate and of all poses equal to it.
 
     Args:
@@ -201,12 +201,12 @@ def starts_met(candidates: Hypotheses, problem: Problem, rule: Evidence, *, symm
     return int(candidates.basin_count[counted].sum())
 
 
-def judged(
+def judge(
     candidates: Hypotheses,
     problem: Problem,
     *,
     batches: int,
-    looks: float | int = 0,
+    local_searches: float | int = 0,
     exhaustive: bool = False,
     rule: Evidence = DEFAULT.evidence,
     rig: Seen = (),
@@ -227,17 +227,17 @@ def judged(
     """
     if not len(candidates):
         return no_pose(batches=batches, settled=exhaustive)
-    candidates = weighed(candidates, problem, rule)
+    candidates = rank_poses(candidates, problem, rule)
     alarms = float(candidates.log10_false_alarms[0])
-    settled = exhaustive or missed(candidates, problem, looks, rule, independent=False) <= rule.missed
+    settled = exhaustive or missed(candidates, problem, local_searches, rule, independent=False) <= rule.missed
     if alarms > 0:
         one = objection("chance", what="no pose fits")
         return SearchResult(candidates, "failed", one.sentence(alarms), batches, one.code, settled)
     result = SearchResult(candidates, "confident", "", batches, CONFIDENT, settled)
-    unseen = -math.inf if exhaustive else missed(candidates, problem, looks, rule)
+    unseen = -math.inf if exhaustive else missed(candidates, problem, local_searches, rule)
     # Costly tests run only if the verdict depends on them.
     seen = rig or [(candidates, problem)]
-    against = [*(other_pose(*each, rule) for each in seen), rougher(candidates)]
+    against = [*(other_pose(*each, rule) for each in seen), rough_residuals(candidates)]
     certain = alarms <= rule.false_alarms and unseen <= rule.missed
     off = share = math.nan
     if certain and all(one is None or one.margin >= rule.lead for one in against):
@@ -250,7 +250,7 @@ def judged(
         if share > (rule.focal_few if is_object(problem, rule) else rule.focal):
             off_by = f"{100 * share:.0f} % off" if share < 10 else "anything"
             return result.doubt(objection("focal_length_not_fixed", off=off_by))
-        against += [misfit(linear, count, rule), contesting(seen, rule)]
+        against += [misfit(linear, count, rule), unrelated_competitor(seen, rule)]
     doubts = [one for one in against if one is not None and one.margin < rule.lead]
     if certain and not doubts:
         return replace(result, reason=reasons.confident(alarms, rule.lead, off, share), settled=True)
@@ -278,7 +278,7 @@ def is_certain(candidates: Hypotheses, problem: Problem, rule: Evidence = DEFAUL
     if not len(candidates) or float(candidates.log10_false_alarms[0]) > rule.false_alarms:
         return False
     other = other_pose(candidates, problem, rule)
-    if (other is not None and other.margin < rule.lead) or rougher(candidates) is not None:
+    if (other is not None and other.margin < rule.lead) or rough_residuals(candidates) is not None:
         return False
     return missed(candidates, problem, REFINED, rule) <= rule.missed
 

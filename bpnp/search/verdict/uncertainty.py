@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc, fdtri
 
 from bpnp.search.config import DEFAULT, Evidence
-from bpnp.search.verdict.covariance import Linearisation, covariance_of, student_factor
 from bpnp.search.pose_model import PoseModel, PoseState, Sight, centre_columns, crossed, lens_columns
 from bpnp.search.problem import Problem
 from bpnp.search.refine.gauss_newton import soft_matches
+from bpnp.search.verdict.covariance import Linearisation, covariance_of, student_factor
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
@@ -371,8 +371,8 @@ def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = 
     distance = max(float(np.linalg.norm(linear.state.centroid)), 1e-300)  # unit of the shift, like a radian of rotation
     posed = linear.jacobian[:, :, :POSE] * np.repeat([1.0, distance], 3)
     columns = np.concatenate([posed, zoomed, strained, linear.residual[..., None]], -1)
-    weighed = (np.sqrt(linear.probability)[:, None, None] * columns).reshape(-1, columns.shape[-1])
-    products = weighed.T @ weighed
+    rank_poses = (np.sqrt(linear.probability)[:, None, None] * columns).reshape(-1, columns.shape[-1])
+    products = rank_poses.T @ rank_poses
     pose = np.linalg.pinv(products[:POSE, :POSE], hermitian=True)
     found = []
     strains = slice(POSE + 1, POSE + 1 + len(STRAINS))

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bpnp.search.kernels.vectors import F, compiled, part, rotated
 from bpnp.search.kernels.sides import Array, visible_weights
+from bpnp.search.kernels.vectors import F, compiled, part, rotated
 
 
-class Raster(NamedTuple):
+class DensityMap(NamedTuple):
     """Density map: the score that a point adds by its location in the view.
 
     Attributes:
@@ -37,11 +37,11 @@ def place(half: Any, per_cell: Any, p: Any, j: Any, turn: Any, t: Any) -> Any:
 
 
 @compiled
-def add_up(raster: Any, points: Any, rotation: Any, translation: Any, score: Any, weight: Any, cell: Any) -> None:
+def add_up(density_map: Any, points: Any, rotation: Any, translation: Any, score: Any, weight: Any, cell: Any) -> None:
     """Score poses by the density map: sum the weighted values at the projections of all points, 0 outside.
 
     Args:
-        raster: A density map.
+        density_map: A density map.
         points: A `WeightedPoints`; the labels are ignored.
         rotation: (S, 3, 3).
         translation: (S, 3).
@@ -49,8 +49,8 @@ def add_up(raster: Any, points: Any, rotation: Any, translation: Any, score: Any
         weight: (n,), overwritten.
         cell: (n,) int32, overwritten.
     """
-    cells, values = np.int32(len(raster.values)), raster.values.reshape(-1)
-    half, per_cell = raster.half, raster.per_cell
+    cells, values = np.int32(len(density_map.values)), density_map.values.reshape(-1)
+    half, per_cell = density_map.half, density_map.per_cell
     last = F(cells - 1)
     for k in range(len(rotation)):
         visible_weights(points, rotation[k], translation[k], weight)

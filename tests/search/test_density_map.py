@@ -14,7 +14,7 @@ from scipy.stats import kstest, truncnorm
 
 from bpnp.search.config import DEFAULT
 from bpnp.search.problem import Problem
-from bpnp.search.propose.density_map import drawn_around, search_near
+from bpnp.search.propose.density_map import draw_around, search_near
 from bpnp.search.scene import Scene
 from bpnp.search.search import search_poses
 from bpnp.search.starts import PosePrior
@@ -121,7 +121,7 @@ def test_poses_drawn_from_a_prior_are_normal_and_cut_to_the_view(reach: float) -
     scene = Scene(problem, 0, DEFAULT)
     prior = scene.enter_prior(problem.prior)
     assert isinstance(prior, PosePrior)
-    drawn = drawn_around(scene, prior, 4000, reach)
+    drawn = draw_around(scene, prior, 4000, reach)
     middle, sigma = scene.bulk3d.mean(0), prior.translation_sigma
     centroids = (drawn.rotation @ middle + drawn.translation)[1:]
     mean = np.asarray(prior.rotation) @ middle + np.asarray(prior.translation)
