@@ -457,16 +457,3 @@ READERS: dict[str, Callable[[Any], Any]] = {  # of the fields with another form 
     "candidates": lambda values: tuple(_read(Candidate, value) for value in values),
     "stats": lambda value: _read(SolutionStats, value),
 }
-
-MOVED = {"solution_points": "solution_points", "solution_picture": "draw_solution"}  # now in bpnp.report.solutions
-
-
-def __getattr__(name: str) -> Any:
-    """Return a function that moved to `bpnp.report.solutions`, with a DeprecationWarning."""
-    if name not in MOVED:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from bpnp.report import solutions
-
-    successor = f"bpnp.report.solutions.{MOVED[name]}"
-    warnings.warn(f"`{__name__}.{name}` is now `{successor}`, and will be removed", DeprecationWarning, stacklevel=2)
-    return getattr(solutions, MOVED[name])

@@ -12,6 +12,7 @@ from bpnp.argument_types import ArrayLike, PointsLike
 from bpnp.cameras import CameraLike, camera_from
 from bpnp.runtime import Deadline
 from bpnp.search.arguments import Array, Labels, checked_pose, checked_seed, numbers, positive, seconds_from
+from bpnp.search.given_pose import judge_given_pose
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.inputs import problem_from
 from bpnp.search.matching import failed_solution, finished
@@ -20,7 +21,6 @@ from bpnp.search.solution import Solution
 from bpnp.search.verdict.decide import match_count
 from bpnp.search.verdict.reasons import objection
 from bpnp.search.verdict.uncertainty import linearised, pose_covariance
-from bpnp.search.verification import judge_given_pose
 
 SECONDS = 10.0
 

@@ -21,9 +21,9 @@ from bpnp.cameras import camera_from
 from bpnp.cli import main
 from bpnp.examples import load
 from bpnp.report.images import save_figure
-from bpnp.search import solution as module
 from bpnp.search.inputs import problem_from
 from bpnp.search.matching import failed_solution
+from bpnp.solving import solution as module
 
 EXAMPLE = load("mesh")
 SOLUTION = bpnp.solve(EXAMPLE.points2d, EXAMPLE.points3d, EXAMPLE.camera)

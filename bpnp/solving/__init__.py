@@ -1,0 +1,1 @@
+"""Deprecated place of `bpnp.search`; the next minor version removes it."""
