@@ -3,6 +3,8 @@
 import ast
 import importlib
 import json
+import logging
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +32,16 @@ def test_a_notebook_is_stored_with_its_outputs(notebook: Path) -> None:
             assert "image/png" not in text
 
 
+@pytest.fixture
+def own_logging() -> Iterator[None]:
+    """Restore the level of Lightning's messages, which a notebook raises for itself."""
+    messages = logging.getLogger("lightning.pytorch")
+    level = messages.level
+    yield
+    messages.setLevel(level)
+
+
+@pytest.mark.usefixtures("own_logging")
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs(
     notebook: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest

@@ -222,15 +222,15 @@ class MethodTest:
         }  # fmt: skip
         messages = logging.getLogger("lightning.pytorch")
         level, threads = messages.level, torch.get_num_threads()
-        messages.setLevel(logging.WARNING)
-        torch.set_num_threads(1)
-        torch.manual_seed(0)  # for the weights of a network without a checkpoint
         callbacks: list[Callback] = [writer] if progress_bar else [writer, ProgressLines()]
-        trainer = Trainer(
-            accelerator="cpu", devices=1, callbacks=callbacks, logger=False, enable_checkpointing=False,
-            enable_progress_bar=progress_bar, enable_model_summary=False,
-        )  # fmt: skip
         try:
+            messages.setLevel(logging.WARNING)
+            torch.set_num_threads(1)
+            torch.manual_seed(0)  # for the weights of a network without a checkpoint
+            trainer = Trainer(
+                accelerator="cpu", devices=1, callbacks=callbacks, logger=False, enable_checkpointing=False,
+                enable_progress_bar=progress_bar, enable_model_summary=False,
+            )  # fmt: skip
             with raise_on_interrupt(trainer):
                 trainer.test(BlindPnPTask(self.method.build()), loader, verbose=False)
         finally:
