@@ -85,7 +85,7 @@ def refine_on_all_points(solution: Solution, photo: Photo, whole: Region) -> Ref
         least = problem.image.scales[0]
         poses = anneal_to_end(Scene(problem, photo.seed, DEFAULT), rotation[None], shift[None], max(scale, least))
     scene, confident = Scene(problem, photo.seed, DEFAULT), solution.verdict == "confident"
-    local_searches = int(poses.scale[0] > scale) if confident else looks_for_certainty(DEFAULT.evidence)
+    local_searches = int(poses.scale[0] > scale) if confident else local_searches_for_certainty(DEFAULT.evidence)
     others = [] if confident else [one for one in solution.candidates[1:] if one.log10_false_alarms < 0][:COMPETITORS]
     if others:
         turns, shifts = problem.from_user(
@@ -138,7 +138,7 @@ def judge_on_all_points(solution: Solution, refined: Refined | None) -> Solution
     return replace(solution, verdict=result.verdict, reason=result.reason, reason_code=result.code)
 
 
-def looks_for_certainty(rule: Evidence) -> int:
+def local_searches_for_certainty(rule: Evidence) -> int:
     """Return the number of local searches that exclude a better pose nearby, whatever its initial poses were."""
     again = (rule.missed - math.log10(rule.look_fails)) / math.log10(rule.again_fails)
     return 1 + max(math.ceil(again), 0)

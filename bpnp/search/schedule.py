@@ -2,6 +2,7 @@
 
 | best pose so far                | steps                                                                      |
 |---------------------------------|----------------------------------------------------------------------------|
+| none, and a guess is given      | batches of starts around it                                                |
 | near a rough prior              | density-map search, then a batch of starts over all rotations              |
 | not significant                 | a batch of starts over all rotations, and density-map searches over all    |
 |                                 | rotations of equal duration; once the proposals of a network; after each,  |
@@ -30,6 +31,7 @@ from bpnp.search.propose.density_map import (
     search_near,
     select_admitted,
 )
+from bpnp.search.propose.given import enter_given
 from bpnp.search.refine.annealing import multistart
 from bpnp.search.starts import PosePrior, Prior
 from bpnp.search.verdict.completeness import far_missed, near_missed
@@ -147,7 +149,10 @@ class Plan:
             pool: Poses found so far.
             around: Guess of the pose in the frame of the problem; None for none.
             proposals: Function that returns poses to start from; None for none.
+            only_proposals: True for no other starts than the proposals. Default False.
         """
+        if only_proposals:
+            return cls(pool, None, proposals, None, None)
         guess, known = (
             None if prior is None else pool.scene.enter_prior(prior) for prior in (around, pool.problem.prior)
         )
@@ -204,7 +209,7 @@ class Plan:
             return step
         pool = self.pool
         enough = pool.alarms >= 0 or pool.local_searches(pool.leaders()) >= pool.scene.settings.schedule.local_searches
-        return None if enough else self._look()
+        return None if enough else self._local_search()
 
     def _take_proposals(self) -> Callable[[], Hypotheses]:
         """Return a function that searches from the proposals, which are then used up."""
@@ -241,10 +246,10 @@ class Plan:
         basin_count = count_starts(leaders, pool.problem, rule, symmetric=symmetric)
         far = far_missed(basin_count, rule, symmetric=symmetric)
         if local_searches < settings.schedule.local_searches and near_missed(basin_count, local_searches, rule) > far:
-            return self._look()
+            return self._local_search()
         return next_start()
 
-    def _look(self) -> Step:
+    def _local_search(self) -> Step:
         """Return a local search around the best pose."""
         scene = self.pool.scene
         leader = to_scene_frame(self.pool.leaders()[:1], scene)
@@ -264,6 +269,17 @@ def search_proposed(pool: Pool, proposals: Proposals) -> Hypotheses:
 
     Returns:
         Distinct poses in the frame of the scene. Their basin counts are 0, since proposals are dependent.
+
+    Raises:
+        ValueError: The proposals have wrong shapes.
     """
-    poses = select_admitted(pool.scene, Hypotheses.from_poses(*pool.scene.enter(*proposals())), pool.problem.prior)
+    rotation, translation = (np.asarray(values, np.float64) for values in proposals())
+    if rotation.shape[1:] != (3, 3) or translation.shape != (len(rotation), 3):
+        raise ValueError(
+            f"proposed poses have the shapes {rotation.shape} and {translation.shape}; rotations are (s, 3, 3) and "
+            "translations (s, 3)"
+        )
+    poses = select_admitted(pool.scene, enter_given(pool.scene, rotation, translation), pool.problem.prior)
+    if not len(poses):
+        return poses
     return search_density(pool.scene, poses, pool.scene.settings.proposed)

@@ -1,7 +1,6 @@
 """Search for poses from two unmatched point sets, without training.
 
-The functions search over all poses, search from proposed poses only, refine or score given poses, and compile the loops
-in advance.
+`search_poses` searches over all poses, or from proposed poses only; `warm_up` compiles the loops in advance.
 """
 
 import time
@@ -62,8 +61,10 @@ def search_poses(
         around: Guess of the pose from the same points, such as that of a network. The first `Schedule.around` batches
             start there; their basin counts are 0, since they are dependent. None for no guess.
         proposals: Function that returns poses to start from, such as the likeliest ones of a network; basin counts are
-            0. It is called only with too many points to enumerate, while the NFA of the best pose is not small enough.
-        only_proposals: True to start from the proposals only. Default False.
+            0. It is called once, after `Schedule.unaided` rounds without a significant pose (near a prior after two),
+            and only with too many points to enumerate.
+        only_proposals: True to start from the proposals only: known matches, the enumeration and `around` are not used.
+            Default False.
         clutter: Expected fraction of the points without a correspondence, from 0 to below 1
             (`SearchSettings.expecting`). None for the fraction of the settings, and several at the end.
         seed: Seed of all random numbers.
@@ -116,7 +117,8 @@ def search_poses(
     if lacks_partners(scene):
         return degenerate_points("too few points with a label of the other side, or all on one line")
     pool = Pool(scene, problem, enumerated)
-    plan = Plan.of(pool, around, proposals if many else None, only_proposals=only_proposals)
+    is_asked = many or only_proposals
+    plan = Plan.of(pool, around, proposals if is_asked else None, only_proposals=only_proposals)
     return run(plan, pool, most=settings.schedule.turns, deadline=deadline, tell=tell)
 
 

@@ -53,7 +53,7 @@ def settle(
         problem: Points of the problem.
         scene_of: Function that returns the scene for refinements; it is called only if one is needed.
         rule: Constants of the verdict.
-        looks: Number of local searches around the best pose that found no better one.
+        local_searches: Number of local searches around the best pose that found no better one.
         exhaustive: True if every pose was tried.
         enumerated: True if the competing poses of a repeated structure are among the candidates already.
 

@@ -128,3 +128,19 @@ def test_an_undecided_search_asks_the_matcher_and_a_confident_one_does_not(
     )
     assert asked == ([] if name is None else [(3, name)])
     assert alone.verdict == helped.verdict != "confident"
+
+
+def test_a_matcher_given_as_solver_proposes_the_poses_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng, calls, original = np.random.default_rng(5), [], networks.proposed
+    points = rng.normal(size=(120, 3))
+    image = seen(points, VIEW, np.array([0, 0, 7.0]))
+
+    def counted(*options: Any) -> Any:
+        calls.append(options)
+        return original(*options)
+
+    monkeypatch.setattr(networks, "proposed", counted)
+    solution = solve(rng.permutation(image), points, solver=Matcher.from_pretrained("matcher-sfm"))
+    assert len(calls) == 1
+    assert solution.verdict == "confident"
+    np.testing.assert_allclose(solution.rotation, VIEW, atol=1e-5)

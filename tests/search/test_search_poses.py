@@ -1,6 +1,7 @@
 """The training-free search and the refinement find planted poses, and say when they do not."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -99,3 +100,35 @@ def test_points_on_a_line_or_without_a_common_label_have_no_pose():
     for lacking in (labelled, Problem.of(problem.bearings, problem.points3d[:, :1] * [1.0, 2, 3])):
         result = search_poses(lacking)
         assert (result.verdict, result.batches, len(result.candidates)) == ("failed", 0, 0)
+
+
+def planted_points(count: int) -> tuple[Problem, np.ndarray, np.ndarray]:  # type: ignore[type-arg]
+    """Return the problem of a planted pose, and this pose in its frame."""
+    rng = np.random.default_rng(count)
+    scene, rotation = rng.normal(size=(count, 3)), Rotation.from_euler("xyz", [0.4, -0.2, 0.9]).as_matrix()
+    camera = scene @ rotation.T + [0, 0, 7]
+    problem = Problem.of(rng.permutation(camera / np.linalg.norm(camera, axis=1, keepdims=True)), scene)
+    return problem, *problem.from_user(rotation, np.array([0, 0, 7.0]))
+
+
+@pytest.mark.parametrize("count", [40, 200])  # few enough to be enumerated, and too many
+def test_a_search_from_proposals_only_starts_nowhere_else(count: int) -> None:
+    problem, rotation, translation = planted_points(count)
+    near = Rotation.from_euler("x", 4, degrees=True).as_matrix() @ rotation
+    half_turn = Rotation.from_euler("y", 180, degrees=True).as_matrix()
+    proposed = {"right": near, "wrong": half_turn @ rotation}
+    found, calls = {}, []
+
+    def proposals(name: str) -> tuple[np.ndarray, np.ndarray]:  # type: ignore[type-arg]
+        calls.append(name)
+        lost = np.full((1, 3, 3), np.nan)
+        return np.concatenate([lost, proposed[name][None]]), np.stack([translation, translation])
+
+    for name in proposed:
+        found[name] = search_poses(problem, proposals=partial(proposals, name), only_proposals=True)
+    assert calls == ["right", "wrong"]
+    np.testing.assert_allclose(found["right"].best[0], rotation, atol=1e-3)
+    assert found["right"].log10_false_alarms < -20
+    assert found["wrong"].verdict == "failed"
+    with pytest.raises(ValueError, match=r"have the shapes \(3, 3\) and \(3,\)"):
+        search_poses(problem, proposals=lambda: (rotation, translation), only_proposals=True)

@@ -212,7 +212,7 @@ class RigPoses:
             seen.append(turns @ problem.middle + shifts)
         return distinct(poses.rotation, seen_from(np.stack(seen, 1)), score, count, *self.rule.same)
 
-    def _looks(self) -> int:
+    def _local_searches(self) -> int:
         """Return the number of local searches around the best pose that found no better one."""
         return sum(
             int(self._as_best(k, to_problem_frame(pool.surrounded, pool.scene)).sum()) for k, pool in self.pools.items()
@@ -233,7 +233,7 @@ class RigPoses:
         if not self.is_significant():
             return False
         strongest, seen = self._strongest()
-        return missed(seen, self.rig.problems[strongest], self._looks(), self.rule) <= self.rule.missed
+        return missed(seen, self.rig.problems[strongest], self._local_searches(), self.rule) <= self.rule.missed
 
     def _strongest(self) -> tuple[int, Hypotheses]:
         """Return the index of the camera with the most evidence for the best pose, and the poses in that camera."""
@@ -281,7 +281,7 @@ class RigPoses:
             seen,
             self.rig.problems[strongest],
             batches=self.turns,
-            local_searches=self._looks(),
+            local_searches=self._local_searches(),
             exhaustive=self.exhaustive,
             rule=self.rule,
             rig=[(self.rig.seen(k, self.best), problem) for k, problem in enumerate(self.rig.problems)],

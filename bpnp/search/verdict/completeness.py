@@ -33,7 +33,7 @@ def log10_missed(
     Args:
         basin_count: Number h of independent initial poses that ended at the best pose or at one that is not different.
         decades_a_match: Evidence e of a match; 0 if matches do not confirm each other, as in repeated structures.
-        looks: Number l of local searches around the best pose that found no better one.
+        local_searches: Number l of local searches around the best pose that found no better one.
         rule: Constants; F is `rule.look_fails`, G is `rule.again_fails`, q is `rule.another`.
         symmetric: Use `rule.uncompared` as q of a far optimum, since the scene's motions were tried.
 

@@ -134,7 +134,7 @@ def missed(
     Args:
         candidates: Poses in the frame of the problem with their NFA, best first.
         problem: Points of the problem.
-        looks: Number of local searches around the first candidate that found nothing better. `REFINED` for an
+        local_searches: Number of local searches around the first candidate that found nothing better. `REFINED` for an
             enumeration, whose exact refinement leaves no better pose nearby.
         rule: Constants of the verdict.
         independent: False to leave out the evidence of the matches.
@@ -217,7 +217,7 @@ def judge(
         candidates: Poses in the frame of the problem, best first.
         problem: Points of the problem.
         batches: Number of iterations of the search.
-        looks: Number of local searches around the best pose that found nothing better.
+        local_searches: Number of local searches around the best pose that found nothing better.
         exhaustive: True if every pose that fits some points was examined; the miss probability is then 0.
         rule: Constants of the verdict.
         rig: Candidates, best first, and points of every camera of a rig; empty for a single camera.
