@@ -43,6 +43,16 @@ def test_an_object_of_two_equal_halves_has_a_competing_pose() -> None:
     assert (solution.verdict, solution.reason_code) == ("ambiguous", "competing_pose")
 
 
+def test_the_pose_of_an_equal_part_beside_it_is_named_by_its_distance() -> None:
+    """Two equal parts, one beside the other: the competing pose has the same rotation."""
+    rng = np.random.default_rng(2)
+    part = rng.uniform(-1, 1, (20, 3))
+    image = part[:, :2] / (part[:, 2:] + 8)
+    solution = bpnp.solve(image, np.concatenate([part, part + [4, 0, 0]]), solver="search")
+    assert (solution.verdict, solution.reason_code) == ("ambiguous", "competing_pose")
+    assert re.match("A competing pose 4[6-9] % of the distance away fits about as well", solution.reason)  # 4 of 8.3
+
+
 def test_points_on_a_line_are_degenerate() -> None:
     line = np.outer(np.arange(8.0), [1, 2, 0.5])
     solution = bpnp.solve(image_of(line), line)

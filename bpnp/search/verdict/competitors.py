@@ -1,4 +1,4 @@
-"""Competing explanations of the points with their margins, and the miss probability of a better pose.
+"""Competing explanations of the points, with their margins.
 
 A competing explanation is another pose, the same pose at far larger residuals, another focal length, or other
 proportions of the scene. Competing poses of a repeated structure are proposed by `bpnp.search.propose.repetitions`
@@ -21,6 +21,7 @@ from bpnp.search.verdict.false_alarms import directions_of, own_evidence
 from bpnp.search.verdict.reasons import Objection, objection
 from bpnp.search.verdict.uncertainty import Linearised, Misfit, systematic_misfit
 
+LEAST_TURN = 0.5  # degrees; the shift of a pose with a smaller rotation is shown instead
 SAME_ZOOM = 0.005  # relative change of the focal length that a reason omits
 Array = NDArray[np.float64]
 Seen = Sequence[tuple[Hypotheses, Problem]]
@@ -40,18 +41,23 @@ def other_pose(candidates: Hypotheses, problem: Problem, rule: Evidence) -> Obje
         return None
     k = int(others[np.argmin(candidates.log10_false_alarms[others])])
     decades = float(candidates.log10_false_alarms[k] - candidates.log10_false_alarms[0])
-    return competing_pose(candidates.rotation[0], candidates.rotation[k], decades)
+    middle = candidates.rotation[[0, k]] @ problem.middle + candidates.translation[[0, k]]
+    shift = float(np.linalg.norm(middle[1] - middle[0]) / max(float(np.linalg.norm(middle[0])), 1e-300))
+    return competing_pose(candidates.rotation[0], candidates.rotation[k], decades, shift)
 
 
-def competing_pose(rotation: Array, other: Array, decades: float) -> Objection:
+def competing_pose(rotation: Array, other: Array, decades: float, shift: float = 0.0) -> Objection:
     """Return a different pose as an objection.
 
     Args:
         rotation: (3, 3) of the best pose.
         other: (3, 3) of the competing pose.
         decades: log10 of the ratio of their false alarms.
+        shift: Shift of the scene centroid between them, in distances from the camera; it is shown for equal rotations.
     """
-    return objection("competing_pose", decades, degrees=math.degrees(rotation_angle(rotation, other)))
+    degrees = math.degrees(rotation_angle(rotation, other))
+    away = f"{degrees:.0f} deg" if degrees >= LEAST_TURN or not shift else f"{100 * shift:.0f} % of the distance"
+    return objection("competing_pose", decades, away=away)
 
 
 def rough_residuals(candidates: Hypotheses) -> Objection | None:

@@ -10,7 +10,7 @@ def log10_missed(
 ) -> float:
     """Return log10 of the probability that a better optimum than the best pose exists and was missed.
 
-    It lies near the best pose or far from it, and the evidence of the matches lowers the probability of both:
+    The better optimum may lie near the best pose or far from it. The evidence of the matches lowers both probabilities:
 
         P = 10^(-3 e) (max(2^-h, q) F G^(l - 1) + q 2^-h)
 
@@ -20,7 +20,7 @@ def log10_missed(
       better one lies near it with the probability q. The first of l local searches around the best pose misses it with
       the probability F. Each further one misses it with G, since local searches miss the same optima. With l = 0,
       F G^(l - 1) is replaced by 1.
-    - Far. A significant pose far from a better one is a rare repetition or symmetry: q.
+    - Far. This needs a repetition or a symmetry of the scene, which has the probability q.
     - Matches. A pose with a better one elsewhere explains part of the points by coincidence: it aligns a part of the
       scene or slides along a surface. Each of its matches then has little evidence. A match with e decades of evidence
       is a coincidence with a probability of 10^-e. Matches are dependent; but three fix a pose, and at least three

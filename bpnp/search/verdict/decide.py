@@ -6,9 +6,9 @@ that fit as well if image and scene are unrelated.
 - "confident": log10 NFA is at most `Evidence.false_alarms`. The margin to every competing pose is at least
   `Evidence.lead` decades. log10 of the probability that the search missed a better optimum is at most
   `Evidence.missed` (`bpnp.search.verdict.completeness`).
-- "ambiguous": The best pose is significant, but one of the three conditions does not hold. Points that do not fix the
-  rotation or the focal length give this verdict too.
-- "failed": No pose was found, or none is significant.
+- "ambiguous": The best pose fits better than chance (log10 NFA at most 0), but one of the three conditions does not
+  hold. Points that do not fix the rotation or the focal length give this verdict too.
+- "failed": No pose was found, or none fits better than chance.
 """
 
 import math

@@ -7,13 +7,13 @@ MIRRORED = "the mirror image of the scene has a significant pose: check the dire
 LEAST_SHOWN = 0.05  # decades that are shown as 0.0
 CONFIDENT = "confident"  # code of a pose without an objection
 CLAUSES = {
-    # The pose is not significant.
+    # There is no pose, or it is not significant.
     "no_pose": "no pose was found",
     "degenerate": "no pose fits: {why}",
     "chance": "{what} better than chance",
     "insignificant": "not significant",
     # Another pose may be the right one.
-    "competing_pose": "a competing pose {degrees:.0f} deg away fits about as well (margin {margin:.1f} decades)",
+    "competing_pose": "a competing pose {away} away fits about as well (margin {margin:.1f} decades)",
     "competing_rotation": "another rotation fits about as well (margin {margin:.1f} decades)",
     "competing_place": "a pose {distance:.3g} scene units and {degrees:.0f} deg away, elsewhere in the map, explains "
     "the image points about as well (margin {margin:.1f} decades)",
@@ -43,7 +43,8 @@ class Objection(NamedTuple):
     """Reason against a pose.
 
     Attributes:
-        margin: Margin by which the pose is likelier than what contradicts it (log10); -inf without a comparison.
+        margin: Decades by which the pose is likelier than what contradicts it, negative if it is less likely; -inf if
+            nothing was compared.
         code: Kind of the reason, a key of `CLAUSES`.
         clause: The reason in words.
     """
