@@ -46,6 +46,6 @@ def verify_pose(
     if solution.verdict == "failed":
         return solution
     competitor = best_competitor(photo, place, solution, [], regions(explained_keypoints(photo, solution)))
-    judge = judge_against(solution, competitor)
+    compared = judge_against(solution, competitor)
     refuted = competitor is not None and competitor.margin <= -DEFAULT.evidence.lead
-    return replace(judge, verdict="failed") if refuted else judge
+    return replace(compared, verdict="failed") if refuted else compared

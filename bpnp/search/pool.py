@@ -33,7 +33,7 @@ class Pool:
 
     def __init__(self, scene: Scene, problem: Problem, enumerated: SearchResult) -> None:
         self.scene, self.problem, self.enumerated = scene, problem, enumerated
-        self.turns, self._judge = 0, 0.0
+        self.turns, self._judged_alarms = 0, 0.0
         self._is_thinned = len(problem.bearings) > scene.settings.fine.bearings
         self._tests = log10_tests(problem)
         self.forget()
@@ -69,7 +69,7 @@ class Pool:
 
     def may_be_decided(self) -> bool:
         """Return True if the verdict on the best pose may be final, or more points may be matched by it."""
-        bettered = self._is_thinned and self.alarms < self._judge - self.scene.settings.evidence.lead
+        bettered = self._is_thinned and self.alarms < self._judged_alarms - self.scene.settings.evidence.lead
         return bettered or self.missed <= self.scene.settings.evidence.missed
 
     def _weighed(self, candidates: Hypotheses, count: int | None = None) -> Hypotheses:
@@ -141,7 +141,7 @@ class Pool:
                 points; False to anneal only the best one.
         """
         scene, problem, rule = self.scene, self.problem, self.scene.settings.evidence
-        self._judge = min(self._judge, self.alarms)
+        self._judged_alarms = min(self._judged_alarms, self.alarms)
         annealed = scene.settings.finished if ended else 1
         ends = finish(scene, self.candidates, annealed) if len(self.candidates) else self.candidates
         if len(ends) and problem.prior is not None:  # keep the version of each pose with the smaller NFA

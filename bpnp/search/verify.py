@@ -102,10 +102,10 @@ def verify(
         scores3d=scores3d,
     )
     given = None if matches is None else _checked_matches(matches, problem)
-    judge = problem if given is None else _of_matches(problem, given)
+    judged = problem if given is None else _of_matches(problem, given)
     limits: dict[str, Any] = {"inlier_threshold": threshold, "seed": checked_seed(seed), "time_limit": limit}
-    solution = verify_problem(judge, *pose, refine=refine, **limits)
-    if given is None or judge.degenerate is not None:
+    solution = verify_problem(judged, *pose, refine=refine, **limits)
+    if given is None or judged.degenerate is not None:
         return solution
     return replace(
         solution,

@@ -58,8 +58,8 @@ def test_scores_of_scene_points_weigh_the_likelihood() -> None:
     planted = plant(1, 80, outliers3d=80, seed=4)
     points = planted.points2d[0], planted.points3d[0]
     scores = np.where(planted.match3d[0] >= 0, 1.0, 0.05)
-    rank_poses, plain = (solve(*points, scores3d=known, clutter=0.3).candidates[0].score for known in (scores, None))
-    assert rank_poses - plain == pytest.approx(math.log(160 / 84), abs=0.1)
+    weighted, plain = (solve(*points, scores3d=known, clutter=0.3).candidates[0].score for known in (scores, None))
+    assert weighted - plain == pytest.approx(math.log(160 / 84), abs=0.1)
 
 
 def test_equal_objects_are_ambiguous_and_a_prior_decides() -> None:

@@ -78,12 +78,10 @@ class EnumeratedPoses:
         """Refine the competing poses of the best pose, and return all poses."""
         leader = self.found[:1]
         self._leaders.append(leader)
-        pose, scale = (
-            (leader.rotation[0], leader.translation[0]),
-            max(float(leader.scale[0]), self.problem.floor or 1e-5),
-        )
-        motions = registered(self.problem, *pose, scale, self.settings.evidence)
-        for one in zip(*competing_poses(self.problem, *pose, motions, self.settings.evidence), strict=True):
+        pose, rule = (leader.rotation[0], leader.translation[0]), self.settings.evidence
+        scale = max(float(leader.scale[0]), self.problem.floor or SMALLEST)
+        motions = registered(self.problem, *pose, scale, rule)
+        for one in zip(*competing_poses(self.problem, *pose, motions, rule), strict=True):
             self.run.propose(*one, self.run.reach)
         return self.run.poses()
 
@@ -140,17 +138,11 @@ class EnumeratedPoses:
     def result(self, *, ended: bool = True) -> SearchResult:
         """Compute the verdict on the best pose and its competing poses."""
         if self._result is None:
-            rule, exhaustive = self.settings.evidence, self.is_exhausted
-            poses, problem = self.candidates, self.problem
-            result = judge(poses, problem, batches=0, local_searches=REFINED, exhaustive=exhaustive, rule=rule)
+            problem, rule, exhaustive = self.problem, self.settings.evidence, self.is_exhausted
+            scene_of, count = self._scene_of, REFINED
+            result = judge(self.candidates, problem, batches=0, local_searches=count, exhaustive=exhaustive, rule=rule)
             self._result = settle(
-                result,
-                self.problem,
-                self._scene_of,
-                rule,
-                local_searches=REFINED,
-                exhaustive=exhaustive,
-                enumerated=True,
+                result, problem, scene_of, rule, local_searches=count, exhaustive=exhaustive, enumerated=True
             )
         return self._result
 

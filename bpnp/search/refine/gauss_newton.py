@@ -195,10 +195,10 @@ def normal_equations(jacobian: Array, residual: Array, weight: Array) -> Equatio
     each = weight[..., None] if per_match else weight
     shape, size = (*residual.shape[:-2], -1), jacobian.shape[-1]
     rows = jacobian.reshape(*shape, size)
-    rank_poses = np.swapaxes((jacobian * each[..., None]).reshape(*shape, size), -1, -2)
+    weighted = np.swapaxes((jacobian * each[..., None]).reshape(*shape, size), -1, -2)
     return Equations(
-        rank_poses @ rows,
-        (rank_poses @ residual.reshape(*shape, 1))[..., 0],
+        weighted @ rows,
+        (weighted @ residual.reshape(*shape, 1))[..., 0],
         np.asarray((each * residual**2).sum((-2, -1))),
         np.asarray(weight.sum(-1) if per_match else weight.mean(-1).sum(-1)),
     )

@@ -201,7 +201,7 @@ class Rig:
         for rotation, translation in zip(rotations, translations, strict=True):
             last = list(self.refined(rotation, translation))[AGAIN - 1 :: AGAIN][-WEIGHED:]
             if last:
-                ends.append(min(((*self.alarms(*end[:3]), *end) for end in last), key=lambda rank_poses: rank_poses[0]))
+                ends.append(min(((*self.alarms(*end[:3]), *end) for end in last), key=lambda scored: scored[0]))
         if not ends:
             return Hypotheses.from_poses(rotations[:0], translations[:0])
         own, rough, rotations, translations, scales, counts = map(np.array, zip(*ends, strict=True))

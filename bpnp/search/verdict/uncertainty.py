@@ -371,8 +371,8 @@ def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = 
     distance = max(float(np.linalg.norm(linear.state.centroid)), 1e-300)  # unit of the shift, like a radian of rotation
     posed = linear.jacobian[:, :, :POSE] * np.repeat([1.0, distance], 3)
     columns = np.concatenate([posed, zoomed, strained, linear.residual[..., None]], -1)
-    rank_poses = (np.sqrt(linear.probability)[:, None, None] * columns).reshape(-1, columns.shape[-1])
-    products = rank_poses.T @ rank_poses
+    weighted = (np.sqrt(linear.probability)[:, None, None] * columns).reshape(-1, columns.shape[-1])
+    products = weighted.T @ weighted
     pose = np.linalg.pinv(products[:POSE, :POSE], hermitian=True)
     found = []
     strains = slice(POSE + 1, POSE + 1 + len(STRAINS))
