@@ -405,7 +405,7 @@ def fit_camera(
     if unknown.bends and min(len(plain.problem.bearings), len(plain.problem.points3d)) >= RULE.fewest_bent:
         others = [] if radial is not None else [each / unknown.outermost(zoom) ** 2 for each in RULE.bends]
         bent = fit([*((each, radial or 0.0) for each in zooms), *((1.0, each) for each in others)])
-        matches = match_count(bent.poses, bent.problem)
+        matches = match_count(bent.poses)
         lead = math.inf if unknown.distorted else math.log10(SEARCH.evidence.focal_chance)
         if matches >= RULE.fewest_bent and bent.log10_false_alarms < plain.log10_false_alarms + lead:
             return bent

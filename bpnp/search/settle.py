@@ -26,7 +26,7 @@ from bpnp.search.verdict.competitors import of_misfit
 from bpnp.search.verdict.decide import SearchResult, add_false_alarms, is_symmetric, judge, match_count
 from bpnp.search.verdict.false_alarms import alarms_of, likeliest_scale
 from bpnp.search.verdict.reasons import Objection, objection
-from bpnp.search.verdict.uncertainty import Misfit, bends_significantly, linearised, systematic_misfit
+from bpnp.search.verdict.uncertainty import Linearised, Misfit, bends_significantly, linearised, systematic_misfit
 
 Array = NDArray[np.float64]
 SceneOf = Callable[[], Scene]
@@ -132,12 +132,14 @@ def other_lens(result: SearchResult, problem: Problem, scene_of: SceneOf, rule: 
     """
     if problem.focal is not None:
         return None
-    count, (rotation, translation) = match_count(result.candidates, problem), result.best
-    other = fitted_lens(problem, rotation, translation, result.residual, count, rule)
+    count, (rotation, translation) = match_count(result.candidates), result.best
+    linear = linearised(problem, rotation, translation, result.residual)
+    other = fitted_lens(linear, count, rule)
     if other is not None or count < rule.zoomed.fewest:
         return other
-    middle, scale = rotation @ problem.middle + translation, max(result.residual, problem.image.scales[0])
-    linear = linearised(problem, rotation, translation, scale)
+    if result.residual < problem.image.scales[0]:
+        linear = linearised(problem, rotation, translation, problem.image.scales[0])
+    middle = rotation @ problem.middle + translation
     starts = (None, 0.0) if bends_significantly(linear, count, rule) else (None,)
 
     def better(found: AtZoom) -> Objection | None:
@@ -160,24 +162,18 @@ def other_lens(result: SearchResult, problem: Problem, scene_of: SceneOf, rule: 
     return better(likeliest)
 
 
-def fitted_lens(
-    problem: Problem, rotation: Array, translation: Array, scale: float, count: float, rule: Evidence
-) -> Objection | None:
+def fitted_lens(linear: Linearised | None, count: float, rule: Evidence) -> Objection | None:
     """Return a focal length that the residuals of a pose support significantly, if its pose is a different one.
 
     Args:
-        problem: Points of the problem.
-        rotation: (3, 3) of the pose.
-        translation: (3,) of the pose.
-        scale: Standard deviation of its residuals, radians.
+        linear: Pose of a given camera from `linearised`, at the standard deviation of its residuals; or None.
         count: Number of its matches.
         rule: Constants of the verdict.
     """
-    linear = linearised(problem, rotation, translation, scale)
-    if problem.focal is not None or systematic_misfit(linear, count, rule).zoom == 1:
+    if linear is None or systematic_misfit(linear, count, rule).zoom == 1:
         return None
-    middle = rotation @ problem.middle + translation
-    fit = fit_lens(problem, rotation, middle, scale)
+    rotation, middle = linear.state.rotation, linear.state.centroid
+    fit = fit_lens(linear.problem, rotation, middle, linear.scale)
     return None if fit is None else of_misfit(misfit_of(rotation, middle, fit), rule)
 
 

@@ -198,7 +198,7 @@ def _of_unrefined(problem: Problem, optimum: Hypotheses, rotation: Array, transl
     """Return the covariance (6, 6) of an unrefined pose: that of the optimum, plus the step to it squared."""
     best, scale = optimum.rotation[0], float(optimum.scale[0])
     linear = linearised(problem, best, optimum.translation[0], scale)
-    covariance = pose_covariance(problem, linear, match_count(optimum, problem))
+    covariance = pose_covariance(problem, linear, match_count(optimum))
     if covariance is None:
         return np.full((6, 6), math.nan)
     _, shift = problem.to_user(best, optimum.translation[0])

@@ -31,9 +31,9 @@ from bpnp.search.scene import Scene
 from bpnp.search.schedule import Plan
 from bpnp.search.search import lacks_partners
 from bpnp.search.settle import fitted_lens
-from bpnp.search.verdict.decide import SearchResult, is_object, judge, missed, no_pose
+from bpnp.search.verdict.decide import SearchResult, is_object, judge, match_count, missed, no_pose
 from bpnp.search.verdict.reasons import objection
-from bpnp.search.verdict.uncertainty import share_bound
+from bpnp.search.verdict.uncertainty import linearised, share_bound
 
 PROPOSING = replace(ENUMERATION, kept=4000)  # number of poses that a camera with few points proposes
 REFINED = 16  # number of enumerated poses that are refined, and of distinct poses that are kept
@@ -256,7 +256,8 @@ class RigPoses:
         if result.verdict == "confident" and self.rig.model.lens is None:
             strongest, seen = self._strongest()
             pose = seen.rotation[0], seen.translation[0], float(seen.scale[0])
-            other = fitted_lens(self.rig.problems[strongest], *pose, float(seen.match_count[0]), self.rule)
+            linear = linearised(self.rig.problems[strongest], *pose)
+            other = fitted_lens(linear, match_count(seen), self.rule)
             result = result if other is None else result.doubt(other)
         if result.verdict == "confident" and self.rig.unknowns > 6:
             best = self.best.rotation[0], self.best.translation[0], float(self.best.scale[0])

@@ -121,7 +121,7 @@ def rank_poses(candidates: Hypotheses, problem: Problem, rule: Evidence = DEFAUL
     return candidates[order]
 
 
-def match_count(candidates: Hypotheses, problem: Problem) -> float:
+def match_count(candidates: Hypotheses) -> float:
     """Return the expected number of matches of the best pose."""
     return float(candidates.match_count[0])
 
@@ -146,7 +146,7 @@ def missed(
     alarms = float(candidates.log10_false_alarms[0]) if len(candidates) else math.inf
     if alarms > 0:
         return 0.0
-    decades = -alarms / max(match_count(candidates, problem), 1.0) if independent else 0.0
+    decades = -alarms / max(match_count(candidates), 1.0) if independent else 0.0
     value = log10_missed(count_starts(candidates, problem, rule), decades, local_searches, rule)
     if value > rule.missed or not is_symmetric(candidates, problem, rule):
         return value
@@ -241,7 +241,7 @@ def judge(
     certain = alarms <= rule.false_alarms and unseen <= rule.missed
     off = share = math.nan
     if certain and all(one is None or one.margin >= rule.lead for one in against):
-        count = match_count(candidates, problem)
+        count = match_count(candidates)
         linear = linearised(problem, candidates.rotation[0], candidates.translation[0], float(candidates.scale[0]))
         off = math.degrees(rotation_bound(problem, linear, count))
         if off >= HALF_TURN or not (rig or is_redundant(problem, count)):
