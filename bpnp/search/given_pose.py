@@ -97,7 +97,7 @@ def judge_given_pose(
     lead = float(claim.log10_false_alarms[0] - optimum.log10_false_alarms[0]) if better else 0.0
     if not refine and result.verdict == "confident" and 2 * math.log(10) * lead > WITHIN:  # see Wilks 1938
         off = math.degrees(rotation_angle(rotation, optimum.rotation[0]))
-        result = result.doubt(objection("better_nearby", lead, degrees=off))
+        result = result.add_objection(objection("better_nearby", lead, degrees=off))
     refined = refine and result.verdict == "confident"
     return replace(result, batches=int(refined)), optimum  # 0 batches: no last fit to the matches
 
@@ -162,16 +162,14 @@ def _of_claim(result: SearchResult, claim: Hypotheses) -> SearchResult:
     """Convert a verdict on several poses into one on the given pose (1,), which becomes the first candidate."""
     candidates = result.candidates
     place = int(np.flatnonzero((candidates.translation == claim.translation[0]).all(-1))[0])
-    ordered = candidates[np.r_[place, np.delete(np.arange(len(candidates)), place)]]
+    ordered = replace(result, candidates=candidates[np.r_[place, np.delete(np.arange(len(candidates)), place)]])
     alarms = float(claim.log10_false_alarms[0])
     if alarms > 0:
-        one = objection("chance", what="the pose fits no")
-        result = replace(result, verdict="failed", reason=one.sentence(alarms), code=one.code)
-    elif place:
+        return ordered.add_objection(objection("chance", what="the pose fits no"), "failed")
+    if place:
         off = math.degrees(rotation_angle(candidates.rotation[0], claim.rotation[0]))
         margin = alarms - float(candidates.log10_false_alarms[0])
-        one = objection("better_pose", margin, degrees=off)
         refuted = result.verdict == "confident"  # the other pose is confident and refutes the given one
         verdict: Verdict = "failed" if refuted else "ambiguous"
-        result = replace(result, verdict=verdict, reason=one.sentence(alarms), code=one.code)
-    return replace(result, candidates=ordered)
+        return ordered.add_objection(objection("better_pose", margin, degrees=off), verdict)
+    return ordered

@@ -42,8 +42,8 @@ def finished(problem: Problem, result: SearchResult, seconds: float, inlier_thre
     """
     start, found = time.perf_counter(), result.candidates
     if not len(found):
-        failed = failed_solution(problem, _note_duplicates(problem, result), inlier_threshold, seconds)
-        return replace(failed, reason_code=result.code)
+        reason = _note_duplicates(problem, result)
+        return failed_solution(problem, reason, inlier_threshold, seconds, code=result.code)
     threshold = inlier_threshold or SCALES * result.residual * problem.per_radian
     poses = list(zip(found.rotation, found.translation, strict=True))
     if result.batches:  # an enumerated pose is a least-squares fit in float64 already
@@ -89,7 +89,14 @@ def angles_between(bearings: Array, directions: Array) -> Array:
     return np.arctan2(sine, (bearings * directions).sum(-1))
 
 
-def failed_solution(problem: Problem, reason: str, inlier_threshold: float | None, seconds: float = 0.0) -> Solution:
+def failed_solution(
+    problem: Problem,
+    reason: str,
+    inlier_threshold: float | None,
+    seconds: float = 0.0,
+    *,
+    code: str = "no_pose",
+) -> Solution:
     """Return a failed solution of a problem, without a pose."""
     return Solution(
         inlier_threshold=math.nan if inlier_threshold is None else inlier_threshold,
@@ -98,6 +105,7 @@ def failed_solution(problem: Problem, reason: str, inlier_threshold: float | Non
         parameters=POSE_PARAMETERS if problem.focal is None else (*POSE_PARAMETERS, FOCAL_LENGTH),
         verdict="failed",
         reason=reason,
+        reason_code=code,
         stats=SolutionStats(dropped2d=problem.dropped2d, taken2d=problem.taken2d),
         seconds=seconds,
         points2d=problem.all2d,

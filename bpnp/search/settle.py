@@ -71,7 +71,7 @@ def settle(
         if np.array_equal(result.best[1], leader):
             break
     other = other_lens(result, problem, scene_of, rule) if result.verdict == "confident" else None
-    return result if other is None else result.doubt(other)
+    return result if other is None else result.add_objection(other)
 
 
 def repeated_competitors(

@@ -72,8 +72,8 @@ def solve_problems(problems: Mapping[int, Problem], options: Options) -> dict[in
     copies: dict[int, torch.nn.Module] = {}
     for i, problem in problems.items():
         if problem.degenerate is not None:
-            failed = failed_solution(problem, problem.degenerate, options.inlier_threshold)
-            solutions[i] = replace(failed, reason_code="degenerate")
+            threshold = options.inlier_threshold
+            solutions[i] = failed_solution(problem, problem.degenerate, threshold, code="degenerate")
             continue
         net = problem.network
         if net is not None or options.solver is not None:

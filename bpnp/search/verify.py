@@ -142,7 +142,7 @@ def verify_problem(
     """
     begun, deadline = time.perf_counter(), Deadline.after(time_limit)
     if problem.degenerate is not None:
-        return replace(failed_solution(problem, problem.degenerate, inlier_threshold), reason_code="degenerate")
+        return failed_solution(problem, problem.degenerate, inlier_threshold, code="degenerate")
     claim = problem.from_user(rotation, translation)
     result, optimum = judge_given_pose(problem, *claim, refine=refine, seed=seed, deadline=deadline)
     if result.verdict == "confident" and deadline.passed():

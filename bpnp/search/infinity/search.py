@@ -556,13 +556,12 @@ def _judge(found: Hypotheses, sight: Sight, turns: int) -> SearchResult:
     alarms = float(found.log10_false_alarms[0])
     result = SearchResult(found, "confident", "", turns, CONFIDENT)
     if alarms > 0:
-        return replace(result.doubt(objection("chance", what="no rotation fits")), verdict="failed")
+        return result.add_objection(objection("chance", what="no rotation fits"), "failed")
     if alarms > rule.false_alarms:
-        reason = reasons.insignificant(alarms, rule.false_alarms)
-        return replace(result, verdict="ambiguous", reason=reason, code="insignificant")
+        return result.as_insignificant(rule.false_alarms)
     lead = float(found.log10_false_alarms[1]) - alarms if len(found) > 1 else math.inf
     if lead < rule.lead:
-        return result.doubt(objection("competing_rotation", lead))
+        return result.add_objection(objection("competing_rotation", lead))
     hit = np.flatnonzero(found.matches[0] >= 0)
     worth = found.point_evidence[0, hit] / math.log(10)
     most = float(worth.mean() + 2 * worth.std() / math.sqrt(len(hit)))  # largest for a competing rotation
@@ -570,13 +569,13 @@ def _judge(found: Hypotheses, sight: Sight, turns: int) -> SearchResult:
     count = len(sight.image.bearings)
     missed = log10_missed(turns, count, min(least, count), sight.settings.power)
     if missed > rule.missed:
-        return result.doubt(objection("incomplete", what="rotation", probability=reasons.number(missed)))
+        return result.add_objection(objection("incomplete", what="rotation", probability=reasons.number(missed)))
     seen, bearings, pixel = _matches(sight, found)
     some = np.linspace(0, len(hit) - 1, min(len(hit), sight.settings.strained)).astype(np.int64)
     strain = strain_of(seen[some], bearings[some], pixel[some], sight.image.bearings)
     if strain > sight.reach:
-        return result.doubt(objection("other_camera_by_pixels", pixels=strain))
+        return result.add_objection(objection("other_camera_by_pixels", pixels=strain))
     bound = how_well_known(seen, bearings, pixel, information=prior_information(sight.problem)).bound
     if not math.isfinite(bound):
-        return result.doubt(objection("rotation_not_fixed", count=len(hit), what="it"))
+        return result.add_objection(objection("rotation_not_fixed", count=len(hit), what="it"))
     return replace(result, reason=reasons.confident(alarms, rule.lead, math.degrees(bound)))

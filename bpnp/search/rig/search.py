@@ -32,7 +32,7 @@ from bpnp.search.schedule import Plan
 from bpnp.search.search import lacks_partners
 from bpnp.search.settle import fitted_lens
 from bpnp.search.verdict.decide import SearchResult, is_object, judge, match_count, missed, no_pose
-from bpnp.search.verdict.reasons import objection
+from bpnp.search.verdict.reasons import focal_length_not_fixed, objection
 from bpnp.search.verdict.uncertainty import linearised, share_bound
 
 PROPOSING = replace(ENUMERATION, kept=4000)  # number of poses that a camera with few points proposes
@@ -258,7 +258,7 @@ class RigPoses:
             pose = seen.rotation[0], seen.translation[0], float(seen.scale[0])
             linear = linearised(self.rig.problems[strongest], *pose)
             other = fitted_lens(linear, match_count(seen), self.rule)
-            result = result if other is None else result.doubt(other)
+            result = result if other is None else result.add_objection(other)
         if result.verdict == "confident" and self.rig.unknowns > 6:
             best = self.best.rotation[0], self.best.translation[0], float(self.best.scale[0])
             covariance = self.rig.covariance(*best)
@@ -269,10 +269,9 @@ class RigPoses:
             for k, (name, limit) in enumerate(limits.items(), 6):
                 bound = math.inf if covariance is None else share_bound(covariance[k : k + 1, k : k + 1], free)
                 if bound > limit and name == "scale":
-                    result = result.doubt(objection("scale_not_fixed", percent=100 * limit))
+                    result = result.add_objection(objection("scale_not_fixed", percent=100 * limit))
                 elif bound > limit:
-                    off = f"{100 * bound:.0f} % off" if bound < 10 else "anything"
-                    result = result.doubt(objection("focal_length_not_fixed", off=off))
+                    result = result.add_objection(focal_length_not_fixed(bound))
         poses = replace(result.candidates, rotation=self.best.rotation, translation=self.best.translation)
         return replace(result, candidates=poses)
 

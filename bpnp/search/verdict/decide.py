@@ -27,7 +27,7 @@ from bpnp.search.verdict import reasons
 from bpnp.search.verdict.competitors import Seen, misfit, other_pose, rough_residuals, unrelated_competitor
 from bpnp.search.verdict.completeness import log10_missed
 from bpnp.search.verdict.false_alarms import alarms_of
-from bpnp.search.verdict.reasons import CLAUSES, CONFIDENT, Objection, objection
+from bpnp.search.verdict.reasons import CLAUSES, CONFIDENT, Objection, focal_length_not_fixed, objection
 from bpnp.search.verdict.uncertainty import focal_bound, is_redundant, linearised, rotation_bound
 
 Verdict = Literal["confident", "ambiguous", "failed"]
@@ -56,10 +56,14 @@ class SearchResult:
     code: str
     settled: bool = False
 
-    def doubt(self, one: Objection) -> "SearchResult":
-        """Return a copy that is ambiguous for a reason."""
-        reason = one.sentence(self.log10_false_alarms)
-        return replace(self, verdict="ambiguous", reason=reason, code=one.code)
+    def add_objection(self, one: Objection, verdict: Verdict = "ambiguous") -> "SearchResult":
+        """Return a copy that is ambiguous, or failed, for a reason."""
+        return replace(self, verdict=verdict, reason=one.sentence(self.log10_false_alarms), code=one.code)
+
+    def as_insignificant(self, most: float) -> "SearchResult":
+        """Return a copy that is ambiguous, since its log10 NFA is above `most`."""
+        reason = reasons.insignificant(self.log10_false_alarms, most)
+        return replace(self, verdict="ambiguous", reason=reason, code="insignificant")
 
     @property
     def best(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -230,10 +234,9 @@ def judge(
     candidates = rank_poses(candidates, problem, rule)
     alarms = float(candidates.log10_false_alarms[0])
     settled = exhaustive or missed(candidates, problem, local_searches, rule, independent=False) <= rule.missed
-    if alarms > 0:
-        one = objection("chance", what="no pose fits")
-        return SearchResult(candidates, "failed", one.sentence(alarms), batches, one.code, settled)
     result = SearchResult(candidates, "confident", "", batches, CONFIDENT, settled)
+    if alarms > 0:
+        return result.add_objection(objection("chance", what="no pose fits"), "failed")
     unseen = -math.inf if exhaustive else missed(candidates, problem, local_searches, rule)
     # Costly tests run only if the verdict depends on them.
     seen = rig or [(candidates, problem)]
@@ -245,21 +248,19 @@ def judge(
         linear = linearised(problem, candidates.rotation[0], candidates.translation[0], float(candidates.scale[0]))
         off = math.degrees(rotation_bound(problem, linear, count))
         if off >= HALF_TURN or not (rig or is_redundant(problem, count)):
-            return result.doubt(objection("rotation_not_fixed", count=count, what="the rotation"))
+            return result.add_objection(objection("rotation_not_fixed", count=count, what="the rotation"))
         share = 0.0 if problem.focal is None else focal_bound(problem, linear, count)
         if share > (rule.focal_few if is_object(problem, rule) else rule.focal):
-            off_by = f"{100 * share:.0f} % off" if share < 10 else "anything"
-            return result.doubt(objection("focal_length_not_fixed", off=off_by))
+            return result.add_objection(focal_length_not_fixed(share))
         against += [misfit(linear, count, rule), unrelated_competitor(seen, rule)]
-    doubts = [one for one in against if one is not None and one.margin < rule.lead]
-    if certain and not doubts:
+    objections = [one for one in against if one is not None and one.margin < rule.lead]
+    if certain and not objections:
         return replace(result, reason=reasons.confident(alarms, rule.lead, off, share), settled=True)
-    if doubts:
-        return result.doubt(min(doubts))
+    if objections:
+        return result.add_objection(min(objections))
     if alarms > rule.false_alarms:
-        reason = reasons.insignificant(alarms, rule.false_alarms)
-        return replace(result, verdict="ambiguous", reason=reason, code="insignificant")
-    return result.doubt(objection("incomplete", what="pose", probability=reasons.miss_probability(unseen)))
+        return result.as_insignificant(rule.false_alarms)
+    return result.add_objection(objection("incomplete", what="pose", probability=reasons.miss_probability(unseen)))
 
 
 def is_object(problem: Problem, rule: Evidence) -> bool:

@@ -55,7 +55,7 @@ class Objection(NamedTuple):
 
     def sentence(self, log10_false_alarms: float) -> str:
         """Return the reason of a pose with this log10 NFA."""
-        return against(self.clause, log10_false_alarms)
+        return f"{self.clause[0].upper()}{self.clause[1:]}; {nfa(log10_false_alarms)}"
 
 
 def objection(code: str, margin: float = -math.inf, **values: object) -> Objection:
@@ -71,6 +71,11 @@ def objection(code: str, margin: float = -math.inf, **values: object) -> Objecti
         'Its 4 matches do not fix the rotation; log10 NFA -5.0'
     """
     return Objection(margin, code, CLAUSES[code].format(margin=margin, **values))
+
+
+def focal_length_not_fixed(bound: float) -> Objection:
+    """Return the objection that the points do not fix the focal length; `bound` is its 99.9 % bound, a fraction."""
+    return objection("focal_length_not_fixed", off=f"{100 * bound:.0f} % off" if bound < 10 else "anything")
 
 
 def confident(log10_false_alarms: float, lead: float, bound_deg: float, focal: float = 0.0) -> str:
@@ -94,18 +99,13 @@ def confident(log10_false_alarms: float, lead: float, bound_deg: float, focal: f
     return f"No competing pose within {lead:g} decades; {nfa(log10_false_alarms)}; {known} (99.9 %)"
 
 
-def against(what: str, log10_false_alarms: float) -> str:
-    """Return the reason of a pose that is not confident; `what` is a clause."""
-    return f"{what[0].upper()}{what[1:]}; {nfa(log10_false_alarms)}"
-
-
 def insignificant(log10_false_alarms: float, most: float) -> str:
     """Return the reason of a pose that is not significant; `most` is the largest significant log10 NFA."""
     return f"Not significant: {nfa(log10_false_alarms)}, and at most {most:g} is needed"
 
 
 def miss_probability(log10_missed: float) -> str:
-    """Format the miss probability of a search, of which the logarithm is given."""
+    """Format a miss probability, given as log10."""
     return number(min(log10_missed, 0.0))
 
 
