@@ -256,7 +256,7 @@ class PoseModel:
                 if name in columns:
                     information[columns[name], columns[name]] = 1 / sigma**2
         if isinstance(self.prior, GravityPrior):
-            up = np.asarray(self.prior.up_camera, np.float64) / np.linalg.norm(self.prior.up_camera)
+            up, _ = self.prior.directions()
             information[:3, :3] = (np.eye(3) - np.outer(up, up)) / math.radians(self.prior.sigma_deg) ** 2
         elif isinstance(self.prior, PosePrior):
             information[:3, :3] = np.eye(3) / math.radians(self.prior.rotation_sigma_deg) ** 2

@@ -373,7 +373,7 @@ class Problem:
         if self.prior is None:
             return 0.0
         if isinstance(self.prior, GravityPrior):
-            up = rotation @ (np.asarray(self.prior.up_scene) / np.linalg.norm(self.prior.up_scene))
+            up = rotation @ self.prior.directions()[1]
             camera = np.asarray(self.prior.up_camera, np.float64)
             off = math.atan2(float(np.linalg.norm(np.cross(up, camera))), float(up @ camera))
             off = min(max(off, math.radians(SIGMAS * self.prior.sigma_deg)), math.pi)

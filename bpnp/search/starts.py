@@ -49,6 +49,11 @@ class GravityPrior(NamedTuple):
     up_scene: ArrayLike
     sigma_deg: float = 2.0
 
+    def directions(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the unit vectors (3,) of the vertical in the camera and in the scene."""
+        camera, scene = (np.asarray(v, np.float64) / np.linalg.norm(v) for v in (self.up_camera, self.up_scene))
+        return camera, scene
+
 
 Prior = PosePrior | GravityPrior
 
@@ -82,7 +87,7 @@ def draw_rotations(count: int, prior: Prior | None, rng: np.random.Generator) ->
         tilt = Rotation.from_rotvec(math.radians(prior.rotation_sigma_deg) * rng.standard_normal((count, 3)))
         mean = np.asarray(prior.rotation, dtype=np.float64)
     else:
-        up, scene = (np.asarray(v, dtype=np.float64) / np.linalg.norm(np.asarray(v)) for v in prior[:2])
+        up, scene = prior.directions()
         angles = 2 * math.pi * (np.arange(count) + rng.random()) / count
         about = Rotation.from_rotvec(rng.permutation(angles)[:, None] * up)
         tilt = Rotation.from_rotvec(math.radians(prior.sigma_deg) * rng.standard_normal((count, 3))) * about

@@ -321,7 +321,7 @@ def prior_arrays(
         arrays = PriorArrays(none, none, 0.0, 0.0, translation, farthest_shift2)
         return arrays, Heading(none, none, np.zeros((3, 3, 3)), sine2), log_share
     if isinstance(prior, GravityPrior):
-        camera, up = (np.asarray(v, np.float64) / np.linalg.norm(v) for v in (prior.up_camera, prior.up_scene))
+        camera, up = prior.directions()
         in_scene, in_camera, off = up[None], (image.turn @ camera)[None], math.radians(prior.sigma_deg)
         from_camera, from_scene = turned_to(in_camera[0]), turned_to(up)
     else:

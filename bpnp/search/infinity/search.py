@@ -415,7 +415,7 @@ def _possible(sight: Sight, i: int) -> Labels:
             angle, sigma = 0.0, problem.prior.rotation_sigma_deg
             axis = bearing @ np.asarray(problem.prior.rotation)
         else:
-            camera, axis = (np.asarray(v, np.float64) / np.linalg.norm(v) for v in problem.prior[:2])
+            camera, axis = problem.prior.directions()
             angle, sigma = float(np.arccos(np.clip(bearing @ camera, -1, 1))), problem.prior.sigma_deg
         off = np.abs(np.arccos(np.clip(directions @ axis, -1, 1)) - angle)
         possible &= off <= PRIOR_SIGMAS * math.radians(sigma) + ANCHOR_OFF
@@ -430,7 +430,7 @@ def _is_admitted(sight: Sight, rotation: Array) -> bool:
     if isinstance(prior, PosePrior):
         off, sigma = rotation_angle(rotation, np.asarray(prior.rotation, np.float64)), prior.rotation_sigma_deg
     else:
-        camera, scene = (np.asarray(v, np.float64) / np.linalg.norm(v) for v in prior[:2])
+        camera, scene = prior.directions()
         off, sigma = math.acos(float(np.clip(camera @ rotation @ scene, -1, 1))), prior.sigma_deg
     return off <= PRIOR_SIGMAS * math.radians(sigma) + PROPOSED_OFF
 
