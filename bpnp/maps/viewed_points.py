@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from bpnp.cameras import Camera
 from bpnp.maps.upright import quarter_turns, turned_view
 from bpnp.maps.views import (
-    RUNG,
     STEP,
+    VIEWS_AHEAD,
     Array,
     Cones,
     Pictures,
@@ -150,7 +150,8 @@ class ViewedPoints:
 
         With `views` these are the given views in their order. Each gets the points that any of them sees, since they
         show one place. Otherwise they are all views of the map by rank (`bpnp.maps.views`), each with its own points.
-        With an unknown focal length several are tried, the likeliest first: the next one follows `RUNG` views behind.
+        With an unknown focal length several are tried, the likeliest first: each begins `VIEWS_AHEAD` views after the
+        one before.
         Views with too few points to fix a pose are skipped.
 
         Args:
@@ -170,11 +171,11 @@ class ViewedPoints:
         cameras: list[Camera] = camera.focal_steps(STEP) if isinstance(camera, UnknownCamera) else [camera]
         scores = self.scores(cameras[0], keypoints, known_focal=isinstance(camera, Camera))
         order = list(places_first(self.views, scores, len(self.points3d)))
-        turns = [(place + RUNG * rung, rung, k) for rung in range(len(cameras)) for place, k in enumerate(order)]
+        queue = [(rank + VIEWS_AHEAD * step, step, k) for step in range(len(cameras)) for rank, k in enumerate(order)]
         tried = [camera.near(one) if isinstance(camera, UnknownCamera) else camera for one in cameras]
         return [
-            Place(view, view.points, tried[rung])
-            for _, rung, k in sorted(turns)
+            Place(view, view.points, tried[step])
+            for _, step, k in sorted(queue)
             if len((view := self.views[k]).points) >= MIN_POINTS
         ]
 

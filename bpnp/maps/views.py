@@ -135,7 +135,7 @@ class RankSettings:
 
 RANK = RankSettings()
 STEP = 1.25  # factor between successive focal lengths of a photo
-RUNG = 4  # views that are tried with one focal length before the next one starts
+VIEWS_AHEAD = 4  # views that are tried with one focal length before the next one starts
 
 
 def pictures_of_views(points3d: Array, views: Sequence[View], rule: RankSettings = RANK) -> Pictures:

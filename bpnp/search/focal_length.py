@@ -274,9 +274,9 @@ class FocalSweep(ABC):
     def best(self) -> Solution:
         return min(self.ends, key=lambda end: end.log10_false_alarms)
 
-    def search_from(self, camera: Camera, turns: int, rungs: int) -> None:
+    def search_from(self, camera: Camera, turns: int, steps: int) -> None:
         """Search with a camera, then with cameras that fit the found poses better."""
-        found = self._search(camera, turns, rungs)
+        found = self._search(camera, turns, steps)
         for _ in range(RULE.alternations):
             if found.verdict == "failed":
                 break
@@ -285,17 +285,17 @@ class FocalSweep(ABC):
                 better, settled = self._refined(found, camera, AROUND)
             if settled:
                 break
-            again = self._search(better, turns, rungs)
+            again = self._search(better, turns, steps)
             if again.log10_false_alarms >= found.log10_false_alarms:
                 break
             found, camera = again, better
         self.ends.append(found)
 
-    def _search(self, camera: Camera, turns: int, rungs: int) -> Solution:
+    def _search(self, camera: Camera, turns: int, steps: int) -> Solution:
         limit = self.options.time_limit
         if limit is not None:
             left = max(limit - (Clock.now() - self.begun), 1e-3)
-            limit = left / max(rungs - len(self.ends), 1)
+            limit = left / max(steps - len(self.ends), 1)
         options = self.options._replace(settings=self.options.settings.limited(turns), time_limit=limit)
         return self.solve_with(camera, options)
 

@@ -75,7 +75,7 @@ def judge_given_pose(
         copies = competing_poses(one, rotation, translation, motions, rule)
         if len(copies[0]):
             others = Hypotheses.concatenate([others, anneal_to_end(scene, *copies, float(claim.scale[0]))])
-    others = _weighed_anew(others, one)
+    others = _with_new_false_alarms(others, one)
     others = others[np.argsort(others.log10_false_alarms, kind="stable")]
     same = np.array([_is_same(one, claim, others[k : k + 1], rule) for k in range(len(others))], np.bool_)
     optimum = others[same][:1]
@@ -88,7 +88,7 @@ def judge_given_pose(
         one = replace(problem, log10_tried=max(log10_tests(problem) + near, 0.0))
         claim = optimum
     competing = others[~same & (others.log10_false_alarms <= 0)]  # insignificant poses do not compete
-    candidates = _weighed_anew(Hypotheses.concatenate([claim, competing]), one)
+    candidates = _with_new_false_alarms(Hypotheses.concatenate([claim, competing]), one)
     result = judge(candidates, one, batches=0, exhaustive=True, rule=rule)
     result = settle(result, one, lambda: scene, rule, exhaustive=True, enumerated=few)
     result = _of_claim(result, candidates[:1])
@@ -120,7 +120,7 @@ def _proposed(problem: Problem, claim: Hypotheses, scene: Scene) -> Hypotheses:
     return to_problem_frame(poses, scene)
 
 
-def _weighed_anew(candidates: Hypotheses, problem: Problem) -> Hypotheses:
+def _with_new_false_alarms(candidates: Hypotheses, problem: Problem) -> Hypotheses:
     """Return the candidates with their false alarms recomputed for the number of tests of the problem."""
     return add_false_alarms(candidates.unweighed(), problem)
 

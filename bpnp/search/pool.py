@@ -58,12 +58,14 @@ class Pool:
         """
         rule, before = self.scene.settings.evidence, self.alarms
         self.turns += 1
-        self.candidates = self._weighed(merge_hypotheses([self.candidates, self._weighed(found)], self.scene), 1)
+        self.candidates = self._with_false_alarms(
+            merge_hypotheses([self.candidates, self._with_false_alarms(found)], self.scene), 1
+        )
         if step.around is not None and self.alarms > before - rule.lead and not self.scene.deadline.passed():
             self.surrounded = Hypotheses.concatenate([self.surrounded, step.around])
         self.missed = self._missed()
         if self.missed > rule.missed:  # otherwise `result` computes the NFA of the others
-            self.candidates = self._weighed(self.candidates)
+            self.candidates = self._with_false_alarms(self.candidates)
             self.candidates = self.candidates[np.argsort(-self.candidates.sort_key, kind="stable")]
             self.missed = self._missed()
 
@@ -72,7 +74,7 @@ class Pool:
         bettered = self._is_thinned and self.alarms < self._judged_alarms - self.scene.settings.evidence.lead
         return bettered or self.missed <= self.scene.settings.evidence.missed
 
-    def _weighed(self, candidates: Hypotheses, count: int | None = None) -> Hypotheses:
+    def _with_false_alarms(self, candidates: Hypotheses, count: int | None = None) -> Hypotheses:
         """Compute the NFA of the promising poses among the first `count` candidates.
 
         None for `count` means as many as a verdict needs.
@@ -117,9 +119,9 @@ class Pool:
         """
         if not len(leaders) or not len(self.surrounded):
             return 0
-        rule, looked = self.scene.settings.evidence, to_problem_frame(self.surrounded, self.scene)
-        rotation = np.concatenate([leaders.rotation[:1], looked.rotation])
-        translation = np.concatenate([leaders.translation[:1], looked.translation])
+        rule, around = self.scene.settings.evidence, to_problem_frame(self.surrounded, self.scene)
+        rotation = np.concatenate([leaders.rotation[:1], around.rotation])
+        translation = np.concatenate([leaders.translation[:1], around.translation])
         return int(self.problem.same_pose(rotation, translation, rule.same).sum()) - 1
 
     def is_searched(self, pose: Hypotheses) -> bool:
@@ -145,7 +147,7 @@ class Pool:
         annealed = scene.settings.finished if ended else 1
         ends = finish(scene, self.candidates, annealed) if len(self.candidates) else self.candidates
         if len(ends) and problem.prior is not None:  # keep the version of each pose with the smaller NFA
-            ends = self._weighed(ends)
+            ends = self._with_false_alarms(ends)
             ends = merge_hypotheses([ends, self.candidates.as_dependent()], scene)
         leaders = rank_poses(to_problem_frame(ends, scene), problem, rule)
         local_searches = self.local_searches(leaders)

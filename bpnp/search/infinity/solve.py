@@ -161,8 +161,8 @@ def _solve(sky: Sky, options: Options) -> Solution:
     ends = list[Solution]()
     rough = replace(DEFAULT, noise=(DEFAULT.zoom_noise,), least_share=DEFAULT.zoom_share)
     exact = replace(rough, noise=DEFAULT.noise)
-    for rung in unknown[0].focal_steps(DEFAULT.zoom):
-        trial = sky.at(*unknown[0].parts(rung))
+    for camera in unknown[0].focal_steps(DEFAULT.zoom):
+        trial = sky.at(*unknown[0].parts(camera))
         found = seen_by(trial, rough)
         if found.verdict == "failed":  # among many directions unrelated ones fit as well at the coarse noise
             found = seen_by(trial, exact if ends else DEFAULT)

@@ -153,7 +153,7 @@ def repetition_margins(
     problem: Problem,
     best: Pose,
     repeated: Pose,
-    rivals: Pose,
+    competitors: Pose,
     scale: float,
     limits: Repetitions = DEFAULT,
     *,
@@ -171,12 +171,12 @@ def repetition_margins(
         problem: Points of the problem.
         best: Rotation (3, 3) and translation (3,) of the best pose.
         repeated: Rotations and translations of the unrefined poses that the motions give.
-        rivals: Rotations (c, 3, 3) and translations (c, 3) of the competing poses.
+        competitors: Rotations (c, 3, 3) and translations (c, 3) of the competing poses.
         scale: Scale of the residuals, radians.
         limits: Constants.
         fraction: Fraction of the matched points that every motion maps; it limits q to 1 - `fraction`. Default 0.
     """
-    seen = [directions_of(problem, *best), *(directions_of(problem, r, t) for r, t in zip(*rivals, strict=True))]
+    seen = [directions_of(problem, *best), *(directions_of(problem, r, t) for r, t in zip(*competitors, strict=True))]
     logs = np.stack([point_evidence(problem, one, np.array([scale]), SHARES[-1:], even=True)[:, 0, 0] for one in seen])
     count = logs.shape[1]
     missing = min((int((logs[0] < 0).sum()) + 1) / (count + 2), (count * (1 - fraction) + 1) / (count + 2))

@@ -119,8 +119,8 @@ class RigPlan:
         while self._plans:
             if not self._waiting:
                 self._waiting = list(self._plans)
-                if (look := self._poses.next_look()) is not None:
-                    return look
+                if (local := self._poses.next_local_search()) is not None:
+                    return local
             k = self._waiting.pop(0)
             if (step := self._plans[k].next_step()) is not None:
                 return step._replace(camera=k)
@@ -132,19 +132,19 @@ class RigPoses:
     """Proposals of the cameras of a rig, and the best of them refined on all cameras.
 
     Attributes:
-        met: All poses of each camera, in the frame of its problem.
+        found: All poses of each camera, in the frame of its problem.
         pools: Pool of each camera that searches, by index.
         starts: Initial poses of the rig that were refined, with their evidence.
-        looked: Initial poses that had a local search.
+        searched: Initial poses that had a local search.
         best: Distinct refined poses, best first.
         exhaustive: True if every pose was tried.
     """
 
     def __init__(self, rig: Rig) -> None:
         self.rig, self.rule, self.exhaustive = rig, DEFAULT.evidence, True
-        self.met = [Hypotheses.empty() for _ in rig.problems]
+        self.found = [Hypotheses.empty() for _ in rig.problems]
         self.starts = Hypotheses.empty(4)
-        self.best, self.looked, self.pools = self.starts, self.starts, dict[int, Pool]()
+        self.best, self.searched, self.pools = self.starts, self.starts, dict[int, Pool]()
 
     @property
     def turns(self) -> int:
@@ -164,9 +164,9 @@ class RigPoses:
             new: Poses of each camera, by index, in the frame of its problem.
             most: Largest number of poses that are refined.
         """
-        rotation, translation = _proposals(self.rig, new, self.met)
+        rotation, translation = _proposals(self.rig, new, self.found)
         for k, poses in new.items():
-            self.met[k] = Hypotheses.concatenate([self.met[k], poses])
+            self.found[k] = Hypotheses.concatenate([self.found[k], poses])
         if len(rotation) > COMPARED:
             best = np.argsort(-_agreement(self.rig, rotation, translation), kind="stable")[:COMPARED]
             rotation, translation = rotation[best], translation[best]
@@ -177,16 +177,16 @@ class RigPoses:
         self.starts = every[np.r_[:known, order]]
         self.add_refined(self.rig.candidates(every.rotation[order], every.translation[order]))
 
-    def next_look(self) -> Step | None:
+    def next_local_search(self) -> Step | None:
         """Return a local search around the best unused initial pose; None if a pose is significant."""
         if not self.pools or not len(self.starts) or self.best.log10_false_alarms[:1].min(initial=math.inf) < 0:
             return None
-        poses = Hypotheses.concatenate([self.looked, self.starts])
-        score = np.r_[np.full(len(self.looked), BEFORE), self.starts.log_likelihood]
+        poses = Hypotheses.concatenate([self.searched, self.starts])
+        score = np.r_[np.full(len(self.searched), BEFORE), self.starts.log_likelihood]
         apart = DEFAULT.schedule.apart_deg
-        order = distinct(poses.rotation, poses.translation, score, len(self.looked) + 1, apart, math.inf)
-        new = poses[order[len(self.looked) :]]
-        self.looked = Hypotheses.concatenate([self.looked, new])
+        order = distinct(poses.rotation, poses.translation, score, len(self.searched) + 1, apart, math.inf)
+        new = poses[order[len(self.searched) :]]
+        self.searched = Hypotheses.concatenate([self.searched, new])
         if not len(new):
             return None
         k = max(self.pools, key=lambda k: len(self.rig.problems[k].bearings))
@@ -201,7 +201,7 @@ class RigPoses:
         self.best = every[self._distinct(every, -every.log10_false_alarms, REFINED)]
         if len(self.best):
             self.best.basin_count[0] = sum(
-                int(poses.basin_count[self._as_best(k, poses)].sum()) for k, poses in enumerate(self.met)
+                int(poses.basin_count[self._as_best(k, poses)].sum()) for k, poses in enumerate(self.found)
             )
 
     def _distinct(self, poses: Hypotheses, score: Array, count: int) -> NDArray[np.int64]:
@@ -288,28 +288,28 @@ class RigPoses:
         )
 
 
-def _proposals(rig: Rig, new: Mapping[int, Hypotheses], met: Sequence[Hypotheses]) -> Pose:
+def _proposals(rig: Rig, new: Mapping[int, Hypotheses], found: Sequence[Hypotheses]) -> Pose:
     """Return the poses of the rig that new poses of the cameras give.
 
     If the scale is unknown, they are those in which two cameras with a non-zero baseline agree. The poses of the second
-    camera include those it had `met` before.
+    camera include those it had `found` before.
     """
     if not rig.model.scale:
         parts = [rig.rig_of(k, poses.rotation, poses.translation) for k, poses in new.items()]
     else:
-        pairs = [(k, other, poses) for k, poses in new.items() for other in range(len(met))]
+        pairs = [(k, other, poses) for k, poses in new.items() for other in range(len(found))]
         parts = []
         for k, other, poses in pairs:
-            others = [met[other], *([new[other]] if other in new and other > k else [])]
+            others = [found[other], *([new[other]] if other in new and other > k else [])]
             if (min(k, other), max(k, other)) in rig.apart:
-                parts.append(_told_by(rig, (k, other), poses, Hypotheses.concatenate(others)))
+                parts.append(_agreeing_poses(rig, (k, other), poses, Hypotheses.concatenate(others)))
     if not parts:
         return np.empty((0, 3, 3)), np.empty((0, 4))
     rotation, translation = map(np.concatenate, zip(*parts, strict=True))
     return rotation, translation
 
 
-def _told_by(rig: Rig, pair: tuple[int, int], first: Hypotheses, second: Hypotheses) -> Pose:
+def _agreeing_poses(rig: Rig, pair: tuple[int, int], first: Hypotheses, second: Hypotheses) -> Pose:
     """Return the poses of the rig in which two cameras agree; the scene centroid is at its least-squares position.
 
     Args:
