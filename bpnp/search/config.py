@@ -231,6 +231,16 @@ class EnumerationSettings:
         sigmas: Standard deviations of a prior beyond which no pose is tried.
         prior_weight: Match radii that weigh as much as one standard deviation of a prior. Noise is a tenth to a third
             of a radius.
+        smallest_scale: Smallest scale of the residuals if the pixel size is unknown. [radians; numerics]
+        ranked: Number of points up to which all neighbours are ranked; beyond, only this many of each. [points; cost]
+        scenes: Number of scenes whose tables stay in the cache. [scenes; cost]
+        opposite: Cosine of two normals below which no camera faces both. [1; not tuned]
+        parallel: Cosine below which a point of a triple faces away; the lines of sight to three points are not quite
+            parallel, so it is that of 95 degrees. [1; not tuned]
+        edge_on: Sine of an angle to a triangle's plane below which either orientation is possible. [1; not tuned]
+        directions: Number of directions with which the orientations of a triangle are tested. [directions; cost]
+        mirrored: Number of hypotheses of a mirrored scene, some 10 ms: a correct pose of clean points is among the
+            first thousands. [hypotheses; cost]
     """
 
     most_products: int = 4000
@@ -254,10 +264,684 @@ class EnumerationSettings:
     witness_chances: tuple[float, float] = (0.05, 0.3)
     sigmas: float = 4.0
     prior_weight: float = 0.1
+    smallest_scale: float = 1e-5
+    ranked: int = 64
+    scenes: int = 8
+    opposite: float = -0.8
+    parallel: float = math.cos(math.radians(95.0))
+    edge_on: float = 0.15
+    directions: int = 192
+    mirrored: int = 20_000
 
 
 RULES = Rules()
 ENUMERATION = EnumerationSettings()
+
+
+@dataclass(frozen=True)
+class TimeSettings:
+    """Time limits, and the time that parts of a search are expected to take.
+
+    Attributes:
+        one: Default time limit of `solve`, and of `verify`. [seconds; convention]
+        of_many: Default time limit of each problem of `solve_many`. [seconds; convention]
+        photo: Default time limit of a photo; the photos of cities are measured with it (docs/maps.md).
+            [seconds; convention]
+        ending: Time of the verdict and of the matching after a search; at most half of a limit is kept for it.
+            [seconds; cost]
+        ending_a_point: Time that each 2D or 3D point adds to `ending`. [seconds per point; cost]
+        hypothesis: Time of a hypothesis of the enumeration before it is measured. [seconds; cost]
+        built: Time of a set of points when a stage of the enumeration begins. [seconds; cost]
+        built_facing: The same for a set of points with normals. [seconds; cost]
+        shortest: Time before the deadline in which no hypothesis is begun. [seconds; cost]
+        scheduler: Time until a Dask scheduler must answer. [seconds; convention]
+    """
+
+    one: float = 10.0
+    of_many: float = 5.0
+    photo: float = 60.0
+    ending: float = 4e-3
+    ending_a_point: float = 8e-6
+    hypothesis: float = 2e-6
+    built: float = 5e-7
+    built_facing: float = 5e-6
+    shortest: float = 5e-5
+    scheduler: int = 10
+
+
+TIME = TimeSettings()
+
+
+@dataclass(frozen=True)
+class InputSettings:
+    """Checks of the arguments (`bpnp.search.arguments`, `bpnp.search.inputs`).
+
+    Attributes:
+        rounding: Largest error of R R^T of a rotation; others are made orthonormal. [1; numerics, float64]
+        unit: Largest error of a unit length, of a rotation, and of a sum of probabilities. [1; convention]
+        sure: Probability of a class from which on points match only within the class. [probability; not tuned]
+        prior_deg: Default standard deviation of a given rotation about each axis. [degrees; convention]
+        one_pixel: Largest coordinate of image points that are refused as normalised coordinates beside a camera in
+            pixels. [pixels; convention]
+        widest_row: Largest number of columns of an array of keypoints whose first two columns are positions.
+            [columns; convention]
+        floor_pixels: Smallest noise of an image point; no point detector is more accurate. [pixels; convention]
+    """
+
+    rounding: float = 1e-12
+    unit: float = 1e-3
+    sure: float = 0.97
+    prior_deg: float = 10.0
+    one_pixel: float = 3.0
+    widest_row: int = 8
+    floor_pixels: float = 0.1
+
+
+INPUTS = InputSettings()
+
+
+@dataclass(frozen=True)
+class ProblemSettings:
+    """Record of the points and its prior (`bpnp.search.problem`, `scene`, `starts`).
+
+    Attributes:
+        bulk: Distance from the median beyond which scene points do not affect the origin and the unit.
+            [median distances; not tuned]
+        turned_deg: Largest standard deviation of a rotation prior with which two matches fix a pose.
+            [degrees; not tuned]
+        tilted: Largest motion of the image points by the tilt with which two matches fix a pose.
+            [match radii; not tuned]
+        radius: Radius of a match if the pixel size is unknown. [radians; not tuned]
+        floors: Radius of a match if it is known: 3 pixels if the floor is a tenth of a pixel.
+            [noise floors; convention]
+        sigmas: Width of a prior within which all poses count as equally near. [standard deviations; convention]
+        log_depths: Logarithm of the farthest over the nearest possible distance of a scene. [nats; convention]
+        pairs_a_point: Largest number of pairs per point for which every pair is computed. [pairs; cost]
+        likely: Least likelihood of a possible match by its classes, relative to a mean match. [ratio; not tuned]
+        line: Second extent of points over the first, below which they lie on a line. [ratio; numerics, float32]
+        shift_along: Weight of a shift along the view over one across it, for an RMS angular radius of one radian; at
+            most 1. [per radian; not tuned]
+        all_around: RMS angular radius above which bearings fill about 220 degrees or more, so that the camera is among
+            the points. [radians; derived]
+        aim_step: Step of the spiral of positions at which searches aim, with radii of `aim_step` times the square root
+            of the number; it leaves no gaps. [RMS angular radii; not tuned]
+    """
+
+    bulk: float = 20.0
+    turned_deg: float = 5.0
+    tilted: float = 2.0
+    radius: float = 3e-3
+    floors: float = 30.0
+    sigmas: float = 2.0
+    log_depths: float = math.log(30.0)
+    pairs_a_point: int = 32
+    likely: float = 0.1
+    line: float = 1e-6
+    shift_along: float = 5.0
+    all_around: float = 0.95
+    aim_step: float = 0.16
+
+
+PROBLEM = ProblemSettings()
+
+
+@dataclass(frozen=True)
+class MatchSettings:
+    """Correspondences of a pose, and the last fit to them (`bpnp.search.correspondences`, `matching`, `known_matches`).
+
+    Attributes:
+        reach: Distance within which an image point has a match, and default inlier threshold; 98.9 % of the errors of
+            two normal coordinates are within it. [scales of the residuals; convention]
+        farthest: Distance within which a scene point counts as a possible correspondence in a weighted fit, where each
+            counts by its likelihood; beyond, it is below e^-8. [scales of the residuals; derived]
+        few_neighbours: Number of nearest scene points of an image point that are tried first. [points; cost]
+        neighbours: Number that is tried if all of these are in reach. [points; cost]
+        dense: Number of possible matches up to which all distances are computed. [matches; cost]
+        fit_rounds: Rounds of the last fit, each with new matches. [rounds; not tuned]
+        damping: First damping of Levenberg and Marquardt, a fraction of the diagonal. [fraction; convention]
+        most_steps: Largest number of its steps, and of those of a fit of the focal length of directions.
+            [steps; numerics]
+        exact: Relative change of a pose, and of the sum of squares, that ends the steps. [ratio; numerics]
+        triples: Largest number of triples of given matches. With a fifth of the matches correct, all of them miss a
+            correct triple 3 times in 10,000. [triples; derived]
+        scored: Number of given matches on which the poses of the triples are compared. [matches; cost]
+        refined: Number of poses of triples that are refined. [poses; not tuned]
+        steps: Steps of a refinement to given matches. [steps; numerics]
+        reweighted: Number of times that the given matches are weighted anew. [rounds; not tuned]
+        wrong: Expected fraction of wrong given matches. A user who gives matches has fewer outliers than points without
+            matches have (`SearchSettings.outliers`). [fraction; not tuned]
+        converged: Difference within which refined poses are one optimum, in tolerances of equal poses.
+            [fraction; not tuned]
+        settled: Relative change of a sum of squares that ends these steps. [ratio; numerics]
+        negligible: Sum of squares that ends them. [radians squared; numerics]
+    """
+
+    reach: float = 3.0
+    farthest: float = 4.0
+    few_neighbours: int = 8
+    neighbours: int = 64
+    dense: int = 4096
+    fit_rounds: int = 5
+    damping: float = 1e-3
+    most_steps: int = 50
+    exact: float = 1e-12
+    triples: int = 1000
+    scored: int = 500
+    refined: int = 6
+    steps: int = 10
+    reweighted: int = 3
+    wrong: float = 0.1
+    converged: float = 0.05
+    settled: float = 1e-6
+    negligible: float = 1e-24
+
+
+MATCHES = MatchSettings()
+
+
+@dataclass(frozen=True)
+class NetworkSettings:
+    """Poses from the assignment of a network (`bpnp.search.propose.networks`, `bpnp.search.sources`).
+
+    Attributes:
+        far: Largest distance from the origin at which float32 is precise enough. [sizes of the scene; numerics]
+        drawn: Match triples per assignment. With 2 % correct matches one in 10^5 is correct, and more nearly so.
+            [triples; derived]
+        sigma_deg: Standard deviation of the rotation of a network's pose. [degrees; not tuned]
+        sigma_shift: Standard deviation of its translation, as a fraction of the distance. [fraction; not tuned]
+        together: Largest assignment matrix of a batch on a GPU, 2D points times 3D points. [entries; cost]
+        most_cells: Largest assignment matrix of a packaged matcher; larger ones take seconds. [entries; cost]
+    """
+
+    far: float = 100.0
+    drawn: int = 80_000
+    sigma_deg: float = 10.0
+    sigma_shift: float = 0.1
+    together: int = 2**26
+    most_cells: int = 2**22
+
+
+NETWORKS = NetworkSettings()
+
+
+class TriangleSettings(NamedTuple):
+    """Minimal solvers (`bpnp.search.propose.minimal_solvers`); compiled with their loops.
+
+    Attributes:
+        flat: Squared height of a triangle over its squared longest side, at which it is a line. [ratio; numerics]
+        tolerance: Largest error of the squared sides, in units of the longest. [ratio; numerics]
+        rounding: Relative size of a discriminant that counts as zero. [ratio; numerics]
+        level: Sine of both rays' height below which a prior vertical does not determine their depths. [1; numerics]
+        upright: Horizontal fraction of the vector between two points below which it does not determine the heading.
+            [fraction; numerics]
+    """
+
+    flat: float = 1e-12
+    tolerance: float = 1e-6
+    rounding: float = 1e-12
+    level: float = 1e-6
+    upright: float = 1e-3
+
+
+TRIANGLES = TriangleSettings()
+
+
+class KernelSettings(NamedTuple):
+    """Annealing on clusters and on all points (`bpnp.search.kernels`); compiled with the loops.
+
+    Attributes:
+        relaxation: Factor on a Gauss-Newton step on clusters. Alternating expectation and maximisation takes short
+            steps. [factor; not tuned]
+        damping: Fraction by which each diagonal entry of the Hessian grows, so that a direction that the points do not
+            fix is left unchanged. [fraction; not tuned]
+        least_base: Smallest base of the kernel on clusters: a kernel of 1e-18, whose square is not denormal. Denormal
+            numbers are 2.5 times as slow. [1; numerics]
+        largest_turn: Largest rotation of one step. [radians; not tuned]
+        sweeps: Alternating normalisations of the assignment on all points, of rows and columns. [sweeps; not tuned]
+        first_tiles: Mean number of tiles near a point that the first buffer holds; a larger one is made where needed.
+            [tiles; cost]
+        least_seen: Smallest weight of the points that face the camera, as a fraction of all weights.
+            [fraction; not tuned]
+        reach: Distance beyond which the kernel on all points is 0; it is below 0.012 there.
+            [scales of the annealing; cost]
+        lanes: Bearings of a tile. [bearings; cost]
+        cells: Cells along the longer side of the grid of scene points. [cells; cost]
+        neighbour_cells: Largest number of cells along a side of the grid of neighbours. [cells; cost]
+    """
+
+    relaxation: float = 1.7
+    damping: float = 1e-3
+    least_base: float = 0.85
+    largest_turn: float = 0.5
+    sweeps: int = 2
+    first_tiles: int = 12
+    least_seen: float = 0.25
+    reach: float = 3.0
+    lanes: int = 16
+    cells: int = 64
+    neighbour_cells: int = 64
+
+
+KERNELS = KernelSettings()
+
+
+@dataclass(frozen=True)
+class RefinerSettings:
+    """Gauss-Newton in float64 (`bpnp.search.refine.gauss_newton`, `pose_model`).
+
+    Attributes:
+        ridge: Least damping, a fraction of the diagonal: unknowns that nothing fixes do not move. [fraction; numerics]
+        difference: Step of central differences, the cube root of the machine precision. [fraction; derived]
+        longer: Factor on the damping after a step that is taken. [factor; convention]
+        shorter: Factor on the damping after a step that is not. [factor; convention]
+        least_slope: Smallest derivative of the distorted by the undistorted radius at which a point is visible.
+            [1; not tuned]
+        undistorted: Newton steps that undistort a radius. [steps; numerics]
+    """
+
+    ridge: float = 1e-12
+    difference: float = 6e-6
+    longer: float = 0.1
+    shorter: float = 10.0
+    least_slope: float = 0.2
+    undistorted: int = 20
+
+
+REFINER = RefinerSettings()
+
+
+@dataclass(frozen=True)
+class LensSettings:
+    """Fit of a lens with the pose (`bpnp.search.propose.lens`).
+
+    Attributes:
+        correspondences: Number of scene points that may correspond to each image point. [points; not tuned]
+        most_zoom: Largest step of the logarithm of the scale factor. [nats; not tuned]
+        most_bend: Largest step of the relative shift of the outermost point. [fraction; not tuned]
+        same_zoom: Change of the logarithm of the scale factor below which no other round of steps is taken.
+            [nats; not tuned]
+        most_rounds: Largest number of rounds. [rounds; not tuned]
+        settled_zoom: Change of the logarithm of the scale factor that ends the last steps, with all points.
+            [nats; numerics]
+        most_steps: Largest number of last steps. [steps; numerics]
+        first: Scales of the steps before the first round. [scales of the residuals; not tuned]
+        widths: Scales of the steps of each round. [scales of the residuals; not tuned]
+        damping: Damping, a fraction of the diagonal of the normal equations. [fraction; numerics]
+    """
+
+    correspondences: int = 2
+    most_zoom: float = 0.2
+    most_bend: float = 0.1
+    same_zoom: float = 0.01
+    most_rounds: int = 4
+    settled_zoom: float = 2e-5
+    most_steps: int = 40
+    first: tuple[float, ...] = (4.0,)
+    widths: tuple[float, ...] = (4.0, 2.0, 2.0, 1.0, 1.0)
+    damping: float = 1e-6
+
+
+LENS = LensSettings()
+
+
+class SymmetrySettings(NamedTuple):
+    """Registration of a scene with itself (`bpnp.search.propose.symmetries`); compiled with the loops.
+
+    Attributes:
+        neighbours: Number of neighbours of a point that a base and its matches come from. [points; not tuned]
+        many_neighbours: The same for scenes of more than `many` points. [points; cost]
+        many: Number of points from which a scene has many. [points; cost]
+        bases: Number of bases. At most (1 - 1/8)^32 = 1.4 % of the registrations miss a motion of half of the points.
+            [bases; derived]
+        compact: Every other base is drawn from this fraction (1 / `compact`) of a neighbourhood. [1; not tuned]
+        widest: Number of triangles drawn for a base; the largest is taken. [triangles; not tuned]
+        fewest: Smallest number of moved points that lie on others. Three fix a motion and are no evidence of it.
+            [points; derived]
+        first: Number of sampled points of which at least one must confirm a motion. One of 12 motions of a third of the
+            points fails. [points; derived]
+        checked: Number of sampled points that confirm a motion before all points do. [points; cost]
+        most_work: Largest number of pairs of points that are compared for all bases together, some 0.1 s; the rest is
+            left out. [pairs; cost]
+        confirming: Number of pairs that take as long as a sampled point. [pairs; cost]
+        most_found: Number of motions of all bases together that are ranked. [motions; cost]
+        refined: Number of motions, those of the largest fraction first, that are refined. [motions; cost]
+        near_symmetry: Largest error of a point under a near symmetry, as a fraction of the extent.
+            [fraction; convention]
+        spacing: Largest error in spacings of the points: at a quarter of the spacing 1 to 6 % of the points lie on
+            others by chance. [spacings; derived]
+        flat: Largest third extent of a flat scene, as a fraction of its second extent. [fraction; not tuned]
+        rounds: Rounds of the refinement: nearest points, rigid fit. [rounds; not tuned]
+        same_deg: Angle between the rotations of two motions below which they can be one; their shifts must be within
+            four tolerances too. [degrees; not tuned]
+    """
+
+    neighbours: int = 96
+    many_neighbours: int = 48
+    many: int = 500
+    bases: int = 32
+    compact: int = 4
+    widest: int = 4
+    fewest: int = 5
+    first: int = 7
+    checked: int = 32
+    most_work: int = 30_000_000
+    confirming: int = 8
+    most_found: int = 4096
+    refined: int = 48
+    near_symmetry: float = 0.02
+    spacing: float = 0.25
+    flat: float = 0.1
+    rounds: int = 3
+    same_deg: float = 3.0
+
+
+SYMMETRIES = SymmetrySettings()
+
+
+@dataclass(frozen=True)
+class AlarmSettings:
+    """Number of false alarms (`bpnp.search.verdict.false_alarms`).
+
+    Attributes:
+        inliers: Inlier fractions w over which the likelihood ratio is averaged; finer steps give the same evidence in
+            twice the time. [fractions; measured, the problems are not recorded]
+        least_inliers: Smallest w if clutter or scores are given. [fraction; convention]
+        most_inliers: Largest w if clutter or scores are given. [fraction; convention]
+        outline: Smoothing width of the density of unrelated points; the outline beyond it is no evidence.
+            [RMS angular radii; not tuned]
+        smoothed: Largest number of projected points from which that density is estimated. [points; cost]
+        farthest: Distance beyond which a pair does not contribute to the density of a match: e^-9.
+            [scales; numerics]
+        own: Largest factor between a scale and that of the residuals at which it is a pose's own. [factor; convention]
+        rough: Smallest factor at which it is rougher (`rough_residuals`). [factor; convention]
+    """
+
+    inliers: tuple[float, ...] = (0.15, 0.4, 0.75)
+    least_inliers: float = 0.02
+    most_inliers: float = 0.98
+    outline: float = 0.5
+    smoothed: int = 256
+    farthest: float = math.sqrt(18.0)
+    own: float = 2.0
+    rough: float = 4.0
+
+
+ALARMS = AlarmSettings()
+
+
+@dataclass(frozen=True)
+class PrecisionSettings:
+    """Covariance and tests of the residuals (`bpnp.search.verdict.covariance`, `uncertainty`).
+
+    Attributes:
+        exceeded: Probability that an error exceeds its bound, and significance level of a test.
+            [probability; convention]
+        far: Squared distance of a pose from its optimum, in its covariance, from which on they differ: the quantile of
+            chi-squared with 6 degrees of freedom at 1 - `exceeded`. [1; derived]
+        slight: Fraction of the information below which an image point hardly moves the estimate.
+            [fraction; numerics]
+        fixed: Smallest eigenvalue of the normalised information of points that fix the estimate. [1; numerics]
+        blocks: Number of blocks of image points along each axis of the image. [blocks; not tuned]
+    """
+
+    exceeded: float = 1e-3
+    far: float = 22.5
+    slight: float = 0.01
+    fixed: float = 1e-9
+    blocks: int = 4
+
+
+PRECISION = PrecisionSettings()
+
+
+@dataclass(frozen=True)
+class ReasonSettings:
+    """Least differences that a reason shows (`bpnp.search.verdict.reasons`, `competitors`).
+
+    Attributes:
+        decades: Logarithm of a number of false alarms below which 0.0 is shown. [decades; convention]
+        degrees: Rotation below which the shift of a pose is shown instead. [degrees; convention]
+        zoom: Relative change of the focal length that is omitted. [fraction; convention]
+    """
+
+    decades: float = 0.05
+    degrees: float = 0.5
+    zoom: float = 0.005
+
+
+REASONS = ReasonSettings()
+
+
+@dataclass(frozen=True)
+class SmoothingSettings:
+    """Smoothing of the density map (`bpnp.search.propose.density_map`).
+
+    Attributes:
+        wide: Distance beyond which a smoothing kernel is 0. [standard deviations; numerics]
+        widest: Half side of the largest density map: 120 degrees off the axis. [stereographic coordinate; convention]
+        narrow: Standard deviation below which a smoothing is computed cell by cell. [cells; cost]
+    """
+
+    wide: float = 5.0
+    widest: float = 2 * math.tan(math.radians(60))
+    narrow: float = 4.0
+
+
+SMOOTHING = SmoothingSettings()
+
+
+@dataclass(frozen=True)
+class FocalSettings:
+    """Search for a focal length (`bpnp.search.focal_length`).
+
+    Lengths in the image are relative to the larger image side, distortions to the distance from the principal point.
+
+    Attributes:
+        smallest: Least focal length that is tried: a field of view of 90 degrees. [image sides; convention]
+        largest: Largest focal length that is tried: a field of view of 19 degrees. [image sides; convention]
+        usual: Focal length that is tried first. [image sides; convention]
+        step: Factor between successive focal lengths, for many points: annealing reaches an optimum half a step away.
+            [factor; not tuned]
+        step_few: Factor between successive focal lengths where an enumeration or a view keeps the focal length, for few
+            points and for photos in maps. [factor; not tuned]
+        sigmas: Half width of the range of an approximate focal length. [standard deviations; convention]
+        turns: Iterations of the first search with each focal length. [iterations; not tuned]
+        alternations: Largest number of alternations of search and refinement from each focal length.
+            [rounds; not tuned]
+        rounds: Largest number of iterations of a refinement. [iterations; numerics]
+        same: Change of the logarithm of the focal length below which a refinement stops. [nats; numerics]
+        bends: Radial displacements at the image corner from which a fit of the distortion also starts. Started at zero
+            distortion, too few points match to reach a large one. [fractions; not tuned]
+        bend_sigma: Standard deviation of the radial displacement at the image corner by an unknown distortion.
+            [fraction; convention]
+        most_bend: Largest radial displacement at the image corner, that of `OtherFocal`. [fraction; derived]
+        fewest_bent: Least number of matches for a fit of the distortion, that of `OtherFocal`. [matches; derived]
+        centre_sigma: Standard deviation of the principal point, as a fraction of the distance to the image corner:
+            about a quarter of a per cent of the larger image side. [fraction; convention]
+        least_reach: Smallest distance from the principal point to the image corner. [focal lengths; numerics]
+    """
+
+    smallest: float = 0.5
+    largest: float = 3.0
+    usual: float = 1.0
+    step: float = 1.57
+    step_few: float = 1.25
+    sigmas: float = 3.0
+    turns: int = 8
+    alternations: int = 3
+    rounds: int = 12
+    same: float = 5e-4
+    bends: tuple[float, ...] = (-0.2, 0.2)
+    bend_sigma: float = 0.05
+    most_bend: float = OtherFocal.bend
+    fewest_bent: int = OtherFocal.fewest
+    centre_sigma: float = 0.004
+    least_reach: float = 1e-3
+
+
+FOCAL = FocalSettings()
+
+
+@dataclass(frozen=True)
+class RigSettings:
+    """Rigs (`bpnp.search.rig`).
+
+    Attributes:
+        wide: Scale at which proposals are compared: a pose of one camera is inaccurate in another.
+            [smallest scales; not tuned]
+        steps: Number of decreasing scales of a refinement. [scales; not tuned]
+        again: Number of Gauss-Newton steps at each. [steps; not tuned]
+        most_scale: Largest step of the logarithm of the scale of the scene. [nats; not tuned]
+        lens_wide: First scale of a fit of the lens. [scales of the residuals; not tuned]
+        most_lens: Largest step of a lens, of its focal length or its distortion. [nats; not tuned]
+        weighed: Number of the last scales at which the false alarms of poses are computed. [scales; cost]
+        same_centre: Distance below which camera centres coincide, as a fraction of their largest coordinate in the rig.
+            [fraction; numerics]
+        proposing: Number of poses that a camera with few points proposes. [poses; cost]
+        refined: Number of enumerated poses that are refined, and of distinct poses that are kept. [poses; cost]
+        each_iteration: Number of poses of an iteration that are refined. [poses; cost]
+        compared: Largest number of proposals whose evidence is computed. [poses; cost]
+        agree_deg: Angle between the poses of two cameras below which they agree. [degrees; not tuned]
+        agree_shift: Distance below which they agree, in distances of the scene. [fraction; not tuned]
+        pairs: Largest number of pairs of poses that are compared. [pairs; cost]
+        least_apart: Smallest baseline of two cameras that determines the scale, in distances of the scene.
+            [fraction; not tuned]
+    """
+
+    wide: float = 60.0
+    steps: int = 9
+    again: int = 2
+    most_scale: float = 1.0
+    lens_wide: float = 8.0
+    most_lens: float = 0.1
+    weighed: int = 7
+    same_centre: float = 1e-6
+    proposing: int = 4000
+    refined: int = 16
+    each_iteration: int = 2
+    compared: int = 64
+    agree_deg: float = 6.0
+    agree_shift: float = 0.2
+    pairs: int = 50_000
+    least_apart: float = 0.01
+
+
+RIG = RigSettings()
+
+
+class SkySettings(NamedTuple):
+    """Catalogue of directions (`bpnp.search.infinity.kernels`); compiled with its loops.
+
+    Attributes:
+        matched: Probability of a match under the true rotation. [probability; convention]
+        crowded: Probability of a direction in reach by chance, from which on a match is no evidence.
+            [probability; not tuned]
+        densities: Numbers of neighbours that give the density around a direction; the larger density counts.
+            [directions; not tuned]
+        catalogues: Number of catalogues that are cached: a camera sees the same sky repeatedly. [catalogues; cost]
+        stored: Number of stored neighbours of all directions, 7 megabytes. [neighbours; cost]
+    """
+
+    matched: float = 0.5
+    crowded: float = 0.45
+    densities: tuple[int, int] = (8, 32)
+    catalogues: int = 4
+    stored: int = 600_000
+
+
+SKY = SkySettings()
+
+
+@dataclass(frozen=True)
+class InfinitySettings:
+    """Search for a rotation from directions (`bpnp.search.infinity`).
+
+    Attributes:
+        noise: Standard deviations of image points that are tried one after the other. [pixels; not tuned]
+        reach: Distance within which a point is a match: 99.4 % of the errors of two normal coordinates.
+            [standard deviations; convention]
+        cell: Cell of the hash table; a point with a larger reach gets no match yet. [reaches; cost]
+        around: Number of image points around one that vote. [points; not tuned]
+        narrowest: Smallest chord to them, which limits the azimuth error to 1/10 radian.
+            [errors of a chord; derived]
+        first: Number of the nearest of them that preselect directions. [points; cost]
+        promising: Number of preselected directions, which all of them vote on. [directions; cost]
+        refined: Number of rotations of a point that are fitted. [rotations; cost]
+        sample: Number of further points that a rotation is fitted to before it is fitted to all. [points; cost]
+        rounds: Steps of the fit to the points around one. [steps; not tuned]
+        last_rounds: Steps of the fit to the sample, and of that to all points. [steps; not tuned]
+        contests: Smallest evidence on the sample of a rotation that is fitted to all points, as a fraction of that of
+            the best one. [fraction; cost]
+        power: Fraction of the true matches that propose their rotation. [fraction; not tuned]
+        turns: Largest number of image points that are tried. [points; cost]
+        rougher: Largest noise of the matches, in multiples of the tried one, before the next one is tried.
+            [factor; not tuned]
+        strained: Largest number of matches that are tested for an error of the camera model. [matches; cost]
+        least_share: Fraction of the image points that a rotation explains. An unsuccessful search ends when it would
+            have found such a rotation. With `clutter`, half of the expected fraction. [fraction; convention]
+        zoom: Factor from one focal length to the next if it is unknown. Far smaller than for poses, since a rotation
+            has no distance that compensates it. [factor; not tuned]
+        zoom_noise: Noise of the first search at each focal length; it includes the error of the focal length near the
+            edge. If it fails, `noise` is tried, since many directions are not significant at a large noise.
+            [pixels; not tuned]
+        zoom_share: `least_share` of these searches. [fraction; not tuned]
+        zoom_alarms: Largest log10 NFA from which the focal length is fitted to the matches; by chance it is mostly
+            above 8. [decades; not tuned]
+        zoom_rounds: Largest number of rounds of fit and search. [rounds; not tuned]
+        zoom_same: Relative change of the focal length below which these end. [fraction; numerics]
+        bins: Binary logarithms of the smallest and largest number of azimuth bins. [bits; cost]
+        proposed_off: Largest error of a proposed rotation beyond a prior. [radians; not tuned]
+        anchor_off: Largest error of the image point that it is proposed for. [radians; not tuned]
+        fewest: Smallest number of image points and of directions; two fix a rotation and leave no evidence.
+            [points; derived]
+        scales: Number of scales of the residuals; each is half the previous one, from the largest noise on.
+            [scales; not tuned]
+        smallest_noise: Smallest noise of matches. [pixels; numerics]
+        pixel_step: Step of the difference that gives the angle per pixel. [pixels; numerics]
+        robust: Residual from which on a match counts less in a fit of the focal length. [pixels; not tuned]
+        lost: Residual of a point that leaves the view. [pixels; numerics]
+        settled: Change of the unknowns that ends this fit. [1; numerics]
+        nominal: Pixel without a camera, as a fraction of the RMS angular radius of the bearings.
+            [fraction; convention]
+    """
+
+    noise: tuple[float, ...] = (0.35, 1.4)
+    reach: float = 3.2
+    cell: float = 4.0
+    around: int = 24
+    narrowest: float = 10.0
+    first: int = 8
+    promising: int = 384
+    refined: int = 4
+    sample: int = 200
+    rounds: int = 6
+    last_rounds: int = 3
+    contests: float = 0.7
+    power: float = 0.9
+    turns: int = 200
+    rougher: float = 1.2
+    strained: int = 1000
+    least_share: float = 0.25
+    zoom: float = 1.02
+    zoom_noise: float = 3.0
+    zoom_share: float = 0.4
+    zoom_alarms: float = 5.0
+    zoom_rounds: int = 6
+    zoom_same: float = 1e-4
+    bins: tuple[int, int] = (6, 7)
+    proposed_off: float = 0.1
+    anchor_off: float = 0.01
+    fewest: int = 3
+    scales: int = 5
+    smallest_noise: float = 1e-12
+    pixel_step: float = 0.5
+    robust: float = 1.0
+    lost: float = 1e3
+    settled: float = 1e-9
+    nominal: float = 1e-3
+
+
+INFINITY = InfinitySettings()
 
 
 @dataclass(frozen=True)
@@ -436,6 +1120,7 @@ class Schedule:
         in_vain: Number of consecutive searches without a better pose after which the other poses of the source are
             skipped.
         local_searches: Number of local searches around a significant pose that find nothing better, at most.
+        proposed_after: Number of steps near a prior after which proposals are requested. [steps; not tuned]
     """
 
     turns: int = 400
@@ -448,6 +1133,7 @@ class Schedule:
     apart_deg: float = 10.0
     in_vain: int = 3
     local_searches: int = 3
+    proposed_after: int = 4
 
 
 @dataclass(frozen=True)
@@ -512,6 +1198,7 @@ class SearchSettings:
         lloyd_iterations: Number of iterations of the clustering.
         starts_a_check: Number of starts annealed on clusters between two checks of the deadline.
         lookups_a_check: Number of poses scored on the density map between two checks of the deadline.
+        warming: Number of points of the problem that compiles the loops. [points; convention]
     """
 
     schedule: Schedule = Schedule()
@@ -567,6 +1254,7 @@ class SearchSettings:
     lloyd_iterations: int = 5
     starts_a_check: int = 32
     lookups_a_check: int = 4096
+    warming: int = 8
 
     def __post_init__(self) -> None:
         if min(self.schedule.turns, self.starts, self.first_starts) < 1 or not self.recipes:
@@ -608,3 +1296,190 @@ class SearchSettings:
 
 
 DEFAULT = SearchSettings()
+
+
+@dataclass(frozen=True)
+class RankSettings:
+    """Ranking of the views of a map (`bpnp.maps.views`).
+
+    Attributes:
+        cells: Cells along a side of a density image. [cells; not tuned]
+        within: Fraction of the points within one unit, the reach of the points. [fraction; not tuned]
+        half: Half width of the density image. [reaches; not tuned]
+        fine: Standard deviation of the narrow smoothing of the contrast. [cells; not tuned]
+        wide: Standard deviation of the wide smoothing of the contrast. [cells; not tuned]
+        shifts: Shifts of the photo along either axis. [cells; not tuned]
+        scales: Scale factors of the photo. [factors; not tuned]
+        ratio: Largest ratio of the reaches of a view and of a photo with a known focal length. [ratio; not tuned]
+        apart: Least fraction of a view's points that no better view sees, for it to count as another place.
+            [fraction; not tuned]
+    """
+
+    cells: int = 32
+    within: float = 0.9
+    half: float = 1.3
+    fine: float = 1.0
+    wide: float = 4.0
+    shifts: tuple[int, ...] = (-9, -6, -3, 0, 3, 6, 9)
+    scales: tuple[float, ...] = (0.7, 0.84, 1.0, 1.2, 1.4)
+    ratio: float = 1.6
+    apart: float = 0.5
+
+
+@dataclass(frozen=True)
+class AliasingSettings:
+    """Short searches near views of other points (`bpnp.maps.aliasing`).
+
+    Attributes:
+        search: Search near each view. Few of the explained image points are outliers for a competing pose. So fewer,
+            more smoothed initial poses suffice than near a view that is tried.
+        most_views: Largest number of views. [views; cost]
+        least_other: Least fraction of a view's points that the pose does not see. [fraction; not tuned]
+        fewest: Least number of such points, and of image points that the pose explains. [points; not tuned]
+    """
+
+    search: DensitySearch = DensitySearch(
+        Draws(2**13, least_starts=2**13),
+        Preselection((50, 300), (2**11, 2**8)),
+        Narrowing(0.1, 0.015, steps=6, points=300),
+        annealed=6,
+    )
+    most_views: int = 8
+    least_other: float = 0.5
+    fewest: int = 12
+
+
+@dataclass(frozen=True)
+class MapSettings:
+    """Photos in maps (`bpnp.maps`).
+
+    Attributes:
+        most_detected: Largest number of SIFT keypoints of a photo, COLMAP's. [keypoints; convention]
+        contrast: Contrast threshold of the keypoints, of three layers together: COLMAP's peak_threshold of 0.02 / 3,
+            half of OpenCV's default. [intensity, 0 to 1; convention]
+        most_keypoints: Largest number of keypoints that are used. Half of the 2,000 largest SIFT keypoints have a map
+            point, an eighth of the next ones. [keypoints; measured, the photos are not recorded]
+        once: Iterations of a search near a view. [iterations; not tuned]
+        longer: Iterations of a longer search near a promising view. [iterations; not tuned]
+        promising: Number of views that get a longer search if none is confident. [views; not tuned]
+        likely: Largest log10 NFA with which a view gets a longer search before the next view. [decades; not tuned]
+        competitors: Number of competing poses of an ambiguous solution that are judged with it on all points.
+            [poses; cost]
+        views_ahead: Number of views that are tried with one focal length before the next one starts.
+            [views; not tuned]
+        indexed: Smallest number of points of a map that gets an index; smaller maps open in two seconds without one.
+            [points; cost]
+        same_focal: Largest ratio of the focal lengths of views whose camera a photo can get. [ratio; not tuned]
+        margin_deg: Margin of the cone from which a point is seen, beyond the directions of its track. A local feature
+            is rarely detected far outside these. In photos of five models, 95 % of the detected points are seen from at
+            most 22 degrees beyond. Of the points that project into these photos and are not detected, 21 to 85 % would
+            be seen from more than 30 degrees beyond. [degrees; measured, photos of five models]
+        view_deg: Standard deviation of the rotation of a photo from that of a view, about the largest angle per axis
+            between photos that share a third of their points. [degrees; not tuned]
+        view_shift: Standard deviation of its translation, about the largest shift of the viewed points, as a fraction
+            of their distance. [fraction; not tuned]
+        least_track: Least number of views of a point after a view is removed. [views; convention]
+        upright_deg: Largest angle between the upward directions of upright views. [degrees; not tuned]
+        least_upright: Smallest fraction of the views that agree on the direction up. [fraction; not tuned]
+        in_plane: Least length of the direction up in the image plane: a steeper view has no upright side.
+            [1; not tuned]
+        queued: Number of photos per worker thread on a cluster: no thread waits, and the scheduler holds few.
+            [photos; cost]
+    """
+
+    most_detected: int = 8192
+    contrast: float = 0.02
+    most_keypoints: int = 2048
+    once: int = 1
+    longer: int = 16
+    promising: int = 3
+    likely: float = -20.0
+    competitors: int = 4
+    views_ahead: int = 4
+    indexed: int = 200_000
+    same_focal: float = 1.05
+    margin_deg: float = 25.0
+    view_deg: float = 15.0
+    view_shift: float = 0.2
+    least_track: int = 2
+    upright_deg: float = 30.0
+    least_upright: float = 0.5
+    in_plane: float = 0.5
+    queued: int = 4
+
+
+@dataclass(frozen=True)
+class DrawingSettings:
+    """Pictures of photos in maps (`bpnp.maps.localized_picture`, `verified_map`).
+
+    Attributes:
+        contrast: Fraction of the photo's contrast that is kept, so that points stand out. [fraction; convention]
+        shown: Fraction of the map's points within the drawing. [per cent; convention]
+        farthest: Largest distance of a camera that is drawn in place. [extents of the points; convention]
+        most_points: Largest number of map points in a picture. [points; cost]
+        most_points_of_page: Largest number of map points on a page. [points; cost]
+        widths: Widths of photo and map. [inches; convention]
+        side: Side of the drawing on a page. [pixels; convention]
+    """
+
+    contrast: float = 0.55
+    shown: float = 98.0
+    farthest: float = 4.0
+    most_points: int = 20_000
+    most_points_of_page: int = 3000
+    widths: tuple[float, float] = (9.0, 6.0)
+    side: float = 1000.0
+
+
+RANK = RankSettings()
+ALIASING = AliasingSettings()
+MAPS = MapSettings()
+DRAWING = DrawingSettings()
+
+
+@dataclass(frozen=True)
+class RansacSettings:
+    """RANSAC and proposals on proposed matches, in torch (`bpnp.robust`).
+
+    Attributes:
+        chunk: Number of residuals scored at a time: 1 MiB in float32, which stays in the cache of a core.
+            [residuals; cost]
+        smallest_pool: Number of matches of largest weight from which the first triples of a growing pool are drawn.
+            [matches; not tuned]
+        subset: Number of matches of largest weight on which all hypotheses are scored. With 256, poses are lost at 10 %
+            inliers. [matches; measured, the problems are not recorded]
+        shortlist: Number of hypotheses that are then scored on all matches. [hypotheses; cost]
+        refined: Number of hypotheses that are refined locally on the subset. [hypotheses; cost]
+        local_steps: Gauss-Newton steps of these. [steps; not tuned]
+        final_steps: Gauss-Newton steps of the best one on all matches. [steps; not tuned]
+        damping: Damping, a fraction of the Hessian's mean diagonal. [fraction; numerics]
+        fewest: Least number of hypotheses of PoseLib. It ends after 3 times the number that has a true triple with
+            probability 0.9999. [hypotheses; not tuned]
+        kept: Fraction of its inliers that OpenCV's refit must keep. [fraction; not tuned]
+        triples: Number of triples of an assignment that are solved, for each sample of a batch. [triples; cost]
+        drawn_each: Number of triples drawn for each that is solved; the widest triangles are solved.
+            [triples; not tuned]
+        scored: Number of matches drawn to score the proposals. [matches; cost]
+        apart_deg: Smallest angle between two proposals. [degrees; not tuned]
+        threshold: Residual that counts half, in root mean square distances of the image points from their mean.
+            [fraction; not tuned]
+    """
+
+    chunk: int = 2**18
+    smallest_pool: int = 16
+    subset: int = 512
+    shortlist: int = 256
+    refined: int = 16
+    local_steps: int = 4
+    final_steps: int = 6
+    damping: float = 1e-9
+    fewest: int = 25
+    kept: float = 0.9
+    triples: int = 1024
+    drawn_each: int = 4
+    scored: int = 512
+    apart_deg: float = 15.0
+    threshold: float = 0.2
+
+
+RANSAC = RansacSettings()

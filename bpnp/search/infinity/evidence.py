@@ -32,18 +32,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc
 
+from bpnp.search.config import ALARMS, INFINITY, PRECISION
 from bpnp.search.kernels.neighbours import sums_near
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem
 from bpnp.search.verdict.covariance import covariance_of, of_sure_matches, student_factor
-from bpnp.search.verdict.false_alarms import LEAST_SHARE, MOST_SHARE, SHARES, Terms, log10_nfa
-from bpnp.search.verdict.uncertainty import EXCEEDED, STRAINS, exceeded_once
+from bpnp.search.verdict.false_alarms import SHARES, Terms, log10_nfa
+from bpnp.search.verdict.uncertainty import STRAINS, exceeded_once
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
 ROTATION = PoseModel(np.zeros(3), moves=False)
-EXACT = 1e-12  # smallest noise of matches, pixels
-STEPS = 5  # number of scales s; each is half the previous one, from the largest noise on
 
 
 class Background(NamedTuple):
@@ -74,18 +73,18 @@ def background_of(problem: Problem, pixel: Array, noise: float) -> Background:
         pixel: (m,) angle of a pixel, radians.
         noise: Largest scale s, pixels.
     """
-    bearings, scales = problem.bearings, np.asarray(noise * 0.5 ** np.arange(STEPS), np.float64)
+    bearings, scales = problem.bearings, np.asarray(noise * 0.5 ** np.arange(INFINITY.scales), np.float64)
     spread = float(np.sqrt(((bearings - bearings.mean(0)) ** 2).sum(-1).mean()))
     radians = scales * np.median(pixel)
     model = PoseModel(np.zeros(3), problem.focal, moves=False)
     tests = math.log(10) * np.minimum(model.log10_cells(spread, radians), model.log10_choices(problem))
     axes = np.linalg.svd(bearings - bearings.mean(0), full_matrices=False)[2][:2].T
-    together = sums_near(bearings, bearings, axes, 2 * scales[::-1] * np.median(pixel), np.zeros(STEPS))
+    together = sums_near(bearings, bearings, axes, 2 * scales[::-1] * np.median(pixel), np.zeros(INFINITY.scales))
     shares = SHARES if problem.clutter is None else np.array([1 - problem.clutter])
     if problem.candidate_scores is not None:
         shares = shares * problem.candidate_scores[:, None, None]
     if problem.clutter is not None or problem.candidate_scores is not None:
-        shares = np.clip(shares, LEAST_SHARE, MOST_SHARE)
+        shares = np.clip(shares, ALARMS.least_inliers, ALARMS.most_inliers)
     return Background(scales, tests, together[:, ::-1], pixel, shares, model.fixing)
 
 
@@ -174,7 +173,7 @@ def uncertainty_of(residual: Array, jacobian: Array, information: Array | None =
     size = jacobian.shape[-1]
     free, covariance = 2 * len(residual) - size, None
     if free > 0:
-        noise = max(float(np.linalg.norm(residual)) / math.sqrt(free), EXACT)
+        noise = max(float(np.linalg.norm(residual)) / math.sqrt(free), INFINITY.smallest_noise)
         matches = of_sure_matches(residual / noise, jacobian / noise)
         matches = matches if information is None else matches._replace(known=information)
         covariance = covariance_of(matches, fitted=size)
@@ -219,7 +218,7 @@ def strain_of(seen: Array, bearings: Array, pixel: Array, all_bearings: Array) -
     added, free = int(rank) - 3, 2 * len(seen) - int(rank)
     if not (added > 0 and free > 0 and after > 0):
         return 0.0
-    if fdtrc(added, free, (before - after) / added / (after / free)) >= EXCEEDED:
+    if fdtrc(added, free, (before - after) / added / (after / free)) >= PRECISION.exceeded:
         return 0.0
     change = moved(all_bearings) @ (solution[3:] / size[3:]) + np.cross(solution[:3] / size[:3], all_bearings)
     return float(np.linalg.norm(change, axis=-1).max() / np.median(pixel))

@@ -13,18 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bpnp.search.config import SKY
 from bpnp.search.enumeration.matching import fits
 from bpnp.search.kernels.neighbours import HashedPoints, entry
 from bpnp.search.kernels.vectors import F, compiled, cross, part, rotated, turn
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
-LOG_HALF = math.log(0.5)  # log probability of a match under the true rotation
+LOG_MATCHED = math.log(SKY.matched)  # log probability of a match under the true rotation
 TURN = 1 << 16  # steps of an azimuth in a full circle
-CROWDED = 0.45  # probability of a direction in reach by chance, from which a match is no evidence
-DENSITIES = (8, 32)  # numbers of neighbours that give the density around a direction; the larger density counts
-KEPT = 4  # size of the cache of catalogues: a camera sees the same sky repeatedly
-MOST = 600_000  # number of stored neighbours of all directions, 7 megabytes
 
 
 class Sky(NamedTuple):
@@ -70,16 +67,16 @@ class Catalogue(NamedTuple):
 
 
 def catalogue_of(directions: Array, labels: Labels | None = None) -> Catalogue:
-    """Build the catalogue of unit directions (n, 3) with labels (n,); the last `KEPT` ones are cached."""
+    """Build the catalogue of unit directions (n, 3) with labels (n,); the last `SKY.catalogues` ones are cached."""
     return _catalogue(directions.tobytes(), None if labels is None else labels.tobytes())
 
 
-@lru_cache(KEPT)
+@lru_cache(SKY.catalogues)
 def _catalogue(content: bytes, content_of_labels: bytes | None) -> Catalogue:
     """Build the catalogue of the n directions and labels with these bytes."""
     directions = np.frombuffer(content).reshape(-1, 3)
     count = len(directions)
-    nearest = min(max(MOST // count, DENSITIES[-1]), count - 1)
+    nearest = min(max(SKY.stored // count, SKY.densities[-1]), count - 1)
     chord, place = (x[:, 1:] for x in cKDTree(directions).query(directions, nearest + 1))
     every = fitting = _densities(chord)
     if content_of_labels is not None:
@@ -98,7 +95,7 @@ def _densities(chord: Array) -> Array:
     """
     count, nearest = chord.shape
     density = np.full(count, count / (4 * math.pi))
-    for k in DENSITIES:
+    for k in SKY.densities:
         k = min(k, nearest)
         if k:
             density = np.maximum(density, k / (math.pi * np.maximum(chord[:, k - 1], 1e-9) ** 2))
@@ -119,7 +116,7 @@ def _densities_of_labels(directions: Array, labels: Labels, every: Array) -> Arr
     first, last = (np.searchsorted(labels[order], values, side) for side in ("left", "right"))
     for start, end in zip(first.tolist(), last.tolist(), strict=True):
         members = np.r_[order[start:end], any_label]
-        points, nearest = directions[members], min(DENSITIES[-1], len(members) - 1)
+        points, nearest = directions[members], min(SKY.densities[-1], len(members) - 1)
         chord = np.empty((1, 0)) if not nearest else cKDTree(points).query(points, nearest + 1)[0][:, 1:]
         density[members[: end - start]] = _densities(chord)[: end - start]
     return density
@@ -312,13 +309,13 @@ def fit(image: Any, chosen: Any, sky: Any, reach: float, rounds: int, result: An
                 label,
             )
             if place < 0:
-                total += LOG_HALF
+                total += LOG_MATCHED
                 continue
             fitting = 1 if labelled and label >= 0 and sky.labels[place] >= 0 else 0
             likely = math.pi * sky.density[fitting, place] * squared
-            if likely > CROWDED:
+            if likely > SKY.crowded:
                 continue
-            total += LOG_HALF - math.log(likely)
+            total += LOG_MATCHED - math.log(likely)
             result.match[i], result.squared[i] = place, distance / image.pixel[i] ** 2
             vx, vy, vz = rotated(turned, directions[place, 0], directions[place, 1], directions[place, 2])
             sx, sy, sz = cross(vx, vy, vz, x, y, z)

@@ -7,13 +7,13 @@ judged.
 A rotation that could compete with the best one explains a minimum number of points. Each of these points, when tried,
 proposes it. If no competing rotation was found, this bounds the miss probability.
 
-With a prior, only rotations within `PRIOR_SIGMAS` standard deviations are proposed. If none of them is significant, the
-search is repeated over all rotations, whose number of tests remains that of the prior.
+With a prior, only rotations within `ENUMERATION.sigmas` standard deviations are proposed. If none of them is
+significant, the search is repeated over all rotations, whose number of tests remains that of the prior.
 """
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -24,8 +24,7 @@ from scipy.special import betaln
 
 from bpnp.poses import rotation_angle
 from bpnp.runtime import NEVER, Deadline
-from bpnp.search.config import DEFAULT as SEARCH
-from bpnp.search.config import ENUMERATION
+from bpnp.search.config import DEFAULT, ENUMERATION, INFINITY, SKY, InfinitySettings
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.infinity.evidence import (
     Array,
@@ -38,19 +37,7 @@ from bpnp.search.infinity.evidence import (
     prior_information,
     strain_of,
 )
-from bpnp.search.infinity.kernels import (
-    CROWDED,
-    TURN,
-    Catalogue,
-    Fit,
-    Image,
-    Rays,
-    Sky,
-    azimuths,
-    catalogue_of,
-    fit,
-    vote,
-)
+from bpnp.search.infinity.kernels import TURN, Catalogue, Fit, Image, Rays, Sky, azimuths, catalogue_of, fit, vote
 from bpnp.search.kernels.neighbours import hashed
 from bpnp.search.loop import Step, run
 from bpnp.search.pose_model import FIXING_ROTATION
@@ -60,72 +47,7 @@ from bpnp.search.verdict import reasons
 from bpnp.search.verdict.decide import SearchResult, no_pose
 from bpnp.search.verdict.reasons import CONFIDENT, objection
 
-BINS = (6, 7)  # log2 of the smallest and largest number of azimuth bins
-PRIOR_SIGMAS = ENUMERATION.sigmas  # standard deviations of a prior beyond which no rotation is proposed
-PROPOSED_OFF, ANCHOR_OFF = 0.1, 0.01  # radians, largest error of a proposed rotation, and of the image point it is for
 NO_LABELS = np.empty(0, np.int64)
-
-
-@dataclass(frozen=True)
-class InfinitySettings:
-    """Constants of the search for a rotation.
-
-    Attributes:
-        noise: Standard deviations of image points, pixels, that are tried one after the other.
-        reach: Distance, in standard deviations, within which a point is a match.
-        cell: Cell of the hash table, in reaches; a point with a larger reach gets no match yet.
-        around: Number of image points around one that vote.
-        narrowest: Smallest chord to them, in errors of a chord, which limits the azimuth error to 1/10 radian.
-        first: Number of the nearest of them that preselect directions.
-        promising: Number of preselected directions, which all of them vote on.
-        refined: Number of rotations of a point that are fitted.
-        sample: Number of further points that a rotation is fitted to before it is fitted to all.
-        rounds: Steps of the fit to the points around one.
-        last_rounds: Steps of the fit to the sample, and of that to all points.
-        contests: Smallest evidence on the sample of a rotation that is fitted to all points, as a fraction of that of
-            the best one.
-        power: Fraction of the true matches that propose their rotation.
-        turns: Largest number of image points that are tried.
-        rougher: Largest noise of the matches, in multiples of the tried one, before the next one is tried.
-        strained: Largest number of matches that are tested for an error of the camera model.
-        least_share: Fraction of the image points that a rotation explains. An unsuccessful search ends when it would
-            have found such a rotation. With `clutter`, half of the expected fraction.
-        zoom: Factor from one focal length to the next if it is unknown.
-        zoom_noise: Noise of the first search at each focal length, pixels; it includes the error of the focal length
-            near the edge. If it fails, `noise` is tried, since many directions are not significant at a large noise.
-        zoom_share: `least_share` of these searches.
-        zoom_alarms: Largest log10 NFA from which the focal length is fitted to the matches; by chance it is mostly
-            above 8.
-        zoom_rounds: Largest number of rounds of fit and search.
-        zoom_same: Relative change of the focal length below which these end.
-    """
-
-    noise: tuple[float, ...] = (0.35, 1.4)
-    reach: float = 3.2
-    cell: float = 4.0
-    around: int = 24
-    narrowest: float = 10.0
-    first: int = 8
-    promising: int = 384
-    refined: int = 4
-    sample: int = 200
-    rounds: int = 6
-    last_rounds: int = 3
-    contests: float = 0.7
-    power: float = 0.9
-    turns: int = 200
-    rougher: float = 1.2
-    strained: int = 1000
-    least_share: float = 0.25
-    zoom: float = 1.02
-    zoom_noise: float = 3.0
-    zoom_share: float = 0.4
-    zoom_alarms: float = 5.0
-    zoom_rounds: int = 6
-    zoom_same: float = 1e-4
-
-
-DEFAULT = InfinitySettings()
 
 
 class Sight(NamedTuple):
@@ -217,7 +139,7 @@ def search_rotation(
     noise: float | None = None,
     seed: int = 0,
     deadline: Deadline = NEVER,
-    settings: InfinitySettings = DEFAULT,
+    settings: InfinitySettings = INFINITY,
 ) -> SearchResult:
     """Search for the rotation under which image points see directions.
 
@@ -238,7 +160,7 @@ def search_rotation(
         new = _at_each_noise(problem, pixel, noise, seed, deadline, settings, is_near=is_near)
         turns += new.batches
         result = min(new, result, key=lambda one: one.log10_false_alarms)
-        if result.log10_false_alarms <= SEARCH.evidence.false_alarms or deadline.passed():
+        if result.log10_false_alarms <= DEFAULT.evidence.false_alarms or deadline.passed():
             break
     return replace(result, batches=turns)
 
@@ -330,7 +252,7 @@ class RotationPoses:
         settings, count = self.sight.settings, len(self.sight.image.bearings)
         result = _judge(self.found, self.sight, self.turns)
         least = min(max(math.ceil(self.sight.least_share * count), FIXING_ROTATION + 1), count)
-        hopeless = log10_missed(self.turns, count, least, settings.power) <= SEARCH.evidence.missed
+        hopeless = log10_missed(self.turns, count, least, settings.power) <= DEFAULT.evidence.missed
         return replace(result, settled=result.verdict == "failed" and hopeless)
 
 
@@ -385,14 +307,14 @@ def _rays(sight: Sight, i: int, tree: cKDTree) -> tuple[Labels, Rays, int]:
     if not len(around):
         none = np.empty(0, np.float32)
         return around, Rays(none, none, np.empty(0, np.int32), none, NO_LABELS), 0
-    bins = 1 << int(np.clip(math.log2(2 * math.pi / float((slack / chord).max())), *BINS))
+    bins = 1 << int(np.clip(math.log2(2 * math.pi / float((slack / chord).max())), *INFINITY.bins))
     label, density = np.full(len(around), -1), np.full(len(around), sight.density)
     if len(sight.image.labels):
         label = sight.image.labels[around]
         density *= _shares_of_labels(sight.sky.labels, label)
-    chance = np.minimum(density * 2 * slack * 2 * chord * 2 * math.pi / bins, CROWDED)
+    chance = np.minimum(density * 2 * slack * 2 * chord * 2 * math.pi / bins, SKY.crowded)
     azimuth = azimuths(bearings[i : i + 1], bearings[around][None])[0]
-    low, high, nats = (x.astype(np.float32) for x in (chord - slack, chord + slack, np.log(0.5 / chance)))
+    low, high, nats = (x.astype(np.float32) for x in (chord - slack, chord + slack, np.log(SKY.matched / chance)))
     return around, Rays(low, high, azimuth, nats, label), bins
 
 
@@ -418,7 +340,7 @@ def _possible(sight: Sight, i: int) -> Labels:
             camera, axis = problem.prior.directions()
             angle, sigma = float(np.arccos(np.clip(bearing @ camera, -1, 1))), problem.prior.sigma_deg
         off = np.abs(np.arccos(np.clip(directions @ axis, -1, 1)) - angle)
-        possible &= off <= PRIOR_SIGMAS * math.radians(sigma) + ANCHOR_OFF
+        possible &= off <= ENUMERATION.sigmas * math.radians(sigma) + INFINITY.anchor_off
     return np.flatnonzero(possible)
 
 
@@ -432,7 +354,7 @@ def _is_admitted(sight: Sight, rotation: Array) -> bool:
     else:
         camera, scene = prior.directions()
         off, sigma = math.acos(float(np.clip(camera @ rotation @ scene, -1, 1))), prior.sigma_deg
-    return off <= PRIOR_SIGMAS * math.radians(sigma) + PROPOSED_OFF
+    return off <= ENUMERATION.sigmas * math.radians(sigma) + INFINITY.proposed_off
 
 
 def _agreeing(sight: Sight, i: int, around: Labels, rays: Rays, bins: int) -> Iterator[tuple[Array, int]]:
@@ -545,12 +467,12 @@ def _merge(found: Hypotheses, new: Hypotheses, sight: Sight) -> Hypotheses:
         return found
     every = Hypotheses.concatenate([found[~alike], new]) if len(found) else new
     every = every[np.argsort(every.log10_false_alarms, kind="stable")]
-    return every[(every.log10_false_alarms <= 0) | (np.arange(len(every)) == 0)][: SEARCH.kept]
+    return every[(every.log10_false_alarms <= 0) | (np.arange(len(every)) == 0)][: DEFAULT.kept]
 
 
 def _judge(found: Hypotheses, sight: Sight, turns: int) -> SearchResult:
     """Judge rotations, best first, by the rules of `bpnp.search.verdict.decide`."""
-    rule = SEARCH.evidence
+    rule = DEFAULT.evidence
     if found.matches is None or found.point_evidence is None:
         return no_pose("no rotation was found", turns)
     alarms = float(found.log10_false_alarms[0])

@@ -27,24 +27,18 @@ from bpnp.search.arguments import (
     scene_points,
     unit_vectors,
 )
-from bpnp.search.config import DEFAULT as SEARCH
+from bpnp.search.config import DEFAULT, INFINITY, MATCHES, InfinitySettings
 from bpnp.search.focal_length import UnknownCamera
 from bpnp.search.infinity.evidence import how_well_known, noise_of, prior_information, uncertainty_of
-from bpnp.search.infinity.search import DEFAULT, InfinitySettings, search_rotation
+from bpnp.search.infinity.search import search_rotation
 from bpnp.search.inputs import bearings_of, check_seen, unit_of
-from bpnp.search.matching import SCALES, angles_between, count_one_to_one, one_to_one
+from bpnp.search.matching import angles_between, count_one_to_one, one_to_one
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.refine.gauss_newton import ImageMatches, Iteration, image_equations, image_rows, refine
 from bpnp.search.solution import FOCAL_LENGTH, ROTATION_PARAMETERS, Solution, SolutionStats, add_pose
 from bpnp.search.sources import Options
 from bpnp.search.starts import PosePrior, Prior
-
-FEWEST = 3  # two fix a rotation and leave no evidence
-HALF = 0.5  # pixels, step for the angle per pixel
-ROBUST, LOST = 1.0, 1e3  # residual from which a match counts less, and that of a point that leaves the view, pixels
-MOST_STEPS, EXACT = 50, 1e-9  # steps of a fit of the focal length, and the change that ends them
-NOMINAL = 1e-3  # nominal pixel without a camera, as a fraction of the RMS angular radius of the bearings
 
 
 class Sky(NamedTuple):
@@ -113,18 +107,18 @@ def prepare_directions(
     if unknown is not None:
         lenses = [one.reference for one in unknown]
     if options.clutter is not None:
-        SEARCH.expecting(options.clutter)  # raises for one that is out of range
+        DEFAULT.expecting(options.clutter)  # raises for one that is out of range
     images, annotations = [], []
     for k, (points, lens) in enumerate(zip(points2d, lenses, strict=True)):
         with about(None if turns is None else f"camera {k}"):
             image = image_points(points)
-            check_points("points2d", image, (2, 3) if lens is None else (2,), FEWEST if turns is None else 1)
+            check_points("points2d", image, (2, 3) if lens is None else (2,), INFINITY.fewest if turns is None else 1)
             images.append(image)
             annotations.append(
                 checked_labels(known["labels2d"][k], known["labels3d"], (len(image), len(scene)))
                 | {"scores2d": checked_scores("scores2d", known["scores2d"][k], len(image))}
             )
-    check_points("points3d", scene, (3,), FEWEST)
+    check_points("points3d", scene, (3,), INFINITY.fewest)
     hint = "divide by the lengths, or leave out `at_infinity` for points of a scene"
     scene = np.ascontiguousarray(unit_vectors("points3d", scene, hint))
     arrays = {name: [each[name] for each in annotations] for name in annotations[0]}
@@ -153,28 +147,28 @@ def _solve(sky: Sky, options: Options) -> Solution:
     """
     begun, deadline, unknown = Clock.now(), Deadline.after(options.time_limit), sky.unknown
 
-    def seen_by(sky: Sky, settings: InfinitySettings = DEFAULT) -> Solution:
+    def seen_by(sky: Sky, settings: InfinitySettings = INFINITY) -> Solution:
         return replace(_seen_by(sky, options, deadline, settings), seconds=Clock.now() - begun)
 
     if unknown is None:
         return seen_by(sky)
     ends = list[Solution]()
-    rough = replace(DEFAULT, noise=(DEFAULT.zoom_noise,), least_share=DEFAULT.zoom_share)
-    exact = replace(rough, noise=DEFAULT.noise)
-    for camera in unknown[0].focal_steps(DEFAULT.zoom):
+    rough = replace(INFINITY, noise=(INFINITY.zoom_noise,), least_share=INFINITY.zoom_share)
+    exact = replace(rough, noise=INFINITY.noise)
+    for camera in unknown[0].focal_steps(INFINITY.zoom):
         trial = sky.at(*unknown[0].parts(camera))
         found = seen_by(trial, rough)
         if found.verdict == "failed":  # among many directions unrelated ones fit as well at the coarse noise
-            found = seen_by(trial, exact if ends else DEFAULT)
-        promising = found.log10_false_alarms <= DEFAULT.zoom_alarms
-        for _ in range(DEFAULT.zoom_rounds if promising else 0):
+            found = seen_by(trial, exact if ends else INFINITY)
+        promising = found.log10_false_alarms <= INFINITY.zoom_alarms
+        for _ in range(INFINITY.zoom_rounds if promising else 0):
             (zoom, radial), trial = trial.lens, _fitted(trial, found)
             again = seen_by(trial)
             if again.log10_false_alarms > found.log10_false_alarms and again.verdict == "failed":
                 break
             found, (new_zoom, new_radial) = again, trial.lens
             bend = abs((new_radial or 0.0) - (radial or 0.0))
-            if max(abs(new_zoom / zoom - 1), bend) < DEFAULT.zoom_same:
+            if max(abs(new_zoom / zoom - 1), bend) < INFINITY.zoom_same:
                 break
         ends.append(found)
         best = min(ends, key=lambda end: end.log10_false_alarms)
@@ -222,14 +216,14 @@ def _fitted(sky: Sky, solution: Solution) -> Sky:
     With `Sky.is_distorted` a radial coefficient is fitted too.
     """
     (zoom, radial), model = sky.lens, _model(sky)
-    linearise = image_equations(model, _in_image(sky, solution.matches), lost=LOST, robust=ROBUST)
+    linearise = image_equations(model, _in_image(sky, solution.matches), lost=INFINITY.lost, robust=INFINITY.robust)
     start = model.state(solution.rotation)
-    end = refine(model, start, linearise, [ROBUST] * MOST_STEPS, settled=_is_settled).state
+    end = refine(model, start, linearise, [INFINITY.robust] * MATCHES.most_steps, settled=_is_settled).state
     return sky.at(zoom * float(end.zoom), float(end.radial) if sky.is_distorted else radial)
 
 
 def _is_settled(last: Iteration) -> bool:
-    return bool(np.abs(last.step).max() < EXACT)
+    return bool(np.abs(last.step).max() < INFINITY.settled)
 
 
 def _with_focal_length(sky: Sky, rotation: Array, matches: Labels) -> Array:
@@ -252,13 +246,13 @@ def _seen_by(sky: Sky, options: Options, deadline: Deadline, settings: InfinityS
     every = np.concatenate([_to_rig(sky, k, rays) for k, (rays, _, _) in enumerate(parts)])
     pixel = np.concatenate([pixel for _, _, pixel in parts])
     usable = np.flatnonzero(np.isfinite(every).all(-1) & np.isfinite(pixel))
-    check_seen(usable, np.concatenate(planes), FEWEST)
+    check_seen(usable, np.concatenate(planes), INFINITY.fewest)
     problem = replace(sky.problem, bearings=every, focal=_focal(sky, planes)).choose(usable)
     every, pixel = np.ascontiguousarray(problem.bearings), np.ascontiguousarray(pixel[usable])
     owner = np.concatenate([np.full(len(image), k) for k, image in enumerate(sky.images)])[usable]
     if lens is None:
         spread = math.sqrt(((every - every.mean(0)) ** 2).sum(-1).mean())
-        pixel = np.full(len(every), max(NOMINAL * spread, 1e-12))
+        pixel = np.full(len(every), max(INFINITY.nominal * spread, 1e-12))
     middle = np.array([np.median(pixel[owner == k]) if (owner == k).any() else np.nan for k in range(len(parts))])
     per_radian = np.ones(len(parts)) if lens is None else 1 / middle
     one = int(np.nanargmin(middle))  # camera in whose pixels the noise is
@@ -267,7 +261,7 @@ def _seen_by(sky: Sky, options: Options, deadline: Deadline, settings: InfinityS
         result = search_rotation(
             replace(problem, bearings=every),
             pixel,
-            noise=noise if settings is DEFAULT else None,
+            noise=noise if settings is INFINITY else None,
             seed=options.seed,
             deadline=deadline,
             settings=settings,
@@ -292,7 +286,7 @@ def _seen_by(sky: Sky, options: Options, deadline: Deadline, settings: InfinityS
     seen = [scene @ rotation.T for rotation in found.rotation]
     hit = np.flatnonzero(found.matches[0] >= 0)
     residual = noise_of(seen[0][found.matches[0, hit]], every[hit], pixel[hit])
-    threshold = inlier_threshold or SCALES * residual * float(middle[one] * per_radian[one])
+    threshold = inlier_threshold or MATCHES.reach * residual * float(middle[one] * per_radian[one])
     pairs, counts = [], np.zeros(len(seen), np.int64)
     for k in np.unique(owner).tolist():
         own = np.flatnonzero(owner == k)
@@ -346,6 +340,7 @@ def _bearings(image: Array, camera: Camera | None) -> tuple[Array, Array, Array]
         return bearings, plane, np.ones(len(bearings))
     check_unit(image, camera)
     bearings = camera.bearings(image)
-    steps = ((camera.bearings(image + step) - bearings) / HALF for step in ([HALF, 0.0], [0.0, HALF]))
+    step = INFINITY.pixel_step
+    steps = ((camera.bearings(image + shift) - bearings) / step for shift in ([step, 0.0], [0.0, step]))
     pixel = np.sqrt(sum((step**2).sum(-1) for step in steps) / 2)
     return bearings, in_front(bearings)[:, :2], pixel
