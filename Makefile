@@ -43,7 +43,6 @@ docs: install
 	$(BIN)/mkdocs build --strict --site-dir build/site
 
 notebooks: install
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt nbclient ipykernel
 	$(BIN)/python examples/store_outputs.py
 
 wheel: install

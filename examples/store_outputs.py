@@ -2,9 +2,9 @@
 
     python examples/store_outputs.py [NOTEBOOK...]
 
-It needs `pip install nbclient ipykernel`. A notebook whose metadata name a folder of photos (`"bpnp": {"photos":
-"sacre_coeur"}`) runs only if the working directory has this folder; otherwise its stored outputs stay. Cells with the
-tag `photo` are stored without their pictures, which would make the repository large.
+It needs `nbclient` and `ipykernel`, which `make install` installs. A notebook whose metadata name a folder of photos
+(`"bpnp": {"photos": "sacre_coeur"}`) runs only if the working directory has this folder; otherwise its stored outputs
+stay. Cells with the tag `photo` are stored without their pictures, which would make the repository large.
 """
 
 import sys

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import nbformat
 import pytest
 
 pytestmark = pytest.mark.slow
@@ -65,9 +66,6 @@ def test_a_notebook_runs_only_with_its_photos(
     has_photos: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Without its folder of photos a notebook stays as it is; with it the notebook has outputs and its metadata."""
-    nbformat = pytest.importorskip("nbformat")
-    for package in ("nbclient", "ipykernel"):
-        pytest.importorskip(package)
     monkeypatch.syspath_prepend(NOTEBOOKS[0].parent)
     monkeypatch.chdir(tmp_path)
     own = {"bpnp": {"photos": "some_photos"}}
