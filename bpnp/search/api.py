@@ -121,8 +121,10 @@ def solve(
         time_limit: Seconds in total, 10 by default; math.inf for no limit. At the limit each stage of the search ends
             with its current poses, and the best pose is returned.
         device: Device on which a copy of a module runs; None for the module's own device. The search runs on the CPU.
-        progress: Callback with (problem index, batches of initial poses, seconds). Problems then run in this process
-            only.
+        progress: Callback with (problem index, batches of initial poses, seconds), called after each batch and after
+            the enumeration of a small problem (0 batches). With `at_infinity` the image points that were tried count
+            instead of batches. With an unknown focal length both numbers restart at each focal length. It is not called
+            if a module computes the poses. None for no callback.
 
     Returns:
         Solution of the problem. Its `verdict` is "confident", "ambiguous" or "failed" (docs/verdict.md). It is also
@@ -164,6 +166,7 @@ def solve(
                 clutter=None if clutter is None else float(clutter),
                 seed=checked_seed(seed),
                 time_limit=seconds,
+                progress=progress,
             ),
             Mode(at_infinity, rig, scale, image_size, focal_error, distortion, solver, device),
             prior,
@@ -243,7 +246,7 @@ def solve_many(
         seed: Seed of the search, default 0.
         time_limit: Seconds per problem, 5 by default; math.inf for no limit.
         device: Device on which a copy of a module runs; as for `solve`.
-        progress: Callback with (problem index, batches of initial poses, seconds).
+        progress: Callback with (problem index, batches of initial poses, seconds); as for `solve`.
 
     Returns:
         List of k solutions, in the order of the problems.
@@ -288,7 +291,7 @@ def solve_many(
         for i, each in enumerate(each_of("prior", prior, count)):
             arrays = {name: values[i] for name, values in known.items()}
             with about(f"problem {i}" if count > 1 else None):
-                ready.append(prepare_mode(images[i], scenes[i], one_each[i], arrays, options, mode, each))
+                ready.append(prepare_mode(images[i], scenes[i], one_each[i], arrays, options.numbered(i), mode, each))
         return [solve_one() for solve_one in ready]
     cameras = each_camera(camera, count)
     priors = [checked_prior(each) for each in each_of("prior", prior, count)]
@@ -310,7 +313,7 @@ def solve_many(
                 whole = problem(i, lens, focal)
                 return whole if taken is None else whole.without(taken)
 
-            return solve_with_focal_length(at, unknown[i], options)
+            return solve_with_focal_length(at, unknown[i], options.numbered(i))
 
         solutions = {i: again(i) for i in problems}
     else:

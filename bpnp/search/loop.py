@@ -9,9 +9,11 @@ Searches differ in their plan and pool only: one camera (`bpnp.search.schedule`)
 from collections.abc import Callable
 from typing import NamedTuple, Protocol, runtime_checkable
 
-from bpnp.runtime import Deadline
+from bpnp.runtime import Clock, Deadline
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.verdict.decide import SearchResult
+
+Progress = Callable[[int, float], None]  # iterations so far, seconds
 
 
 class Step(NamedTuple):
@@ -54,6 +56,21 @@ class Poses(Protocol):
 
     def result(self, *, ended: bool = True) -> SearchResult:
         """Compute the verdict; `ended` is False while the search may go on."""
+
+
+def teller(progress: Progress | None) -> Callable[[int], None]:
+    """Return a function that calls `progress` with a number of iterations and the seconds since now.
+
+    Args:
+        progress: Callback of a search; None for no callback.
+    """
+    begun = Clock.now()
+
+    def tell(iterations: int) -> None:
+        if progress is not None:
+            progress(iterations, Clock.now() - begun)
+
+    return tell
 
 
 def run(

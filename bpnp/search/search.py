@@ -3,8 +3,6 @@
 `search_poses` searches over all poses, or from proposed poses only; `warm_up` compiles the loops in advance.
 """
 
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
@@ -17,7 +15,7 @@ from bpnp.search.enumeration.plan import EnumeratedPoses, EnumerationPlan
 from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.infinity.search import search_rotation
-from bpnp.search.loop import run
+from bpnp.search.loop import Progress, run, teller
 from bpnp.search.pool import Pool
 from bpnp.search.problem import Problem
 from bpnp.search.propose.density_map import preselect
@@ -31,7 +29,6 @@ from bpnp.search.settle import SceneOf, settle
 from bpnp.search.starts import Prior
 from bpnp.search.verdict.decide import SearchResult, degenerate_points, judge, no_pose
 
-Progress = Callable[[int, float], None]  # batches so far, seconds
 WARMING = 8  # number of points of the problem that compiles the loops
 
 
@@ -83,11 +80,7 @@ def search_poses(
     """
     if clutter is not None:
         settings, problem = settings.expecting(clutter), replace(problem, clutter=clutter)
-    start, enumerated = time.monotonic(), no_pose()
-
-    def tell(batches: int) -> None:
-        if progress is not None:
-            progress(batches, time.monotonic() - start)
+    tell, enumerated = teller(progress), no_pose()
 
     @cache
     def scene_of() -> Scene:

@@ -57,6 +57,17 @@ class Options(NamedTuple):
     settings: SearchSettings = DEFAULT
     until: Deadline = Deadline()
 
+    def progress_of(self, i: int) -> Callable[[int, float], None] | None:
+        """Return the callback of problem i, with (batches of initial poses, seconds); None without one."""
+        return None if self.progress is None else partial(self.progress, i)
+
+    def numbered(self, i: int) -> "Options":
+        """Return the options of problem i when it is solved alone: the callback gets this index."""
+        progress = self.progress
+        if progress is None:
+            return self
+        return self._replace(progress=lambda _, batches, seconds: progress(i, batches, seconds))
+
     def deadline(self, problem: Problem) -> Deadline:
         """Return when the search of a problem that starts now has to stop, so that verdict and matching end in time."""
         begun = Clock.now()
@@ -102,7 +113,7 @@ def _by_search(i: int, problem: Problem, options: Options) -> Solution:
         seed=options.seed,
         deadline=deadline,
         settings=options.settings,
-        progress=None if options.progress is None else partial(options.progress, i),
+        progress=options.progress_of(i),
     )
     seconds = time.perf_counter() - start
     if not len(result.candidates) and deadline.passed():
@@ -165,6 +176,7 @@ def _by_module(
                 seed=options.seed,
                 deadline=options.deadline(problem),
                 settings=options.settings,
+                progress=options.progress_of(i),
             )
             yield i, finished(problem, result, time.perf_counter() - start, options.inlier_threshold)
         elif groups and device_of(net).type != "cpu" and cells[i] * (len(groups[-1]) + 1) <= TOGETHER:

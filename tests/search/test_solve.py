@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -202,6 +203,35 @@ def test_progress_has_the_index_of_the_problem() -> None:
     first, second = ([batch for pair, batch in calls if pair == number] for number in (0, 1))
     solve(sets2d[0], sets3d, progress=lambda pair, batch, _: calls.append((pair + 2, batch)))
     assert first == second == [batch for pair, batch in calls if pair == 2]
+
+
+def test_progress_is_called_in_every_mode_with_the_index_of_the_problem() -> None:
+    """With a rig, directions, an unknown focal length and a prior of the rig; twice the same problem."""
+    rng = np.random.default_rng(4)
+    scene = rng.uniform(-1, 1, (12, 3))
+    images = [rng.permutation(seen(scene, np.eye(3), [x, 0, 5])) for x in (0.0, 0.2)]
+    rig = [(np.eye(3), np.array([x, 0, 0])) for x in (0.0, 0.2)]
+    sky = rng.standard_normal((200, 3))
+    sky /= np.linalg.norm(sky, axis=1, keepdims=True)
+    stars = sky[sky[:, 2] > 0.7]
+    modes: dict[str, tuple[Any, Any, dict[str, Any]]] = {
+        "rig": (images, scene, {"rig": rig}),
+        "directions": (stars, sky, {"at_infinity": True}),
+        "rig of directions": ([stars, stars], sky, {"at_infinity": True, "rig": [(np.eye(3), np.zeros(3))] * 2}),
+        "focal length": (500 * images[0] + [320, 240], scene, {"image_size": (640, 480)}),
+    }
+    for name, (points2d, points3d, options) in modes.items():
+        calls: list[tuple[int, int, float]] = []
+
+        def progress(*call: Any, calls: list[tuple[int, int, float]] = calls) -> None:
+            calls.append(call)
+
+        solve_many([points2d] * 2, points3d, **options, progress=progress)
+        assert {problem for problem, *_ in calls} == {0, 1}, name
+        assert all(batches >= 0 and seconds >= 0 for _, batches, seconds in calls), name
+        calls.clear()
+        solve(points2d, points3d, **options, progress=progress)
+        assert {problem for problem, *_ in calls} == {0}, name
 
 
 def test_keypoints_of_opencv_count_from_the_centre_of_the_first_pixel() -> None:

@@ -12,7 +12,7 @@ significant, the search is repeated over all rotations, whose number of tests re
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -39,7 +39,7 @@ from bpnp.search.infinity.evidence import (
 )
 from bpnp.search.infinity.kernels import TURN, Catalogue, Fit, Image, Rays, Sky, azimuths, catalogue_of, fit, vote
 from bpnp.search.kernels.neighbours import hashed
-from bpnp.search.loop import Step, run
+from bpnp.search.loop import Progress, Step, run, teller
 from bpnp.search.pose_model import FIXING_ROTATION
 from bpnp.search.problem import Problem
 from bpnp.search.starts import PosePrior
@@ -140,6 +140,7 @@ def search_rotation(
     seed: int = 0,
     deadline: Deadline = NEVER,
     settings: InfinitySettings = INFINITY,
+    progress: Progress | None = None,
 ) -> SearchResult:
     """Search for the rotation under which image points see directions.
 
@@ -151,13 +152,15 @@ def search_rotation(
         seed: Random seed of the order in which points are tried.
         deadline: When to stop.
         settings: Constants.
+        progress: Callback with the number of tried image points and the seconds, after each of them. None for no
+            callback.
 
     Returns:
         Verdict and rotations, with translations of 0; `batches` is the number of image points that were tried.
     """
-    result, turns = no_pose("no rotation was found"), 0
+    result, turns, tell = no_pose("no rotation was found"), 0, teller(progress)
     for is_near in (False,) if problem.prior is None else (True, False):
-        new = _at_each_noise(problem, pixel, noise, seed, deadline, settings, is_near=is_near)
+        new = _at_each_noise(problem, pixel, noise, seed, deadline, settings, _after(turns, tell), is_near=is_near)
         turns += new.batches
         result = min(new, result, key=lambda one: one.log10_false_alarms)
         if result.log10_false_alarms <= DEFAULT.evidence.false_alarms or deadline.passed():
@@ -172,10 +175,11 @@ def _at_each_noise(
     seed: int,
     deadline: Deadline,
     settings: InfinitySettings,
+    tell: Callable[[int], None],
     *,
     is_near: bool,
 ) -> SearchResult:
-    """Search at one noise after the other; arguments as for `search_rotation`, with `is_near` of `Sight`."""
+    """Search at one noise after the other; arguments as for `search_rotation` and `run`, with `is_near` of `Sight`."""
     unlabelled = problem.labels2d is None or problem.labels3d is None
     labels2d = NO_LABELS if unlabelled or problem.labels2d is None else np.array(problem.labels2d)
     labels3d = NO_LABELS if unlabelled or problem.labels3d is None else np.array(problem.labels3d)
@@ -204,13 +208,18 @@ def _at_each_noise(
             is_near,
         )
         poses = RotationPoses(sight)
-        new = run(RotationPlan(poses, seed), poses, most=settings.turns, deadline=deadline)
+        new = run(RotationPlan(poses, seed), poses, most=settings.turns, deadline=deadline, tell=_after(turns, tell))
         turns += new.batches
         if new.log10_false_alarms <= result.log10_false_alarms:
             result = new
         if result.verdict != "failed" and noise_of(*_matches(sight, result.candidates)) < settings.rougher * scale:
             break
     return replace(result, batches=turns)
+
+
+def _after(turns: int, tell: Callable[[int], None]) -> Callable[[int], None]:
+    """Return a function that calls `tell` with its argument plus the number of earlier iterations."""
+    return lambda new: tell(turns + new)
 
 
 def _matches(sight: Sight, found: Hypotheses) -> tuple[Array, Array, Array]:

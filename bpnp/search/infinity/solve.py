@@ -265,6 +265,7 @@ def _seen_by(sky: Sky, options: Options, deadline: Deadline, settings: InfinityS
             seed=options.seed,
             deadline=deadline,
             settings=settings,
+            progress=options.progress_of(0),
         )
     parameters = ROTATION_PARAMETERS if sky.unknown is None else (*ROTATION_PARAMETERS, FOCAL_LENGTH)
     solution = Solution(

@@ -20,7 +20,7 @@ from bpnp.search.config import DEFAULT, ENUMERATION, SearchSettings
 from bpnp.search.enumeration.points import predicted_pose
 from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame, to_scene_frame
-from bpnp.search.loop import Step, run
+from bpnp.search.loop import Progress, Step, run, teller
 from bpnp.search.pool import Pool
 from bpnp.search.problem import Problem
 from bpnp.search.propose.density_map import search_around
@@ -52,6 +52,7 @@ def search_rig(
     seed: int = 0,
     deadline: Deadline = NEVER,
     settings: SearchSettings = DEFAULT,
+    progress: Progress | None = None,
 ) -> SearchResult:
     """Search for the pose of a rig.
 
@@ -61,12 +62,14 @@ def search_rig(
         seed: Random seed.
         deadline: When to stop.
         settings: Constants of the search.
+        progress: Callback with the number of iterations and the seconds, after the cameras with few points (0) and
+            after each iteration. None for no callback.
 
     Returns:
         Distinct poses of the rig, best first, and the verdict on the first one.
     """
     settings = settings if clutter is None else settings.expecting(clutter)
-    poses = RigPoses(rig)
+    poses, tell = RigPoses(rig), teller(progress)
     for k, problem in enumerate(rig.problems):
         if exceeds_enumeration(problem):
             scene = Scene(problem, seed + k, settings, deadline)
@@ -79,9 +82,10 @@ def search_rig(
     if rig.model.prior is not None and not poses.is_significant():
         without = [replace(problem, prior=None) for problem in rig.problems]
         poses.take(_of_few_points(poses, without, seed, deadline), REFINED)
+    tell(0)
     if poses.may_be_decided() and (result := poses.result(ended=False)).verdict == "confident":
         return result
-    return run(RigPlan(poses), poses, most=settings.schedule.turns, deadline=deadline)
+    return run(RigPlan(poses), poses, most=settings.schedule.turns, deadline=deadline, tell=tell)
 
 
 def _of_few_points(

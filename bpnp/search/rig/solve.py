@@ -151,7 +151,12 @@ def _solve(rig: Rig, options: Options) -> Solution:
     else:
         deadline = Deadline.after(options.time_limit)
         result = search_rig(
-            rig, clutter=options.clutter, seed=options.seed, deadline=deadline, settings=options.settings
+            rig,
+            clutter=options.clutter,
+            seed=options.seed,
+            deadline=deadline,
+            settings=options.settings,
+            progress=options.progress_of(0),
         )
     solution = _finished(rig, rig.problems, result, options.inlier_threshold)
     return replace(solution, seconds=Clock.now() - begun)
