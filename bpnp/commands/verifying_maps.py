@@ -47,10 +47,11 @@ def verify_images(
         raise ValueError(f"{map} has no COLMAP model, but {inside[0]} has; try bpnp verify {inside[0]}")
 
     from bpnp.maps.scene_map import SceneMap
-    from bpnp.maps.verified_map import SECONDS, as_csv, as_json, page_html, summary, verify_map
+    from bpnp.maps.verified_map import as_csv, as_json, page_html, summary, verify_map
     from bpnp.search.arguments import seconds_from
+    from bpnp.search.config import TIME
 
-    limit = seconds_from(time_limit, SECONDS)
+    limit = seconds_from(time_limit, TIME.one)
     scene = SceneMap.from_colmap(map)
     with count_items("verifying", len(scene.views), quiet=quiet) as done:
         verified = verify_map(map, scene, seed=seed, time_limit=limit, done=done)

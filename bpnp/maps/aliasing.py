@@ -18,7 +18,7 @@ from bpnp.maps.viewed_points import Region
 from bpnp.maps.views import Array
 from bpnp.poses import rotation_angle, same_pose
 from bpnp.runtime import one_blas_thread
-from bpnp.search.config import DEFAULT, DensitySearch, DensityShape, Draws, Narrowing, Preselection
+from bpnp.search.config import ALIASING, DEFAULT, DensityShape
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
 from bpnp.search.kernels.density_map import DensityMap
 from bpnp.search.matching import count_one_to_one
@@ -33,32 +33,6 @@ from bpnp.search.verdict.decide import rank_poses
 from bpnp.search.verdict.reasons import objection
 
 Pose = tuple[Array, Array]  # rotation (3, 3) and translation (3,), in the frame of a problem
-
-
-@dataclass(frozen=True)
-class AliasingSettings:
-    """Constants of the short searches near views of other points.
-
-    Attributes:
-        search: Search near each view. Few of the explained image points are outliers for a competing pose. So fewer,
-            more smoothed initial poses suffice than near a view that is tried.
-        most_views: Largest number of views.
-        least_other: Least fraction of a view's points that the pose does not see.
-        fewest: Least number of such points, and of image points that the pose explains.
-    """
-
-    search: DensitySearch = DensitySearch(
-        Draws(2**13, least_starts=2**13),
-        Preselection((50, 300), (2**11, 2**8)),
-        Narrowing(0.1, 0.015, steps=6, points=300),
-        annealed=6,
-    )
-    most_views: int = 8
-    least_other: float = 0.5
-    fewest: int = 12
-
-
-ALIASING = AliasingSettings()
 
 
 @dataclass(frozen=True, eq=False)

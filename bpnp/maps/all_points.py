@@ -11,7 +11,7 @@ from bpnp.maps.viewed_points import Region
 from bpnp.maps.views import Array
 from bpnp.poses import MIN_POINTS
 from bpnp.runtime import one_blas_thread
-from bpnp.search.config import DEFAULT, Evidence
+from bpnp.search.config import DEFAULT, MAPS, Evidence
 from bpnp.search.focal_length import AROUND, UnknownCamera, fit_camera
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
 from bpnp.search.matching import finished
@@ -23,8 +23,6 @@ from bpnp.search.settle import other_lens, settle
 from bpnp.search.solution import Solution, add_objection
 from bpnp.search.verdict.competitors import competing_pose
 from bpnp.search.verdict.decide import judge
-
-COMPETITORS = 4  # competing poses of an ambiguous solution that are judged with it on all points
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +84,8 @@ def refine_on_all_points(solution: Solution, photo: Photo, whole: Region) -> Ref
         poses = anneal_to_end(Scene(problem, photo.seed, DEFAULT), rotation[None], shift[None], max(scale, least))
     scene, confident = Scene(problem, photo.seed, DEFAULT), solution.verdict == "confident"
     local_searches = int(poses.scale[0] > scale) if confident else local_searches_for_certainty(DEFAULT.evidence)
-    others = [] if confident else [one for one in solution.candidates[1:] if one.log10_false_alarms < 0][:COMPETITORS]
+    significant = [one for one in solution.candidates[1:] if one.log10_false_alarms < 0]
+    others = [] if confident else significant[: MAPS.competitors]
     if others:
         turns, shifts = problem.from_user(
             np.stack([one.rotation for one in others]), np.stack([one.translation for one in others])

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from bpnp.cameras import camera_from, camera_to_json
 from bpnp.datamodules.colmap.model_files import FILES
 from bpnp.files import cache_folder, file_states, fingerprint, lock_folder, write_atomically
-from bpnp.maps.views import MARGIN_DEG, RANK, Array, Cones, Pictures, View
+from bpnp.maps.views import Array, Cones, Pictures, View
+from bpnp.search.config import MAPS, RANK
 
-LARGE = 200_000  # least number of points of a map with an index; smaller maps open in two seconds without one
 FORMAT = 1
 
 
@@ -34,7 +34,7 @@ def _stamp(folder: Path) -> str:
     """Return a fingerprint of the files of a model and of the constants of its index."""
     files = [folder / f"{name}.{suffix}" for name in FILES for suffix in ("bin", "txt")]
     model = file_states(file for file in files if file.is_file())
-    return fingerprint([FORMAT, MARGIN_DEG, repr(RANK), model])
+    return fingerprint([FORMAT, MAPS.margin_deg, repr(RANK), model])
 
 
 def index_file(folder: Path) -> Path:

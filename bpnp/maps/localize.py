@@ -20,21 +20,17 @@ from bpnp.maps.photo_problem import Photo, with_ids
 from bpnp.maps.viewed_points import Place, Region, ViewedPoints
 from bpnp.runtime import Clock, Deadline
 from bpnp.search.arguments import checked_prior
-from bpnp.search.config import DEFAULT, SearchSettings
+from bpnp.search.config import DEFAULT, MAPS, SearchSettings
 from bpnp.search.focal_length import UnknownCamera, solve_with_focal_length
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.solution import Candidate, Solution
 from bpnp.search.sources import Options, solve_problems
 from bpnp.search.verdict import reasons
 
-SECONDS = 60.0  # default time limit of a photo, with which the photos of cities are measured (docs/maps.md)
-MOST_KEYPOINTS = 2048  # half of the 2,000 largest SIFT keypoints have a map point, an eighth of the next ones
 # The search stays near the view's pose, not near the best pose of an unsuccessful earlier search.
 # A search in a fourth of the time finds four fifths as many poses, so that short searches near many views pay.
-BRIEF = replace(DEFAULT, near=(DEFAULT.everywhere,)).limited(1)
-ONCE, LONGER = DEFAULT.limited(1), DEFAULT.limited(16)
-PROMISING = 3  # views that get a longer search if none is confident
-LIKELY = -20.0  # log10 NFA below which a view gets a longer search before the next view
+BRIEF = replace(DEFAULT, near=(DEFAULT.everywhere,)).limited(MAPS.once)
+ONCE, LONGER = DEFAULT.limited(MAPS.once), DEFAULT.limited(MAPS.longer)
 RANKS = {"failed": 0, "ambiguous": 1, "confident": 2}
 
 
@@ -131,8 +127,8 @@ def _localize_in(
         if "confident" in (own.verdict, found.solution.verdict):
             return LoopResult(found.solution, True)
         earlier += significant(found.solution)
-        best = sorted([*best, found], key=lambda one: one.rank, reverse=True)[:PROMISING]
-        again = [found] if found.solution.log10_false_alarms < LIKELY and len(longer) < PROMISING else []
+        best = sorted([*best, found], key=lambda one: one.rank, reverse=True)[: MAPS.promising]
+        again = [found] if found.solution.log10_false_alarms < MAPS.likely and len(longer) < MAPS.promising else []
         if not queue:  # not significant so far, but perhaps with all points of the map
             best = [judge_in_map(scene, photo, views, one, earlier) for one in best]
             best.sort(key=lambda one: one.rank, reverse=True)
@@ -259,7 +255,7 @@ def strongest_of(scores: Any, shape: tuple[int, ...]) -> NDArray[np.int64]:
     """Return the indices of the strongest keypoints, ascending; raise ValueError unless each keypoint has a score."""
     if np.shape(scores) != shape:
         raise ValueError(f"`scores` has the shape {np.shape(scores)}, not {shape}, one score per keypoint")
-    return np.sort(np.argsort(-np.asarray(scores), kind="stable")[:MOST_KEYPOINTS])
+    return np.sort(np.argsort(-np.asarray(scores), kind="stable")[: MAPS.most_keypoints])
 
 
 def among_all(solution: Solution, used: NDArray[np.int64], keypoints: Any) -> Solution:

@@ -9,6 +9,7 @@ import numpy.typing as npt
 from bpnp.cameras import camera_from
 from bpnp.report.images import size_in_camera
 from bpnp.report.terminal import LIGHT, QUIET, VERDICTS, number
+from bpnp.search.config import DRAWING
 from bpnp.search.solution import Solution
 from bpnp.search.verdict.uncertainty import centre_covariance
 
@@ -20,12 +21,7 @@ if TYPE_CHECKING:
     from bpnp.maps.views import View
 
 Array = npt.NDArray[Any]
-FADED = 0.55  # fraction of the photo's contrast that is kept, so that points stand out
 BOUND = 3.72  # standard deviations that hold 99.9 % of a plane's normal distribution
-SHOWN = 98.0  # % of the map's points within the drawing
-FARTHEST = 4.0  # largest distance of a camera drawn in place, in extents of the points
-MOST_POINTS = 20_000  # largest number of map points drawn
-WIDTHS = (9.0, 6.0)  # widths of photo and map, inches
 
 
 def localized_picture(
@@ -48,8 +44,8 @@ def localized_picture(
 
     from bpnp.report.solutions import solution_points
 
-    figure = Figure(figsize=(sum(WIDTHS), 6.5), layout="constrained")
-    image, above = figure.subplots(1, 2, width_ratios=WIDTHS)
+    figure = Figure(figsize=(sum(DRAWING.widths), 6.5), layout="constrained")
+    image, above = figure.subplots(1, 2, width_ratios=DRAWING.widths)
     marks = draw_matches(image, solution, photo=photo)
     if marks is not None:
         figure.colorbar(marks, ax=image, location="bottom", shrink=0.5, aspect=40, label=f"residual, {solution.unit}")
@@ -75,7 +71,7 @@ def draw_matches(axes: "Axes", solution: Solution, *, photo: Array | None = None
     residuals = np.linalg.norm(seen[image] - reprojected, axis=-1)
     if photo is not None:
         width, height = size_in_camera(photo, camera)
-        faded = (255 - FADED * (255 - photo.astype(float))).astype(np.uint8)
+        faded = (255 - DRAWING.contrast * (255 - photo.astype(float))).astype(np.uint8)
         axes.imshow(faded, extent=(0, width, height, 0), zorder=0)
         axes.set(xlim=(0, width), ylim=(height, 0))
     else:
@@ -112,7 +108,7 @@ def draw_from_above(axes: "Axes", scene: "SceneMap", solution: Solution) -> None
     """
     found = solution.verdict != "failed"
     plane = plane_from_above(scene.views, solution.rotation[2] if found else scene.views[0].rotation[2])
-    step = -(-len(scene.points3d) // MOST_POINTS)
+    step = -(-len(scene.points3d) // DRAWING.most_points)
     points, centres = scene.points3d[::step] @ plane.T, np.array([view.centre for view in scene.views]) @ plane.T
     axes.plot(*points.T, ".", color=QUIET, ms=1, alpha=0.35, zorder=1)
     local_searches = np.array([view.rotation[2] for view in scene.views]) @ plane.T
@@ -120,8 +116,8 @@ def draw_from_above(axes: "Axes", scene: "SceneMap", solution: Solution) -> None
     if solution.verdict == "ambiguous" and len(solution.candidates) > 1:
         drawn.append(("or here", solution.candidates[1].centre, solution.candidates[1].rotation))
     stars = np.array([centre for _, centre, _ in drawn]).reshape(-1, 3) @ plane.T
-    low, high = np.percentile(points, [(100 - SHOWN) / 2, (100 + SHOWN) / 2], axis=0)
-    farthest = FARTHEST * (high - low)
+    low, high = np.percentile(points, [(100 - DRAWING.shown) / 2, (100 + DRAWING.shown) / 2], axis=0)
+    farthest = DRAWING.farthest * (high - low)
     placed = np.clip(np.concatenate([centres, stars]), low - farthest, high + farthest)
     low, high = np.minimum(low, placed.min(0)), np.maximum(high, placed.max(0))
     middle, reach = (low + high) / 2, 0.5 * 1.15 * float((high - low).max())

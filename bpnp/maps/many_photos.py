@@ -19,12 +19,12 @@ from scipy.spatial.transform import Rotation
 from bpnp.cameras import camera_from, camera_to_json
 from bpnp.datamodules.colmap.model_files import FILES, model_format
 from bpnp.files import delay_interrupts, fingerprint, write_text
-from bpnp.maps.localize import SECONDS
 from bpnp.maps.localized_picture import localized_picture
 from bpnp.maps.photos import photo_keypoints
 from bpnp.maps.scene_map import UNKNOWN, SceneMap
 from bpnp.report.images import read_photo, save_figure
 from bpnp.search.arguments import seconds_from
+from bpnp.search.config import TIME
 from bpnp.search.solution import Solution
 
 CHANGES = {"photo": "another photo", "map": "another map", "views": "other views", "keypoints": "other keypoints"}
@@ -100,7 +100,7 @@ def photo_task(
         keypoints = keypoints.absolute()
         points = photo_keypoints(photo, keypoints, name)
         points_content = fingerprint([points.pixels.tolist(), points.scores.tolist()])
-    limit = seconds_from(search.get("time_limit"), SECONDS)
+    limit = seconds_from(search.get("time_limit"), TIME.photo)
     shared = {"views": shown, **search}
     made_with = {
         "photo": photo_content,

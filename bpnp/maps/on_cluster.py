@@ -11,10 +11,8 @@ from distributed.comm import connect
 
 from bpnp.maps.many_photos import Attempt, PhotoTask, attempt
 from bpnp.maps.scene_map import SceneMap
+from bpnp.search.config import MAPS, TIME
 from bpnp.search.solution import Solution
-
-QUEUED = 4  # photos per worker thread: no thread waits, and the scheduler holds few
-PATIENCE = 10  # seconds until a scheduler answers
 
 
 class MapOfWorker(WorkerPlugin):
@@ -51,7 +49,7 @@ def attempts_on_cluster(scene: SceneMap, tasks: Iterable[PhotoTask], cluster: st
                 yield future
 
         waiting = submitted()
-        done = as_completed(islice(waiting, QUEUED * max(sum(client.nthreads().values()), 1)))
+        done = as_completed(islice(waiting, MAPS.queued * max(sum(client.nthreads().values()), 1)))
         for future in done:
             task = running.pop(future.key)
             yield task, str(future.exception()) if future.status == "error" else future.result()
@@ -77,13 +75,13 @@ def connected(cluster: str) -> Iterator[Client]:
         raise ValueError(
             f"--cluster is {cluster}, not a number of processes, and no Dask scheduler answers there: {error}"
         ) from error
-    with Client(cluster, timeout=PATIENCE) as client:
+    with Client(cluster, timeout=TIME.scheduler) as client:
         yield client
 
 
 async def _answers(address: str) -> None:
     """Raise OSError or ValueError if no scheduler answers."""
-    comm = await connect(address, timeout=PATIENCE)
+    comm = await connect(address, timeout=TIME.scheduler)
     await comm.close()
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.cameras import CENTRE, outside_image, same_aspect_ratio
+from bpnp.search.config import MAPS
 
 Array = NDArray[np.float64]
 Size = tuple[int, int]  # width and height, pixels
@@ -25,8 +26,6 @@ UP_OF_ORIENTATION = {1: (0.0, -1.0, 0.0), 3: (0.0, 1.0, 0.0), 6: (-1.0, 0.0, 0.0
 PIXELS_X, PIXELS_Y = 0xA002, 0xA003
 DIAGONAL_35MM = 43.2666  # of a frame of 36 x 24 mm; equivalent focal lengths are by the diagonal (CIPA DCG-001)
 MILLIMETRES = {2: 25.4, 3: 10.0}  # per unit of the resolution, by EXIF number: inch, centimetre
-MOST_DETECTED = 8192
-CONTRAST = 0.02  # of three layers together, of 1: COLMAP's peak_threshold of 0.02 / 3; half of OpenCV's default
 SQLITE = b"SQLite format 3\0"
 # x, y; and scale, orientation; or and a 2x2 matrix of the local shape. https://colmap.github.io/database.html
 COLUMNS = (2, 4, 6)
@@ -145,7 +144,7 @@ def photo_keypoints(photo: Path, file: str | Path | None, name: str) -> Keypoint
     return (read_database if head == SQLITE else read_features)(path, name, size)
 
 
-def detected_keypoints(photo: Path, *, most: int = MOST_DETECTED) -> Keypoints:
+def detected_keypoints(photo: Path, *, most: int = MAPS.most_detected) -> Keypoints:
     """Detect SIFT keypoints (Lowe 2004, with OpenCV), one per position; the score is the scale in pixels.
 
     The contrast threshold is COLMAP's. Like COLMAP, the `most` largest keypoints are kept. Large keypoints are more
@@ -165,7 +164,7 @@ def detected_keypoints(photo: Path, *, most: int = MOST_DETECTED) -> Keypoints:
     image = cv2.imread(str(photo), as_stored)
     if image is None:
         raise ValueError(f"OpenCV cannot read the photo {photo}; give a JPEG or PNG file")
-    points = cv2.SIFT.create(contrastThreshold=CONTRAST, enable_precise_upscale=True).detect(image)
+    points = cv2.SIFT.create(contrastThreshold=MAPS.contrast, enable_precise_upscale=True).detect(image)
     rows = np.array([(*point.pt, point.size) for point in points], np.float64).reshape(-1, 3)
     rows = rows[np.argsort(-rows[:, 2], kind="stable")[:most]]
     pixels, first = np.unique(rows[:, :2], axis=0, return_index=True)

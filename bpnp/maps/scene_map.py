@@ -17,7 +17,7 @@ from bpnp.cameras import image_size as image_size_of
 from bpnp.datamodules.colmap.model_files import ColmapError
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
 from bpnp.maps import index
-from bpnp.maps.localize import SECONDS, among_all, localize, strongest_of
+from bpnp.maps.localize import among_all, localize, strongest_of
 from bpnp.maps.photo_problem import Photo
 from bpnp.maps.photos import focal_from_exif, photo_keypoints, photo_size, up_from_exif
 from bpnp.maps.verify_view import verify_pose
@@ -33,18 +33,17 @@ from bpnp.search.arguments import (
     seconds_from,
     source_from,
 )
+from bpnp.search.config import MAPS, TIME
 from bpnp.search.focal_length import UnknownCamera, unknown_camera
 from bpnp.search.solution import Solution
 from bpnp.search.sources import Options
-from bpnp.search.verify import SECONDS as SECONDS_OF_VERIFICATION
 
 if TYPE_CHECKING:
     import torch
 
 UNKNOWN = "unknown"  # focal length
-SAME_FOCAL = 1.05  # largest ratio of the focal lengths of views whose camera a photo can get
 DEFAULT_LIMIT = (
-    f"the search of a photo now ends after {SECONDS:.0f} s by default, and this photo was not decided; "
+    f"the search of a photo now ends after {TIME.photo:.0f} s by default, and this photo was not decided; "
     "`time_limit=math.inf` is no limit"
 )
 
@@ -97,7 +96,7 @@ class SceneMap(ViewedPoints):
                 "model with registered images"
             )
         scene = cls(model.points3d, model.point_ids, np.zeros(len(model.point_ids), np.int32), views).seen_by(1)
-        if len(scene.points3d) < index.LARGE:
+        if len(scene.points3d) < MAPS.indexed:
             return scene
         parts = scene.points3d, scene.point_ids, scene.track_lengths, scene.views
         return cls._from_index(
@@ -170,7 +169,7 @@ class SceneMap(ViewedPoints):
         Raises:
             ValueError: A view is unknown, or `bpnp.solve` rejects the input.
         """
-        limit = seconds_from(time_limit, SECONDS)
+        limit = seconds_from(time_limit, TIME.photo)
         pixels = pixels_from(keypoints, image_size or camera)
         lens = self._lens(camera, image_size, focal_error, distortion)
         if image_size is not None:
@@ -194,7 +193,7 @@ class SceneMap(ViewedPoints):
         keypoints: PointsLike,
         *,
         seed: int = 0,
-        time_limit: float | int | None = SECONDS_OF_VERIFICATION,
+        time_limit: float | int | None = TIME.one,
     ) -> Solution:
         """Verify the pose of a view without its own observations.
 
@@ -220,7 +219,7 @@ class SceneMap(ViewedPoints):
         if time_limit is None:
             message = "`time_limit=None` of `verify_view` is its default limit now, 10 s; math.inf is no limit"
             warnings.warn(message, DeprecationWarning, stacklevel=2)
-        limit = seconds_from(time_limit, SECONDS_OF_VERIFICATION)
+        limit = seconds_from(time_limit, TIME.one)
         view, rest = self.named([name])[0], self.without([name])
         pixels = np.asarray(pixels_from(keypoints, view.camera), np.float64)
         regions = partial(rest.ranked_regions, None, view.camera)
@@ -339,7 +338,7 @@ class SceneMap(ViewedPoints):
             if known == size or (not exif and known is not None and same_aspect_ratio(known, size))
         ]
         fitting.sort(key=lambda item: item[0].focal)
-        if fitting and fitting[-1][0].focal <= SAME_FOCAL * fitting[0][0].focal:
+        if fitting and fitting[-1][0].focal <= MAPS.same_focal * fitting[0][0].focal:
             return fitting[len(fitting) // 2]
         if exif:
             return None, "unknown focal length"

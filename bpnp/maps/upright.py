@@ -11,10 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.maps.views import Array, View
-
-AGREE = np.cos(np.radians(30.0))  # largest angle between the upward directions of upright views
-LEAST_AGREEING = 0.5  # fraction of the views that agree on the direction up
-IN_PLANE = 0.5  # least length of the direction up in the image plane: a steeper view has no upright side
+from bpnp.search.config import MAPS
 
 
 def up_of_views(views: Sequence[View]) -> Array | None:
@@ -23,9 +20,10 @@ def up_of_views(views: Sequence[View]) -> Array | None:
     The y axis of an upright photo points down. Photos stored on their side are outvoted.
     """
     ups = -np.array([view.rotation[1] for view in views])
-    agree = ups @ ups[:: -(-len(ups) // 200)].T > AGREE  # compared with at most 200 views
+    cosines = ups @ ups[:: -(-len(ups) // 200)].T  # compared with at most 200 views
+    agree = cosines > np.cos(np.radians(MAPS.upright_deg))
     best = agree[:, int(agree.sum(0).argmax())]
-    if best.mean() < LEAST_AGREEING:
+    if best.mean() < MAPS.least_upright:
         return None
     mean = ups[best].mean(0)
     return np.asarray(mean / np.linalg.norm(mean))
@@ -43,12 +41,12 @@ def quarter_turns(views: Sequence[View], up_camera: Array) -> NDArray[np.int64]:
             the direction up in the map is unknown.
     """
     up = up_of_views(views)
-    if up is None or np.hypot(*up_camera[:2]) < IN_PLANE * np.linalg.norm(up_camera):
+    if up is None or np.hypot(*up_camera[:2]) < MAPS.in_plane * np.linalg.norm(up_camera):
         return np.zeros(len(views), np.int64)
     seen = np.array([view.rotation @ up for view in views])
     angles = np.arctan2(up_camera[1], up_camera[0]) - np.arctan2(seen[:, 1], seen[:, 0])
     turns = np.round(angles / (np.pi / 2)).astype(np.int64) % 4
-    return np.where(np.hypot(seen[:, 0], seen[:, 1]) < IN_PLANE, 0, turns)
+    return np.where(np.hypot(seen[:, 0], seen[:, 1]) < MAPS.in_plane, 0, turns)
 
 
 def turned_view(view: View, turns: int) -> View:

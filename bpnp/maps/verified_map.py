@@ -18,13 +18,11 @@ from bpnp.maps.localized_picture import plane_from_above
 from bpnp.maps.scene_map import SceneMap
 from bpnp.report.templates import render_page
 from bpnp.report.terminal import VERDICTS, number
-from bpnp.search.verify import SECONDS
+from bpnp.search.config import DRAWING, TIME
 
 UNTESTED = "untested"
 MATCHED_ONLY = "Significant on the matched keypoints alone, log10 NFA {0:.1f}, but not on all {2} keypoints, {1:.1f}"
 WORST_FIRST = ("failed", "ambiguous", UNTESTED, "confident")
-DRAWN = 3000  # points of the map on the page
-SIDE = 1000.0  # side of the drawing
 
 
 @dataclass(frozen=True)
@@ -65,7 +63,7 @@ def verify_map(
     scene: SceneMap,
     *,
     seed: int = 0,
-    time_limit: float = SECONDS,
+    time_limit: float = TIME.one,
     done: Callable[[str], None] = lambda words: None,
 ) -> list[VerifiedView]:
     """Verify the pose of each image of a COLMAP model without the image's own observations.
@@ -165,7 +163,7 @@ def page_html(verified: Sequence[VerifiedView], scene: SceneMap, folder: Path) -
         summary=summary(verified),
         rows=[(one, *cells(one)) for one in verified],
         drawing=_drawing(verified, scene),
-        side=SIDE,
+        side=DRAWING.side,
     )
 
 
@@ -178,18 +176,18 @@ def cells(one: VerifiedView) -> tuple[str, str, str, str, str]:
 
 
 def _drawing(verified: Sequence[VerifiedView], scene: SceneMap) -> dict[str, Any]:
-    """Return the page coordinates of the points, the views and the competing poses, in a square of side `SIDE`."""
+    """Return the page coordinates of the points, the views and the competing poses, in a square."""
     plane = plane_from_above(scene.views, scene.views[0].rotation[2]) * np.array([[1.0], [-1.0]])  # y is down
     views = scene.named([one.name for one in verified])
     centres = np.array([view.centre for view in views]) @ plane.T
-    points = scene.points3d[:: -(-len(scene.points3d) // DRAWN)] @ plane.T
+    points = scene.points3d[:: -(-len(scene.points3d) // DRAWING.most_points_of_page)] @ plane.T
     low, high = np.percentile(np.concatenate([points, centres]), [1, 99], axis=0)
     low, high = np.minimum(low, centres.min(0)), np.maximum(high, centres.max(0))
-    scale = 0.92 * SIDE / max(float((high - low).max()), 1e-9)
-    size = (high - low) * scale + 0.08 * SIDE
+    scale = 0.92 * DRAWING.side / max(float((high - low).max()), 1e-9)
+    size = (high - low) * scale + 0.08 * DRAWING.side
 
     def placed(values: Any) -> Any:
-        return np.round((np.asarray(values) - low) * scale + 0.04 * SIDE, 1).tolist()
+        return np.round((np.asarray(values) - low) * scale + 0.04 * DRAWING.side, 1).tolist()
 
     inside = ((points >= low) & (points <= high)).all(-1)
     local_searches = np.array([view.rotation[2] for view in views]) @ plane.T

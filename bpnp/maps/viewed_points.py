@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from bpnp.cameras import Camera
 from bpnp.maps.upright import quarter_turns, turned_view
 from bpnp.maps.views import (
-    STEP,
-    VIEWS_AHEAD,
     Array,
     Cones,
     Pictures,
@@ -23,14 +21,12 @@ from bpnp.maps.views import (
     viewing_cones,
 )
 from bpnp.poses import MIN_POINTS
+from bpnp.search.config import FOCAL, MAPS
 from bpnp.search.focal_length import UnknownCamera
 from bpnp.search.problem import faces
 from bpnp.search.starts import PosePrior
 
 Map = TypeVar("Map", bound="ViewedPoints")
-LEAST_TRACK = 2  # least number of views of a point after a view is removed
-VIEW_DEGREES = 15.0  # about the largest angle per axis between photos that share a third of their points
-VIEW_SHARE = 0.2  # about the largest shift of the viewed points, as a fraction of their distance
 
 
 class Place(NamedTuple):
@@ -61,7 +57,7 @@ class Region:
 
     def prior(self) -> PosePrior:
         """Return a prior at the view's pose, as wide as the poses of photos of one place differ."""
-        return PosePrior(self.view.rotation, self.view.translation, VIEW_DEGREES, VIEW_SHARE * self.distance)
+        return PosePrior(self.view.rotation, self.view.translation, MAPS.view_deg, MAPS.view_shift * self.distance)
 
     def part(self, points: NDArray[np.integer]) -> "Region":
         """Return the region with only the points of these indices (j,)."""
@@ -131,7 +127,7 @@ class ViewedPoints:
         """
         left_out = {view.name for view in self.named(names)}
         views = tuple(view for view in self.views if view.name not in left_out)
-        return replace(self, views=views).seen_by(LEAST_TRACK)
+        return replace(self, views=views).seen_by(MAPS.least_track)
 
     def seen_by(self: Map, least: int) -> Map:
         """Return the map with only the points that `least` or more views see; raise ValueError if none is left."""
@@ -150,8 +146,8 @@ class ViewedPoints:
 
         With `views` these are the given views in their order. Each gets the points that any of them sees, since they
         show one place. Otherwise they are all views of the map by rank (`bpnp.maps.views`), each with its own points.
-        With an unknown focal length several are tried, the likeliest first: each begins `VIEWS_AHEAD` views after the
-        one before.
+        With an unknown focal length several are tried, the likeliest first: each begins `MAPS.views_ahead` views after
+        the one before.
         Views with too few points to fix a pose are skipped.
 
         Args:
@@ -168,10 +164,11 @@ class ViewedPoints:
                 raise ValueError("`views` is empty; give names of views, or None for all views of the map")
             points = np.unique(np.concatenate([view.points for view in named]))
             return [Place(view, points, camera) for view in named if len(view.points) and len(points) >= MIN_POINTS]
-        cameras: list[Camera] = camera.focal_steps(STEP) if isinstance(camera, UnknownCamera) else [camera]
+        cameras: list[Camera] = camera.focal_steps(FOCAL.step_few) if isinstance(camera, UnknownCamera) else [camera]
         scores = self.scores(cameras[0], keypoints, known_focal=isinstance(camera, Camera))
         order = list(places_first(self.views, scores, len(self.points3d)))
-        queue = [(rank + VIEWS_AHEAD * step, step, k) for step in range(len(cameras)) for rank, k in enumerate(order)]
+        ahead = MAPS.views_ahead
+        queue = [(rank + ahead * step, step, k) for step in range(len(cameras)) for rank, k in enumerate(order)]
         tried = [camera.near(one) if isinstance(camera, UnknownCamera) else camera for one in cameras]
         return [
             Place(view, view.points, tried[step])

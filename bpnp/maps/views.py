@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from bpnp.cameras import Camera
+from bpnp.search.config import MAPS, RANK, RankSettings
 
 Array = NDArray[np.float64]
 # A local feature is rarely detected far outside the directions of its track. In photos of five models, 95 % of the
 # detected points are seen from at most 22 degrees beyond these directions. Of the points that project into these photos
 # and are not detected, 21 to 85 % would be seen from more than 30 degrees beyond.
-MARGIN_DEG = 25.0  # margin beyond the directions of the track
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +63,8 @@ class Cones(NamedTuple):
 def viewing_cones(points3d: Array, views: Iterable[tuple[Array, NDArray[np.integer]]]) -> Cones:
     """Return the visibility cones of n points.
 
-    The axis is the mean direction to the cameras. The cone holds all of them with a margin of MARGIN_DEG. A point that
-    no view sees has a cone of all directions.
+    The axis is the mean direction to the cameras. The cone holds all of them with a margin of `MAPS.margin_deg`. A
+    point that no view sees has a cone of all directions.
 
     Args:
         points3d: (n, 3) scene points.
@@ -82,7 +82,7 @@ def viewing_cones(points3d: Array, views: Iterable[tuple[Array, NDArray[np.integ
     for centre, seen in tracks:
         cosine = (_directions(points3d[seen], centre) * axes[seen]).sum(-1)
         least[seen] = np.minimum(least[seen], cosine)
-    half = np.degrees(np.arccos(np.clip(least, -1, 1))) + MARGIN_DEG
+    half = np.degrees(np.arccos(np.clip(least, -1, 1))) + MAPS.margin_deg
     cosines = np.cos(np.radians(np.minimum(half, 180.0)))
     unseen = np.asarray(~sums.any(-1))
     return Cones(np.where(unseen[:, None], [0.0, 0, 1], axes), np.where(unseen, -1.0, cosines))
@@ -104,38 +104,6 @@ class Pictures(NamedTuple):
 
     contrasts: NDArray[np.float32]
     reaches: Array
-
-
-@dataclass(frozen=True)
-class RankSettings:
-    """Constants of the ranking of views.
-
-    Attributes:
-        cells: Cells along a side of a density image.
-        within: Fraction of the points within one unit, the reach of the points.
-        half: Half width of the density image, in units of the reach.
-        fine: Standard deviation of the narrow smoothing of the contrast, cells.
-        wide: Standard deviation of the wide smoothing of the contrast, cells.
-        shifts: Shifts of the photo along either axis, cells.
-        scales: Scale factors of the photo.
-        ratio: Largest ratio of the reaches of a view and of a photo with a known focal length.
-        apart: Least fraction of a view's points that no better view sees, for it to count as another place.
-    """
-
-    cells: int = 32
-    within: float = 0.9
-    half: float = 1.3
-    fine: float = 1.0
-    wide: float = 4.0
-    shifts: tuple[int, ...] = (-9, -6, -3, 0, 3, 6, 9)
-    scales: tuple[float, ...] = (0.7, 0.84, 1.0, 1.2, 1.4)
-    ratio: float = 1.6
-    apart: float = 0.5
-
-
-RANK = RankSettings()
-STEP = 1.25  # factor between successive focal lengths of a photo
-VIEWS_AHEAD = 4  # views that are tried with one focal length before the next one starts
 
 
 def pictures_of_views(points3d: Array, views: Sequence[View], rule: RankSettings = RANK) -> Pictures:

@@ -20,15 +20,8 @@ from bpnp.geometry import bearings, retract
 from bpnp.poses import MIN_POINTS
 from bpnp.robust.matches import Matches, distinct_triples, residuals, truncated_scores
 from bpnp.robust.minimal_solvers import poses_of_triples, take
+from bpnp.search.config import RANSAC
 
-SMALLEST_POOL = 16  # matches of largest weight, from which the first triples of a growing pool are drawn
-SUBSET = 512  # matches of largest weight, on which all hypotheses are scored; with 256, poses are lost at 10 % inliers
-SHORTLIST = 256  # hypotheses that are then scored on all matches
-REFINED = 16  # hypotheses that are refined locally on the subset
-LOCAL_STEPS, FINAL_STEPS = 4, 6  # Gauss-Newton steps of these, and of the best one on all matches
-DAMPING = 1e-9  # fraction of the Hessian's mean diagonal
-FEWEST = 25  # hypotheses of PoseLib; it ends after 3 times the number that has a true triple with probability 0.9999
-KEPT_SHARE = 0.9  # fraction of its inliers that OpenCV's refit must keep
 Array = NDArray[np.float64]
 # points2d (k, 2), points3d (k, 3), threshold, most hypotheses, seed -> pose [R | t] and hypotheses, None for no pose
 SingleEstimator = Callable[[Array, Array, float, int, int], tuple[Array, int] | None]
@@ -56,10 +49,10 @@ def consensus(
         Poses, and the number of hypotheses. The pose of a sample without one is arbitrary or NaN.
     """
     threshold2 = threshold**2
-    subset = Matches(*(values[:, :SUBSET] for values in matches))
+    subset = Matches(*(values[:, : RANSAC.subset] for values in matches))
     progress = (torch.arange(hypotheses, device=matches.real.device, dtype=torch.float64) + 0.5) / hypotheses
     last = matches.real.sum(-1, keepdim=True).clamp(min=3).double()
-    first = last.clamp(max=SMALLEST_POOL)
+    first = last.clamp(max=RANSAC.smallest_pool)
     triples = distinct_triples((first * (last / first) ** progress).ceil(), seed)
     # With fewer than three matches, a triple repeats one and has no pose.
     triples = triples.clamp(max=matches.real.shape[1] - 1).flatten(1)
@@ -67,14 +60,14 @@ def consensus(
         take(v, triples).unflatten(1, (hypotheses, 3)) for v in (bearings(matches.points2d), matches.points3d)
     )
     poses = poses_of_triples(rays, scene)
-    poses = _best(poses, truncated_scores(poses, subset, threshold2), SHORTLIST)
-    poses = _best(poses, truncated_scores(poses, matches, threshold2), REFINED)
-    poses = refine_locally(poses, subset, threshold2, LOCAL_STEPS)
+    poses = _best(poses, truncated_scores(poses, subset, threshold2), RANSAC.shortlist)
+    poses = _best(poses, truncated_scores(poses, matches, threshold2), RANSAC.refined)
+    poses = refine_locally(poses, subset, threshold2, RANSAC.local_steps)
     pose = _best(poses, truncated_scores(poses, matches, threshold2), 1)
-    pose = refine_locally(pose, matches, threshold2, FINAL_STEPS)
+    pose = refine_locally(pose, matches, threshold2, RANSAC.final_steps)
     squared, inlier, *_ = residuals(pose, matches, threshold2)
     median = torch.where(inlier, squared, torch.nan).nanmedian(-1).values.nan_to_num(threshold2)
-    pose = refine_locally(pose, matches, threshold2, FINAL_STEPS, cauchy=4 * median)
+    pose = refine_locally(pose, matches, threshold2, RANSAC.final_steps, cauchy=4 * median)
     return pose.squeeze(1), matches.real.sum(-1).fill_(hypotheses)
 
 
@@ -109,7 +102,7 @@ def refine_locally(
     scale = None if cauchy is None else cauchy.clamp(min=1e-24).unsqueeze(-1)
     best = poses
     lowest = torch.full(poses.shape[:2], torch.inf, dtype=poses.dtype, device=poses.device)
-    damping = DAMPING * torch.eye(6, dtype=poses.dtype, device=poses.device)
+    damping = RANSAC.damping * torch.eye(6, dtype=poses.dtype, device=poses.device)
     for _ in range(steps + 1):
         squared, inlier, residual, camera = residuals(poses, matches, threshold2)
         loss, weight = torch.where(inlier, squared, threshold2), inlier.to(squared.dtype)
@@ -167,7 +160,7 @@ def _poselib(x: Array, p: Array, threshold: float, max_iterations: int, seed: in
     options = {
         "max_reproj_error": threshold,
         "max_iterations": max_iterations,
-        "min_iterations": min(FEWEST, max_iterations),
+        "min_iterations": min(RANSAC.fewest, max_iterations),
         "progressive_sampling": True,
         "seed": seed,
     }
@@ -189,7 +182,7 @@ def _opencv(x: Array, p: Array, threshold: float, max_iterations: int, seed: int
         # EPnP has no unique solution for points of one plane: its result may be far from the RANSAC pose.
         x, p = x[inliers.ravel()], p[inliers.ravel()]
         kept = _count_inliers(pose, x, p, threshold)
-        if kept < KEPT_SHARE * len(x):
+        if kept < RANSAC.kept * len(x):
             ok, rotvec, translation = cv2.solvePnP(p, x, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP)
             other = np.column_stack([cv2.Rodrigues(rotvec)[0], translation])
             pose = other if ok and _count_inliers(other, x, p, threshold) > kept else pose

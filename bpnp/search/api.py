@@ -26,6 +26,7 @@ from bpnp.search.arguments import (
     seconds_from,
     source_from,
 )
+from bpnp.search.config import TIME
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.focal_length import solve_with_focal_length, unknown_camera
 from bpnp.search.inputs import problem_from
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
     import torch
 
 NO_RIG = "`scale=True` needs a `rig`: one camera does not determine the unit of a scene"
-SECONDS, SECONDS_OF_MANY = 10.0, 5.0  # default time limits per problem of `solve` and `solve_many`
 
 
 def solve(
@@ -154,7 +154,7 @@ def solve(
     }
     if scale and rig is None and not at_infinity:
         raise ValueError(NO_RIG)
-    seconds = seconds_from(time_limit, SECONDS)
+    seconds = seconds_from(time_limit, TIME.one)
     if at_infinity or rig is not None:
         solve_one = prepare_mode(
             points2d,
@@ -262,7 +262,7 @@ def solve_many(
     begun = Clock.now()
     images = each_set("points2d", points2d, None)
     count = len(images)
-    seconds = seconds_from(time_limit, SECONDS_OF_MANY)
+    seconds = seconds_from(time_limit, TIME.of_many)
     options = Options(
         None if at_infinity or rig is not None else source_from(solver),
         solver == "auto",

@@ -7,14 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bpnp.search.config import DEFAULT, MATCHES
 from bpnp.search.problem import Problem, faces
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
-FARTHEST = 4.0  # reach, in scales, within which a scene point may be the correspondence of an image point
-FEW_NEIGHBOURS, NEIGHBOURS = 8, 64  # nearest scene points of an image point: first try, and if all are in reach
-DENSE = 4096  # possible matches up to which all distances are computed
-OUTLIERS = 0.3  # expected fraction of image points without a correspondence
 
 
 def facing(problem: Problem, camera: Array, rotation: Array) -> Labels:
@@ -32,7 +29,7 @@ def facing(problem: Problem, camera: Array, rotation: Array) -> Labels:
 
 
 def possible_matches(
-    problem: Problem, seen: Array, places: Labels, chosen: Labels, scale: float, most: int = NEIGHBOURS
+    problem: Problem, seen: Array, places: Labels, chosen: Labels, scale: float, most: int = MATCHES.neighbours
 ) -> tuple[Any, Any, Array, Array]:
     """Return the possible matches of chosen image points and scene points near them.
 
@@ -50,14 +47,14 @@ def possible_matches(
         Index (k,) into `chosen`, index (k,) into `seen` and density (k,) of each match; and the total density (m,) of
         each image point, which includes that of no correspondence.
     """
-    bearings, reach = problem.bearings[chosen], FARTHEST * scale
-    if len(bearings) * len(seen) <= DENSE:
+    bearings, reach = problem.bearings[chosen], MATCHES.farthest * scale
+    if len(bearings) * len(seen) <= MATCHES.dense:
         squared = ((bearings[:, None] - seen) ** 2).sum(-1)
         i, j = np.nonzero(squared < reach**2)
         squared = squared[i, j]
     else:
         tree, counts = cKDTree(seen), range(1, min(most, len(seen)) + 1)
-        for count in (counts[:FEW_NEIGHBOURS][-1], counts[-1]):  # few are enough unless all of them are near
+        for count in (counts[: MATCHES.few_neighbours][-1], counts[-1]):  # few are enough unless all of them are near
             distance, nearest = tree.query(bearings, counts[:count], distance_upper_bound=reach)
             if count == len(counts) or not np.isfinite(distance[:, -1]).any():
                 break
@@ -73,8 +70,10 @@ def possible_matches(
         i, j, squared, odds = i[agree], j[agree], squared[agree], odds[agree]
         of_label = np.bincount(others + 1, minlength=int(label.max(initial=0)) + 2)
         candidates = np.where(label < 0, len(seen), of_label[label + 1] + of_label[0])
-    density = odds * np.exp(squared * (-0.5 / scale**2)) * (1 - OUTLIERS) / (candidates[i] * 2 * math.pi * scale**2)
-    every = np.bincount(i, density, len(bearings)) + OUTLIERS / problem.image.solid_angle
+    density = (
+        odds * np.exp(squared * (-0.5 / scale**2)) * (1 - DEFAULT.outliers) / (candidates[i] * 2 * math.pi * scale**2)
+    )
+    every = np.bincount(i, density, len(bearings)) + DEFAULT.outliers / problem.image.solid_angle
     return i, j, np.asarray(density, np.float64), np.asarray(every, np.float64)
 
 

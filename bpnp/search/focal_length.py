@@ -28,8 +28,7 @@ from bpnp.cameras import (
 from bpnp.poses import rotation_angle, same_pose
 from bpnp.runtime import Clock, one_blas_thread
 from bpnp.search.arguments import Array, checked_size
-from bpnp.search.config import DEFAULT as SEARCH
-from bpnp.search.config import OtherFocal
+from bpnp.search.config import DEFAULT, FOCAL, OtherFocal
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, UnknownFocal
@@ -44,54 +43,7 @@ from bpnp.search.verdict.uncertainty import is_within
 
 ProblemAt = Callable[[Camera, UnknownFocal], Problem]
 RADIAL_PLACES = {"SIMPLE_RADIAL": 3, "OPENCV": 4}  # index of the radial coefficient in the parameters of a camera model
-LEAST_REACH = 1e-3  # focal lengths
 AROUND = (1.0, OtherFocal.step, 1 / OtherFocal.step)  # focal lengths around one that has converged
-
-
-@dataclass(frozen=True)
-class FocalSettings:
-    """Constants of the search for a focal length.
-
-    Lengths in the image are relative to the larger image side, distortions to the distance from the principal point.
-
-    Attributes:
-        smallest: Least focal length that is tried: a field of view of 90 degrees.
-        largest: Largest focal length that is tried: a field of view of 19 degrees.
-        usual: Focal length that is tried first.
-        step: Factor between successive focal lengths, for many points.
-        step_few: Factor between successive focal lengths, for few points.
-        sigmas: Half width of the range of an approximate focal length, standard deviations.
-        turns: Iterations of the first search with each focal length.
-        alternations: Largest number of alternations of search and refinement from each focal length.
-        rounds: Largest number of iterations of a refinement.
-        same: Change of the logarithm of the focal length below which a refinement stops.
-        bends: Radial displacements at the image corner from which a fit of the distortion also starts. Started at zero
-            distortion, too few points match to reach a large one.
-        bend_sigma: Standard deviation of the radial displacement at the image corner by an unknown distortion.
-        most_bend: Largest radial displacement at the image corner.
-        fewest_bent: Least number of matches for a fit of the distortion.
-        centre_sigma: Standard deviation of the principal point, as a fraction of the distance to the image corner:
-            about a quarter of a per cent of the larger image side.
-    """
-
-    smallest: float = 0.5
-    largest: float = 3.0
-    usual: float = 1.0
-    step: float = 1.57
-    step_few: float = 1.25
-    sigmas: float = 3.0
-    turns: int = 8
-    alternations: int = 3
-    rounds: int = 12
-    same: float = 5e-4
-    bends: tuple[float, ...] = (-0.2, 0.2)
-    bend_sigma: float = 0.05
-    most_bend: float = OtherFocal.bend
-    fewest_bent: int = 24
-    centre_sigma: float = 0.004
-
-
-RULE = FocalSettings()
 
 
 class UnknownCamera(NamedTuple):
@@ -136,20 +88,20 @@ class UnknownCamera(NamedTuple):
 
     def outermost(self, zoom: float) -> float:
         """Return the reach in focal lengths of the camera with `zoom` times that of the reference."""
-        return max(self.reach / zoom, LEAST_REACH)
+        return max(self.reach / zoom, FOCAL.least_reach)
 
     def focal(self, camera: Camera) -> UnknownFocal:
         """Return the prior of the focal length and distortion of one of these cameras."""
         zoom, radial = self.parts(camera)
-        sigma = math.inf if radial is not None else RULE.bend_sigma if self.bends else 0.0
+        sigma = math.inf if radial is not None else FOCAL.bend_sigma if self.bends else 0.0
         return UnknownFocal(
             math.log(self.largest / self.smallest),
             self.sigma,
             math.log(zoom),
             radial or 0.0,
             radial_sigma=sigma / self.outermost(zoom) ** 2,
-            radial_range=0.0 if radial is None else 2 * RULE.most_bend / self.outermost(zoom) ** 2,
-            centre_sigma=RULE.centre_sigma * self.outermost(zoom),
+            radial_range=0.0 if radial is None else 2 * FOCAL.most_bend / self.outermost(zoom) ** 2,
+            centre_sigma=FOCAL.centre_sigma * self.outermost(zoom),
         )
 
     def focal_steps(self, step: float) -> list[Camera]:
@@ -205,9 +157,9 @@ def unknown_camera(
         reference = camera_from(("SIMPLE_PINHOLE", width, height, (max(width, height), width / 2, height / 2)))
         return UnknownCamera(
             reference,
-            RULE.smallest,
-            RULE.largest,
-            RULE.usual,
+            FOCAL.smallest,
+            FOCAL.largest,
+            FOCAL.usual,
             bends=True,
             distorted=bool(distortion),
             reach=math.hypot(width, height) / 2 / max(width, height),
@@ -218,7 +170,7 @@ def unknown_camera(
         )
     if focal_error is None or not 0 < focal_error < 1:
         raise ValueError(f"`focal_error` is {focal_error}; it is a fraction of the focal length, above 0 and below 1")
-    widest, lens = math.exp(RULE.sigmas * focal_error), camera_from(camera)
+    widest, lens = math.exp(FOCAL.sigmas * focal_error), camera_from(camera)
     if distortion and not is_pinhole(lens):
         raise ValueError(
             f"`distortion=True` needs a pinhole `camera`; the distortion of {camera_to_json(lens)} is known"
@@ -262,11 +214,11 @@ class FocalSweep(ABC):
     def sweep(self, *, few: bool) -> Solution:
         """Return the solution with the fewest false alarms; `few` is True for points that are enumerated."""
         most = self.options.settings.schedule.turns
-        for camera in (focal_steps := self.unknown.focal_steps(RULE.step_few if few else RULE.step)):
-            self.search_from(camera, min(RULE.turns, most), len(focal_steps))
+        for camera in (focal_steps := self.unknown.focal_steps(FOCAL.step_few if few else FOCAL.step)):
+            self.search_from(camera, min(FOCAL.turns, most), len(focal_steps))
             if self.best.verdict == "confident" and not few:
                 break
-        if self.best.verdict != "confident" and not few and most > RULE.turns and self.best.camera is not None:
+        if self.best.verdict != "confident" and not few and most > FOCAL.turns and self.best.camera is not None:
             self.search_from(self.best.camera, most, 1)
         return replace(self.contested(), seconds=Clock.now() - self.begun)
 
@@ -277,7 +229,7 @@ class FocalSweep(ABC):
     def search_from(self, camera: Camera, turns: int, steps: int) -> None:
         """Search with a camera, then with cameras that fit the found poses better."""
         found = self._search(camera, turns, steps)
-        for _ in range(RULE.alternations):
+        for _ in range(FOCAL.alternations):
             if found.verdict == "failed":
                 break
             better, settled = self._refined(found, camera)
@@ -304,14 +256,14 @@ class FocalSweep(ABC):
         fitted = self.refine(solution, camera, zooms)
         (zoom, radial), (before, old) = self.unknown.parts(fitted), self.unknown.parts(camera)
         bend = abs((radial or 0.0) - (old or 0.0)) * self.unknown.outermost(zoom) ** 2
-        return fitted, max(abs(math.log(zoom / before)), bend) < RULE.same
+        return fitted, max(abs(math.log(zoom / before)), bend) < FOCAL.same
 
     def contested(self) -> Solution:
         """Return the best solution, "ambiguous" if another focal length has a different pose that fits about as well.
 
         A pose within the uncertainty of the best solution does not count as different.
         """
-        best, rule = self.best, SEARCH.evidence
+        best, rule = self.best, DEFAULT.evidence
         if best.verdict != "confident":
             return best
         middle = np.median(best.points3d, 0)
@@ -350,7 +302,7 @@ def is_within_bound(solution: Solution, rotation: Array, zoom: float) -> bool:
 
     A rotation difference of more than `Contested.far` times the limit of the same pose is outside, whatever the bound.
     """
-    turn, rule = Rotation.from_matrix(rotation @ solution.rotation.T).as_rotvec(), SEARCH.evidence
+    turn, rule = Rotation.from_matrix(rotation @ solution.rotation.T).as_rotvec(), DEFAULT.evidence
     if math.degrees(float(np.linalg.norm(turn))) > rule.contested.far * rule.same.degrees:
         return False
     chosen = [solution.parameters.index(name) for name in (*ROTATION_PARAMETERS, FOCAL_LENGTH)]
@@ -402,12 +354,12 @@ def fit_camera(
         return min(fits, key=lambda one: one.log10_false_alarms)
 
     plain = fit([(each, None) for each in zooms])
-    if unknown.bends and min(len(plain.problem.bearings), len(plain.problem.points3d)) >= RULE.fewest_bent:
-        others = [] if radial is not None else [each / unknown.outermost(zoom) ** 2 for each in RULE.bends]
+    if unknown.bends and min(len(plain.problem.bearings), len(plain.problem.points3d)) >= FOCAL.fewest_bent:
+        others = [] if radial is not None else [each / unknown.outermost(zoom) ** 2 for each in FOCAL.bends]
         bent = fit([*((each, radial or 0.0) for each in zooms), *((1.0, each) for each in others)])
         matches = match_count(bent.poses)
-        lead = math.inf if unknown.distorted else math.log10(SEARCH.evidence.focal_chance)
-        if matches >= RULE.fewest_bent and bent.log10_false_alarms < plain.log10_false_alarms + lead:
+        lead = math.inf if unknown.distorted else math.log10(DEFAULT.evidence.focal_chance)
+        if matches >= FOCAL.fewest_bent and bent.log10_false_alarms < plain.log10_false_alarms + lead:
             return bent
     return plain
 
@@ -439,15 +391,15 @@ def _fit_track(
     middle = (rotation @ problem.middle + translation) * (1, 1, farther)
     translation = middle - rotation @ problem.middle
     end = _anneal_pose(problem, rotation, translation, scale, seed)
-    for _ in range(RULE.rounds):
+    for _ in range(FOCAL.rounds):
         pinhole = unknown.at(zoom)
         flat = problem if radial is None else problem_at(pinhole, unknown.focal(pinhole))
         middle = rotation @ flat.middle + translation
         fitted = fit_lens(flat, rotation, middle, scale, radial)
-        if fitted is None or not 1 / RULE.step < zoom * fitted.zoom / first < RULE.step:
+        if fitted is None or not 1 / FOCAL.step < zoom * fitted.zoom / first < FOCAL.step:
             break
         bend = abs((fitted.radial or 0.0) - (radial or 0.0)) * unknown.outermost(zoom) ** 2
-        if bend > RULE.most_bend:
+        if bend > FOCAL.most_bend:
             break
         zoom, radial, camera = zoom * fitted.zoom, fitted.radial, unknown.at(zoom * fitted.zoom, fitted.radial)
         problem = problem_at(camera, unknown.focal(camera))
@@ -455,11 +407,11 @@ def _fit_track(
         end = _anneal_pose(problem, rotation, fitted.middle - rotation @ problem.middle, scale, seed)
         rotation, scale = end.rotation[0], min(scale, float(end.scale[0]))
         translation = end.translation[0]
-        if max(abs(math.log(fitted.zoom)), bend) < RULE.same:
+        if max(abs(math.log(fitted.zoom)), bend) < FOCAL.same:
             break
     return FittedCamera(camera, problem, end)
 
 
 def _anneal_pose(problem: Problem, rotation: Array, translation: Array, scale: float, seed: int) -> Hypotheses:
-    scene = Scene(problem, seed, SEARCH)
+    scene = Scene(problem, seed, DEFAULT)
     return rank_poses(anneal_to_end(scene, rotation[None], translation[None], scale), problem)[:1]

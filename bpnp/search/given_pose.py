@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from bpnp.poses import rotation_angle
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
-from bpnp.search.config import DEFAULT, Evidence
+from bpnp.search.config import DEFAULT, PRECISION, PROBLEM, Evidence
 from bpnp.search.correspondences import score_pose
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.pose_model import log10_tests
-from bpnp.search.problem import SIGMAS, Problem, in_bulk
+from bpnp.search.problem import Problem, in_bulk
 from bpnp.search.propose.density_map import perturb_each
 from bpnp.search.propose.repetitions import competing_poses, registered
 from bpnp.search.propose.symmetries import mirror_pose
@@ -37,7 +37,6 @@ from bpnp.search.verdict.uncertainty import linearised, local_covariance
 
 Array = NDArray[np.float64]
 ONE_POSE = "only this pose and its competitors were tested, no better one was searched for"
-WITHIN = 22.5  # 99.9 % quantile of chi-squared with 6 degrees of freedom: distance of a given pose to its optimum
 
 
 @one_blas_thread
@@ -83,7 +82,9 @@ def judge_given_pose(
     if refine and better:
         scale = float(optimum.scale[0])
         distance = float(np.linalg.norm(rotation @ problem.middle + translation))
-        prior = PosePrior(rotation, translation, math.degrees(scale) / SIGMAS, scale * distance / SIGMAS)
+        prior = PosePrior(
+            rotation, translation, math.degrees(scale) / PROBLEM.sigmas, scale * distance / PROBLEM.sigmas
+        )
         near = replace(problem, prior=prior).log10_share(optimum.rotation[0], optimum.translation[0])
         one = replace(problem, log10_tried=max(log10_tests(problem) + near, 0.0))
         claim = optimum
@@ -95,7 +96,7 @@ def judge_given_pose(
     if result.verdict == "confident":
         result = replace(result, reason=f"{result.reason}; {ONE_POSE}")
     lead = float(claim.log10_false_alarms[0] - optimum.log10_false_alarms[0]) if better else 0.0
-    if not refine and result.verdict == "confident" and 2 * math.log(10) * lead > WITHIN:  # see Wilks 1938
+    if not refine and result.verdict == "confident" and 2 * math.log(10) * lead > PRECISION.far:  # see Wilks 1938
         off = math.degrees(rotation_angle(rotation, optimum.rotation[0]))
         result = result.add_objection(objection("better_nearby", lead, degrees=off))
     refined = refine and result.verdict == "confident"
@@ -155,7 +156,7 @@ def _is_same(problem: Problem, claim: Hypotheses, pose: Hypotheses, rule: Eviden
     vector = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
     middles = rotations @ problem.middle + translations
     step = np.r_[vector, middles[0] - middles[1]]
-    return bool(step @ np.linalg.solve(covariance, step) < WITHIN)
+    return bool(step @ np.linalg.solve(covariance, step) < PRECISION.far)
 
 
 def _of_claim(result: SearchResult, claim: Hypotheses) -> SearchResult:

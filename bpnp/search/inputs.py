@@ -19,10 +19,9 @@ from bpnp.search.arguments import (
     scene_points,
     unit_bearings,
 )
+from bpnp.search.config import INPUTS
 from bpnp.search.problem import Problem, Unit, UnknownFocal, units_per_radian
 from bpnp.search.starts import GravityPrior, PosePrior
-
-FLOOR_PIXELS = 0.1  # no point detector is more accurate
 
 
 def problem_from(
@@ -72,7 +71,7 @@ def problem_from(
         cosines3d=cosines3d,
         scores2d=checked_scores("scores2d", scores2d, len(image)),
         scores3d=checked_scores("scores3d", scores3d, len(scene)),
-        floor=None if camera is None else FLOOR_PIXELS / units_per_radian(plane[usable], unit, camera),
+        floor=None if camera is None else INPUTS.floor_pixels / units_per_radian(plane[usable], unit, camera),
         focal=focal,
         points2d=None if unit == "rad" else image,
         camera=camera,

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from bpnp.poses import MIN_POINTS
 from bpnp.search.arguments import Array, Labels
+from bpnp.search.config import MATCHES, PRECISION
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem
 from bpnp.search.refine.gauss_newton import ImageMatches, Iteration, image_equations, refine
@@ -21,13 +22,6 @@ from bpnp.search.verdict.decide import SearchResult
 from bpnp.search.verdict.uncertainty import linearised, pose_covariance
 
 Allowed = Callable[[Labels, Labels], NDArray[np.bool_]]
-DENSE = 4096  # largest number of possible matches that are all compared
-NEIGHBOURS = 8  # candidate matches of a point; there are more only if the radius is far too large
-SCALES = 3.0  # default inlier threshold, in scales of the residuals
-FIT_ROUNDS = 5
-DAMPING, MOST_STEPS = 1e-3, 50  # first damping of Levenberg and Marquardt, and steps
-EXACT = 1e-12  # relative change of a pose, and of the sum of squares, that ends the steps
-SIGNIFICANT = 22.5  # chi-squared with 6 degrees of freedom, one in a thousand
 
 
 def finished(problem: Problem, result: SearchResult, seconds: float, inlier_threshold: float | None) -> Solution:
@@ -44,7 +38,7 @@ def finished(problem: Problem, result: SearchResult, seconds: float, inlier_thre
     if not len(found):
         reason = _note_duplicates(problem, result)
         return failed_solution(problem, reason, inlier_threshold, seconds, code=result.code)
-    threshold = inlier_threshold or SCALES * result.residual * problem.per_radian
+    threshold = inlier_threshold or MATCHES.reach * result.residual * problem.per_radian
     poses = list(zip(found.rotation, found.translation, strict=True))
     if result.batches:  # an enumerated pose is a least-squares fit in float64 already
         poses[0] = _fitted(problem, *poses[0], threshold)
@@ -75,7 +69,7 @@ def finished(problem: Problem, result: SearchResult, seconds: float, inlier_thre
 
 def _note_duplicates(problem: Problem, result: SearchResult) -> str:
     """Return the reason of a verdict, with the number of duplicate points unless the verdict is "confident"."""
-    if result.verdict == "confident" or len(problem.points3d) > DENSE:
+    if result.verdict == "confident" or len(problem.points3d) > MATCHES.dense:
         return result.reason
     sides = {"image": problem.image_points, "scene": problem.points3d}
     counts = {side: len(points) - len(np.unique(points, axis=0)) for side, points in sides.items()}
@@ -132,7 +126,7 @@ def _fitted(problem: Problem, rotation: Array, translation: Array, threshold: fl
     sum of n squared residuals, is distributed as chi-squared with 6 degrees of freedom.
     """
     image = problem.image_points
-    for _ in range(FIT_ROUNDS):
+    for _ in range(MATCHES.fit_rounds):
         seen = problem.project_scene(rotation, translation)
         i, j = mutual_nearest(image, seen, threshold, problem.may_match).T
         if len(i) < MIN_POINTS:
@@ -141,7 +135,7 @@ def _fitted(problem: Problem, rotation: Array, translation: Array, threshold: fl
         trial = fit_pose(problem.project, points, target, rotation, translation, scale=threshold)
         after = problem.project(points @ trial[0].T + trial[1])
         squares = [float(((each - target) ** 2).sum()) for each in (seen[j], after)]
-        if not squares[0] > squares[1] * math.exp(SIGNIFICANT / target.size):
+        if not squares[0] > squares[1] * math.exp(PRECISION.far / target.size):
             break
         rotation, translation = trial
     return rotation, translation
@@ -152,8 +146,8 @@ def one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed |
 
     The matches (i, j) satisfy |image_i - projected_j| <= radius, and no point is in two of them. Among the maximum
     matchings it has the least sum of squared distances. It is a minimum-weight matching in which an unmatched image
-    point costs more than all distances together. With many points only the `NEIGHBOURS` nearest neighbours of each are
-    edges.
+    point costs more than all distances together. With many points only the `MATCHES.few_neighbours` nearest neighbours
+    of each are edges.
 
     Args:
         image: (m, 2) image points.
@@ -232,23 +226,26 @@ def fit_pose(
 
     def settled(last: Iteration) -> bool:
         return bool(
-            (np.abs(last.step) <= EXACT * relative).all() or np.abs(last.gain) <= EXACT * np.asarray(last.before.cost)
+            (np.abs(last.step) <= MATCHES.exact * relative).all()
+            or np.abs(last.gain) <= MATCHES.exact * np.asarray(last.before.cost)
         )
 
     linearise = image_equations(model, [ImageMatches(project, points, target)], lost=1e3 * scale)
-    end = refine(model, state, linearise, [scale] * MOST_STEPS, settled=settled, damping=DAMPING, adaptive=True)
+    end = refine(
+        model, state, linearise, [scale] * MATCHES.most_steps, settled=settled, damping=MATCHES.damping, adaptive=True
+    )
     return model.pose(end.state)
 
 
 def _near(image: Array, projected: Array, radius: float, allowed: Allowed | None) -> tuple[Labels, Array]:
     """Return the allowed matches (e, 2) within `radius`, ordered, and their distances; nearest neighbours if many."""
     seen = np.flatnonzero(np.isfinite(projected).all(-1))
-    if len(image) * len(seen) <= DENSE:
+    if len(image) * len(seen) <= MATCHES.dense:
         distance = np.sqrt(((image[:, None] - projected[seen]) ** 2).sum(-1))
         matches = np.argwhere(distance <= radius)
     else:
         both = _neighbours(image, projected[seen], radius)
-        if np.bincount(both[:, 0]).max(initial=0) == NEIGHBOURS:  # there may be more
+        if np.bincount(both[:, 0]).max(initial=0) == MATCHES.few_neighbours:  # there may be more
             both = np.concatenate([both, _neighbours(projected[seen], image, radius)[:, ::-1]])
         # One number per match: sorting unique rows as records takes ten times as long.
         matches = np.stack(np.divmod(np.unique(both[:, 0] * len(seen) + both[:, 1]), len(seen)), -1)
@@ -259,7 +256,7 @@ def _near(image: Array, projected: Array, radius: float, allowed: Allowed | None
 
 def _neighbours(points: Array, others: Array, radius: float) -> Labels:
     """Return the indices (e, 2) of each point and of its nearest neighbours within `radius`."""
-    count = min(NEIGHBOURS, len(others))
+    count = min(MATCHES.few_neighbours, len(others))
     distance, index = cKDTree(others).query(points, range(1, count + 1), distance_upper_bound=radius)
     point, nth = np.nonzero(np.isfinite(distance))
     return np.stack([point, index[point, nth]], -1)

@@ -36,14 +36,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bpnp.search.config import REFINER
 from bpnp.search.problem import Problem, UnknownFocal, label_groups
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
 Extrinsics = tuple[Array, Array]
-LEAST_SLOPE = 0.2  # smallest derivative of the seen by the true radius at which a point is visible
-UNDISTORTED = 20  # Newton steps
 FIXING_ROTATION = 2  # matches that fix a rotation
 
 
@@ -366,7 +365,7 @@ class PoseModel:
             return np.broadcast_to(zoom, camera.shape[:-1])
         ahead = camera[..., 2] > 0
         squared = (camera[..., :2] ** 2).sum(-1) / np.where(ahead, camera[..., 2], np.inf) ** 2
-        visible = ahead & (1 + 3 * state.radial * squared > LEAST_SLOPE)
+        visible = ahead & (1 + 3 * state.radial * squared > REFINER.least_slope)
         stretch = np.where(visible, zoom * (1 + state.radial * squared), np.nan)
         if lens.radial:
             radius = stretch * np.sqrt(squared)
@@ -432,10 +431,10 @@ def true_radius(radius: Array, radial: float) -> Array:
     Returns:
         (...) r, at most the largest radius of the camera model.
     """
-    most = math.sqrt((1 - LEAST_SLOPE) / (-3 * radial)) if radial < 0 else math.inf
+    most = math.sqrt((1 - REFINER.least_slope) / (-3 * radial)) if radial < 0 else math.inf
     true = np.minimum(radius, most)
-    for _ in range(UNDISTORTED):
-        slope = np.maximum(1 + 3 * radial * true**2, LEAST_SLOPE)
+    for _ in range(REFINER.undistorted):
+        slope = np.maximum(1 + 3 * radial * true**2, REFINER.least_slope)
         true = np.clip(true - (true * (1 + radial * true**2) - radius) / slope, 0.0, most)
     return np.asarray(true)
 
@@ -444,7 +443,7 @@ def _radii(seen: Array, radial: float) -> tuple[Array, Array]:
     """Return |x'|^2 (...) of directions (..., 3), 0 behind the camera, and the derivative of the image radius."""
     ahead = seen[..., 2] > 0
     squared = (seen[..., :2] ** 2).sum(-1) / np.where(ahead, seen[..., 2], 1.0) ** 2 * ahead
-    return squared, np.maximum(1 + 3 * radial * squared, LEAST_SLOPE)
+    return squared, np.maximum(1 + 3 * radial * squared, REFINER.least_slope)
 
 
 def _outwards(seen: Array) -> Array:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from bpnp.cameras import Camera, in_front
 from bpnp.poses import MIN_POINTS, SAME, Tolerance, rotation_angle, same_pose
+from bpnp.search.config import PROBLEM
 from bpnp.search.image_statistics import ImageStatistics
 from bpnp.search.propose.symmetries import Motions
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
@@ -21,16 +22,6 @@ from bpnp.search.starts import GravityPrior, PosePrior, Prior
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
 Unit = Literal["px", "normalised", "rad"]
-BULK = 20.0  # median distances from the median; farther scene points do not affect the origin and the unit
-TURNED_DEG = 5.0  # largest standard deviation, degrees, of a rotation prior with which two matches fix a pose
-RADIUS = 3e-3  # radius of a match, radians, if the pixel size is unknown
-FLOORS = 30.0  # radius of a match in noise floors: 3 pixels if the floor is a tenth of a pixel
-TILTED = 2.0  # largest motion of image points by the tilt, in match radii, with which two matches fix a pose
-SIGMAS = 2.0  # standard deviations of a prior within which all poses count as equally near
-LOG_DEPTHS = math.log(30.0)  # logarithm of the farthest over the nearest possible distance of a scene
-PAIRS_A_POINT = 32  # largest number of pairs per point for which every pair is computed
-LIKELY = 0.1  # least likelihood of a possible match by its classes, relative to a mean match
-FLAT = 1e-6  # largest second extent of a line as a fraction of the first, in float32
 OF_IMAGE = "bearings", "labels2d", "scores2d", "odds2d", "points2d"  # fields with one row per image point
 OF_SCENE = "points3d", "normals3d", "labels3d", "cosines3d", "scores3d", "classes3d"  # one row per scene point
 
@@ -255,7 +246,7 @@ class Problem:
     def may_match(self, i: Labels, j: Labels) -> NDArray[np.bool_]:
         """Return a mask (k,) of pairs i, j (k,) of image and scene points that their labels or classes admit."""
         if self.odds2d is not None and self.classes3d is not None:
-            return np.asarray((self.odds2d[i] * self.classes3d[j]).sum(-1) > LIKELY)
+            return np.asarray((self.odds2d[i] * self.classes3d[j]).sum(-1) > PROBLEM.likely)
         if self.labels2d is None or self.labels3d is None:
             return np.ones(len(i), np.bool_)
         label2d, label3d = self.labels2d[i], self.labels3d[j]
@@ -286,7 +277,7 @@ class Problem:
             return None
         chosen, n = self.image.chosen, len(self.points3d)
         groups = label_groups(chosen, self.labels2d, self.labels3d, n)
-        if sum(len(rows) * len(columns) for rows, columns in groups) > PAIRS_A_POINT * (len(chosen) + n):
+        if sum(len(rows) * len(columns) for rows, columns in groups) > PROBLEM.pairs_a_point * (len(chosen) + n):
             return None
         i = [np.repeat(rows, len(columns)) for rows, columns in groups]
         j = [np.tile(columns, len(rows)) for rows, columns in groups]
@@ -329,14 +320,14 @@ class Problem:
     @property
     def has_known_rotation(self) -> bool:
         """True if a prior has the rotation to 5 degrees: a half turn then has 10^3.5 times the false alarms."""
-        return isinstance(self.prior, PosePrior) and self.prior.rotation_sigma_deg <= TURNED_DEG
+        return isinstance(self.prior, PosePrior) and self.prior.rotation_sigma_deg <= PROBLEM.turned_deg
 
     @property
     def match_radius(self) -> float:
         """Largest residual of a match in an enumeration, radians: `radius`, or 3 pixels if the pixel size is known."""
         if self.radius is not None:
             return self.radius
-        return RADIUS if self.floor is None else FLOORS * self.floor
+        return PROBLEM.radius if self.floor is None else PROBLEM.floors * self.floor
 
     @property
     def has_known_vertical(self) -> bool:
@@ -348,7 +339,7 @@ class Problem:
             return False
         if min(len(self.bearings), len(self.points3d)) == 3:
             return True
-        return math.radians(self.prior.sigma_deg) * self.image.spread <= TILTED * self.match_radius
+        return math.radians(self.prior.sigma_deg) * self.image.spread <= PROBLEM.tilted * self.match_radius
 
     @property
     def fixing_matches(self) -> int:
@@ -376,17 +367,19 @@ class Problem:
             up = rotation @ self.prior.directions()[1]
             camera = np.asarray(self.prior.up_camera, np.float64)
             off = math.atan2(float(np.linalg.norm(np.cross(up, camera))), float(up @ camera))
-            off = min(max(off, math.radians(SIGMAS * self.prior.sigma_deg)), math.pi)
+            off = min(max(off, math.radians(PROBLEM.sigmas * self.prior.sigma_deg)), math.pi)
             return math.log10(max((1 - math.cos(off)) / 2, 1e-12))
         known = np.asarray(self.prior.rotation, np.float64)
-        off = min(max(rotation_angle(rotation, known), math.radians(SIGMAS * self.prior.rotation_sigma_deg)), math.pi)
+        within = math.radians(PROBLEM.sigmas * self.prior.rotation_sigma_deg)
+        off = min(max(rotation_angle(rotation, known), within), math.pi)
         share = max((off - math.sin(off)) / math.pi, 1e-15)
         if self.prior.translation is not None and math.isfinite(self.prior.translation_sigma):
             expected = known @ self.middle + np.asarray(self.prior.translation)
             distance = max(float(np.linalg.norm(expected)), 1e-12)
             shift = float(np.linalg.norm(rotation @ self.middle + translation - expected))
-            relative = max(shift, SIGMAS * self.prior.translation_sigma) / distance
-            share *= min(1.0, math.pi * relative**2 / self.image.solid_angle) * min(1.0, 2 * relative / LOG_DEPTHS)
+            relative = max(shift, PROBLEM.sigmas * self.prior.translation_sigma) / distance
+            across = min(1.0, math.pi * relative**2 / self.image.solid_angle)
+            share *= across * min(1.0, 2 * relative / PROBLEM.log_depths)
         return math.log10(share)
 
 
@@ -434,9 +427,9 @@ def label_groups(
 
 
 def in_bulk(points3d: Array) -> NDArray[np.bool_]:
-    """Return a mask of the points (n, 3) that are within `BULK` median distances of the median."""
+    """Return a mask of the points (n, 3) that are within `PROBLEM.bulk` median distances of the median."""
     distance = np.linalg.norm(points3d - np.median(points3d, 0), axis=-1)
-    return np.asarray(distance <= BULK * float(np.median(distance)))
+    return np.asarray(distance <= PROBLEM.bulk * float(np.median(distance)))
 
 
 def units_per_radian(points2d: Array, unit: Unit, camera: Camera | None) -> float:
@@ -468,6 +461,6 @@ def why_degenerate(bearings: Array, points3d: Array, fewest: int = MIN_POINTS) -
         if count < fewest:
             return f"only {count} different {name} point{'s' if count > 1 else ''}: {fewest} or more fix a pose"
     extents = np.linalg.svd(points3d - points3d.mean(0), compute_uv=False)
-    if extents[1] <= FLAT * extents[0]:
+    if extents[1] <= PROBLEM.line * extents[0]:
         return "the 3D points lie on one line: the camera can turn about it"
     return None

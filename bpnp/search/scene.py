@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.poses import MIN_POINTS
 from bpnp.runtime import NEVER, Deadline
-from bpnp.search.config import DensityShape, SearchSettings
+from bpnp.search.config import PROBLEM, DensityShape, SearchSettings
 from bpnp.search.kernels.density_map import DensityMap
 from bpnp.search.kernels.sides import (
     FORWARD,
@@ -26,8 +26,6 @@ from bpnp.search.problem import Problem, in_bulk
 from bpnp.search.starts import Array, GravityPrior, Prior, turned_to
 
 Sides = tuple[WeightedBearings, WeightedPoints]
-SHIFT_ALONG = 5.0  # weight of a shift along the view over one across it, per RMS angular radius; at most 1
-ON_A_LINE = 1e-6  # second singular value over the first, below which points lie on a line
 
 
 class Companion(NamedTuple):
@@ -85,7 +83,7 @@ class Scene:
         self.seen = side_of(self.points3d, problem.scores3d, problem.labels3d, problem.cones3d, order)
         self.image, self.seen = with_partners(self.image, self.seen), with_partners(self.seen, self.image)
         self.spread, self.solid_angle = problem.image.spread, problem.image.solid_angle
-        self.shift_weight = np.array([1, 1, min(1, SHIFT_ALONG * self.spread)], np.float32)
+        self.shift_weight = np.array([1, 1, min(1, PROBLEM.shift_along * self.spread)], np.float32)
         fine = settings.fine
         floor = math.inf if problem.floor is None else problem.floor
         self.smallest_scale = min(fine.smallest_scale, fine.relative_smallest * self.spread, floor)
@@ -174,4 +172,4 @@ def degenerate(points: NDArray[np.float64]) -> bool:
         return True
     values = np.linalg.svd(points - points.mean(0), compute_uv=False)
     extent = max(float(np.abs(points).max()), float(values[0]))
-    return bool(values[0] <= 1e-9 * extent or values[1] <= ON_A_LINE * values[0])
+    return bool(values[0] <= 1e-9 * extent or values[1] <= PROBLEM.line * values[0])

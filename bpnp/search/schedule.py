@@ -38,7 +38,6 @@ from bpnp.search.verdict.completeness import far_missed, near_missed
 from bpnp.search.verdict.decide import count_starts, is_symmetric
 
 Proposals = Callable[[], tuple[NDArray[np.float64], NDArray[np.float64]]]  # rotations (s, 3, 3), translations (s, 3)
-PROPOSED_AFTER = 4  # steps near a prior after which proposals are requested
 
 
 @dataclass
@@ -179,7 +178,7 @@ class Plan:
         scene, number = self.pool.scene, self.taken_near - self.asked_near
         undecided = self.pool.alarms > scene.settings.evidence.false_alarms
         self.taken_near += 1
-        if number == PROPOSED_AFTER and self.proposals is not None and undecided:
+        if number == scene.settings.schedule.proposed_after and self.proposals is not None and undecided:
             self.asked_near = True
             return Step(self._take_proposals())
         if number % 2:

@@ -29,8 +29,6 @@ from bpnp.search.settle import SceneOf, settle
 from bpnp.search.starts import Prior
 from bpnp.search.verdict.decide import SearchResult, degenerate_points, judge, no_pose
 
-WARMING = 8  # number of points of the problem that compiles the loops
-
 
 @one_blas_thread
 def search_poses(
@@ -141,16 +139,16 @@ def warm_up() -> None:
 
     A tracker calls it before its first frame, since loops cached on disk are still loaded at their first call.
     """
-    points = np.random.default_rng(0).uniform(-1, 1, (WARMING, 3))
+    points = np.random.default_rng(0).uniform(-1, 1, (DEFAULT.warming, 3))
     rays = points + (0, 0, 6)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     problem = Problem(rays, points)
     enumerate_poses(problem)
     p3p_poses(rays[None, :3], points[None, :3])
     self_motions(points, 0.1)
-    search_rotation(Problem(rays, rays), np.full(WARMING, 1e-3))
+    search_rotation(Problem(rays, rays), np.full(DEFAULT.warming, 1e-3))
     scene = Scene(problem, 0, DEFAULT)
     start = Hypotheses.from_poses(*scene.enter(np.eye(3)[None], np.array([[0, 0, 6.0]])))
     run_batch(scene, start)
     local_searches = DEFAULT.local.density_map, DEFAULT.local.narrowing.first_scale
-    preselect(scene, start, *local_searches, WARMING, 1)
+    preselect(scene, start, *local_searches, DEFAULT.warming, 1)

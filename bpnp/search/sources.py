@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from bpnp.runtime import Clock, Deadline
 from bpnp.search.arguments import Array
-from bpnp.search.config import DEFAULT, SearchSettings
+from bpnp.search.config import DEFAULT, NETWORKS, TIME, SearchSettings
 from bpnp.search.enumeration.search import exceeds_enumeration
 from bpnp.search.matching import failed_solution, finished
 from bpnp.search.problem import Problem
@@ -23,11 +23,8 @@ if TYPE_CHECKING:
     import torch
 
 Progress = Callable[[int, int, float], None]  # problem index, batches of initial poses so far, seconds
-TOGETHER = 2**26  # largest assignment matrix, 2D points x 3D points, of a batch on a GPU
 VIEW_MATCHER, SCENE_MATCHER = "matcher-maps", "matcher-sfm"  # packaged weights for the frames "view" and "any"
-MOST_CELLS = 2**22  # largest assignment matrix of a packaged matcher, 2D points x 3D points: seconds
 # Seconds, and seconds per 2D or 3D point, of verdict and matching after the search; at most half of a limit.
-ENDING, ENDING_A_POINT = 4e-3, 8e-6
 
 
 class Options(NamedTuple):
@@ -72,7 +69,7 @@ class Options(NamedTuple):
         """Return when the search of a problem that starts now has to stop, so that verdict and matching end in time."""
         begun = Clock.now()
         end = min(self.until.at, Deadline.after(self.time_limit).at)
-        ending = ENDING + ENDING_A_POINT * (len(problem.bearings) + len(problem.points3d))
+        ending = TIME.ending + TIME.ending_a_point * (len(problem.bearings) + len(problem.points3d))
         return Deadline(max(end - ending, (begun + end) / 2))
 
 
@@ -140,7 +137,7 @@ def _proposals_of_matcher(problem: Problem, seed: int) -> Proposals | None:
     undecided.
     """
     weights = VIEW_MATCHER if isinstance(problem.prior, PosePrior) else SCENE_MATCHER
-    too_many = len(problem.bearings) * len(problem.points3d) > MOST_CELLS
+    too_many = len(problem.bearings) * len(problem.points3d) > NETWORKS.most_cells
     if weights == SCENE_MATCHER and (too_many or problem.prior is not None or problem.network is not None):
         return None
 
@@ -179,7 +176,7 @@ def _by_module(
                 progress=options.progress_of(i),
             )
             yield i, finished(problem, result, time.perf_counter() - start, options.inlier_threshold)
-        elif groups and device_of(net).type != "cpu" and cells[i] * (len(groups[-1]) + 1) <= TOGETHER:
+        elif groups and device_of(net).type != "cpu" and cells[i] * (len(groups[-1]) + 1) <= NETWORKS.together:
             groups[-1].append(i)
         else:
             groups.append([i])

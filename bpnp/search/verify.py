@@ -12,6 +12,7 @@ from bpnp.argument_types import ArrayLike, PointsLike
 from bpnp.cameras import CameraLike, camera_from
 from bpnp.runtime import Deadline
 from bpnp.search.arguments import Array, Labels, checked_pose, checked_seed, numbers, positive, seconds_from
+from bpnp.search.config import TIME
 from bpnp.search.given_pose import judge_given_pose
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.inputs import problem_from
@@ -21,8 +22,6 @@ from bpnp.search.solution import Solution
 from bpnp.search.verdict.decide import match_count
 from bpnp.search.verdict.reasons import objection
 from bpnp.search.verdict.uncertainty import linearised, pose_covariance
-
-SECONDS = 10.0
 
 
 def verify(
@@ -88,7 +87,7 @@ def verify(
     >>> bpnp.verify(image, scene, np.eye(3), [0, 1, 6]).verdict
     'failed'
     """
-    limit = seconds_from(time_limit, SECONDS)
+    limit = seconds_from(time_limit, TIME.one)
     threshold = positive("inlier_threshold", inlier_threshold, finite=True)
     pose = checked_pose("", rotation, translation)
     problem = problem_from(
@@ -124,7 +123,7 @@ def verify_problem(
     refine: bool = True,
     inlier_threshold: float | None = None,
     seed: int = 0,
-    time_limit: float = SECONDS,
+    time_limit: float = TIME.one,
 ) -> Solution:
     """Verify a pose of a problem whose points have been checked; see `verify`.
 

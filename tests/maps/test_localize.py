@@ -23,6 +23,7 @@ from bpnp.maps import localize
 from bpnp.maps.all_points import judge_on_all_points, refine_on_all_points
 from bpnp.maps.localize import BRIEF
 from bpnp.maps.photo_problem import Photo
+from bpnp.search.config import MAPS, TIME
 from bpnp.search.verdict.decide import SearchResult, judge
 from bpnp.search.verdict.false_alarms import alarms_of
 from bpnp.search.verdict.reasons import Objection, objection
@@ -125,7 +126,7 @@ def test_the_default_time_limit_warns_where_there_was_none(
     planted: tuple[SceneMap, Planted], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene, truth = planted
-    monkeypatch.setattr("bpnp.maps.scene_map.SECONDS", 1e-9)
+    monkeypatch.setattr("bpnp.maps.scene_map.TIME", replace(TIME, photo=1e-9))
     noise = np.random.default_rng(0).uniform((0, 0), (800, 600), (90, 2))
     with pytest.warns(DeprecationWarning, match="`time_limit=math.inf` is no limit"):
         assert "1 of 3 views" in scene.localize(noise, PINHOLE, solver="search").reason
@@ -139,7 +140,8 @@ def test_the_warning_of_the_default_time_limit_reaches_a_script(tmp_path: Path) 
     plant_model(tmp_path / "map", camera=PINHOLE, images=3, points=140, seen=90)
     script = tmp_path / "script.py"
     script.write_text(
-        "import numpy as np\nfrom bpnp import SceneMap\nfrom bpnp.maps import scene_map\nscene_map.SECONDS = 1e-9\n"
+        "import numpy as np\nfrom bpnp import SceneMap\nfrom bpnp.maps import scene_map\n"
+        "scene_map.TIME = type(scene_map.TIME)(photo=1e-9)\n"
         f"scene, noise = SceneMap.from_colmap({str(tmp_path / 'map')!r}), np.random.default_rng(0).random((90, 2))\n"
         f"scene.localize(noise * (800, 600), {PINHOLE!r}, solver='search')\n"
     )
@@ -204,7 +206,7 @@ def test_only_strong_keypoints_are_tried_and_matches_are_among_all_of_them(
     scene, truth = planted
     keypoints, ids = photo_of(truth, 1)
     scores = (ids > 0).astype(float)
-    monkeypatch.setattr("bpnp.maps.localize.MOST_KEYPOINTS", 90)
+    monkeypatch.setattr("bpnp.maps.localize.MAPS", replace(MAPS, most_keypoints=90))
     shuffled = np.random.default_rng(0).permutation(len(ids))
     solution = scene.localize(keypoints[shuffled], PINHOLE, views=["photo 1.jpg"], scores=scores[shuffled])
     assert_right(solution, truth, 1, ids[shuffled])

@@ -4,6 +4,7 @@ import shutil
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from planted_model import OPENCV, Planted, plant_model
 from bpnp import SceneMap
 from bpnp.maps import index, scene_map
 from bpnp.maps.many_photos import read_views
+from bpnp.search.config import MAPS
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +51,7 @@ def test_a_large_map_is_indexed_once(tmp_path: Path, monkeypatch: pytest.MonkeyP
     files = sorted(folder.iterdir())
     SceneMap.from_colmap(folder)
     assert not (tmp_path / "cache").exists()
-    monkeypatch.setattr(index, "LARGE", 10)
+    monkeypatch.setattr(scene_map, "MAPS", replace(MAPS, indexed=10))
     first = SceneMap.from_colmap(folder)
     assert sorted(folder.iterdir()) == files
     with monkeypatch.context() as without_model:

@@ -1,6 +1,7 @@
 """`bpnp.verify`: planted poses that are right, a little off, far off, mirrored, or of points that have none."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from planted import degrees_between, seen, view_with_outliers
 from scipy.spatial.transform import Rotation
 
 import bpnp
+from bpnp.search.config import PROBLEM
 
 
 @pytest.fixture(scope="module")
@@ -209,6 +211,6 @@ def test_thousands_of_matches_are_judged_as_labels_of_one_pair_each(monkeypatch:
     labels2d, labels3d = np.arange(60) % 7 - 1, np.arange(60) % 9 - 1
     poses = rotation[None], translation[None]
     together = alarms_of(Problem(bearings, points, labels2d=labels2d, labels3d=labels3d), *poses).own
-    monkeypatch.setattr(problem, "PAIRS_A_POINT", 0)
+    monkeypatch.setattr(problem, "PROBLEM", replace(PROBLEM, pairs_a_point=0))
     one_by_one = alarms_of(Problem(bearings, points, labels2d=labels2d, labels3d=labels3d), *poses).own
     assert together == pytest.approx(one_by_one, rel=1e-6)

@@ -24,8 +24,6 @@ from bpnp.search.settle import SceneOf, settle
 from bpnp.search.starts import GravityPrior
 from bpnp.search.verdict.decide import REFINED, SearchResult, add_false_alarms, is_certain, judge, rank_poses
 
-SMALLEST = 1e-5  # smallest scale of the residuals if the pixel size is unknown, radians
-
 
 class EnumeratedPoses:
     """Poses of few points that enumerations have found so far.
@@ -79,7 +77,7 @@ class EnumeratedPoses:
         leader = self.found[:1]
         self._leaders.append(leader)
         pose, rule = (leader.rotation[0], leader.translation[0]), self.settings.evidence
-        scale = max(float(leader.scale[0]), self.problem.floor or SMALLEST)
+        scale = max(float(leader.scale[0]), self.problem.floor or ENUMERATION.smallest_scale)
         motions = registered(self.problem, *pose, scale, rule)
         for one in zip(*competing_poses(self.problem, *pose, motions, rule), strict=True):
             self.run.propose(*one, self.run.reach)
@@ -120,7 +118,7 @@ class EnumeratedPoses:
         if poses.evidence is None or not len(poses):
             return poses
         poses = poses[poses.evidence >= poses.evidence.max() - ENUMERATION.near_nats][: self.settings.kept]
-        scale = np.maximum(poses.scale, self.problem.floor or SMALLEST)
+        scale = np.maximum(poses.scale, self.problem.floor or ENUMERATION.smallest_scale)
         each = zip(poses.rotation, poses.translation, scale, strict=True)
         likelihood = np.array([score_pose(self.problem, *one)[0] for one in each])
         return replace(poses, scale=scale, log_likelihood=likelihood)

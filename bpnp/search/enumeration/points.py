@@ -8,18 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.search.config import RULES, EnumerationSettings
+from bpnp.search.config import ENUMERATION, RULES, EnumerationSettings
 from bpnp.search.problem import Problem
 from bpnp.search.propose.minimal_solvers import Triangles, triangles_of
 from bpnp.search.starts import GravityPrior, PosePrior, Prior, turned_to
 
 Array = NDArray[np.float64]
 Places = NDArray[np.int64]
-DENSE = 64  # points up to which all neighbours are ranked; beyond, only the nearest of each
-OPPOSITE = -0.8  # cosine of two normals that no camera faces at once
-SCENES = 8  # scenes whose tables stay in the cache
-SLACK = math.cos(math.radians(95.0))  # the lines of sight to three points are not quite parallel
-EDGE_ON = 0.15  # sine of an angle to the triangle's plane, below which either orientation is possible
 
 
 class SceneArrays(NamedTuple):
@@ -181,7 +176,7 @@ def scene_side(points3d: Array, normals3d: Array | None, labels3d: Places | None
     )
 
 
-@functools.lru_cache(maxsize=SCENES)
+@functools.lru_cache(maxsize=ENUMERATION.scenes)
 def _remembered(points3d: bytes, normals3d: bytes | None, labels3d: bytes | None) -> SceneSide:
     """Build a scene from the bytes of its arrays, which are the key of the cache."""
     return SceneSide(
@@ -201,14 +196,14 @@ def nearest_of(points: Array, normals: Array) -> Places:
         normals: (n, 3), or (0, 3) for none.
     """
     n = len(points)
-    if n > DENSE:
-        order = cKDTree(points).query(points, DENSE)[1]
+    if n > ENUMERATION.ranked:
+        order = cKDTree(points).query(points, ENUMERATION.ranked)[1]
         itself_last = np.argsort(order == np.arange(n)[:, None], axis=1, kind="stable")
         order = np.take_along_axis(order, itself_last, 1)[:, :-1]
     else:
         distance2 = ((points[:, None] - points[None]) ** 2).sum(-1)
         if len(normals):
-            distance2 += np.where(normals @ normals.T < OPPOSITE, 1e6 * (distance2.max() + 1e-300), 0.0)
+            distance2 += np.where(normals @ normals.T < ENUMERATION.opposite, 1e6 * (distance2.max() + 1e-300), 0.0)
         np.fill_diagonal(distance2, np.inf)
         order = np.argsort(distance2, axis=1, kind="stable")[:, :-1]
     return np.ascontiguousarray(order, np.int64)
@@ -239,9 +234,10 @@ def visible_triangles(points: Array, normals: Array, triples: Places) -> Triangl
     triangles = triangles_of(points, triples)
     orientation = triangles.orientation
     if len(normals):
-        facing = (normals @ DIRECTIONS.T > SLACK)[triangles.triples].all(1)
+        facing = (normals @ DIRECTIONS.T > ENUMERATION.parallel)[triangles.triples].all(1)
         above = triangles.frames[:, 2] @ DIRECTIONS.T
-        orientation &= np.stack([(facing & (side * above < EDGE_ON)).any(1) for side in (-1, 1)], -1) @ (1, 2)
+        seen = [(facing & (side * above < ENUMERATION.edge_on)).any(1) for side in (-1, 1)]
+        orientation &= np.stack(seen, -1) @ (1, 2)
     tables: Any = (np.ascontiguousarray(table[orientation > 0]) for table in triangles)
     return Triangles(*tables)
 
@@ -262,7 +258,7 @@ def sphere(count: int) -> Array:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], -1)
 
 
-DIRECTIONS = sphere(192)
+DIRECTIONS = sphere(ENUMERATION.directions)
 
 
 def grid_of(flat: Array, gain: Array, labels: Places, reach: float) -> Grid:

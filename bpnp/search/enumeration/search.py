@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from bpnp.runtime import Clock
-from bpnp.search.config import ENUMERATION, RULES, EnumerationSettings, Stage
+from bpnp.search.config import ENUMERATION, RULES, TIME, EnumerationSettings, Stage
 from bpnp.search.enumeration.hypotheses import Block, Kept, Work, explore
 from bpnp.search.enumeration.matching import EnumerationTables, Matches
 from bpnp.search.enumeration.points import (
@@ -33,9 +33,6 @@ ORDERS = {
     3: np.array([[0, 1, 2], [1, 2, 0], [2, 0, 1], [0, 2, 1], [1, 0, 2], [2, 1, 0]]),
 }
 
-SLOWEST = 2e-6  # seconds a hypothesis, before it is measured
-BUILT, BUILT_FACING = 5e-7, 5e-6  # seconds a set of points when a stage begins, and one with normals
-SHORTEST = 5e-5  # seconds before the deadline, in which no hypothesis is begun
 Ended = Literal["exhausted", "safe", "interrupted", "most"]
 
 
@@ -78,7 +75,7 @@ class Enumeration:
         image = ImageSide(problem.bearings, radius, problem.labels2d, self.reach)
         (prior, heading, log_share), fixing = prior_arrays(problem, scene, image, settings), problem.fixing_matches
         self.problem, self.scene, self.image, self.settings = problem, scene, image, settings
-        self.fixing, self.solved, self._pace = fixing, 0, SLOWEST
+        self.fixing, self.solved, self._pace = fixing, 0, TIME.hypothesis
         self.ended: Ended | None = None
         self._predicted, self._safe = predicted_pose(problem.prior), 0.0
         self._stages = [stage for stage in settings.stages if stage.matches >= fixing]
@@ -137,7 +134,7 @@ class Enumeration:
         )
         if (stage.matches, min(stage.near3d, self.scene.nearest.shape[1])) in self.scene.tables:
             scene = 0
-        return BUILT * image + (BUILT_FACING if len(self.scene.arrays.normals) else BUILT) * scene
+        return TIME.built * image + (TIME.built_facing if len(self.scene.arrays.normals) else TIME.built) * scene
 
     def begin(self, stage: Stage) -> None:
         """Continue with the hypotheses of a stage, without those solved before."""
@@ -183,7 +180,7 @@ class Enumeration:
     def _advance(self, deadline: float) -> None:
         """Solve some hypotheses of the current stage, begin the next stage, or end."""
         settings, stage = self.settings, self._stage
-        late = not self._is_checked and deadline - Clock.now() < SHORTEST
+        late = not self._is_checked and deadline - Clock.now() < TIME.shortest
         if not self._is_checked and (late or self.solved > settings.most):
             self.ended = "interrupted" if late else "most"
             return

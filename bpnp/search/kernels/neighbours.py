@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.search.config import KERNELS
 from bpnp.search.kernels.vectors import compiled, part
 
 Array = NDArray[np.float64]
-CELLS = 64  # along a side of the grid, at most
 
 
 def sums_near(
@@ -30,7 +30,7 @@ def sums_near(
     """
     at = bearings @ axes
     low, extent = at.min(0), float(np.ptp(at, 0).max())
-    cell = max(float(radii[-1]), extent / CELLS)
+    cell = max(float(radii[-1]), extent / KERNELS.neighbour_cells)
     side = int(extent / cell) + 1
     key = ((at - low) / cell).astype(np.int64) @ [side, 1]
     order = np.argsort(key, kind="stable")

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 
 from bpnp.runtime import FAST, compiler
+from bpnp.search.config import KERNELS
 
 F = np.float32
 compiled = compiler(fastmath=FAST | {"afn"})
 # For functions that only compiled functions call. They are inlined: the calling loops would not vectorise otherwise,
 # and take twice the time.
 part = compiler(fastmath=FAST | {"afn"}, part=True, forceinline=True)
-LARGEST_TURN = 0.5  # radians in one step
 
 
 @part
@@ -59,10 +59,10 @@ def direction(x: Any, y: Any, z: Any) -> Any:
 
 @part
 def turn(rotation: Any, vector: Any) -> None:
-    """Apply R <- exp([w]x) R in place through a unit quaternion; w = vector[:3], clipped to length LARGEST_TURN."""
+    """Apply R <- exp([w]x) R in place through a unit quaternion; w = vector[:3], clipped to length `largest_turn`."""
     x, y, z = vector[0], vector[1], vector[2]
     angle: Any = math.sqrt(x * x + y * y + z * z)
-    shrink = F(LARGEST_TURN) / angle if angle > F(LARGEST_TURN) else F(1)
+    shrink = F(KERNELS.largest_turn) / angle if angle > F(KERNELS.largest_turn) else F(1)
     angle *= shrink
     half = F(0.5) * angle
     factor = shrink * (F(0.5) if angle < F(1e-4) else math.sin(half) / angle)

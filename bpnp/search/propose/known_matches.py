@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.poses import SAME, distinct, seen_from
+from bpnp.search.config import MATCHES
 from bpnp.search.correspondences import score_pose
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.pose_model import PoseModel
@@ -21,14 +22,6 @@ from bpnp.search.refine.gauss_newton import match_equations, refine
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
 FIXING = 3  # matches that fix a pose
-TRIPLES = 1000  # of matches, at most; with a fifth of the matches right, all of them miss a right triple 3 times in 1e4
-SCORED = 500  # matches on which the poses of triples are compared
-REFINED = 6  # poses that are refined
-STEPS, ROUNDS = 10, 3  # of Levenberg and Marquardt; with new weights
-WRONG = 0.1  # expected fraction of wrong matches
-CONVERGED = 0.05  # times the tolerance of equal poses, within which refined poses are one optimum
-DAMPING = 1e-3  # first factor of Levenberg and Marquardt
-SETTLED, EXACT = 1e-6, 1e-24  # relative and absolute change of a sum of squares, of radians, that ends the steps
 
 
 def known_matches(problem: Problem) -> tuple[Labels, Labels] | None:
@@ -58,7 +51,7 @@ def poses_of_matches(problem: Problem, i: Labels, j: Labels, seed: int = 0) -> H
         problem: Points of the problem.
         i: (k,) indices of image points, more than three.
         j: (k,) indices of their scene points.
-        seed: Of the triples that are drawn where there are more than `TRIPLES`.
+        seed: Of the triples that are drawn where there are more than `MATCHES.triples`.
 
     Returns:
         The least-squares poses of all matches, then those of the matches that agree, each with the fewest residuals
@@ -73,16 +66,17 @@ def poses_of_matches(problem: Problem, i: Labels, j: Labels, seed: int = 0) -> H
     poses = poses[np.isfinite(poses).all((1, 2))]
     if not len(poses):
         return Hypotheses.empty()
-    some = np.arange(len(i)) if len(i) <= SCORED else rng.choice(len(i), SCORED, replace=False)
+    some = np.arange(len(i)) if len(i) <= MATCHES.scored else rng.choice(len(i), MATCHES.scored, replace=False)
     squared = _squared(rays[some], points[some], poses)
     scales = _scales(problem)
     density = 1 / problem.image.solid_angle
     agreeing, scale_of = _agreement(squared, scales, density)
-    every = poses[np.argsort(np.sort(np.minimum(squared, 1.0), 1)[:, : -(len(some) // 4) or None].sum(1))[:REFINED]]
+    cost = np.sort(np.minimum(squared, 1.0), 1)[:, : -(len(some) // 4) or None].sum(1)
+    every = poses[np.argsort(cost)[: MATCHES.refined]]
     every = _refined(rays, points, every, np.ones((len(every), len(i))))
-    best = np.argsort(-agreeing, kind="stable")[:REFINED]
+    best = np.argsort(-agreeing, kind="stable")[: MATCHES.refined]
     fitted, scale = poses[best], scales[scale_of[best]]
-    for _ in range(ROUNDS):
+    for _ in range(MATCHES.reweighted):
         squared = _squared(rays, points, fitted)
         weight = _inlier_probability(squared, scale[:, None], density)
         count = weight.sum(1)
@@ -90,7 +84,7 @@ def poses_of_matches(problem: Problem, i: Labels, j: Labels, seed: int = 0) -> H
         scale = np.clip(np.sqrt((weight * squared).sum(1) / np.maximum(free, 1e-3)), scales[0], scales[-1])
         enough = count > FIXING + 0.5
         fitted, scale, weight = fitted[enough], scale[enough], weight[enough]
-        fitted = _refined(rays, points, fitted, weight, STEPS // 2)
+        fitted = _refined(rays, points, fitted, weight, MATCHES.steps // 2)
     ends = []
     for group in (every, fitted):
         if len(group):
@@ -103,11 +97,13 @@ def poses_of_matches(problem: Problem, i: Labels, j: Labels, seed: int = 0) -> H
 
 
 def _triples(count: int, rng: np.random.Generator) -> Labels:
-    """Return all triples (t, 3) of `count` matches, or `TRIPLES` of them."""
-    if math.comb(count, 3) <= TRIPLES:
+    """Return all triples (t, 3) of `count` matches, or `MATCHES.triples` of them."""
+    if math.comb(count, 3) <= MATCHES.triples:
         a, b, c = np.meshgrid(*[np.arange(count)] * 3, indexing="ij")
         return np.argwhere((a < b) & (b < c))
-    return np.argsort(rng.random((TRIPLES, count)), 1)[:, :3] if count < 64 else rng.integers(count, size=(TRIPLES, 3))
+    if count < 64:
+        return np.argsort(rng.random((MATCHES.triples, count)), 1)[:, :3]
+    return rng.integers(count, size=(MATCHES.triples, 3))
 
 
 def _scales(problem: Problem) -> Array:
@@ -125,8 +121,8 @@ def _squared(rays: Array, points: Array, poses: Array) -> Array:
 
 def _inlier_probability(squared: Array, scale: Array, density: float) -> Array:
     """Return the probability that a residual belongs to an inlier, not to a point anywhere in view."""
-    inlier = (1 - WRONG) * np.exp(-0.5 * squared / scale**2) / (2 * math.pi * scale**2)
-    return np.asarray(inlier / (inlier + WRONG * density))
+    inlier = (1 - MATCHES.wrong) * np.exp(-0.5 * squared / scale**2) / (2 * math.pi * scale**2)
+    return np.asarray(inlier / (inlier + MATCHES.wrong * density))
 
 
 def _agreement(squared: Array, scales: Array, density: float) -> tuple[Array, Labels]:
@@ -137,12 +133,12 @@ def _agreement(squared: Array, scales: Array, density: float) -> tuple[Array, La
     evidence = np.empty((len(squared), len(scales)))
     for s, scale in enumerate(scales.tolist()):
         kernel = np.exp(-0.5 * squared / scale**2) / (2 * math.pi * scale**2)
-        terms = np.log(WRONG + (1 - WRONG) * kernel / density)
+        terms = np.log(MATCHES.wrong + (1 - MATCHES.wrong) * kernel / density)
         evidence[:, s] = np.sort(terms, 1)[:, :-FIXING].sum(1)
     return evidence.max(1), evidence.argmax(1)
 
 
-def _refined(rays: Array, points: Array, poses: Array, weights: Array, most: int = STEPS) -> Array:
+def _refined(rays: Array, points: Array, poses: Array, weights: Array, most: int = MATCHES.steps) -> Array:
     """Return poses (h, 4, 3) after Levenberg-Marquardt steps on weighted residuals of unit rays (k, 3)."""
     if not len(poses):
         return poses
@@ -152,8 +148,8 @@ def _refined(rays: Array, points: Array, poses: Array, weights: Array, most: int
         model.state(poses[:, :3], poses[:, 3]),
         match_equations(model, rays, points, weights),
         [1.0] * most,
-        settled=lambda last: bool((np.abs(last.gain) <= SETTLED * last.before.cost + EXACT).all()),
-        damping=DAMPING,
+        settled=lambda last: bool((np.abs(last.gain) <= MATCHES.settled * last.before.cost + MATCHES.negligible).all()),
+        damping=MATCHES.damping,
         adaptive=True,
     )
     return np.concatenate([end.state.rotation, end.state.centroid[:, None]], 1)
@@ -171,4 +167,4 @@ def _scored(problem: Problem, i: Labels, j: Labels, rotation: Array, translation
     score, count = (np.array([one[k] for one in found]) for k in (0, 1))
     hypotheses = Hypotheses.from_poses(rotation, translation, log_likelihood=score, match_count=count, scale=scale)
     seen, order = seen_from(rotation @ problem.middle + translation), -np.arange(float(len(score)))
-    return hypotheses[distinct(rotation, seen, order, len(score), *SAME.times(CONVERGED))]
+    return hypotheses[distinct(rotation, seen, order, len(score), *SAME.times(MATCHES.converged))]

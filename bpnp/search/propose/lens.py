@@ -9,19 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.config import OtherFocal
+from bpnp.search.config import LENS, OtherFocal
 from bpnp.search.pose_model import PoseModel, PoseState
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.refine.gauss_newton import refine, soft_equations
 
 Array = NDArray[np.float64]
-FEW_PARTNERS = 2  # scene points that may correspond to each image point
-MOST_ZOOM, MOST_BEND = 0.2, 0.1  # largest step of the log scale factor, and relative shift of the outermost point
-SAME_ZOOM = 0.01  # change of the log scale factor below which no other round of steps is taken
-MOST_ROUNDS = 4
-SETTLED_ZOOM, MOST_STEPS = 2e-5, 40  # the same for the last steps, with all points; steps at most
-FIRST, WIDTHS = (4.0,), (4.0, 2.0, 2.0, 1.0, 1.0)  # scales of the steps before the first round, and of each round
-DAMPING = 1e-6  # fraction of the diagonal of the normal equations
 
 
 class LensFit(NamedTuple):
@@ -81,30 +74,30 @@ def fit_lens(
     model = lens_model(problem, bends=radial is not None)
     zoom = model.columns["log_focal"].start
     largest = np.full(model.size, math.inf)
-    largest[zoom] = MOST_ZOOM
+    largest[zoom] = LENS.most_zoom
     if radial is not None:
         outermost = float(((problem.bearings[:, :2] / problem.bearings[:, 2:]) ** 2).sum(-1).max())
-        largest[model.columns["radial"]] = MOST_BEND / outermost
+        largest[model.columns["radial"]] = LENS.most_bend / outermost
     chosen = problem.image.chosen
     some = chosen[:: max(len(chosen) // OtherFocal.bearings, 1)]
-    linearise = soft_equations(model, [problem], chosen=some, most=FEW_PARTNERS)
+    linearise = soft_equations(model, [problem], chosen=some, most=LENS.correspondences)
     state = PoseState(rotation, middle, radial=radial or 0.0)
-    for widths in (FIRST + WIDTHS, *[WIDTHS] * (MOST_ROUNDS - 1)):
+    for widths in (LENS.first + LENS.widths, *[LENS.widths] * (LENS.most_rounds - 1)):
         scales = [width * scale for width in widths]
-        end = refine(model, state, linearise, scales, damping=DAMPING, largest=largest)
+        end = refine(model, state, linearise, scales, damping=LENS.damping, largest=largest)
         if end.lost:
             return None
         moved = math.log(end.state.zoom / state.zoom)
         state = end.state
-        if abs(moved) < SAME_ZOOM:
+        if abs(moved) < LENS.same_zoom:
             break
     end = refine(
         model,
         state,
-        soft_equations(model, [problem], most=FEW_PARTNERS),
-        [scale] * MOST_STEPS,
-        settled=lambda last: bool(abs(last.step[zoom]) < SETTLED_ZOOM),
-        damping=DAMPING,
+        soft_equations(model, [problem], most=LENS.correspondences),
+        [scale] * LENS.most_steps,
+        settled=lambda last: bool(abs(last.step[zoom]) < LENS.settled_zoom),
+        damping=LENS.damping,
         largest=largest,
     )
     if end.lost:

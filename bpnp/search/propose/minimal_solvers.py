@@ -11,15 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.runtime import compiler, in_threads
+from bpnp.search.config import TRIANGLES
 from bpnp.search.kernels.vectors import cross, rotated
 
 compiled = compiler()
 part = compiler(part=True, forceinline=True)  # called by compiled functions alone
-FLAT = 1e-12  # squared height of a triangle over its squared longest side
-TOLERANCE = 1e-6  # of the squared sides, in units of the longest
-ROUNDING = 1e-12  # of a discriminant: what is smaller than this counts as zero
-LEVEL = 1e-6  # sine of both rays' height, below which a prior vertical does not determine their depths
-UPRIGHT = 1e-3  # horizontal fraction of the vector between two points, below which it does not determine the heading
 Array = NDArray[np.float64]
 
 
@@ -55,7 +51,7 @@ def triangles_of(points: Array, triples: NDArray[np.int64]) -> Triangles:
     normal /= np.sqrt(np.maximum(height2, 1e-300))[:, None]
     a, b = (((p[:, 0] - p[:, k]) ** 2).sum(-1) / length2 for k in (1, 2))
     sides, frames = np.stack([a, b, np.sqrt(length2)], -1), np.stack([along, np.cross(normal, along), normal], 1)
-    return Triangles(triples, sides, frames, p.mean(1), np.where(height2 > FLAT * length2, 3, 0))
+    return Triangles(triples, sides, frames, p.mean(1), np.where(height2 > TRIANGLES.flat * length2, 3, 0))
 
 
 def p3p_poses(rays: Array, points: Array) -> Array:
@@ -129,7 +125,7 @@ def solve_p3p(rays: Any, seen: Any, chords: Any, triangles: Any, t: int, poses: 
         ax, ay, az = x1 - x2, y1 - y2, z1 - z2
         nx, ny, nz = cross(ax, ay, az, x0 - x2, y0 - y2, z0 - z2)
         length2, area2 = ax * ax + ay * ay + az * az, nx * nx + ny * ny + nz * nz
-        if not area2 > FLAT * length2 * length2:
+        if not area2 > TRIANGLES.flat * length2 * length2:
             continue
         scale, across = 1 / math.sqrt(length2), 1 / math.sqrt(area2)
         ax, ay, az, nx, ny, nz = ax * scale, ay * scale, az * scale, nx * across, ny * across, nz * across
@@ -271,7 +267,7 @@ def _meet(line: Any, conics: Any, chords: Any, a: float, b: float, poses: Any, c
     if _size(other) > _size((q, h, k)):
         q, h, k = other
     discriminant = h * h - q * k
-    if not discriminant > -ROUNDING * (h * h + abs(q * k)):
+    if not discriminant > -TRIANGLES.rounding * (h * h + abs(q * k)):
         return count
     larger = -(h + math.copysign(math.sqrt(max(discriminant, 0.0)), h))
     for root in range(2):
@@ -323,7 +319,7 @@ def anneal_to_end(d0: float, d1: float, d2: float, chords: Any, a: float, b: flo
         d0 -= scale * (a2 * (e0 * a1 - b0 * e1) + b0 * b1 * e2)
         d1 -= scale * (a0 * (e1 * a2 - b1 * e2) + b1 * b2 * e0)
         d2 -= scale * (a1 * (e2 * a0 - b2 * e0) + b2 * b0 * e1)
-    return bool(worst < TOLERANCE and depths[0] > 0 and depths[1] > 0 and depths[2] > 0)
+    return bool(worst < TRIANGLES.tolerance and depths[0] > 0 and depths[1] > 0 and depths[2] > 0)
 
 
 @part
@@ -348,11 +344,11 @@ def solve_p2p(i: int, j: int, a: int, b: int, heading: Any, rays: Any, points: A
         The number of poses, up to two.
     """
     f, g, p, q = heading.rays[i], heading.rays[j], heading.points[a], heading.points[b]
-    if max(abs(f[2]), abs(g[2])) < LEVEL:
+    if max(abs(f[2]), abs(g[2])) < TRIANGLES.level:
         return 0
     rise, along0, along1 = q[2] - p[2], q[0] - p[0], q[1] - p[1]
     length2 = along0 * along0 + along1 * along1
-    if length2 < UPRIGHT * UPRIGHT * (length2 + rise * rise):
+    if length2 < TRIANGLES.upright * TRIANGLES.upright * (length2 + rise * rise):
         return 0
     # R (q - p) lies in the plane of the rays; the prior rotation must bring it there within its largest error.
     n0, n1, n2 = cross(f[0], f[1], f[2], g[0], g[1], g[2])

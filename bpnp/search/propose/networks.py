@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from bpnp.runtime import Deadline
 from bpnp.search.arguments import Array
-from bpnp.search.config import DEFAULT
+from bpnp.search.config import DEFAULT, NETWORKS
 from bpnp.search.problem import Problem
 from bpnp.search.propose.given import score_given
 from bpnp.search.scene import Scene
@@ -22,10 +22,7 @@ from bpnp.types import Batch
 if TYPE_CHECKING:
     from bpnp.models.matcher import Matcher
 
-FAR = 100.0  # largest distance from the origin, in sizes of the scene, at which float32 is precise enough
 ESTIMATES = ("refined", "ransac", "pnp")  # estimates of a prediction, the most reliable first
-DRAWN = 80_000  # match triples per assignment: with 2 % correct matches one in 10^5 is correct, more nearly so
-NET_SIGMA_DEG, NET_SIGMA_SHIFT = 10.0, 0.1  # uncertainty of a network's pose; the latter as a fraction of the distance
 
 
 def evaluation_copy(module: nn.Module, device: torch.device | None) -> nn.Module:
@@ -56,7 +53,8 @@ def pose_prior(net: nn.Module, problem: Problem, deadline: Deadline) -> PosePrio
         return None
     rotation, translation = asked.best
     centre = rotation @ problem.points3d.mean(0) + translation
-    return PosePrior(rotation, translation, NET_SIGMA_DEG, NET_SIGMA_SHIFT * float(np.linalg.norm(centre)) + 1e-12)
+    sigma = NETWORKS.sigma_shift * float(np.linalg.norm(centre)) + 1e-12
+    return PosePrior(rotation, translation, NETWORKS.sigma_deg, sigma)
 
 
 def predicted(net: nn.Module, members: list[Problem], deadline: Deadline) -> list[SearchResult]:
@@ -95,7 +93,12 @@ def proposed(net: "Matcher", problem: Problem, seed: int) -> tuple[Array, Array]
         assignment = net.match(batch).assignment
     assert assignment is not None
     drawn = drawn_poses(
-        assignment.sqrt(), batch.points2d, batch.points3d, triples=DRAWN, seed=seed, aligned=net.frame == "view"
+        assignment.sqrt(),
+        batch.points2d,
+        batch.points3d,
+        triples=NETWORKS.drawn,
+        seed=seed,
+        aligned=net.frame == "view",
     )
     poses = _host(drawn[0])
     poses = poses[np.isfinite(poses).all((-2, -1))]
@@ -153,7 +156,7 @@ def view_for(net: nn.Module, problem: Problem) -> View:
 
 def _near_origin(problem: Problem) -> Array:
     """Return the origin of a problem in the user's coordinates; 0 if it is too far away for float32."""
-    is_far = problem.origin is None or np.linalg.norm(problem.origin) > FAR * problem.size
+    is_far = problem.origin is None or np.linalg.norm(problem.origin) > NETWORKS.far * problem.size
     return np.zeros(3) if is_far else np.asarray(problem.origin)
 
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bpnp.poses import distinct
+from bpnp.search.config import SYMMETRIES
 from bpnp.search.kernels.neighbours import HashedPoints, hashed, lies_on
 from bpnp.search.kernels.vectors import compiled, part
 
@@ -28,22 +29,6 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 # Neighbours of a point that a base and its matches come from, in scenes up to MANY points, and in larger ones.
-NEIGHBOURS, MANY_NEIGHBOURS, MANY = 96, 48, 500
-BASES = 32  # at most (1 - 1/8)^32 = 1.4 % of the registrations miss a motion of half of the points
-COMPACT = 4  # every other base is drawn from this fraction (1 / COMPACT) of a neighbourhood
-WIDEST = 4  # triangles drawn for a base, the largest of them
-FEWEST = 5  # moved points that lie on others: three fix a motion and are no evidence of it
-FIRST = 7  # sampled points; at least one must confirm a motion, which one of 12 motions of a third of the points fails
-CHECKED = 32  # sampled points that confirm a motion before all points do
-MOST_WORK = 30_000_000  # pairs of points that are compared for all bases together, some 0.1 s; the rest is left out
-CONFIRMING = 8  # pairs that take as long as a sampled point
-MOST_FOUND = 4096  # motions of all bases together that are ranked
-REFINED = 48  # motions, those of the largest fraction first, that are refined
-NEAR_SYMMETRY = 0.02  # largest error of a point under a near symmetry, as a fraction of the extent
-SPACING = 0.25  # at a quarter of the spacing 1 to 6 % of the points lie on others by chance
-FLAT = 0.1  # largest third extent of a flat scene, as a fraction of its second extent
-ROUNDS = 3  # of the refinement: nearest points, rigid fit
-SAME_DEG = 3.0  # motions with rotations closer than this and shifts closer than four tolerances are one
 
 
 class Motions(NamedTuple):
@@ -83,7 +68,7 @@ class Motions(NamedTuple):
         near = np.isfinite(tree.query(moved, distance_upper_bound=tolerance)[0])
         fraction = near.mean(-1) if len(sources) else np.zeros(len(near))
         order = np.argsort(-fraction, kind="stable")
-        order = order[fraction[order] >= max(least, FEWEST / max(len(sources), 1))]
+        order = order[fraction[order] >= max(least, SYMMETRIES.fewest / max(len(sources), 1))]
         return Motions(self.rotation[order], self.shift[order], fraction[order], self.complete)
 
 
@@ -95,13 +80,13 @@ def mirror_pose(points3d: Array, rotation: Array, translation: Array) -> tuple[A
         rotation: (3, 3), translation: (3,) of a pose.
 
     Returns:
-        Rotation (3, 3) and translation (3,), or None where the scene is not flat (`FLAT`).
+        Rotation (3, 3) and translation (3,), or None where the scene is not flat (`SYMMETRIES.flat`).
 
     Source: D. Oberkampf, D. DeMenthon, L. Davis, Iterative pose estimation using coplanar feature points, CVIU 1996.
     """
     middle = points3d.mean(0)
     _, extents, axes = np.linalg.svd(points3d - middle, full_matrices=False)
-    if len(points3d) < 3 or extents[2] > FLAT * extents[1]:
+    if len(points3d) < 3 or extents[2] > SYMMETRIES.flat * extents[1]:
         return None
     seen = rotation @ middle + translation
     sight = seen / max(float(np.linalg.norm(seen)), 1e-300)
@@ -118,7 +103,7 @@ def self_motions(
     labels3d: Indices | None = None,
     normals3d: Array | None = None,
     least: float = 0.3,
-    bases: int = BASES,
+    bases: int = SYMMETRIES.bases,
 ) -> Motions:
     """Find rigid motions that map a fraction of a scene's points onto its points.
 
@@ -153,19 +138,22 @@ def self_motions(
     labels = np.full(len(points), -1) if labels3d is None else np.asarray(labels3d, np.int64)
     normals = np.empty((0, 3)) if normals3d is None else np.ascontiguousarray(normals3d, np.float64)
     scene = Scene(points, hashed(points, 2 * tolerance), distance, index.astype(np.int64), labels, normals)
-    least = max(least, FEWEST / len(moved))
+    least = max(least, SYMMETRIES.fewest / len(moved))
     chosen, sample = _bases(points, moved, bases), _sample(moved)
-    found = Found(np.zeros((MOST_FOUND, 3, 3)), np.zeros((MOST_FOUND, 3)), np.zeros(MOST_FOUND))
-    most = MOST_WORK // max(len(chosen), 1)
+    room = SYMMETRIES.most_found
+    found = Found(np.zeros((room, 3, 3)), np.zeros((room, 3)), np.zeros(room))
+    most = SYMMETRIES.most_work // max(len(chosen), 1)
     total = _register(
         scene, chosen, sample, tolerance, math.ceil(0.7 * least * len(sample)), most, found, np.empty((4, 3, 3))
     )
-    kept = min(total, MOST_FOUND)
+    kept = min(total, room)
     rotation, shift, score = found.rotation[:kept], found.shift[:kept], found.score[:kept]
     middle = np.median(points[moved], 0)
     size = extent(points[moved])
     offsets = rotation @ middle + shift
-    unique = distinct(rotation, offsets / size, score, REFINED, SAME_DEG, max(4 * tolerance / size, 1e-6))
+    unique = distinct(
+        rotation, offsets / size, score, SYMMETRIES.refined, SYMMETRIES.same_deg, max(4 * tolerance / size, 1e-6)
+    )
     refined = [_refine(points, tree, moved, rotation[k], shift[k], tolerance, labels, normals) for k in unique]
     motions = [one for one in refined if one[2] >= least and _moves(one, points[moved], 3 * tolerance)]
     if not motions:
@@ -173,8 +161,10 @@ def self_motions(
     motions.sort(key=lambda one: -one[2])
     rotation, shift, fraction = (np.array(part) for part in zip(*motions, strict=True))
     offsets = rotation @ middle + shift
-    unique = distinct(rotation, offsets / size, fraction, REFINED, SAME_DEG, max(4 * tolerance / size, 1e-6))
-    return Motions(rotation[unique], shift[unique], fraction[unique], len(unique) < REFINED)
+    unique = distinct(
+        rotation, offsets / size, fraction, SYMMETRIES.refined, SYMMETRIES.same_deg, max(4 * tolerance / size, 1e-6)
+    )
+    return Motions(rotation[unique], shift[unique], fraction[unique], len(unique) < SYMMETRIES.refined)
 
 
 def extent(points: Array) -> float:
@@ -191,17 +181,17 @@ def matching_tolerance(points3d: Array, sources: Indices, noise: float) -> float
         noise: standard deviation of a match, in the unit of the scene.
 
     Returns:
-        Three standard deviations or `NEAR_SYMMETRY` of the extent, whichever is larger, rounded up to a power of two
-        of the latter; at most `SPACING` of the median distance of a source from its nearest neighbour, beyond which
-        points lie on others by chance.
+        Three standard deviations or `near_symmetry` of the extent, whichever is larger, rounded up to a power of two of
+        the latter; at most `spacing` of the median distance of a source from its nearest neighbour, beyond which points
+        lie on others by chance.
     """
-    least = NEAR_SYMMETRY * extent(points3d[sources])
+    least = SYMMETRIES.near_symmetry * extent(points3d[sources])
     if not least > 0:
         return 0.0
     steps = math.ceil(math.log2(max(3 * noise / least, 1.0)))
     nearest = cKDTree(points3d).query(points3d[sources], 2)[0][:, 1]
     spacing = float(np.median(nearest[nearest > 0])) if nearest.any() else 0.0
-    return min(2.0**steps * least, SPACING * spacing)
+    return min(2.0**steps * least, SYMMETRIES.spacing * spacing)
 
 
 class Scene(NamedTuple):
@@ -247,8 +237,8 @@ def _bases(points: Array, moved: Indices, count: int) -> Indices:
     around = around.reshape(count, -1)
     # The widest of several triangles determines the motion best. Every other base is compact, for small parts.
     size = around.shape[1]
-    last = np.where(np.arange(count) % 2, size, max(size // COMPACT, min(size, 4)))
-    drawn = 1 + (rng.random((count, WIDEST, 2)) * (last - 1)[:, None, None]).astype(np.int64)
+    last = np.where(np.arange(count) % 2, size, max(size // SYMMETRIES.compact, min(size, 4)))
+    drawn = 1 + (rng.random((count, SYMMETRIES.widest, 2)) * (last - 1)[:, None, None]).astype(np.int64)
     draws = moved[np.take_along_axis(around[:, None], drawn.reshape(count, 1, -1), 2).reshape(drawn.shape)]
     u, v = np.moveaxis(points[draws] - points[first][:, None, None], 2, 0)
     # Twice the area, squared: |u|^2 |v|^2 - (u v)^2.
@@ -259,13 +249,13 @@ def _bases(points: Array, moved: Indices, count: int) -> Indices:
 
 def _neighbours(points: Array) -> int:
     """Return the number of neighbours of a point that bases and matches come from."""
-    return NEIGHBOURS if len(points) <= MANY else MANY_NEIGHBOURS
+    return SYMMETRIES.neighbours if len(points) <= SYMMETRIES.many else SYMMETRIES.many_neighbours
 
 
 def _sample(moved: Indices) -> Indices:
-    """Return at most `CHECKED` sources, drawn at random."""
+    """Return at most `SYMMETRIES.checked` sources, drawn at random."""
     order = np.random.default_rng(1).permutation(len(moved))
-    return np.ascontiguousarray(moved[order[:CHECKED]])
+    return np.ascontiguousarray(moved[order[: SYMMETRIES.checked]])
 
 
 def _refine(
@@ -280,14 +270,14 @@ def _refine(
 ) -> tuple[Array, Array, float]:
     """Return a motion fitted to the nearest scene points of the moved ones, and the fraction that it maps."""
     own, near, reach = points[moved], np.zeros(len(moved), bool), 2 * tolerance
-    for step in range(ROUNDS + 1):
+    for step in range(SYMMETRIES.rounds + 1):
         distance, target = tree.query(own @ rotation.T + shift, distance_upper_bound=reach)
         near = np.isfinite(distance)
         target = np.where(near, target, 0)
         near &= (labels[moved] == labels[target]) | (labels[moved] < 0) | (labels[target] < 0)
         if len(normals):
             near &= ((normals[moved] @ rotation.T) * normals[target]).sum(-1) > 0.5
-        if step == ROUNDS or near.sum() < 3:
+        if step == SYMMETRIES.rounds or near.sum() < 3:
             break
         one, other = own[near], points[target[near]]
         centre, onto = one.mean(0), other.mean(0)
@@ -367,10 +357,10 @@ def _register(
                         )
                     score, left = 0, len(sample)
                     for s in range(len(sample)):
-                        if score + left < least or (score == 0 and s == FIRST):
+                        if score + left < least or (score == 0 and s == SYMMETRIES.first):
                             break
                         left -= 1
-                        work_done += CONFIRMING
+                        work_done += SYMMETRIES.confirming
                         score += _on(scene, rotation, shift, sample[s])
                     if score >= least:
                         place = count if count < len(found.score) else -1

@@ -16,15 +16,13 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.correspondences import NEIGHBOURS, facing, possible_matches
+from bpnp.search.config import MATCHES, REFINER
+from bpnp.search.correspondences import facing, possible_matches
 from bpnp.search.pose_model import PoseModel, PoseState, Sight
 from bpnp.search.problem import Problem
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
-RIDGE = 1e-12  # least damping, a fraction of the diagonal: unknowns that nothing fixes do not move
-DIFFERENCE = 6e-6  # step of the central differences: cube root of the machine precision
-LONGER, SHORTER = 0.1, 10.0  # factors on the damping after a step that was taken, and one that was not
 
 
 class Equations(NamedTuple):
@@ -45,7 +43,7 @@ class Equations(NamedTuple):
     def step(self, damping: Array | float | int = 0) -> Array:
         """Return the step (..., p), damped by a fraction of the diagonal."""
         diagonal = np.einsum("...ii->...i", self.products)
-        damped = np.where(diagonal > 0, (np.asarray(damping)[..., None] + RIDGE) * diagonal, 1.0)
+        damped = np.where(diagonal > 0, (np.asarray(damping)[..., None] + REFINER.ridge) * diagonal, 1.0)
         products = self.products + damped[..., None] * np.eye(diagonal.shape[-1])
         return np.asarray(np.linalg.solve(products, self.gradient[..., None])[..., 0])
 
@@ -133,7 +131,7 @@ def steps(
         gain = np.asarray(here.cost) - there.cost
         before, better = here, np.asarray(gain > 0)
         state, here = _select(better, trial, state), _select(better, there, here)
-        factor = factor * np.where(better, LONGER, SHORTER)
+        factor = factor * np.where(better, REFINER.longer, REFINER.shorter)
         yield Iteration(state, scale, step, before, gain)
 
 
@@ -255,7 +253,7 @@ def image_rows(model: PoseModel, matches: ImageMatches, state: PoseState) -> tup
         Residuals (k, d) and derivatives (k, d, p) of the predictions; NaN outside the view.
     """
     sight = model.sight(state, matches.points, matches.camera)
-    h = DIFFERENCE * np.maximum(np.linalg.norm(sight.camera, axis=-1), 1e-300)
+    h = REFINER.difference * np.maximum(np.linalg.norm(sight.camera, axis=-1), 1e-300)
     moved = sight.camera + h[:, None] * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])[:, None]
     seen = matches.project(moved.reshape(-1, 3)).reshape(7, *matches.target.shape)
     if model.lens is None:
@@ -328,7 +326,7 @@ def soft_matches(
     *,
     camera: int = 0,
     chosen: Labels | None = None,
-    most: int = NEIGHBOURS,
+    most: int = MATCHES.neighbours,
 ) -> SoftMatches | None:
     """Return the possible matches of one camera under a state, or None if there are none.
 
@@ -359,7 +357,7 @@ def soft_equations(
     problems: Sequence[Problem],
     *,
     chosen: Labels | None = None,
-    most: int = NEIGHBOURS,
+    most: int = MATCHES.neighbours,
     fewest: float | int = 0,
 ) -> Linearise:
     """Return the linearisation of the possible matches of all cameras, weighted with their probabilities.

@@ -18,6 +18,7 @@ from itertools import combinations, permutations
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.search.config import RIG
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem, UnknownFocal
@@ -30,12 +31,6 @@ from bpnp.search.verdict.uncertainty import linearise, matches_of
 
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]
-WIDE = 60.0  # scale at which proposals are compared, in smallest scales: a pose of one camera is inaccurate in another
-STEPS, AGAIN = 9, 2  # number of decreasing scales, and Gauss-Newton steps at each
-MOST_SCALE = 1.0  # largest step of the log scale
-LENS_WIDE, MOST_LENS = 8.0, 0.1  # first scale of a fit of the lens, in scales of the residuals; largest step of a lens
-WEIGHED = 7  # number of the last scales at which the false alarms of poses are computed
-SAME_CENTRE = 1e-6  # fraction of the largest coordinate of a camera centre in the rig; nearer centres coincide
 
 
 class Rig:
@@ -72,7 +67,7 @@ class Rig:
         self.model = PoseModel(problems[0].middle, lens, mounts=self.mounts, scale=not is_metric, prior=prior)
         self.unknowns = self.model.size
         centres = np.array([-turn.T @ shift for turn, shift in mounts])
-        least = SAME_CENTRE * np.abs(centres).max()
+        least = RIG.same_centre * np.abs(centres).max()
         pairs = combinations(range(len(mounts)), 2)
         self.apart = [(k, other) for k, other in pairs if np.linalg.norm(centres[k] - centres[other]) > least]
 
@@ -114,11 +109,11 @@ class Rig:
         Yields:
             Rotation, translation, scale (radians) and expected number of matches after each step.
         """
-        scales = (np.geomspace(WIDE, 1.0, STEPS).repeat(AGAIN) * self.floor).tolist()
+        scales = (np.geomspace(RIG.wide, 1.0, RIG.steps).repeat(RIG.again) * self.floor).tolist()
         model = replace(self.model, lens=None)
         linearise = soft_equations(model, self.problems, fewest=model.size - 3)
         largest = np.full(model.size, math.inf)
-        largest[6:] = MOST_SCALE
+        largest[6:] = RIG.most_scale
         for last in steps(model, model.state(rotation, translation), linearise, scales, largest=largest):
             yield (*model.pose(last.state), last.scale, float(last.before.matched))
 
@@ -134,8 +129,8 @@ class Rig:
             Factor of the focal length, and the radial coefficient.
         """
         linearise = soft_equations(self.model, self.problems, fewest=self.model.size - 3)
-        scales = (max(scale, self.floor) * np.geomspace(LENS_WIDE, 1.0, STEPS).repeat(AGAIN)).tolist()
-        largest = np.where(np.arange(self.model.size) < 6, math.inf, MOST_LENS)
+        scales = (max(scale, self.floor) * np.geomspace(RIG.lens_wide, 1.0, RIG.steps).repeat(RIG.again)).tolist()
+        largest = np.where(np.arange(self.model.size) < 6, math.inf, RIG.most_lens)
         end = refine(self.model, self.model.state(rotation, translation), linearise, scales, largest=largest)
         return float(end.state.zoom), float(end.state.radial)
 
@@ -199,7 +194,7 @@ class Rig:
         """Return poses refined on all cameras, each at the scale with the fewest false alarms."""
         ends = []
         for rotation, translation in zip(rotations, translations, strict=True):
-            last = list(self.refined(rotation, translation))[AGAIN - 1 :: AGAIN][-WEIGHED:]
+            last = list(self.refined(rotation, translation))[RIG.again - 1 :: RIG.again][-RIG.weighed :]
             if last:
                 ends.append(min(((*self.alarms(*end[:3]), *end) for end in last), key=lambda scored: scored[0]))
         if not ends:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from bpnp.poses import distinct, seen_from
 from bpnp.runtime import NEVER, Clock, Deadline, one_blas_thread
-from bpnp.search.config import DEFAULT, ENUMERATION, SearchSettings
+from bpnp.search.config import DEFAULT, ENUMERATION, RIG, SearchSettings
 from bpnp.search.enumeration.points import predicted_pose
 from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame, to_scene_frame
@@ -26,7 +26,7 @@ from bpnp.search.problem import Problem
 from bpnp.search.propose.density_map import search_around
 from bpnp.search.propose.known_matches import known_matches, poses_of_matches
 from bpnp.search.propose.repetitions import repeated_poses
-from bpnp.search.rig.cameras import WIDE, Array, Pose, Rig
+from bpnp.search.rig.cameras import Array, Pose, Rig
 from bpnp.search.scene import Scene
 from bpnp.search.schedule import Plan
 from bpnp.search.search import lacks_partners
@@ -35,13 +35,8 @@ from bpnp.search.verdict.decide import SearchResult, is_object, judge, match_cou
 from bpnp.search.verdict.reasons import focal_length_not_fixed, objection
 from bpnp.search.verdict.uncertainty import linearised, share_bound
 
-PROPOSING = replace(ENUMERATION, kept=4000)  # number of poses that a camera with few points proposes
-REFINED = 16  # number of enumerated poses that are refined, and of distinct poses that are kept
-A_TURN = 2  # number of poses of an iteration that are refined
-COMPARED = 64  # largest number of proposals whose evidence is computed
+PROPOSING = replace(ENUMERATION, kept=RIG.proposing)
 BEFORE = 1e9  # score of the poses that were refined before, nats: above the evidence of any pose
-AGREE_DEG, AGREE, PAIRS = 6.0, 0.2, 50_000  # two poses agree within: deg, distances; most pairs
-LEAST_APART = 0.01  # smallest baseline of two cameras, in distances of the scene, that determines the scale
 
 
 @one_blas_thread
@@ -78,10 +73,10 @@ def search_rig(
     rig.join({k: pool.scene for k, pool in poses.pools.items()})
     if (predicted := predicted_pose(rig.model.prior)) is not None:
         poses.add_refined(rig.candidates(predicted[0][None], np.r_[predicted[1], 1.0][None]))
-    poses.take(_of_few_points(poses, rig.problems, seed, deadline), REFINED)
+    poses.take(_of_few_points(poses, rig.problems, seed, deadline), RIG.refined)
     if rig.model.prior is not None and not poses.is_significant():
         without = [replace(problem, prior=None) for problem in rig.problems]
-        poses.take(_of_few_points(poses, without, seed, deadline), REFINED)
+        poses.take(_of_few_points(poses, without, seed, deadline), RIG.refined)
     tell(0)
     if poses.may_be_decided() and (result := poses.result(ended=False)).verdict == "confident":
         return result
@@ -159,7 +154,7 @@ class RigPoses:
         """Add the poses of one camera, in the frame of its scene."""
         if step.counts:
             self.pools[step.camera].add(step, found)
-        self.take({step.camera: to_problem_frame(found, self.pools[step.camera].scene)}, A_TURN)
+        self.take({step.camera: to_problem_frame(found, self.pools[step.camera].scene)}, RIG.each_iteration)
 
     def take(self, new: Mapping[int, Hypotheses], most: int) -> None:
         """Refine those proposals of the cameras that have the most evidence in all cameras.
@@ -171,8 +166,8 @@ class RigPoses:
         rotation, translation = _proposals(self.rig, new, self.found)
         for k, poses in new.items():
             self.found[k] = Hypotheses.concatenate([self.found[k], poses])
-        if len(rotation) > COMPARED:
-            best = np.argsort(-_agreement(self.rig, rotation, translation), kind="stable")[:COMPARED]
+        if len(rotation) > RIG.compared:
+            best = np.argsort(-_agreement(self.rig, rotation, translation), kind="stable")[: RIG.compared]
             rotation, translation = rotation[best], translation[best]
         score = np.array([self.rig.evidence(*pose).sum() for pose in zip(rotation, translation, strict=True)])
         poses, known = Hypotheses.from_poses(rotation, translation, log_likelihood=score), len(self.starts)
@@ -202,7 +197,7 @@ class RigPoses:
     def add_refined(self, refined: Hypotheses) -> None:
         """Add refined poses; the basin count of the best one is the sum over all cameras."""
         every = Hypotheses.concatenate([self.best, refined])
-        self.best = every[self._distinct(every, -every.log10_false_alarms, REFINED)]
+        self.best = every[self._distinct(every, -every.log10_false_alarms, RIG.refined)]
         if len(self.best):
             self.best.basin_count[0] = sum(
                 int(poses.basin_count[self._as_best(k, poses)].sum()) for k, poses in enumerate(self.found)
@@ -326,24 +321,24 @@ def _agreeing_poses(rig: Rig, pair: tuple[int, int], first: Hypotheses, second: 
     middle = rig.problems[0].middle
     turns, others = (turn.T @ first.rotation).reshape(-1, 9), (other.T @ second.rotation).reshape(-1, 9)
     traces = turns.astype(np.float32) @ others.T.astype(np.float32)
-    near = np.flatnonzero(traces.ravel() > 1 + 2 * math.cos(math.radians(AGREE_DEG)))
-    i, j = np.divmod(near[np.argsort(-traces.ravel()[near], kind="stable")[:PAIRS]], max(len(others), 1))
+    near = np.flatnonzero(traces.ravel() > 1 + 2 * math.cos(math.radians(RIG.agree_deg)))
+    i, j = np.divmod(near[np.argsort(-traces.ravel()[near], kind="stable")[: RIG.pairs]], max(len(others), 1))
     rotation = turn.T @ first.rotation[i]
     seen = (first.rotation[i] @ middle + first.translation[i]) @ turn  # from the first camera, in the rig's axes
     way = seen - (second.rotation[j] @ middle + second.translation[j]) @ other
     apart = shift @ turn - moved @ other
     distance, length = np.linalg.norm(seen, axis=-1), float(np.linalg.norm(apart))
-    unit = np.maximum(way @ apart / length, LEAST_APART * distance)[:, None] / length
+    unit = np.maximum(way @ apart / length, RIG.least_apart * distance)[:, None] / length
     translation = np.concatenate(
         [seen - unit * (shift @ turn) - (way - unit * apart) / 2 - rotation @ middle, unit], -1
     )
-    agree = np.linalg.norm(way - unit * apart, axis=-1) < AGREE * distance
+    agree = np.linalg.norm(way - unit * apart, axis=-1) < RIG.agree_shift * distance
     return rotation[agree], translation[agree]
 
 
 def _agreement(rig: Rig, rotations: Array, translations: Array) -> Array:
     """Score poses (p, 3, 3), (p, 4) cheaply: robust log-likelihood (p,) of all bearings at a wide scale, nats."""
-    total, scale = np.zeros(len(rotations)), WIDE * rig.floor
+    total, scale = np.zeros(len(rotations)), RIG.wide * rig.floor
     for k, problem in enumerate(rig.problems):
         turns, shifts = rig.pose_of(k, rotations, translations)
         seen = problem.points3d @ turns.transpose(0, 2, 1) + shifts[:, None]

@@ -11,11 +11,11 @@ import numpy as np
 from bpnp.cameras import Camera, camera_from
 from bpnp.runtime import Clock, Deadline
 from bpnp.search.arguments import Array, about, checked_pose, pose_of
-from bpnp.search.config import DEFAULT as SEARCH
+from bpnp.search.config import DEFAULT, MATCHES
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.focal_length import FocalSweep, UnknownCamera
 from bpnp.search.inputs import problem_from
-from bpnp.search.matching import SCALES, failed_solution, one_to_one
+from bpnp.search.matching import failed_solution, one_to_one
 from bpnp.search.pose_model import crossed
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.rig.cameras import Pose, Rig
@@ -59,7 +59,7 @@ def prepare_rig(
             "the distance of the scene from a camera; use PosePrior(rotation, None, rotation_sigma_deg)"
         )
     if options.clutter is not None:
-        SEARCH.expecting(options.clutter)  # raises for one that is out of range
+        DEFAULT.expecting(options.clutter)  # raises for one that is out of range
     points = RigPoints(list(points2d), points3d, list(mounts), dict(known), options.clutter, prior, is_metric=not scale)
     lenses = [None if camera is None else camera_from(camera) for camera in cameras]
     if unknown is None:
@@ -189,7 +189,7 @@ def _finished(rig: Rig, problems: Sequence[Problem], result: SearchResult, inlie
     rotation, translation = found.rotation[0], found.translation[0]
     matches, errors, angles, count = [], [], [], 0
     for k, problem in enumerate(problems):
-        threshold = inlier_threshold or SCALES * result.residual * problem.per_radian
+        threshold = inlier_threshold or MATCHES.reach * result.residual * problem.per_radian
         seen = problem.project_scene(*rig.pose_of(k, rotation, translation))
         i, j = one_to_one(problem.image_points, seen, threshold, problem.may_match).T
         errors.append(np.linalg.norm(problem.image_points[i] - seen[j], axis=-1))
@@ -216,7 +216,7 @@ def _finished(rig: Rig, problems: Sequence[Problem], result: SearchResult, inlie
         np.concatenate(errors),
         np.concatenate(angles),
         most=sum(min(len(problem.all2d), len(problem.points3d)) for problem in problems),
-        threshold=inlier_threshold or SCALES * result.residual * first.per_radian,
+        threshold=inlier_threshold or MATCHES.reach * result.residual * first.per_radian,
         residual=result.residual,
         covariance=covariance,
     )

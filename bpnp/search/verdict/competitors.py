@@ -14,15 +14,13 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bpnp.poses import rotation_angle
-from bpnp.search.config import Evidence
+from bpnp.search.config import REASONS, Evidence
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, label_groups
 from bpnp.search.verdict.false_alarms import directions_of, own_evidence
 from bpnp.search.verdict.reasons import Objection, objection
 from bpnp.search.verdict.uncertainty import Linearised, Misfit, systematic_misfit
 
-LEAST_TURN = 0.5  # degrees; the shift of a pose with a smaller rotation is shown instead
-SAME_ZOOM = 0.005  # relative change of the focal length that a reason omits
 Array = NDArray[np.float64]
 Seen = Sequence[tuple[Hypotheses, Problem]]
 
@@ -56,7 +54,7 @@ def competing_pose(rotation: Array, other: Array, decades: float, shift: float =
         shift: Shift of the scene centroid between them, in distances from the camera; it is shown for equal rotations.
     """
     degrees = math.degrees(rotation_angle(rotation, other))
-    away = f"{degrees:.0f} deg" if degrees >= LEAST_TURN or not shift else f"{100 * shift:.0f} % of the distance"
+    away = f"{degrees:.0f} deg" if degrees >= REASONS.degrees or not shift else f"{100 * shift:.0f} % of the distance"
     return objection("competing_pose", decades, away=away)
 
 
@@ -92,7 +90,7 @@ def of_misfit(off: Misfit, rule: Evidence) -> Objection | None:
         return None
     other = f"{off.zoom:.2f} times the focal length" if off.zoom != 1 else "other proportions of the scene"
     if off.radial:
-        zoomed = f" and {off.zoom:.2f} times the focal length" if abs(off.zoom - 1) > SAME_ZOOM else ""
+        zoomed = f" and {off.zoom:.2f} times the focal length" if abs(off.zoom - 1) > REASONS.zoom else ""
         other = f"a radial distortion of {off.radial:.2g}{zoomed}"
     return objection("other_camera", camera=other, degrees=math.degrees(off.turn), percent=100 * off.shift)
 

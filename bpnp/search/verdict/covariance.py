@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.special import stdtrit
 
+from bpnp.search.config import PRECISION
+
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
-SLIGHT = 0.01  # fraction of the information; image points below it hardly move the estimate
-FIXED = 1e-9  # smallest eigenvalue of the normalised information if the points fix the estimate
 ONE_SIGMA = 0.8413447460685429  # probability of a normal variable below one standard deviation
 
 
@@ -111,15 +111,15 @@ def covariance_of(
     # The complete information has a unit diagonal in these units, so that the rank can be determined.
     unit = 1 / np.sqrt(np.maximum(complete + np.diag(matches.known), 1e-300))
     values, vectors = np.linalg.eigh(observed * np.outer(unit, unit))
-    if values[0] <= FIXED:
+    if values[0] <= PRECISION.fixed:
         return None
     root = unit[:, None] * vectors / np.sqrt(values)
     steps = expected @ root
-    matters = np.flatnonzero(own.reshape(-1, size * size) @ (root @ root.T).ravel() > SLIGHT)
+    matters = np.flatnonzero(own.reshape(-1, size * size) @ (root @ root.T).ravel() > PRECISION.slight)
     if 2 * (round(float(counted.sum())) - 1) <= fitted:
         matters = matters[:0]  # without one of these matches, the others fix several estimates or none
     without = np.eye(size) - root.T @ own[matters] @ root
-    fixed = np.linalg.eigvalsh(without)[:, 0] > FIXED  # the estimate is fixed without the point too
+    fixed = np.linalg.eigvalsh(without)[:, 0] > PRECISION.fixed  # the estimate is fixed without the point too
     steps[matters[fixed]] = np.linalg.solve(without[fixed], steps[matters[fixed], :, None])[..., 0]
     ratio, axes = np.linalg.eigh((weight[:, None] * steps).T @ steps + root.T @ matches.known @ root)
     along = root @ axes

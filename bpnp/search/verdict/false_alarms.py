@@ -43,6 +43,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.search.config import ALARMS
 from bpnp.search.image_statistics import ImageStatistics
 from bpnp.search.kernels.neighbours import sums_near
 from bpnp.search.pose_model import PoseModel
@@ -51,12 +52,7 @@ from bpnp.search.problem import Problem, faces, label_groups
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
 
-SHARES = np.array([0.15, 0.4, 0.75])  # w
-LEAST_SHARE, MOST_SHARE = 0.02, 0.98  # range of w if clutter or scores are given
-OUTLINE = 0.5  # smoothing width of l, in RMS angular radii of the bearings; the outline beyond it is no evidence
-MOST_SMOOTHED = 256  # number of projected points from which l is estimated
-FARTHEST = math.sqrt(18.0)  # distance over s beyond which a pair does not contribute to g
-OWN, ROUGH = 2.0, 4.0  # factors of the scale of the residuals: s up to OWN is a pose's own, from ROUGH on rougher
+SHARES = np.array(ALARMS.inliers)  # w
 
 
 class Terms(NamedTuple):
@@ -191,7 +187,7 @@ def camera_terms(
     if min(len(problem.bearings), int(np.isfinite(seen[:, 0]).sum())) <= PoseModel.of(problem).fixing:
         return None
     ratio = np.ones(len(problem.image.scales)) if scale is None else _ratio(problem.image, scale)
-    own, rough = _is_own(ratio), ratio >= ROUGH
+    own, rough = _is_own(ratio), ratio >= ALARMS.rough
     finest = int(own.argmax())
     logs, less = _terms(problem, seen, finest), np.broadcast_to(fewer, own.shape)[finest:]
     pairs = len(own) * logs.shape[2]
@@ -228,7 +224,7 @@ def _ratio(image: ImageStatistics, scale: float) -> Array:
 
 
 def _is_own(ratio: Array) -> NDArray[np.bool_]:
-    return (ratio >= 1 / OWN) & (ratio <= OWN)
+    return (ratio >= 1 / ALARMS.own) & (ratio <= ALARMS.own)
 
 
 def _shares(problem: Problem) -> Array:
@@ -245,7 +241,7 @@ def _shares(problem: Problem) -> Array:
         shares = shares * problem.candidate_scores[problem.image.chosen][:, None, None]
     elif problem.clutter is None and problem.scores2d is None:
         return shares
-    return np.asarray(np.clip(shares, LEAST_SHARE, MOST_SHARE))
+    return np.asarray(np.clip(shares, ALARMS.least_inliers, ALARMS.most_inliers))
 
 
 def _terms(problem: Problem, seen: Array, finest: int) -> Array:
@@ -312,7 +308,7 @@ def _sums(problem: Problem, seen: Array, scales: Array, even: bool) -> tuple[Arr
         every[rows] += odds * share.sum()
         inside[rows] += odds * share[in_view[columns]].sum()
         used, share, bearings = seen[columns][ahead], share[ahead], problem.bearings[image.chosen[rows]]
-        near = sums_near(bearings, used, image.axes, FARTHEST * scales, 0.5 / scales**2, share)
+        near = sums_near(bearings, used, image.axes, ALARMS.farthest * scales, 0.5 / scales**2, share)
         predicted[rows] += odds[:, None] * near
         if not even:
             smooth[rows] += odds * _smoothed(image, bearings, used, share)
@@ -335,9 +331,9 @@ def _sums_of_pairs(
     ahead = np.isfinite(seen[j, 0])
     i, j = i[ahead], j[ahead]
     squared = ((problem.bearings[problem.image.chosen[i]] - seen[j]) ** 2).sum(-1)
-    near = (np.where(squared < (FARTHEST * s) ** 2, np.exp(-0.5 * squared / s**2), 0.0) for s in scales.tolist())
+    near = (np.where(squared < (ALARMS.farthest * s) ** 2, np.exp(-0.5 * squared / s**2), 0.0) for s in scales.tolist())
     predicted = np.stack([np.bincount(i, weight[j] * kernel, count) for kernel in near], -1)
-    width2 = (OUTLINE * problem.image.spread) ** 2
+    width2 = (ALARMS.outline * problem.image.spread) ** 2
     outline = weight[j] * np.exp(-0.5 * squared / width2) / (2 * math.pi * width2)
     smooth = np.zeros(count) if even else np.asarray(np.bincount(i, outline, count), np.float64)
     return np.asarray(predicted, np.float64), smooth, inside, every
@@ -360,12 +356,12 @@ def _partners(problem: Problem, weight: Array) -> Iterator[tuple[Labels, Labels,
 
 
 def _smoothed(image: ImageStatistics, bearings: Array, directions: Array, share: Array) -> Array:
-    """Return the weighted directions per steradian around each bearing, smoothed by `OUTLINE` RMS angular radii."""
-    step = -(-len(directions) // MOST_SMOOTHED) or 1
+    """Return the weighted directions per steradian around each bearing, smoothed by `ALARMS.outline` radii."""
+    step = -(-len(directions) // ALARMS.smoothed) or 1
     some, share = directions[::step], share[::step]
     if not len(some):
         return np.zeros(len(bearings))
-    width2 = (OUTLINE * image.spread) ** 2
+    width2 = (ALARMS.outline * image.spread) ** 2
     # Relative to the centre of the view, float32 is precise enough for a narrow one.
     one, other = ((points - image.centre) / math.sqrt(2 * width2) for points in (bearings, some))
     one = np.column_stack([2 * one, -(one * one).sum(1), np.ones(len(one))]).astype(np.float32)

@@ -3,8 +3,9 @@
 import math
 from typing import NamedTuple
 
+from bpnp.search.config import REASONS
+
 MIRRORED = "the mirror image of the scene has a significant pose: check the directions of its axes"
-LEAST_SHOWN = 0.05  # decades that are shown as 0.0
 CONFIDENT = "confident"  # code of a pose without an objection
 CLAUSES = {
     # There is no pose, or it is not significant.
@@ -137,7 +138,7 @@ def rounded(bound: float) -> str:
 
 def nfa(log10_false_alarms: float) -> str:
     """Format the logarithm of a number of false alarms."""
-    shown = 0.0 if abs(log10_false_alarms) < LEAST_SHOWN else log10_false_alarms
+    shown = 0.0 if abs(log10_false_alarms) < REASONS.decades else log10_false_alarms
     return f"log10 NFA {shown:.1f}"
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc, fdtri
 
-from bpnp.search.config import DEFAULT, Evidence
+from bpnp.search.config import DEFAULT, PRECISION, Evidence
 from bpnp.search.pose_model import PoseModel, PoseState, Sight, centre_columns, crossed, lens_columns
 from bpnp.search.problem import Problem
 from bpnp.search.refine.gauss_newton import soft_matches
@@ -19,7 +19,6 @@ from bpnp.search.verdict.covariance import Linearisation, covariance_of, student
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
 MANY = 1e9  # degrees of freedom of a number that does not vary
-EXCEEDED = 1e-3  # probability that an error exceeds its bound, and significance level of a test
 
 # Basis of the strains that preserve the volume; the sixth is the unit of length, which no image shows.
 STRAINS = np.array(
@@ -33,7 +32,6 @@ STRAINS = np.array(
     np.float64,
 )
 POSE = 6  # parameters of a pose
-BLOCKS = 4  # number of blocks of image points along each axis of the image
 
 
 def rotation_bound(problem: Problem, linear: "Linearised | None", count: float) -> float:
@@ -113,7 +111,7 @@ def exceeded_once(covariance: Array, free: float) -> float:
     squared, cubed = (float(np.trace(np.linalg.matrix_power(covariance / total, k))) for k in (2, 3))
     d = squared * (squared / cubed) ** 2
     b = math.sqrt(d * squared)
-    quantiles = fdtri(np.array([MANY, d]), free, 1 - EXCEEDED)
+    quantiles = fdtri(np.array([MANY, d]), free, 1 - PRECISION.exceeded)
     return math.sqrt(total * float(max(1 - b, 0.0) * quantiles[0] + b * quantiles[1]))
 
 
@@ -132,7 +130,7 @@ def is_within(error: Array, covariance: Array, free: float | int) -> bool:
         return False
     free, size = max(float(free), 1.0), len(error)
     squared = float(error @ np.linalg.pinv(covariance, hermitian=True) @ error) * student_factor(free)
-    return bool(squared < size * fdtri(size, free, 1 - EXCEEDED))
+    return bool(squared < size * fdtri(size, free, 1 - PRECISION.exceeded))
 
 
 def pose_covariance(problem: Problem, linear: "Linearised | None", count: float) -> Array | None:
@@ -240,7 +238,9 @@ def _of_louis(linear: "Linearised") -> Array | None:
 
 
 def _blocks(problem: Problem, matched: Array) -> Labels:
-    """Return the block (k,) of each chosen image point; the at most `BLOCKS`^2 blocks have equal expected matches.
+    """Return the block (k,) of each chosen image point; the blocks have equal expected matches.
+
+    There are at most `PRECISION.blocks`^2.
 
     Args:
         problem: Points.
@@ -248,17 +248,18 @@ def _blocks(problem: Problem, matched: Array) -> Labels:
     """
     x, y = ((problem.bearings[problem.image.chosen] - problem.image.centre) @ problem.image.axes).T
     column, row = _quantile(x, matched), np.zeros(len(x), np.int64)
-    for k in range(BLOCKS):
+    for k in range(PRECISION.blocks):
         row[column == k] = _quantile(y[column == k], matched[column == k])
-    return column * BLOCKS + row
+    return column * PRECISION.blocks + row
 
 
 def _quantile(values: Array, weights: Array) -> Labels:
-    """Return the index of each value among `BLOCKS` intervals of equal weight."""
+    """Return the index of each value among `PRECISION.blocks` intervals of equal weight."""
     order = np.argsort(values, kind="stable")
     below = np.empty(len(values))
     below[order] = np.cumsum(weights[order]) - weights[order] / 2
-    return np.minimum(below * BLOCKS / max(float(weights.sum()), 1e-300), BLOCKS - 1).astype(np.int64)
+    block = below * PRECISION.blocks / max(float(weights.sum()), 1e-300)
+    return np.minimum(block, PRECISION.blocks - 1).astype(np.int64)
 
 
 class Linearised(NamedTuple):
@@ -376,7 +377,7 @@ def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = 
     pose = np.linalg.pinv(products[:POSE, :POSE], hermitian=True)
     found = []
     strains = slice(POSE + 1, POSE + 1 + len(STRAINS))
-    for fitted, chance in ((slice(POSE, POSE + 1), rule.focal_chance), (strains, EXCEEDED)):
+    for fitted, chance in ((slice(POSE, POSE + 1), rule.focal_chance), (strains, PRECISION.exceeded)):
         moved, step = _moved(products, pose, fitted, free, chance)
         zoom = math.exp(float(step[0])) if len(step) == 1 else 1.0
         found.append(Misfit(float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:])), zoom))
