@@ -76,18 +76,21 @@ class Lens:
 
     @property
     def focal(self) -> float:
-        """Mean focal length in pixels.
+        """Focal length in pixels: the geometric mean of both axes, as for a `Pinhole`.
 
         For a model without focal length (equirectangular) it is the scale at the principal ray.
         """
+        focals = np.asarray(self.camera.params, np.float64)[list(self.camera.focal_length_idxs())]
+        if len(focals):
+            return float(np.prod(np.abs(focals)) ** (1 / len(focals)))
         step = 1e-4
         axis, off_axis = self.camera.img_from_cam(np.array([[0.0, 0.0, 1.0], [step, 0.0, 1.0]]))
-        return float(self.camera.mean_focal_length() or np.linalg.norm(off_axis - axis) / step)
+        return float(np.linalg.norm(off_axis - axis) / step)
 
     @property
     def matrix(self) -> Array:
         """K (3, 3) of the undistorted image, pixels."""
-        if self.camera.mean_focal_length():
+        if len(self.camera.focal_length_idxs()):
             return np.asarray(self.camera.calibration_matrix(), np.float64)
         ((x, y),) = self.camera.img_from_cam(np.array([[0.0, 0.0, 1.0]]))
         return np.array([[self.focal, 0, x], [0, self.focal, y], [0, 0, 1]])

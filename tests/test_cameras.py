@@ -16,6 +16,19 @@ OPENCV = ("OPENCV", [520.0, 500.0, 405.0, 290.0, -0.28, 0.09, 0.004, -0.006])
 RAYS = np.random.default_rng(0).uniform((-0.6, -0.5, 1), (0.6, 0.5, 1), (50, 3))
 
 
+@pytest.mark.parametrize(
+    "given",
+    [
+        np.array([[900.0, 0, 320], [0, 400, 240], [0, 0, 1]]),
+        ("PINHOLE", [900.0, 400.0, 320.0, 240.0]),
+        ("OPENCV_FISHEYE", [900.0, 400.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0]),
+    ],
+)
+def test_the_focal_length_is_the_geometric_mean_of_both_axes(given: Any) -> None:
+    """A square pixel of the same area has it: sqrt(900 * 400) = 600."""
+    assert camera_from(given).focal == pytest.approx(600, rel=1e-12)
+
+
 @pytest.mark.parametrize("given", [K, K.tolist(), torch.tensor(K), 2 * K, K.astype(np.float32)])
 def test_a_matrix_is_the_projection_of_opencv(given: object) -> None:
     camera = camera_from(given)
@@ -41,7 +54,7 @@ def test_distortion_is_removed_and_applied_as_in_opencv(given: object) -> None:
     expected, _ = cv2.projectPoints(RAYS, np.zeros(3), np.zeros(3), matrix, np.array(distortion))
     np.testing.assert_allclose(camera.project(2 * RAYS), expected[:, 0], atol=1e-6)
     np.testing.assert_allclose(camera.normalise(expected[:, 0]), RAYS[:, :2], atol=1e-6)
-    assert camera.focal == pytest.approx(510)
+    assert camera.focal == pytest.approx(np.sqrt(520 * 500))
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from bpnp.search.propose.density_map import search_around
 from bpnp.search.refine.annealing import anneal_to_end, finish
 from bpnp.search.scene import Scene
 from bpnp.search.settle import other_lens, settle
-from bpnp.search.solution import Solution, add_objection
+from bpnp.search.solution import Solution, add_objection, change_verdict
 from bpnp.search.verdict.competitors import competing_pose
 from bpnp.search.verdict.decide import judge
 
@@ -134,7 +134,7 @@ def judge_on_all_points(solution: Solution, refined: Refined | None) -> Solution
         return solution if lens_objection is None else add_objection(solution, lens_objection)
     if result.verdict == "confident":
         return solution
-    return replace(solution, verdict=result.verdict, reason=result.reason, reason_code=result.code)
+    return change_verdict(solution, result.verdict, result.reason, result.code)
 
 
 def local_searches_for_certainty(rule: Evidence) -> int:

@@ -1,7 +1,6 @@
 """Verification of the pose of a view: against the points that other views see, and against the rest of the map."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 
 from bpnp.cameras import camera_from
 from bpnp.maps.aliasing import best_competitor, explained_keypoints, judge_against
@@ -10,7 +9,7 @@ from bpnp.maps.viewed_points import Region
 from bpnp.maps.views import Array, View
 from bpnp.poses import MIN_POINTS
 from bpnp.search.config import DEFAULT
-from bpnp.search.solution import Solution
+from bpnp.search.solution import Solution, change_verdict
 from bpnp.search.verify import verify_problem
 
 
@@ -48,4 +47,4 @@ def verify_pose(
     competitor = best_competitor(photo, place, solution, [], regions(explained_keypoints(photo, solution)))
     compared = judge_against(solution, competitor)
     refuted = competitor is not None and competitor.margin <= -DEFAULT.evidence.lead
-    return replace(compared, verdict="failed") if refuted else compared
+    return change_verdict(compared, "failed", compared.reason, compared.reason_code) if refuted else compared

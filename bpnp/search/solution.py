@@ -63,7 +63,7 @@ class SolutionStats:
     Attributes:
         iterations: Number of batches of initial poses.
         residual: Scale of the residuals, radians.
-        converged: True if the verdict is "confident", so that the search stopped by itself.
+        converged: True if the verdict is "confident".
         dropped2d: Number of 2D points that could not be undistorted and were dropped.
         taken2d: Number of 2D points that other problems of the same image use (`solve_many`).
     """
@@ -177,7 +177,7 @@ class Solution:
 
     @property
     def focal_length(self) -> float:
-        """Focal length of the camera, pixels, given or estimated; NaN without a camera."""
+        """Focal length of `camera`, pixels: the geometric mean of both axes; NaN without a camera."""
         return math.nan if self.camera is None else self.camera.focal
 
     @property
@@ -312,8 +312,21 @@ class Solution:
 
 def add_objection(solution: Solution, one: Objection) -> Solution:
     """Return a copy of a solution that is ambiguous for a reason."""
-    reason = one.sentence(solution.log10_false_alarms)
-    return replace(solution, verdict="ambiguous", reason=reason, reason_code=one.code)
+    return change_verdict(solution, "ambiguous", one.sentence(solution.log10_false_alarms), one.code)
+
+
+def change_verdict(solution: Solution, verdict: Verdict, reason: str, code: str) -> Solution:
+    """Return a copy of a solution with another verdict, and with the values that depend on the verdict.
+
+    Args:
+        solution: Solution with a pose.
+        verdict: New verdict. "failed" sets the covariance to NaN.
+        reason: Reason of the verdict, a sentence.
+        code: Kind of the reason.
+    """
+    covariance = np.full_like(solution.covariance, math.nan) if verdict == "failed" else solution.covariance
+    stats = replace(solution.stats, converged=verdict == "confident")
+    return replace(solution, verdict=verdict, reason=reason, reason_code=code, covariance=covariance, stats=stats)
 
 
 def candidates_of(poses: Hypotheses, counts: Sequence[int]) -> tuple[Candidate, ...]:

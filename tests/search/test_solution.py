@@ -7,6 +7,8 @@ import pytest
 from planted import plant
 
 from bpnp import Solution, solve
+from bpnp.search.solution import add_objection, change_verdict
+from bpnp.search.verdict.reasons import objection
 
 
 def test_a_solution_is_the_same_after_its_json(tmp_path: Path) -> None:
@@ -30,3 +32,17 @@ def test_a_solution_is_the_same_after_its_json(tmp_path: Path) -> None:
 def test_a_text_that_is_no_solution_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="not the JSON of a solution"):
         Solution.from_json(text)
+
+
+def test_values_that_depend_on_the_verdict_change_with_it() -> None:
+    """`converged` is true for confident solutions only, and failed ones have no uncertainty."""
+    planted = plant(1, 30, noise=0.001)
+    solution = solve(planted.points2d[0], planted.points3d[0])
+    assert (solution.verdict, solution.stats.converged) == ("confident", True)
+    doubtful = add_objection(solution, objection("incomplete", what="pose", probability="0.1"))
+    assert (doubtful.verdict, doubtful.reason_code, doubtful.stats.converged) == ("ambiguous", "incomplete", False)
+    assert doubtful.rotation_std_deg == solution.rotation_std_deg
+    failed = change_verdict(solution, "failed", "another pose is better", "better_place")
+    assert (failed.verdict, failed.stats.converged) == ("failed", False)
+    assert np.isnan([failed.rotation_std_deg, failed.centre_std]).all()
+    assert failed.stats.iterations == solution.stats.iterations
