@@ -90,6 +90,7 @@ else:
 def short_repr(value: object) -> str:
     """Return the representation of a value in one line of at most 80 characters, for an error message.
 
+    >>> from bpnp.argument_types import short_repr
     >>> short_repr([[1.0], [2.0]])
     '[[1.0], [2.0]]'
     """

@@ -182,6 +182,7 @@ def camera_from(camera: Any) -> Camera:
         ValueError: K is singular or not finite, the model is unknown, the number of parameters is wrong, or the focal
             length is not positive.
 
+    >>> from bpnp.cameras import camera_from
     >>> camera_from(("PINHOLE", 640, 480, [800, 800, 320, 240])).focal
     800.0
     """
@@ -251,6 +252,8 @@ def outside_image(pixels: Array, sides: Any) -> npt.NDArray[np.bool_]:
     Returns:
         Mask (m,) of the points farther outside; all False if they are no more than 2 %.
 
+    >>> import numpy as np
+    >>> from bpnp.cameras import outside_image
     >>> outside_image(np.array([[101.8, 20.0], [50, 50], [10, 20]]), (100, 100)).tolist()
     [True, False, False]
     """
@@ -267,6 +270,7 @@ def resize_camera(camera: Camera, size: tuple[int, int]) -> Camera:
         camera: Camera with a known image size.
         size: Width and height of the resized images, pixels, with the same aspect ratio.
 
+    >>> from bpnp.cameras import camera_from, resize_camera
     >>> resize_camera(camera_from(("PINHOLE", 1000, 800, [900, 880, 500, 400])), (500, 400)).matrix.tolist()
     [[450.0, 0.0, 250.0], [0.0, 440.0, 200.0], [0.0, 0.0, 1.0]]
     """
@@ -291,6 +295,7 @@ def scale_focal_length(camera: Camera, zoom: float) -> Camera:
         camera: Any camera.
         zoom: Factor.
 
+    >>> from bpnp.cameras import camera_from, scale_focal_length
     >>> scale_focal_length(camera_from(("SIMPLE_RADIAL", 1000, 800, [900, 500, 400, 0.1])), 2.0).focal
     1800.0
     """
@@ -321,6 +326,7 @@ def with_radial_distortion(camera: Camera, radial: float) -> Lens:
     Returns:
         A SIMPLE_RADIAL camera, or an OPENCV camera for two different focal lengths.
 
+    >>> from bpnp.cameras import camera_from, with_radial_distortion
     >>> with_radial_distortion(camera_from(("SIMPLE_PINHOLE", 1000, 800, [900, 500, 400])), 0.1).camera.params.tolist()
     [900.0, 500.0, 400.0, 0.1]
     """

@@ -28,6 +28,8 @@ def check_shapes(function: _F) -> _F:
 
     >>> import torch
     >>> from jaxtyping import Float
+    >>> from torch import Tensor
+    >>> from bpnp.checks import check_shapes
     >>> @check_shapes
     ... def mean(points2d: Float[Tensor, "b m 2"]) -> Float[Tensor, "b 2"]:
     ...     return points2d.mean(1)
@@ -96,6 +98,7 @@ def check_within(least: float | int, most: float | int, **options: Any) -> None:
         most: Upper limit, included.
         **options: A number, or a pair (low, high) with low <= high, by the name of the option.
 
+    >>> from bpnp.checks import check_within
     >>> check_within(0, 1, share=(0.2, 0.5))
     >>> check_within(0, 1, share=(0.5, 0.2))
     Traceback (most recent call last):

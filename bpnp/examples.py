@@ -68,6 +68,8 @@ class Example:
         Returns:
             The angle in [0, 180], or NaN for a rotation that is not finite, such as that of a failed solution.
 
+        >>> import numpy as np
+        >>> from bpnp.examples import load
         >>> load("mesh").rotation_error_deg(np.full((3, 3), np.nan))
         nan
         """

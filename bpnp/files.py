@@ -137,6 +137,8 @@ def packaged_config(name: str) -> str:
         name: Path of a file, which is returned unchanged, or the name of a packaged configuration, such as
             `quickstart`.
 
+    >>> from pathlib import Path
+    >>> from bpnp.files import packaged_config
     >>> Path(packaged_config("quickstart")).name
     'quickstart.yaml'
     """

@@ -18,6 +18,8 @@ def bearings(points2d: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 3"]:
     Returns:
         Unit vectors (..., 3) in camera coordinates.
 
+    >>> import torch
+    >>> from bpnp.geometry import bearings
     >>> bearings(torch.tensor([[0.75, 0.0]]))
     tensor([[0.6000, 0.0000, 0.8000]])
     """
@@ -50,6 +52,8 @@ def project(points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 2"]:
     Returns:
         (x/z, y/z), (..., 2); infinite at z = 0.
 
+    >>> import torch
+    >>> from bpnp.geometry import project
     >>> project(torch.tensor([1.0, 2.0, 4.0]))
     tensor([0.2500, 0.5000])
     """
@@ -112,6 +116,8 @@ def retract(
     Returns:
         The new rotation (..., 3, 3) and translation (..., 3).
 
+    >>> import torch
+    >>> from bpnp.geometry import retract
     >>> _, translation = retract(torch.tensor([0.0, 0, 0, 1, 2, 3]), torch.eye(3), torch.zeros(3))
     >>> translation
     tensor([1., 2., 3.])

@@ -52,6 +52,8 @@ def rotation_error(rotation: Float[Tensor, "b 3 3"], rotation_gt: Float[Tensor, 
     Returns:
         Angles (b,) in [0, 180], degrees, float64; 180 where R is not finite.
 
+    >>> import torch
+    >>> from bpnp.metrics import rotation_error
     >>> quarter_turn = torch.tensor([[[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]])
     >>> float(rotation_error(quarter_turn, torch.eye(3)[None]))
     90.0
@@ -70,6 +72,8 @@ def translation_error(translation: Float[Tensor, "b 3"], translation_gt: Float[T
     Returns:
         Distances (b,), scene units, float64; infinity where t is not finite.
 
+    >>> import torch
+    >>> from bpnp.metrics import translation_error
     >>> float(translation_error(torch.tensor([[3.0, 4.0, 1.0]]), torch.tensor([[0.0, 0.0, 1.0]])))
     5.0
     """
@@ -164,7 +168,18 @@ def pose_errors(pose: Pose, batch: Batch) -> PoseErrors:
 
 
 def prediction_errors(prediction: Prediction, batch: Batch) -> dict[str, PoseErrors]:
-    """Return the `pose_errors` of each estimate of a prediction, by its name."""
+    """Return the `pose_errors` of each estimate of a prediction.
+
+    Args:
+        prediction: Prediction with any number of poses.
+        batch: Problems with their true pose.
+
+    Returns:
+        The errors by the name of the estimate.
+
+    Raises:
+        ValueError: The batch has no true pose, or one that is not finite.
+    """
     return {name: pose_errors(pose, batch) for name, pose in prediction.poses.items()}
 
 
@@ -209,10 +224,10 @@ def pose_quartiles(errors: PoseErrors) -> dict[str, Tensor]:
         errors: Errors of at least one problem.
 
     Returns:
-        Float64 scalars by name: "rotation_q1_deg", "translation_q2", "centre_q3", "reprojection_q1_deg" and so on (q2
-            is
-        the median); "found", the fraction of problems with a pose; "without_matches", the number of problems without a
-        reprojection error. The reprojection quartiles are absent if no problem has that error.
+        Float64 scalars by name: "rotation_q1_deg", "translation_q2", "centre_q3", "reprojection_q1_deg" and so on,
+            where q2 is the median; "found", the fraction of problems with a pose; "without_matches", the number of
+            problems without a reprojection error. Quartiles of the reprojection error leave these problems out, and are
+            absent if no problem has that error.
 
     Raises:
         ValueError: There are no problems.
@@ -234,13 +249,16 @@ def pose_quartiles(errors: PoseErrors) -> dict[str, Tensor]:
 def pose_recalls(errors: PoseErrors, thresholds: RecallThresholds | None = None) -> dict[str, Tensor]:
     """Return the fraction of problems with an error up to each threshold.
 
+    The fractions of the reprojection error are of the problems that have one.
+
     Args:
         errors: Errors of at least one problem.
         thresholds: Thresholds. Default: `RecallThresholds()`.
 
     Returns:
         Float64 scalars in [0, 1] by name: "recall_rotation_5deg", "recall_translation_0.5", "recall_centre_0.5",
-        "recall_reprojection_1deg" and so on, and "recall_joint_15deg_0.5" for rotation and translation together.
+            "recall_reprojection_1deg" and so on, and "recall_joint_15deg_0.5" for rotation and translation together.
+            Those of the reprojection error are absent if no problem has that error.
 
     Raises:
         ValueError: There are no problems.
@@ -266,6 +284,8 @@ def recall_curve(error: Float[Tensor, " b"], limits: Limits) -> Float[Tensor, " 
     Returns:
         Fractions (k,), float64.
 
+    >>> import torch
+    >>> from bpnp.metrics import recall_curve
     >>> recall_curve(torch.tensor([1.0, 3.0, 3.0, 9.0]), [1, 3, 4]).tolist()
     [0.25, 0.75, 0.75]
     """
@@ -349,6 +369,11 @@ class MeanOverProblems(ProblemMetric):
 
     A problem is counted once, by its `Batch.index`.
 
+    Args:
+        **kwargs: Options of `torchmetrics.Metric`.
+
+    >>> import torch
+    >>> from bpnp.metrics import MeanOverProblems
     >>> mean = MeanOverProblems()
     >>> mean.update(torch.tensor([1.0, 2.0, 6.0]), torch.tensor([0, 1, 2]))
     >>> mean.update(torch.tensor([6.0]), torch.tensor([2]))
@@ -360,7 +385,12 @@ class MeanOverProblems(ProblemMetric):
     width = 1
 
     def update(self, values: Float[Tensor, " b"], index: Int[Tensor, " b"]) -> None:
-        """Add the values (b,) of the problems with these indices (b,)."""
+        """Add the values of a batch.
+
+        Args:
+            values: One value per problem (b,).
+            index: `Batch.index` of the problems (b,).
+        """
         self._append(values, index=index)
 
     def compute(self) -> Float[Tensor, ""]:
@@ -391,6 +421,11 @@ class PoseMetric(ProblemMetric):
 class PoseQuartiles(PoseMetric):
     """`pose_quartiles` over all problems, as a metric.
 
+    Args:
+        **kwargs: Options of `torchmetrics.Metric`.
+
+    >>> import torch
+    >>> from bpnp.metrics import PoseErrors, PoseQuartiles
     >>> metric = PoseQuartiles()
     >>> metric.update(PoseErrors(*torch.tensor([[1.0, 3.0, 5.0], [0.1, 0.2, 0.3], [0.1, 0.2, 0.3], [0.2, 0.2, 0.4]])))
     >>> float(metric.compute()["rotation_q1_deg"])
@@ -411,6 +446,8 @@ class PoseRecall(PoseMetric):
         thresholds: Largest errors of a correct pose. Default: `RecallThresholds()`.
         **kwargs: Options of `torchmetrics.Metric`.
 
+    >>> import torch
+    >>> from bpnp.metrics import PoseErrors, PoseRecall, RecallThresholds
     >>> metric = PoseRecall(RecallThresholds(rotation_deg=(4,)))
     >>> metric.update(PoseErrors(*torch.tensor([[1.0, 3.0, 5.0], [0.1, 0.2, 0.3], [0.1, 0.2, 0.3], [0.2, 0.2, 0.4]])))
     >>> round(float(metric.compute()["recall_rotation_4deg"]), 3)

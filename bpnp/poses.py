@@ -51,6 +51,8 @@ def same_pose(
         Mask (c,), or (k, c) for several indices.
 
     Examples:
+        >>> import numpy as np
+        >>> from bpnp.poses import same_pose
         >>> middle = np.array([[0, 0, 10], [0.4, 0, 10], [0, 0, 10.6]])
         >>> same_pose(np.stack([np.eye(3)] * 3), middle)
         array([ True,  True, False])

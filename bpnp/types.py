@@ -78,6 +78,8 @@ class SolveStats(Tensors):
             converged: True where the solver succeeded (b,).
             residual: Residuals (b,). Default: 0 where it converged, infinity elsewhere.
 
+        >>> import torch
+        >>> from bpnp import SolveStats
         >>> SolveStats.of(torch.tensor([True, False])).residual.tolist()
         [0.0, inf]
         """
@@ -216,6 +218,8 @@ class Batch(Tensors):
             ValueError: An array has a wrong shape, holds NaN or infinity, or has no points; the points are pixels; the
                 lists differ in length; `match3d` holds no integers or no index of a 2D point.
 
+        >>> import torch
+        >>> from bpnp import Batch
         >>> batch = Batch.from_arrays([torch.rand(5, 2), torch.rand(7, 2)], [torch.rand(9, 3), torch.rand(6, 3)])
         >>> tuple(batch.points2d.shape), batch.count2d.tolist(), batch.count3d.tolist()
         ((2, 7, 2), [5, 7], [9, 6])

@@ -203,13 +203,16 @@ class ProblemDataModule(LightningDataModule):
     test and predict.
 
     Args:
-        train_outliers: Synthetic outliers and occlusion in training and validation. Default: none.
-        test_outliers: Synthetic outliers and occlusion in testing and prediction. Default: none.
+        train_outliers: Synthetic outliers and occlusion in training and validation. Default: None, without.
+        test_outliers: Synthetic outliers and occlusion in testing and prediction. Default: None, without.
         batch_size: Training problems in a step, over all processes.
-        eval_batch_size: Problems in a step of validation, testing and prediction; none for batch_size.
-        max_cells: Limit of problems x 2D points x 3D points in such a step, to bound the memory; none for no limit.
+        eval_batch_size: Problems in a step of validation, testing and prediction; None for batch_size.
+        max_cells: Limit of problems x 2D points x 3D points in such a step, to bound the memory; None for no limit.
         num_workers: Number of loader processes.
         seed: Seed of all random numbers and of the order.
+
+    Raises:
+        ValueError: An option is out of range.
     """
 
     fresh = False  # True if each epoch draws new training problems
@@ -260,7 +263,7 @@ class ProblemDataModule(LightningDataModule):
         return self._loader("train")
 
     def val_dataloader(self) -> DataLoader[Batch] | list[DataLoader[Batch]]:
-        """Return the loader of the validation problems; none if there are no such problems."""
+        """Return the loader of the validation problems; an empty list if there are no such problems."""
         return self._loader("val") if "val" in self.datasets or not self.datasets else []
 
     def test_dataloader(self) -> DataLoader[Batch]:

@@ -51,12 +51,15 @@ class RandomCameras:
     the 640 x 480 image are kept.
 
     Args:
-        rotation: euler for R = Rz Ry Rx with angles from euler_range, so3 for uniform rotations.
+        rotation: "euler" for R = Rz Ry Rx with angles uniform in euler_range, "so3" for uniform rotations.
         euler_range: Smallest and largest Euler angle, degrees.
         translation_range: Half width of the uniform distribution of each coordinate, scene units.
         distance: Added to the translation along the optical axis, scene units.
         focal: Focal length, pixels.
         noise_px: Standard deviation of the noise of 2D points, pixels.
+
+    Raises:
+        ValueError: An option is out of range.
     """
 
     rotation: Literal["euler", "so3"] = "euler"
@@ -75,7 +78,14 @@ class RandomCameras:
         check_positive(focal=self.focal)
 
     def poses(self, random: Generators) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"]]:
-        """Draw a pose camera = R p + t from each generator, float64."""
+        """Draw a pose camera = R p + t from each generator.
+
+        Args:
+            random: One random generator per pose.
+
+        Returns:
+            Rotations (b, 3, 3) and translations (b, 3), float64.
+        """
         numbers = uniform(random, 6)
         if self.rotation == "so3":
             rotation = rotations(random)
@@ -145,7 +155,14 @@ class MeshSource:
         """Return random camera views of `num_points` samples of each mesh, drawn without replacement.
 
         2D points are x/z and y/z plus noise, computed in float64. A point with a depth below 0.1 has no 2D point and -1
-        in match3d.
+        in match3d. All other points have one, on the far side of the mesh too.
+
+        Args:
+            index: Indices of the problems (b,).
+            epoch: Epoch, which is part of the seed.
+
+        Returns:
+            The problems with their true poses and matches.
 
         Raises:
             ValueError: A problem has fewer than 4 points in front of its camera.
@@ -196,28 +213,28 @@ class MeshSource:
 class MeshDataModule(ProblemDataModule):
     """Virtual cameras around meshes, by default as in Campbell et al. (ECCV 2020), or around procedural shapes.
 
-    Every problem is a subset of a mesh's surface samples, seen by a random camera. Validation meshes are held out of
-    the training split; test meshes serve testing and prediction only. Works without a Trainer: `setup()`, then the
-    loaders.
+    Every problem is a subset of a mesh's surface samples, seen by a random camera. Self-occlusion is not simulated: the
+    camera sees points on the far side of the mesh too. Validation meshes are held out of the training split; test
+    meshes serve testing and prediction only. Works without a Trainer: `setup()`, then the loaders.
 
     Args:
         root: Folder that `bpnp prepare modelnet40` made, or folder of meshes or point clouds in ModelNet40's layout,
             <class>/{train,test}/*.{glb,obj,off,ply,stl,npy,txt,xyz}, or ModelNet40's HDF5 or `normal_resampled`
-            archive, unpacked; none for procedural shapes.
+            archive, unpacked; None for procedural shapes.
         train_problems: Number of training problems; problem i shows training mesh i modulo the number of meshes.
-        fresh_views: Draw new cameras, points and noise every epoch; false for the fixed problems of the paper.
+        fresh_views: Draw new cameras, points and noise every epoch. Default False, the fixed problems of the paper.
         val_fraction: Fraction of the training meshes held out for validation.
-        val_problems: Number of validation problems, fixed; none for one per held-out mesh.
-        test_problems: Number of test problems, fixed; none for one per test mesh. Fewer use a random choice of meshes,
+        val_problems: Number of validation problems, fixed; None for one per held-out mesh.
+        test_problems: Number of test problems, fixed; None for one per test mesh. Fewer use a random choice of meshes,
             more are further views.
         num_points: Number of 3D points of a problem.
         pool_size: Number of surface samples kept of each mesh, at least num_points. Every problem draws its own
             num_points of them. With pool_size equal to num_points all problems of a mesh have the same points, as in
             the paper. A point cloud with fewer points is used whole.
-        normalisation: Frame of each mesh. unit_sphere: mean of its surface samples at the origin, farthest at distance
-            1;
-            unit_cube: bounding box centred, longest side 1; none: units of the file.
-        rotation: euler for R = Rz Ry Rx with angles from euler_range, so3 for uniform rotations.
+        normalisation: Frame of each mesh. "unit_sphere", the default: the mean of its surface samples is the origin,
+            the farthest one at distance 1. "unit_cube": the bounding box is centred, its longest side is 1. "none": the
+            units of the file.
+        rotation: "euler" for R = Rz Ry Rx with angles uniform in euler_range, "so3" for uniform rotations.
         euler_range: Smallest and largest Euler angle, degrees.
         translation_range: Half width of the uniform distribution of each coordinate of the translation, scene units.
         distance: Added to the translation along the optical axis, scene units.
@@ -226,8 +243,12 @@ class MeshDataModule(ProblemDataModule):
         train_shapes: Number of procedural training shapes; used without root only, as are val_shapes and test_shapes.
         val_shapes: Number of procedural validation shapes; with root, val_fraction is used.
         test_shapes: Number of procedural test shapes.
-        cache_dir: Folder for the surface samples; none for BPNP_CACHE, else the user's cache folder.
-        loading: Options of `ProblemDataModule`: batch_size, eval_batch_size, train_outliers, test_outliers, seed, ...
+        cache_dir: Folder for the surface samples; None for BPNP_CACHE, else the user's cache folder.
+        **loading: Options of `ProblemDataModule`: train_outliers, test_outliers, batch_size, eval_batch_size,
+            max_cells, num_workers and seed.
+
+    Raises:
+        ValueError: An option is out of range. A folder without usable meshes raises in `setup`.
     """
 
     def __init__(

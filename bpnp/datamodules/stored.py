@@ -101,20 +101,21 @@ class StoredDataModule(ProblemDataModule):
 
     Args:
         root: Folder of the store.
-        train_scenes: Scenes to train on, or a text file with one a line; none for all scenes that the others leave.
-        val_scenes: Scenes to validate on, or a file; none to draw val_fraction.
-        test_scenes: Scenes to test and predict on, or a file; none to draw test_fraction.
+        train_scenes: Scenes to train on, or a text file with one a line; None for all scenes that the others leave.
+        val_scenes: Scenes to validate on, or a file; None to draw val_fraction.
+        test_scenes: Scenes to test and predict on, or a file; None to draw test_fraction.
         val_fraction: Fraction of the scenes to validate on, drawn by seed.
         test_fraction: Fraction of the scenes to test and predict on, drawn by seed; 1 for all.
         min_points: Images that see fewer points are skipped; at least 4.
-        max_points: Largest number of matches of a training image; of more, a random subset is taken. none for all.
+        max_points: Largest number of matches of a training image; of more, a random subset is taken. None for all.
         fresh_subsets: Draw new subsets, clutter and rotations every epoch in training.
-        eval_max_points: As max_points, in validation, testing and prediction, where the subset is fixed; none for all.
+        eval_max_points: As max_points, in validation, testing and prediction, where the subset is fixed; None for all.
         clutter: Natural clutter, as a ratio to the matches: keypoints without a 3D point, and points of the scene that
             the image does not see.
-        clutter_side: Side that gets clutter, both, 2d or 3d.
+        clutter_side: Side that gets clutter: "both", "2d" or "3d".
         rotate: Rotate the scene of each problem at random; never in prediction.
-        loading: Options of `ProblemDataModule`: batch_size, eval_batch_size, train_outliers, test_outliers, seed, ...
+        **loading: Options of `ProblemDataModule`: train_outliers, test_outliers, batch_size, eval_batch_size,
+            max_cells, num_workers and seed.
     """
 
     def __init__(

@@ -34,32 +34,37 @@ def sinkhorn(
 ) -> tuple[Float[Tensor, "b m n"], SolveStats]:
     """Solve the entropic transport problem (paper Eq. 9): the joint probability P of every match.
 
-    P minimises <P, M> + mu sum P (log P - 1) subject to P 1 = r and P^T 1 = c. Samples stop independently of each
-    other. The gradient is that of the optimum (`bpnp.layers.implicit`) and takes O(m n) memory. There is no second
-    derivative.
+    P minimises <P, M> + mu sum P (log P - 1) subject to P 1 = r and P^T 1 = c. With a `dustbin` M, r and c are first
+    extended by one point on each side (`dustbin_marginals`). Samples stop independently of each other. The gradient is
+    that of the optimum (`bpnp.layers.implicit`) and takes O(m n) memory. There is no second derivative.
 
     Args:
-        cost: Cost M (b, m, n); infinite for an impossible match.
+        cost: Cost M (b, m, n); infinite for an impossible match, but not for all matches of a point.
         mu: Entropy weight > 0, a number or a scalar tensor, which receives a gradient.
         row_marginal: r (b, m), summing to one over the real points; receives a gradient. Default: uniform.
         col_marginal: c (b, n), as `row_marginal`.
         mask2d: True at real image points (b, m). A padded row gets no mass. Default: all are real.
         mask3d: True at real scene points (b, n). A padded column gets no mass. Default: all are real.
         dustbin: Cost of leaving a point unmatched, a number or a scalar tensor, which receives a gradient. Each side
-            gets one more point, the dustbin (`dustbin_marginals`), which is left out of the result, so that P sums to
-            less than one. Default: None, every point is matched.
+            gets one more point, the dustbin, with room for all points of the other side: with m and n real points,
+            image points have the marginal m / (m + n) r, their dustbin n / (m + n), and likewise for c. The dustbins
+            are left out of the result, so that P sums to less than one. Default: None, every point is matched.
         tolerance: Largest L1 error of the row sums, and of the column sums, at which a sample stops.
-        max_iterations: Largest number of row and column scalings of a sample.
+        max_iterations: Largest number of sweeps of a sample; a sweep scales all rows, then all columns.
         backward_stats: Counts the samples of backward passes and those that did not converge. Default: None, a
             RuntimeWarning reports the latter.
 
     Returns:
-        P (b, m, n), and stats whose `residual` is the L1 error of the marginals.
+        P (b, m, n), and stats whose `residual` is the L1 error of the marginals and whose `iterations` counts sweeps. A
+            NaN in the cost, or a point without a finite cost and without a dustbin, gives NaN in P and `converged`
+            False.
 
     Raises:
         ValueError: mu is not positive, a sample has no real point on one side, or an argument has a wrong shape or
             dtype.
 
+    >>> import torch
+    >>> from bpnp.layers import sinkhorn
     >>> assignment, stats = sinkhorn(torch.tensor([[[0.0, 1.0], [1.0, 0.2]]]), mu=0.5)
     >>> assignment
     tensor([[[0.4291, 0.0709],
@@ -139,12 +144,14 @@ class Sinkhorn(nn.Module):
     `backward_stats.unconverged` at the end of an epoch, then call `backward_stats.reset()`.
 
     Args:
-        mu: Entropy weight of the transport.
-        learn_mu: Learn the entropy weight, starting from `mu`.
-        dustbin: Cost of leaving a point unmatched. Default: null, every point is matched.
-        tolerance: L1 error of the marginals at which a sample stops.
-        max_iterations: Largest number of row and column scalings.
+        mu: Entropy weight of the transport, default 0.1.
+        learn_mu: Learn the entropy weight, starting from `mu`. Default False.
+        dustbin: Cost of leaving a point unmatched. Default: None, every point is matched.
+        tolerance: L1 error of the marginals at which a sample stops, default 1e-6.
+        max_iterations: Largest number of sweeps over rows and columns, default 1000.
 
+    >>> import torch
+    >>> from bpnp.layers import Sinkhorn
     >>> layer = Sinkhorn(mu=0.1, learn_mu=True)
     >>> assignment, stats = layer(torch.rand(2, 5, 6))
     >>> assignment.shape, [name for name, _ in layer.named_parameters()]

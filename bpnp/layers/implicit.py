@@ -28,6 +28,7 @@ class BackwardStats:
         samples: Samples so far.
         unconverged: Samples whose solver did not converge.
 
+    >>> import torch
     >>> from bpnp.layers import Sinkhorn
     >>> layer = Sinkhorn(mu=0.1)
     >>> cost = torch.rand(2, 5, 6, requires_grad=True)

@@ -251,6 +251,8 @@ def weighted_pnp(
     Raises:
         ValueError: An argument has a wrong shape or dtype, the solver is unknown, or `clip_columns` is not positive.
 
+    >>> import torch
+    >>> from bpnp.layers import weighted_pnp
     >>> points3d = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]])
     >>> bearings = torch.nn.functional.normalize(points3d + torch.tensor([0.0, 0, 4]), dim=-1)
     >>> start = torch.eye(3)[None], torch.tensor([[0.1, 0.2, 4.5]])
@@ -390,12 +392,14 @@ class WeightedPnP(nn.Module):
     `clipped.reset()` after reading it.
 
     Args:
-        solver: newton, or lbfgs for the paper's L-BFGS with a strong Wolfe line search.
-        tolerance: Gradient norm per unit of weight at which a sample stops, radians and scene radii.
-        max_iterations: Largest number of iterations.
+        solver: "newton", the default, or "lbfgs" for the paper's L-BFGS with a strong Wolfe line search.
+        tolerance: Gradient norm per unit of weight at which a sample stops, radians and scene radii; default 1e-9.
+        max_iterations: Largest number of iterations of a sample, default 50.
         clip_columns: Largest norm of a column of the derivative with respect to the assignment; the paper uses 100.
-            Default: null, no limit.
+            Default: None, no limit.
 
+    >>> import torch
+    >>> from bpnp.layers import WeightedPnP
     >>> layer = WeightedPnP(max_iterations=20)
     >>> points3d = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]])
     >>> bearings = torch.nn.functional.normalize(points3d + torch.tensor([0.0, 0, 4]), dim=-1)

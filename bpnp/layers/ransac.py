@@ -23,13 +23,16 @@ def top_matches(
     mask3d: Bool[Tensor, "b n"] | None,
     matches_factor: float,
 ) -> tuple[Int[Tensor, "b k"], Int[Tensor, "b k"], Bool[Tensor, "b k"]]:
-    """Select the k = matches_factor * min(m, n) most probable matches of each sample, m and n its real points.
+    """Select the most probable matches of each sample.
+
+    A sample with m' and n' real points has floor(matches_factor * min(m', n')) matches, at most m' n'. The width k of
+    the result is the same of the padded sizes m and n, and at least 1.
 
     Args:
         assignment: P (b, m, n).
         mask2d: True at real image points (b, m). None: all are real.
         mask3d: True at real scene points (b, n). None: all are real.
-        matches_factor: Matches per point of the smaller side.
+        matches_factor: Number of matches per point of the smaller side.
 
     Returns:
         Indices of the 2D points (b, k) and of the 3D points (b, k), most probable match first, and which of them are
@@ -62,9 +65,10 @@ def ransac_pnp(
     max_iterations: int = 1000,
     seed: int = 0,
 ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], SolveStats]:
-    """Estimate a pose from the k = matches_factor * min(m, n) most probable matches by RANSAC with a P3P solver.
+    """Estimate a pose from the most probable matches by RANSAC with a P3P solver.
 
-    The pose has no gradient: it is the initial pose of a layer that has one.
+    With m and n real points the floor(matches_factor * min(m, n)) most probable matches are used. The pose has no
+    gradient: it is the initial pose of a layer that has one.
 
     Args:
         assignment: P (b, m, n); only the order of its entries matters.
@@ -74,21 +78,26 @@ def ransac_pnp(
         mask3d: True at real scene points (b, n). Default: all are real.
         backend: "poselib" is LO-RANSAC that samples in the order of P (PROSAC). "opencv" is the paper's P3P-RANSAC
             followed by EPnP on its inliers, or by SQPnP where EPnP loses inliers, as it may for coplanar points.
-            "torch" samples in the order of P too and solves the whole batch at once on its device. "auto" is torch on
-            cuda, else poselib.
-        matches_factor: Matches per point of the smaller side.
-        threshold: Largest reprojection error of an inlier, normalised units (0.01 is 8 px at a focal length of 800).
-        max_iterations: Largest number of hypotheses; the paper uses 1000.
-        seed: Seed of the sampling, the same for each sample, so that a pose does not depend on the other samples.
+            "torch" samples in the order of P too and solves the whole batch at once on its device. "auto", the default,
+            is "torch" on cuda, else "poselib".
+        matches_factor: Number of matches per point of the smaller side, default 1.5.
+        threshold: Largest reprojection error of an inlier, normalised units, default 0.01 (8 px at a focal length of
+            800).
+        max_iterations: Largest number of hypotheses, 1000 by default and in the paper.
+        seed: Seed of the sampling, default 0. It is the same for each sample, so that a pose does not depend on the
+            other samples.
 
     Returns:
-        Rotation (b, 3, 3), translation (b, 3) and stats. `residual` is the mean reprojection error of the inliers;
-        `iterations` is the number of hypotheses, or its limit where the backend does not report it. A sample without a
-        pose of 4 or more inliers holds NaN, and its `converged` is False.
+        Rotation (b, 3, 3) and translation (b, 3) in the dtype of the assignment, and stats. `residual` (float64) is the
+            mean reprojection error of the inliers, normalised units. `iterations` is the number of hypotheses, or its
+            limit where the backend does not report it. A sample without a pose of 4 or more inliers has a pose of NaN,
+            an infinite `residual`, and `converged` is False.
 
     Raises:
         ValueError: An argument has a wrong shape or dtype, the backend is unknown, or an option is not positive.
 
+    >>> import torch
+    >>> from bpnp.layers import ransac_pnp
     >>> points3d = torch.rand(1, 50, 3, generator=torch.Generator().manual_seed(0))
     >>> camera = points3d + torch.tensor([0.0, 0.0, 4.0])
     >>> points2d = camera[..., :2] / camera[..., 2:]
@@ -121,12 +130,13 @@ class RansacPnP(nn.Module):
     """RANSAC as a module; see `ransac_pnp`.
 
     Args:
-        backend: poselib (LO-RANSAC, PROSAC order), opencv (the paper's P3P-RANSAC and EPnP), torch (the whole batch on
-            its device), or auto (torch on cuda, else poselib).
-        matches_factor: Matches per point of the smaller side; RANSAC uses the most probable ones.
-        threshold: Largest reprojection error of an inlier, normalised image coordinates.
-        max_iterations: Largest number of hypotheses; the paper uses 1000.
-        seed: Seed of the sampling.
+        backend: "poselib" (LO-RANSAC, PROSAC order), "opencv" (the paper's P3P-RANSAC and EPnP), "torch" (the whole
+            batch on its device), or "auto", the default ("torch" on cuda, else "poselib").
+        matches_factor: Number of matches per point of the smaller side, default 1.5; RANSAC uses the most probable
+            ones.
+        threshold: Largest reprojection error of an inlier, normalised image coordinates, default 0.01.
+        max_iterations: Largest number of hypotheses, 1000 by default and in the paper.
+        seed: Seed of the sampling, default 0.
     """
 
     def __init__(

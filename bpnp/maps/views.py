@@ -70,6 +70,8 @@ def viewing_cones(points3d: Array, views: Iterable[tuple[Array, NDArray[np.integ
         points3d: (n, 3) scene points.
         views: Camera centre (3,) and indices of the visible points, for each view.
 
+    >>> import numpy as np
+    >>> from bpnp.maps.views import viewing_cones
     >>> cones = viewing_cones(np.zeros((1, 3)), [(np.array([0.0, 0, 2]), np.array([0]))])
     >>> (cones.axes + 0.0).tolist(), round(float(np.degrees(np.arccos(cones.cosines[0]))))
     ([[0.0, 0.0, 1.0]], 25)

@@ -52,22 +52,28 @@ class BPnPNet(TrainedNet):
 
     The transport turns distances of features into an assignment. RANSAC estimates an initial pose from the most
     probable matches, and weighted PnP refines it on all of them. Every part is a module with its own options, and may
-    be replaced by another with the same arguments and results. A part that is None is the paper's with its default
-    options.
+    be replaced by another with the same arguments and results. A part that is None is the class of this package with
+    its default options. The options of the paper are in the files of
+    configs/paper.
 
     Args:
-        features2d: Maps image points (b, m, 2) and their mask to unit features (b, m, c).
-        features3d: Maps scene points (b, n, 3) and their mask to unit features (b, n, c).
-        transport: Maps a cost (b, m, n) and both masks to the assignment (b, m, n) and its `SolveStats`.
+        features2d: Maps image points (b, m, 2) and their mask to unit features (b, m, c). None for `ImageFeatures()`.
+        features3d: Maps scene points (b, n, 3) and their mask to unit features (b, n, c). None for `SceneFeatures()`.
+        transport: Maps a cost (b, m, n) and both masks to the assignment (b, m, n) and its `SolveStats`. None for
+            `Sinkhorn()`.
         ransac: Maps assignment, points2d, points3d and both masks to rotation, translation and `SolveStats` of an
-            initial pose.
+            initial pose. None for `RansacPnP()`.
         pnp: Maps assignment, bearings, points3d and the initial pose to a pose that is differentiable in the
-            assignment.
-        refinement: Computes the third pose "refined" in evaluation.
-        rounds: Number of times that the points are matched again under the last pose in evaluation, starting from
-            RANSAC's (`bpnp.models.evaluation.match_again`). The residuals of the last round have the width of RANSAC's
-            `threshold`.
+            assignment. None for `WeightedPnP()`.
+        refinement: Computes the third pose "refined" in evaluation. None for `Refinement()`.
+        rounds: Number of times that the points are matched again under the last pose in evaluation, starting from that
+            of RANSAC (`bpnp.models.evaluation.match_again`). Default 0. A round adds the squared residuals, in units
+            of a width, to the cost; the width decreases from round to round, to `ransac.threshold` in the last one.
+            Rounds need a `ransac` with that attribute and a `transport` with the attribute `entropy`.
 
+    >>> import torch
+    >>> from bpnp import Batch, BPnPNet
+    >>> from bpnp.layers import Sinkhorn
     >>> net = BPnPNet(transport=Sinkhorn(mu=0.05)).eval()
     >>> prediction = net(Batch.from_arrays(torch.rand(20, 2), torch.rand(30, 3)))
     >>> tuple(prediction.assignment.shape), list(prediction.poses)
@@ -99,6 +105,12 @@ class BPnPNet(TrainedNet):
         """Return the assignment and the poses "ransac" and "pnp".
 
         In evaluation "pnp" is the pose after the rounds, and "refined" is added.
+
+        Args:
+            batch: Problems.
+
+        Returns:
+            Prediction with the assignment P (b, m, n), its stats and the poses.
         """
         clock = Clock()
         cost = self.cost(batch)
@@ -114,15 +126,36 @@ class BPnPNet(TrainedNet):
         return clock.add_times(self.refinement(again, batch))
 
     def match(self, batch: Batch) -> Prediction:
-        """Return the assignment without poses, which is all that training without the pose loss needs."""
+        """Return the assignment without poses, which is all that training without the pose loss needs.
+
+        Args:
+            batch: Problems.
+
+        Returns:
+            Prediction with the assignment P (b, m, n) and its stats.
+        """
         return Prediction(*self.transport(self.cost(batch), batch.mask2d, batch.mask3d))
 
     def cost(self, batch: Batch) -> Float[Tensor, "b m n"]:
-        """Return the feature distances M_ij = ||z_i - z_j||_2 (b, m, n), in [0, 2], in the network's dtype."""
+        """Return the feature distances M_ij = ||z_i - z_j||_2, in [0, 2].
+
+        Args:
+            batch: Problems.
+
+        Returns:
+            M (b, m, n), in the dtype of the network.
+        """
         return pairwise_distance(*self.features(batch))
 
     def features(self, batch: Batch) -> tuple[Float[Tensor, "b m c"], Float[Tensor, "b n c"]]:
-        """Return the unit features of both sides, (b, m, c) and (b, n, c), in the network's dtype."""
+        """Return the unit features of both sides.
+
+        Args:
+            batch: Problems.
+
+        Returns:
+            Features of the image points (b, m, c) and of the scene points (b, n, c), in the dtype of the network.
+        """
         batch = batch.to(next((p.dtype for p in self.parameters()), batch.points2d.dtype))
         return self.features2d(batch.points2d, batch.mask2d), self.features3d(batch.points3d, batch.mask3d)
 

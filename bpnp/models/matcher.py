@@ -45,6 +45,8 @@ class Matcher(TrainedNet):
         pnp: As in `BPnPNet`.
         refinement: As in `BPnPNet`.
 
+    >>> import torch
+    >>> from bpnp import Batch, Matcher
     >>> net = Matcher(channels=32, depth=2).eval()
     >>> prediction = net.match(Batch.from_arrays(torch.rand(20, 2), torch.rand(30, 3)))
     >>> mass = prediction.assignment.sum(2) + prediction.unmatched2d

@@ -118,6 +118,12 @@ class MaskedBatchNorm(nn.BatchNorm1d):
     momentum: float | None
 
     def forward(self, x: Tensor, mask: Bool[Tensor, "b k"] | None = None) -> Tensor:
+        """Return the normalised features, in the shape of x.
+
+        Args:
+            x: Features (b, k, c) or (b, c).
+            mask: True at real points (b, k). Default: None, all are real.
+        """
         mean, variance = self.running_mean, self.running_var
         if self.training:
             mean, variance = self._statistics(x, mask)
@@ -181,7 +187,7 @@ class PointFeatures(nn.Module):
         channels: Width of the residual network.
         depth: Number of residual blocks.
         centre: Subtract the mean feature of the set before scaling to unit length, which sharpens the assignment (an
-            addition to the paper).
+            addition to the paper). Default False.
     """
 
     def __init__(self, coordinates: int, *, channels: int = 128, depth: int = 12, centre: bool = False) -> None:
@@ -210,7 +216,8 @@ class ImageFeatures(PointFeatures):
         channels: Width of the residual network.
         depth: Number of residual blocks.
         centre: As in `PointFeatures`.
-        scale: Factor of the coordinates; 4 brings the image of a 50 degree camera to the size of a unit scene.
+        scale: Factor of the coordinates, default 1. With 4 the coordinates of a camera with a field of view of 50
+            degrees, which reach +-0.47, reach +-1.9 and are thus of the order of those of the scene.
     """
 
     def __init__(self, *, channels: int = 128, depth: int = 12, centre: bool = False, scale: float = 1.0) -> None:
@@ -218,6 +225,12 @@ class ImageFeatures(PointFeatures):
         self.scale = scale
 
     def forward(self, points: Float[Tensor, "b m 2"], mask: Bool[Tensor, "b m"]) -> Float[Tensor, "b m c"]:
+        """Return unit features (b, m, c).
+
+        Args:
+            points: Normalised image coordinates (b, m, 2).
+            mask: True at real points (b, m).
+        """
         return super().forward(self.scale * points, mask)
 
 
@@ -238,6 +251,12 @@ class SceneFeatures(PointFeatures):
         self.align = InputTransform()
 
     def forward(self, points: Float[Tensor, "b n 3"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b n c"]:
+        """Return unit features (b, n, c).
+
+        Args:
+            points: Scene points (b, n, 3).
+            mask: True at real points (b, n).
+        """
         points = normalise_points3d(points, mask) if self.normalise else points
         return super().forward(self.align(points, mask), mask)
 
@@ -253,6 +272,12 @@ class InputTransform(nn.Module):
         self.out = nn.Linear(256, 9)
 
     def forward(self, points: Float[Tensor, "b n 3"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b n 3"]:
+        """Return the transformed points (b, n, 3).
+
+        Args:
+            points: Scene points (b, n, 3).
+            mask: True at real points (b, n).
+        """
         z, padding_mask = points, None if has_no_padding(mask) else mask
         for linear, norm in zip(self.linears[:3], self.norms[:3], strict=True):
             z = torch.relu(norm(linear(z), padding_mask))
@@ -317,7 +342,11 @@ class Attention(nn.Module):
 
 
 class FeedForward(nn.Module):
-    """Residual network x + linear(gelu(linear(norm(x)))) of each point."""
+    """Residual network x + linear(gelu(linear(norm(x)))) of each point.
+
+    Args:
+        channels: Width; the hidden layer has twice as many.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -326,6 +355,11 @@ class FeedForward(nn.Module):
         self.out = nn.Linear(2 * channels, channels)
 
     def forward(self, x: Float[Tensor, "b k c"]) -> Float[Tensor, "b k c"]:
+        """Return the features (b, k, c).
+
+        Args:
+            x: Features (b, k, c).
+        """
         return x + self.out(functional.gelu(self.enter(self.norm(x))))
 
 
@@ -350,6 +384,14 @@ class ExchangeBlock(nn.Module):
         mask2d: Bool[Tensor, "b m"],
         mask3d: Bool[Tensor, "b n"],
     ) -> tuple[Float[Tensor, "b m c"], Float[Tensor, "b n c"]]:
+        """Return the features of both sets, (b, m, c) and (b, n, c).
+
+        Args:
+            x2d: Features of the image points (b, m, c).
+            x3d: Features of the scene points (b, n, c).
+            mask2d: True at real image points (b, m).
+            mask3d: True at real scene points (b, n).
+        """
         x2d, x3d = self.within(x2d, x2d, mask2d), self.within(x3d, x3d, mask3d)
         x2d, x3d = self.between(x2d, x3d, mask3d), self.between(x3d, x2d, mask2d)
         return self.feed(x2d), self.feed(x3d)
@@ -374,6 +416,12 @@ class Neighbourhood(nn.Module):
         self.out = nn.Linear(channels, channels)
 
     def forward(self, points: Float[Tensor, "b k d"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
+        """Return the features (b, k, c).
+
+        Args:
+            points: Coordinates (b, k, d).
+            mask: True at real points (b, k).
+        """
         k = min(self.neighbours, points.shape[1] - 1)
         if k < 1:
             return points.new_zeros(*points.shape[:2], self.out.out_features)

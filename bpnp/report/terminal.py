@@ -140,6 +140,7 @@ class SplitTable:
 def shorten(names: Sequence[str], width: int) -> list[str]:
     """Cut names to a width: their heads, an ellipsis, and their tails, so that as many as possible stay different.
 
+    >>> from bpnp.report.terminal import shorten
     >>> shorten(["cam0/000001.jpg", "cam1/000001.jpg", "a.jpg"], 9)
     ['cam0….jpg', 'cam1….jpg', 'a.jpg']
     """
@@ -155,6 +156,7 @@ def shorten(names: Sequence[str], width: int) -> list[str]:
 def fixed(values: Sequence[float | int]) -> list[str]:
     """Write numbers of one kind, such as coordinates, without exponents: three decimals, more if all are small.
 
+    >>> from bpnp.report.terminal import fixed
     >>> fixed([500000.25, 5123456.789, 0]), fixed([0.02, -1.5, 0])
     (['500000.250', '5123456.789', '0.000'], ['0.02000', '-1.50000', '0.00000'])
     """
@@ -168,6 +170,7 @@ def number(value: float | None) -> str:
 
     Below 0.01 there are two digits. None gives "-".
 
+    >>> from bpnp.report.terminal import number
     >>> [number(value) for value in (12.34, 0.00126, 12345.6, None)]
     ['12.3', '0.0013', '12346', '-']
     """

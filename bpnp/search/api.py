@@ -77,20 +77,23 @@ def solve(
         camera: 3x3 matrix K; OpenCV's (K, distortion); (COLMAP model, parameters); (model, width, height, parameters);
             or a pycolmap.Camera. Points are undistorted. Pixels that cannot be undistorted are dropped and counted in
             `stats.dropped2d`. None for normalised coordinates and bearings.
-        image_size: (width, height) of the image, pixels, if the focal length is unknown. The focal length is estimated
-            with the pose and returned in `Solution.camera`. The principal point is assumed at the image centre.
-        focal_error: Standard deviation of the focal length of `camera`, as a fraction of it, such as 0.1. The focal
-            length is then estimated too. None if the focal length is exact.
-        distortion: With `image_size` or `focal_error`: always fit a radial distortion coefficient. By default a
-            coefficient is kept only if it is significantly better, and none is fitted if `camera` has distortion.
+        image_size: (width, height) of the image, pixels, if there is no `camera`. The focal length is then estimated
+            with the pose and returned in `Solution.camera`, and the principal point is the image centre. An error with
+            a `camera`. None if there is a camera, or no pixels.
+        focal_error: Standard deviation of the focal length of `camera`, as a fraction of it between 0 and 1, such as
+            0.1. The focal length is then estimated too. An error without a `camera`. None if the focal length is exact.
+        distortion: True to fit a radial distortion coefficient in any case. It needs an `image_size`, or a
+            `focal_error` with a camera that has no distortion. Default False: a coefficient is fitted with the focal
+            length and kept only if it is significantly better; with a `rig` or `at_infinity` none is fitted.
         normals3d: (n, 3) outward unit normals. A point that faces away from the camera is not visible. None: all points
             are visible from all sides.
         labels2d: (m,) integers, such as colours, classes or identities; only points with equal labels match, and -1
             matches any. Or (m, c) class probabilities whose rows sum to 1, such as those of a network: a match then
-            weighs more, the better its classes agree.
+            weighs more, the better its classes agree. Give both `labels2d` and `labels3d`, or neither. None: any two
+            points may match.
         labels3d: (n,) integers or (n, c) class probabilities, as `labels2d`.
         scores2d: (m,) probabilities in (0, 1] that a point has a correspondence, such as from keypoint strength. They
-            weight the points in the search and the verdict. Only their ratios matter.
+            weight the points in the search and the verdict. Only their ratios matter. None: all are equal.
         scores3d: (n,) probabilities in (0, 1], as `scores2d`, such as from the number of views that see a point.
         solver: "search" runs the search, which needs no training. "auto", the default, also starts it from poses of a
             packaged matcher if the search is undecided: "matcher-maps" with a `PosePrior`, and "matcher-sfm" without a
@@ -101,22 +104,25 @@ def solve(
             or (4, 4), or a pycolmap.Rigid3d; a `GravityPrior`; or a BPnPNet or Matcher, or its checkpoint, whose pose
             is tried first. None for no prior.
         inlier_threshold: Largest reprojection error of a match, in pixels with a camera, else in normalised image units
-            (radians for bearings). Default: three times the scale of the residuals. Small problems also use it as
-            search radius, by default 3 pixels. Labels that pair each point with one other need no radius.
-        clutter: Expected outlier fraction. None if it is unknown.
+            (radians for bearings). Default: three times the scale of the residuals. Small problems, those whose matches
+            are enumerated (m n at most 4,000, or 250,000 where a prior lets two matches fix a pose), also use it as
+            search radius, by default 3 pixels, or 0.003 without a camera. It is not used if the labels pair each point
+            with one other.
+        clutter: Expected fraction of the image points without a correspondence, 0 or more and below 1. None if it is
+            unknown: several fractions are tried.
         at_infinity: `points3d` are unit directions, such as of stars. Only the rotation is estimated; the translation
             is zero. Pixels of a fisheye camera may lie 90 degrees or more off its axis. Points with the largest
-            `scores2d` are tried first. The translation of a `prior` is ignored. `normals3d` and `scale` have no meaning
-            here, and networks are not trained for directions; all other options apply. See docs/stars.md.
+            `scores2d` are tried first. The translation of a `prior` is ignored. `normals3d`, `scale`, `device`, and a
+            network as `solver` or `prior`, raise ValueError. Default False. See docs/stars.md.
         rig: Extrinsics cam_from_rig of each camera of a rig, as (R, t), (3, 4), (4, 4) or a pycolmap.Rigid3d.
             `points2d`, `labels2d` and `scores2d` are then lists with one array per camera; `camera` is a list or one
             for all. The returned pose is rig_from_world, in the unit of the rig and of the scene, and a `prior` is one
             of this pose. `matches` index the 2D points of all cameras, concatenated. An unknown focal length is one
-            factor for all cameras, and `Solution.camera` is then the first camera. Networks are not trained for rigs;
-            all other options apply.
+            factor for all cameras, and `Solution.camera` is then the first camera. `device`, and a network as `solver`
+            or `prior`, raise ValueError. None for one camera.
         scale: With `rig`: also estimate the scale of a scene whose unit differs from the rig's, such as a COLMAP model.
             `Solution.scale` satisfies rig = scale R p + t, with t in the unit of the rig. The rig needs a non-zero
-            baseline.
+            baseline, and a `prior` has no `translation_sigma`. Default False.
         seed: Seed of the search, default 0.
         time_limit: Seconds in total, 10 by default; math.inf for no limit. At the limit each stage of the search ends
             with its current poses, and the best pose is returned.
@@ -132,9 +138,12 @@ def solve(
             given as `solver` is not modified.
 
     Raises:
-        ValueError: The input has wrong or swapped shapes, NaN, fewer than 4 points (3 with a `GravityPrior`), a
-            singular camera matrix or an unknown option.
+        ValueError: The input has wrong or swapped shapes, NaN, a singular camera matrix, or options that exclude each
+            other. Or there are too few points: fewer than 4 in an image (each image of a `rig`) or in the scene, 3 with
+            a `GravityPrior`; `at_infinity` fewer than 3 in all images together or in the scene.
 
+    >>> import numpy as np
+    >>> from bpnp import solve
     >>> rng = np.random.default_rng(0)
     >>> scene = rng.normal(size=(60, 3))
     >>> camera = scene + [0, 0, 6]  # R = I, t = (0, 0, 6)
@@ -218,9 +227,10 @@ def solve_many(
 ) -> list[Solution]:
     """Solve many problems, each as `solve` does.
 
-    Problems are independent, except that small problems with the same image points never share a match. The problem
-    with the fewest false alarms keeps its matches. A later one that used some of them is solved again without these
-    points, which `stats.taken2d` counts.
+    Problems are independent, with one exception: small problems (m n at most 4,000, or 250,000 where a prior lets two
+    matches fix a pose) with the same image points and camera never share an image point. The problem with the fewest
+    false alarms keeps its matches. A later one that used some of their points is solved again without them;
+    `stats.taken2d` counts them.
 
     Args:
         points2d: Sequence of k arrays (m_i, 2) or (m_i, 3), one per problem.
@@ -237,7 +247,7 @@ def solve_many(
         solver: As for `solve`. On a GPU a module solves problems of similar size in one batch.
         prior: One prior for all problems, or a list of k priors.
         inlier_threshold: Largest reprojection error of a match, for all problems; as for `solve`.
-        clutter: Expected outlier fraction, for all problems. None if it is unknown.
+        clutter: Expected fraction of the image points without a correspondence, for all problems; as for `solve`.
         at_infinity: `points3d` are unit directions; as for `solve`. The problems are then independent.
         rig: Extrinsics of the cameras of a rig that sees all problems; as for `solve`. The image points of a problem,
             `labels2d` and `scores2d` are then lists with one array per camera, and `camera` is one for all or a list
@@ -254,6 +264,8 @@ def solve_many(
     Raises:
         ValueError: The input is invalid, as for `solve`. The message names the problem; nothing has been solved then.
 
+    >>> import numpy as np
+    >>> from bpnp import solve_many
     >>> scene = np.random.default_rng(0).normal(size=(60, 3))
     >>> images = [(scene + [x, 0, 6])[:, :2] / (scene + [x, 0, 6])[:, 2:] for x in (0, 1)]
     >>> [round(float(solution.translation[0]), 3) + 0.0 for solution in solve_many(images, scene)]

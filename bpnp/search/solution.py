@@ -61,7 +61,8 @@ class SolutionStats:
     """Statistics of the search.
 
     Attributes:
-        iterations: Number of batches of initial poses.
+        iterations: Number of batches of initial poses; 0 if an enumeration or known matches decided. For points at
+            infinity the number of image points that were tried, for a network as `solver` that of its poses.
         residual: Scale of the residuals, radians.
         converged: True if the verdict is "confident".
         dropped2d: Number of 2D points that could not be undistorted and were dropped.
@@ -81,22 +82,24 @@ class Solution:
 
     Attributes:
         rotation: (3, 3) rotation matrix.
-        translation: (3,) translation, scene units.
+        translation: (3,) translation, scene units; with `scale=True` units of the rig.
         matches: (k, 2) indices into `points2d` and `points3d`; no point is in two matches.
         inlier_count: Number of matches within `inlier_threshold` (paper Eq. 1).
-        inlier_ratio: `inlier_count` as a fraction of min(m, n).
+        inlier_ratio: `inlier_count` as a fraction of min(m, n); with a `rig` of the sum of min(m, n) over its cameras;
+            from `verify` with `matches` of the number of given matches.
         inlier_threshold: Largest reprojection error of a match, in `unit`.
         reprojection_error: Mean reprojection error of the matches, in `unit`.
         reprojection_error_deg: Mean angle between the bearings of the matches, degrees.
         unit: Pixels with a camera, else normalised image units, or radians for bearings.
         covariance: (p, p) covariance of the errors of `parameters`, which for a pose are (w, v) with R' = exp([w]x) R
-            and t' = t + v. Here w is in radians in the camera axes, and v in scene units. It is the first-order
-            estimate
+            and t' = t + v. Here w is in radians in the camera axes, and v in the unit of `translation`. It is the
+            first-order estimate
 
                 C = max(H^-1, sum_i d_i d_i^T),  H = -d2 log p(image points | pose) / d(w, v)^2 + prior,
 
-            where d_i is the step to the optimum without image point i, with unknown correspondences (docs/verdict.md).
-            NaN if the verdict is "failed" or the points do not fix the pose.
+            where max is the larger of the two matrices along each of their common axes, and d_i is the step to the
+            optimum without image point i, with unknown correspondences (docs/verdict.md). NaN if the verdict is
+            "failed" or the points do not fix the pose.
         parameters: Names of the p estimated parameters, in the order of the covariance: "rotation_x", "rotation_y",
             "rotation_z"; then "translation_x", "translation_y", "translation_z", except for points at infinity; then
             "focal_length" (pixels) or "scale" if it was estimated.
@@ -226,7 +229,7 @@ class Solution:
 
         Args:
             photo: File or (h, w, 3) uint8 image to draw under the points; not undistorted. It needs a camera. None for
-                none.
+                a white background.
             camera: Camera whose pixels are the axes, as for `bpnp.solve`. Default: `self.camera`; without a camera the
                 axes are normalised coordinates.
 
@@ -260,16 +263,16 @@ class Solution:
         """Write a COLMAP text model with this image, its matches as tracks, and all 3D points.
 
         Args:
-            folder: Folder to write to.
+            folder: New or empty folder to write to.
             camera: Camera to write, as for `bpnp.solve`. Default: `self.camera`, else a pinhole camera of 1000 pixels.
-            name: Name of the image file, default "image.jpg".
+            name: Name of the image file without spaces, default "image.jpg".
             size: (width, height) of the image, pixels. Default: the size of the camera, else one that holds the points.
 
         Returns:
             The folder.
 
         Raises:
-            ValueError: The solution has no pose.
+            ValueError: The solution has no pose, the folder has files, the name has spaces, or the camera has skew.
         """
         from bpnp.datamodules.colmap.reconstruction import write_image
 
@@ -295,8 +298,11 @@ class Solution:
         Args:
             text: JSON text, or the path of a JSON file as a `Path`.
 
+        Returns:
+            The solution.
+
         Raises:
-            ValueError: The text is not the JSON of a solution.
+            ValueError: The text is not the JSON of a solution, or the file cannot be read.
         """
         name = f" in {text}" if isinstance(text, Path) else ""
         try:

@@ -21,6 +21,8 @@ class PosePrior(NamedTuple):
         rotation_sigma_deg: Standard deviation about each axis, degrees.
         translation_sigma: Standard deviation along each axis, scene units; infinite by default.
 
+    >>> import numpy as np
+    >>> from bpnp import PosePrior
     >>> PosePrior(np.eye(3), np.array([0, 0, 6]), rotation_sigma_deg=5.0, translation_sigma=0.5).rotation_sigma_deg
     5.0
     """
@@ -39,6 +41,8 @@ class GravityPrior(NamedTuple):
         up_scene: (3,) direction in scene coordinates, of any length.
         sigma_deg: Standard deviation of the angle between them, degrees; 2 by default.
 
+    >>> import numpy as np
+    >>> from bpnp import GravityPrior
     >>> GravityPrior(up_camera=np.array([0, -1, 0]), up_scene=np.array([0, 0, 1])).sigma_deg
     2.0
     """

@@ -60,23 +60,28 @@ def verify(
         labels3d: (n,) integers or (n, c) class probabilities, as for `solve`.
         scores2d: (m,) probabilities in (0, 1] that a point has a correspondence, as for `solve`.
         scores3d: (n,) probabilities in (0, 1], as `scores2d`.
-        matches: (k, 2) indices into points2d and points3d, each point in one match at most. The pose is judged on these
-            matches alone; some of them may be wrong. None if the matches are unknown.
-        refine: Return and judge the nearby optimum. It counts as the same pose if it is rotated by at most 2 degrees
-            and shifts the centroid of the scene by at most a twentieth of its distance, or is within the pose's
-            uncertainty. With False the pose is kept. It is "ambiguous" if the nearby optimum fits significantly better,
-            and `covariance` is that of the optimum plus the outer product of the step to it.
+        matches: (k, 2) indices into points2d and points3d; an index out of range, or a point in two matches, raises.
+            The pose is judged on these matches alone; some of them may be wrong. A match of a 2D point that cannot be
+            undistorted is left out without a message. None if the matches are unknown.
+        refine: True, the default, to return and judge the nearby optimum. The optimum counts as the same pose if it is
+            rotated by at most 2 degrees and shifts the centroid of the scene by at most a twentieth of its distance, or
+            if it is within the uncertainty of the pose. False to return the given pose. The verdict is then "ambiguous"
+            if the nearby optimum fits significantly better, and `covariance` is that of the optimum plus the outer
+            product of the step to it.
         inlier_threshold: Largest reprojection error of a match, as for `solve`.
         seed: Seed of the perturbed copies of the pose from which it is refined, default 0.
-        time_limit: Seconds, 10 by default; math.inf for no limit.
+        time_limit: Seconds, 10 by default; math.inf for no limit. At the limit not all competing poses have been
+            tested, and the verdict is "ambiguous" at best.
 
     Returns:
         Solution with this pose, and with its competing poses in `candidates`. It is "failed" if the pose is not
-            significant, or if a competing pose is more likely by three decades; `matches` may then be empty.
+            significant, or if a competing pose is more likely by a factor of 1,000; `matches` may then be empty.
 
     Raises:
-        ValueError: The input is invalid, as for `solve`, or `rotation` is not a rotation matrix.
+        ValueError: The input is invalid, as for `solve`, `rotation` is not a rotation matrix, or `matches` are not
+            pairs of indices.
 
+    >>> import numpy as np
     >>> import bpnp
     >>> rng = np.random.default_rng(0)
     >>> scene = rng.normal(size=(60, 3))

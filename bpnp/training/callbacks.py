@@ -34,11 +34,12 @@ RETURNED = 'a dictionary with "prediction", "seconds" and "losses", as BlindPnPT
 class PoseLossWarmup(Callback):
     """Switch from L_c alone to L_c + weight * L_p at an epoch (paper section 3.5).
 
-    Before the switch, no pose is computed in training. A run resumed after the switch stays switched.
+    Before the switch, training computes no pose, unless the solver has no `match` or the task's `loss` needs a pose. A
+    run resumed after the switch stays switched.
 
     Args:
         start_epoch: First epoch with the pose loss, counted from 0; 120 in the paper.
-        weight: gamma_p of Eq. 15. Default: None, the task's `pose_weight`, or 1 if that is 0.
+        weight: gamma_p of Eq. 15. Default: None, the `pose_weight` of the task, or 1 if that is 0.
     """
 
     def __init__(self, start_epoch: int = 120, weight: float | None = None) -> None:
@@ -53,7 +54,8 @@ class PoseLossWarmup(Callback):
         """Read the weight of the task.
 
         Raises:
-            ValueError: The task has another weight, or no pose for the loss.
+            ValueError: The module has no `pose_weight`, or one that is neither 0 nor `weight`; or the solver does not
+                return the pose "pnp" that the loss needs.
         """
         configured = getattr(pl_module, "pose_weight", None)
         if not isinstance(configured, float | int):
@@ -137,6 +139,7 @@ class ParameterCount(Callback):
     """Print how many parameters each part of the solver has when a training starts."""
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Print the numbers of parameters: all, trained, and of each part with any."""
         if not trainer.is_global_zero:
             return
         solver = getattr(pl_module, "solver", pl_module)
@@ -151,13 +154,14 @@ class ParameterCount(Callback):
 class TrainingMonitor(Callback):
     """Log values of the first few validation problems that show the progress of a training.
 
-    "val/true_match_mass" is the probability of the true matches in the assignment, "val/<estimate>_iterations" are
-    those of each pose, "val/feature_spread_2d" and "val/feature_spread_3d" are `feature_spreads`. A spread below 0.05
-    causes a warning: if all points of a set have the same feature, the assignment is uniform and the loss does not
-    change.
+    "val/true_match_mass" is the sum of the probabilities P of the true matches, at most 1. "val/<estimate>_iterations"
+    is the number of iterations of a pose. "val/feature_spread_2d" and "val/feature_spread_3d" are `feature_spreads`.
+    Each is a mean over the problems. A spread below 0.05 causes a warning: if all points of a set have the same
+    feature, the assignment is uniform and the loss does not change.
 
     Args:
-        problems: Number of validation problems.
+        problems: Number of validation problems, default 4. They come from the first validation batch, so its size is
+            the largest number.
     """
 
     def __init__(self, problems: int = 4) -> None:
@@ -194,6 +198,10 @@ class TrainingMonitor(Callback):
 def feature_spreads(solver: nn.Module, batch: Batch) -> dict[str, Tensor]:
     """Return the mean distance of the unit features of each set from their mean.
 
+    Args:
+        solver: Solver, whose `features(batch)` returns the features of both sets.
+        batch: Problems.
+
     Returns:
         "feature_spread_2d" and "feature_spread_3d": 1 for vectors in all directions, 0 for equal vectors. Empty for a
         solver without a method `features`.
@@ -207,7 +215,16 @@ def feature_spreads(solver: nn.Module, batch: Batch) -> dict[str, Tensor]:
 
 
 def watched_values(prediction: Prediction, batch: Batch) -> dict[str, Tensor]:
-    """Return the mean over the problems of the probability of true matches, and of the iterations of each pose."""
+    """Return means over the problems: the probability of the true matches, and the iterations of each pose.
+
+    Args:
+        prediction: Prediction of the solver.
+        batch: Problems, with or without true matches.
+
+    Returns:
+        "<estimate>_iterations" of each pose; "true_match_mass", the sum of P over the true matches, if there are an
+        assignment and true matches.
+    """
     values = {f"{name}_iterations": pose.stats.iterations.float().mean() for name, pose in prediction.poses.items()}
     if prediction.assignment is not None and batch.match3d is not None:
         matched = batch.match3d >= 0
@@ -220,7 +237,7 @@ class ResultsWriter(Callback):
     """Write `problems.csv`, `summary.json` and the points of every problem after a test.
 
     Args:
-        folder: Folder of the files; null for `test` in the trainer's default_root_dir.
+        folder: Folder of the files. Default: None, the folder `test` in the default_root_dir of the trainer.
     """
 
     rows: list[ProblemRow]

@@ -116,7 +116,18 @@ def correspondence_losses(prediction: Prediction, batch: Batch, *, angle: float 
 
 
 def pose_losses(pose: Pose, batch: Batch) -> dict[str, Float[Tensor, " b"]]:
-    """Return the terms of L_p as `pose_terms` does, zero and without a gradient where the pose did not converge."""
+    """Return the terms of L_p as `pose_terms` does, zero and without a gradient where the pose did not converge.
+
+    Args:
+        pose: Estimated poses (b) with their stats.
+        batch: Problems with their true poses.
+
+    Returns:
+        "rotation" in radians and "translation" in scene units, (b,) each.
+
+    Raises:
+        ValueError: The batch has no true poses.
+    """
     solved, truth = pose.stats.converged, _true_pose(batch)
     # Replace a missing pose (NaN) by the true one, whose loss has no gradient, and mask it.
     rotation = torch.where(solved[:, None, None], pose.rotation, truth[0])
@@ -131,7 +142,7 @@ def _true_pose(batch: Batch) -> tuple[Tensor, Tensor]:
 
 
 def correspondence_loss(assignment: Float[Tensor, "b m n"], match3d: Int[Tensor, "b n"]) -> Float[Tensor, " b"]:
-    """Return L_c = sum_ij P_ij (1 - 2 C_ij) (paper Eq. 11) with C from indices; in [-1, 1) if P sums to one.
+    """Return L_c = sum_ij P_ij (1 - 2 C_ij) (paper Eq. 11) with C from indices; in [-1, 1] if P sums to one.
 
     Args:
         assignment: P (b, m, n).

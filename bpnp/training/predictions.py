@@ -82,7 +82,7 @@ class PredictionWriter(BasePredictionWriter):
     """Write the poses of a prediction atomically when it ends, sorted by problem.
 
     Args:
-        folder: Folder of the file; null for the trainer's default_root_dir.
+        folder: Folder of the file; None for the trainer's default_root_dir.
         format: csv for quaternions (w, x, y, z) and translations; json for rotation matrices and translations.
         overwrite: Replace the file of an earlier prediction.
     """

@@ -15,7 +15,9 @@ class ReprojectionLoss(nn.Module):
     5 of the paper). The gradient reaches the assignment directly and through the pose. It sharpens existing
     assignments; it cannot detect a wrong pose.
 
+    >>> import torch
     >>> from bpnp import Batch, BPnPNet
+    >>> from bpnp.training import ReprojectionLoss
     >>> batch = Batch.from_arrays(torch.rand(20, 2), torch.rand(20, 3))
     >>> ReprojectionLoss()(BPnPNet()(batch), batch).shape
     torch.Size([1])

@@ -59,27 +59,29 @@ class BlindPnPTask(LightningModule):
 
     Args:
         solver: Module that maps a Batch to a Prediction. Its class attribute `estimates` is a tuple of the names of its
-            poses. Checkpoints are selected by `val/pose_error`, the pose error of the estimate "pnp", or of the first
-            estimate if there is no "pnp". `val/rotation_q2_deg`, without a name, is that of the first estimate. If the
-            solver has a method `match(batch)` that returns a prediction without poses, training steps that need no pose
-            call it. None for a `BPnPNet` with its default options.
+            poses. Checkpoints are selected by `val/pose_error`, the median rotation error (radians) plus the median
+            translation error (scene units) of the estimate "pnp", or of the first estimate if there is no "pnp".
+            `val/rotation_q2_deg`, without a name, is that of the first estimate. If the solver has a method
+            `match(batch)` that returns a prediction without poses, training steps that need no pose call it. None for a
+            `BPnPNet` with its default options.
         weights: Initial weights of the solver: a name of packaged weights (docs/model-card.md), or a checkpoint. The
-            optimiser and the step count start anew; `--ckpt_path` continues those of a run. None for the weights that
-            the solver has.
+            optimiser and the step count start from zero; `--ckpt_path` resumes those of a run. None for the weights
+            that the solver has.
         learning_rate: Learning rate of Adam, 1e-5 by default, as in the paper.
         weight_decay: Weight decay of Adam; 0 in the paper and by default, 1e-3 in the authors' code.
         warmup_steps: Number of optimiser steps in which the learning rate rises from zero, default 0.
         decay_start: First step of the decay, a half cosine to a fiftieth of the learning rate; None for no decay.
         decay_steps: Number of steps of the decay, default 1000.
         pose_weight: gamma_p of Eq. 15, the weight of the pose loss of the estimate "pnp". While it is 0, the default,
-            no pose is computed in training. `PoseLossWarmup` sets it from an epoch on.
-        matching_loss: Loss of the assignment: correspondence for the paper's L_c (Eq. 11); likelihood for the negative
-            log-likelihood of each point's correspondence (`matching_likelihood_loss`).
+            training computes no pose, unless the solver has no `match` or `loss` needs a pose. `PoseLossWarmup` sets it
+            from an epoch on.
+        matching_loss: Loss of the assignment: "correspondence", the default, for the paper's L_c (Eq. 11), or
+            "likelihood" for the negative log-likelihood of each point's correspondence (`matching_likelihood_loss`).
         correspondence_angle: With L_c: an image point and a scene point correspond if the true pose projects the scene
             point within this angle of the image point, radians, at most 0.5. None for the true correspondences.
         loss: Module that replaces `matching_loss`, from (Prediction, Batch) to one value per problem (b,), NaN for a
-            problem without a loss. If its attribute `needs_pose` is False, it gets a prediction without poses in
-            training.
+            problem without a loss. If it has an attribute `needs_pose` that is False, it gets a prediction without
+            poses in training; without the attribute it gets the poses. None for `matching_loss`.
         refine_validation: Refine the poses in validation too, as in a test. That takes most of the time of a
             validation. Default False.
     """
@@ -172,21 +174,26 @@ class BlindPnPTask(LightningModule):
     ) -> "BlindPnPTask":
         """Build the task of a checkpoint: its solver, its weights, and the options of its training.
 
+        Packaged weights have no options of a training; the task then has the defaults of the constructor.
+
         Args:
             checkpoint_path: File, or the name of packaged weights.
             map_location: Device of the weights. Default: the CPU.
-            hparams_file: Rejected; the checkpoint has the hyperparameters.
-            strict: False allows missing and unexpected weights.
-            weights_only: False is rejected; a checkpoint is read as data.
-            parts: Classes outside this package that the solver or the loss is made of.
-            kwargs: Constructor arguments that replace those of the checkpoint.
+            hparams_file: Rejected unless None; the checkpoint has the hyperparameters.
+            strict: False allows missing and unexpected weights outside of the solver, such as those of a `loss`. The
+                weights of the solver always have to fit. Default: None, as True.
+            weights_only: False is rejected; a checkpoint is read as data. Default: None, as True.
+            parts: Classes outside this package that the solver or the loss is made of. Default: none.
+            **kwargs: Constructor arguments that replace those of the checkpoint.
 
         Returns:
             The task in training mode, as Lightning returns it; call `eval()` to predict without a Trainer.
 
         Raises:
+            FileNotFoundError: There is no such file, and no packaged weights of that name.
             ValueError: The file is no checkpoint of a task, or does not fit a `solver` among `kwargs`.
 
+        >>> from bpnp.training import BlindPnPTask
         >>> BlindPnPTask.load_from_checkpoint("procedural-so3").solver.rounds
         8
         """
@@ -229,11 +236,17 @@ class BlindPnPTask(LightningModule):
         return loss * torch.where(loss.isfinite(), 1.0, torch.nan)
 
     def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
-        """Return the prediction, its seconds, the loss of each problem, and the errors of each estimate."""
+        """Return the prediction, its seconds, L_c of each problem or None, and the errors of each estimate.
+
+        L_c (paper Eq. 11) is computed whatever the loss of the training; it is None if it is undefined.
+        """
         return self._evaluate(batch, "val", first=batch_idx == 0)
 
     def test_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
-        """Return the prediction, its seconds, the loss of each problem, and the errors of each estimate."""
+        """Return the prediction, its seconds, L_c of each problem or None, and the errors of each estimate.
+
+        L_c (paper Eq. 11) is computed whatever the loss of the training; it is None if it is undefined.
+        """
         return self._evaluate(batch, "test", first=batch_idx == 0)
 
     def predict_step(self, batch: Batch, batch_idx: int) -> Prediction:
@@ -253,7 +266,18 @@ class BlindPnPTask(LightningModule):
     on_test_batch_start = on_predict_batch_start = on_validation_batch_start
 
     def losses(self, prediction: Prediction, batch: Batch) -> Losses:
-        """Return the matching loss and, with a `pose_weight`, the pose loss of the samples whose pose converged."""
+        """Return the matching loss and, with a `pose_weight`, the pose loss of the samples whose pose converged.
+
+        Args:
+            prediction: Prediction of the solver.
+            batch: Problems with what the losses need: true matches or true poses.
+
+        Returns:
+            The terms of L (paper Eq. 15) of each sample.
+
+        Raises:
+            ValueError: The prediction or the batch lacks what a loss needs.
+        """
         if self.loss is not None:
             losses = own_losses(self.loss, prediction, batch)
         else:
@@ -323,7 +347,14 @@ class BlindPnPTask(LightningModule):
         return self.with_schedule(Adam(trained, lr=self.learning_rate, weight_decay=self.weight_decay, fused=fused))
 
     def with_schedule(self, optimizer: Optimizer) -> OptimizerLRScheduler:
-        """Return an optimiser with the warm-up and the decay of this task, or alone if it has neither."""
+        """Add the learning-rate schedule of this task to an optimiser.
+
+        Args:
+            optimizer: Optimiser with the peak learning rate.
+
+        Returns:
+            The optimiser with the warm-up and the decay, or the optimiser alone if the task has neither.
+        """
         if not self.warmup_steps and self.decay_start is None:
             return optimizer
         # The factor depends only on the step, because a resumed run may have another schedule; `SequentialLR` would
@@ -372,7 +403,11 @@ class BlindPnPTask(LightningModule):
                 scheduler.base_lrs = [group["initial_lr"] for group in scheduler.optimizer.param_groups]
 
     def rate_factor(self, step: int) -> float:
-        """Return the factor on the learning rate: a linear rise, one, and a half cosine down to `DECAYED`."""
+        """Return the factor on the learning rate: a linear rise, one, and a half cosine down to a fiftieth.
+
+        Args:
+            step: Number of optimiser steps so far.
+        """
         rise = min(1.0, (step + 1) / (self.warmup_steps + 1))
         if self.decay_start is None:
             return rise

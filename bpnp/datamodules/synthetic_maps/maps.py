@@ -279,7 +279,7 @@ class SyntheticMapDataModule(ProblemDataModule):
         outliers: Largest fraction of the points of each side without correspondence; 1 for all that there are. Two
             numbers, [low, high], draw it uniformly for each problem.
         views: Smallest and largest number of photos whose map points are taken.
-        kinds: Weight of each kind of scene; none for half facades, and a quarter each street and statue.
+        kinds: Weight of each kind of scene; None for half facades, and a quarter each street and statue.
         frame: Frame of the map: any, rotated at random; upright, the third axis upwards and any heading; view, the
             coordinates of the first of the cameras whose map points are taken.
         tilt_deg: Standard deviation of an upright frame's rotation about each of its horizontal axes, degrees.
@@ -289,7 +289,8 @@ class SyntheticMapDataModule(ProblemDataModule):
             logarithm.
         noise_px: Standard deviation of the noise of 2D points, pixels of an image with 1200 on its longer side; a
             number or [low, high], uniform in the logarithm.
-        loading: Options of `ProblemDataModule`: batch_size, eval_batch_size, train_outliers, test_outliers, seed, ...
+        **loading: Options of `ProblemDataModule`: train_outliers, test_outliers, batch_size, eval_batch_size,
+            max_cells, num_workers and seed.
     """
 
     def __init__(

@@ -25,9 +25,9 @@ class RandomRansac(SingleSolver):
     Args:
         threshold: Largest distance of matching points in the normalised image.
         confidence: Probability at which to stop; 1 for never.
-        max_hypotheses: Largest number of triples; null for as many as the time allows.
+        max_hypotheses: Largest number of triples; None for as many as the time allows.
         seed: Seed of the triples.
-        time_limit: Seconds for each problem; null for no limit, which needs `max_hypotheses`.
+        time_limit: Seconds for each problem; None for no limit, which needs `max_hypotheses`.
     """
 
     estimates = ("random_ransac",)

@@ -224,8 +224,8 @@ class GOPAC(BranchAndBound):
 
     Args:
         angle: Largest angle between an inlier's ray and its scene point, radians.
-        max_boxes: Largest number of boxes, including those of inner searches; null for as many as the time allows.
-        time_limit: Seconds for each problem; then the best pose so far is returned, not converged. Null for no limit.
+        max_boxes: Largest number of boxes, including those of inner searches; None for as many as the time allows.
+        time_limit: Seconds for each problem; then the best pose so far is returned, not converged. None for no limit.
     """
 
     estimates = ("gopac",)

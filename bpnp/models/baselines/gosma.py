@@ -75,8 +75,8 @@ class GOSMA(BranchAndBound):
         cluster3d: Largest distance from the mean of a scene cluster, in root mean square distances of all points to
             their mean.
         batch: Number of boxes split together.
-        max_boxes: Largest number of boxes; null for as many as the time allows.
-        time_limit: Seconds for each problem; then the best pose so far is returned, not converged. Null for no limit.
+        max_boxes: Largest number of boxes; None for as many as the time allows.
+        time_limit: Seconds for each problem; then the best pose so far is returned, not converged. None for no limit.
     """
 
     estimates = ("gosma",)

@@ -18,8 +18,8 @@ class Hungarian(nn.Module):
     assignment has no gradient.
 
     Args:
-        checkpoint: Checkpoint of a BPnPNet, written by `bpnp fit`; null to use `net`.
-        net: Network; null with a null checkpoint for untrained weights with the default settings.
+        checkpoint: Checkpoint of a BPnPNet, written by `bpnp fit`; None to use `net`.
+        net: Network; None with a checkpoint of None for untrained weights with the default settings.
         ransac_backend: As in BPnPNet; opencv is the paper's.
     """
 

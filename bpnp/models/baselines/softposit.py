@@ -42,9 +42,9 @@ class SoftPOSIT(SingleSolver):
             with a perturbation (the paper's for MegaDepth; not comparable with blind solvers). random: uniform
             rotations.
         starts: Number of random initial poses.
-        max_steps: Largest number of annealing steps; null for all.
+        max_steps: Largest number of annealing steps; None for all.
         seed: Seed of the initial poses.
-        time_limit: Seconds for each problem; then the best pose so far is returned, not converged. Null for no limit.
+        time_limit: Seconds for each problem; then the best pose so far is returned, not converged. None for no limit.
     """
 
     estimates = ("softposit",)
