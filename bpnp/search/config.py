@@ -1,7 +1,19 @@
-"""Constants of the search, of the enumeration and of the verdict: meaning, unit and the reason for each value.
+"""Constants of the search, of the verdict, of maps and of RANSAC, each once.
 
-They were chosen on the calibration set of docs/verdict.md. The tables of docs/results.md were measured on other scenes
-and seeds. Constants that only bound a numerical error, such as the step of a difference, stand beside their algorithm.
+Each attribute ends with [unit; origin]. The origin is one of these:
+
+- calibration: chosen on the calibration set of docs/verdict.md, the scenes castle-P30, sceaux_castle_txt,
+  statue_of_liberty, walk_2 and walk_6, and drawn shapes. The tables of docs/results.md are of other scenes and seeds.
+- chosen on: chosen on the data that follow.
+- measured: measured as the text says.
+- derived: follows from the text, from a formula or from another constant.
+- convention: a definition, or a value that is usual in this field.
+- cost: bounds time or memory; a larger value costs more and rarely changes an answer.
+- numerics: bounds a rounding error, or ends an iteration that has converged.
+- not tuned: a plausible value; no comparison with other values is recorded.
+
+Groups that compiled loops read are named tuples: numba compiles their values in. Numbers that cannot be chosen, such as
+an index into an array, a format or a mathematical constant, stand where they are used.
 """
 
 import math
@@ -16,12 +28,16 @@ class ImageSettings:
     """Statistics of the image points (`bpnp.search.image_statistics`).
 
     Attributes:
-        scale_step: Factor from one scale of the residuals to the next.
-        coarsest: Largest scale, in spacings sqrt(A / m) of the points; beyond it only the outline fits.
+        scale_step: Factor from one scale of the residuals to the next. [factor; measured, coarser steps give the same
+            evidence in half the time]
+        coarsest: Largest scale, in spacings sqrt(A / m) of the points; beyond it only the outline fits. [spacings of
+            the points; not tuned]
         floor: Smallest scale, in RMS angular radii of the bearings: some hundredths of a pixel of an ordinary camera.
-        together: Distance, in scales, below which points count as one observation.
-        crowded: Standard deviations above the count of an even spread from which neighbours form a clump.
-        most: Largest number of image points that are used, evenly spaced among the given ones.
+            [RMS angular radii; convention]
+        together: Distance, in scales, below which points count as one observation. [scales; convention]
+        crowded: Standard deviations above the count of an even spread from which neighbours form a clump. [standard
+            deviations; not tuned]
+        most: Largest number of image points that are used, evenly spaced among the given ones. [points; cost]
     """
 
     scale_step: float = 2.0
@@ -37,15 +53,16 @@ class Contested:
     """Conditions under which a far pose competes with the best one (`unrelated_competitor`).
 
     Attributes:
-        near: Distance, in scales of the residuals, within which an image point has a match and two matches coincide.
         far: Smallest distance, in multiples of `Evidence.same`; nearer poses slide along the same lines and surfaces.
+            [multiples of `Evidence.same`; calibration]
         most: Largest evidence of an image point, nats: that of a match among 100 scene points at the finest scale.
+            [nats; derived]
         alone: A pose is no repetition of the best one from this ratio on: points that only it explains, over points
-            that only the best one explains.
+            that only the best one explains. [ratio; calibration]
         same: Fraction of the matches of a pose that coincide with those of the best one; from it on, they agree.
+            [fraction; calibration]
     """
 
-    near: float = 3.0
     far: float = 5.0
     most: float = 13.0
     alone: float = 0.5
@@ -57,24 +74,27 @@ class Repetitions:
     """Motions that map a scene onto itself (`bpnp.search.propose.repetitions`).
 
     Attributes:
-        near: Distance, in scales of the residuals, within which an image point has a match.
-        fewest: Smallest number of matched points; with fewer, the three that fix a pose are too large a part.
-        share: Smallest fraction of the matched points that a motion maps.
-        share_of_scene: Smallest fraction of all points that a motion of a whole scene maps.
-        symmetric: Fraction of the matched points from which a motion could by itself explain a better pose.
-        whole: Largest number of points of a scene that is registered as a whole, once for all problems of it.
-        bases_of_scene: Number of bases of that registration. A motion of a third of the points is missed by at most
-            (1 - 1/27)^128 = 0.8 % of the registrations.
-        around: Number of points nearest to the matched ones that these are registered with, in a larger scene.
-        many: Number of points up to which such a registration has `bases` bases; with more, `fewer_bases`.
-        bases: Number of bases with few points.
-        fewer_bases: Number of bases with many points. A motion of nine tenths of the matches is missed by
-            (1 - 0.9^3)^8 = 3e-5 of the registrations.
-        kept: Largest number of competing poses; those with the fewest false alarms are kept.
-        most_missing: Largest fraction of its points that a map may lack.
+        fewest: Smallest number of matched points; with fewer, the three that fix a pose are too large a part. [points;
+            derived]
+        share: Smallest fraction of the matched points that a motion maps. [fraction; calibration]
+        share_of_scene: Smallest fraction of all points that a motion of a whole scene maps. [fraction; calibration]
+        symmetric: Fraction of the matched points from which a motion could by itself explain a better pose. [fraction;
+            calibration]
+        whole: Largest number of points of a scene that is registered as a whole, once for all problems of it. [points;
+            cost]
+        bases_of_scene: Number of bases of that registration. A motion of a third of the points is missed by at most (1
+            - 1/27)^128 = 0.8 % of the registrations. [bases; derived]
+        around: Number of points nearest to the matched ones that these are registered with, in a larger scene. [points;
+            cost]
+        many: Number of points up to which such a registration has `bases` bases; with more, `fewer_bases`. [points;
+            cost]
+        bases: Number of bases with few points. [bases; cost]
+        fewer_bases: Number of bases with many points. A motion of nine tenths of the matches is missed by (1 - 0.9^3)^8
+            = 3e-5 of the registrations. [bases; derived]
+        kept: Largest number of competing poses; those with the fewest false alarms are kept. [poses; cost]
+        most_missing: Largest fraction of its points that a map may lack. [fraction; not tuned]
     """
 
-    near: float = 3.0
     fewest: int = 6
     share: float = 0.3
     share_of_scene: float = 0.2
@@ -94,13 +114,15 @@ class OtherFocal:
     """Search for another focal length near a confident pose (`bpnp.search.settle`).
 
     Attributes:
-        step: Factor from one focal length to the next.
-        widest: Largest factor on the given focal length; its inverse is the smallest.
-        bearings: Largest number of bearings that most steps are fitted to.
-        fewest: Smallest number of matches; a seventh unknown explains too much of fewer.
+        step: Factor from one focal length to the next. [factor; calibration]
+        widest: Largest factor on the given focal length; its inverse is the smallest. [factor; calibration]
+        bearings: Largest number of bearings that most steps are fitted to. [bearings; cost]
+        fewest: Smallest number of matches; a seventh unknown explains too much of fewer. [matches; calibration]
         bend: Largest radial distortion, as a fraction of the distance of the outermost image point from the axis.
-        bend_deg: Rotation, degrees, from which poses with radial distortion are different.
-        bend_shift: Shift, in distances of the scene, from which poses with radial distortion are different.
+            [fraction; convention]
+        bend_deg: Rotation, degrees, from which poses with radial distortion are different. [degrees; convention]
+        bend_shift: Shift, in distances of the scene, from which poses with radial distortion are different. [fraction;
+            convention]
     """
 
     step: float = 1.08
@@ -118,25 +140,31 @@ class Evidence:
 
     Attributes:
         false_alarms: Largest log of the number of false alarms (NFA). The NFA is an upper bound: on unrelated points,
-            an exhaustive search stayed above 1 in 999 of 1000 cases and never fell below 0.1.
-        lead: Smallest margin to every competing pose; by chance a wrong pose has it once in a thousand cases.
-        same: Tolerance within which two poses are the same.
-        missed: Largest log of the miss probability of a better optimum (`bpnp.search.verdict.competitors`).
+            an exhaustive search stayed above 1 in 999 of 1000 cases and never fell below 0.1. [decades; derived]
+        lead: Smallest margin to every competing pose; by chance a wrong pose has it once in a thousand cases. [decades;
+            convention]
+        same: Tolerance within which two poses are the same. [`Tolerance`; convention]
+        missed: Largest log of the miss probability of a better optimum (`bpnp.search.verdict.competitors`). [decades;
+            convention]
         independent: Number of matches that must be coincidences for a better optimum to exist, as many as fix a pose.
+            [matches; derived]
         another: Probability of a better optimum although several initial poses ended at a significant one.
-        uncompared: Probability that a better pose of a symmetric scene is not among those of its motions.
+            [probability; calibration]
+        uncompared: Probability that a better pose of a symmetric scene is not among those of its motions. [probability;
+            measured, symmetric objects of `benchmarks completeness`]
         look_fails: Probability that a local search around a wrong pose misses a better one near it: 40 of 922 did.
-        again_fails: Probability that a further local search misses it as well: 8 of 29 did.
-        focal_chance: Significance level of a test for another focal length. With 0.001, cameras with a focal length
-            off by a tenth are accepted 1.5 times as often.
+            [probability; calibration]
+        again_fails: Probability that a further local search misses it as well: 8 of 29 did. [probability; calibration]
+        focal_chance: Significance level of a test for another focal length. With 0.001, cameras with a focal length off
+            by a tenth are accepted 1.5 times as often. [probability; calibration]
         contested: Constants of the competing far poses.
         repetitions: Constants of the competing poses of a repeated structure.
         zoomed: Constants of the competing focal lengths.
         focal: Largest 99.9 % bound of a fitted focal length, as a fraction. The distance has the same error, and from
-            `same.shift` on the pose is a different one.
-        focal_few: Bound as `focal` for an object: a scene of at most `Repetitions.whole` points that is no map, such
-            as LEDs. Its rotation is correct long before its distance. The reason gives the bound.
-        scale: Largest 99.9 % bound of the scale of a rig's scene, as a fraction.
+            `same.shift` on the pose is a different one. [fraction; derived]
+        focal_few: Bound as `focal` for an object: a scene of at most `Repetitions.whole` points that is no map, such as
+            LEDs. Its rotation is correct long before its distance. The reason gives the bound. [fraction; convention]
+        scale: Largest 99.9 % bound of the scale of a rig's scene, as a fraction. [fraction; convention]
     """
 
     false_alarms: float = -2.0
@@ -161,10 +189,10 @@ class Stage(NamedTuple):
     """Block of hypotheses: the `near2d` nearest of an image point with the `near3d` nearest of a scene point.
 
     Attributes:
-        matches: Matches of a hypothesis: 3, or 2 where a prior lets two matches fix a pose.
-        near2d: Neighbours of an image point.
-        near3d: Neighbours of a scene point.
-        reach: Largest residual of a match before the pose is refined, in match radii.
+        matches: Matches of a hypothesis: 3, or 2 where a prior lets two matches fix a pose. [matches; derived]
+        near2d: Neighbours of an image point. [points; calibration]
+        near3d: Neighbours of a scene point. [points; calibration]
+        reach: Largest residual of a match before the pose is refined, in match radii. [match radii; calibration]
     """
 
     matches: int
@@ -177,19 +205,21 @@ class Rules(NamedTuple):
     """Constants of the compiled loops, compiled with them.
 
     Attributes:
-        cells: Cells along a side of the grid of the image points.
-        matched_cosine: Smallest cosine between a normal and the line of sight at which a point can have a match.
-        expected_cosine: Smallest cosine at which a point with a normal is expected to be seen.
-        ladder: Number of radii 1, 1/2, 1/4 ... at which matches are counted.
-        missed: Nats subtracted for each expected but missing point; one in five is missed.
-        lacking: Matches subtracted from a hypothesis for each expected but missing point.
-        behind: Matches that a hypothesis may lack against the best one of its stage and still be refined.
-        skipped: Matches of the best pose from which its own triples are not solved again.
-        counted: Basin count of the best pose that this requires too.
-        tighter: Factor of the radius from one step of a refinement to the next.
-        final: Steps of a refinement at its last radius.
-        same_trace: Smallest trace of the rotation between two poses that are the same (`Tolerance`).
-        same_shift: Largest shift between them, as a fraction of the scene's distance.
+        cells: Cells along a side of the grid of the image points. [cells; cost]
+        matched_cosine: Smallest cosine between a normal and the line of sight at which a point can have a match. [1;
+            calibration]
+        expected_cosine: Smallest cosine at which a point with a normal is expected to be seen. [1; calibration]
+        ladder: Number of radii 1, 1/2, 1/4 ... at which matches are counted. [radii; calibration]
+        missed: Nats subtracted for each expected but missing point; one in five is missed. [nats; calibration]
+        lacking: Matches subtracted from a hypothesis for each expected but missing point. [matches; calibration]
+        behind: Matches that a hypothesis may lack against the best one of its stage and still be refined. [matches;
+            calibration]
+        skipped: Matches of the best pose from which its own triples are not solved again. [matches; calibration]
+        counted: Basin count of the best pose that this requires too. [hypotheses; calibration]
+        tighter: Factor of the radius from one step of a refinement to the next. [factor; calibration]
+        final: Steps of a refinement at its last radius. [steps; calibration]
+        same_trace: Smallest trace of the rotation between two poses that are the same (`Tolerance`). [1; derived]
+        same_shift: Largest shift between them, as a fraction of the scene's distance. [fraction; derived]
     """
 
     cells: int = 48
@@ -212,25 +242,29 @@ class EnumerationSettings:
     """Constants of the enumeration.
 
     Attributes:
-        most_products: Largest number of image points times scene points that are enumerated: 60 x 60.
-        most_products_known: The limit where a prior lets two matches fix a pose.
+        most_products: Largest number of image points times scene points that are enumerated: 60 x 60. [products; cost]
+        most_products_known: The limit where a prior lets two matches fix a pose. [products; cost]
         stages: Blocks of hypotheses, in their order; those of two matches need a prior that lets two fix a pose.
-        kept: Distinct poses that are kept.
-        safe: Margin in nats, over chance and over any other pose, at which the search ends at once.
+            [`Stage`; calibration]
+        kept: Distinct poses that are kept. [poses; cost]
+        safe: Margin in nats, over chance and over any other pose, at which the search ends at once. [nats; calibration]
         patience: Hypotheses after which the required margin has fallen linearly to 0. After twice as many the search
-            ends with any significant pose.
-        look: Hypotheses between checks of the best pose once it is significant.
-        chunk: Hypotheses between checks before.
-        most: Largest number of hypotheses.
-        widest: Largest radius within which points are matched to a predicted pose, in match radii.
-        near_nats: Evidence in nats by which a competing pose may be behind the best.
+            ends with any significant pose. [hypotheses; calibration]
+        look: Hypotheses between checks of the best pose once it is significant. [hypotheses; cost]
+        chunk: Hypotheses between checks before. [hypotheses; cost]
+        most: Largest number of hypotheses. [hypotheses; cost]
+        widest: Largest radius within which points are matched to a predicted pose, in match radii. [match radii;
+            calibration]
+        near_nats: Evidence in nats by which a competing pose may be behind the best. [nats; calibration]
         seen_witnesses: Preverification points that are seen, if the image points are spread evenly over the scene.
-        fewest_witnesses: Fewest preverification points of a hypothesis.
-        most_witnesses: Most preverification points of a hypothesis.
+            [points; calibration]
+        fewest_witnesses: Fewest preverification points of a hypothesis. [points; calibration]
+        most_witnesses: Most preverification points of a hypothesis. [points; cost]
         witness_chances: Expected chance matches of these points from which two, and three, matches are required.
-        sigmas: Standard deviations of a prior beyond which no pose is tried.
+            [matches; calibration]
+        sigmas: Standard deviations of a prior beyond which no pose is tried. [standard deviations; convention]
         prior_weight: Match radii that weigh as much as one standard deviation of a prior. Noise is a tenth to a third
-            of a radius.
+            of a radius. [match radii; calibration]
         smallest_scale: Smallest scale of the residuals if the pixel size is unknown. [radians; numerics]
         ranked: Number of points up to which all neighbours are ranked; beyond, only this many of each. [points; cost]
         scenes: Number of scenes whose tables stay in the cache. [scenes; cost]
@@ -285,8 +319,8 @@ class TimeSettings:
     Attributes:
         one: Default time limit of `solve`, and of `verify`. [seconds; convention]
         of_many: Default time limit of each problem of `solve_many`. [seconds; convention]
-        photo: Default time limit of a photo; the photos of cities are measured with it (docs/maps.md).
-            [seconds; convention]
+        photo: Default time limit of a photo; the photos of cities are measured with it (docs/maps.md). [seconds;
+            convention]
         ending: Time of the verdict and of the matching after a search; at most half of a limit is kept for it.
             [seconds; cost]
         ending_a_point: Time that each 2D or 3D point adds to `ending`. [seconds per point; cost]
@@ -323,8 +357,8 @@ class InputSettings:
         prior_deg: Default standard deviation of a given rotation about each axis. [degrees; convention]
         one_pixel: Largest coordinate of image points that are refused as normalised coordinates beside a camera in
             pixels. [pixels; convention]
-        widest_row: Largest number of columns of an array of keypoints whose first two columns are positions.
-            [columns; convention]
+        widest_row: Largest number of columns of an array of keypoints whose first two columns are positions. [columns;
+            convention]
         floor_pixels: Smallest noise of an image point; no point detector is more accurate. [pixels; convention]
     """
 
@@ -345,15 +379,15 @@ class ProblemSettings:
     """Record of the points and its prior (`bpnp.search.problem`, `scene`, `starts`).
 
     Attributes:
-        bulk: Distance from the median beyond which scene points do not affect the origin and the unit.
-            [median distances; not tuned]
-        turned_deg: Largest standard deviation of a rotation prior with which two matches fix a pose.
-            [degrees; not tuned]
-        tilted: Largest motion of the image points by the tilt with which two matches fix a pose.
-            [match radii; not tuned]
+        bulk: Distance from the median beyond which scene points do not affect the origin and the unit. [median
+            distances; not tuned]
+        turned_deg: Largest standard deviation of a rotation prior with which two matches fix a pose. [degrees; not
+            tuned]
+        tilted: Largest motion of the image points by the tilt with which two matches fix a pose. [match radii; not
+            tuned]
         radius: Radius of a match if the pixel size is unknown. [radians; not tuned]
-        floors: Radius of a match if it is known: 3 pixels if the floor is a tenth of a pixel.
-            [noise floors; convention]
+        floors: Radius of a match if it is known: 3 pixels if the floor is a tenth of a pixel. [noise floors;
+            convention]
         sigmas: Width of a prior within which all poses count as equally near. [standard deviations; convention]
         log_depths: Logarithm of the farthest over the nearest possible distance of a scene. [nats; convention]
         pairs_a_point: Largest number of pairs per point for which every pair is computed. [pairs; cost]
@@ -399,8 +433,8 @@ class MatchSettings:
         dense: Number of possible matches up to which all distances are computed. [matches; cost]
         fit_rounds: Rounds of the last fit, each with new matches. [rounds; not tuned]
         damping: First damping of Levenberg and Marquardt, a fraction of the diagonal. [fraction; convention]
-        most_steps: Largest number of its steps, and of those of a fit of the focal length of directions.
-            [steps; numerics]
+        most_steps: Largest number of its steps, and of those of a fit of the focal length of directions. [steps;
+            numerics]
         exact: Relative change of a pose, and of the sum of squares, that ends the steps. [ratio; numerics]
         triples: Largest number of triples of given matches. With a fifth of the matches correct, all of them miss a
             correct triple 3 times in 10,000. [triples; derived]
@@ -410,8 +444,8 @@ class MatchSettings:
         reweighted: Number of times that the given matches are weighted anew. [rounds; not tuned]
         wrong: Expected fraction of wrong given matches. A user who gives matches has fewer outliers than points without
             matches have (`SearchSettings.outliers`). [fraction; not tuned]
-        converged: Difference within which refined poses are one optimum, in tolerances of equal poses.
-            [fraction; not tuned]
+        converged: Difference within which refined poses are one optimum, in tolerances of equal poses. [fraction; not
+            tuned]
         settled: Relative change of a sum of squares that ends these steps. [ratio; numerics]
         negligible: Sum of squares that ends them. [radians squared; numerics]
     """
@@ -500,10 +534,10 @@ class KernelSettings(NamedTuple):
         sweeps: Alternating normalisations of the assignment on all points, of rows and columns. [sweeps; not tuned]
         first_tiles: Mean number of tiles near a point that the first buffer holds; a larger one is made where needed.
             [tiles; cost]
-        least_seen: Smallest weight of the points that face the camera, as a fraction of all weights.
-            [fraction; not tuned]
-        reach: Distance beyond which the kernel on all points is 0; it is below 0.012 there.
-            [scales of the annealing; cost]
+        least_seen: Smallest weight of the points that face the camera, as a fraction of all weights. [fraction; not
+            tuned]
+        reach: Distance beyond which the kernel on all points is 0; it is below 0.012 there. [scales of the annealing;
+            cost]
         lanes: Bearings of a tile. [bearings; cost]
         cells: Cells along the longer side of the grid of scene points. [cells; cost]
         neighbour_cells: Largest number of cells along a side of the grid of neighbours. [cells; cost]
@@ -534,8 +568,8 @@ class RefinerSettings:
         difference: Step of central differences, the cube root of the machine precision. [fraction; derived]
         longer: Factor on the damping after a step that is taken. [factor; convention]
         shorter: Factor on the damping after a step that is not. [factor; convention]
-        least_slope: Smallest derivative of the distorted by the undistorted radius at which a point is visible.
-            [1; not tuned]
+        least_slope: Smallest derivative of the distorted by the undistorted radius at which a point is visible. [1; not
+            tuned]
         undistorted: Newton steps that undistort a radius. [steps; numerics]
     """
 
@@ -558,11 +592,11 @@ class LensSettings:
         correspondences: Number of scene points that may correspond to each image point. [points; not tuned]
         most_zoom: Largest step of the logarithm of the scale factor. [nats; not tuned]
         most_bend: Largest step of the relative shift of the outermost point. [fraction; not tuned]
-        same_zoom: Change of the logarithm of the scale factor below which no other round of steps is taken.
-            [nats; not tuned]
+        same_zoom: Change of the logarithm of the scale factor below which no other round of steps is taken. [nats; not
+            tuned]
         most_rounds: Largest number of rounds. [rounds; not tuned]
-        settled_zoom: Change of the logarithm of the scale factor that ends the last steps, with all points.
-            [nats; numerics]
+        settled_zoom: Change of the logarithm of the scale factor that ends the last steps, with all points. [nats;
+            numerics]
         most_steps: Largest number of last steps. [steps; numerics]
         first: Scales of the steps before the first round. [scales of the residuals; not tuned]
         widths: Scales of the steps of each round. [scales of the residuals; not tuned]
@@ -605,8 +639,8 @@ class SymmetrySettings(NamedTuple):
         confirming: Number of pairs that take as long as a sampled point. [pairs; cost]
         most_found: Number of motions of all bases together that are ranked. [motions; cost]
         refined: Number of motions, those of the largest fraction first, that are refined. [motions; cost]
-        near_symmetry: Largest error of a point under a near symmetry, as a fraction of the extent.
-            [fraction; convention]
+        near_symmetry: Largest error of a point under a near symmetry, as a fraction of the extent. [fraction;
+            convention]
         spacing: Largest error in spacings of the points: at a quarter of the spacing 1 to 6 % of the points lie on
             others by chance. [spacings; derived]
         flat: Largest third extent of a flat scene, as a fraction of its second extent. [fraction; not tuned]
@@ -647,11 +681,10 @@ class AlarmSettings:
             twice the time. [fractions; measured, the problems are not recorded]
         least_inliers: Smallest w if clutter or scores are given. [fraction; convention]
         most_inliers: Largest w if clutter or scores are given. [fraction; convention]
-        outline: Smoothing width of the density of unrelated points; the outline beyond it is no evidence.
-            [RMS angular radii; not tuned]
+        outline: Smoothing width of the density of unrelated points; the outline beyond it is no evidence. [RMS angular
+            radii; not tuned]
         smoothed: Largest number of projected points from which that density is estimated. [points; cost]
-        farthest: Distance beyond which a pair does not contribute to the density of a match: e^-9.
-            [scales; numerics]
+        farthest: Distance beyond which a pair does not contribute to the density of a match: e^-9. [scales; numerics]
         own: Largest factor between a scale and that of the residuals at which it is a pose's own. [factor; convention]
         rough: Smallest factor at which it is rougher (`rough_residuals`). [factor; convention]
     """
@@ -674,12 +707,11 @@ class PrecisionSettings:
     """Covariance and tests of the residuals (`bpnp.search.verdict.covariance`, `uncertainty`).
 
     Attributes:
-        exceeded: Probability that an error exceeds its bound, and significance level of a test.
-            [probability; convention]
+        exceeded: Probability that an error exceeds its bound, and significance level of a test. [probability;
+            convention]
         far: Squared distance of a pose from its optimum, in its covariance, from which on they differ: the quantile of
             chi-squared with 6 degrees of freedom at 1 - `exceeded`. [1; derived]
-        slight: Fraction of the information below which an image point hardly moves the estimate.
-            [fraction; numerics]
+        slight: Fraction of the information below which an image point hardly moves the estimate. [fraction; numerics]
         fixed: Smallest eigenvalue of the normalised information of points that fix the estimate. [1; numerics]
         blocks: Number of blocks of image points along each axis of the image. [blocks; not tuned]
     """
@@ -746,8 +778,8 @@ class FocalSettings:
             points and for photos in maps. [factor; not tuned]
         sigmas: Half width of the range of an approximate focal length. [standard deviations; convention]
         turns: Iterations of the first search with each focal length. [iterations; not tuned]
-        alternations: Largest number of alternations of search and refinement from each focal length.
-            [rounds; not tuned]
+        alternations: Largest number of alternations of search and refinement from each focal length. [rounds; not
+            tuned]
         rounds: Largest number of iterations of a refinement. [iterations; numerics]
         same: Change of the logarithm of the focal length below which a refinement stops. [nats; numerics]
         bends: Radial displacements at the image corner from which a fit of the distortion also starts. Started at zero
@@ -787,8 +819,8 @@ class RigSettings:
     """Rigs (`bpnp.search.rig`).
 
     Attributes:
-        wide: Scale at which proposals are compared: a pose of one camera is inaccurate in another.
-            [smallest scales; not tuned]
+        wide: Scale at which proposals are compared: a pose of one camera is inaccurate in another. [smallest scales;
+            not tuned]
         steps: Number of decreasing scales of a refinement. [scales; not tuned]
         again: Number of Gauss-Newton steps at each. [steps; not tuned]
         most_scale: Largest step of the logarithm of the scale of the scene. [nats; not tuned]
@@ -804,8 +836,8 @@ class RigSettings:
         agree_deg: Angle between the poses of two cameras below which they agree. [degrees; not tuned]
         agree_shift: Distance below which they agree, in distances of the scene. [fraction; not tuned]
         pairs: Largest number of pairs of poses that are compared. [pairs; cost]
-        least_apart: Smallest baseline of two cameras that determines the scale, in distances of the scene.
-            [fraction; not tuned]
+        least_apart: Smallest baseline of two cameras that determines the scale, in distances of the scene. [fraction;
+            not tuned]
     """
 
     wide: float = 60.0
@@ -834,8 +866,8 @@ class SkySettings(NamedTuple):
 
     Attributes:
         matched: Probability of a match under the true rotation. [probability; convention]
-        crowded: Probability of a direction in reach by chance, from which on a match is no evidence.
-            [probability; not tuned]
+        crowded: Probability of a direction in reach by chance, from which on a match is no evidence. [probability; not
+            tuned]
         densities: Numbers of neighbours that give the density around a direction; the larger density counts.
             [directions; not tuned]
         catalogues: Number of catalogues that are cached: a camera sees the same sky repeatedly. [catalogues; cost]
@@ -858,12 +890,11 @@ class InfinitySettings:
 
     Attributes:
         noise: Standard deviations of image points that are tried one after the other. [pixels; not tuned]
-        reach: Distance within which a point is a match: 99.4 % of the errors of two normal coordinates.
-            [standard deviations; convention]
+        reach: Distance within which a point is a match: 99.4 % of the errors of two normal coordinates. [standard
+            deviations; convention]
         cell: Cell of the hash table; a point with a larger reach gets no match yet. [reaches; cost]
         around: Number of image points around one that vote. [points; not tuned]
-        narrowest: Smallest chord to them, which limits the azimuth error to 1/10 radian.
-            [errors of a chord; derived]
+        narrowest: Smallest chord to them, which limits the azimuth error to 1/10 radian. [errors of a chord; derived]
         first: Number of the nearest of them that preselect directions. [points; cost]
         promising: Number of preselected directions, which all of them vote on. [directions; cost]
         refined: Number of rotations of a point that are fitted. [rotations; cost]
@@ -874,16 +905,16 @@ class InfinitySettings:
             the best one. [fraction; cost]
         power: Fraction of the true matches that propose their rotation. [fraction; not tuned]
         turns: Largest number of image points that are tried. [points; cost]
-        rougher: Largest noise of the matches, in multiples of the tried one, before the next one is tried.
-            [factor; not tuned]
+        rougher: Largest noise of the matches, in multiples of the tried one, before the next one is tried. [factor; not
+            tuned]
         strained: Largest number of matches that are tested for an error of the camera model. [matches; cost]
         least_share: Fraction of the image points that a rotation explains. An unsuccessful search ends when it would
             have found such a rotation. With `clutter`, half of the expected fraction. [fraction; convention]
         zoom: Factor from one focal length to the next if it is unknown. Far smaller than for poses, since a rotation
             has no distance that compensates it. [factor; not tuned]
         zoom_noise: Noise of the first search at each focal length; it includes the error of the focal length near the
-            edge. If it fails, `noise` is tried, since many directions are not significant at a large noise.
-            [pixels; not tuned]
+            edge. If it fails, `noise` is tried, since many directions are not significant at a large noise. [pixels;
+            not tuned]
         zoom_share: `least_share` of these searches. [fraction; not tuned]
         zoom_alarms: Largest log10 NFA from which the focal length is fitted to the matches; by chance it is mostly
             above 8. [decades; not tuned]
@@ -892,17 +923,16 @@ class InfinitySettings:
         bins: Binary logarithms of the smallest and largest number of azimuth bins. [bits; cost]
         proposed_off: Largest error of a proposed rotation beyond a prior. [radians; not tuned]
         anchor_off: Largest error of the image point that it is proposed for. [radians; not tuned]
-        fewest: Smallest number of image points and of directions; two fix a rotation and leave no evidence.
-            [points; derived]
-        scales: Number of scales of the residuals; each is half the previous one, from the largest noise on.
-            [scales; not tuned]
+        fewest: Smallest number of image points and of directions; two fix a rotation and leave no evidence. [points;
+            derived]
+        scales: Number of scales of the residuals; each is half the previous one, from the largest noise on. [scales;
+            not tuned]
         smallest_noise: Smallest noise of matches. [pixels; numerics]
         pixel_step: Step of the difference that gives the angle per pixel. [pixels; numerics]
         robust: Residual from which on a match counts less in a fit of the focal length. [pixels; not tuned]
         lost: Residual of a point that leaves the view. [pixels; numerics]
         settled: Change of the unknowns that ends this fit. [1; numerics]
-        nominal: Pixel without a camera, as a fraction of the RMS angular radius of the bearings.
-            [fraction; convention]
+        nominal: Pixel without a camera, as a fraction of the RMS angular radius of the bearings. [fraction; convention]
     """
 
     noise: tuple[float, ...] = (0.35, 1.4)
@@ -950,8 +980,8 @@ class Recipe:
 
     Attributes:
         off_centre: 0 puts the centroid of the 3D points on the mean bearing. 1 puts a random 3D point there, for
-            cameras that see a part of the scene. Values between interpolate.
-        log_depth: The depth is multiplied by exp(u), u uniform in [-log_depth, log_depth].
+            cameras that see a part of the scene. Values between interpolate. [fraction; calibration]
+        log_depth: The depth is multiplied by exp(u), u uniform in [-log_depth, log_depth]. [nats; calibration]
     """
 
     off_centre: float
@@ -963,14 +993,16 @@ class ClusterStage:
     """Annealing of many poses on weighted clusters of both point sets.
 
     Attributes:
-        clusters: Number of clusters of each set, at most; the cost of an iteration grows with its square.
-        first_scale: Scale of the first iteration, in units of the RMS angular radius of the bearings.
-        last_scale: Scale of the last iteration, in the same unit.
-        iterations: Number of scales between the two, with one Gauss-Newton step each.
-        kept: Number of poses that the next stage receives.
-        apart_deg: Least angle between the rotations of two kept poses, degrees.
+        clusters: Number of clusters of each set, at most; the cost of an iteration grows with its square. [clusters;
+            calibration]
+        first_scale: Scale of the first iteration, in units of the RMS angular radius of the bearings. [RMS angular
+            radii; calibration]
+        last_scale: Scale of the last iteration, in the same unit. [RMS angular radii; calibration]
+        iterations: Number of scales between the two, with one Gauss-Newton step each. [iterations; calibration]
+        kept: Number of poses that the next stage receives. [poses; calibration]
+        apart_deg: Least angle between the rotations of two kept poses, degrees. [degrees; calibration]
         halvings: Iterations after which only the likelier half of the poses is kept, and at least twice `kept`. Below 6
-            iterations, this step loses correct poses in clutter.
+            iterations, this step loses correct poses in clutter. [iterations; calibration]
     """
 
     clusters: int
@@ -993,11 +1025,12 @@ class FineStage:
 
     Attributes:
         bearings: Number of bearings before the last stage, which uses all. More cost time and rarely change the best
-            pose.
-        smallest_scale: Radians; 2e-4 is a tenth of a pixel at a focal length of 500 pixels.
-        relative_smallest: In units of the RMS angular radius of the bearings, for narrow views.
-        cooling: Factor from one scale to the next.
-        patience: Number of scales after the likeliest one before the annealing of a pose stops.
+            pose. [bearings; cost]
+        smallest_scale: Radians; 2e-4 is a tenth of a pixel at a focal length of 500 pixels. [radians; convention]
+        relative_smallest: In units of the RMS angular radius of the bearings, for narrow views. [RMS angular radii;
+            convention]
+        cooling: Factor from one scale to the next. [factor; calibration]
+        patience: Number of scales after the likeliest one before the annealing of a pose stops. [scales; calibration]
     """
 
     bearings: int = 1000
@@ -1014,13 +1047,17 @@ class Draws:
     Attributes:
         starts: Number for a prior with the standard deviations `wide_deg`, `wide_shift` and `wide_across`, or larger
             ones. These leave few gaps over the width of a basin. A narrower prior gets fewer, at the same density.
-        wide_deg: Standard deviation of the rotation, degrees.
-        wide_shift: Standard deviation of the translation along the view, as a fraction of the distance.
-        least_starts: Least number of initial poses.
+            [poses; calibration]
+        wide_deg: Standard deviation of the rotation, degrees. [degrees; calibration]
+        wide_shift: Standard deviation of the translation along the view, as a fraction of the distance. [fraction;
+            calibration]
+        least_starts: Least number of initial poses. [poses; calibration]
         wide_across: Standard deviation of the translation across the view, in RMS angular radii of the bearings: that
-            of `wide_shift` where that radius is 0.3. Basins shrink with the view in these directions.
+            of `wide_shift` where that radius is 0.3. Basins shrink with the view in these directions. [RMS angular
+            radii; derived]
         reach: Largest distance of the centroid of the points from the centre of the view, in RMS angular radii of the
-            bearings and the points. In 13 of 14 calibration photos it was at most 0.83 of the former.
+            bearings and the points. In 13 of 14 calibration photos it was at most 0.83 of the former. [RMS angular
+            radii; calibration]
     """
 
     starts: int = 2**16
@@ -1036,8 +1073,8 @@ class Preselection:
     """Preselection of initial poses on the density map, in steps.
 
     Attributes:
-        points: Number of 3D points that each step scores.
-        kept: Number of poses that each step keeps.
+        points: Number of 3D points that each step scores. [points; calibration]
+        kept: Number of poses that each step keeps. [poses; calibration]
     """
 
     points: tuple[int, ...] = (300, 5000)
@@ -1050,12 +1087,13 @@ class Narrowing:
 
     Attributes:
         first_scale: Smoothing of the bearings at the first step, in units of their RMS angular radius. From 0.12 on,
-            chance fills the view. At 0.03, the gaps between the initial poses are wider than the basins.
-        last_scale: Smoothing at the last step, in the same unit.
+            chance fills the view. At 0.03, the gaps between the initial poses are wider than the basins. [RMS angular
+            radii; calibration]
+        last_scale: Smoothing at the last step, in the same unit. [RMS angular radii; calibration]
         steps: Number of steps; 0 for the first scale alone. Below a factor of 0.7 from step to step, the narrower
-            optimum is lost more often.
-        copies: Number of copies of each pose at each step.
-        points: Number of 3D points that each step scores.
+            optimum is lost more often. [steps; calibration]
+        copies: Number of copies of each pose at each step. [poses; calibration]
+        points: Number of 3D points that each step scores. [points; calibration]
     """
 
     first_scale: float = 0.06
@@ -1070,11 +1108,13 @@ class DensityShape:
     """Density map of the view.
 
     Attributes:
-        background: Standard deviation of the background density, in multiples of the scale.
-        cells: Number of cells per scale.
-        most_cells: Largest number of cells per side.
-        outliers: Outlier fraction of the map; also the least outlier fraction of the annealing that follows.
-        inside: Fraction of the largest background density below which a cell is outside the view.
+        background: Standard deviation of the background density, in multiples of the scale. [scales; calibration]
+        cells: Number of cells per scale. [cells; calibration]
+        most_cells: Largest number of cells per side. [cells; cost]
+        outliers: Outlier fraction of the map; also the least outlier fraction of the annealing that follows. [fraction;
+            calibration]
+        inside: Fraction of the largest background density below which a cell is outside the view. [fraction;
+            calibration]
     """
 
     background: float = 8.0
@@ -1093,7 +1133,7 @@ class DensitySearch:
         preselection: Preselection of the initial poses.
         narrowing: Scales from the preselection to the annealing.
         density_map: Density map of the view.
-        annealed: Number of poses that are annealed at the end.
+        annealed: Number of poses that are annealed at the end. [poses; calibration]
     """
 
     draws: Draws = Draws()
@@ -1108,18 +1148,22 @@ class Schedule:
     """Order and number of the steps of a search (`bpnp.search.schedule`).
 
     Attributes:
-        turns: Number of iterations, at most.
+        turns: Number of iterations, at most. [iterations; convention]
         enumerated: Number of iterations, at most, for points few enough to be enumerated. Clusters keep every one of so
-            small a set, and further iterations end at the same poses.
-        around: Number of batches around a guess of the pose, before all others.
-        near: Number of steps near a rough prior before the search treats the prior as possibly wrong.
-        unaided: Number of rounds without a significant pose before proposals are requested.
-        starts_a_search: Starts in a batch that take as long as one density-map search over all rotations.
-        around_each: Number of poses of a source that density-map searches are made around, at most.
-        apart_deg: Least angle between the rotations of these poses, degrees.
+            small a set, and further iterations end at the same poses. [iterations; calibration]
+        around: Number of batches around a guess of the pose, before all others. [batches; calibration]
+        near: Number of steps near a rough prior before the search treats the prior as possibly wrong. [steps;
+            calibration]
+        unaided: Number of rounds without a significant pose before proposals are requested. [rounds; calibration]
+        starts_a_search: Starts in a batch that take as long as one density-map search over all rotations. [starts;
+            measured, CPU time of both]
+        around_each: Number of poses of a source that density-map searches are made around, at most. [poses;
+            calibration]
+        apart_deg: Least angle between the rotations of these poses, degrees. [degrees; calibration]
         in_vain: Number of consecutive searches without a better pose after which the other poses of the source are
-            skipped.
-        local_searches: Number of local searches around a significant pose that find nothing better, at most.
+            skipped. [searches; calibration]
+        local_searches: Number of local searches around a significant pose that find nothing better, at most. [searches;
+            calibration]
         proposed_after: Number of steps near a prior after which proposals are requested. [steps; not tuned]
     """
 
@@ -1142,9 +1186,10 @@ class Facing:
 
     Attributes:
         softness: Difference of the cosine between the edge of the viewing cone and full or least visibility. Poses
-            during the annealing are some degrees off, and so are normals.
-        unseen: Least weight of a point, for a point outside its viewing cone.
-        extent: Distance, in extents of the scene, that clustering treats like one radian between normals.
+            during the annealing are some degrees off, and so are normals. [1; calibration]
+        unseen: Least weight of a point, for a point outside its viewing cone. [weight; calibration]
+        extent: Distance, in extents of the scene, that clustering treats like one radian between normals. [extents of
+            the scene; calibration]
     """
 
     softness: float = 0.2
@@ -1158,16 +1203,17 @@ class SearchSettings:
 
     Attributes:
         schedule: Order of the sources of poses, and the budget.
-        starts: Number of starts of a full batch; 1200 leave no gap of 25 degrees.
+        starts: Number of starts of a full batch; 1200 leave no gap of 25 degrees. [starts; derived]
         first_starts: Number of starts of the first batch, enough for easy problems. Each next batch has twice as many
-            until it is full.
+            until it is full. [starts; calibration]
         least_kept: Least number of poses that a stage keeps. A small batch keeps the square root of its fraction of a
-            full one.
-        recipes: Sampling of the batches, in turn.
-        coarse: First stages on clusters.
-        middle: Stages on finer clusters.
+            full one. [poses; calibration]
+        recipes: Sampling of the batches, in turn. [`Recipe`; calibration]
+        coarse: First stages on clusters. [`ClusterStage`; calibration]
+        middle: Stages on finer clusters. [`ClusterStage`; calibration]
         fine: Annealing on all points.
-        near: Density-map searches around a prior.
+        near: Density-map searches around a prior. [`DensitySearch`; chosen on photos of south_building, which
+            docs/results.md reports too]
         local: Density-map search around a pose that the search has found.
         zoomed: Density-map search around a pose at the next step of the focal length.
         proposed: Density-map search from proposed poses.
@@ -1175,29 +1221,33 @@ class SearchSettings:
         facing: Visibility of points with normals.
         evidence: Constants of the verdict.
         most_volumes: Largest volume of a prior that counts as near, in multiples of the widest one with a full number
-            of starts; the prior of a map view has 9.
+            of starts; the prior of a map view has 9. [volumes; calibration]
         admitted: Standard deviations of a prior within which proposed poses are used; 94 % of the poses drawn from it.
+            [standard deviations; derived]
         least_annealed: Least number of points of the smaller set for annealing. Fewer points have no smooth optimum and
-            are only enumerated.
-        outliers: Outlier fraction of the annealing if the caller gives none.
+            are only enumerated. [points; calibration]
+        outliers: Outlier fraction of the annealing if the caller gives none. [fraction; calibration]
         end_outliers: Other outlier fractions with which the last stage anneals the best poses; the likelihood chooses.
+            [fractions; calibration]
         least_outliers: Lower bound of the caller's outlier fraction. Without it, a single outlier would be forced into
-            a match.
+            a match. [fraction; convention]
         finished: Number of candidates whose NFA each batch computes and that are annealed on all bearings at the end.
-        refined_directly: Number of initial poses of `refine_poses`, at most, that need no clusters.
-        copied: Number of poses from other sources, the best first, that are also copied.
-        copies: Number of copies of each of them.
+            [poses; cost]
+        refined_directly: Number of initial poses of `refine_poses`, at most, that need no clusters. [poses; cost]
+        copied: Number of poses from other sources, the best first, that are also copied. [poses; calibration]
+        copies: Number of copies of each of them. [poses; calibration]
         copied_scale: Angular distance of the points of a copy from those of its pose, in units of the RMS angular
-            radius of the bearings. Optima of one basin are about as far apart.
+            radius of the bearings. Optima of one basin are about as far apart. [RMS angular radii; calibration]
         end_scale: Scale at which the last stage begins, in multiples of the scale of the pose, so that other points can
-            enter.
-        kept: Number of candidates that a search keeps from one iteration to the next.
-        same_deg: Angle below which two poses can be the same, degrees.
-        same_shift: Shift below which they can be, in extents of the scene; both conditions are necessary.
-        sampled: Number of points per cluster from which the cluster centres are computed.
-        lloyd_iterations: Number of iterations of the clustering.
-        starts_a_check: Number of starts annealed on clusters between two checks of the deadline.
-        lookups_a_check: Number of poses scored on the density map between two checks of the deadline.
+            enter. [factor; calibration]
+        kept: Number of candidates that a search keeps from one iteration to the next. [poses; cost]
+        same_deg: Angle below which two poses can be the same, degrees. [degrees; convention]
+        same_shift: Shift below which they can be, in extents of the scene; both conditions are necessary. [extents of
+            the scene; convention]
+        sampled: Number of points per cluster from which the cluster centres are computed. [points; cost]
+        lloyd_iterations: Number of iterations of the clustering. [iterations; cost]
+        starts_a_check: Number of starts annealed on clusters between two checks of the deadline. [starts; cost]
+        lookups_a_check: Number of poses scored on the density map between two checks of the deadline. [poses; cost]
         warming: Number of points of the problem that compiles the loops. [points; convention]
     """
 
@@ -1311,8 +1361,8 @@ class RankSettings:
         shifts: Shifts of the photo along either axis. [cells; not tuned]
         scales: Scale factors of the photo. [factors; not tuned]
         ratio: Largest ratio of the reaches of a view and of a photo with a known focal length. [ratio; not tuned]
-        apart: Least fraction of a view's points that no better view sees, for it to count as another place.
-            [fraction; not tuned]
+        apart: Least fraction of a view's points that no better view sees, for it to count as another place. [fraction;
+            not tuned]
     """
 
     cells: int = 32
@@ -1363,10 +1413,9 @@ class MapSettings:
         longer: Iterations of a longer search near a promising view. [iterations; not tuned]
         promising: Number of views that get a longer search if none is confident. [views; not tuned]
         likely: Largest log10 NFA with which a view gets a longer search before the next view. [decades; not tuned]
-        competitors: Number of competing poses of an ambiguous solution that are judged with it on all points.
-            [poses; cost]
-        views_ahead: Number of views that are tried with one focal length before the next one starts.
-            [views; not tuned]
+        competitors: Number of competing poses of an ambiguous solution that are judged with it on all points. [poses;
+            cost]
+        views_ahead: Number of views that are tried with one focal length before the next one starts. [views; not tuned]
         indexed: Smallest number of points of a map that gets an index; smaller maps open in two seconds without one.
             [points; cost]
         same_focal: Largest ratio of the focal lengths of views whose camera a photo can get. [ratio; not tuned]
@@ -1381,10 +1430,10 @@ class MapSettings:
         least_track: Least number of views of a point after a view is removed. [views; convention]
         upright_deg: Largest angle between the upward directions of upright views. [degrees; not tuned]
         least_upright: Smallest fraction of the views that agree on the direction up. [fraction; not tuned]
-        in_plane: Least length of the direction up in the image plane: a steeper view has no upright side.
-            [1; not tuned]
-        queued: Number of photos per worker thread on a cluster: no thread waits, and the scheduler holds few.
-            [photos; cost]
+        in_plane: Least length of the direction up in the image plane: a steeper view has no upright side. [1; not
+            tuned]
+        queued: Number of photos per worker thread on a cluster: no thread waits, and the scheduler holds few. [photos;
+            cost]
     """
 
     most_detected: int = 8192
@@ -1442,8 +1491,8 @@ class RansacSettings:
     """RANSAC and proposals on proposed matches, in torch (`bpnp.robust`).
 
     Attributes:
-        chunk: Number of residuals scored at a time: 1 MiB in float32, which stays in the cache of a core.
-            [residuals; cost]
+        chunk: Number of residuals scored at a time: 1 MiB in float32, which stays in the cache of a core. [residuals;
+            cost]
         smallest_pool: Number of matches of largest weight from which the first triples of a growing pool are drawn.
             [matches; not tuned]
         subset: Number of matches of largest weight on which all hypotheses are scored. With 256, poses are lost at 10 %
@@ -1457,8 +1506,8 @@ class RansacSettings:
             probability 0.9999. [hypotheses; not tuned]
         kept: Fraction of its inliers that OpenCV's refit must keep. [fraction; not tuned]
         triples: Number of triples of an assignment that are solved, for each sample of a batch. [triples; cost]
-        drawn_each: Number of triples drawn for each that is solved; the widest triangles are solved.
-            [triples; not tuned]
+        drawn_each: Number of triples drawn for each that is solved; the widest triangles are solved. [triples; not
+            tuned]
         scored: Number of matches drawn to score the proposals. [matches; cost]
         apart_deg: Smallest angle between two proposals. [degrees; not tuned]
         threshold: Residual that counts half, in root mean square distances of the image points from their mean.

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from bpnp.search.config import Evidence, Repetitions
+from bpnp.search.config import MATCHES, Evidence, Repetitions
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem
 from bpnp.search.propose.symmetries import Motions, matching_tolerance, mirror_pose, self_motions
@@ -40,7 +40,7 @@ def registered(problem: Problem, rotation: Array, translation: Array, scale: flo
     camera = points @ rotation.T + translation
     depth = np.linalg.norm(camera, axis=-1)
     away, nearest = cKDTree(camera / np.maximum(depth, 1e-300)[:, None]).query(problem.bearings)
-    matched = np.unique(nearest[away < limits.near * scale])
+    matched = np.unique(nearest[away < MATCHES.reach * scale])
     if len(matched) < limits.fewest:
         return Motions.none()
     noise = scale * float(np.median(depth[matched]))
@@ -182,7 +182,7 @@ def repetition_margins(
     missing = min((int((logs[0] < 0).sum()) + 1) / (count + 2), (count * (1 - fraction) + 1) / (count + 2))
     missing = min(missing, limits.most_missing)
     most = math.log((1 - missing) / missing)
-    is_repeated = _is_repeated(problem, best, repeated, limits.near * scale)
+    is_repeated = _is_repeated(problem, best, repeated, MATCHES.reach * scale)
     counted = np.stack([_among(problem, one) for one in seen[1:]]) | ~is_repeated
     return np.asarray(np.where(counted, np.clip(logs[0] - logs[1:], -most, most), 0).sum(-1) / math.log(10))
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bpnp.poses import rotation_angle
-from bpnp.search.config import REASONS, Evidence
+from bpnp.search.config import MATCHES, REASONS, Evidence
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, label_groups
 from bpnp.search.verdict.false_alarms import directions_of, own_evidence
@@ -130,14 +130,14 @@ def unrelated_competitor(seen: Seen, rule: Evidence) -> Objection | None:
     if not len(others):
         return None
     scales = np.maximum(candidates.scale, problem.image.scales[0])
-    best, first = _explained(seen, 0, scales[0], limits.near)
+    best, first = _explained(seen, 0, scales[0], MATCHES.reach)
     for k in others.tolist():
-        evidence, other = _explained(seen, k, scales[k], limits.near)
+        evidence, other = _explained(seen, k, scales[k], MATCHES.reach)
         gap = best - evidence
         squared = float((gap**2).sum())
         if float(np.abs(gap).sum()) ** 2 < least * squared:
             continue
-        reach = limits.near * max(scales[0], scales[k]) * np.linalg.norm(first.places, axis=-1)
+        reach = MATCHES.reach * max(scales[0], scales[k]) * np.linalg.norm(first.places, axis=-1)
         same = (first.points == other.points) | (np.linalg.norm(first.places - other.places, axis=-1) < reach)
         alone, others_alone = int((first.near & ~other.near).sum()), int((other.near & ~first.near).sum())
         apart = others_alone >= limits.alone * alone and alone + others_alone >= least
