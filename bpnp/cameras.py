@@ -204,12 +204,20 @@ def camera_from(camera: Any) -> Camera:
 
 
 def is_opencv(camera: Any) -> bool:
-    """Return True for OpenCV's (K, distortion), whose pixel (0, 0) is the centre of the first pixel."""
+    """Return True for OpenCV's (K, distortion), whose pixel (0, 0) is the centre of the first pixel.
+
+    Args:
+        camera: Description of a camera, as for `camera_from`.
+    """
     return isinstance(camera, tuple) and len(camera) == 2 and np.shape(camera[0]) == (3, 3)
 
 
 def image_size(camera: Camera) -> tuple[int, int] | None:
-    """Return the width and height of a camera's images in pixels, or None if they are unknown."""
+    """Return the width and height of a camera's images in pixels, or None if they are unknown.
+
+    Args:
+        camera: Camera; only one of a COLMAP model has a size.
+    """
     size = (camera.camera.width, camera.camera.height) if isinstance(camera, Lens) else (0, 0)
     return size if all(size) else None
 

@@ -62,7 +62,7 @@ def solve(
         image: name of the image whose camera is used, if the --camera model has several.
         image_size: WIDTH,HEIGHT or WIDTHxHEIGHT of the image in pixels, if its focal length is unknown; it is found
             with the pose.
-        focal_error: relative standard deviation of the focal length of --camera, if that is rough.
+        focal_error: relative standard deviation of the focal length of --camera, such as 0.1, if it is not exact.
         distortion: fit a radial coefficient with an unknown focal length even where it is not significantly better.
         output: write the solution as JSON.
         picture: write a picture of it as .png, .jpg, .svg or .pdf.
@@ -77,7 +77,7 @@ def solve(
         up_camera: direction up in the camera (x right, y down, z forward), such as 0 -1 0, if gravity is measured.
         up_scene: the same direction in the scene, such as 0 0 1.
         up_degrees: standard deviation of the direction up, degrees.
-        clutter: expected fraction of points without a correspondence.
+        clutter: expected fraction of the image points without a correspondence, below 1; unknown by default.
         at_infinity: points3d are unit directions, such as of stars; only the rotation is found.
         solver: auto, which also runs a packaged matcher if the search is not confident; search; or a network, packaged
             weights by name or a checkpoint.

@@ -36,10 +36,11 @@ class AuthorsDataModule(StoredDataModule):
     Args:
         root: Folder that `bpnp prepare authors` made, or the authors' folder that holds <dataset>_{train,test}, which
             is converted once into cache_dir.
-        dataset: modelnet40, megadepth or data61_2d3d; None if the folder holds only one data set.
+        dataset: "modelnet40", "megadepth" or "data61_2d3d"; None if the folder holds only one data set.
         val_fraction: Fraction of the training problems held out for validation, at random.
         cache_dir: Folder for the converted files; None for BPNP_CACHE, else the user's cache folder.
-        options: Options of `StoredDataModule`.
+        **options: Options of `StoredDataModule` except those of the split: min_points, max_points, fresh_subsets,
+            eval_max_points, clutter, clutter_side and rotate, and those of `ProblemDataModule`.
     """
 
     def __init__(

@@ -116,7 +116,12 @@ class ProblemSource(Protocol):
         """Numbers of points of each problem."""
 
     def batch(self, index: Int[Tensor, " b"], epoch: int) -> Batch:
-        """Return problems from `stack_problems`, each a function of its index, the epoch and the seed of the source."""
+        """Return problems from `stack_problems`, each a function of its index, the epoch and the seed of the source.
+
+        Args:
+            index: Indices of the problems (b,).
+            epoch: Epoch, for problems that change from epoch to epoch.
+        """
 
 
 def stack_problems(problems: Sequence[Problem], index: Int[Tensor, " b"]) -> Batch:

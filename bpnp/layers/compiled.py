@@ -33,9 +33,21 @@ def conjugate_gradients(
     tolerance: Float[Tensor, " b"],
     limit: int,
 ) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b m"], Bool[Tensor, " b"]]:
-    """Solve for x as `bpnp.layers.laplacian.conjugate_gradients` does; same arguments and results.
+    """Solve S x = rhs by preconditioned conjugate gradients, as `bpnp.layers.laplacian.conjugate_gradients` does.
 
-    The inputs may have any strides.
+    The inputs are on the CPU and may have any strides.
+
+    Args:
+        plan: P (b, m, n).
+        rows: Row sums of P (b, m).
+        cols: Column sums of P (b, n).
+        degree: Preconditioner (b, n).
+        rhs: Right-hand side (b, n).
+        tolerance: Relative tolerance (b,).
+        limit: Largest number of iterations.
+
+    Returns:
+        x (b, n), P x / rows (b, m), and which samples met the tolerance (b,).
     """
     inputs = plan.kernel, plan.alpha, plan.beta, rows, cols, degree, rhs, tolerance
     x, mean = rhs.new_zeros(rhs.shape), rhs.new_zeros(rows.shape)

@@ -150,16 +150,16 @@ class SceneMap(ViewedPoints):
                 in the order in which their point density resembles that of the keypoints.
             scores: (m,) strengths of the keypoints; the strongest 2,048 are used. None to use all keypoints.
             prior: Prior of the photo's pose, as for `bpnp.solve`; None to use the pose of the view that is tried.
-            up_camera: (3,) direction up in the camera frame of the photo, accurate to a quarter turn, such as from the
-                EXIF orientation. Views are first rotated about their optical axes by quarter turns to match it. If no
-                pose is confident, they are tried unrotated. None for an unknown direction. It has no effect with a
-                prior.
+            up_camera: (3,) direction up in the camera frame of the photo, of any length, such as from the EXIF
+                orientation; only the nearest quarter turn of it is used. Views are first rotated about their optical
+                axes by quarter turns to match it, for at most half of the time. If no pose is confident, they are tried
+                unrotated. None for an unknown direction. It has no effect with a prior.
             solver: As for `bpnp.solve`. A network that was trained in the frame of a view gets the points in the frame
                 of the view that is tried, or of the prior.
             seed: Seed of the search, default 0.
-            time_limit: Seconds for all views together, 60 by default; math.inf for no limit. After it no search starts,
-                but competing poses of a confident pose are still tested, which takes about a second. A pose that is not
-                confident then has a reason with the number of views that were tried.
+            time_limit: Seconds for all views together; math.inf for no limit. Default: None, 60 seconds. After it no
+                search starts, but competing poses of a confident pose are still tested, which takes about a second. A
+                pose that is not confident then has a reason with the number of views that were tried.
 
         Returns:
             Solution of the photo. `view` is the view near which the pose was found. `points3d` are the points of
@@ -200,7 +200,7 @@ class SceneMap(ViewedPoints):
         The view is removed from the map, with the points that fewer than two other views see: these have no position
         without it. Its pose is judged on the other points that it can see, whatever points the reconstruction matched
         its keypoints to. It is then compared with poses elsewhere in the map. It is "ambiguous" if another pose is
-        about as likely. It is "failed" if it is not significant, or another pose is more likely by three decades.
+        about as likely. It is "failed" if it is not significant, or another pose is more likely by a factor of 1,000.
 
         Args:
             name: Name of the view.
@@ -208,13 +208,15 @@ class SceneMap(ViewedPoints):
                 centre of the first pixel.
             seed: Seed of the perturbed copies of the pose from which it is refined, default 0.
             time_limit: Seconds until competing poses in view are no longer tested, 10 by default; math.inf for no
-                limit.
+                limit. A pose for which they were not all tested is "ambiguous" at best. None is deprecated: it warns
+                and stands for 10 seconds.
 
         Returns:
             Solution as of `bpnp.verify`. `points3d` and `point_ids` are the points in view.
 
         Raises:
-            ValueError: The name is not in the map, or the view can see fewer than 4 of the remaining points.
+            ValueError: The name is not in the map, there are fewer than 4 keypoints, or the view can see fewer than 4
+                of the remaining points.
         """
         if time_limit is None:
             message = "`time_limit=None` of `verify_view` is its default limit now, 10 s; math.inf is no limit"
@@ -269,14 +271,14 @@ class SceneMap(ViewedPoints):
             name: Name of the photo in that file; None for the name of the image file.
             ignore_orientation: Ignore the EXIF orientation. By default it is the `up_camera` of `localize`. The photo
                 is never rotated, as in COLMAP.
-            focal_error: Relative standard deviation of the focal length of the camera, as for `localize`. It has no
-                effect on a photo with an unknown camera.
+            focal_error: Relative standard deviation of the focal length of the camera, as for `localize`; None if it is
+                exact. It has no effect on a photo with an unknown camera.
             distortion: Always fit a radial distortion coefficient, as for `localize`. Default False.
             views: Names of views that may show the same place, best first, as for `localize`; None for all views.
-            prior: Prior of the photo's pose, as for `localize`.
+            prior: Prior of the photo's pose, as for `localize`; None for the pose of the view that is tried.
             solver: As for `localize`.
             seed: Seed of the search, default 0.
-            time_limit: Seconds for all views together, 60 by default; math.inf for no limit.
+            time_limit: Seconds for all views together; math.inf for no limit. Default: None, 60 seconds.
 
         Returns:
             Solution as of `localize`.
@@ -312,20 +314,21 @@ class SceneMap(ViewedPoints):
         )
 
     def camera_for(self, photo: Path, *, exif: bool = True) -> tuple[Camera | None, str]:
-        """Return the camera of a photo, and its source in words.
+        """Return the camera of a photo, and its source as text.
 
         Args:
             photo: Image file.
-            exif: Use the focal length of the EXIF data, with the principal point at the image centre. Without EXIF data
-                use the camera of views with images of the photo's size. If False, use only the camera of views with
-                images of its aspect ratio, scaled to its size.
+            exif: True, the default, to use the focal length of the EXIF data, with the principal point at the image
+                centre, and without EXIF data the camera of views with images of the photo's size. False to use only the
+                camera of views with images of its aspect ratio, scaled to its size.
 
         Returns:
-            Camera and source. The camera is None if there is none, or if the focal lengths of the views differ by more
-                than 5 %.
+            Camera and source, such as "EXIF". With `exif` the camera is None if there is neither EXIF data nor such a
+                view, or if the focal lengths of these views differ by more than 5 %.
 
         Raises:
-            ValueError: `exif` is False and there is no such camera.
+            ValueError: The photo cannot be read. Or `exif` is False and there is no such view, or the focal lengths of
+                these views differ by more than 5 %.
         """
         size = width, height = photo_size(photo)
         if exif and (focal := focal_from_exif(photo)) is not None:

@@ -109,7 +109,14 @@ class ViewedPoints:
         return {view.name: i for i, view in enumerate(self.views)}
 
     def named(self, names: Iterable[str]) -> list[View]:
-        """Return the views with these names; raise ValueError for a name that is not in the map."""
+        """Return the views with some names.
+
+        Args:
+            names: Names of views.
+
+        Raises:
+            ValueError: A name is not in the map.
+        """
         wanted = list(names)
         if unknown := [name for name in wanted if name not in self.view_numbers]:
             some = ", ".join(view.name for view in self.views[:5])
@@ -130,7 +137,14 @@ class ViewedPoints:
         return replace(self, views=views).seen_by(MAPS.least_track)
 
     def seen_by(self: Map, least: int) -> Map:
-        """Return the map with only the points that `least` or more views see; raise ValueError if none is left."""
+        """Return the map with only the points that enough views see.
+
+        Args:
+            least: Smallest number of views that see a point.
+
+        Raises:
+            ValueError: No point is left.
+        """
         tracks = np.zeros(len(self.points3d), np.int32)
         for view in self.views:
             tracks[view.points] += 1
@@ -177,12 +191,23 @@ class ViewedPoints:
         ]
 
     def scores(self, camera: Camera, keypoints: Array, *, known_focal: bool = True) -> NDArray[np.float32]:
-        """Return the scores (views,) of the views for keypoints (m, 2), pixels (`scores_of_views`)."""
+        """Return the scores (v,) of the views for a photo: how well their point density resembles its keypoints.
+
+        Args:
+            camera: Camera of the photo.
+            keypoints: (m, 2) pixels.
+            known_focal: False if the focal length of the camera is a guess. Default True.
+        """
         points2d = camera.normalise(np.asarray(keypoints, np.float64))
         return scores_of_views(points2d, self.pictures, known_focal=known_focal)
 
     def region(self, view: View, points: NDArray[np.integer] | None = None) -> Region:
-        """Return the region of some points (k,), None for all points of the map, with the view to search near."""
+        """Return some points of the map, with the view to search near.
+
+        Args:
+            view: View to search near.
+            points: (k,) indices of points; None for all points of the map.
+        """
         in_camera = self.points3d[view.points] @ view.rotation.T + view.translation
         distance = float(np.median(np.linalg.norm(in_camera, axis=-1)))
         whole = Region(view, self.points3d, self.point_ids, self.cones, distance)
@@ -192,6 +217,11 @@ class ViewedPoints:
         """Yield the points seen by the given views, or by all views ranked for the keypoints of a known camera.
 
         Several views may show the same place.
+
+        Args:
+            views: Names of views, in the order of the result; None for all views of the map.
+            camera: Camera of the photo.
+            keypoints: (m, 2) pixels.
         """
         if views is not None:
             order = self.named(views)
@@ -200,9 +230,13 @@ class ViewedPoints:
         yield from (self.region(view, view.points) for view in order if len(view.points) >= MIN_POINTS)
 
     def turned(self: Map, up_camera: Array) -> Map:
-        """Return the map with each view rotated by quarter turns until its up direction is that of a photo (3,).
+        """Return the map with each view rotated by quarter turns until its up direction is that of a photo.
 
-        Return the map itself if no view needs a rotation.
+        Args:
+            up_camera: (3,) direction up in the camera frame of the photo.
+
+        Returns:
+            The map with rotated views; the map itself if no view needs a rotation.
         """
         turns = quarter_turns(self.views, up_camera)
         if not turns.any():

@@ -51,8 +51,8 @@ class Search(nn.Module):
     """`search_poses` as a solver. The prediction has the pose "search" and no assignment.
 
     Args:
-        seed: Random seed of the initial poses.
-        time_limit: Time limit for each problem in seconds. Default: 5. None: no limit.
+        seed: Random seed of the initial poses, default 0.
+        time_limit: Time limit for each problem in seconds, default 5. None for no limit.
         settings: Constants of the search.
     """
 
@@ -64,7 +64,11 @@ class Search(nn.Module):
         self.seed, self.time_limit, self.settings = seed, time_limit, settings
 
     def forward(self, batch: Batch) -> Prediction:
-        """Return the pose "search" of each problem."""
+        """Return the pose "search" of each problem.
+
+        Args:
+            batch: Problems.
+        """
         results = (
             (problem, search_poses(problem, seed=self.seed, deadline=self._deadline(), settings=self.settings))
             for problem in problems_of(batch)
@@ -295,8 +299,8 @@ class Refinement(nn.Module):
     that.
 
     Args:
-        hypotheses: Largest number of hypotheses drawn from the assignment as initial poses; 0 for none.
-        enabled: False returns predictions unchanged.
+        hypotheses: Largest number of hypotheses drawn from the assignment as initial poses, default 192; 0 for none.
+        enabled: False returns predictions unchanged. Default True.
     """
 
     def __init__(self, *, hypotheses: int = 192, enabled: bool = True) -> None:
@@ -305,7 +309,12 @@ class Refinement(nn.Module):
         self.hypotheses, self.enabled = hypotheses, enabled
 
     def forward(self, prediction: Prediction, batch: Batch) -> Prediction:
-        """Return the prediction with the pose "refined"."""
+        """Return the prediction with the pose "refined".
+
+        Args:
+            prediction: Prediction with poses, and with an assignment unless `hypotheses` is 0.
+            batch: Problems.
+        """
         if not self.enabled:
             return prediction
         poses = prediction.poses.values()

@@ -31,16 +31,16 @@ class Matcher(TrainedNet):
     RANSAC, weighted PnP and the refinement turn it into poses as in `BPnPNet`.
 
     Args:
-        channels: Width, a multiple of heads.
-        depth: Number of attention blocks.
-        heads: Heads of each attention.
-        neighbours: Number of nearest neighbours that describe a point; 0 for none.
+        channels: Width, a multiple of heads. Default 128.
+        depth: Number of attention blocks, default 6.
+        heads: Number of heads of each attention, default 4.
+        neighbours: Number of nearest neighbours that describe a point, default 8; 0 for none.
         frame: Frame in which the 3D points are expected: "any", or "view", that of a camera nearby which looks along
             the third axis, such as a map's view of the same scene. In "view" a 3D point is also described by its image
             in that camera, as a 2D point is. `bpnp.solve` and `SceneMap.localize` transform the points, and the pose
             back.
-        mu: Entropy weight of the transport at the start of training; it is learned.
-        tolerance: L1 error of the marginals at which the transport stops.
+        mu: Entropy weight of the transport at the start of training, default 0.1; it is learned.
+        tolerance: L1 error of the marginals at which the transport stops, default 1e-6.
         ransac: As in `BPnPNet`.
         pnp: As in `BPnPNet`.
         refinement: As in `BPnPNet`.
@@ -95,7 +95,14 @@ class Matcher(TrainedNet):
         self.refinement = Refinement() if refinement is None else refinement
 
     def forward(self, batch: Batch) -> Prediction:
-        """Return the assignment, unmatched probabilities, and poses "ransac", "pnp" and, in evaluation, "refined"."""
+        """Return the assignment, unmatched probabilities, and poses "ransac", "pnp" and, in evaluation, "refined".
+
+        Args:
+            batch: Problems.
+
+        Returns:
+            Prediction with P (b, m, n), `unmatched2d` (b, m), `unmatched3d` (b, n), the stats and the poses.
+        """
         clock = Clock()
         prediction = self.match(batch)
         assert prediction.assignment is not None
@@ -107,7 +114,14 @@ class Matcher(TrainedNet):
         return prediction if self.training else clock.add_times(self.refinement(prediction, batch))
 
     def match(self, batch: Batch) -> Prediction:
-        """Return the assignment and the unmatched probabilities, without poses."""
+        """Return the assignment and the unmatched probabilities, without poses.
+
+        Args:
+            batch: Problems.
+
+        Returns:
+            Prediction with P (b, m, n), `unmatched2d` (b, m), `unmatched3d` (b, n) and the stats.
+        """
         plan, stats = self.transport(batch)
         return Prediction(plan[:, :-1, :-1], stats, unmatched2d=plan[:, :-1, -1], unmatched3d=plan[:, -1, :-1])
 
@@ -116,6 +130,9 @@ class Matcher(TrainedNet):
 
         Every real point has the mass 1 / (m + n), each dustbin that of all points of the other side. A match costs the
         distance of the unit features, an unmatched point its own predicted cost.
+
+        Args:
+            batch: Problems.
 
         Returns:
             The plan (b, m + 1, n + 1), dustbins last, and the stats of the transport.
@@ -138,7 +155,14 @@ class Matcher(TrainedNet):
         )
 
     def features(self, batch: Batch) -> tuple[Float[Tensor, "b m c"], Float[Tensor, "b n c"]]:
-        """Return the features of both sides after the last block, layer-normalised, not of unit length."""
+        """Return the features of both sides after the last block, layer-normalised, not of unit length.
+
+        Args:
+            batch: Problems, in the dtype of the network.
+
+        Returns:
+            Features of the image points (b, m, c) and of the scene points (b, n, c).
+        """
         centre3d, radius3d = robust_frame(batch.points3d, batch.mask3d)
         local3d = (batch.points3d - centre3d) / radius3d
         x2d, x3d = self._image_features(batch.points2d, batch.mask2d), self.enter3d(encode(local3d))

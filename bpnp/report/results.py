@@ -120,11 +120,19 @@ class Results:
     written: str
 
     def of(self, estimate: str) -> list[ProblemRow]:
-        """Return the rows of one estimate, in the order of the data set."""
+        """Return the rows of one estimate, in the order of the data set.
+
+        Args:
+            estimate: Name of the estimate, such as "pnp"; an unknown name has no rows.
+        """
         return [row for row in self.rows if row.estimate == estimate]
 
     def errors(self, estimate: str) -> PoseErrors:
-        """Return the errors of one estimate, in the order of its rows."""
+        """Return the errors of one estimate, in the order of its rows.
+
+        Args:
+            estimate: Name of the estimate, such as "pnp".
+        """
         return _errors(self.of(estimate))
 
     @property

@@ -25,7 +25,11 @@ LINE = 130  # characters per line of the reason in a figure
 def solution_points(solution: Solution, *, title: str | None = None) -> ProblemPoints:
     """Return the points of a solution, ready to draw.
 
-    Their id is the caption: title, verdict with its figures, and reason. A failed solution has no figures.
+    Their id is the caption: title, verdict with its numbers, and reason. A failed solution has no numbers.
+
+    Args:
+        solution: Solution.
+        title: First line of the caption; None for a caption without title.
 
     Raises:
         ValueError: A match has no point.
@@ -57,6 +61,10 @@ def competing_points(solution: Solution, points: ProblemPoints) -> ProblemPoints
     """Return the points under the next candidate of an ambiguous solution; None if there is none.
 
     The matches are mutual nearest neighbours within the inlier threshold.
+
+    Args:
+        solution: Solution.
+        points: Points of the solution, from `solution_points`.
     """
     if solution.verdict != "ambiguous" or len(solution.candidates) < 2:
         return None

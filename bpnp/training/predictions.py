@@ -82,9 +82,10 @@ class PredictionWriter(BasePredictionWriter):
     """Write the poses of a prediction atomically when it ends, sorted by problem.
 
     Args:
-        folder: Folder of the file; None for the trainer's default_root_dir.
-        format: csv for quaternions (w, x, y, z) and translations; json for rotation matrices and translations.
-        overwrite: Replace the file of an earlier prediction.
+        folder: Folder of the file. Default: None, the default_root_dir of the trainer.
+        format: "csv", the default, for quaternions (w, x, y, z) and translations; "json" for rotation matrices and
+            translations.
+        overwrite: Replace the file of an earlier prediction. Default False: such a file is an error.
     """
 
     def __init__(

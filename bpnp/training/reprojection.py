@@ -28,6 +28,13 @@ class ReprojectionLoss(nn.Module):
     def forward(self, prediction: Prediction, batch: Batch) -> Float[Tensor, " b"]:
         """Return sum_ij P_ij angle(f_i, R p_j + t) / sum_ij P_ij in radians; NaN for a sample without a pose.
 
+        Args:
+            prediction: Prediction with an assignment and the pose "pnp".
+            batch: Problems.
+
+        Returns:
+            Losses (b,), radians.
+
         Raises:
             ValueError: The solver has no assignment, or no pose named "pnp".
         """

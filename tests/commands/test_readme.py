@@ -7,9 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from bpnp.cli import COMMANDS, LIGHTNING, main
 from bpnp.commands.parser import parse_arguments
+from bpnp.datamodules import StoredDataModule
+from bpnp.geometry import project, transform
 
 pytestmark = pytest.mark.slow
 
@@ -86,3 +89,19 @@ def test_the_code_of_the_readme_runs(
     assert (tmp_path / "pose.png").stat().st_size > 5000
     expected = [line.split("# ")[-1] for code in (network, search) for line in code.splitlines() if "print(" in line]
     assert capsys.readouterr().out.split() == expected
+
+
+def test_the_code_of_the_data_guide_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Problems of a user's own, from a store and on demand: the true poses project the points onto their matches."""
+    monkeypatch.chdir(tmp_path)
+    stored, on_demand, _ = blocks(ROOT / "docs" / "data.md", "python")
+    exec(stored, {})
+    names: dict[str, Any] = {}
+    exec(on_demand, names)
+    for module in (StoredDataModule(root="data/mine"), names["MyDataModule"]()):
+        module.setup()
+        assert sum(len(module.datasets[part]) for part in ("train", "val", "test")) >= 20
+        for batch in module.train_dataloader():
+            seen = project(transform(batch.rotation, batch.translation, batch.points3d))
+            matched = batch.points2d.gather(1, batch.match3d[..., None].expand(-1, -1, 2))
+            torch.testing.assert_close(matched, seen, atol=1e-5, rtol=0)

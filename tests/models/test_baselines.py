@@ -107,7 +107,7 @@ def test_softposit_starts_within_the_stated_angle_of_the_truth() -> None:
 @pytest.mark.parametrize(
     ("solver", "options", "message"),
     [
-        (RandomRansac, {"time_limit": None}, "`time_limit` and `max_hypotheses` are both null"),
+        (RandomRansac, {"time_limit": None}, "`time_limit` and `max_hypotheses` are both None"),
         (RandomRansac, {"confidence": 0.0}, r"`threshold` is 0.01 and `confidence` 0.0; both must be above 0"),
         (Hungarian, {"checkpoint": "x.ckpt", "net": BPnPNet()}, "`checkpoint` and `net` are both given"),
     ],

@@ -34,7 +34,9 @@ class ColmapDataModule(StoredDataModule):
         root: Folder that `bpnp prepare megadepth` made; or a folder of scenes, <scene>/sparse/0 or
             <scene>/sparse/manhattan/0 with cameras, images and points3D (.bin or .txt) in it; or one scene, one model,
             or a list of any of these.
-        options: Options of `StoredDataModule`.
+        **options: Options of `StoredDataModule`: train_scenes, val_scenes, test_scenes, val_fraction, test_fraction,
+            min_points, max_points, fresh_subsets, eval_max_points, clutter, clutter_side and rotate, and those of
+            `ProblemDataModule`.
     """
 
     def __init__(self, root: str | list[str], **options: Any) -> None:

@@ -271,7 +271,7 @@ class SyntheticMapDataModule(ProblemDataModule):
 
     Args:
         train_problems: Number of training problems in an epoch.
-        fresh_views: Draw new scenes and cameras every epoch; false for fixed problems.
+        fresh_views: Draw new scenes and cameras every epoch, the default; False for fixed problems.
         val_problems: Number of validation problems, fixed.
         test_problems: Number of problems to test and predict on, fixed.
         num_points: Largest number of points of a side; of more, matches and others are reduced in proportion.
@@ -280,8 +280,8 @@ class SyntheticMapDataModule(ProblemDataModule):
             numbers, [low, high], draw it uniformly for each problem.
         views: Smallest and largest number of photos whose map points are taken.
         kinds: Weight of each kind of scene; None for half facades, and a quarter each street and statue.
-        frame: Frame of the map: any, rotated at random; upright, the third axis upwards and any heading; view, the
-            coordinates of the first of the cameras whose map points are taken.
+        frame: Frame of the map: "any", the default, rotated at random; "upright", the third axis upwards and any
+            heading; "view", the coordinates of the first of the cameras whose map points are taken.
         tilt_deg: Standard deviation of an upright frame's rotation about each of its horizontal axes, degrees.
         scale_range: Smallest and largest number of scene units in a metre, drawn for each scene, uniform in its
             logarithm.

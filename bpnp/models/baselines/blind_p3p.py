@@ -23,11 +23,11 @@ class RandomRansac(SingleSolver):
     the seed and on the index of the problem.
 
     Args:
-        threshold: Largest distance of matching points in the normalised image.
-        confidence: Probability at which to stop; 1 for never.
+        threshold: Largest distance of matching points in the normalised image, default 0.01.
+        confidence: Probability at which to stop, default 0.9; 1 for never.
         max_hypotheses: Largest number of triples; None for as many as the time allows.
         seed: Seed of the triples.
-        time_limit: Seconds for each problem; None for no limit, which needs `max_hypotheses`.
+        time_limit: Seconds for each problem, default 30; None for no limit, which needs `max_hypotheses`.
     """
 
     estimates = ("random_ransac",)
@@ -43,7 +43,7 @@ class RandomRansac(SingleSolver):
     ) -> None:
         super().__init__(time_limit)
         if time_limit is None and max_hypotheses is None:
-            raise ValueError("`time_limit` and `max_hypotheses` are both null; set one of them, such as time_limit 30")
+            raise ValueError("`time_limit` and `max_hypotheses` are both None; set one of them, such as time_limit 30")
         if not 0 < confidence <= 1 or not threshold > 0:
             raise ValueError(
                 f"`threshold` is {threshold} and `confidence` {confidence}; both must be above 0, `confidence` up to 1"
@@ -52,7 +52,7 @@ class RandomRansac(SingleSolver):
         self.max_hypotheses = math.inf if max_hypotheses is None else max_hypotheses
 
     def solve(self, problem: SingleProblem, deadline: Deadline) -> Answer:
-        """Return the pose with the most inliers among random triples."""
+        """Return the pose with the most inliers among random triples; arguments as for `SingleSolver.solve`."""
         sides, rays = (problem.points2d, problem.points3d), bearings(problem.points2d)
         m, n = map(len, sides)
         seed, best, tried, most, matches = 2 * problem.seed(self.seed), None, 0, 0, 0

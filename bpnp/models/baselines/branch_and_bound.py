@@ -75,7 +75,9 @@ class BestPose(NamedTuple):
 
 
 class BranchAndBound(SingleSolver):
-    """Base of searches over all rotations and over camera centres in a cube around the scene's centre.
+    """Base of searches over all rotations and over camera centres in a cube around the scene's centroid.
+
+    The half side of the cube is 1.5 times the weak-perspective distance (`weak_perspective_distance`).
 
     Args:
         max_boxes: Largest number of boxes, None for no limit.
@@ -87,7 +89,7 @@ class BranchAndBound(SingleSolver):
         self.max_boxes = math.inf if max_boxes is None else max_boxes
 
     def solve(self, problem: SingleProblem, deadline: Deadline) -> Answer:
-        """Normalise the scene, search, and return the pose in scene coordinates."""
+        """Normalise the scene, search, and return the pose in scene coordinates; see `SingleSolver.solve`."""
         scene_centre = problem.points3d.mean(0)
         radius = root_mean_square((problem.points3d - scene_centre).norm(dim=-1))
         points = (problem.points3d - scene_centre) / radius
@@ -223,7 +225,7 @@ class GOPAC(BranchAndBound):
     more inliers.
 
     Args:
-        angle: Largest angle between an inlier's ray and its scene point, radians.
+        angle: Largest angle between an inlier's ray and its scene point, radians. Default 0.005.
         max_boxes: Largest number of boxes, including those of inner searches; None for as many as the time allows.
         time_limit: Seconds for each problem; then the best pose so far is returned, not converged. None for no limit.
     """

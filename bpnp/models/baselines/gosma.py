@@ -64,10 +64,10 @@ class SceneMixture(NamedTuple):
 class GOSMA(BranchAndBound):
     """Branch and bound on the distance between the mixtures of both point sets, without matches or an initial pose.
 
-    Camera centres are no closer to the scene's centre than CLOSEST. `residual` of the pose is its distance as a
-    fraction of the image mixture's squared norm (0 for mixtures that coincide). `converged` certifies that no pose of
-    the domain is better by more than GAP. This is a certificate of the mixtures' alignment, which need not be that of
-    the points.
+    Camera centres are no closer to the scene's centroid than half the weak-perspective distance. `residual` of the pose
+    is its distance as a fraction of the image mixture's squared norm (0 for mixtures that coincide). `converged`
+    certifies that no pose of the domain is better by more than 0.1 of this norm. This is a certificate of the mixtures'
+    alignment, which need not be that of the points.
 
     Args:
         cluster2d: Largest angle from the mean of an image cluster, in root mean square angles of all rays to their

@@ -20,7 +20,11 @@ class Hungarian(nn.Module):
     Args:
         checkpoint: Checkpoint of a BPnPNet, written by `bpnp fit`; None to use `net`.
         net: Network; None with a checkpoint of None for untrained weights with the default settings.
-        ransac_backend: As in BPnPNet; opencv is the paper's.
+        ransac_backend: Backend of `bpnp.layers.RansacPnP`, default "poselib"; "opencv" is the paper's. Threshold and
+            number of hypotheses are those of the network's RANSAC.
+
+    Raises:
+        ValueError: `checkpoint` and `net` are both given.
     """
 
     estimates = ("ransac", "pnp")
@@ -40,14 +44,22 @@ class Hungarian(nn.Module):
         )
 
     def forward(self, batch: Batch) -> Prediction:
-        """Return the assignment and the poses "ransac" and "pnp"."""
+        """Return the assignment and the poses "ransac" and "pnp".
+
+        Args:
+            batch: Problems.
+        """
         assignment = self.match(batch).assignment
         assert assignment is not None
         start = ransac_pose(self.ransac, assignment, batch)
         return Prediction(assignment, None, {"ransac": start, "pnp": pnp_pose(self.net.pnp, assignment, batch, start)})
 
     def match(self, batch: Batch) -> Prediction:
-        """Return the assignment without poses."""
+        """Return the assignment without poses.
+
+        Args:
+            batch: Problems.
+        """
         with torch.no_grad():
             return Prediction(hungarian(self.net.cost(batch), batch))
 

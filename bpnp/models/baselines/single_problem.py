@@ -34,7 +34,11 @@ class SingleProblem(NamedTuple):
     translation: Float[Tensor, "3"] | None
 
     def seed(self, seed: int) -> int:
-        """Return the seed of the problem's random numbers, which does not depend on its batch."""
+        """Return the seed of the problem's random numbers, which does not depend on its batch.
+
+        Args:
+            seed: Seed of the solver.
+        """
         mixed = torch.Generator().manual_seed(seed)
         return int(torch.randint(2**31, (1,), generator=mixed)) * 1_000_003 + self.number
 
@@ -66,6 +70,14 @@ class SingleSolver(nn.Module):
         self.time_limit = time_limit
 
     def forward(self, batch: Batch) -> Prediction:
+        """Solve the problems of a batch one after the other.
+
+        Args:
+            batch: Problems.
+
+        Returns:
+            Prediction with the one pose of the solver, NaN where it found none, and no assignment.
+        """
         like, answers = batch.points3d, []
         # A local optimiser needs gradients, which the trainer's inference mode forbids.
         with torch.inference_mode(False), torch.no_grad():
@@ -85,7 +97,12 @@ class SingleSolver(nn.Module):
             return Prediction(poses={self.estimates[0]: Pose(rotation, translation, stats.to(like))})
 
     def solve(self, problem: SingleProblem, deadline: Deadline) -> Answer:
-        """Return the pose of one problem, found before the deadline."""
+        """Return the pose of one problem.
+
+        Args:
+            problem: Problem with at least 4 points on each side.
+            deadline: Time at which to return the best pose so far.
+        """
         raise NotImplementedError
 
 

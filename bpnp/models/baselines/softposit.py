@@ -38,10 +38,10 @@ class SoftPOSIT(SingleSolver):
     root mean square distance of the matched points in pixels.
 
     Args:
-        start: Initial pose. mean: a fixed pose (the paper's for ModelNet40: its mean pose). near_truth: the true pose
-            with a perturbation (the paper's for MegaDepth; not comparable with blind solvers). random: uniform
-            rotations.
-        starts: Number of random initial poses.
+        start: Initial pose. "mean", the default: a fixed pose (the paper's for ModelNet40: its mean pose).
+            "near_truth": the true pose with a perturbation (the paper's for MegaDepth; not comparable with blind
+            solvers). "random": uniform rotations.
+        starts: Number of random initial poses, default 64; used with "random" only.
         max_steps: Largest number of annealing steps; None for all.
         seed: Seed of the initial poses.
         time_limit: Seconds for each problem; then the best pose so far is returned, not converged. None for no limit.
@@ -64,7 +64,7 @@ class SoftPOSIT(SingleSolver):
         self.start, self.starts, self.seed, self.max_steps = start, starts, seed, max_steps
 
     def solve(self, problem: SingleProblem, deadline: Deadline) -> Answer:
-        """Return the best pose of all initial poses."""
+        """Return the best pose of all initial poses; arguments as for `SingleSolver.solve`."""
         points = problem.points2d, problem.points3d
         m, n = map(len, points)
         best, most, finished = Answer(), -1, True
