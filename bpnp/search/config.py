@@ -780,6 +780,8 @@ class FocalSettings:
         turns: Iterations of the first search with each focal length. [iterations; not tuned]
         alternations: Largest number of alternations of search and refinement from each focal length. [rounds; not
             tuned]
+        promising: Largest log10 NFA of a failed search whose poses are refined. [decades; not tuned]
+        divides_time: Divide the time limit evenly among the focal lengths that are left. [yes or no; not tuned]
         rounds: Largest number of iterations of a refinement. [iterations; numerics]
         same: Change of the logarithm of the focal length below which a refinement stops. [nats; numerics]
         bends: Radial displacements at the image corner from which a fit of the distortion also starts. Started at zero
@@ -791,6 +793,7 @@ class FocalSettings:
         centre_sigma: Standard deviation of the principal point, as a fraction of the distance to the image corner:
             about a quarter of a per cent of the larger image side. [fraction; convention]
         least_reach: Smallest distance from the principal point to the image corner. [focal lengths; numerics]
+        least_limit: Smallest time limit of a search. [seconds; numerics]
     """
 
     smallest: float = 0.5
@@ -801,6 +804,8 @@ class FocalSettings:
     sigmas: float = 3.0
     turns: int = 8
     alternations: int = 3
+    promising: float = -math.inf
+    divides_time: bool = True
     rounds: int = 12
     same: float = 5e-4
     bends: tuple[float, ...] = (-0.2, 0.2)
@@ -809,6 +814,7 @@ class FocalSettings:
     fewest_bent: int = OtherFocal.fewest
     centre_sigma: float = 0.004
     least_reach: float = 1e-3
+    least_limit: float = 1e-3
 
 
 FOCAL = FocalSettings()
@@ -910,16 +916,12 @@ class InfinitySettings:
         strained: Largest number of matches that are tested for an error of the camera model. [matches; cost]
         least_share: Fraction of the image points that a rotation explains. An unsuccessful search ends when it would
             have found such a rotation. With `clutter`, half of the expected fraction. [fraction; convention]
-        zoom: Factor from one focal length to the next if it is unknown. Far smaller than for poses, since a rotation
-            has no distance that compensates it. [factor; not tuned]
-        zoom_noise: Noise of the first search at each focal length; it includes the error of the focal length near the
-            edge. If it fails, `noise` is tried, since many directions are not significant at a large noise. [pixels;
-            not tuned]
-        zoom_share: `least_share` of these searches. [fraction; not tuned]
-        zoom_alarms: Largest log10 NFA from which the focal length is fitted to the matches; by chance it is mostly
-            above 8. [decades; not tuned]
-        zoom_rounds: Largest number of rounds of fit and search. [rounds; not tuned]
-        zoom_same: Relative change of the focal length below which these end. [fraction; numerics]
+        sweep: Sweep over focal lengths. Its steps are far smaller than for poses, since a rotation has no distance
+            that compensates a wrong focal length. The log10 NFA of unrelated points is mostly above 8.
+        coarse_noise: Noise of the first search at each focal length; it includes the error of the focal length near
+            the edge. If it fails, `noise` is tried, since many directions are not significant at a large noise.
+            [pixels; not tuned]
+        first_share: `least_share` of the first searches with each focal length. [fraction; not tuned]
         bins: Binary logarithms of the smallest and largest number of azimuth bins. [bits; cost]
         proposed_off: Largest error of a proposed rotation beyond a prior. [radians; not tuned]
         anchor_off: Largest error of the image point that it is proposed for. [radians; not tuned]
@@ -952,12 +954,9 @@ class InfinitySettings:
     rougher: float = 1.2
     strained: int = 1000
     least_share: float = 0.25
-    zoom: float = 1.02
-    zoom_noise: float = 3.0
-    zoom_share: float = 0.4
-    zoom_alarms: float = 5.0
-    zoom_rounds: int = 6
-    zoom_same: float = 1e-4
+    sweep: FocalSettings = FocalSettings(step=1.02, alternations=6, promising=5.0, same=1e-5, divides_time=False)
+    coarse_noise: float = 3.0
+    first_share: float = 0.4
     bins: tuple[int, int] = (6, 7)
     proposed_off: float = 0.1
     anchor_off: float = 0.01

@@ -28,7 +28,7 @@ from bpnp.cameras import (
 from bpnp.poses import rotation_angle, same_pose
 from bpnp.runtime import Clock, one_blas_thread
 from bpnp.search.arguments import Array, checked_size
-from bpnp.search.config import DEFAULT, FOCAL, OtherFocal
+from bpnp.search.config import DEFAULT, FOCAL, FocalSettings, OtherFocal
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, UnknownFocal
@@ -196,11 +196,20 @@ def solve_with_focal_length(problem_at: ProblemAt, unknown: UnknownCamera, optio
 
 @dataclass
 class FocalSweep(ABC):
-    """Searches with several focal lengths, and their final solutions `ends`."""
+    """Searches with several focal lengths.
+
+    Attributes:
+        unknown: Camera with an unknown focal length.
+        options: Options of the searches.
+        rule: Constants of the sweep.
+        begun: Time at which the sweep began, seconds of `Clock`.
+        ends: Final solution of each focal length so far.
+    """
 
     unknown: UnknownCamera
     options: Options
-    begun: float = field(default_factory=Clock.now)
+    rule: FocalSettings = FOCAL
+    begun: float = 0.0
     ends: list[Solution] = field(default_factory=list)
 
     @abstractmethod
@@ -211,14 +220,18 @@ class FocalSweep(ABC):
     def refine(self, solution: Solution, camera: Camera, zooms: Sequence[float] = (1.0,)) -> Camera:
         """Return the camera that fits best near a pose, from some factors of the focal length of a camera."""
 
-    def sweep(self, *, few: bool) -> Solution:
+    def preselect(self, camera: Camera) -> Camera:
+        """Return the camera to search with at a focal length of the sweep; a cheap search may find a better one."""
+        return camera
+
+    def sweep(self, *, few: bool = False) -> Solution:
         """Return the solution with the fewest false alarms; `few` is True for points that are enumerated."""
-        most = self.options.settings.schedule.turns
-        for camera in (focal_steps := self.unknown.focal_steps(FOCAL.step_few if few else FOCAL.step)):
-            self.search_from(camera, min(FOCAL.turns, most), len(focal_steps))
-            if self.best.verdict == "confident" and not few:
+        most, rule, self.begun = self.options.settings.schedule.turns, self.rule, Clock.now()
+        for camera in (focal_steps := self.unknown.focal_steps(rule.step_few if few else rule.step)):
+            self.search_from(self.preselect(camera), min(rule.turns, most), len(focal_steps))
+            if (self.best.verdict == "confident" and not few) or self.time_left(1) == 0:
                 break
-        if self.best.verdict != "confident" and not few and most > FOCAL.turns and self.best.camera is not None:
+        if self.best.verdict != "confident" and not few and most > rule.turns and self.best.camera is not None:
             self.search_from(self.best.camera, most, 1)
         return replace(self.contested(), seconds=Clock.now() - self.begun)
 
@@ -229,8 +242,8 @@ class FocalSweep(ABC):
     def search_from(self, camera: Camera, turns: int, steps: int) -> None:
         """Search with a camera, then with cameras that fit the found poses better."""
         found = self._search(camera, turns, steps)
-        for _ in range(FOCAL.alternations):
-            if found.verdict == "failed":
+        for _ in range(self.rule.alternations):
+            if found.verdict == "failed" and found.log10_false_alarms > self.rule.promising:
                 break
             better, settled = self._refined(found, camera)
             if settled:  # a better optimum may lie at a slightly different focal length
@@ -243,11 +256,14 @@ class FocalSweep(ABC):
             found, camera = again, better
         self.ends.append(found)
 
+    def time_left(self, steps: int) -> float | None:
+        """Return the seconds for the next one of a number of focal lengths; None without a time limit."""
+        limit, waiting = self.options.time_limit, max(steps - len(self.ends), 1) if self.rule.divides_time else 1
+        return None if limit is None else max(limit - (Clock.now() - self.begun), 0.0) / waiting
+
     def _search(self, camera: Camera, turns: int, steps: int) -> Solution:
-        limit = self.options.time_limit
-        if limit is not None:
-            left = max(limit - (Clock.now() - self.begun), 1e-3)
-            limit = left / max(steps - len(self.ends), 1)
+        limit = self.time_left(steps)
+        limit = None if limit is None else max(limit, self.rule.least_limit)
         options = self.options._replace(settings=self.options.settings.limited(turns), time_limit=limit)
         return self.solve_with(camera, options)
 
@@ -256,7 +272,7 @@ class FocalSweep(ABC):
         fitted = self.refine(solution, camera, zooms)
         (zoom, radial), (before, old) = self.unknown.parts(fitted), self.unknown.parts(camera)
         bend = abs((radial or 0.0) - (old or 0.0)) * self.unknown.outermost(zoom) ** 2
-        return fitted, max(abs(math.log(zoom / before)), bend) < FOCAL.same
+        return fitted, max(abs(math.log(zoom / before)), bend) < self.rule.same
 
     def contested(self) -> Solution:
         """Return the best solution, "ambiguous" if another focal length has a different pose that fits about as well.

@@ -28,7 +28,7 @@ from bpnp.search.arguments import (
     unit_vectors,
 )
 from bpnp.search.config import DEFAULT, INFINITY, MATCHES, InfinitySettings
-from bpnp.search.focal_length import UnknownCamera
+from bpnp.search.focal_length import FocalSweep, UnknownCamera
 from bpnp.search.infinity.evidence import how_well_known, noise_of, prior_information, uncertainty_of
 from bpnp.search.infinity.search import search_rotation
 from bpnp.search.inputs import bearings_of, check_seen, unit_of
@@ -39,6 +39,9 @@ from bpnp.search.refine.gauss_newton import ImageMatches, Iteration, image_equat
 from bpnp.search.solution import FOCAL_LENGTH, ROTATION_PARAMETERS, Solution, SolutionStats, add_pose
 from bpnp.search.sources import Options
 from bpnp.search.starts import PosePrior, Prior
+
+FIRST = replace(INFINITY, least_share=INFINITY.first_share)  # of the first search with each focal length
+COARSE = replace(FIRST, noise=(INFINITY.coarse_noise,))
 
 
 class Sky(NamedTuple):
@@ -135,46 +138,49 @@ def prepare_directions(
         prior=prior._replace(translation=None) if isinstance(prior, PosePrior) else prior,
         **joined,
     )
-    return partial(_solve, Sky(images, turns, lenses, unknown, problem, distortion), options)
+    sky = Sky(images, turns, lenses, unknown, problem, distortion)
+    return partial(_solve, sky, options) if unknown is None else _SkySweep(sky, options).sweep
 
 
-def _solve(sky: Sky, options: Options) -> Solution:
-    """Estimate the rotation.
+class _SkySweep(FocalSweep):
+    """Focal lengths of cameras that see directions, which have one factor of those of their references.
 
-    With an unknown focal length a sweep of focal lengths is searched at a coarse noise. Its steps are so small that
-    points half an image from the image centre still match. The focal length is then fitted to the matches, and the
-    search repeated.
+    A search at a coarse noise comes first. The focal length is fitted to its matches, and then searched with. Many
+    directions are not significant at a coarse noise; if this search fails, the given focal length is searched with.
+
+    Args:
+        sky: Cameras with an unknown focal length.
+        options: Options of the search.
     """
-    begun, deadline, unknown = Clock.now(), Deadline.after(options.time_limit), sky.unknown
 
-    def seen_by(sky: Sky, settings: InfinitySettings = INFINITY) -> Solution:
-        return replace(_seen_by(sky, options, deadline, settings), seconds=Clock.now() - begun)
+    def __init__(self, sky: Sky, options: Options) -> None:
+        assert sky.unknown is not None
+        first, *others = sky.unknown
+        for image, lens in zip(sky.images, sky.lenses, strict=True):
+            reach = np.nanmax(np.linalg.norm(_bearings(image, lens)[1], axis=-1), initial=first.reach)
+            first = first._replace(reach=float(reach))
+        self.sky = sky._replace(unknown=[first, *others])
+        super().__init__(first, options, INFINITY.sweep)
 
-    if unknown is None:
-        return seen_by(sky)
-    ends = list[Solution]()
-    rough = replace(INFINITY, noise=(INFINITY.zoom_noise,), least_share=INFINITY.zoom_share)
-    exact = replace(rough, noise=INFINITY.noise)
-    for camera in unknown[0].focal_steps(INFINITY.zoom):
-        trial = sky.at(*unknown[0].parts(camera))
-        found = seen_by(trial, rough)
-        if found.verdict == "failed":  # among many directions unrelated ones fit as well at the coarse noise
-            found = seen_by(trial, exact if ends else INFINITY)
-        promising = found.log10_false_alarms <= INFINITY.zoom_alarms
-        for _ in range(INFINITY.zoom_rounds if promising else 0):
-            (zoom, radial), trial = trial.lens, _fitted(trial, found)
-            again = seen_by(trial)
-            if again.log10_false_alarms > found.log10_false_alarms and again.verdict == "failed":
-                break
-            found, (new_zoom, new_radial) = again, trial.lens
-            bend = abs((new_radial or 0.0) - (radial or 0.0))
-            if max(abs(new_zoom / zoom - 1), bend) < INFINITY.zoom_same:
-                break
-        ends.append(found)
-        best = min(ends, key=lambda end: end.log10_false_alarms)
-        if best.verdict == "confident" or deadline.passed():
-            break
-    return best
+    def preselect(self, camera: Camera) -> Camera:
+        sky = self.sky.at(*self.unknown.parts(camera))
+        found = _solve(sky, self.options._replace(time_limit=self.time_left(1)), COARSE)
+        return camera if found.verdict == "failed" else self.refine(found, camera)
+
+    def solve_with(self, camera: Camera, options: Options) -> Solution:
+        settings = FIRST if options.settings.schedule.turns <= self.rule.turns else INFINITY
+        return _solve(self.sky.at(*self.unknown.parts(camera)), options, settings)
+
+    def refine(self, solution: Solution, camera: Camera, zooms: Sequence[float] = (1.0,)) -> Camera:
+        """Return the camera that fits the matches best; a radial coefficient is fitted with `Sky.is_distorted`."""
+        zoom, radial = self.unknown.parts(camera)
+        sky = self.sky.at(zoom, radial)
+        model = _model(sky)
+        matches = _in_image(sky, solution.matches)
+        linearise = image_equations(model, matches, lost=INFINITY.lost, robust=INFINITY.robust)
+        start = model.state(solution.rotation)
+        end = refine(model, start, linearise, [INFINITY.robust] * MATCHES.most_steps, settled=_is_settled).state
+        return self.unknown.at(zoom * float(end.zoom), float(end.radial) if sky.is_distorted else radial)
 
 
 def _parts(sky: Sky, matches: Labels) -> list[tuple[int, Array, Array]]:
@@ -210,18 +216,6 @@ def _in_image(sky: Sky, matches: Labels) -> list[ImageMatches]:
     return [ImageMatches(lenses[k].project, points, pixels, k) for k, pixels, points in _parts(sky, matches)]
 
 
-def _fitted(sky: Sky, solution: Solution) -> Sky:
-    """Return the cameras with the focal length that fits the matches best, fitted together with a rotation.
-
-    With `Sky.is_distorted` a radial coefficient is fitted too.
-    """
-    (zoom, radial), model = sky.lens, _model(sky)
-    linearise = image_equations(model, _in_image(sky, solution.matches), lost=INFINITY.lost, robust=INFINITY.robust)
-    start = model.state(solution.rotation)
-    end = refine(model, start, linearise, [INFINITY.robust] * MATCHES.most_steps, settled=_is_settled).state
-    return sky.at(zoom * float(end.zoom), float(end.radial) if sky.is_distorted else radial)
-
-
 def _is_settled(last: Iteration) -> bool:
     return bool(np.abs(last.step).max() < INFINITY.settled)
 
@@ -238,8 +232,9 @@ def _with_focal_length(sky: Sky, rotation: Array, matches: Labels) -> Array:
     return np.asarray(covariance * np.outer(unit, unit))
 
 
-def _seen_by(sky: Sky, options: Options, deadline: Deadline, settings: InfinitySettings) -> Solution:
+def _solve(sky: Sky, options: Options, settings: InfinitySettings = INFINITY) -> Solution:
     """Return the solution for given cameras, which are some of the sweep if the focal length is unknown."""
+    begun, deadline = Clock.now(), Deadline.after(options.time_limit)
     inlier_threshold, scene, lens = options.inlier_threshold, sky.problem.points3d, sky.lenses[0]
     parts = [_bearings(image, own) for image, own in zip(sky.images, sky.lenses, strict=True)]
     planes = [plane for _, plane, _ in parts]
@@ -247,7 +242,8 @@ def _seen_by(sky: Sky, options: Options, deadline: Deadline, settings: InfinityS
     pixel = np.concatenate([pixel for _, _, pixel in parts])
     usable = np.flatnonzero(np.isfinite(every).all(-1) & np.isfinite(pixel))
     check_seen(usable, np.concatenate(planes), INFINITY.fewest)
-    problem = replace(sky.problem, bearings=every, focal=_focal(sky, planes)).choose(usable)
+    focal = None if sky.unknown is None or lens is None else sky.unknown[0].focal(lens)
+    problem = replace(sky.problem, bearings=every, focal=focal).choose(usable)
     every, pixel = np.ascontiguousarray(problem.bearings), np.ascontiguousarray(pixel[usable])
     owner = np.concatenate([np.full(len(image), k) for k, image in enumerate(sky.images)])[usable]
     if lens is None:
@@ -261,7 +257,7 @@ def _seen_by(sky: Sky, options: Options, deadline: Deadline, settings: InfinityS
         result = search_rotation(
             replace(problem, bearings=every),
             pixel,
-            noise=noise if settings is INFINITY else None,
+            noise=None if settings is COARSE else noise,
             seed=options.seed,
             deadline=deadline,
             settings=settings,
@@ -274,6 +270,7 @@ def _seen_by(sky: Sky, options: Options, deadline: Deadline, settings: InfinityS
         verdict=result.verdict,
         reason=result.reason,
         reason_code=result.code,
+        seconds=Clock.now() - begun,
         unit=unit_of(sky.images[0], lens),
         inlier_threshold=math.nan if inlier_threshold is None else inlier_threshold,
         stats=SolutionStats(result.batches, dropped2d=problem.dropped2d),
@@ -307,7 +304,7 @@ def _seen_by(sky: Sky, options: Options, deadline: Deadline, settings: InfinityS
     else:
         covariance = _with_focal_length(sky, found.rotation[0], matches)
     angles = angles_between(every[i], seen[0][j])
-    return add_pose(
+    solution = add_pose(
         solution,
         result,
         found,
@@ -320,15 +317,7 @@ def _seen_by(sky: Sky, options: Options, deadline: Deadline, settings: InfinityS
         residual=residual * float(middle[one]),
         covariance=np.full_like(covariance, math.nan) if result.verdict == "failed" else covariance,
     )
-
-
-def _focal(sky: Sky, planes: list[Array]) -> UnknownFocal | None:
-    """Return the prior of an unknown focal length, from the normalised image points (m_k, 2) of each camera."""
-    if sky.unknown is None or sky.lenses[0] is None:
-        return None
-    reach = sky.lens[0] * float(np.nanmax(np.linalg.norm(np.concatenate(planes), axis=-1)))
-    unknown = sky.unknown[0]
-    return unknown._replace(reach=max(unknown.reach, reach)).focal(sky.lenses[0])
+    return replace(solution, seconds=Clock.now() - begun)
 
 
 def _bearings(image: Array, camera: Camera | None) -> tuple[Array, Array, Array]:

@@ -67,7 +67,8 @@ def prepare_rig(
     rig = points.rig([one.reference for one in unknown])
     if any(problem.degenerate is not None for problem in rig.problems):
         return partial(_solve, rig, options)
-    return _RigSweep(list(unknown), points, options).solve
+    sweep = _RigSweep(list(unknown), points, options)
+    return partial(sweep.sweep, few=all(is_enumerable(problem) for problem in rig.problems))
 
 
 @dataclass
@@ -112,18 +113,12 @@ class _RigSweep(FocalSweep):
 
     def __init__(self, unknown: list[UnknownCamera], points: RigPoints, options: Options) -> None:
         self.points, self.every = points, unknown
-        problems = points.rig([one.reference for one in unknown]).problems
         first = unknown[0]
-        for problem in problems:
+        for problem in points.rig([one.reference for one in unknown]).problems:
             first = first.seen_by(problem)
         # A radial coefficient is fitted only if it is asked for.
         first = first._replace(radial=0.0) if first.distorted else first._replace(bends=False)
-        self.few = all(is_enumerable(problem) for problem in problems)
         super().__init__(first, options)
-
-    def solve(self) -> Solution:
-        self.begun = Clock.now()
-        return self.sweep(few=self.few)
 
     def rig(self, camera: Camera) -> Rig:
         """Return the rig whose first camera is one of the sweep."""
