@@ -36,7 +36,7 @@ RATIO = 0.8  # largest ratio of the distances to the nearest descriptor and to t
 THRESHOLD_PX = 8.0  # of an inlier
 LEAST_INLIERS = 12  # of a pose that counts as confident, the limit of hloc
 AT_ONCE = 256  # descriptors of the photo in one product
-WORDS, ROUNDS, EVERY = 512, 5, 4  # of the vocabulary; rounds of k-means; one descriptor of so many makes it
+WORDS, ROUNDS, EVERY = 512, 5, 4  # words of the vocabulary; rounds of k-means; it uses every fourth descriptor
 RETRIEVED = 10  # views
 
 

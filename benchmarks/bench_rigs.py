@@ -32,7 +32,7 @@ def pose_matrix(rotation: Array, translation: Array) -> Array:
 
 
 def problems(cameras: int, used: int, limit: int, seed: int, scale: bool) -> Iterator[Problem]:
-    """Yield problems with a number of cameras in random places that look at a device, of which the first ones are used.
+    """Yield problems with cameras at random positions that look at a device; the search uses only the first ones.
 
     Every fifth frame has a new device. The pose is rig_from_world, that of the first camera.
     """

@@ -71,7 +71,7 @@ def spread(items: Sequence[T], limit: int, first: float = 0.0) -> list[T]:
 
 @dataclass(frozen=True)
 class Problem:
-    """A problem and its true poses, any of which is correct; none for points without a common pose."""
+    """A problem and its true poses: each of them is correct; no poses for points without a common pose."""
 
     name: str
     solve: Callable[[], Solution]

@@ -18,11 +18,11 @@ def rotation_angle(one: Array, other: Array) -> float:
 
 
 class Tolerance(NamedTuple):
-    """How far apart two poses may be to count as the same one.
+    """Largest difference between two poses that count as the same one.
 
     Attributes:
         degrees: Angle between the rotations.
-        shift: How far the middle of the scene moves in the camera's frame, a fraction of its distance.
+        shift: Motion of the centroid of the scene in the camera's frame, a fraction of its distance.
     """
 
     degrees: float = 2.0
@@ -93,7 +93,7 @@ def close_poses(
 def distinct(
     rotation: Array, translation: Array, score: Array, count: int, degrees: float, shift: float
 ) -> NDArray[np.int64]:
-    """Select the best poses of which no two are closer than both limits.
+    """Select the best poses such that no two are closer than both limits.
 
     Args:
         rotation: Rotations (c, 3, 3).

@@ -31,7 +31,7 @@ FOCAL, SIZE = 600.0, (640, 480)
 CAMERA = np.array([[FOCAL, 0, SIZE[0] / 2], [0, FOCAL, SIZE[1] / 2], [0, 0, 1]])
 FACING = math.cos(math.radians(78.0))
 HIDDEN, HALF_HIDDEN = (6.0, 8.0), (12.0, 14.0)  # seconds
-AGAIN = 30  # every so many frames one is first solved without the prior
+AGAIN = 30  # every 30th frame is first solved without the prior
 SIGMA_DEG, SIGMA = 3.0, 0.012  # standard deviation of a predicted pose, degrees and metres
 
 

@@ -4,7 +4,7 @@ from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from planted import Planted, plant
 
-FEW = settings(  # examples cost a search: the first that fails is shown as it is
+FEW = settings(  # examples cost a search: the first that fails is shown without shrinking
     max_examples=5,
     deadline=None,
     derandomize=True,

@@ -12,7 +12,7 @@ Sample = dict[str, np.ndarray]
 
 
 class Exploit:
-    """Runs a command as it is unpickled."""
+    """Run a command when unpickled."""
 
     def __reduce__(self) -> tuple[object, ...]:
         return os.system, ("touch hacked",)

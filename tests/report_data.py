@@ -18,7 +18,7 @@ HOSTILE = "</script><script>document.title='owned'</script><b>&amp;%%data%%\udcf
 
 
 def inflated(text: str) -> str:
-    """What `compress_text` put into the page."""
+    """Decompress text that `compress_text` put into the page."""
     return gzip.decompress(base64.b64decode(text)).decode()
 
 

@@ -36,7 +36,7 @@ MAY_IMPORT = {
     "__main__": {"cli"},
     "": {"maps", "models", "search"},
 }
-# Files of the search that reach a trained network, a picture or a COLMAP model, each imported when it is asked for.
+# Files of the search that reach a trained network, a picture or a COLMAP model, each imported at its first use.
 BRIDGES = {
     "bpnp/search/arguments.py": {"models"},
     "bpnp/search/sources.py": {"models"},

@@ -79,7 +79,7 @@ def called(package: Path, cache: Path) -> tuple[str, str]:
 def test_a_loop_is_compiled_once_into_the_users_cache(package: Path, tmp_path: Path) -> None:
     cache = tmp_path / "cache"
     first, second = called(package, cache), called(package, cache)
-    assert first[0] == second[0] == "8 10 True \n"  # numba's own setting is as it was: empty
+    assert first[0] == second[0] == "8 10 True \n"  # numba's own setting is unchanged: empty
     assert (first[1].count("compiling"), second[1]) == (1, "")
     assert list((cache / "bpnp" / "loops").rglob("*.nbc"))
     assert not list(package.rglob("*.nbc"))

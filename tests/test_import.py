@@ -1,4 +1,4 @@
-"""What `import bpnp` and the first `solve` load: nothing that they do not use."""
+"""`import bpnp` and the first `solve` load nothing that they do not use."""
 
 import json
 import subprocess

@@ -65,7 +65,7 @@ def test_a_notebook_runs(
 def test_a_notebook_runs_only_with_its_photos(
     has_photos: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Without its folder of photos a notebook stays as it is; with it the notebook has outputs and its metadata."""
+    """Without its folder of photos a notebook is unchanged; with it the notebook has outputs and its metadata."""
     monkeypatch.syspath_prepend(NOTEBOOKS[0].parent)
     monkeypatch.chdir(tmp_path)
     own = {"bpnp": {"photos": "some_photos"}}

@@ -1,4 +1,4 @@
-"""The layers keep their digits whatever precision the user chose for products, and leave that choice as it was."""
+"""The layers keep their digits whatever precision the user chose for products, and do not change that choice."""
 
 from collections.abc import Iterator
 from typing import Any

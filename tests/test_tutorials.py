@@ -29,7 +29,7 @@ SHORT = {
 
 
 def run(language: str, code: str, names: dict[str, Any]) -> None:
-    """A block of Python, or of commands of which trainings and tables are cut short."""
+    """Run a block of Python, or of commands; trainings and tables are cut short."""
     if language == "python":
         exec(compile(code, "tutorial", "exec"), names)
         return

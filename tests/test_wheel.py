@@ -17,7 +17,7 @@ BUILD = "import sys; from setuptools import build_meta; getattr(build_meta, sys.
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """What setuptools makes of the files that git tracks, so that nothing of the checkout's caches gets in."""
+    """Build sdist and wheel from the files that git tracks, without the checkout's caches."""
     folder = tmp_path_factory.mktemp("distributions")
     listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False)
     if listed.returncode:

@@ -1,4 +1,4 @@
-"""What a Trainer did in a run of the command: a callback by its class path, and the runs that tests make with it."""
+"""Callback that records a Trainer in a run of the command, and the runs that tests make with it."""
 
 from pathlib import Path
 from typing import Any, ClassVar

@@ -103,7 +103,7 @@ def parse_arguments(name: str, command: Callable[..., None], arguments: Sequence
 
 
 def _infinity(before: str, text: str) -> str:
-    """Return the YAML form of an infinite value, `--option inf` or `--option=inf`, and any other word as it is."""
+    """Return the YAML form of an infinite value, `--option inf` or `--option=inf`, and any other word unchanged."""
     if text == "inf" and before.startswith("--"):
         return ".inf"
     return re.sub(r"^(--\w+=)inf$", r"\1.inf", text)

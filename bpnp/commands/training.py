@@ -202,7 +202,7 @@ class BpnpCLI(LightningCLI):
             callbacks.append(RichProgressBar() if bar else ProgressLines())
             kwargs["enable_progress_bar"] = bar
         own = any(isinstance(callback, ModelSummary) for callback in _as_list(options["callbacks"]))
-        if options["enable_model_summary"] is None and not own:  # Lightning's counts operations, of which it sees none
+        if options["enable_model_summary"] is None and not own:  # Lightning's ends with "Total FLOPs: 0"
             callbacks.append(ParameterCount())
             kwargs["enable_model_summary"] = False
         self.trainer_defaults["callbacks"] = callbacks

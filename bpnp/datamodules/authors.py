@@ -273,8 +273,8 @@ def load_pickle(path: Path) -> Any:
                 raise pickle.UnpicklingError(f"a bare {type(content).__name__} is refused")
         except Exception as error:
             raise PickleError(
-                f"{path}: {error!r}; only numpy arrays, plain containers and numbers are unpickled. Use the authors' "
-                "file as it was downloaded"
+                f"{path}: {error!r}; only numpy arrays, plain containers and numbers are unpickled. Use the "
+                "authors' original file"
             ) from error
     return content
 

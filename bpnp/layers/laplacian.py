@@ -16,7 +16,7 @@ from bpnp.layers.implicit import BackwardStats, first_derivative, record
 from bpnp.layers.plan import Plan, cached_parts, divide, times, transpose_times
 
 ITERATIONS = 150  # limit of conjugate gradients; slower systems are factorised
-BETWEEN_TESTS = 8  # torch iterations between two tests for convergence, each of which makes the host wait for a GPU
+BETWEEN_TESTS = 8  # torch iterations between two tests for convergence; a test makes the host wait for a GPU
 RIDGE = 1e-13  # added to the diagonal before the factorisation, relative to its scale
 FACTORISED = 1e-6  # largest relative residual of a factorised system that counts as solved
 TOLERANCE = {torch.float32: 5e-6, torch.float64: 1e-13}  # relative, for conjugate gradients

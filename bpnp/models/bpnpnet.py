@@ -239,7 +239,7 @@ def load_authors_weights(path: str | Path, *, backend: Backend = "auto") -> BPnP
         more = f" and {len(problems) - 3} more problems" if len(problems) > 3 else ""
         raise ValueError(
             f"{file} does not hold the {len(maps)} tensors of the authors' BPnPNet: {'; '.join(sorted(problems)[:3])}"
-            f"{more}. Use the authors' file as it was downloaded"
+            f"{more}. Use the authors' original file"
         )
     net = BPnPNet(ransac=RansacPnP(backend=backend))
     shapes = {name: value.shape for name, value in net.state_dict().items()}

@@ -341,7 +341,7 @@ def refinement_enabled(solver: nn.Module, enabled: bool) -> Iterator[None]:
 
     Args:
         solver: Solver.
-        enabled: False to switch the refinement off; True leaves it as it is.
+        enabled: False to switch the refinement off; True changes nothing.
     """
     refinements = [module for module in solver.modules() if isinstance(module, Refinement)]
     before = [module.enabled for module in refinements]

@@ -23,7 +23,7 @@ FREQUENCIES = 8  # frequencies that encode a coordinate, from half a period per 
 
 
 class Matcher(TrainedNet):
-    """Network for point sets of which many points have no correspondence.
+    """Network for point sets with many points that have no correspondence.
 
     Points are encoded from their coordinates in a robust frame of their set and from their nearest neighbours. Blocks
     of self and cross attention exchange information between both sets, which BPnPNet's features do not. A head predicts

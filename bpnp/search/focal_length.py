@@ -140,7 +140,7 @@ def unknown_camera(
     """
     if distortion and image_size is None and focal_error is None:
         raise ValueError(
-            "`distortion=True` needs an `image_size`, or a `focal_error` beside the `camera`; a camera that is known "
+            "`distortion=True` needs an `image_size`, or a `focal_error` with the `camera`; a given camera already "
             "has its distortion"
         )
     if image_size is not None:

@@ -99,7 +99,7 @@ def test_a_users_mistake_is_one_clear_error(
 
 
 def test_a_closed_pipe_is_no_error() -> None:
-    """As `bpnp --help | head -1` does."""
+    """The pipe is closed as in `bpnp --help | head -1`."""
     process = subprocess.Popen(
         [sys.executable, "-m", "bpnp", "--help"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )

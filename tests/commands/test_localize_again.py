@@ -1,5 +1,5 @@
-"""What `bpnp localize` finds in its output folder is kept only where photo, map, views, keypoints and options are those
-of before; the planted poses are the answer."""
+"""`bpnp localize` keeps a result in its output folder only if photo, map, views, keypoints and options are unchanged;
+the planted poses are the answer."""
 
 import json
 import math
@@ -155,7 +155,7 @@ def test_an_edited_file_of_views_is_another_one_for_the_photos_whose_lines_chang
 def test_the_time_limit_of_a_photo_is_that_of_a_map_unless_given(
     limit: float | None, kept: object, used: float, place: Place
 ) -> None:
-    """What earlier runs without a limit wrote, null, is kept; a file is strict JSON."""
+    """`null`, written by earlier runs without a limit, is kept; a file is strict JSON."""
     scene = SceneMap.from_colmap(place.folder / "map")
     options = {"camera": PINHOLE, "keypoints": place.folder / "database.db", "time_limit": limit}
     task = photo_task(scene, "a.png", place.folder / "a.png", **options)
@@ -218,7 +218,7 @@ def test_the_camera_of_views_of_the_same_size_is_taken_and_named(
 
 
 def test_a_focal_length_is_found_with_the_pose(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
-    """Of a photo whose camera is unknown; the map's views, which have its size, tell the answer."""
+    """The photo's camera is unknown; views of the same size have the true focal length."""
     place.run("a.png")
     before = place.poses()["a.png"]
     place.run("a.png", more=("--camera", "unknown"))

@@ -231,7 +231,7 @@ def test_normals_that_are_all_zero_are_ignored(tmp_path: Path) -> None:
 
 
 def test_a_pipe_is_read(tmp_path: Path) -> None:
-    """As the shell's `<(...)`: a path that is no file and has no suffix, and can be read once."""
+    """A path like the shell's `<(...)`: it is no regular file, has no suffix, and can be read once."""
     array = io.BytesIO()
     np.save(array, POINTS)
     for content in (("x,y,z\n" + rows(POINTS, ",")).encode(), array.getvalue()):

@@ -81,7 +81,7 @@ def check(store: Store, root: Path) -> None:
 
 @pytest.mark.parametrize("form", ["folder", "parent", "folder in capitals"])
 def test_every_form_of_the_meshes_gives_the_same_store(meshes: Path, tmp_path: Path, form: str) -> None:
-    """The same splits, whether a folder is `train` or `Train`, and the data module opens them."""
+    """Folders `train` and `Train` give the same splits, and the data module opens them."""
     source = meshes.parent if form == "parent" else meshes
     if form == "folder in capitals":
         source = shutil.copytree(meshes, tmp_path / "capitals")

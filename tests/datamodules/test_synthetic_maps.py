@@ -70,7 +70,7 @@ def test_points_lie_in_the_image_and_the_frame_is_arbitrary() -> None:
         elif frame == "view":  # another photo near by, which looks almost the same way
             angles = np.degrees(Rotation.from_matrix(batch.rotation.numpy()).magnitude())
             assert 3 < np.median(angles) < 30
-            real = batch.points3d[batch.mask3d]  # most of which its camera sees
+            real = batch.points3d[batch.mask3d]  # its camera sees most of them
             assert (real[:, 2] > 0).float().mean() > 0.95
             assert (real[:, :2].norm(dim=1) < 1.6 * real[:, 2]).float().mean() > 0.9
         else:

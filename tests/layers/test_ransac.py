@@ -75,7 +75,7 @@ def test_ransac_solves_points_of_one_plane(backend: str) -> None:
 
 @pytest.mark.parametrize("backend", ["poselib", "torch"])
 def test_the_most_probable_matches_are_tried_first(backend: str) -> None:
-    """Of 300 matches the 15 most probable ones are true: no triple in ten thousand, had all the same chance."""
+    """The 15 most probable of 300 matches are true. Uniform draws would find a true triple once in ten thousand."""
     planted = plant(8, 300, noise=0.0005, seed=3)
     place = torch.arange(300).expand(8, 300)
     matched = torch.where(place < 15, planted.match3d, planted.match3d.roll(1, -1))

@@ -184,7 +184,7 @@ def not_sure(*known: Any, **options: Any) -> SearchResult:
         ({"settle": elsewhere}, "A competing pose 10 deg away fits about as well"),
         ({"judge": not_sure, "other_lens": of_another_lens}, "With 1.30 times the focal length"),
     ],
-    ids=["a rival", "another pose", "another camera of a pose that is in doubt"],
+    ids=["competing pose", "other pose", "other camera of an ambiguous pose"],
 )
 def test_an_ambiguous_verdict_on_all_points_is_kept_though_the_nfa_does_not_improve(
     planted: tuple[SceneMap, Planted], monkeypatch: pytest.MonkeyPatch, stages: dict[str, Any], reason: str

@@ -54,7 +54,7 @@ def test_problems_without_a_pose_are_infinite_and_leave_the_rest_alone() -> None
 
 
 def test_an_interval_of_nan_or_unequal_lists_is_refused() -> None:
-    with pytest.raises(ValueError, match="there are 2, of which 1 are NaN"):
+    with pytest.raises(ValueError, match="there are 2, 1 of them NaN"):
         bootstrap(np.array([1.0, np.nan]))
     with pytest.raises(ValueError, match="the same problems; there are 2 and 3"):
         paired_difference(np.ones(2), np.ones(3))

@@ -70,7 +70,7 @@ def severe(browser: Any) -> list[str]:
 
 @pytest.fixture
 def page(browser: Any, written: tuple[Path, dict[str, Results]]) -> Iterator[Callable[..., Any]]:
-    """Runs a script on the freshly opened page. Afterwards no error is logged, and nothing was asked of a network."""
+    """Run a script on the freshly opened page; afterwards no error is logged, and no network was used."""
     address = written[0].as_uri()
     browser.get("about:blank")
     browser.get_log("performance")

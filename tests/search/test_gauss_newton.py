@@ -31,7 +31,7 @@ MODEL = PoseModel(POINTS.mean(0))
 
 
 def near(scale: float, seed: int = 1) -> tuple[Array, Array]:
-    """A pose beside the planted one."""
+    """A pose near the planted one."""
     rng = np.random.default_rng(seed)
     return Rotation.from_rotvec(scale * rng.standard_normal(3)).as_matrix() @ ROTATION, TRANSLATION * (1 + scale / 4)
 

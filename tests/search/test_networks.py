@@ -76,7 +76,7 @@ class Knowing(Matcher):
         return Prediction(assignment)
 
     def forward(self, batch: Batch) -> Prediction:
-        raise AssertionError("expected the assignment to be asked for, not poses")
+        raise AssertionError("the assignment is needed, not the poses")
 
 
 @pytest.mark.parametrize("frame", ["any", "view"])

@@ -44,7 +44,7 @@ def test_an_object_of_two_equal_halves_has_a_competing_pose() -> None:
 
 
 def test_the_pose_of_an_equal_part_beside_it_is_named_by_its_distance() -> None:
-    """Two equal parts, one beside the other: the competing pose has the same rotation."""
+    """Two equal parts, side by side: the competing pose has the same rotation."""
     rng = np.random.default_rng(2)
     part = rng.uniform(-1, 1, (20, 3))
     image = part[:, :2] / (part[:, 2:] + 8)

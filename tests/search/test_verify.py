@@ -45,7 +45,7 @@ def test_an_unrefined_pose_is_returned_unchanged(view: Any) -> None:
     turned = moved(*pose, points, 1.0)
     off = bpnp.verify(bearings, points, *turned, refine=False)
     assert off.verdict == "ambiguous"
-    assert "optimum beside it" in off.reason
+    assert "nearest optimum" in off.reason
     assert "fits better" in off.reason
     assert np.array_equal(off.rotation, turned[0])
     assert off.rotation_std_deg == pytest.approx(1.0, abs=0.1)  # the way to the optimum

@@ -239,7 +239,7 @@ def test_a_test_writes_results_and_a_prediction_poses(tmp_path: Path) -> None:
     assert float(run.callback_metrics["test/correspondence_loss"]) == pytest.approx(results.correspondence_loss)
 
 
-# Ten problems without a number, as a user's own data set gives them; `padded` is what docs/data.md says of collating.
+# Ten problems without a number, as a user's own data set gives them; `padded` collates them as docs/data.md shows.
 OWN = [plant(1, 12, seed=number, dtype=torch.float32) for number in range(10)]
 
 
@@ -321,8 +321,8 @@ def test_a_training_starts_from_packaged_weights_or_those_of_a_file(tmp_path: Pa
     torch.testing.assert_close(view.solver.match(batch).assignment, small.solver.match(batch).assignment)
     with pytest.raises(ValueError, match=r"another Matcher: channels=128 \(saved: 16\), depth=6 \(saved: 1\)"):
         BlindPnPTask(Matcher(), weights=str(tmp_path / "small.ckpt"))
-    with pytest.raises(FileNotFoundError, match="matcher-of-nobody"):
-        BlindPnPTask(Matcher(), weights="matcher-of-nobody")
+    with pytest.raises(FileNotFoundError, match="matcher-of-none"):
+        BlindPnPTask(Matcher(), weights="matcher-of-none")
 
 
 def test_overfit_batches_repeats_the_same_problems(tmp_path: Path) -> None:

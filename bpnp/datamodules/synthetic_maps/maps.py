@@ -276,7 +276,7 @@ class SyntheticMapDataModule(ProblemDataModule):
         test_problems: Number of problems to test and predict on, fixed.
         num_points: Largest number of points of a side; of more, matches and others are reduced in proportion.
         min_points: Least number of matches, at least 4; a scene with fewer is replaced.
-        outliers: Largest fraction of the points of each side without correspondence; 1 for all that there are. Two
+        outliers: Largest fraction of the points of each side without correspondence; 1 keeps all of them. Two
             numbers, [low, high], draw it uniformly for each problem.
         views: Smallest and largest number of photos whose map points are taken.
         kinds: Weight of each kind of scene; None for half facades, and a quarter each street and statue.

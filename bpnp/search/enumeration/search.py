@@ -113,12 +113,12 @@ class Enumeration:
 
     @property
     def safe_margin(self) -> float:
-        """Margin in nats from which the best pose need not be doubted; it falls with the hypotheses solved."""
+        """Margin in nats above which the best pose ends the enumeration; it falls with the hypotheses solved."""
         return self._safe * (1 - self.solved / self.settings.patience)
 
     @property
     def is_long(self) -> bool:
-        """True after so many hypotheses that a significant pose ends the enumeration."""
+        """True if enough hypotheses are solved for a significant pose to end the enumeration."""
         return self.solved >= 2 * self.settings.patience
 
     @property

@@ -116,7 +116,7 @@ class _RigSweep(FocalSweep):
         first = unknown[0]
         for problem in points.rig([one.reference for one in unknown]).problems:
             first = first.seen_by(problem)
-        # A radial coefficient is fitted only if it is asked for.
+        # A radial coefficient is fitted only with `distortion=True`.
         first = first._replace(radial=0.0) if first.distorted else first._replace(bends=False)
         super().__init__(first, options)
 

@@ -21,7 +21,7 @@ CLAUSES = {
     "better_place": "a pose {distance:.3g} scene units and {degrees:.0f} deg away, elsewhere in the map, explains "
     "the image points better (by {better:.1f} decades)",
     "better_pose": "a pose {degrees:.0f} deg away fits better (by {margin:.1f} decades)",
-    "better_nearby": "the optimum beside it, {degrees:.2g} deg away, fits better (by {margin:.1f} decades)",
+    "better_nearby": "the nearest optimum, {degrees:.2g} deg away, fits better (by {margin:.1f} decades)",
     "other_points": "a pose {degrees:.0f} deg away explains other points, as many as two unrelated poses do by chance",
     "rough_residuals": "the points agree with it better at residuals far larger than those of its matches",
     "untested": "not decided in {seconds:.3g} s: its competing poses were not tested",
