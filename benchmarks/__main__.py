@@ -20,18 +20,18 @@ def programs() -> dict[str, tuple[str, str]]:
 
 
 def main() -> None:
-    known = programs()
+    commands = programs()
     name = sys.argv[1] if len(sys.argv) > 1 else ""
-    if name not in known:
-        width = max(map(len, known))
+    if name not in commands:
+        width = max(map(len, commands))
         print("python -m benchmarks NAME [OPTION...]\n")
-        print("\n".join(f"  {key:{width}}  {sentence}" for key, (_, sentence) in known.items()))
+        print("\n".join(f"  {key:{width}}  {sentence}" for key, (_, sentence) in commands.items()))
         if name and not name.startswith("-"):
             raise SystemExit(f"\n{name!r} is not in this list")
         return
     sys.path.insert(0, str(FOLDER))
     sys.argv = [f"python -m benchmarks {name}", *sys.argv[2:]]
-    importlib.import_module(known[name][0]).main()
+    importlib.import_module(commands[name][0]).main()
 
 
 if __name__ == "__main__":

@@ -58,7 +58,7 @@ class CityPhoto(NamedTuple):
     distance: float  # of the median point that it sees
 
 
-def moved(place: SceneMap, to: Similarity) -> SceneMap:
+def move_place(place: SceneMap, to: Similarity) -> SceneMap:
     """Return the place in another frame."""
     poses = (to.pose(view.rotation, view.translation) for view in place.views)
     views = (replace(view, rotation=r, translation=t) for view, (r, t) in zip(place.views, poses, strict=True))
@@ -71,7 +71,7 @@ def distance_of(place: SceneMap) -> float:
     return float(np.median([median_distance(*one) for one in seen if len(one[0])]))
 
 
-def changed(place: SceneMap, rng: np.random.Generator, name: str) -> SceneMap:
+def change_place(place: SceneMap, rng: np.random.Generator, name: str) -> SceneMap:
     """Return another place of the same kind: points displaced and dropped, or mirrored with all views."""
     unit, points = distance_of(place), place.points3d
     field = np.zeros_like(points)
@@ -118,10 +118,10 @@ def city(
     for place, scene in zip(first, scenes, strict=True):
         unit = distance_of(place)
         moves = [anywhere(rng, len(scenes), unit) for _ in range(1 if twice is None else 2)]
-        places.append(moved(place, moves[0]))
+        places.append(move_place(place, moves[0]))
         if twice is not None:
             again = part_of(place, np.flatnonzero(rng.random(len(place.points3d)) >= twice), "again/")
-            places.append(moved(again, moves[1]))
+            places.append(move_place(again, moves[1]))
         for image in left_out[scene.name]:
             poses = tuple(move.pose(image.rotation, image.translation) for move in moves)
             keypoints = np.concatenate([image.points2d, image.clutter2d]).astype(np.float64)
@@ -130,20 +130,20 @@ def city(
             found.append(CityPhoto(name, keypoints, image.camera.focal, poses, moves[0].scale * far))
     if twice is None:
         places += copies(first, views - sum(len(place.views) for place in places), views, rng)
-    return merged(places), found
+    return merge_places(places), found
 
 
 def copies(first: Sequence[SceneMap], more: int, views: int, rng: np.random.Generator) -> Iterator[SceneMap]:
     """Yield changed copies of the places in turn, with at most a number of views."""
     number = 0
     while more > 0:
-        place = changed(first[number % len(first)], rng, f"copy {number // len(first) + 1}/")
+        place = change_place(first[number % len(first)], rng, f"copy {number // len(first) + 1}/")
         place = replace(place, views=place.views[:more])
-        yield moved(place, anywhere(rng, len(first) * max(views // 500, 1), distance_of(place)))
+        yield move_place(place, anywhere(rng, len(first) * max(views // 500, 1), distance_of(place)))
         more, number = more - len(place.views), number + 1
 
 
-def merged(places: Sequence[SceneMap]) -> SceneMap:
+def merge_places(places: Sequence[SceneMap]) -> SceneMap:
     """Return one map of all places, with ids in their order."""
     starts = np.cumsum([0] + [len(place.points3d) for place in places])
     views = tuple(
@@ -155,7 +155,7 @@ def merged(places: Sequence[SceneMap]) -> SceneMap:
     return SceneMap(points, np.arange(len(points)), np.empty(0, np.int32), views).seen_by(1)
 
 
-def written(scene: SceneMap, folder: Path) -> None:
+def write_map(scene: SceneMap, folder: Path) -> None:
     """Write a map as COLMAP's binary files, with all keypoints in a corner."""
     counts = np.array([len(view.points) for view in scene.views])
     (folder / "cameras.bin").write_bytes(np.array([1, 1, 2, 2], "<u8").tobytes() + np.ones(3).tobytes())
@@ -179,7 +179,7 @@ def written(scene: SceneMap, folder: Path) -> None:
             file.write(point.tobytes() + track.tobytes())
 
 
-def opened(folder: Path) -> str:
+def open_map(folder: Path) -> str:
     """Open a map in this process, and return the CPU seconds and the peak memory as text."""
     warm_up()
     start = time.process_time()
@@ -190,7 +190,7 @@ def opened(folder: Path) -> str:
     return f"{seconds:.2g} CPU s, {int(status['VmHWM'].split()[0]) / 1e6:.2g} GB"  # ru_maxrss is the parent's too
 
 
-def ranked(scene: SceneMap, photos: Sequence[CityPhoto]) -> str:
+def rank_views(scene: SceneMap, photos: Sequence[CityPhoto]) -> str:
     """Return the fractions of the photos with a close view among the first ones, and milliseconds per view."""
     start = time.process_time()
     places = [scene.places(None, photo.points2d, CAMERA) for photo in photos]
@@ -213,10 +213,10 @@ def is_near(view: View, photo: CityPhoto) -> bool:
 
 def problems(scene: SceneMap, photos: Sequence[CityPhoto], seed: int) -> Iterator[Problem]:
     with tempfile.TemporaryDirectory() as folder, multiprocessing.get_context("spawn").Pool(1, None, (), 1) as pool:
-        written(scene, Path(folder))
-        first, again = pool.map(opened, [Path(folder)] * 2, chunksize=1)
+        write_map(scene, Path(folder))
+        first, again = pool.map(open_map, [Path(folder)] * 2, chunksize=1)
     _ = scene.cones, scene.pictures  # before the first photo
-    print(f"opened in {first}, again {again}, {ranked(scene, photos)}", end="; ", flush=True)
+    print(f"opened in {first}, again {again}, {rank_views(scene, photos)}", end="; ", flush=True)
     for photo in photos:
         pixels, camera = photo.focal * photo.points2d, np.diag([photo.focal, photo.focal, 1.0])
         search = partial(scene.localize, pixels, camera, seed=seed, time_limit=TIME_LIMIT)

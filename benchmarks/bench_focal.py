@@ -39,8 +39,8 @@ LEDS = [Setting(f"{kind}, {n} lights, 10 seen", kind, n, least=10) for kind in (
 
 
 def of_photos(options: argparse.Namespace) -> Iterator[Problem]:
-    known: dict[str, Any] = {"against": "map", "outliers": 1.0, "seed": options.seed}
-    for photo in scene_problems(options.data, options.scenes, options.limit, **known):
+    settings: dict[str, Any] = {"against": "map", "outliers": 1.0, "seed": options.seed}
+    for photo in scene_problems(options.data, options.scenes, options.limit, **settings):
         (pixels, size), distance = image_of(photo), median_distance(photo.points3d[photo.matched], photo.pose)
         search = partial(photo.scene.localize, pixels, image_size=size, seed=options.seed, time_limit=TIME_LIMIT)
         yield Problem(photo.name, search, [photo.pose], distance=distance, focal=photo.focal)
@@ -48,11 +48,11 @@ def of_photos(options: argparse.Namespace) -> Iterator[Problem]:
 
 def distorted_photos(options: argparse.Namespace) -> Iterator[Problem]:
     """Yield photos in whole maps whose keypoints are distorted by a lens, those within the image."""
-    known: dict[str, Any] = {"against": "map", "outliers": 1.0, "seed": options.seed}
+    settings: dict[str, Any] = {"against": "map", "outliers": 1.0, "seed": options.seed}
     for name in options.scenes:
         scene = model_of(options.data, name)
         for k, query in enumerate(images_of(scene, options.limit)):
-            photo, size = view_problem(scene, query, **known), image_size(query.camera)
+            photo, size = view_problem(scene, query, **settings), image_size(query.camera)
             assert size is not None
             centre, radial = (size[0] / 2, size[1] / 2), RADIAL[(k + options.seed) % len(RADIAL)]
             bent = camera_from(("SIMPLE_RADIAL", (photo.focal, *centre, radial)))
@@ -61,8 +61,8 @@ def distorted_photos(options: argparse.Namespace) -> Iterator[Problem]:
             inside = ((pixels >= 0) & (pixels <= size)).all(-1) & np.isfinite(
                 lens.normalise(np.nan_to_num(pixels))
             ).all(-1)
-            given: dict[str, Any] = {"image_size": size, "seed": options.seed, "time_limit": TIME_LIMIT}
-            search = partial(photo.scene.localize, pixels[inside], **given)
+            search_options: dict[str, Any] = {"image_size": size, "seed": options.seed, "time_limit": TIME_LIMIT}
+            search = partial(photo.scene.localize, pixels[inside], **search_options)
             distance = median_distance(photo.points3d[photo.matched], photo.pose)
             yield Problem(f"{photo.name}, {radial}", search, [photo.pose], distance=distance, focal=lens.focal)
 
@@ -85,8 +85,8 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
         yield Row("whole map, distorted", partial(distorted_photos, options), RIGHT_DEG["lenses"])
         return
     for k, setting in enumerate(LEDS):
-        known = {"image_size": (setting.camera.size, setting.camera.size), "seed": options.seed}
-        drawn = partial(frames, setting, k, options.limit, options.seed, **known)
+        arguments = {"image_size": (setting.camera.size, setting.camera.size), "seed": options.seed}
+        drawn = partial(frames, setting, k, options.limit, options.seed, **arguments)
         yield Row(setting.name, drawn, RIGHT_DEG["leds"])
 
 

@@ -45,7 +45,7 @@ FORWARD: tuple[tuple[Kind, float, float, int], ...] = (
 BACKWARD: tuple[tuple[Kind, float], ...] = (("independent", 0.7), ("smooth", 10))
 
 
-def planted(batch: int, points: int, *, kind: Kind, level: float, seed: int = 0) -> tuple[Batch, Tensor]:
+def plant(batch: int, points: int, *, kind: Kind, level: float, seed: int = 0) -> tuple[Batch, Tensor]:
     """Return scenes in which 3D point j was seen as 2D point j, and the cost: distances between unit features."""
     generator = torch.Generator().manual_seed(seed)
     scene = nn.functional.normalize(torch.randn(batch, points, 3, generator=generator), dim=-1)
@@ -83,21 +83,21 @@ def race(ours: Callable[[], object], papers: Callable[[], object], rounds: int) 
     """
     timers = [Timer(candidate, timer=time.process_time) for candidate in (ours, papers)]
     repeats = [max(1, round(SHORTEST / max(timer.repeat(2, 1)[1], 1e-6))) for timer in timers]
-    turns = [[1000 * t.timeit(n) / n for t, n in zip(timers, repeats, strict=True)] for _ in range(rounds)]
-    return *(float(x) for x in np.median(turns, 0)), float(np.median([b / a for a, b in turns]))  # type: ignore[return-value]
+    times = [[1000 * t.timeit(n) / n for t, n in zip(timers, repeats, strict=True)] for _ in range(rounds)]
+    return *(float(x) for x in np.median(times, 0)), float(np.median([b / a for a, b in times]))  # type: ignore[return-value]
 
 
 def rows(points: int, batch: int) -> Iterator[Row]:
     yield from pnp_rows(points, batch)
     for kind, level, mu, iterations in FORWARD:
-        cost = planted(batch, points, kind=kind, level=level)[1]
+        cost = plant(batch, points, kind=kind, level=level)[1]
         tolerance = SINKHORN_TOLERANCE if iterations == MANY else 0
         ours, papers = partial(sinkhorn, cost, mu=mu), partial(PaperSinkhorn.apply, cost, mu, iterations, tolerance)
         ends = "to its tolerance" if tolerance else f"{iterations} iterations"
         inputs = f"{kind}, {diagonal_mass(ours()[0]):.0%}"
         yield f"Sinkhorn forward, mu {mu}, the paper's {ends}", inputs, ours, papers
     for kind, level in BACKWARD:
-        cost = planted(batch, points, kind=kind, level=level)[1].requires_grad_()
+        cost = plant(batch, points, kind=kind, level=level)[1].requires_grad_()
         plan = sinkhorn(cost, mu=MU)[0]
         back = [gradient_of(each, cost, 1 - 2 * torch.eye(points).expand_as(plan))
                 for each in (plan, PaperSinkhorn.apply(cost, MU))]  # fmt: skip
@@ -105,7 +105,7 @@ def rows(points: int, batch: int) -> Iterator[Row]:
 
 
 def pnp_rows(points: int, batch: int) -> Iterator[Row]:
-    problems, cost = planted(batch, points, kind="smooth", level=10)
+    problems, cost = plant(batch, points, kind="smooth", level=10)
     plan, rays, points3d = sinkhorn(cost)[0], bearings(problems.points2d), problems.points3d
     start = ransac_pnp(plan, problems.points2d, points3d)[:2]
     inputs, vector = f"smooth, {diagonal_mass(plan):.0%}", torch.cat([roma.rotmat_to_rotvec(start[0]), start[1]], -1)

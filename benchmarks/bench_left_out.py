@@ -19,7 +19,7 @@ import numpy as np
 import poselib
 import pycolmap
 from numpy.typing import NDArray
-from rebuilt_maps import PhotoScene, aligned
+from rebuilt_maps import PhotoScene, align
 from record import TIME_LIMIT, Array, Problem, Row, parser, run, spread
 from scipy.cluster.vq import kmeans2, vq
 from view_problems import median_distance
@@ -62,7 +62,7 @@ class DescribedMap:
     def word_counts(self, descriptors: NDArray[np.float32]) -> NDArray[np.int64]:
         return np.bincount(vq(descriptors, self.centres)[0], minlength=WORDS)
 
-    def retrieved(self, photo: str) -> list[str]:
+    def retrieve(self, photo: str) -> list[str]:
         """Return the views whose words are most similar to those of the photo."""
         likeness = self.bags @ (self.rarity * self.word_counts(self.features[photo][1]))
         return [list(self.views)[i] for i in np.argsort(-likeness, kind="stable")[:RETRIEVED]]
@@ -126,14 +126,14 @@ def problems_of(scene: PhotoScene, photo: str, full: SceneMap, seed: int) -> dic
     likely = [full.views[i].name for i in np.argsort(-shared, kind="stable")]
     views = [name for name in likely if name != photo and name in place.view_numbers][:VIEWS]
     far = median_distance(full.points3d[true.points], (true.rotation, true.translation))
-    alignment = aligned(full, place)
+    alignment = align(full, place)
     described = DescribedMap(model, scene.database)
-    known: dict[str, Any] = {"scores": found.scores, "seed": seed, "time_limit": TIME_LIMIT}
+    arguments: dict[str, Any] = {"scores": found.scores, "seed": seed, "time_limit": TIME_LIMIT}
     searches: dict[str, Callable[[], Solution]] = {}
     for method, named in (("views", views), ("map", None)):
-        searches[method] = partial(place.localize, found.pixels, ("PINHOLE", CAMERA), views=named, **known)
+        searches[method] = partial(place.localize, found.pixels, ("PINHOLE", CAMERA), views=named, **arguments)
         searches[f"{method}-sift"] = partial(described.localize, photo, CAMERA, named)
-    searches["words-sift"] = lambda: described.localize(photo, CAMERA, described.retrieved(photo))
+    searches["words-sift"] = lambda: described.localize(photo, CAMERA, described.retrieve(photo))
     name, pose = f"{scene.photos.name}/{photo}", alignment.pose(true.rotation, true.translation)
     return {
         method: Problem(name, search, [pose], distance=far * alignment.scale) for method, search in searches.items()

@@ -80,14 +80,14 @@ def of_photos(used: slice, options: argparse.Namespace) -> Iterator[Problem]:
 
 
 def rig_search(
-    pixels: Sequence[Array], points3d: Array, cameras: Sequence[Any], poses: Sequence[Array], **known: Any
+    pixels: Sequence[Array], points3d: Array, cameras: Sequence[Any], poses: Sequence[Array], **arguments: Any
 ) -> partial[bpnp.Solution]:
     """Return the search for cameras with the poses camera_from_world, in the frame of the first."""
-    known["time_limit"] = TIME_LIMIT
+    arguments["time_limit"] = TIME_LIMIT
     if len(pixels) == 1:
-        return partial(bpnp.solve, pixels[0], points3d, cameras[0], **known)
+        return partial(bpnp.solve, pixels[0], points3d, cameras[0], **arguments)
     rig = [one @ np.linalg.inv(poses[0]) for one in poses[: len(pixels)]]
-    return partial(bpnp.solve, list(pixels), points3d, list(cameras), rig=rig, **known)
+    return partial(bpnp.solve, list(pixels), points3d, list(cameras), rig=rig, **arguments)
 
 
 def rows(options: argparse.Namespace) -> Iterator[Row]:

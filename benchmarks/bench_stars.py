@@ -85,8 +85,8 @@ def frame(count: int, field: float, seed: int, i: int, false: float = FALSE) -> 
 def problems(count: int, field: float, limit: int, seed: int) -> Iterator[Problem]:
     for i in range(limit):
         shown = frame(count, field, seed, i)
-        known: dict[str, Any] = {"at_infinity": True, "seed": i, "time_limit": TIME_LIMIT}
-        search = partial(bpnp.solve, shown.pixels, shown.directions, lens(field).model, **known)
+        arguments: dict[str, Any] = {"at_infinity": True, "seed": i, "time_limit": TIME_LIMIT}
+        search = partial(bpnp.solve, shown.pixels, shown.directions, lens(field).model, **arguments)
         yield Problem(f"{i}", search, [(shown.rotation, np.zeros(3))])
 
 

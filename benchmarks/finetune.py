@@ -29,7 +29,7 @@ RECALL = (10.0, 1.0)  # degrees, scene units
 FILE, PAGES = ROOT / "benchmarks" / "finetune.json", (ROOT / "docs" / "train.md",)
 
 
-def tuned(scene: Path, folder: Path) -> Path:
+def fine_tune(scene: Path, folder: Path) -> Path:
     """Fine-tune the weights to the photos of a scene, unless that was done, and return the checkpoint."""
     checkpoint = folder / "checkpoints" / "last.ckpt"
     if not checkpoint.is_file():
@@ -65,7 +65,7 @@ def main() -> None:
         torch.set_num_threads(1)
         for name in chosen.scenes:
             scene = chosen.data / "colmap" / name
-            after = tuned(scene, chosen.run / name)
+            after = fine_tune(scene, chosen.run / name)
             for when, checkpoint in {"before": checkpoint_path(WEIGHTS), "after": after}.items():
                 data = ColmapDataModule(str(scene), test_fraction=1.0, eval_max_points=POINTS)
                 file = chosen.run / name / f"{when}.jsonl"

@@ -25,7 +25,7 @@ import leds
 import numpy as np
 import shapes
 import symmetric
-from record import Problem, command, machine, nearest, parser, solved
+from record import Problem, command, machine, nearest, parser, solve_problem
 from scipy.spatial.transform import Rotation
 from view_problems import photos
 
@@ -123,7 +123,9 @@ def measure(problem: Problem) -> dict[str, Any]:
         kept.append(problem.solve())
         return kept[0]
 
-    outcome = solved(Problem(problem.name, search, problem.poses, problem.points3d, problem.distance, problem.focal))
+    outcome = solve_problem(
+        Problem(problem.name, search, problem.poses, problem.points3d, problem.distance, problem.focal)
+    )
     found = kept[0]
     row = {key: value for key, value in asdict(outcome).items() if key != "sigmas"}
     right = bool(problem.poses) and outcome.rotation_deg < RIGHT_DEG and outcome.moved < 0.1

@@ -97,14 +97,14 @@ def helix(rng: np.random.Generator) -> Drawn:
     count = int(rng.choice([40, 100]))
     angles = rng.uniform(0, 12.5, (2, count))
     image, scene = (np.column_stack([np.cos(a), np.sin(a), 0.15 * a - 0.9]) for a in angles)
-    return _projected(image, scene, _any(rng), rng)
+    return _project(image, scene, _any(rng), rng)
 
 
 def stretched(rng: np.random.Generator) -> Drawn:
     """Draw a cloud of 8 to 100 points that is stretched by 10 to 30 % along one axis in the image."""
     scene = rng.standard_normal((int(rng.choice([8, 12, 30, 100])), 3))
     factors = 1, 1, 1 + rng.choice([-0.3, -0.2, 0.1, 0.2, 0.3])
-    return _projected(scene * factors, scene, _any(rng), rng)
+    return _project(scene * factors, scene, _any(rng), rng)
 
 
 def hinged(rng: np.random.Generator) -> Drawn:
@@ -112,20 +112,20 @@ def hinged(rng: np.random.Generator) -> Drawn:
     scene = rng.uniform(-1, 1, (int(rng.choice([12, 24, 60, 200])), 3)) * (2, 1, 1)
     hinge = Rotation.from_euler("yz"[rng.integers(2)], rng.uniform(4, 12), degrees=True).as_matrix()
     image, (rotation, translation) = np.where(scene[:, :1] > 0, scene @ hinge.T, scene), _any(rng)
-    pixels, _, _ = _projected(image, scene, (rotation, translation), rng)
+    pixels, _, _ = _project(image, scene, (rotation, translation), rng)
     return pixels, scene, [(rotation, translation), (rotation @ hinge, translation)]
 
 
 def wrong_focal_cloud(rng: np.random.Generator) -> Drawn:
     """Draw a cloud of 8 to 100 points, seen by a camera of 0.5 to 2 times the focal length."""
     scene = rng.standard_normal((int(rng.choice([8, 15, 40, 100])), 3))
-    return _projected(scene, scene, _any(rng), rng, rng.choice([0.5, 0.6, 0.8, 1.2, 1.5, 2.0]))
+    return _project(scene, scene, _any(rng), rng, rng.choice([0.5, 0.6, 0.8, 1.2, 1.5, 2.0]))
 
 
 def wrong_focal_plane(rng: np.random.Generator) -> Drawn:
     """Draw a plane of 8 to 40 points, seen by a camera of 0.5 to 2 times the focal length."""
     scene = rng.uniform(-1, 1, (int(rng.choice([8, 15, 40])), 3)) * (1, 1, 0)
-    return _projected(scene, scene, _facing(rng, 60, (3, 6)), rng, rng.choice([0.5, 0.6, 0.8, 1.2, 1.5, 2.0]))
+    return _project(scene, scene, _facing(rng, 60, (3, 6)), rng, rng.choice([0.5, 0.6, 0.8, 1.2, 1.5, 2.0]))
 
 
 SCENES: tuple[Callable[[np.random.Generator], Drawn], ...] = (
@@ -149,7 +149,7 @@ def _facing(rng: np.random.Generator, degrees: float, distance: tuple[float, flo
     return turn, np.array([*rng.uniform(-aside, aside, 2), rng.uniform(*distance)])
 
 
-def _projected(image: Array, scene: Array, pose: Pose, rng: np.random.Generator, focal: float = 1.0) -> Drawn:
+def _project(image: Array, scene: Array, pose: Pose, rng: np.random.Generator, focal: float = 1.0) -> Drawn:
     """Return the shuffled pixels of the points `image` under the pose, with `focal` times the focal length."""
     camera = image @ pose[0].T + pose[1]
     pixels = camera[:, :2] / camera[:, 2:] * focal * FOCAL + (WIDTH / 2, HEIGHT / 2)
@@ -160,8 +160,8 @@ def _in_frame(
     seen: Array, points: Array, pose: Pose, rng: np.random.Generator, mapped: NDArray[np.bool_] | None = None
 ) -> Drawn:  # fmt: skip
     """Return the visible points that lie in the image, and the points of the map, both relative to their centroid."""
-    middle = points.mean(0)
-    ahead = seen[((seen - middle) @ pose[0].T + pose[1])[:, 2] > 0.05]
-    pixels, _, _ = _projected(ahead - middle, points, pose, rng)
+    centroid = points.mean(0)
+    ahead = seen[((seen - centroid) @ pose[0].T + pose[1])[:, 2] > 0.05]
+    pixels, _, _ = _project(ahead - centroid, points, pose, rng)
     inside = (pixels > 0).all(1) & (pixels < (WIDTH, HEIGHT)).all(1)
-    return pixels[inside], (points if mapped is None else points[mapped]) - middle, [pose]
+    return pixels[inside], (points if mapped is None else points[mapped]) - centroid, [pose]

@@ -125,8 +125,8 @@ def frame(device: Device, setting: Setting, rng: np.random.Generator) -> Frame |
     pointing = camera_from(camera.model)
     for _ in range(MOST_POSES):
         rotation = Rotation.random(random_state=rng.integers(2**31)).as_matrix()
-        middle = pointing.bearings(camera.size / 2 * (1 + OFF_AXIS * rng.uniform(-1, 1, (1, 2))))[0]
-        translation = rng.uniform(*DISTANCE) * middle
+        towards = pointing.bearings(camera.size / 2 * (1 + OFF_AXIS * rng.uniform(-1, 1, (1, 2))))[0]
+        translation = rng.uniform(*DISTANCE) * towards
         led, pixels = seen(device, setting, rotation, translation, rng)
         if len(led) < setting.least:
             continue
@@ -196,20 +196,20 @@ def problems(name: str, limit: int, seed: int) -> Iterator[Problem]:
     return frames(setting, list(SETTINGS).index(name), limit, seed, camera=setting.camera.model)
 
 
-def frames(setting: Setting, number: int, limit: int, seed: int, /, **known: Any) -> Iterator[Problem]:
+def frames(setting: Setting, number: int, limit: int, seed: int, /, **options: Any) -> Iterator[Problem]:
     """Yield frames of a setting, whose number is part of the seed; every fifth frame has a new device."""
     rng = np.random.default_rng([seed, number])
     for i in range(limit):
         shown = picture(setting, 1000 * seed + i // 5, rng)
         normals = shown.device.normals3d if setting.normals else None
         prior = vertical(shown, rng) if setting.gravity else None
-        yield problem(f"{setting.name}/{i}", shown, normals3d=normals, prior=prior, **known)
+        yield problem(f"{setting.name}/{i}", shown, normals3d=normals, prior=prior, **options)
 
 
-def problem(name: str, shown: Frame, **known: Any) -> Problem:
+def problem(name: str, shown: Frame, **options: Any) -> Problem:
     """Return the problem of a frame with options of `solve`; without a camera the focal length is to be estimated."""
-    focal = np.nan if "camera" in known else shown.camera.focal
-    search = partial(bpnp.solve, shown.pixels, shown.device.points3d, **known)
+    focal = np.nan if "camera" in options else shown.camera.focal
+    search = partial(bpnp.solve, shown.pixels, shown.device.points3d, **options)
     distance = float(np.linalg.norm(shown.translation))
     return Problem(name, search, [(shown.rotation, shown.translation)], shown.device.points3d, distance, focal)
 

@@ -187,9 +187,9 @@ def branches(
 
 def network_methods(weights: Iterable[tuple[str, str, Path]], *, problems: int, our_problems: int) -> Iterator[Method]:
     """Networks, given as group, label and checkpoint, with the paper's inference and with ours."""
-    known = [(group, label, checkpoint) for group, label, checkpoint in weights if checkpoint.is_file()]
+    existing = [(group, label, checkpoint) for group, label, checkpoint in weights if checkpoint.is_file()]
     for ours in (False, True):
-        for group, label, checkpoint in known:
+        for group, label, checkpoint in existing:
             identity = {"steps": trained_steps(checkpoint), "bytes": checkpoint.stat().st_size, "ours": ours}
             limit = min(problems, our_problems) if ours else problems
             name = f"{group}, our inference" if ours else group
@@ -362,8 +362,8 @@ def figures(rows: Sequence[ProblemRow], recall: tuple[float, float]) -> dict[str
     found: dict[str, Any] = {"problems": len(rows)}
     for name, field in ERRORS.items():
         values = np.array([getattr(row, field) for row in rows])
-        found[name] = [_rounded(bootstrap(values, quantile(quarter))) for quarter in QUARTERS]
-    found["recall"] = _rounded(bootstrap(successes(rows, recall), fraction))
+        found[name] = [_round_interval(bootstrap(values, quantile(quarter))) for quarter in QUARTERS]
+    found["recall"] = _round_interval(bootstrap(successes(rows, recall), fraction))
     found["seconds"] = round(float(np.mean([row.seconds for row in rows])), 4)
     return found
 
@@ -381,13 +381,13 @@ def effect(first: Sequence[ProblemRow], second: Sequence[ProblemRow], recall: tu
     found: dict[str, Any] = {"problems": len(one)}
     for name, field in ERRORS.items():
         before, after = (np.array([getattr(row, field) for row in rows]) for rows in (one, other))
-        found[name] = _rounded(paired_difference(before, after))
+        found[name] = _round_interval(paired_difference(before, after))
         found[f"{name} better"] = round(float(np.mean(after < before)), 3)
-    found["recall"] = _rounded(paired_difference(successes(one, recall), successes(other, recall), fraction))
+    found["recall"] = _round_interval(paired_difference(successes(one, recall), successes(other, recall), fraction))
     return found
 
 
-def _rounded(interval: Interval) -> list[float]:
+def _round_interval(interval: Interval) -> list[float]:
     return [float(f"{value:.4g}") for value in (interval.value, interval.low, interval.high)]
 
 
@@ -461,14 +461,16 @@ def _short(value: float) -> str:
     return f"{value:.0f}" if value >= 99.5 else f"{value:.2g}" if value < 10 else f"{value:.3g}"
 
 
-def filled(text: str, marker: str, tables: Mapping[str, str]) -> str:
+def fill_tables(text: str, marker: str, tables: Mapping[str, str]) -> str:
     """Return a page with the tables between `<!-- marker: name -->` and `<!-- end of marker -->`."""
 
-    def replaced(match: re.Match[str]) -> str:
+    def replace_table(match: re.Match[str]) -> str:
         new = tables.get(match[1])
         return match[0] if new is None else f"<!-- {marker}: {match[1]} -->\n{new}<!-- end of {marker} -->"
 
-    return re.sub(rf"<!-- {marker}: ([a-z0-9-]+) -->\n(.*?)<!-- end of {marker} -->", replaced, text, flags=re.DOTALL)
+    return re.sub(
+        rf"<!-- {marker}: ([a-z0-9-]+) -->\n(.*?)<!-- end of {marker} -->", replace_table, text, flags=re.DOTALL
+    )
 
 
 def fill_pages(pages: Iterable[Path], marker: str, tables: Mapping[str, str], *, check: bool) -> None:
@@ -476,7 +478,7 @@ def fill_pages(pages: Iterable[Path], marker: str, tables: Mapping[str, str], *,
     stale = []
     for page in pages:
         text = page.read_text(encoding="utf-8")
-        if (new := filled(text, marker, tables)) != text:
+        if (new := fill_tables(text, marker, tables)) != text:
             stale.append(page.name)
             if not check:
                 with write_atomically(page) as temporary:

@@ -74,15 +74,15 @@ class PhotoScene:
         return folder
 
 
-def aligned(here: SceneMap, there: SceneMap) -> Similarity:
+def align(here: SceneMap, there: SceneMap) -> Similarity:
     """Return the frame of `there` in that of `here`, from the poses of the views that both have: the mean rotation
     between their cameras, then their centres.
     """
     names = [view.name for view in here.views if view.name in there.view_numbers]
     ours, theirs = here.named(names), there.named(names)
-    turns = [b.rotation.T @ a.rotation for a, b in zip(ours, theirs, strict=True)]
-    turn = Rotation.from_matrix(np.array(turns)).mean().as_matrix()
+    rotations = [b.rotation.T @ a.rotation for a, b in zip(ours, theirs, strict=True)]
+    rotation = Rotation.from_matrix(np.array(rotations)).mean().as_matrix()
     a, b = (np.array([view.centre for view in views]) for views in (ours, theirs))
     a0, b0 = a - a.mean(0), b - b.mean(0)
-    scale = float(((a0 @ turn.T) * b0).sum() / (a0**2).sum())
-    return Similarity(scale, turn, b.mean(0) - scale * turn @ a.mean(0))
+    scale = float(((a0 @ rotation.T) * b0).sum() / (a0**2).sum())
+    return Similarity(scale, rotation, b.mean(0) - scale * rotation @ a.mean(0))

@@ -113,7 +113,7 @@ class Row:
         return all(error < limit or np.isinf(limit) for error, limit in limits)
 
 
-def solved(problem: Problem) -> Outcome:
+def solve_problem(problem: Problem) -> Outcome:
     start = time.process_time()
     found = problem.solve()
     seconds = time.process_time() - start
@@ -127,10 +127,10 @@ def solved(problem: Problem) -> Outcome:
 
 def nearest(problem: Problem, rotation: Array, translation: Array) -> tuple[float, float, float, Any]:
     """Return the angle in degrees to the nearest true pose, the shifts as in `Outcome`, and that pose."""
-    middle, errors = np.median(problem.points3d, 0), []
+    centroid, errors = np.median(problem.points3d, 0), []
     for true in problem.poses:
-        at = true[0] @ middle + true[1]
-        moved = np.linalg.norm(rotation @ middle + translation - at) / max(np.linalg.norm(at), np.finfo(float).tiny)
+        at = true[0] @ centroid + true[1]
+        moved = np.linalg.norm(rotation @ centroid + translation - at) / max(np.linalg.norm(at), np.finfo(float).tiny)
         shift = np.linalg.norm(rotation.T @ translation - true[0].T @ true[1]) / problem.distance
         errors.append((degrees(rotation, true[0]), float(shift), float(moved), true))
     return min(errors, default=(NO_POSE_DEG, np.inf, np.inf, None), key=lambda error: error[0])
@@ -148,21 +148,21 @@ def beyond_bound(found: Solution, pose: Pose) -> bool:
     return not len(squared) or any(squared[:d].sum() > d * fdtri(d, free, BOUND) / widened for d in {3, len(squared)})
 
 
-def sigmas(found: Solution, pose: Pose, middle: Array) -> list[float]:
+def sigmas(found: Solution, pose: Pose, centroid: Array) -> list[float]:
     """Return the errors along three or six independent directions, in their standard deviations by the covariance.
 
     The directions of the rotation come first. The shift is that of the centroid of the scene (3,), because far from it
     a rotation moves points by more than its first order. The list is empty for a solution without a covariance.
     """
-    (rotation, translation), seen = pose, found.rotation @ middle
+    (rotation, translation), rotated = pose, found.rotation @ centroid
     if not (np.isfinite(found.covariance).all() and np.isfinite(rotation).all()):
         return []
     size = 3 if len(found.covariance) < 6 else 6  # of directions the rotation alone; a focal length is the last one
     moved = np.eye(6)
-    moved[3:, :3] = np.cross(np.eye(3), seen).T  # w x (R m)
+    moved[3:, :3] = np.cross(np.eye(3), rotated).T  # w x (R m)
     moved = moved[:size, :size]
     covariance = moved @ found.covariance[:size, :size] @ moved.T
-    shift = rotation @ middle + translation - seen - found.translation
+    shift = rotation @ centroid + translation - rotated - found.translation
     error = np.r_[Rotation.from_matrix(rotation @ found.rotation.T).as_rotvec(), shift][:size]
     unit = 1 / np.sqrt(np.maximum(np.diag(covariance), 1e-300))  # radians and units of the scene differ by decades
     scaled = covariance * np.outer(unit, unit) + 1e-12 * np.eye(size)
@@ -208,7 +208,9 @@ def summary(found: Sequence[Outcome], row: Row) -> dict[str, Any]:
     return result
 
 
-def measured(rows: Iterable[Row], only: Sequence[str] = ("",)) -> Iterator[tuple[Row, dict[str, Any], list[Outcome]]]:
+def measure_rows(
+    rows: Iterable[Row], only: Sequence[str] = ("",)
+) -> Iterator[tuple[Row, dict[str, Any], list[Outcome]]]:
     """Yield the rows that have one of these parts in their name, with summary and outcomes, and print a line for each.
 
     The problems of a row are drawn before the first of them is solved.
@@ -217,7 +219,7 @@ def measured(rows: Iterable[Row], only: Sequence[str] = ("",)) -> Iterator[tuple
     for row in rows:
         if not any(part in row.name for part in only):
             continue
-        found = [one if isinstance(one, Outcome) else solved(one) for one in list(row.draw())]
+        found = [one if isinstance(one, Outcome) else solve_problem(one) for one in list(row.draw())]
         if not found:
             print(f"{row.name}: no problems", flush=True)
             continue
@@ -230,7 +232,7 @@ def measured(rows: Iterable[Row], only: Sequence[str] = ("",)) -> Iterator[tuple
 def run(rows: Callable[[argparse.Namespace], Iterable[Row]], options: argparse.ArgumentParser) -> None:
     """Measure the rows of a benchmark, and write each with its outcomes to `--output` at once."""
     chosen, results = options.parse_args(), {}
-    for row, result, found in measured(rows(chosen), chosen.only):
+    for row, result, found in measure_rows(rows(chosen), chosen.only):
         results[row.name] = result | {"outcomes": [asdict(outcome) for outcome in found]}
         if chosen.output:
             write(chosen.output, {"rows": results})

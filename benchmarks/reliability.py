@@ -85,12 +85,12 @@ def of_photos(
     against: Against, factors: Sequence[Sequence[float]],
 ) -> Iterator[Problem]:  # fmt: skip
     """Yield photos whose cameras have these factors of the focal length in turn; NaN for an unknown focal length."""
-    solve_one, known = in_map if against == "map" else with_cones, limits(options)
+    solve_one, arguments = in_map if against == "map" else with_cones, limits(options)
     for photo, chosen in zip(drawn(outliers, against), cycle(factors)):
         for factor in chosen:
             if np.isfinite(factor):
                 seen = photo.points3d if against == "view" and factor == 1 else photo.points3d[photo.matched]
-                run = partial(solve_one, photo, factor, **known)
+                run = partial(solve_one, photo, factor, **arguments)
                 yield problem(f"{photo.name} x {factor}", run, [photo.pose], seen)
 
 
@@ -98,22 +98,27 @@ def in_turns(options: argparse.Namespace, outliers: float, against: Against) -> 
     """Return photos of the scenes in turn, so that every part of the list has all scenes; only those with enough true
     matches.
     """
-    known = {"against": against, "outliers": outliers, "seed": options.seed}
-    turns = [scene_problems(options.data, [scene], options.limit, **known) for scene in options.scenes]
-    return [photo for turn in zip(*turns, strict=False) for photo in turn if photo.matched.sum() >= LEAST_MATCHES]
+    arguments = {"against": against, "outliers": outliers, "seed": options.seed}
+    per_scene = [scene_problems(options.data, [scene], options.limit, **arguments) for scene in options.scenes]
+    return [
+        photo
+        for one_each in zip(*per_scene, strict=False)
+        for photo in one_each
+        if photo.matched.sum() >= LEAST_MATCHES
+    ]
 
 
-def in_map(photo: ViewProblem, factor: float, **known: Any) -> Solution:
+def in_map(photo: ViewProblem, factor: float, **arguments: Any) -> Solution:
     pixels, camera = photo.pixels
-    return photo.scene.localize(pixels, camera * [[factor], [factor], [1]], **known)
+    return photo.scene.localize(pixels, camera * [[factor], [factor], [1]], **arguments)
 
 
-def with_cones(photo: ViewProblem, factor: float, **known: Any) -> Solution:
+def with_cones(photo: ViewProblem, factor: float, **arguments: Any) -> Solution:
     """Solve a photo against one view, with the viewing cones of the points."""
     camera = camera_from(np.diag([factor * photo.focal, factor * photo.focal, 1.0]))
     cones: dict[str, Any] = {"normals3d": photo.scene.cones.axes, "cosines3d": photo.scene.cones.cosines}
     points = problem_from(photo.focal * photo.points2d, photo.points3d, camera, **cones)
-    return solve_problems({0: points}, Options(asks=False, **known))[0]
+    return solve_problems({0: points}, Options(asks=False, **arguments))[0]
 
 
 def limits(options: argparse.Namespace) -> dict[str, Any]:
@@ -137,10 +142,10 @@ def of_classes(kind: str, options: argparse.Namespace) -> Iterator[Problem]:
         scene = rng.permutation(np.arange(len(shown.device.points3d)) % COLOURS)
         image = np.where(shown.led >= 0, scene[shown.led], rng.integers(COLOURS, size=len(shown.led)))
         score = (np.eye(COLOURS)[image] + BLUR * rng.standard_normal((len(image), COLOURS))) / BLUR**2
-        known: dict[str, Any] = {"likeliest": {"labels2d": score.argmax(1), "labels3d": scene}}.get(kind, {})
+        arguments: dict[str, Any] = {"likeliest": {"labels2d": score.argmax(1), "labels3d": scene}}.get(kind, {})
         if kind == "probabilities":
-            known = {"labels2d": softmax(score, 1), "labels3d": np.eye(COLOURS)[scene]}
-        yield leds.problem(f"{k}", shown, camera=shown.camera.model, **known, **limits(options))
+            arguments = {"labels2d": softmax(score, 1), "labels3d": np.eye(COLOURS)[scene]}
+        yield leds.problem(f"{k}", shown, camera=shown.camera.model, **arguments, **limits(options))
 
 
 def problem(name: str, run: Callable[[], Solution], poses: Sequence[Pose], points3d: Array) -> Problem:

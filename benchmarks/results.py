@@ -26,7 +26,7 @@ import leds
 import record
 import shapes
 import torch
-from record import ROOT, Outcome, Problem, measured, parser, write
+from record import ROOT, Outcome, Problem, measure_rows, parser, write
 from view_problems import REPORTED, photos
 
 from bpnp.datamodules import MeshDataModule, Outliers
@@ -64,8 +64,8 @@ def lights(name: str, limit: int, seed: int, _: Path) -> Iterator[Problem]:
 
 def network(weights: str, options: dict[str, Any], limit: int, seed: int, data: Path) -> Iterator[Outcome]:
     """Test packaged weights on meshes or, without `root`, on procedural shapes."""
-    known = {"num_points": 1000, "test_problems": limit, "test_shapes": limit, "batch_size": 1, "seed": seed}
-    module = MeshDataModule(**known | options | {"root": str(data / options["root"]) if "root" in options else None})
+    settings = {"num_points": 1000, "test_problems": limit, "test_shapes": limit, "batch_size": 1, "seed": seed}
+    module = MeshDataModule(**settings | options | {"root": str(data / options["root"]) if "root" in options else None})
     module.setup("test")
     net = TrainedNet.from_pretrained(weights).eval()
     for batch in module.test_dataloader():
@@ -73,17 +73,17 @@ def network(weights: str, options: dict[str, Any], limit: int, seed: int, data: 
         with torch.no_grad():
             pose = net(batch).poses["refined"]
         seconds = time.process_time() - start
-        turn = float(rotation_error(pose.rotation, batch.rotation).nan_to_num(nan=180.0))
+        angle = float(rotation_error(pose.rotation, batch.rotation).nan_to_num(nan=180.0))
         shift = float(translation_error(pose.translation, batch.translation).nan_to_num(nan=torch.inf))
-        yield Outcome(batch.ids[0], turn, shift, "", seconds)
+        yield Outcome(batch.ids[0], angle, shift, "", seconds)
 
 
 def of_benchmark(
     rows: Callable[[argparse.Namespace], Iterable[record.Row]], name: str, limit: int, seed: int, data: Path
 ) -> Iterable[Problem | Outcome]:
     """Return the problems of a row of another benchmark."""
-    known = argparse.Namespace(limit=limit, seed=seed, data=data, scenes=REPORTED, peers=False)
-    return next(row for row in rows(known) if row.name == name).draw()
+    options = argparse.Namespace(limit=limit, seed=seed, data=data, scenes=REPORTED, peers=False)
+    return next(row for row in rows(options) if row.name == name).draw()
 
 
 PAPER = (15.0, 0.5)  # degrees and scene units
@@ -192,14 +192,14 @@ def table(name: str, results: dict[str, Any]) -> str | None:
     return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
 
 
-def filled(text: str, results: dict[str, Any]) -> str:
+def fill_tables(text: str, results: dict[str, Any]) -> str:
     """Return a document with the tables between its markers; a table with a row that is not measured is kept."""
 
-    def replaced(match: re.Match[str]) -> str:
+    def replace_table(match: re.Match[str]) -> str:
         new = table(match[1], results)
         return match[0] if new is None else f"<!-- results: {match[1]} -->\n{new}<!-- end of results -->"
 
-    return re.sub(TABLE.format("([a-z]+)"), replaced, text, flags=re.DOTALL)
+    return re.sub(TABLE.format("([a-z]+)"), replace_table, text, flags=re.DOTALL)
 
 
 def main() -> None:
@@ -211,22 +211,22 @@ def main() -> None:
     chosen = options.parse_args()
     kept = json.loads(chosen.file.read_text()) if chosen.file.is_file() else {}
     part = "quick" if chosen.quick else "full"
-    known: dict[str, Any] = kept.get(part, {})
-    seeds = {name: old["seed"] for name, old in known.items()} if chosen.check and chosen.seed is None else {}
+    results: dict[str, Any] = kept.get(part, {})
+    seeds = {name: old["seed"] for name, old in results.items()} if chosen.check and chosen.seed is None else {}
     chosen.seed = SEEDS[part] if chosen.seed is None else chosen.seed
     failures = []
-    for row, found, _ in measured(rows(chosen, seeds)):
+    for row, found, _ in measure_rows(rows(chosen, seeds)):
         result = found | {"seed": seeds.get(row.name, chosen.seed)}
         if chosen.check:
-            old = known.get(row.name)
+            old = results.get(row.name)
             bad = ["never measured"] if old is None else differences(result, old)
             failures += [f"{row.name}: {reason}" for reason in bad]
             continue
-        known[row.name] = result
-        write(chosen.file, {name: kept.get(name, {}) for name in ("quick", "full")} | {part: known})
+        results[row.name] = result
+        write(chosen.file, {name: kept.get(name, {}) for name in ("quick", "full")} | {part: results})
     for document in DOCUMENTS:
         text = document.read_text(encoding="utf-8")
-        if (new := filled(text, known if part == "full" else kept.get("full", {}))) == text:
+        if (new := fill_tables(text, results if part == "full" else kept.get("full", {}))) == text:
             continue
         if chosen.check:
             failures.append(f"{document.name}: a table is not that of {chosen.file.name}; try without --check")

@@ -56,8 +56,8 @@ def points_of(kind: Kind, rng: np.random.Generator) -> Array:
         radius = np.where(rim, 1 + 0.03 * part[:, 0], rng.uniform(0.1, 1, kind.each))
         part = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.1 * part[:, 2]], -1)
         unique *= (0.8, 0.8, 0.2)
-    turns = Rotation.from_rotvec([[0, 0, 2 * np.pi * k / kind.fold] for k in range(kind.fold)])
-    return np.concatenate([*(part @ turn.T for turn in turns.as_matrix()), unique])
+    rotations = Rotation.from_rotvec([[0, 0, 2 * np.pi * k / kind.fold] for k in range(kind.fold)])
+    return np.concatenate([*(part @ turn.T for turn in rotations.as_matrix()), unique])
 
 
 def problems(kind: Kind, limit: int, seed: int, time_limit: float | None = None) -> Iterator[Problem]:
@@ -77,8 +77,8 @@ def problems(kind: Kind, limit: int, seed: int, time_limit: float | None = None)
             shown = image[rng.permutation(len(image))[: int(0.8 * len(image))]]
             count = round(len(shown) * kind.outliers / (1 - kind.outliers))
             image = np.concatenate([shown, rng.uniform(shown.min(0), shown.max(0), (count, 2))])
-        known: dict[str, Any] = {"seed": k, "time_limit": time_limit}
-        search = partial(bpnp.solve, rng.permutation(image), rng.permutation(points), **known)
+        options: dict[str, Any] = {"seed": k, "time_limit": time_limit}
+        search = partial(bpnp.solve, rng.permutation(image), rng.permutation(points), **options)
         # Of an exactly symmetric object no pose is right: its copies fit as well.
         yield Problem(f"{kind.label} #{k}", search, [(rotation, translation)] if kind.unique else [], points)
 
@@ -111,8 +111,8 @@ def device_problems(limit: int, seed: int, *, normals: bool = True, frames: int 
             seen = (at[:, :2] / at[:, 2:] * 500 + 400)[facing]
         others = rng.uniform(seen.min(0) - 30, seen.max(0) + 30, (rng.integers(0, 4), 2))
         pixels = rng.permutation(np.concatenate([seen + 0.3 * rng.normal(size=seen.shape), others]))
-        known: dict[str, Any] = {"normals3d": outward if normals else None, "seed": k, "time_limit": 10}
-        search = partial(bpnp.solve, pixels, points, camera, **known)
+        options: dict[str, Any] = {"normals3d": outward if normals else None, "seed": k, "time_limit": 10}
+        search = partial(bpnp.solve, pixels, points, camera, **options)
         name = f"device {k // frames}, {'' if normals else 'no '}normals #{k}"
         yield Problem(name, search, [(rotation, translation)], points)
 
@@ -125,8 +125,8 @@ def pitch_problems(tilt_deg: float, limit: int, seed: int) -> Iterator[Problem]:
     """
     camera = np.array([[1000.0, 0, 640], [0, 1000, 360], [0, 0, 1]])
     half = [(0, 0), (0, 68), (16.5, 13.84), (16.5, 54.16), (5.5, 24.84), (5.5, 43.16), (0, 13.84), (0, 54.16)]
-    middle = [(52.5, 0), (52.5, 68), (52.5, 24.85), (52.5, 43.15), (0, 24.84), (0, 43.16), (11, 34)]
-    field = np.array([*half, *middle])
+    halfway = [(52.5, 0), (52.5, 68), (52.5, 24.85), (52.5, 43.15), (0, 24.84), (0, 43.16), (11, 34)]
+    field = np.array([*half, *halfway])
     field = np.concatenate([field, field[field[:, 0] < 52] * (-1, 1) + (105, 0)])
     points = np.column_stack([field - (52.5, 34), np.zeros(len(field))])
     for k in range(limit):
@@ -144,8 +144,8 @@ def pitch_problems(tilt_deg: float, limit: int, seed: int) -> Iterator[Problem]:
             seen = pixels[inside]
         up = Rotation.from_rotvec(np.radians(1.0) * rng.normal(size=3)).as_matrix() @ rotation[:, 2]
         prior = bpnp.GravityPrior(up, np.array([0.0, 0.0, 1.0]), 2.0)
-        known: dict[str, Any] = {"prior": prior, "seed": k, "time_limit": 10}
-        search = partial(bpnp.solve, rng.permutation(seen + rng.normal(size=seen.shape)), points, camera, **known)
+        options: dict[str, Any] = {"prior": prior, "seed": k, "time_limit": 10}
+        search = partial(bpnp.solve, rng.permutation(seen + rng.normal(size=seen.shape)), points, camera, **options)
         half_turn = np.diag([-1.0, -1.0, 1.0])  # which maps the field onto itself
         poses = [(rotation, translation), (rotation @ half_turn, translation)]
         yield Problem(f"pitch, tilt {tilt_deg:g} #{k}", search, poses, points)

@@ -37,8 +37,8 @@ SEARCH_SECONDS = 10.0
 
 def data_module(root: Path, seed: int, name: str) -> MeshDataModule:
     """The paper's protocol: 1,000 fixed points a shape, one view of each test shape."""
-    known = {"num_points": 1000, "pool_size": 1000, "test_problems": SETS[name], "seed": seed}
-    return MeshDataModule(str(root / name), **known)  # type: ignore[arg-type]
+    settings = {"num_points": 1000, "pool_size": 1000, "test_problems": SETS[name], "seed": seed}
+    return MeshDataModule(str(root / name), **settings)  # type: ignore[arg-type]
 
 
 def trainings(options: argparse.Namespace) -> dict[str, Training]:
@@ -64,7 +64,7 @@ def methods(options: argparse.Namespace, trained: dict[str, Training], _: str) -
     yield Method("baselines", "search", search, limit, {"time_limit": SEARCH_SECONDS})
 
 
-def measured(options: argparse.Namespace) -> dict[str, Any]:
+def measure(options: argparse.Namespace) -> dict[str, Any]:
     trained = trainings(options)
     data = partial(data_module, options.data, options.seed)
     return paper_tables.measure(TABLE, trained, partial(methods, options, trained), data, options)
@@ -73,4 +73,4 @@ def measured(options: argparse.Namespace) -> dict[str, Any]:
 def main() -> None:
     run = ROOT / "runs" / "table1"
     parser = paper_tables.options(__doc__, file=FILE, run=run, sets=TABLE.sets, steps=3000, pose_steps=600)
-    paper_tables.run(TABLE, parser, PAGES, measured)
+    paper_tables.run(TABLE, parser, PAGES, measure)

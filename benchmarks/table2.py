@@ -72,7 +72,7 @@ def methods(options: argparse.Namespace, trained: dict[str, Training], _: str) -
     yield Method("baselines", "search", search, limit, {"time_limit": SEARCH_SECONDS})
 
 
-def measured(options: argparse.Namespace) -> dict[str, Any]:
+def measure(options: argparse.Namespace) -> dict[str, Any]:
     trained = trainings(options)
     data = partial(data_module, options.data, options.seed)
     return paper_tables.measure(TABLE, trained, partial(methods, options, trained), data, options)
@@ -82,4 +82,4 @@ def main() -> None:
     run = ROOT / "runs" / "table2"
     parser = paper_tables.options(__doc__, file=FILE, run=run, sets=TABLE.sets, steps=2000, pose_steps=400)
     parser.add_argument("--drawn_steps", type=int, default=2000, help="on drawn maps (default: %(default)s)")
-    paper_tables.run(TABLE, parser, PAGES, measured)
+    paper_tables.run(TABLE, parser, PAGES, measure)

@@ -160,6 +160,6 @@ def photos(
         pixels, camera = shown.pixels
         search = partial(solve, pixels, photo.points3d, camera, seed=seed)
         if in_map:
-            known: dict[str, Any] = {"views": photo.view and [photo.view], "seed": seed, "time_limit": TIME_LIMIT}
-            search = partial(photo.scene.localize, pixels, camera, **known)
+            options: dict[str, Any] = {"views": photo.view and [photo.view], "seed": seed, "time_limit": TIME_LIMIT}
+            search = partial(photo.scene.localize, pixels, camera, **options)
         yield Problem(photo.name, search, [photo.pose], photo.points3d, photo.distance)

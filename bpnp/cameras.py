@@ -309,12 +309,12 @@ def scale_focal_length(camera: Camera, zoom: float) -> Camera:
     """
     if isinstance(camera, Pinhole):
         return Pinhole(camera.matrix * [[zoom, zoom, 1.0], [zoom, zoom, 1.0], [1.0, 1.0, 1.0]])
-    zoomed = camera_from(camera_to_json(camera))
-    assert isinstance(zoomed, Lens)
-    params = zoomed.camera.params
-    params[list(zoomed.camera.focal_length_idxs())] *= zoom
-    zoomed.camera.params = params
-    return zoomed
+    scaled = camera_from(camera_to_json(camera))
+    assert isinstance(scaled, Lens)
+    params = scaled.camera.params
+    params[list(scaled.camera.focal_length_idxs())] *= zoom
+    scaled.camera.params = params
+    return scaled
 
 
 def is_pinhole(camera: Camera) -> bool:

@@ -37,13 +37,13 @@ SAME = Tolerance()
 
 
 def same_pose(
-    rotation: Array, middle: Array, i: int | NDArray[np.int64] = 0, tolerance: Tolerance = SAME
+    rotation: Array, centroid: Array, i: int | NDArray[np.int64] = 0, tolerance: Tolerance = SAME
 ) -> NDArray[np.bool_]:
     """Find the poses that are the same as pose i.
 
     Args:
         rotation: Rotations (c, 3, 3).
-        middle: (c, 3) the middle of the scene in the camera's frame; (c, k, 3) in the frames of several cameras.
+        centroid: (c, 3) the centroid of the scene in the camera's frame; (c, k, 3) in the frames of several cameras.
         i: Index of the reference pose, or several indices (k,).
         tolerance: Largest differences.
 
@@ -57,14 +57,14 @@ def same_pose(
         >>> same_pose(np.stack([np.eye(3)] * 3), middle)
         array([ True,  True, False])
     """
-    return close_poses(rotation, seen_from(middle), i, *tolerance)
+    return close_poses(rotation, polar_coordinates(centroid), i, *tolerance)
 
 
-def seen_from(middle: Array) -> Array:
+def polar_coordinates(points: Array) -> Array:
     """Return the directions and log distances (c, 4 k) of points (c, 3) or (c, k, 3) in cameras' frames."""
-    distance = np.maximum(np.linalg.norm(middle, axis=-1, keepdims=True), 1e-300)
-    seen = np.concatenate([middle / distance, np.log(distance)], -1)
-    return np.asarray(seen.reshape(len(seen), int(np.prod(seen.shape[1:]))))
+    distance = np.maximum(np.linalg.norm(points, axis=-1, keepdims=True), 1e-300)
+    polar = np.concatenate([points / distance, np.log(distance)], -1)
+    return np.asarray(polar.reshape(len(polar), int(np.prod(polar.shape[1:]))))
 
 
 def close_poses(

@@ -234,7 +234,7 @@ def _njit_into(folder: Path, function: Callable[..., Any], options: dict[str, An
 
 def _folder_of(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Path:
     """Return the folder for this version of a function's source."""
-    types = {type(value) for value in _flattened(arguments) if hasattr(value, "_fields")}
+    types = {type(value) for value in _flatten(arguments) if hasattr(value, "_fields")}
     files = sorted({__file__, *_files_of(function), *map(inspect.getfile, types)})
     content = hashlib.blake2b(numba.__version__.encode(), digest_size=8)
     for file in files:
@@ -243,12 +243,12 @@ def _folder_of(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Path
     return root / f"{function.__module__}.{function.__name__}-{content.hexdigest()}"
 
 
-def _flattened(values: tuple[Any, ...]) -> Iterator[Any]:
+def _flatten(values: tuple[Any, ...]) -> Iterator[Any]:
     """Yield tuples within tuples, the outer ones first."""
     for value in values:
         if isinstance(value, tuple):
             yield value
-            yield from _flattened(value)
+            yield from _flatten(value)
 
 
 @cache

@@ -237,7 +237,7 @@ def test_models_of_the_same_views_are_aligned() -> None:
         for v in views
     ]
     here, there = (SceneMap(np.zeros((4, 3)), np.arange(4), seen, tuple(v)) for v in (views[:5], moved[1:]))
-    rotation, translation = rebuilt_maps.aligned(here, there).pose(views[0].rotation, views[0].translation)
+    rotation, translation = rebuilt_maps.align(here, there).pose(views[0].rotation, views[0].translation)
     np.testing.assert_allclose(rotation, moved[0].rotation, atol=1e-12)
     np.testing.assert_allclose(translation, moved[0].translation, atol=1e-12)
 
@@ -270,11 +270,11 @@ def test_a_photo_is_localised_by_descriptors_in_the_views_that_its_words_retriev
     monkeypatch.setattr(bench_left_out, "features_of", lambda _: views | {"photo": views["view 0"]})
     monkeypatch.setattr(bench_left_out, "WORDS", 100)
     place = bench_left_out.DescribedMap(Path(), Path())
-    assert place.retrieved("photo")[0] == "view 0"
-    assert len(place.retrieved("photo")) == 10
-    for named in (None, place.retrieved("photo")):
+    assert place.retrieve("photo")[0] == "view 0"
+    assert len(place.retrieve("photo")) == 10
+    for named in (None, place.retrieve("photo")):
         search = partial(place.localize, "photo", (1000.0, 1000.0, 500.0, 500.0), named)
-        outcome = record.solved(record.Problem("", search, [pose], points))
+        outcome = record.solve_problem(record.Problem("", search, [pose], points))
         assert outcome.rotation_deg < 0.01
         assert outcome.verdict == "confident"
 
@@ -338,4 +338,4 @@ def test_a_row_of_another_benchmark_has_its_problems(name: str, tmp_path: Path) 
     one, other = (list(row.measure(2, seed, tmp_path)) for seed in (1, 2))
     assert len(one) == len(other) == 2
     assert not np.array_equal(one[0].poses[0][0], other[0].poses[0][0])
-    assert record.solved(one[0]).rotation_deg < row.right_deg
+    assert record.solve_problem(one[0]).rotation_deg < row.right_deg

@@ -12,7 +12,7 @@ import results
 import table1
 import table2
 import torch
-from paper_tables import Training, effect, figures, filled, network, printed_rows, row_text, solve_problems
+from paper_tables import Training, effect, figures, fill_tables, network, printed_rows, row_text, solve_problems
 from paper_weights import EPOCH, STAGES, trainings
 from report_data import row
 from small_data import SMALL_FEATURES
@@ -134,7 +134,7 @@ def test_the_papers_rows_are_printed_as_in_the_paper() -> None:
 
 def test_tables_stand_between_their_markers_and_a_page_that_differs_is_found(tmp_path: Path) -> None:
     page = "a\n<!-- t: one -->\nold\n<!-- end of t -->\nb\n<!-- t: two -->\nkept\n<!-- end of t -->\n"
-    new = filled(page, "t", {"one": "new\n"})
+    new = fill_tables(page, "t", {"one": "new\n"})
     assert new == page.replace("old", "new")
     (tmp_path / "page.md").write_text(page)
     with pytest.raises(SystemExit, match="tables of page.md are not those of the record"):
@@ -195,4 +195,4 @@ def test_the_guides_hold_the_tables_of_the_results() -> None:
     kept = json.loads(results.FILE.read_text())["full"]
     for document in results.DOCUMENTS:
         text = document.read_text(encoding="utf-8")
-        assert results.filled(text, kept) == text, document.name
+        assert results.fill_tables(text, kept) == text, document.name

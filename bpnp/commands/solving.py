@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from bpnp.files import require_new_folder, write_text
-from bpnp.report.terminal import console, fixed, number, progress, say
+from bpnp.report.terminal import console, format_fixed, number, progress, say
 
 if TYPE_CHECKING:
     from bpnp.search.solution import Solution
@@ -310,7 +310,8 @@ def solution_table(solution: "Solution", annotations: Mapping[str, Any] | None =
         table.add_row("camera centre", _numbers(solution.centre))
         if solution.focal_length_std:
             table.add_row(
-                "focal length", f"{fixed([solution.focal_length])[0]} +- {number(solution.focal_length_std)} px, found"
+                "focal length",
+                f"{format_fixed([solution.focal_length])[0]} +- {number(solution.focal_length_std)} px, found",
             )
         smaller = min(len(solution.points2d), len(solution.points3d))
         table.add_row("inliers", f"{solution.inlier_count} of {smaller} ({100 * solution.inlier_ratio:.1f} %)")
@@ -336,7 +337,7 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _numbers(values: Any) -> str:
-    return "  ".join(f"{text:>12}" for text in fixed(values.tolist()))
+    return "  ".join(f"{text:>12}" for text in format_fixed(values.tolist()))
 
 
 def warm_up() -> None:

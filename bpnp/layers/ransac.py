@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from bpnp.checks import check_positive, check_shapes
 from bpnp.poses import MIN_POINTS
 from bpnp.precision import full_precision
-from bpnp.robust.matches import Matches, in_scene, normalised, residuals
+from bpnp.robust.matches import Matches, in_scene, normalise_matches, residuals
 from bpnp.robust.minimal_solvers import take
 from bpnp.robust.ransac import BACKENDS
 from bpnp.types import SolveStats
@@ -112,7 +112,7 @@ def ransac_pnp(
         backend = "torch" if assignment.device.type == "cuda" else "poselib"
     index2d, index3d, real = top_matches(assignment, mask2d, mask3d, matches_factor)
     matches = Matches(take(points2d, index2d).double(), take(points3d, index3d).double(), real)
-    local, centre, scale = normalised(matches)
+    local, centre, scale = normalise_matches(matches)
     poses, iterations = BACKENDS[backend](local, threshold, max_iterations, seed)
     rotation, translation = (values.squeeze(1) for values in in_scene(poses.unsqueeze(1), centre, scale))
     # The returned pose itself is scored: a refit to the inliers of another pose may have lost them.

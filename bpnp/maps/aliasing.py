@@ -98,18 +98,18 @@ def propose_elsewhere(
     return [
         *(_pose_of(problem, one) for one in earlier),
         *zip(repeated.rotation, repeated.translation, strict=True),
-        *_found_in(_other_regions(regions, place, problem, solution), photo, problem, solution),
+        *_find_poses_in(_other_regions(regions, place, problem, solution), photo, problem, solution),
     ]
 
 
 def refine_elsewhere(problem: Problem, solution: Solution, proposals: Sequence[Pose], seed: int) -> Hypotheses:
     """Return the proposals that differ from a solution before and after their refinement, refined."""
     best = _pose_of(problem, solution)
-    middle = np.median(problem.points_from_user(solution.points3d[solution.matches[:, 1]]), 0)
+    centroid = np.median(problem.points_from_user(solution.points3d[solution.matches[:, 1]]), 0)
 
     def differ(rotations: Array, translations: Array) -> NDArray[np.bool_]:
         rotations, translations = np.concatenate([best[0][None], rotations]), np.r_[best[1][None], translations]
-        return np.asarray(~same_pose(rotations, rotations @ middle + translations, 0, DEFAULT.evidence.same)[1:])
+        return np.asarray(~same_pose(rotations, rotations @ centroid + translations, 0, DEFAULT.evidence.same)[1:])
 
     rotations = np.array([rotation for rotation, _ in proposals]).reshape(-1, 3, 3)
     translations = np.array([translation for _, translation in proposals]).reshape(-1, 3)
@@ -122,12 +122,12 @@ def refine_elsewhere(problem: Problem, solution: Solution, proposals: Sequence[P
 
 
 def judge_against(solution: Solution, competitor: Competitor | None) -> Solution:
-    """Return a confident solution, or an ambiguous one if a competing pose elsewhere is within the margin `lead`.
+    """Return a confident solution, or an ambiguous one if a competing pose elsewhere is within the margin.
 
     An ambiguous solution has both poses as its first candidates.
     """
-    lead = DEFAULT.evidence.lead
-    if competitor is None or competitor.margin >= lead:
+    least_margin = DEFAULT.evidence.lead
+    if competitor is None or competitor.margin >= least_margin:
         return solution
     other, margin = competitor.pose, competitor.margin
     values = {
@@ -135,7 +135,7 @@ def judge_against(solution: Solution, competitor: Competitor | None) -> Solution
         "degrees": math.degrees(rotation_angle(solution.rotation, other.rotation)),
         "better": -margin,
     }
-    code = "better_place" if margin <= -lead else "competing_place"
+    code = "better_place" if margin <= -least_margin else "competing_place"
     doubtful = add_objection(solution, objection(code, margin, **values))
     return replace(doubtful, candidates=(solution.candidates[0], other, *solution.candidates[1:]))
 
@@ -183,7 +183,7 @@ def _other_regions(regions: Iterable[Region], place: Region, problem: Problem, s
             return
 
 
-def _found_in(regions: Iterable[Region], photo: Photo, problem: Problem, solution: Solution) -> Iterator[Pose]:
+def _find_poses_in(regions: Iterable[Region], photo: Photo, problem: Problem, solution: Solution) -> Iterator[Pose]:
     """Yield the poses that short searches in other regions find for the explained image points of a solution."""
     explained = replace(photo, keypoints=explained_keypoints(photo, solution), view_count=1)
     density_maps: dict[tuple[DensityShape, float], DensityMap] = {}  # shared, since the image points are the same

@@ -111,7 +111,7 @@ def draw_from_above(axes: "Axes", scene: "SceneMap", solution: Solution) -> None
     step = -(-len(scene.points3d) // DRAWING.most_points)
     points, centres = scene.points3d[::step] @ plane.T, np.array([view.centre for view in scene.views]) @ plane.T
     axes.plot(*points.T, ".", color=QUIET, ms=1, alpha=0.35, zorder=1)
-    local_searches = np.array([view.rotation[2] for view in scene.views]) @ plane.T
+    viewing_axes = np.array([view.rotation[2] for view in scene.views]) @ plane.T
     drawn = [("the photo", solution.centre, solution.rotation)] if found else []
     if solution.verdict == "ambiguous" and len(solution.candidates) > 1:
         drawn.append(("or here", solution.candidates[1].centre, solution.candidates[1].rotation))
@@ -120,8 +120,8 @@ def draw_from_above(axes: "Axes", scene: "SceneMap", solution: Solution) -> None
     farthest = DRAWING.farthest * (high - low)
     placed = np.clip(np.concatenate([centres, stars]), low - farthest, high + farthest)
     low, high = np.minimum(low, placed.min(0)), np.maximum(high, placed.max(0))
-    middle, reach = (low + high) / 2, 0.5 * 1.15 * float((high - low).max())
-    axes.quiver(*centres.T, *local_searches.T, color=LIGHT[0], width=0.004, scale=25, zorder=2)
+    drawing_centre, reach = (low + high) / 2, 0.5 * 1.15 * float((high - low).max())
+    axes.quiver(*centres.T, *viewing_axes.T, color=LIGHT[0], width=0.004, scale=25, zorder=2)
     axes.plot(*centres.T, ".", color=LIGHT[0], ms=4, label=f"{len(centres)} views", zorder=2)
     colour, half = VERDICTS[solution.verdict], np.tan(np.nanmax(np.abs(np.arctan(solution.points2d[:, 0]))))
     for (label, _, rotation), star, inside in zip(drawn, stars, placed[len(centres) :], strict=True):
@@ -135,10 +135,12 @@ def draw_from_above(axes: "Axes", scene: "SceneMap", solution: Solution) -> None
         axes.plot(*inside, "*", color=face, ms=14, mec=edge_colour, label=shown, zorder=4)
     if found:
         draw_ellipse(axes, solution, plane, colour)
-    axes.set(xlim=middle[0] + np.array([-reach, reach]), ylim=middle[1] + np.array([-reach, reach]))
+    axes.set(xlim=drawing_centre[0] + np.array([-reach, reach]), ylim=drawing_centre[1] + np.array([-reach, reach]))
     axes.set(aspect="equal", xticks=[], yticks=[])
-    known = f"; centre known to {number(solution.centre_std)} scene units" if np.isfinite(solution.centre_std) else ""
-    axes.set_title(f"the map from above{known if found else '; no pose'}", fontsize=9)
+    precision = (
+        f"; centre known to {number(solution.centre_std)} scene units" if np.isfinite(solution.centre_std) else ""
+    )
+    axes.set_title(f"the map from above{precision if found else '; no pose'}", fontsize=9)
     axes.legend(loc="lower right", fontsize=8)
 
 

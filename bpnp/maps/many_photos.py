@@ -172,7 +172,7 @@ def localize_photos(
     """
     outcome = Outcome()
 
-    def failed(name: str, photo: Path, error: Exception) -> None:
+    def describe_failure(name: str, photo: Path, error: Exception) -> None:
         outcome.errors[name] = str(error)
         folder.forget_replaced(name, photo)
         done(f"{name}: could not be tried")
@@ -182,7 +182,7 @@ def localize_photos(
             try:
                 task = photo_task(scene, name, photo, map_content=folder.map_content, **options)
             except (ValueError, OSError) as error:
-                failed(name, photo, error)
+                describe_failure(name, photo, error)
                 continue
             changes = folder.changes(task)
             if changes == []:
@@ -200,7 +200,7 @@ def localize_photos(
                     folder.keep(task, solution, draw_in=scene if pictures else None)
                 done(f"{task.name}: {folder.records[task.name]['verdict']}")
             except (ValueError, OSError) as error:
-                failed(task.name, task.photo, error)
+                describe_failure(task.name, task.photo, error)
     finally:
         folder.compare(scene)
         folder.write()
@@ -308,8 +308,8 @@ class SolutionFolder:
     def compare(self, scene: SceneMap) -> None:
         """Add the error relative to the map's pose to each photo that was left out of this map."""
         for name, record in self.records.items():
-            known = record["rotation"] is not None and name in scene.view_numbers
-            if known and record[MADE_WITH]["leave_one_out"] and record[MADE_WITH]["map"] == self.map_content:
+            comparable = record["rotation"] is not None and name in scene.view_numbers
+            if comparable and record[MADE_WITH]["leave_one_out"] and record[MADE_WITH]["map"] == self.map_content:
                 (view,), rotation = scene.named([name]), np.array(record["rotation"])
                 degrees = np.degrees(Rotation.from_matrix(rotation @ view.rotation.T).magnitude())
                 shift = np.linalg.norm(rotation.T @ record["translation"] + view.centre)

@@ -38,17 +38,17 @@ def attempts_on_cluster(scene: SceneMap, tasks: Iterable[PhotoTask], cluster: st
         ValueError: There is no scheduler at the address.
     """
     plugin = MapOfWorker(scene)
-    with connected(cluster) as client:
+    with connect_client(cluster) as client:
         client.register_plugin(plugin)
         running: dict[object, PhotoTask] = {}
 
-        def submitted() -> Iterator[Future]:
+        def submit() -> Iterator[Future]:
             for task in tasks:
                 future = client.submit(_attempt, plugin.name, task, pure=False)
                 running[future.key] = task
                 yield future
 
-        waiting = submitted()
+        waiting = submit()
         done = as_completed(islice(waiting, MAPS.queued * max(sum(client.nthreads().values()), 1)))
         for future in done:
             task = running.pop(future.key)
@@ -58,7 +58,7 @@ def attempts_on_cluster(scene: SceneMap, tasks: Iterable[PhotoTask], cluster: st
 
 
 @contextmanager
-def connected(cluster: str) -> Iterator[Client]:
+def connect_client(cluster: str) -> Iterator[Client]:
     """Yield a client of the scheduler at an address, or of a given number of new single-threaded processes."""
     if cluster.isdecimal():
         if int(cluster) < 1:

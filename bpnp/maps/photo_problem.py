@@ -44,8 +44,8 @@ class Photo:
             focal: Prior of the focal length; None if it is known.
         """
         axes, cosines = region.cones
-        known: dict[str, Any] = {"normals3d": axes, "cosines3d": cosines, "prior": prior, "focal": focal}
-        problem = problem_from(self.keypoints, region.points3d, camera_from(camera), **known)
+        arguments: dict[str, Any] = {"normals3d": axes, "cosines3d": cosines, "prior": prior, "focal": focal}
+        problem = problem_from(self.keypoints, region.points3d, camera_from(camera), **arguments)
         return replace(problem, log10_views=math.log10(self.view_count))
 
 
@@ -56,6 +56,6 @@ def with_ids(solution: Solution, region: Region) -> Solution:
 
 def in_picture(problem: Problem, pose: Solution | Candidate) -> NDArray[np.bool_]:
     """Return a mask (n,) of the scene points visible from a pose, within the bounding box of the image points."""
-    seen, image = problem.project_scene(*problem.from_user(pose.rotation, pose.translation)), problem.image_points
-    inside = (seen >= image.min(0)) & (seen <= image.max(0))  # not NaN
+    projected, image = problem.project_scene(*problem.from_user(pose.rotation, pose.translation)), problem.image_points
+    inside = (projected >= image.min(0)) & (projected <= image.max(0))  # not NaN
     return np.asarray(inside.all(-1))

@@ -74,7 +74,7 @@ def photo_files(paths: Iterable[Path], besides: Path | None = None) -> dict[str,
 
 def photo_size(photo: Path) -> Size:
     """Return (width, height) of a photo, pixels; raise ValueError if it cannot be read."""
-    return _opened(photo)[0]
+    return _read_size_and_tags(photo)[0]
 
 
 def focal_from_exif(photo: Path) -> float | None:
@@ -88,7 +88,7 @@ def focal_from_exif(photo: Path) -> float | None:
     Raises:
         ValueError: The photo cannot be read.
     """
-    size, tags = _opened(photo)
+    size, tags = _read_size_and_tags(photo)
     taken = int(tags.get(PIXELS_X, 0)), int(tags.get(PIXELS_Y, 0))
     if all(taken) and not same_aspect_ratio((max(taken), min(taken)), (max(size), min(size))):
         return None
@@ -111,10 +111,10 @@ def up_from_exif(photo: Path) -> tuple[float, float, float] | None:
     Raises:
         ValueError: The photo cannot be read.
     """
-    return UP_OF_ORIENTATION.get(_opened(photo)[1].get(ORIENTATION, 0))
+    return UP_OF_ORIENTATION.get(_read_size_and_tags(photo)[1].get(ORIENTATION, 0))
 
 
-def _opened(photo: Path) -> tuple[Size, dict[int, Any]]:
+def _read_size_and_tags(photo: Path) -> tuple[Size, dict[int, Any]]:
     """Return the size of a photo and its EXIF tags, with the orientation."""
     from PIL import Image
 
@@ -204,7 +204,7 @@ def read_features(file: Path, photo: str, size: Size | None = None) -> Keypoints
         raise ValueError(
             f"{photo} in {file} has keypoints {pixels.shape} and scores {scores.shape}, not (m, 2) and (m,)"
         )
-    return _checked(Keypoints(pixels + CENTRE, scores, stored), size, f"{photo} in {file}")  # type: ignore[arg-type]
+    return _check_keypoints(Keypoints(pixels + CENTRE, scores, stored), size, f"{photo} in {file}")  # type: ignore[arg-type]
 
 
 def read_database(file: Path, photo: str, size: Size | None = None) -> Keypoints:
@@ -244,20 +244,21 @@ def read_database(file: Path, photo: str, size: Size | None = None) -> Keypoints
     if columns == 6:  # the mean length of the columns of the shape
         scores = np.linalg.norm(rows[:, 2:].reshape(-1, 2, 2), axis=1).mean(1)
     pixels, first = np.unique(rows[:, :2], axis=0, return_index=True)
-    known = None if None in stored else (int(stored[0]), int(stored[1]))
-    return _checked(Keypoints(pixels, scores[first], known), size, where)
+    image_size = None if None in stored else (int(stored[0]), int(stored[1]))
+    return _check_keypoints(Keypoints(pixels, scores[first], image_size), size, where)
 
 
-def _checked(keypoints: Keypoints, size: Size | None, where: str) -> Keypoints:
+def _check_keypoints(keypoints: Keypoints, size: Size | None, where: str) -> Keypoints:
     """Return keypoints with the size of their photo; raise ValueError if sizes differ or keypoints lie outside it."""
     if None not in (keypoints.size, size) and keypoints.size != size:
         raise ValueError(
             f"the keypoints of {where} are those of a photo of size {keypoints.size}, but the photo has {size}"
         )
-    known = size or keypoints.size
-    if known is not None and (outside := outside_image(keypoints.pixels, known)).any():
+    full_size = size or keypoints.size
+    if full_size is not None and (outside := outside_image(keypoints.pixels, full_size)).any():
         raise ValueError(
-            f"{int(outside.sum())} keypoints are outside the {known[0]} x {known[1]} pixels of {where}, such as "
+            f"{int(outside.sum())} keypoints are outside the {full_size[0]} x {full_size[1]} pixels of {where}, such "
+            "as "
             f"{keypoints.pixels[outside][0].round(1).tolist()}; give features of a photo of this size"
         )
-    return keypoints._replace(size=known)
+    return keypoints._replace(size=full_size)

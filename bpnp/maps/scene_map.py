@@ -82,9 +82,9 @@ class SceneMap(ViewedPoints):
             with TemporaryDirectory() as folder:
                 path.write_binary(folder)
                 return cls.from_colmap(folder)
-        known = index.read_index(Path(path))
-        if known is not None:
-            return cls._from_index(known)
+        stored = index.read_index(Path(path))
+        if stored is not None:
+            return cls._from_index(stored)
         model = read_reconstruction(path, keypoints=False)
         views = tuple(
             View(image.name, image.camera, image.rotation, image.translation, image.observed.astype(np.int32))
@@ -104,9 +104,9 @@ class SceneMap(ViewedPoints):
         )
 
     @classmethod
-    def _from_index(cls, known: index.Index) -> "SceneMap":
-        scene = cls(*known[:4])
-        vars(scene).update(pictures=known.pictures, cones=known.cones)
+    def _from_index(cls, stored: index.Index) -> "SceneMap":
+        scene = cls(*stored[:4])
+        vars(scene).update(pictures=stored.pictures, cones=stored.cones)
         return scene
 
     def localize(
@@ -179,8 +179,9 @@ class SceneMap(ViewedPoints):
         photo = Photo(used, lens, checked_prior(prior), seed=checked_seed(seed))
         options = Options(source_from(solver), solver == "auto", seed=photo.seed)
         maps = [self]
-        if up_camera is not None and prior is None and (turned := self.turned(_direction(up_camera))) is not self:
-            maps = [turned, self]
+        if up_camera is not None and prior is None:
+            upright = self.match_orientation(_direction(up_camera))
+            maps = [upright, self] if upright is not self else maps
         result = localize(maps, photo, None if views is None else list(views), options, limit)
         if time_limit is None and not result.is_complete:
             warnings.warn(DEFAULT_LIMIT, DeprecationWarning, stacklevel=_level_of_user())
@@ -239,9 +240,9 @@ class SceneMap(ViewedPoints):
         unknown = unknown_camera(camera, image_size, focal_error, distortion)
         if camera is not None:
             return unknown
-        known = [view.camera.focal / max(size) for view in self.views if (size := image_size_of(view.camera))]
-        smallest, largest = min([unknown.smallest, *known]), max([unknown.largest, *known])
-        return unknown._replace(smallest=smallest, largest=largest, usual=float(np.median(known or [unknown.usual])))
+        ratios = [view.camera.focal / max(size) for view in self.views if (size := image_size_of(view.camera))]
+        smallest, largest = min([unknown.smallest, *ratios]), max([unknown.largest, *ratios])
+        return unknown._replace(smallest=smallest, largest=largest, usual=float(np.median(ratios or [unknown.usual])))
 
     def localize_photo(
         self,
@@ -291,10 +292,10 @@ class SceneMap(ViewedPoints):
         if camera is None or isinstance(camera, SceneMap):
             camera = (camera or self).camera_for(path, exif=camera is None)[0]
         size, lens = photo_size(path), None if camera is None or isinstance(camera, str) else camera_from(camera)
-        if lens is not None and (known := image_size_of(lens)) not in (None, size):
+        if lens is not None and (camera_size := image_size_of(lens)) not in (None, size):
             raise ValueError(
-                f"{path.name} has {size[0]} x {size[1]} pixels, but its camera {known[0]} x {known[1]}; give a camera "
-                "with the focal length and the centre of this size, or that of the map"
+                f"{path.name} has {size[0]} x {size[1]} pixels, but its camera {camera_size[0]} x "
+                f"{camera_size[1]}; give a camera with the focal length and the centre of this size, or that of the map"
             )
         points = photo_keypoints(path, keypoints, path.name if name is None else name)
         known_lens = lens is not None
@@ -337,8 +338,8 @@ class SceneMap(ViewedPoints):
         sizes = {key: image_size_of(view.camera) for key, view in owners.items()}
         fitting = [
             (resize_camera(owners[key].camera, size), f"view {owners[key].name} of the map")
-            for key, known in sizes.items()
-            if known == size or (not exif and known is not None and same_aspect_ratio(known, size))
+            for key, camera_size in sizes.items()
+            if camera_size == size or (not exif and camera_size is not None and same_aspect_ratio(camera_size, size))
         ]
         fitting.sort(key=lambda item: item[0].focal)
         if fitting and fitting[-1][0].focal <= MAPS.same_focal * fitting[0][0].focal:
@@ -349,7 +350,9 @@ class SceneMap(ViewedPoints):
             focals = f"{fitting[0][0].focal:.0f} to {fitting[-1][0].focal:.0f} pixels"
             found = f"the {len(fitting)} cameras of this shape have focal lengths of {focals}"
         else:
-            others = ", ".join(sorted({"{} x {}".format(*known) for known in sizes.values() if known})[:4])
+            others = ", ".join(
+                sorted({"{} x {}".format(*camera_size) for camera_size in sizes.values() if camera_size})[:4]
+            )
             found = f"its images have {others} pixels"
         raise ValueError(
             f"no camera of the map fits {photo} of {width} x {height} pixels: {found}; give --camera of the photo, or "

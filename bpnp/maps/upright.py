@@ -29,7 +29,7 @@ def up_of_views(views: Sequence[View]) -> Array | None:
     return np.asarray(mean / np.linalg.norm(mean))
 
 
-def quarter_turns(views: Sequence[View], up_camera: Array) -> NDArray[np.int64]:
+def count_quarter_turns(views: Sequence[View], up_camera: Array) -> NDArray[np.int64]:
     """Return the number of quarter turns (v,), 0 to 3, that rotate each view to the orientation of a photo.
 
     Args:
@@ -43,14 +43,14 @@ def quarter_turns(views: Sequence[View], up_camera: Array) -> NDArray[np.int64]:
     up = up_of_views(views)
     if up is None or np.hypot(*up_camera[:2]) < MAPS.in_plane * np.linalg.norm(up_camera):
         return np.zeros(len(views), np.int64)
-    seen = np.array([view.rotation @ up for view in views])
-    angles = np.arctan2(up_camera[1], up_camera[0]) - np.arctan2(seen[:, 1], seen[:, 0])
-    turns = np.round(angles / (np.pi / 2)).astype(np.int64) % 4
-    return np.where(np.hypot(seen[:, 0], seen[:, 1]) < MAPS.in_plane, 0, turns)
+    ups = np.array([view.rotation @ up for view in views])
+    angles = np.arctan2(up_camera[1], up_camera[0]) - np.arctan2(ups[:, 1], ups[:, 0])
+    quarters = np.round(angles / (np.pi / 2)).astype(np.int64) % 4
+    return np.where(np.hypot(ups[:, 0], ups[:, 1]) < MAPS.in_plane, 0, quarters)
 
 
-def turned_view(view: View, turns: int) -> View:
+def rotate_view(view: View, quarters: int) -> View:
     """Return a view with its camera rotated about the optical axis by quarter turns, from x towards y; same centre."""
-    cosine, sine = ((1, 0), (0, 1), (-1, 0), (0, -1))[turns]
-    turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-    return replace(view, rotation=turn @ view.rotation, translation=turn @ view.translation)
+    cosine, sine = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarters]
+    quarter_rotation = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    return replace(view, rotation=quarter_rotation @ view.rotation, translation=quarter_rotation @ view.translation)

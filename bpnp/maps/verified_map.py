@@ -90,10 +90,10 @@ def verify_map(
     for view in scene.views:
         image = images[view.name]
         usable = np.isfinite(image.keypoints).all(-1)
-        one = _verified(scene, view.name, np.unique(image.keypoints[usable], axis=0), seed, time_limit)
+        one = _verify_view(scene, view.name, np.unique(image.keypoints[usable], axis=0), seed, time_limit)
         if one.verdict == "failed" and one.log10_false_alarms > 0:
             matched = np.unique(image.keypoints[usable & (image.point_ids >= 0)], axis=0)
-            again = _verified(scene, view.name, matched, seed, time_limit)
+            again = _verify_view(scene, view.name, matched, seed, time_limit)
             if again.verdict != "failed":
                 reason = MATCHED_ONLY.format(again.log10_false_alarms, one.log10_false_alarms, len(image.keypoints))
                 one = replace(again, verdict="ambiguous", reason=reason)
@@ -102,7 +102,9 @@ def verify_map(
     return sorted(verified, key=lambda one: (WORST_FIRST.index(one.verdict), -one.log10_false_alarms, one.name))
 
 
-def _verified(scene: SceneMap, name: str, keypoints: NDArray[np.float64], seed: int, time_limit: float) -> VerifiedView:
+def _verify_view(
+    scene: SceneMap, name: str, keypoints: NDArray[np.float64], seed: int, time_limit: float
+) -> VerifiedView:
     view = scene.named([name])[0]
     try:
         solution = scene.verify_view(name, keypoints, seed=seed, time_limit=time_limit)
@@ -186,15 +188,15 @@ def _drawing(verified: Sequence[VerifiedView], scene: SceneMap) -> dict[str, Any
     scale = 0.92 * DRAWING.side / max(float((high - low).max()), 1e-9)
     size = (high - low) * scale + 0.08 * DRAWING.side
 
-    def placed(values: Any) -> Any:
+    def to_drawing(values: Any) -> Any:
         return np.round((np.asarray(values) - low) * scale + 0.04 * DRAWING.side, 1).tolist()
 
     inside = ((points >= low) & (points <= high)).all(-1)
-    local_searches = np.array([view.rotation[2] for view in views]) @ plane.T
-    local_searches /= np.maximum(np.linalg.norm(local_searches, axis=-1, keepdims=True), 1e-9)
+    directions = np.array([view.rotation[2] for view in views]) @ plane.T
+    directions /= np.maximum(np.linalg.norm(directions, axis=-1, keepdims=True), 1e-9)
     others = [
-        placed(np.clip(plane @ np.array(one.other_centre), low, high)) if one.other_centre is not None else None
+        to_drawing(np.clip(plane @ np.array(one.other_centre), low, high)) if one.other_centre is not None else None
         for one in verified
     ]
-    drawn = zip(verified, placed(centres), np.round(24 * local_searches, 1).tolist(), others, strict=True)
-    return {"size": size.round().tolist(), "points": placed(points[inside]), "views": list(drawn)[::-1]}
+    drawn = zip(verified, to_drawing(centres), np.round(24 * directions, 1).tolist(), others, strict=True)
+    return {"size": size.round().tolist(), "points": to_drawing(points[inside]), "views": list(drawn)[::-1]}

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.cameras import Camera
-from bpnp.maps.upright import quarter_turns, turned_view
+from bpnp.maps.upright import count_quarter_turns, rotate_view
 from bpnp.maps.views import (
     Array,
     Cones,
@@ -69,8 +69,8 @@ class Region:
         in_camera = self.points3d @ rotation.T + translation
         ahead = (in_camera[:, 2] > 0) & faces(self.cones.axes, self.cones.cosines, in_camera, rotation)
         indices = np.flatnonzero(ahead)
-        seen = camera.project(in_camera[indices])
-        inside = ((seen >= keypoints.min(0)) & (seen <= keypoints.max(0))).all(-1)  # not NaN
+        projected = camera.project(in_camera[indices])
+        inside = ((projected >= keypoints.min(0)) & (projected <= keypoints.max(0))).all(-1)  # not NaN
         return indices[inside]
 
 
@@ -229,7 +229,7 @@ class ViewedPoints:
             order = [self.views[k] for k in np.argsort(-self.scores(camera, keypoints), kind="stable")]
         yield from (self.region(view, view.points) for view in order if len(view.points) >= MIN_POINTS)
 
-    def turned(self: Map, up_camera: Array) -> Map:
+    def match_orientation(self: Map, up_camera: Array) -> Map:
         """Return the map with each view rotated by quarter turns until its up direction is that of a photo.
 
         Args:
@@ -238,17 +238,17 @@ class ViewedPoints:
         Returns:
             The map with rotated views; the map itself if no view needs a rotation.
         """
-        turns = quarter_turns(self.views, up_camera)
-        if not turns.any():
+        quarters = count_quarter_turns(self.views, up_camera)
+        if not quarters.any():
             return self
-        key = turns.tobytes()
-        if key not in self._turned_maps:
-            views = tuple(map(turned_view, self.views, turns.tolist()))
-            self._turned_maps[key] = turned = replace(self, views=views)
-            vars(turned).update(cones=self.cones)  # cones depend on the view centres only, which are unchanged
-        found: Map = self._turned_maps[key]
+        key = quarters.tobytes()
+        if key not in self._rotated_maps:
+            views = tuple(map(rotate_view, self.views, quarters.tolist()))
+            self._rotated_maps[key] = rotated = replace(self, views=views)
+            vars(rotated).update(cones=self.cones)  # cones depend on the view centres only, which are unchanged
+        found: Map = self._rotated_maps[key]
         return found
 
     @cached_property
-    def _turned_maps(self) -> dict[bytes, Any]:
+    def _rotated_maps(self) -> dict[bytes, Any]:
         return {}

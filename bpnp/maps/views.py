@@ -108,66 +108,66 @@ class Pictures(NamedTuple):
     reaches: Array
 
 
-def pictures_of_views(points3d: Array, views: Sequence[View], rule: RankSettings = RANK) -> Pictures:
+def pictures_of_views(points3d: Array, views: Sequence[View], settings: RankSettings = RANK) -> Pictures:
     """Return the density images of the points that each view sees."""
-    contrasts, reaches = np.zeros((len(views), rule.cells**2), np.float32), np.zeros(len(views))
+    contrasts, reaches = np.zeros((len(views), settings.cells**2), np.float32), np.zeros(len(views))
     for k, view in enumerate(views):
         camera = points3d[view.points] @ view.rotation.T + view.translation
         camera = camera[camera[:, 2] > 0]
         points2d = camera[:, :2] / camera[:, 2:]
-        reaches[k] = reach(points2d, rule)
-        contrasts[k] = contrast(points2d, reaches[k], rule)
+        reaches[k] = reach(points2d, settings)
+        contrasts[k] = contrast(points2d, reaches[k], settings)
     return Pictures(contrasts, reaches)
 
 
-def pictures_of_photo(points2d: Array, rule: RankSettings = RANK) -> Pictures:
+def pictures_of_photo(points2d: Array, settings: RankSettings = RANK) -> Pictures:
     """Return the density images of a photo's normalised keypoints (m, 2), shifted and scaled, and their reach (1,)."""
-    side, most, found, unit = rule.cells, max(rule.shifts), [], reach(points2d, rule)
-    for scale in rule.scales:
-        wide = np.pad(contrast(points2d, unit / scale, rule).reshape(side, side), most)
-        for down, right in product(rule.shifts, rule.shifts):
+    side, most, found, unit = settings.cells, max(settings.shifts), [], reach(points2d, settings)
+    for scale in settings.scales:
+        wide = np.pad(contrast(points2d, unit / scale, settings).reshape(side, side), most)
+        for down, right in product(settings.shifts, settings.shifts):
             found.append(wide[most + down :, most + right :][:side, :side].ravel())
     return Pictures(np.stack(found), np.array([unit]))
 
 
-def reach(points2d: Array, rule: RankSettings = RANK) -> float:
+def reach(points2d: Array, settings: RankSettings = RANK) -> float:
     """Return the half side of the square about the image centre that holds most of the points (k, 2)."""
-    return max(float(np.quantile(np.abs(points2d).max(-1), rule.within)), 1e-12) if len(points2d) else 1.0
+    return max(float(np.quantile(np.abs(points2d).max(-1), settings.within)), 1e-12) if len(points2d) else 1.0
 
 
-def contrast(points2d: Array, unit: float, rule: RankSettings = RANK) -> NDArray[np.float32]:
+def contrast(points2d: Array, unit: float, settings: RankSettings = RANK) -> NDArray[np.float32]:
     """Return the density contrast (cells^2,) of points (k, 2), of unit length; 0 without points.
 
-    It is the narrowly smoothed density less the widely smoothed one, in an image of `rule.half` units to each side.
+    It is the narrowly smoothed density less the widely smoothed one, in an image of `settings.half` units to each side.
     """
-    edges = np.linspace(-rule.half, rule.half, rule.cells + 1) * unit
+    edges = np.linspace(-settings.half, settings.half, settings.cells + 1) * unit
     counts, _, _ = np.histogram2d(points2d[:, 1], points2d[:, 0], bins=(edges, edges))
-    density = np.sqrt(gaussian_filter(counts, rule.fine, mode="constant"))
-    picture = (density - gaussian_filter(density, rule.wide, mode="constant")).ravel()
+    density = np.sqrt(gaussian_filter(counts, settings.fine, mode="constant"))
+    picture = (density - gaussian_filter(density, settings.wide, mode="constant")).ravel()
     return np.asarray(picture / max(float(np.linalg.norm(picture)), 1e-12), np.float32)
 
 
 def scores_of_views(
-    points2d: Array, views: Pictures, rule: RankSettings = RANK, *, known_focal: bool = True
+    points2d: Array, views: Pictures, settings: RankSettings = RANK, *, known_focal: bool = True
 ) -> NDArray[np.float32]:
     """Return the largest correlation (views,) of each view's density image with a photo of normalised keypoints (m, 2).
 
     If the photo's focal length is known, the score of a view whose points are much wider or narrower is reduced by 2.
     """
-    photo = pictures_of_photo(points2d[np.isfinite(points2d).all(-1)], rule)
+    photo = pictures_of_photo(points2d[np.isfinite(points2d).all(-1)], settings)
     scores = (views.contrasts @ photo.contrasts.T).max(-1)
-    unlike = np.abs(np.log(views.reaches / photo.reaches)) > np.log(rule.ratio)
+    unlike = np.abs(np.log(views.reaches / photo.reaches)) > np.log(settings.ratio)
     return np.asarray(scores - 2 * (unlike & known_focal), np.float32)
 
 
 def places_first(
-    views: Sequence[View], scores: NDArray[np.float32], count: int, rule: RankSettings = RANK
+    views: Sequence[View], scores: NDArray[np.float32], count: int, settings: RankSettings = RANK
 ) -> Iterator[int]:
     """Yield the indices of the views, best first; views of a place that a better view shows come last."""
     unseen, later = np.ones(count, bool), []
     for k in np.argsort(-scores, kind="stable").tolist():
         points = views[k].points
-        if len(points) and unseen[points].mean() >= rule.apart:
+        if len(points) and unseen[points].mean() >= settings.apart:
             unseen[points] = False
             yield k
         else:

@@ -90,12 +90,12 @@ def refine(batch: Batch, rotation: Float[Tensor, "b s 3 3"], translation: Float[
         translation: Initial translations (b, s, 3).
     """
     samples = zip(problems_of(batch), rotation, translation, strict=True)
-    results = ((problem, _refined(problem, *problem.from_user(_host(r), _host(t)))) for problem, r, t in samples)
+    results = ((problem, _refine(problem, *problem.from_user(_host(r), _host(t)))) for problem, r, t in samples)
     pose = best_poses(results, batch.points3d)
     return replace(pose, stats=replace(pose.stats, converged=pose.rotation.isfinite().all(-1).all(-1)))
 
 
-def _refined(problem: Problem, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> SearchResult:
+def _refine(problem: Problem, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> SearchResult:
     """Return the annealed poses of one problem, the best one first."""
     if degenerate(problem.bearings) or degenerate(problem.points3d):
         return degenerate_points("too few points, or all on one line")

@@ -115,9 +115,7 @@ def _draws(count: int, seed: int) -> NDArray[np.int64]:
 def _check_values(values: NDArray[np.float64]) -> NDArray[np.float64]:
     array = np.asarray(values, np.float64)
     if not len(array) or np.isnan(array).any():
-        raise ValueError(
-            f"a bootstrap needs numbers; there are {len(array)}, {int(np.isnan(array).sum())} of them NaN"
-        )
+        raise ValueError(f"a bootstrap needs numbers; there are {len(array)}, {int(np.isnan(array).sum())} of them NaN")
     return np.clip(array, -FINITE, FINITE)
 
 

@@ -153,7 +153,7 @@ def shorten(names: Sequence[str], width: int) -> list[str]:
     return [cut(name, best) for name in names]
 
 
-def fixed(values: Sequence[float | int]) -> list[str]:
+def format_fixed(values: Sequence[float | int]) -> list[str]:
     """Write numbers of one kind, such as coordinates, without exponents: three decimals, more if all are small.
 
     >>> from bpnp.report.terminal import fixed

@@ -96,7 +96,7 @@ class Residuals(NamedTuple):
     camera: Float[Tensor, "b c k 3"]
 
 
-def normalised(matches: Matches) -> tuple[Matches, Float[Tensor, "b 3"], Float[Tensor, "b 1"]]:
+def normalise_matches(matches: Matches) -> tuple[Matches, Float[Tensor, "b 3"], Float[Tensor, "b 1"]]:
     """Convert matches to float64 with centred scene points of unit variance.
 
     A scene far from its origin then loses no digits in the minimal solver. Points with NaN or infinity are not real.
@@ -121,8 +121,8 @@ def in_scene(
 
     Args:
         poses: (b, c, 3, 4) poses [R | t].
-        centre: (b, 3) of `normalised`.
-        scale: (b, 1) of `normalised`.
+        centre: (b, 3) of `normalise_matches`.
+        scale: (b, 1) of `normalise_matches`.
 
     Returns:
         Rotation and translation.

@@ -12,7 +12,7 @@ from torch import Tensor
 from bpnp.geometry import bearings
 from bpnp.poses import distinct
 from bpnp.precision import full_precision
-from bpnp.robust.matches import Matches, in_scene, normalised, truncated_scores, weighted_draws
+from bpnp.robust.matches import Matches, in_scene, normalise_matches, truncated_scores, weighted_draws
 from bpnp.robust.minimal_solvers import poses_of_triples, take
 from bpnp.search.config import RANSAC
 
@@ -57,7 +57,7 @@ def pose_hypotheses(
     draws = RANSAC.scored + 3 * RANSAC.drawn_each * RANSAC.triples
     drawn = weighted_draws(torch.where(usable.unsqueeze(-1), probability, 1), draws, 0)
     chosen = Matches(take(points2d, drawn // n), take(points3d, drawn % n), usable.unsqueeze(-1).expand_as(drawn))
-    matches, centre, scale = normalised(chosen)
+    matches, centre, scale = normalise_matches(chosen)
     poses = _poses_of_widest(*(points[:, RANSAC.scored :].unflatten(1, (-1, 3)) for points in matches[:2]))
     sample = Matches(*(values[:, : RANSAC.scored] for values in matches))
     size = mask2d.sum(-1, keepdim=True).clamp(min=1)
@@ -107,7 +107,7 @@ def drawn_poses(
     drawn = weighted_draws(assignment.flatten(1), 3 * triples, seed)
     n = assignment.shape[2]
     chosen = Matches(take(points2d, drawn // n), take(points3d, drawn % n), torch.ones_like(drawn, dtype=torch.bool))
-    matches, centre, scale = normalised(chosen)
+    matches, centre, scale = normalise_matches(chosen)
     poses = _poses_of_widest(*(points.unflatten(1, (-1, 3)) for points in matches[:2]), aligned=aligned)
     rotation, translation = in_scene(poses, centre, scale)
     return torch.cat([rotation, translation.unsqueeze(-1)], -1)

@@ -95,9 +95,9 @@ class Solution:
             and t' = t + v. Here w is in radians in the camera axes, and v in the unit of `translation`. It is the
             first-order estimate
 
-                C = max(H^-1, sum_i d_i d_i^T),  H = -d2 log p(image points | pose) / d(w, v)^2 + prior,
+                C = max(H^-1, sum_i D_i D_i^T),  H = -d2 log p(image points | pose) / d(w, v)^2 + prior,
 
-            where max is the larger of the two matrices along each of their common axes, and d_i is the step to the
+            where max is the larger of the two matrices along each of their common axes, and D_i is the step to the
             optimum without image point i, with unknown correspondences (docs/verdict.md). NaN if the verdict is
             "failed" or the points do not fix the pose.
         parameters: Names of the p estimated parameters, in the order of the covariance: "rotation_x", "rotation_y",
@@ -210,13 +210,13 @@ class Solution:
         return self.found
 
     def __repr__(self) -> str:
-        from bpnp.report.terminal import fixed
+        from bpnp.report.terminal import format_fixed
 
         rows = "\n            ".join("  ".join(f"{value: .6f}" for value in row) for row in self.rotation)
         return (
             f"Solution({self.verdict}: {self.reason}\n  rotation: {rows}\n"
-            f"  translation: {'  '.join(fixed(self.translation.tolist()))}\n"
-            f"  centre: {'  '.join(fixed(self.centre.tolist()))}\n"
+            f"  translation: {'  '.join(format_fixed(self.translation.tolist()))}\n"
+            f"  centre: {'  '.join(format_fixed(self.centre.tolist()))}\n"
             f"  matches: {self.inlier_count} of {min(len(self.points2d), len(self.points3d))}, "
             f"mean error {self.reprojection_error:.3g} {self.unit}\n"
             f"  candidates: {len(self.candidates)}, seconds: {self.seconds:.2f})"

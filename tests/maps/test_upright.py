@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from bpnp import SceneMap
 from bpnp.cameras import camera_from
 from bpnp.maps.photos import UP_OF_ORIENTATION, up_from_exif
-from bpnp.maps.upright import quarter_turns, turned_view, up_of_views
+from bpnp.maps.upright import count_quarter_turns, rotate_view, up_of_views
 from bpnp.maps.views import View
 
 TURNED = camera_from(("PINHOLE", HEIGHT, WIDTH, [520.0, 520.0, HEIGHT / 2, WIDTH / 2]))  # of a photo on its side
@@ -68,24 +68,24 @@ def test_a_photo_without_an_orientation_has_no_hint(tmp_path: Path) -> None:
 def test_up_is_what_most_views_agree_on() -> None:
     """One of five views is stored on its side, and is the only one to be turned for an upright photo."""
     scene, _ = street(5)
-    views = [*scene.views[:4], turned_view(scene.views[4], 1)]
+    views = [*scene.views[:4], rotate_view(scene.views[4], 1)]
     up = up_of_views(views)
     assert up is not None
     np.testing.assert_allclose(up, [0, -1, 0], atol=0.2)
-    assert quarter_turns(views, np.array(UP_OF_ORIENTATION[1])).tolist() == [0, 0, 0, 0, 3]
+    assert count_quarter_turns(views, np.array(UP_OF_ORIENTATION[1])).tolist() == [0, 0, 0, 0, 3]
     for orientation, turns in ((6, 3), (3, 2), (8, 1)):
-        found = quarter_turns(views, np.array(UP_OF_ORIENTATION[orientation]))
+        found = count_quarter_turns(views, np.array(UP_OF_ORIENTATION[orientation]))
         assert found.tolist() == [turns] * 4 + [(turns + 3) % 4]
-        seen = turned_view(views[0], turns).rotation @ up
+        seen = rotate_view(views[0], turns).rotation @ up
         assert seen @ UP_OF_ORIENTATION[orientation] > 0.9
-    np.testing.assert_allclose(turned_view(views[0], 1).centre, views[0].centre, atol=1e-12)
+    np.testing.assert_allclose(rotate_view(views[0], 1).centre, views[0].centre, atol=1e-12)
 
 
 def test_views_without_a_common_up_direction_are_not_rotated() -> None:
     scene, _ = street(4)
-    views = [turned_view(view, k) for k, view in enumerate(scene.views)]
+    views = [rotate_view(view, k) for k, view in enumerate(scene.views)]
     assert up_of_views(views) is None
-    assert not quarter_turns(views, np.array([1.0, 0, 0])).any()
+    assert not count_quarter_turns(views, np.array([1.0, 0, 0])).any()
 
 
 def test_a_photo_on_its_side_is_found_with_its_orientation() -> None:

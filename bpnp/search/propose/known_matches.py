@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.poses import SAME, distinct, seen_from
+from bpnp.poses import SAME, distinct, polar_coordinates
 from bpnp.search.config import MATCHES
 from bpnp.search.correspondences import score_pose
 from bpnp.search.hypotheses import Hypotheses
@@ -166,5 +166,5 @@ def _scored(problem: Problem, i: Labels, j: Labels, rotation: Array, translation
     found = [score_pose(problem, *each) for each in zip(rotation, translation, scale, strict=True)]
     score, count = (np.array([one[k] for one in found]) for k in (0, 1))
     hypotheses = Hypotheses.from_poses(rotation, translation, log_likelihood=score, match_count=count, scale=scale)
-    seen, order = seen_from(rotation @ problem.middle + translation), -np.arange(float(len(score)))
+    seen, order = polar_coordinates(rotation @ problem.middle + translation), -np.arange(float(len(score)))
     return hypotheses[distinct(rotation, seen, order, len(score), *SAME.times(MATCHES.converged))]

@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.poses import distinct, seen_from
+from bpnp.poses import distinct, polar_coordinates
 from bpnp.runtime import NEVER, Clock, Deadline, one_blas_thread
 from bpnp.search.config import DEFAULT, ENUMERATION, RIG, SearchSettings
 from bpnp.search.enumeration.points import predicted_pose
@@ -209,7 +209,7 @@ class RigPoses:
         for k, problem in enumerate(self.rig.problems):
             turns, shifts = self.rig.pose_of(k, poses.rotation, poses.translation)
             seen.append(turns @ problem.middle + shifts)
-        return distinct(poses.rotation, seen_from(np.stack(seen, 1)), score, count, *self.rule.same)
+        return distinct(poses.rotation, polar_coordinates(np.stack(seen, 1)), score, count, *self.rule.same)
 
     def _local_searches(self) -> int:
         """Return the number of local searches around the best pose that found no better one."""

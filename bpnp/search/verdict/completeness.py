@@ -12,29 +12,29 @@ def log10_missed(
 
     The better optimum may lie near the best pose or far from it. The evidence of the matches lowers both probabilities:
 
-        P = 10^(-3 e) (max(2^-h, q) F G^(l - 1) + q 2^-h)
+        P = 10^(-3 e) (max(2^-k, q) mu1 mu2^(L - 1) + q 2^-k)
 
-    - Basin count h. Let a better optimum attract initial poses at least as often as the best pose. If h independent
-      ones ended at one of the two, all ended at the best pose with a probability of at most 2^-h.
+    - Basin count k. Let a better optimum attract initial poses at least as often as the best pose. If k independent
+      ones ended at one of the two, all ended at the best pose with a probability of at most 2^-k.
     - Near. Initial poses that share a wide optimum end at the same narrow one inside it. However many they are, a
-      better one lies near it with the probability q. The first of l local searches around the best pose misses it with
-      the probability F. Each further one misses it with G, since local searches miss the same optima. With l = 0,
-      F G^(l - 1) is replaced by 1.
+      better one lies near it with the probability q. The first of L local searches around the best pose misses it with
+      the probability mu1. Each further one misses it with mu2, which is larger, since local searches miss the same
+      optima. With L = 0, mu1 mu2^(L - 1) is replaced by 1.
     - Far. This needs a repetition or a symmetry of the scene, which has the probability q.
     - Matches. A pose with a better one elsewhere explains part of the points by coincidence: it aligns a part of the
       scene or slides along a surface. Each of its matches then has little evidence. A match with e decades of evidence
       is a coincidence with a probability of 10^-e. Matches are dependent; but three fix a pose, and at least three
       others must be independent coincidences: 10^-3e.
 
-    The term 2^-h is the posterior of unseen optima of Boender and Rinnooy Kan for two optima.
+    The term 2^-k is the posterior of unseen optima of Boender and Rinnooy Kan for two optima.
     Source: C. G. E. Boender, A. H. G. Rinnooy Kan, Bayesian stopping rules for multistart global optimization methods,
     Math. Programming 1987.
 
     Args:
-        basin_count: Number h of independent initial poses that ended at the best pose or at one that is not different.
+        basin_count: Number k of independent initial poses that ended at the best pose or at one that is not different.
         decades_a_match: Evidence e of a match; 0 if matches do not confirm each other, as in repeated structures.
-        local_searches: Number l of local searches around the best pose that found no better one.
-        rule: Constants; F is `rule.look_fails`, G is `rule.again_fails`, q is `rule.another`.
+        local_searches: Number L of local searches around the best pose that found no better one.
+        rule: Constants; mu1 is `rule.look_fails`, mu2 is `rule.again_fails`, q is `rule.another`.
         symmetric: Use `rule.uncompared` as q of a far optimum, since the scene's motions were tried.
 
     >>> rule = Evidence()
