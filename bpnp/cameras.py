@@ -237,7 +237,10 @@ def check_normalised(points2d: Any, remedy: str) -> None:
 
     Args:
         points2d: Image points (m, 2), array or tensor, finite.
-        remedy: What the message proposes.
+        remedy: Proposal of the message, after "try".
+
+    Raises:
+        ValueError: The points are pixels.
     """
     points = np.asarray(points2d)
     if np.median(np.linalg.norm(points, axis=-1)) > WIDEST:

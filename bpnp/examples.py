@@ -79,7 +79,7 @@ class Example:
 
 
 def load(kind: Kind | str, *, seed: int = 0) -> Example:
-    """Return an example problem.
+    """Return an example problem with its true pose.
 
     - "mesh": 200 points on a shape, all of them visible, seen from any side.
     - "photo": keypoints of a photo and points of a map; a third of them have no correspondence.
@@ -87,8 +87,11 @@ def load(kind: Kind | str, *, seed: int = 0) -> Example:
     - "stars": 42 of 500 catalogue directions and 18 false stars. `points3d` are unit vectors, for `at_infinity=True`.
 
     Args:
-        kind: Kind of problem.
-        seed: Random seed; the same seed gives the same problem.
+        kind: Kind of problem: "mesh", "photo", "leds" or "stars".
+        seed: Random seed, default 0; the same seed gives the same problem.
+
+    Returns:
+        The problem.
 
     Raises:
         ValueError: The kind is unknown.
@@ -155,12 +158,12 @@ def _pixels(points: Any, rotation: Any, translation: Any) -> Any:
 def draw_photos(folder: Path | str, *, count: int = 14, seed: int = 0) -> dict[str, tuple[Array, Array]]:
     """Draw photos of a house and some boxes, taken on an arc around them, for COLMAP to build a map from.
 
-    The photos are 00.png, 01.png, ..., taken by `PHOTO_CAMERA`.
+    The photos 00.png, 01.png, ... have 640 x 480 pixels; their camera is `bpnp.examples.PHOTO_CAMERA`.
 
     Args:
-        folder: Folder for the photos, created if needed.
-        count: Number of photos.
-        seed: Random seed.
+        folder: Folder for the photos, created if needed; photos of these names are replaced.
+        count: Number of photos, default 14.
+        seed: Random seed, default 0.
 
     Returns:
         True pose of each photo by its file name: R (3, 3) and t (3,), camera = R p + t, metres.
@@ -185,13 +188,13 @@ def draw_photos(folder: Path | str, *, count: int = 14, seed: int = 0) -> dict[s
 def draw_map(folder: Path | str, *, seed: int = 0) -> dict[str, tuple[Array, Array]]:
     """Draw a COLMAP model of two equal houses in which one image has a wrong pose.
 
-    Eleven images show a house and its copy `HOUSES_APART` metres to the right. `WRONG_IMAGE` shows the second house but
-    has the pose and the points of the first one, as structure from motion may assign where buildings repeat. The
-    surroundings of the houses differ.
+    Eleven images show a house and its copy 40 metres to the right. The image 07.jpg shows the second house but has the
+    pose and the points of the first one, an error of structure from motion that equal buildings cause. The surroundings
+    of the houses differ.
 
     Args:
-        folder: New folder for cameras, images and points3D, .bin.
-        seed: Random seed.
+        folder: New or empty folder for cameras, images and points3D, .bin.
+        seed: Random seed, default 0.
 
     Returns:
         True pose of each image by its name: R (3, 3) and t (3,), camera = R p + t, metres.

@@ -62,7 +62,7 @@ class SolveStats(Tensors):
 
     Attributes:
         iterations: Iterations used (b,).
-        residual: What the solver compares with its tolerance (b,).
+        residual: Value that the solver compares with its tolerance (b,); its unit depends on the solver.
         converged: True where the tolerance was met (b,).
     """
 
@@ -207,12 +207,15 @@ class Batch(Tensors):
         Args:
             points2d: Normalised image coordinates (m, 2).
             points3d: Scene points (n, 3).
-            rotation: True rotation (3, 3).
-            translation: True translation (3,), scene units.
-            match3d: Index of the 2D point of each 3D point (n,), -1 for none.
-            focal: Focal length in pixels (), one for each problem or one for all. Default: 1.
-            index: Position of each problem in its data set. Default: 0, 1, 2, ...
-            ids: Name of each problem. Default: "0", "1", ...
+            rotation: True rotation (3, 3). None if it is unknown.
+            translation: True translation (3,), scene units. None if it is unknown.
+            match3d: Index of the 2D point of each 3D point (n,), -1 for none. None if the matches are unknown.
+            focal: Focal length in pixels, one for each problem or one for all. Default: None, 1.
+            index: Position of each problem in its data set. Default: None, 0, 1, 2, ...
+            ids: Name of each problem. Default: None, its index as text.
+
+        Returns:
+            The batch of b problems.
 
         Raises:
             ValueError: An array has a wrong shape, holds NaN or infinity, or has no points; the points are pixels; the

@@ -2,9 +2,12 @@
 
 import doctest
 import importlib
+import inspect
 import pydoc
 import re
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -26,11 +29,32 @@ def is_pasted(example: doctest.DocTest, public: set[str]) -> bool:
     return not name.startswith(INTERNAL) or any(name == each or name.startswith(f"{each}.") for each in public)
 
 
-def public_names() -> set[str]:
-    """Return the names in docs/api.md as "module.name", where they are defined."""
+def public_objects() -> list[Any]:
     objects = [pydoc.locate(name) for name in REFERENCE]
     assert None not in objects
-    return {f"{each.__module__}.{each.__qualname__}" for each in objects}  # type: ignore[union-attr]
+    return objects
+
+
+def public_names() -> set[str]:
+    """Return the names in docs/api.md as "module.name", where they are defined."""
+    return {f"{each.__module__}.{each.__qualname__}" for each in public_objects()}
+
+
+def public_callables() -> Iterator[tuple[str, Any, str]]:
+    """Yield the name, the callable and the docstring of each public function, constructor and method.
+
+    Constructors and methods that a base class of another package describes are left out, except `forward`.
+    """
+    for each in public_objects():
+        foreign = [base for base in getattr(each, "__mro__", ()) if not base.__module__.startswith("bpnp.")]
+        if not inspect.isclass(each) or all(each.__init__ is not base.__init__ for base in foreign):
+            yield each.__qualname__, each, inspect.getdoc(each) or ""
+        if not inspect.isclass(each):
+            continue
+        for name, member in inspect.getmembers(each, lambda one: inspect.isfunction(one) or inspect.ismethod(one)):
+            inherited = name != "forward" and any(hasattr(base, name) for base in foreign)
+            if not name.startswith("_") and not inherited:
+                yield f"{each.__qualname__}.{name}", member, inspect.getdoc(member) or ""
 
 
 @pytest.mark.parametrize("name", MODULES)
@@ -48,3 +72,17 @@ def test_examples_are_right(name: str) -> None:
 def test_the_reference_has_names_of_the_internals() -> None:
     """Otherwise no example of `solve` would run in an empty namespace."""
     assert {"bpnp.search.api.solve", "bpnp.search.verify.verify"} <= public_names()
+
+
+def test_every_argument_of_a_public_name_is_described() -> None:
+    """In a section `Args:`, among the attributes of a class, or by a reference to a method with the same arguments."""
+    missing = []
+    for name, function, text in public_callables():
+        if "arguments as for `" in text.lower():
+            continue
+        parameters = [
+            each for each in inspect.signature(function).parameters.values() if each.name not in ("self", "cls", "_")
+        ]
+        missing += [f"{name}: no docstring"] if not text else []
+        missing += [f"{name}: {each.name}" for each in parameters if not re.search(rf"^ +\**{each.name}: ", text, re.M)]
+    assert missing == []

@@ -32,10 +32,13 @@ class Outliers:
         ratio: Ratio of synthetic outliers to matches, rho: int(rho * matches) points are added, uniform in the
             axis-aligned bounding box of the matched points of that side; 1 makes half of the points outliers. Two
             numbers, [low, high], draw it uniformly for each problem.
-        side: Side that gets the outliers, both, 2d or 3d, or random for one of the three in each problem.
+        side: Side that gets the outliers: "both", "2d" or "3d", or "random" for one of the three in each problem.
         occlusion: Fraction of the matches that lose one of their two points, so that the other has no correspondence; a
             number or [low, high], as ratio. At least 4 matches are left.
-        occluded_side: Side of the lost points, 2d, 3d, both for half of the matches on each side, or random.
+        occluded_side: Side of the lost points: "2d", "3d", "both" for half of the matches on each side, or "random".
+
+    Raises:
+        ValueError: An option is out of range.
     """
 
     ratio: NumberOrRange = 0.0

@@ -28,7 +28,7 @@ class ProblemDataset(Dataset[Batch]):
 
     Args:
         source: Source of the problems.
-        augmentation: Augmentation of the problems. Default: none.
+        augmentation: Augmentation of the problems. Default: None, without.
         seed: A problem is a function of (seed, index).
         fresh: Make a problem a function of the epoch too.
     """

@@ -24,13 +24,13 @@ class Problem:
     Attributes:
         name: Name.
         points2d: Normalised image coordinates (m, 2).
-        points3d: Scene points (n, 3).
+        points3d: Scene points (n, 3), scene units.
         matched: Number of matches.
-        rotation: R (3, 3).
-        translation: t (3,).
+        rotation: True R (3, 3), camera = R p + t.
+        translation: True t (3,), scene units.
         focal: Pixels per unit of normalised coordinates.
         origin: Vector that was subtracted from the scene's coordinates (3,), for coordinates so large that float32
-            would lose digits. Default: none.
+            would lose digits. Default: None, nothing was subtracted.
     """
 
     name: str
@@ -59,12 +59,15 @@ class Problem:
         Args:
             name: Name.
             points2d: Normalised image coordinates (m, 2).
-            points3d: Scene points (n, 3).
-            rotation: R (3, 3).
-            translation: t (3,).
+            points3d: Scene points (n, 3), scene units.
+            rotation: True R (3, 3), camera = R p + t.
+            translation: True t (3,), scene units.
             match3d: Index of the 2D point of each 3D point (n,), -1 for none.
             focal: Pixels per unit of normalised coordinates.
-            origin: Vector that was subtracted from the scene's coordinates (3,). Default: none.
+            origin: Vector that was subtracted from the scene's coordinates (3,). Default: None, nothing was subtracted.
+
+        Returns:
+            The problem, with the matched points first on both sides.
 
         Raises:
             ValueError: Shapes do not fit, a value is NaN or infinite, or `match3d` holds no integers, an index that is

@@ -33,8 +33,8 @@ def write_problems(
 
     Args:
         folder: New folder.
-        problems: Pairs (scene, problem).
-        parameters: JSON content for the manifest.
+        problems: Pairs (scene, problem); a split keeps the problems of a scene together.
+        parameters: JSON content for the manifest. None for no additional content.
 
     Raises:
         StoreError: The folder exists.

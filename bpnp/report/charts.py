@@ -74,8 +74,9 @@ def recall_chart(runs: Mapping[str, Results], error: Error, *, paper: Paper | No
 
     Args:
         runs: Results by name.
-        error: Kind of error.
-        paper: Table of the paper whose quartiles are drawn as rings. Default: none.
+        error: Kind of error: "rotation_deg", "translation", "joint" or "reprojection_deg".
+        paper: Table of the paper whose quartiles are drawn as rings, "modelnet40" or "megadepth". Default: None, no
+            rings.
 
     Returns:
         The figure, or None if no problem has an error above zero.

@@ -40,7 +40,11 @@ def recall_curve(runs: Sequence[Path | str] | Mapping[str, Results], *, paper: P
 
     Args:
         runs: Results folders, or results by name.
-        paper: Table of the paper whose quartiles are drawn as rings. Default: none.
+        paper: Table of the paper whose quartiles are drawn as rings, "modelnet40" or "megadepth". Default: None, no
+            rings.
+
+    Returns:
+        The figure.
 
     Raises:
         ValueError: A folder cannot be read.
@@ -108,6 +112,9 @@ def plot_problem(problem: ProblemPoints, *, estimate: str | None = None, lines: 
         problem: Problem.
         estimate: As in `plot_image`.
         lines: As in `plot_image`.
+
+    Returns:
+        The figure.
 
     Raises:
         ValueError: The estimate is unknown.
@@ -191,7 +198,7 @@ def plot_image(
     """Draw rings around image points, crosses at projected 3D points, and lines between matches.
 
     Points whose normals face away from the camera are small dots. The indices of 3D points are drawn if there are at
-    most `NUMBERED`.
+    most 40.
 
     Args:
         axes: Matplotlib axes.
@@ -291,7 +298,7 @@ def plot_matches(
         problem: Problem with an estimate.
         colour: Colour of the id.
         photo: As in `plot_image`.
-        competing: The problem with another estimate, drawn next to it. Default: none.
+        competing: The problem with another estimate, drawn next to it. Default: None, without.
     """
     from matplotlib.figure import Figure
 

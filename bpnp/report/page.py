@@ -76,12 +76,15 @@ class TableRow(NamedTuple):
 
 
 def write_page(paths: Sequence[Path | str], output: Path | str, *, paper: Paper | None = None) -> Path:
-    """Write the page of one or several results folders atomically, and return its path.
+    """Write the page of one or several results folders atomically.
 
     Args:
         paths: Results folders.
-        output: File.
-        paper: Data set whose published rows are added. Default: none.
+        output: HTML file; an existing one is replaced.
+        paper: Data set whose published rows are added, "modelnet40" or "megadepth". Default: None, no rows.
+
+    Returns:
+        Path of the file.
 
     Raises:
         ValueError: A folder or its points cannot be read.

@@ -76,7 +76,7 @@ def utf8(name: str) -> str:
 def points_from(
     prediction: Prediction, batch: Batch, errors: Mapping[str, PoseErrors] | None = None
 ) -> list[ProblemPoints]:
-    """Return the points of each problem, at most `MOST` on each side, evenly spaced, matched ones first.
+    """Return the points of each problem, at most 100 on each side, evenly spaced, matched ones first.
 
     Args:
         prediction: Prediction for the batch.
@@ -166,10 +166,13 @@ def write_points(folder: Path | str, problems: Iterable[ProblemPoints]) -> None:
 
 
 def read_points(folder: Path | str) -> tuple[ProblemPoints, ...]:
-    """Read the file of `write_points`; the result is empty if the folder has none.
+    """Read the file of `write_points`.
 
     Args:
         folder: Results folder.
+
+    Returns:
+        The points of each problem; empty if the folder has no such file.
 
     Raises:
         ValueError: The file cannot be read.

@@ -51,8 +51,8 @@ class ProblemRow:
         m: Number of 2D points.
         n: Number of 3D points.
         matches: Number of 3D points with a true match.
-        iterations: Iterations of the solver.
-        residual: Residual of the solver.
+        iterations: Number of iterations of the solver, see `SolveStats`.
+        residual: Residual of the solver, see `SolveStats`.
         converged: True if the solver converged.
         found: True if there is a pose.
         seconds: Time until the estimates of the problem's batch were found, divided by the number of its problems.
@@ -80,10 +80,10 @@ class ProblemRow:
         """Outcome, the first of `CAUSES` that holds.
 
         - "no pose": the solver returned none;
-        - "solved": rotation error up to `SOLVED_DEG` degrees, whether the solver converged or not;
+        - "solved": rotation error up to 5 degrees, whether the solver converged or not;
         - "wrong, not converged": the solver did not converge;
-        - "wrong, but fits the image": `PLAUSIBLE_INLIERS` of the 2D points are inliers: another minimum, or a symmetric
-          scene, whose image does not differ from that of the true pose;
+        - "wrong, but fits the image": at least half of the 2D points are inliers (`count_inliers`): another minimum, or
+          a symmetric scene, whose image does not differ from that of the true pose;
         - "wrong": none of these.
         """
         if not self.found:
@@ -243,7 +243,7 @@ def write_results(
     correspondence_loss: float | None = None,
     settings: Mapping[str, Any] | None = None,
 ) -> Results:
-    """Write `problems.csv` and `summary.json` atomically, and return the results.
+    """Write `problems.csv` and `summary.json` atomically.
 
     A problem that several processes tested is written once, its first row. Rows are sorted by index, so that the files
     do not depend on the order of batches or processes.
@@ -251,8 +251,12 @@ def write_results(
     Args:
         folder: Results folder.
         rows: Rows.
-        correspondence_loss: Mean of L_c, if known.
-        settings: Settings to record (the command, the configuration); values that JSON cannot hold become text.
+        correspondence_loss: Mean of L_c; None if it is unknown.
+        settings: Settings to record (the command, the configuration); values that JSON cannot hold become text. None
+            for no settings.
+
+    Returns:
+        The results.
 
     Raises:
         ValueError: There is no row, an estimate is missing for a problem, or one index has two ids, as when two data
@@ -283,6 +287,9 @@ def read_results(folder: Path | str) -> Results:
 
     Args:
         folder: Results folder.
+
+    Returns:
+        The results.
 
     Raises:
         ValueError: A file is missing, of another format, incomplete, or has a value that is no number. The message

@@ -89,8 +89,11 @@ def draw_solution(solution: Solution, *, title: str | None = None, photo: Any = 
 
     Args:
         solution: Solution to draw.
-        title: First line of the caption.
-        photo: (h, w, 3) uint8, to draw under the points.
+        title: First line of the caption; None for a caption without title.
+        photo: (h, w, 3) uint8, to draw under the points; None for a white background.
+
+    Returns:
+        The figure.
     """
     points, colour = solution_points(solution, title=title), VERDICTS[solution.verdict]
     return plot_matches(points, colour=colour, photo=photo, competing=competing_points(solution, points))

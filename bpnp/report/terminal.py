@@ -69,7 +69,7 @@ def count_items(what: str, total: int, *, quiet: bool = False) -> Iterator[Calla
     """Show how many items are done, on stderr: a bar on a terminal, elsewhere, such as in a pipe, a line each.
 
     Args:
-        what: What is being done.
+        what: Name of the work, such as "localizing".
         total: Number of items.
         quiet: Show nothing.
 

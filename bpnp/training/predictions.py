@@ -96,7 +96,11 @@ class PredictionWriter(BasePredictionWriter):
         self.rows: list[PoseRow] = []
 
     def path(self, trainer: Trainer) -> Path:
-        """Return the path of the file."""
+        """Return the path of the file.
+
+        Args:
+            trainer: Trainer of the prediction, whose default_root_dir is the default folder.
+        """
         return Path(self.folder or trainer.default_root_dir) / f"predictions.{self.format}"
 
     def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:

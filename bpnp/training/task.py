@@ -51,7 +51,7 @@ MOST_SKIPPED = 20  # consecutive steps without a finite gradient that end the ru
 
 
 class TrainingDivergedError(RuntimeError):
-    """Error after `MOST_SKIPPED` consecutive optimiser steps without a finite loss and gradient."""
+    """Error after 20 consecutive optimiser steps without a finite loss and gradient."""
 
 
 class BlindPnPTask(LightningModule):
@@ -215,7 +215,11 @@ class BlindPnPTask(LightningModule):
         return task
 
     def forward(self, batch: Batch) -> Prediction:
-        """Return the prediction of the solver."""
+        """Return the prediction of the solver.
+
+        Args:
+            batch: Problems.
+        """
         return self.solver(batch)
 
     def on_train_batch_start(self, batch: object, batch_idx: int) -> None:
@@ -290,7 +294,11 @@ class BlindPnPTask(LightningModule):
         return replace(losses, pose=values, posed=pose.stats.converged, pose_weight=self.pose_weight)
 
     def check_pose_loss(self, estimates: tuple[str, ...]) -> None:
-        """Raise ValueError if the pose of the pose loss is not among the estimates of the solver."""
+        """Raise ValueError if the pose of the pose loss, "pnp", is not among the estimates of the solver.
+
+        Args:
+            estimates: Names of the poses of the solver.
+        """
         if POSED not in estimates:
             raise ValueError(
                 f"The pose loss needs the pose {POSED!r}, and {type(self.solver).__name__} returns "
@@ -322,7 +330,7 @@ class BlindPnPTask(LightningModule):
         No optimiser of torch changes a parameter without a gradient, or its state.
 
         Raises:
-            TrainingDivergedError: `MOST_SKIPPED` consecutive steps had no finite gradient.
+            TrainingDivergedError: 20 consecutive steps had no finite gradient.
         """
         norm = torch.nn.utils.get_total_norm([p.grad for p in self.parameters() if p.grad is not None])
         self._log_train(gradient_norm=norm)

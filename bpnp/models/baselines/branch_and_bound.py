@@ -89,7 +89,7 @@ class BranchAndBound(SingleSolver):
         self.max_boxes = math.inf if max_boxes is None else max_boxes
 
     def solve(self, problem: SingleProblem, deadline: Deadline) -> Answer:
-        """Normalise the scene, search, and return the pose in scene coordinates; see `SingleSolver.solve`."""
+        """Normalise the scene, search, and return the pose in scene axes; arguments as for `SingleSolver.solve`."""
         scene_centre = problem.points3d.mean(0)
         radius = root_mean_square((problem.points3d - scene_centre).norm(dim=-1))
         points = (problem.points3d - scene_centre) / radius
@@ -246,7 +246,7 @@ class GOPAC(BranchAndBound):
         centre c. For each box there are two inner searches over R. The first, at the centre of the box, looks for a
         better pose, which is refined. The second, with every angle widened by the uncertainty psi_t(p_j), decides
         whether the box can hold one. Boxes under SMALLEST_CENTRE are not split, so their bound may stay above the
-        count.
+        count. Arguments as for `BranchAndBound.search`.
         """
         del camera_distance
         best: tuple[Tensor | None, Tensor, int] = (None, domain.centre[0], 0)

@@ -97,7 +97,7 @@ class GOSMA(BranchAndBound):
     def search(
         self, rays: Tensor, points: Tensor, domain: Boxes, camera_distance: float, deadline: Deadline
     ) -> BestPose:
-        """Align the mixtures of the scene and of the image; see `BranchAndBound.search`."""
+        """Align the mixtures of the scene and of the image; arguments as for `BranchAndBound.search`."""
         angle = root_mean_square(torch.acos((rays @ normalize(rays.sum(0), dim=0)).clamp(-1, 1)))
         scene, image = scene_mixture(points, self.cluster3d), ray_mixture(rays, self.cluster2d * angle)
         return self.align(scene, image, domain, closest=CLOSEST * camera_distance, deadline=deadline)
@@ -117,6 +117,14 @@ class GOSMA(BranchAndBound):
         The `batch` boxes of lowest bound are split together, in rotation or in translation, whichever is less certain.
         Adam descends from their best centres, and L-BFGS refines a better pose. Value and bound are fractions of the
         image mixture's squared norm.
+
+        Args:
+            scene: Mixture of the scene points.
+            rays: Mixture of the bearings.
+            domain: One box that holds all poses to search.
+            gap: Distance from the optimum that is allowed, as a fraction of the squared norm. Default 0.1.
+            closest: Smallest distance of a camera centre from the origin. Default 0.
+            deadline: Time at which to return the best pose so far. Default: none.
         """
         norm = float(squared_norm(rays))
         best = (math.inf, domain.rotation[0], domain.centre[0])
