@@ -111,7 +111,7 @@ def _localize_in(
         options: Options of each search, with the deadline of all of them.
         tried: Names of the views that were tried; those of this call are added.
     """
-    places = scene.places(views, photo.keypoints, photo.camera)
+    places = scene.places(views, photo.keypoints, photo.camera, photo.rank_views)
     if not places:
         raise ValueError("no view of the map sees 4 or more points, which a pose needs")
     photo = replace(photo, view_count=len({place.view.name for place in places}))
@@ -221,7 +221,8 @@ def find_competitor(
         earlier: Significant poses that were found with the points of other views.
     """
     compared = scene.region(place.view, None if views is None else place.points)
-    regions = scene.ranked_regions(views, camera_from(solution.camera), explained_keypoints(photo, solution))
+    explained = explained_keypoints(photo, solution)
+    regions = scene.ranked_regions(views, camera_from(solution.camera), explained, photo.rank_views)
     return best_competitor(photo, compared, solution, earlier, regions)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.cameras import Camera, camera_from
-from bpnp.maps.viewed_points import Region
+from bpnp.maps.viewed_points import RankViews, Region
 from bpnp.maps.views import Array
 from bpnp.search.focal_length import UnknownCamera
 from bpnp.search.inputs import problem_from
@@ -26,6 +26,7 @@ class Photo:
         prior: Prior of the pose; None for none.
         view_count: Number of views that are tried, which the NFA counts as tests. Default 1.
         seed: Seed of the search, default 0.
+        rank_views: Function that scores the views, as for `SceneMap.localize`; None for the density of the points.
     """
 
     keypoints: Array
@@ -33,6 +34,7 @@ class Photo:
     prior: Any = None
     view_count: int = 1
     seed: int = 0
+    rank_views: RankViews | None = None
 
     def problem(self, region: Region, camera: Any, prior: Any = None, focal: UnknownFocal | None = None) -> Problem:
         """Return the problem of the keypoints and the points of one region.

@@ -21,7 +21,7 @@ from bpnp.maps.localize import among_all, localize, strongest_of
 from bpnp.maps.photo_problem import Photo
 from bpnp.maps.photos import focal_from_exif, photo_keypoints, photo_size, up_from_exif
 from bpnp.maps.verify_view import verify_pose
-from bpnp.maps.viewed_points import ViewedPoints
+from bpnp.maps.viewed_points import RankViews, ViewedPoints
 from bpnp.maps.views import Array, View
 from bpnp.search.arguments import (
     PriorLike,
@@ -118,6 +118,7 @@ class SceneMap(ViewedPoints):
         focal_error: float | int | None = None,
         distortion: bool = False,
         views: Iterable[str] | None = None,
+        rank_views: RankViews | None = None,
         scores: ArrayLike | None = None,
         prior: PriorLike | None = None,
         up_camera: ArrayLike | None = None,
@@ -148,6 +149,10 @@ class SceneMap(ViewedPoints):
             views: Names of views that may show the same place, best first, from any image retrieval. The search near
                 each uses the points that any of them sees. None to try all views of the map, each with its own points,
                 in the order in which their point density resembles that of the keypoints.
+            rank_views: Function `(points2d, views) -> scores` that ranks the views instead, such as an image retrieval:
+                `points2d` (m, 2) are the keypoints in normalised image coordinates, `views` the views of the map, and
+                `scores` one number per view, the largest for the view to try first. It is called again with the
+                keypoints that a confident pose explains, for the competing poses. No effect with `views`.
             scores: (m,) strengths of the keypoints; the strongest 2,048 are used. None to use all keypoints.
             prior: Prior of the photo's pose, as for `bpnp.solve`; None to use the pose of the view that is tried.
             up_camera: (3,) direction up in the camera frame of the photo, of any length, such as from the EXIF
@@ -176,7 +181,7 @@ class SceneMap(ViewedPoints):
             check_inside(pixels, image_size)
         strongest = None if scores is None else strongest_of(scores, np.shape(pixels)[:1])
         used = np.asarray(pixels if strongest is None else np.asarray(pixels)[strongest], np.float64)
-        photo = Photo(used, lens, checked_prior(prior), seed=checked_seed(seed))
+        photo = Photo(used, lens, checked_prior(prior), seed=checked_seed(seed), rank_views=rank_views)
         options = Options(source_from(solver), solver == "auto", seed=photo.seed)
         maps = [self]
         if up_camera is not None and prior is None:

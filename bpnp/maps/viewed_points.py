@@ -1,6 +1,6 @@
 """Points and views of a map: their parts, the order in which views are tried, and the points in view of a pose."""
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple, TypeVar
@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.argument_types import ArrayLike
 from bpnp.cameras import Camera
 from bpnp.maps.upright import count_quarter_turns, rotate_view
 from bpnp.maps.views import (
@@ -27,6 +28,7 @@ from bpnp.search.problem import faces
 from bpnp.search.starts import PosePrior
 
 Map = TypeVar("Map", bound="ViewedPoints")
+RankViews = Callable[[Array, Sequence[View]], ArrayLike]  # normalised keypoints (m, 2), views -> scores (views,)
 
 
 class Place(NamedTuple):
@@ -155,7 +157,13 @@ class ViewedPoints:
         views = tuple(replace(view, points=index[view.points[enough[view.points]]]) for view in self.views)
         return type(self)(self.points3d[enough], self.point_ids[enough], tracks[enough], views)
 
-    def places(self, views: Iterable[str] | None, keypoints: Array, camera: Camera | UnknownCamera) -> list[Place]:
+    def places(
+        self,
+        views: Iterable[str] | None,
+        keypoints: Array,
+        camera: Camera | UnknownCamera,
+        rank_views: RankViews | None = None,
+    ) -> list[Place]:
         """Return the views to search near for a photo's keypoints, in this order.
 
         With `views` these are the given views in their order. Each gets the points that any of them sees, since they
@@ -168,6 +176,7 @@ class ViewedPoints:
             views: Names of views, best first; None for all views of the map.
             keypoints: (m, 2) pixels.
             camera: Camera model, or its prior if the focal length is unknown.
+            rank_views: Function that scores the views, as for `SceneMap.localize`.
 
         Raises:
             ValueError: A name is unknown, or `views` is empty.
@@ -179,7 +188,7 @@ class ViewedPoints:
             points = np.unique(np.concatenate([view.points for view in named]))
             return [Place(view, points, camera) for view in named if len(view.points) and len(points) >= MIN_POINTS]
         cameras: list[Camera] = camera.focal_steps(FOCAL.step_few) if isinstance(camera, UnknownCamera) else [camera]
-        scores = self.scores(cameras[0], keypoints, known_focal=isinstance(camera, Camera))
+        scores = self.scores(cameras[0], keypoints, known_focal=isinstance(camera, Camera), rank_views=rank_views)
         order = list(places_first(self.views, scores, len(self.points3d)))
         ahead = MAPS.views_ahead
         queue = [(rank + ahead * step, step, k) for step in range(len(cameras)) for rank, k in enumerate(order)]
@@ -190,16 +199,31 @@ class ViewedPoints:
             if len((view := self.views[k]).points) >= MIN_POINTS
         ]
 
-    def scores(self, camera: Camera, keypoints: Array, *, known_focal: bool = True) -> NDArray[np.float32]:
-        """Return the scores (v,) of the views for a photo: how well their point density resembles its keypoints.
+    def scores(
+        self, camera: Camera, keypoints: Array, *, known_focal: bool = True, rank_views: RankViews | None = None
+    ) -> NDArray[np.float32]:
+        """Return the scores (views,) of the views for a photo's keypoints.
 
         Args:
-            camera: Camera of the photo.
+            camera: Camera model of the photo.
             keypoints: (m, 2) pixels.
             known_focal: False if the focal length of the camera is a guess. Default True.
+            rank_views: Function that scores the views; None for the correlation of the densities of the points
+                (`scores_of_views`).
+
+        Raises:
+            ValueError: `rank_views` does not return one number per view.
         """
         points2d = camera.normalise(np.asarray(keypoints, np.float64))
-        return scores_of_views(points2d, self.pictures, known_focal=known_focal)
+        if rank_views is None:
+            return scores_of_views(points2d, self.pictures, known_focal=known_focal)
+        scores = np.asarray(rank_views(points2d, self.views), np.float32)
+        if scores.shape != (len(self.views),) or np.isnan(scores).any():
+            what = "NaN" if scores.shape == (len(self.views),) else f"an array of shape {scores.shape}"
+            raise ValueError(
+                f"`rank_views` returned {what}; one score for each of the {len(self.views)} views is needed"
+            )
+        return scores
 
     def region(self, view: View, points: NDArray[np.integer] | None = None) -> Region:
         """Return some points of the map, with the view to search near.
@@ -213,7 +237,9 @@ class ViewedPoints:
         whole = Region(view, self.points3d, self.point_ids, self.cones, distance)
         return whole if points is None else whole.part(points)
 
-    def ranked_regions(self, views: Iterable[str] | None, camera: Camera, keypoints: Array) -> Iterator[Region]:
+    def ranked_regions(
+        self, views: Iterable[str] | None, camera: Camera, keypoints: Array, rank_views: RankViews | None = None
+    ) -> Iterator[Region]:
         """Yield the points seen by the given views, or by all views ranked for the keypoints of a known camera.
 
         Several views may show the same place.
@@ -226,7 +252,8 @@ class ViewedPoints:
         if views is not None:
             order = self.named(views)
         else:
-            order = [self.views[k] for k in np.argsort(-self.scores(camera, keypoints), kind="stable")]
+            scores = self.scores(camera, keypoints, rank_views=rank_views)
+            order = [self.views[k] for k in np.argsort(-scores, kind="stable")]
         yield from (self.region(view, view.points) for view in order if len(view.points) >= MIN_POINTS)
 
     def match_orientation(self: Map, up_camera: Array) -> Map:

@@ -5,6 +5,7 @@ import math
 import subprocess
 import sys
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from bpnp.maps import localize
 from bpnp.maps.all_points import judge_on_all_points, refine_on_all_points
 from bpnp.maps.localize import BRIEF
 from bpnp.maps.photo_problem import Photo
+from bpnp.maps.views import View
 from bpnp.search.config import MAPS, TIME
 from bpnp.search.verdict.decide import SearchResult, judge
 from bpnp.search.verdict.false_alarms import alarms_of
@@ -120,6 +122,38 @@ def test_the_reason_has_the_number_of_views_tried_within_the_time_limit(planted:
     whole = scene.localize(photo_of(truth, 0)[0], PINHOLE, solver="search", time_limit=math.inf)
     assert whole.verdict == "confident"
     assert "views tried" not in whole.reason
+
+
+def test_a_function_ranks_the_views(planted: tuple[SceneMap, Planted]) -> None:
+    """It gets normalised keypoints and all views; with time for one view, that is the one with the largest score."""
+    scene, truth = planted
+    pixels, _ = photo_of(truth, 1)
+    for first in ("photo 0.jpg", "photo 2.jpg"):
+
+        def rank_views(points2d: np.ndarray, views: Sequence[View], first: str = first) -> list[float]:
+            np.testing.assert_allclose(520 * points2d + [400, 300], pixels)
+            return [float(view.name == first) for view in views]
+
+        found = scene.localize(pixels, PINHOLE, rank_views=rank_views, solver="search", time_limit=1e-9)
+        assert found.view == first
+    with pytest.raises(ValueError, match=r"returned an array of shape \(2,\); one score for each of the 3 views"):
+        scene.localize(pixels, PINHOLE, rank_views=lambda points2d, views: [1.0, 2.0], solver="search")
+
+
+def test_a_function_ranks_the_places_of_competing_poses(planted: tuple[SceneMap, Planted]) -> None:
+    scene, truth = planted
+    pixels, ids = photo_of(truth, 1)
+    calls = list[int]()
+
+    def rank_views(points2d: np.ndarray, views: Sequence[View]) -> np.ndarray:
+        calls.append(len(points2d))
+        return np.array([view.name == "photo 1.jpg" for view in views], float)
+
+    solution = scene.localize(pixels, PINHOLE, rank_views=rank_views, solver="search", time_limit=math.inf)
+    assert_right(solution, truth, 1, ids)
+    assert calls[0] == len(pixels)
+    assert len(calls) > 1
+    assert calls[1] < len(pixels)
 
 
 def test_the_default_time_limit_warns_where_there_was_none(
