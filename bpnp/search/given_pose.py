@@ -85,7 +85,7 @@ def judge_given_pose(
         prior = PosePrior(
             rotation, translation, math.degrees(scale) / PROBLEM.sigmas, scale * distance / PROBLEM.sigmas
         )
-        near = replace(problem, prior=prior).log10_share(optimum.rotation[0], optimum.translation[0])
+        near = replace(problem, prior=prior).log10_prior_fraction(optimum.rotation[0], optimum.translation[0])
         one = replace(problem, log10_tried=max(log10_tests(problem) + near, 0.0))
         claim = optimum
     competing = others[~same & (others.log10_false_alarms <= 0)]  # insignificant poses do not compete

@@ -276,22 +276,16 @@ class PoseModel:
             gradient[at] = -(self.lens.offset + math.log(state.zoom)) / self.lens.sigma**2
         return information, gradient
 
-    def log10_tests(self, problems: Sequence[Problem], log10_shares: Sequence[float] = ()) -> float:
+    def log10_tests(self, problems: Sequence[Problem]) -> float:
         """Return log10 of the number T of tests with the points of all cameras, which propose poses independently.
 
         The tests of a camera are the choices of as many matches as fix the unknowns, or those of a given lens for each
         distinguishable lens if they are fewer. `Problem.log10_tried` replaces their number if it is set. An unknown
-        scale of the scene takes one match more, of any two points of a camera.
-
-        Args:
-            problems: Points of each camera.
-            log10_shares: log10 of the fraction of the poses of each camera that a prior allows; empty without a prior.
+        scale of the scene takes one match more, of any two points of a camera. A prior does not change the number; see
+        `Problem.log10_prior_fraction`.
         """
-        shares = log10_shares or [0.0] * len(problems)
-        alone = [self._log10_tests_of(problem) + share for problem, share in zip(problems, shares, strict=True)]
+        alone = [self._log10_tests_of(problem) for problem in problems]
         tests = alone[0] if len(alone) == 1 else math.log10(sum(10**one for one in alone))
-        if any(shares):  # a prior leaves at least one test
-            tests = max(tests, 0.0)
         if self.scale:
             tests += math.log10(sum(len(each.bearings) * len(each.points3d) for each in problems))
         return tests

@@ -352,35 +352,44 @@ class Problem:
         lens = 0 if self.focal is None else 1 + (self.focal.radial_range > 0)
         return 2 * self.fixing_matches + lens
 
-    def log10_share(self, rotation: Array, translation: Array) -> float:
-        """Return log10 of the fraction of all poses that are as near to the prior as this one.
+    def log10_prior_fraction(self, rotation: Array, translation: Array) -> float:
+        """Return log10 of the fraction F of all poses that are at least as near to the prior as this one.
 
-        The poses are those that fit matches of these points: their rotations fill SO(3) evenly, the directions to the
-        median scene point fill the view, and the logarithms of its distance a factor of 30. Poses within two standard
-        deviations of the prior are equally near. F is this fraction and F_0 the smallest one.
-        Weighted by 1 / F, the tests of all poses add up to 1 + log(1 / F_0) times as many as without a prior. The NFA
-        omits this factor, 8 for a vertical with a standard deviation of 2 degrees.
+        The nearness is the larger of the deviations of rotation and position from the prior, in standard deviations.
+        Poses within `PROBLEM.sigmas` of them are equally near. The poses are those that fit matches of these points:
+        their rotations fill SO(3) evenly, the directions to the median scene point fill the view, and the logarithms of
+        its distance a factor of 30. For poses of unrelated points, F exceeds a uniform variable in [0, 1]: it is a
+        p-value of the prior, and the NFA is the number of tests times F over the likelihood ratio of the points.
+
+        Args:
+            rotation: (3, 3) of the pose.
+            translation: (3,) of the pose.
+
+        Returns:
+            log10 F; 0 without a prior.
         """
-        if self.prior is None:
+        prior, sigmas = self.prior, PROBLEM.sigmas
+        if prior is None:
             return 0.0
-        if isinstance(self.prior, GravityPrior):
-            up = rotation @ self.prior.directions()[1]
-            camera = np.asarray(self.prior.up_camera, np.float64)
+        if isinstance(prior, GravityPrior):
+            up = rotation @ prior.directions()[1]
+            camera = np.asarray(prior.up_camera, np.float64)
             off = math.atan2(float(np.linalg.norm(np.cross(up, camera))), float(up @ camera))
-            off = min(max(off, math.radians(PROBLEM.sigmas * self.prior.sigma_deg)), math.pi)
+            off = min(max(off, math.radians(sigmas * prior.sigma_deg)), math.pi)
             return math.log10(max((1 - math.cos(off)) / 2, 1e-12))
-        known = np.asarray(self.prior.rotation, np.float64)
-        within = math.radians(PROBLEM.sigmas * self.prior.rotation_sigma_deg)
-        off = min(max(rotation_angle(rotation, known), within), math.pi)
-        share = max((off - math.sin(off)) / math.pi, 1e-15)
-        if self.prior.translation is not None and math.isfinite(self.prior.translation_sigma):
-            expected = known @ self.middle + np.asarray(self.prior.translation)
-            distance = max(float(np.linalg.norm(expected)), 1e-12)
+        known, sigma = np.asarray(prior.rotation, np.float64), math.radians(prior.rotation_sigma_deg)
+        far, has_position = max(rotation_angle(rotation, known) / sigma, sigmas), False
+        if prior.translation is not None and math.isfinite(prior.translation_sigma):
+            expected, has_position = known @ self.middle + np.asarray(prior.translation), True
             shift = float(np.linalg.norm(rotation @ self.middle + translation - expected))
-            relative = max(shift, PROBLEM.sigmas * self.prior.translation_sigma) / distance
-            across = min(1.0, math.pi * relative**2 / self.image.solid_angle)
-            share *= across * min(1.0, 2 * relative / PROBLEM.log_depths)
-        return math.log10(share)
+            far = max(far, shift / prior.translation_sigma)
+        off = min(far * sigma, math.pi)
+        fraction = max((off - math.sin(off)) / math.pi, 1e-15)
+        if has_position:
+            relative = far * prior.translation_sigma / max(float(np.linalg.norm(expected)), 1e-12)
+            fraction *= min(1.0, math.pi * relative**2 / self.image.solid_angle)
+            fraction *= min(1.0, 2 * math.atanh(relative) / PROBLEM.log_depths) if relative < 1 else 1.0
+        return math.log10(fraction)
 
 
 def faces(normals3d: Array, cosines3d: Array | None, camera: Array, rotation: Array) -> NDArray[np.bool_]:

@@ -133,6 +133,65 @@ def test_a_prior_lowers_the_nfa_of_a_pose_that_agrees_with_it() -> None:
     assert evidence(rays, points, rotation, prior=far) == pytest.approx(free)
 
 
+def wide_priors(rng: np.random.Generator) -> list[PosePrior | GravityPrior]:
+    """Priors of a rotation, of a pose and of a vertical, which have nothing to do with a pose."""
+    turn, up = Rotation.random(random_state=rng).as_matrix(), directions(rng.standard_normal((2, 3)))
+    return [
+        PosePrior(turn, None, 15.0),
+        PosePrior(turn, np.array([0.2, 0.1, 6.0]), 10.0, 0.6),
+        PosePrior(turn, np.array([0.2, 0.1, 6.0]), 40.0, 0.1),
+        GravityPrior(up[0], up[1], 10.0),
+    ]
+
+
+def test_the_fraction_of_poses_as_near_to_a_prior_is_a_p_value() -> None:
+    """Over evenly drawn poses of a scene about the origin it is at most u with a probability of at most u."""
+    rng, count = np.random.default_rng(0), 8000
+    problem = Problem(scattered(rng, 400, 0.4), rng.uniform(-1, 1, (41, 3)))
+    turns = Rotation.random(count, random_state=rng).as_matrix()
+    shifts = scattered(rng, count, 0.4) * 6 * 30 ** rng.uniform(-0.5, 0.5, (count, 1)) - turns @ problem.middle
+    for prior in wide_priors(rng):
+        known = replace(problem, prior=prior)
+        fractions = np.array([known.log10_prior_fraction(*pose) for pose in zip(turns, shifts, strict=True)])
+        for u in (0.03, 0.1, 0.3, 0.6, 0.9):
+            assert (fractions <= math.log10(u)).mean() <= u + 4 * math.sqrt(u * (1 - u) / count), prior
+        if isinstance(prior, GravityPrior) or prior.translation is None:  # then it is exact
+            assert (fractions <= math.log10(0.3)).mean() == pytest.approx(0.3, abs=0.02)
+
+
+def test_a_prior_does_not_change_the_number_of_tests() -> None:
+    """The NFA of each pose is that without a prior, times the fraction of poses that are as near to the prior."""
+    rng = np.random.default_rng(1)
+    rays, points, rotation = planted(rng, 12)
+    problem = Problem(rays, points, floor=2e-4)
+    other = rotation @ Rotation.from_rotvec([0, 0, 2.0]).as_matrix()
+    for prior in wide_priors(rng):
+        known = replace(problem, prior=prior)
+        for turn in (rotation, other):
+            fraction = known.log10_prior_fraction(turn, SHIFT)
+            assert alarms(known, turn, SHIFT) == pytest.approx(alarms(problem, turn, SHIFT) + fraction)
+
+
+@pytest.mark.parametrize("kind", range(4))
+def test_the_bound_of_markov_holds_with_a_prior(kind: int) -> None:
+    """Without the number of tests, a pose that was not chosen by the points exceeds b in at most one of b cases."""
+    rng, products = np.random.default_rng(kind), []
+    matches = math.log10(2 * math.comb(20, 3) ** 2 * 6)
+    for _ in range(400):
+        turn, middle = (
+            Rotation.random(random_state=rng).as_matrix(),
+            scattered(rng, 1, 0.3) * 6 * 30 ** rng.uniform(-0.5, 0.5),
+        )
+        seen = rng.uniform(-1, 1, (20, 3)) + middle
+        prior = wide_priors(rng)[kind]
+        problem = Problem(scattered(rng, 20, 0.4), seen @ turn, prior=prior)
+        image = problem.image
+        cells = PoseModel.of(problem).log10_cells(image.spread, image.scales, image.solid_angle)
+        products.append(-np.log10(np.mean(10.0 ** -np.minimum(cells, matches))) - alarms(problem, turn, np.zeros(3)))
+    for bound in (0.5, 1, 2):
+        assert np.mean(np.array(products) > bound) <= 10**-bound
+
+
 def test_residuals_below_the_floor_count_as_the_floor() -> None:
     rays, points, rotation = planted(np.random.default_rng(5), 6, 0.0)
     assert evidence(rays, points, rotation, 5e-3) > evidence(rays, points, rotation, 1e-4) + 3

@@ -17,8 +17,8 @@ within 2 s of point i are one observation. With h the RMS angular radius of the 
 are distinguishable at s; T is this number if it is smaller.
 
 With labels, T counts only pairs with equal labels, and l_i is the density of the directions with the label. Class
-probabilities and scores of the directions multiply the predicted density. A prior reduces T to the fraction of the
-rotations that it allows.
+probabilities and scores of the directions multiply the predicted density. A prior multiplies the NFA by the fraction of
+all rotations that are at least as near to it.
 
 Sources: A. Desolneux, L. Moisan, J.-M. Morel, Meaningful alignments, IJCV 2000; F. L. Markley, Attitude determination
 using vector observations and the singular value decomposition, J. Astronautical Sciences 1988 (covariance).
@@ -89,7 +89,7 @@ def background_of(problem: Problem, pixel: Array, noise: float) -> Background:
 
 
 def log10_false_alarms(
-    squared: Array, density: Array, known: Background, log10_share: float = 0.0
+    squared: Array, density: Array, known: Background, log10_fraction: float = 0.0
 ) -> tuple[float, Array]:
     """Compute the logarithm of the number of false alarms of a rotation.
 
@@ -97,7 +97,7 @@ def log10_false_alarms(
         squared: (m,) squared distances to the nearest directions, in squared pixels; infinite beyond reach.
         density: (m,) density around these directions, per steradian.
         known: Constants from `background_of`.
-        log10_share: log10 of the fraction of the rotations that a prior allows; default 0.
+        log10_fraction: `Problem.log10_prior_fraction` of the rotation; default 0, without a prior.
 
     Returns:
         log10 NFA, and the log x_i / c_i (m,) of each image point at the scale and fraction with the largest sum.
@@ -106,8 +106,8 @@ def log10_false_alarms(
     ratio = np.exp(-0.5 * squared[:, None] / known.scales**2) / (2 * math.pi * width**2 * density[:, None])
     logs = np.log(1 - known.shares + known.shares * ratio[:, :, None]) / known.together[:, :, None]
     every, tests = np.ones(len(known.scales), np.bool_), known.log_tests
-    if log10_share:  # a prior leaves at least one test
-        tests = np.maximum(tests + math.log(10) * log10_share, 0.0)
+    if log10_fraction:  # a prior leaves at least one test
+        tests = np.maximum(tests + math.log(10) * log10_fraction, 0.0)
     most = float(tests.max())
     terms = Terms(logs, known.together, every, ~every, len(every) * known.shares.shape[-1], tests - most)
     return log10_nfa([terms], most / math.log(10), [[known.fixing]])[0], terms.of_points()

@@ -444,9 +444,9 @@ def _fitted(
     if sight.problem.odds2d is not None:
         match = np.where(sight.problem.may_match(np.arange(m), match), match, -1)
     squared = np.where(match >= 0, state.squared, np.inf)
-    share = sight.problem.log10_share(rotation, np.zeros(3))
+    fraction = sight.problem.log10_prior_fraction(rotation, np.zeros(3))
     density = sight.densities(match) / sight.odds(match)
-    alarms, nats_of_points = log10_false_alarms(squared, density, sight.known, share)
+    alarms, nats_of_points = log10_false_alarms(squared, density, sight.known, fraction)
     return Hypotheses.from_poses(
         rotation[None],
         np.zeros((1, 3)),

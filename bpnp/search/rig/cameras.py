@@ -138,14 +138,14 @@ class Rig:
         """Return log10 of the number of false alarms at the scale of the residuals, and at rougher ones.
 
         Three matches of a camera fix the pose. An unknown scale needs one more, of a camera with a non-zero baseline. A
-        prior reduces the number of tests of each camera to the fraction of its poses that it allows.
+        prior multiplies their number by the largest fraction of the poses of a camera that are as near to it.
         """
         cameras = self._terms(rotation, translation, scale)
         ways = self.model.fixing_ways(len(self.problems), self.apart)
         poses = (self.pose_of(k, rotation, translation) for k in range(len(self.problems)))
-        shares = [each.log10_share(*pose) for each, pose in zip(self.problems, poses, strict=True)]
+        nearest = max(each.log10_prior_fraction(*pose) for each, pose in zip(self.problems, poses, strict=True))
         problems = [replace(each, focal=self.model.lens) for each in self.problems]
-        return log10_nfa(cameras, self.model.log10_tests(problems, shares), ways)
+        return log10_nfa(cameras, max(self.model.log10_tests(problems) + nearest, 0.0), ways)
 
     def _terms(self, rotation: Array, translation: Array, scale: float | None) -> list[Terms | None]:
         seen = (

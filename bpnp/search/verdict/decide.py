@@ -154,10 +154,10 @@ def missed(
     value = log10_missed(count_starts(candidates, problem, rule), decades, local_searches, rule)
     if value > rule.missed or not is_symmetric(candidates, problem, rule):
         return value
-    basin_count, share = count_starts(candidates, problem, rule, symmetric=True), 0.0
-    if problem.prior is not None:  # the prior reduces the probability of a better pose elsewhere
-        share = problem.log10_share(candidates.rotation[0], candidates.translation[0])
-    return min(log10_missed(basin_count, 0.0, local_searches, rule, symmetric=True) + share, 0.0)
+    basin_count = count_starts(candidates, problem, rule, symmetric=True)
+    # A prior reduces the probability of a better pose elsewhere.
+    fraction = problem.log10_prior_fraction(candidates.rotation[0], candidates.translation[0])
+    return min(log10_missed(basin_count, 0.0, local_searches, rule, symmetric=True) + fraction, 0.0)
 
 
 def motions_of(candidates: Hypotheses, problem: Problem, rule: Evidence) -> Motions:

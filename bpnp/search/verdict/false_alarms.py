@@ -21,8 +21,11 @@ of point i: keypoints that lie together are one observation.
 
 The location of a clump is one observation as well. A clump has more points within 2 s' than an even spread explains.
 There, the gain of log x_i from one scale to the next finer one s' counts with 1 / c_i(s'), over its expected value
-(`ImageStatistics.weights`). The mean over a fixed set of (s, w) accounts for the tested values. A prior reduces T to
-the fraction of the poses that it allows.
+(`ImageStatistics.weights`). The mean over a fixed set of (s, w) accounts for the tested values.
+
+A prior multiplies the NFA by the fraction F of all poses that are at least as near to the prior as the pose. T is the
+same for all poses. For unrelated points F exceeds a uniform variable, and does not depend on the x_i. With x their
+product, P(F / x <= a) <= E[a x] <= a, so that the NFA keeps its bound.
 
 If the focal length is fitted too, four matches fix the seven unknowns, and an eighth, a radial coefficient. Then
 T = 2 (m)_4 (n)_4 / 4!, or T of a pose times the number of distinguishable lenses if that is smaller. The four largest
@@ -147,13 +150,14 @@ def alarms_of(problem: Problem, rotations: Array, translations: Array, scales: A
     model, image = PoseModel.of(problem), problem.image
     tests = model.log10_tests([problem])
     cells = np.minimum(model.log10_cells(image.spread, image.scales, image.solid_angle), tests)
-    share = [problem.log10_share(r, t) for r, t in zip(rotations, translations, strict=True)]
-    none = np.array([max(tests + one, 0.0) for one in share])
+    poses = zip(rotations, translations, strict=True)
+    fraction = np.array([problem.log10_prior_fraction(*pose) for pose in poses])
+    none = np.maximum(tests + fraction, 0.0)
     result = Alarms(none, none.copy())
     for k in range(len(none)):
         seen = directions_of(problem, rotations[k], translations[k])
         # Fewer tests at a scale add evidence by their ratio to all tests; a prior leaves at least one test.
-        fewer = math.log(10) * (np.maximum(cells + share[k], 0.0) - none[k])
+        fewer = math.log(10) * (np.maximum(cells + fraction[k], 0.0) - none[k])
         scale = None if scales is None else float(scales[k])
         terms = camera_terms(problem, seen, scale, fewer=fewer)
         result.own[k], result.rough[k] = log10_nfa([terms], float(none[k]), model.fixing_ways())
