@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import bpnp
 from bpnp.search.solution import Solution
-from bpnp.search.verdict.reasons import CLAUSES, CONFIDENT
+from bpnp.search.verdict.reasons import CLAUSES, CONFIDENT, confident
 
 PAGE = Path(__file__).parents[2] / "docs" / "verdict.md"
 
@@ -18,6 +18,16 @@ def test_every_reason_code_is_in_the_table_of_the_page() -> None:
     codes = re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)
     assert codes[:2] == ["reason_code", CONFIDENT]
     assert sorted(codes[2:]) == sorted(CLAUSES)
+
+
+def test_every_sentence_of_the_table_is_one_of_its_code() -> None:
+    table = PAGE.read_text(encoding="utf-8").split("## Reasons")[1].split("\n## ")[0]
+    rows = re.findall(r"^\| `(\w+)` \| [^|]+ \| ([^|]+) \|$", table, re.MULTILINE)
+    assert len(rows) == len(CLAUSES) + 2
+    for code, sentence in rows[2:]:
+        clause = re.sub(r"\\\{.*?\\\}", ".+", re.escape(CLAUSES[code]))
+        assert re.match(clause, sentence, re.IGNORECASE), code
+    assert rows[1] == (CONFIDENT, confident(-69.1, 3.0, 0.213))
 
 
 def image_of(scene: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
