@@ -27,10 +27,11 @@ def prepare_modelnet40(
     """Pack ModelNet40, or any folder of meshes in its layout. An interrupted run leaves no files.
 
     Args:
-        source: folder of <class>/{train,test}/*.{off,obj,ply,stl,glb}.
+        source: folder of <class>/{train,test}/*.{off,obj,ply,stl,glb}, or of point clouds (docs/data.md).
         output: new folder.
-        points: surface samples of each mesh.
-        normalisation: frame of each mesh.
+        points: surface samples of each mesh, or random points of each cloud.
+        normalisation: frame of each mesh: unit_sphere, the mean at the origin and the farthest sample at distance 1;
+            unit_cube, the bounding box centred with a longest side of 1; none, the units of the file.
         processes: number of worker processes.
     """
     from bpnp.datamodules.clouds import open_shapes

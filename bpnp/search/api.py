@@ -96,13 +96,14 @@ def solve(
             weight the points in the search and the verdict. Only their ratios matter. None: all are equal.
         scores3d: (n,) probabilities in (0, 1], as `scores2d`, such as from the number of views that see a point.
         solver: "search" runs the search, which needs no training. "auto", the default, also starts it from poses of a
-            packaged matcher if the search is undecided: "matcher-maps" with a `PosePrior`, and "matcher-sfm" without a
-            prior and with m n at most four million. Or a module from `Batch` to `Prediction`, or a checkpoint of a
-            BPnPNet or a Matcher. With a Matcher and too many points to enumerate, the search starts only from P3P poses
-            of match triples sampled from the assignment.
+            packaged matcher if the search is undecided and the problem is not small (see `inlier_threshold`):
+            "matcher-maps" with a `PosePrior`, and "matcher-sfm" without a prior and with m n at most four million. Or a
+            module from `Batch` to `Prediction`, or a checkpoint of a BPnPNet or a Matcher or the name of packaged
+            weights: the pose is then that of the module. With a Matcher and a problem that is not small, the search
+            starts only from P3P poses of match triples sampled from the assignment.
         prior: A `PosePrior`; a pose with an uncertainty of 10 degrees, as a `Solution`, (R, t), [R | t] of shape (3, 4)
-            or (4, 4), or a pycolmap.Rigid3d; a `GravityPrior`; or a BPnPNet or Matcher, or its checkpoint, whose pose
-            is tried first. None for no prior.
+            or (4, 4), or a pycolmap.Rigid3d; a `GravityPrior`; or a BPnPNet or Matcher, its checkpoint, or "learned"
+            for the weights "procedural-so3", whose pose is tried first. None for no prior.
         inlier_threshold: Largest reprojection error of a match, in pixels with a camera, else in normalised image units
             (radians for bearings). Default: three times the scale of the residuals. Small problems, those whose matches
             are enumerated (m n at most 4,000, or 250,000 where a prior lets two matches fix a pose), also use it as

@@ -36,9 +36,10 @@ class Candidate:
 
     Attributes:
         rotation: (3, 3) rotation matrix.
-        translation: (3,) translation, scene units.
-        score: Mean log-likelihood of the bearings, nats; larger is better.
-        inlier_count: Number of one-to-one inliers (paper Eq. 1).
+        translation: (3,) translation, in the unit of `Solution.translation`.
+        score: Mean log-likelihood of the bearings, nats; larger is better. For points at infinity it is the mean
+            log-likelihood ratio to unrelated points, for a rig -log10 of the false alarms.
+        inlier_count: Number of one-to-one inliers (paper Eq. 1) within `Solution.inlier_threshold`, over all cameras.
         log10_false_alarms: Expected number of equally good poses for unrelated points, log10; see `Solution`.
         scale: Scale of the scene, rig = scale R p + t; 1 unless it was estimated.
     """
@@ -83,11 +84,12 @@ class Solution:
     Attributes:
         rotation: (3, 3) rotation matrix.
         translation: (3,) translation, scene units; with `scale=True` units of the rig.
-        matches: (k, 2) indices into `points2d` and `points3d`; no point is in two matches.
+        matches: (k, 2) indices into `points2d` and `points3d`. No point is in two matches, except that with a `rig` a
+            scene point may have one in each camera.
         inlier_count: Number of matches within `inlier_threshold` (paper Eq. 1).
         inlier_ratio: `inlier_count` as a fraction of min(m, n); with a `rig` of the sum of min(m, n) over its cameras;
             from `verify` with `matches` of the number of given matches.
-        inlier_threshold: Largest reprojection error of a match, in `unit`.
+        inlier_threshold: Largest reprojection error of a match, in `unit`. With a `rig` it is that of the first camera.
         reprojection_error: Mean reprojection error of the matches, in `unit`.
         reprojection_error_deg: Mean angle between the bearings of the matches, degrees.
         unit: Pixels with a camera, else normalised image units, or radians for bearings.

@@ -6,6 +6,9 @@ import numpy as np
 import pycolmap
 import pytest
 from planted import degrees_between
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import maximum_bipartite_matching
+from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 import bpnp
@@ -132,6 +135,29 @@ def test_a_rig_with_a_prior_returns_what_it_has_when_the_time_is_over() -> None:
     assert degrees_between(late.rotation, pose[0]) < 0.3
     without = bpnp.solve(images, scene, [CAMERA] * 2, rig=mounts, time_limit=1e-9)
     assert without.verdict == "failed"
+
+
+def test_candidates_of_a_rig_count_the_inliers_of_all_cameras() -> None:
+    """A half turn about z maps the scene onto itself: two poses have the inliers of a maximum matching of scipy's."""
+    half = np.random.default_rng(7).uniform(-0.5, 0.5, (6, 3))
+    scene, mounts = np.concatenate([half, half * [-1, -1, 1]]), [(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0, 0.3)]
+    rotation, translation = Rotation.from_rotvec([0.5, 0.3, 0.8]).as_matrix(), np.array([0.05, 0.1, 3.0])
+
+    def image_of(turn: Any, shift: Any, mount: Any) -> Any:
+        camera = scene @ turn.T + shift + mount[1]
+        return 500 * camera[:, :2] / camera[:, 2:] + [320, 240]
+
+    images = [image_of(rotation, translation, mount) for mount in mounts]
+    solution = bpnp.solve(images, scene, CAMERA, rig=mounts, inlier_threshold=3.0, time_limit=60)
+    assert solution.verdict == "ambiguous"
+    assert len(solution.candidates) >= 2
+    for one in solution.candidates:
+        count = 0
+        for image, mount in zip(images, mounts, strict=True):
+            apart = cdist(image, image_of(one.rotation, one.translation, mount))
+            count += int((maximum_bipartite_matching(csr_array(apart <= 3.0), perm_type="column") >= 0).sum())
+        assert one.inlier_count == count
+    assert [one.inlier_count for one in solution.candidates[:2]] == [24, 24]
 
 
 def test_the_prior_of_a_rig_counts_once() -> None:

@@ -15,7 +15,7 @@ from bpnp.search.config import DEFAULT, MATCHES
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.focal_length import FocalSweep, UnknownCamera
 from bpnp.search.inputs import problem_from
-from bpnp.search.matching import failed_solution, one_to_one
+from bpnp.search.matching import count_one_to_one, failed_solution, one_to_one
 from bpnp.search.pose_model import crossed
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.rig.cameras import Pose, Rig
@@ -183,20 +183,22 @@ def _finished(rig: Rig, problems: Sequence[Problem], result: SearchResult, inlie
         return solution
     rotation, translation = found.rotation[0], found.translation[0]
     matches, errors, angles, count = [], [], [], 0
+    counts = np.zeros(len(found), np.int64)  # inliers of each pose in all cameras
     for k, problem in enumerate(problems):
         threshold = inlier_threshold or MATCHES.reach * result.residual * problem.per_radian
-        seen = problem.project_scene(*rig.pose_of(k, rotation, translation))
-        i, j = one_to_one(problem.image_points, seen, threshold, problem.may_match).T
-        errors.append(np.linalg.norm(problem.image_points[i] - seen[j], axis=-1))
+        image, may_match = problem.image_points, problem.may_match
+        seen, *others = map(problem.project_scene, *rig.pose_of(k, found.rotation, found.translation))
+        i, j = one_to_one(image, seen, threshold, may_match).T
+        counts += [len(i), *(count_one_to_one(image, other, threshold, may_match) for other in others)]
+        errors.append(np.linalg.norm(image[i] - seen[j], axis=-1))
         angles.append(errors[-1] / problem.per_radian)
         matches.append(np.stack([problem.usable[i] + count, j], -1))
         count += len(problem.all2d)
-    matched = sum(map(len, matches))
     covariance = None if result.verdict == "failed" else rig.covariance(rotation, translation, result.residual)
     if covariance is not None:
         middle = rotation @ first.middle_of_user
         _, shift = first.to_user(rotation, translation[:3])
-        free = max(2 * matched - rig.unknowns, 1)
+        free = max(2 * int(counts[0]) - rig.unknowns, 1)
         moved_by = _about_origin(rig, first.size, middle, shift, 1 / translation[3])
         covariance = student_factor(free) * moved_by @ covariance @ moved_by.T
     _, moved = first.to_user(found.rotation, found.translation[:, :3])
@@ -206,7 +208,7 @@ def _finished(rig: Rig, problems: Sequence[Problem], result: SearchResult, inlie
         replace(solution, points2d=points2d, stats=replace(solution.stats, dropped2d=dropped)),
         result,
         replace(found, translation=np.column_stack([moved, found.translation[:, 3]])),
-        [matched, *[0] * (len(found) - 1)],
+        counts.tolist(),
         np.concatenate(matches),
         np.concatenate(errors),
         np.concatenate(angles),
