@@ -442,8 +442,8 @@ class MatchSettings:
         refined: Number of poses of triples that are refined. [poses; not tuned]
         steps: Steps of a refinement to given matches. [steps; numerics]
         reweighted: Number of times that the given matches are weighted anew. [rounds; not tuned]
-        wrong: Expected fraction of wrong given matches. A user who gives matches has fewer outliers than points without
-            matches have (`SearchSettings.outliers`). [fraction; not tuned]
+        wrong: Expected fraction of wrong given matches; `SearchSettings.outliers` is that of points without matches.
+            [fraction; not tuned]
         converged: Difference within which refined poses are one optimum, in tolerances of equal poses. [fraction; not
             tuned]
         settled: Relative change of a sum of squares that ends these steps. [ratio; numerics]
@@ -631,7 +631,7 @@ class SymmetrySettings(NamedTuple):
         widest: Number of triangles drawn for a base; the largest is taken. [triangles; not tuned]
         fewest: Smallest number of moved points that lie on others. Three fix a motion and are no evidence of it.
             [points; derived]
-        first: Number of sampled points of which at least one must confirm a motion. One of 12 motions of a third of the
+        first: Number of sampled points; at least one must confirm a motion. One of 12 motions of a third of the
             points fails. [points; derived]
         checked: Number of sampled points that confirm a motion before all points do. [points; cost]
         most_work: Largest number of pairs of points that are compared for all bases together, some 0.1 s; the rest is
@@ -772,10 +772,9 @@ class FocalSettings:
         smallest: Least focal length that is tried: a field of view of 90 degrees. [image sides; convention]
         largest: Largest focal length that is tried: a field of view of 19 degrees. [image sides; convention]
         usual: Focal length that is tried first. [image sides; convention]
-        step: Factor between successive focal lengths, for many points: annealing reaches an optimum half a step away.
+        step: Factor between successive focal lengths, for many points; four steps lead from `smallest` to `largest`.
             [factor; not tuned]
-        step_few: Factor between successive focal lengths where an enumeration or a view keeps the focal length, for few
-            points and for photos in maps. [factor; not tuned]
+        step_few: Factor between successive focal lengths, for few points and for photos in maps. [factor; not tuned]
         sigmas: Half width of the range of an approximate focal length. [standard deviations; convention]
         turns: Iterations of the first search with each focal length. [iterations; not tuned]
         alternations: Largest number of alternations of search and refinement from each focal length. [rounds; not
@@ -787,11 +786,11 @@ class FocalSettings:
         bends: Radial displacements at the image corner from which a fit of the distortion also starts. Started at zero
             distortion, too few points match to reach a large one. [fractions; not tuned]
         bend_sigma: Standard deviation of the radial displacement at the image corner by an unknown distortion.
-            [fraction; convention]
+            [fraction; not tuned]
         most_bend: Largest radial displacement at the image corner, that of `OtherFocal`. [fraction; derived]
         fewest_bent: Least number of matches for a fit of the distortion, that of `OtherFocal`. [matches; derived]
         centre_sigma: Standard deviation of the principal point, as a fraction of the distance to the image corner:
-            about a quarter of a per cent of the larger image side. [fraction; convention]
+            about a quarter of a per cent of the larger image side. [fraction; not tuned]
         least_reach: Smallest distance from the principal point to the image corner. [focal lengths; numerics]
         least_limit: Smallest time limit of a search. [seconds; numerics]
     """

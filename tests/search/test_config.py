@@ -18,7 +18,7 @@ PACKAGE = Path(config.__file__).parents[1]
 FILES = [file for folder in ("search", "maps", "robust") for file in sorted((PACKAGE / folder).rglob("*.py"))]
 GROUPS = [each for each in vars(config).values() if inspect.isclass(each) and each.__module__ == config.__name__]
 ORIGINS = ("calibration", "chosen on ", "measured, ", "derived", "convention", "cost", "numerics", "not tuned")
-# Numbers that nobody can choose, by file.
+# Numbers that cannot be chosen, by file.
 FIXED = {
     "search/enumeration/search.py": {"ORDERS"},  # permutations
     "search/focal_length.py": {"RADIAL_PLACES", "AROUND"},  # indices of parameters; 1 and the step of `OtherFocal`
