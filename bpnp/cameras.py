@@ -178,6 +178,9 @@ def camera_from(camera: Any) -> Camera:
             parameters); a mapping with `model` and `params`, and optionally `width` and `height`; a `pycolmap.Camera`;
             a `Camera`, which is returned unchanged.
 
+    Returns:
+        A `Pinhole` for K without distortion, else a `Lens`.
+
     Raises:
         ValueError: K is singular or not finite, the model is unknown, the number of parameters is wrong, or the focal
             length is not positive.
@@ -280,6 +283,9 @@ def resize_camera(camera: Camera, size: tuple[int, int]) -> Camera:
     Args:
         camera: Camera with a known image size.
         size: Width and height of the resized images, pixels, with the same aspect ratio.
+
+    Raises:
+        ValueError: The image size of the camera is unknown, or the aspect ratios differ.
 
     >>> from bpnp.cameras import camera_from, resize_camera
     >>> resize_camera(camera_from(("PINHOLE", 1000, 800, [900, 880, 500, 400])), (500, 400)).matrix.tolist()

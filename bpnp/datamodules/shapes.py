@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import trimesh
@@ -207,18 +207,27 @@ def normalise(points: NDArray[np.float64], mode: Normalisation) -> NDArray[np.fl
 
     Args:
         points: Samples (k, 3).
-        mode: unit_sphere: mean at the origin, farthest sample at distance 1. unit_cube: bounding box centred, longest
-            side 1. none: unchanged.
+        mode: "unit_sphere": mean at the origin, farthest sample at distance 1. "unit_cube": bounding box centred,
+            longest side 1. "none": unchanged.
+
+    Returns:
+        Samples (k, 3) in that frame.
+
+    Raises:
+        ValueError: The mode is unknown.
+        MeshError: All samples coincide.
     """
+    if mode not in get_args(Normalisation):
+        raise ValueError(f"`normalisation` is {mode!r}; it is one of {', '.join(get_args(Normalisation))}")
     if mode == "none":
         return points
+    low, high = points.min(0), points.max(0)
+    if not (high > low).any():
+        raise MeshError(f"all {len(points)} points coincide at {low.tolist()}; they have no size to normalise")
     if mode == "unit_sphere":
         centred = points - points.mean(0)
         return centred / np.linalg.norm(centred, axis=-1).max()
-    if mode == "unit_cube":
-        low, high = points.min(0), points.max(0)
-        return (points - (low + high) / 2) / (high - low).max()
-    raise ValueError(f"`normalisation` is {mode!r}; it is one of unit_sphere, unit_cube, none")
+    return (points - (low + high) / 2) / (high - low).max()
 
 
 @dataclass(frozen=True)

@@ -75,6 +75,9 @@ class SceneMap(ViewedPoints):
         Args:
             path: Folder with cameras, images and points3D, all .bin or all .txt; or a pycolmap.Reconstruction.
 
+        Returns:
+            The map.
+
         Raises:
             ColmapError: The model cannot be read, or no view sees a point. It is a ValueError.
         """

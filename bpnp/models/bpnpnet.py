@@ -216,7 +216,10 @@ def load_authors_weights(path: str | Path, *, backend: Backend = "auto") -> BPnP
 
     Args:
         path: File.
-        backend: Backend of `bpnp.layers.RansacPnP`, which has no weights.
+        backend: Backend of `bpnp.layers.RansacPnP`, which has no weights. Default "auto".
+
+    Returns:
+        The network, on the CPU.
 
     Raises:
         FileNotFoundError: There is no such file.

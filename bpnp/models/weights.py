@@ -55,7 +55,10 @@ class TrainedNet(nn.Module):
         Args:
             path: File, or the name of packaged weights.
             parts: Classes outside this package that the network is made of. A checkpoint names its classes, and only
-                those passed here are used.
+                those passed here are used. Default: none.
+
+        Returns:
+            The network in evaluation mode, on the CPU.
 
         Raises:
             FileNotFoundError: There is no such file.
@@ -83,8 +86,11 @@ class TrainedNet(nn.Module):
         Args:
             name: Name of the weights; `docs/model-card.md` lists them.
 
+        Returns:
+            The network in evaluation mode, on the CPU.
+
         Raises:
-            ValueError: There are no such weights.
+            ValueError: There are no such weights, or they are of another class.
         """
         if name not in (names := pretrained_names()):
             raise ValueError(f"there are no packaged weights {name!r}; the names are {', '.join(names)}")

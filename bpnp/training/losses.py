@@ -56,7 +56,7 @@ def matching_losses(prediction: Prediction, batch: Batch, *, kind: MatchingLoss,
     Args:
         prediction: Prediction with an assignment.
         batch: Problems with the labels that the kind needs.
-        kind: correspondence for `correspondence_losses`, likelihood for `matching_likelihood_loss`.
+        kind: "correspondence" for `correspondence_losses`, "likelihood" for `matching_likelihood_loss`.
         angle: As in `correspondence_losses`.
 
     Raises:

@@ -1,6 +1,7 @@
 """Point clouds in ModelNet's layouts: fixed or sampled points of the files, and errors that name the file."""
 
 from pathlib import Path
+from typing import Literal
 
 import h5py
 import numpy as np
@@ -9,7 +10,7 @@ import trimesh
 
 from bpnp.datamodules.clouds import draw_points, is_cloud, open_shapes, read_cloud
 from bpnp.datamodules.meshes import MeshDataModule
-from bpnp.datamodules.shapes import MeshError
+from bpnp.datamodules.shapes import MeshError, normalise
 from bpnp.datamodules.store import StoreError
 
 SIZES = (40, 40, 50, 40, 60, 40)
@@ -78,6 +79,15 @@ def test_a_file_that_is_no_cloud_is_one_error_with_its_name(tmp_path: Path, name
     (tmp_path / name).write_bytes(content)
     with pytest.raises(MeshError, match=name):
         read_cloud(tmp_path / name)
+
+
+@pytest.mark.parametrize("mode", ["unit_sphere", "unit_cube"])
+def test_points_without_extent_have_no_unit_frame(mode: Literal["unit_sphere", "unit_cube"]) -> None:
+    """They would all become NaN; in the units of the file they stay."""
+    same = np.full((5, 3), 2.0)
+    with pytest.raises(MeshError, match="all 5 points coincide at"):
+        normalise(same, mode)
+    np.testing.assert_array_equal(normalise(same, "none"), same)
 
 
 def test_a_pool_as_large_as_a_problem_gives_the_same_points_in_every_view(folder: Path) -> None:

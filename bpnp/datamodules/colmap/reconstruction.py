@@ -85,8 +85,11 @@ def read_reconstruction(folder: str | Path, *, name: str | None = None, keypoint
     Args:
         folder: Folder of the model.
         name: Name of the model. Default: that of the folder.
-        keypoints: Read the keypoints. Without them images only have the points that they observe, in a tenth of the
-            time.
+        keypoints: Read the keypoints, the default. Without them images only have the points that they observe, in a
+            tenth of the time.
+
+    Returns:
+        The model, with its points in the order of their ids and its images in the order of their names.
 
     Raises:
         ColmapError: A file cannot be read, no image is left, or a camera is missing or broken.
