@@ -67,3 +67,6 @@ def test_points_on_a_line_are_degenerate() -> None:
     line = np.outer(np.arange(8.0), [1, 2, 0.5])
     solution = bpnp.solve(image_of(line), line)
     assert (solution.verdict, solution.reason_code) == ("failed", "degenerate")
+    rig = [(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 0.5)]
+    solution = bpnp.solve([image_of(line + shift) for _, shift in rig], line, rig=rig)
+    assert (solution.verdict, solution.reason_code) == ("failed", "degenerate")

@@ -14,7 +14,7 @@ from bpnp import solve
 from bpnp.search.problem import Problem
 from bpnp.search.starts import GravityPrior, PosePrior
 from bpnp.search.verdict import uncertainty
-from bpnp.search.verdict.uncertainty import linearised, local_covariance, pose_covariance, rotation_bound
+from bpnp.search.verdict.uncertainty import error_bounds, linearised, local_covariance, pose_covariance
 
 Array = NDArray[np.float64]
 SHIFT = np.array([0.1, -0.2, 6.0])
@@ -48,9 +48,9 @@ def test_bounds_are_exceeded_once_in_a_thousand() -> None:
     for count, free in ((5, 4), (8, 10), (500, 994)):
         errors = rng.multivariate_normal(np.zeros(6), covariance, 300_000)
         errors /= np.sqrt(chi2.rvs(free, size=(300_000, 1), random_state=rng) / free)
-        exceeded = np.mean(np.linalg.norm(errors[:, :3], axis=1) > rotation_bound(problem, linear, float(count)))
+        exceeded = np.mean(np.linalg.norm(errors[:, :3], axis=1) > error_bounds(problem, linear, float(count))[0])
         assert 0.75e-3 < exceeded < 1.25e-3
-    assert rotation_bound(problem, linear, 3.0) == math.inf
+    assert error_bounds(problem, linear, 3.0)[0] == math.inf
 
 
 def test_errors_exceed_the_bound_of_a_covariance_once_in_a_thousand() -> None:

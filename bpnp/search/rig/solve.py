@@ -142,7 +142,7 @@ def _solve(rig: Rig, options: Options) -> Solution:
     begun = Clock.now()
     reasons = [problem.degenerate for problem in rig.problems if problem.degenerate is not None]
     if reasons:
-        result = no_pose(reasons[0])
+        result = no_pose(reasons[0], code="degenerate", settled=True)
     else:
         deadline = Deadline.after(options.time_limit)
         result = search_rig(
@@ -171,7 +171,7 @@ def mount_from(name: str, value: Any) -> Pose:
 def _finished(rig: Rig, problems: Sequence[Problem], result: SearchResult, inlier_threshold: float | None) -> Solution:
     """Build the solution with the matches of all cameras; 2D points are indexed over all cameras, concatenated."""
     found, first = result.candidates, problems[0]
-    solution = replace(failed_solution(first, result.reason, inlier_threshold), camera=None)
+    solution = replace(failed_solution(first, result.reason, inlier_threshold, code=result.code), camera=None)
     parameters: tuple[str, ...] = POSE_PARAMETERS
     if rig.model.lens is not None:
         parameters = (*parameters, FOCAL_LENGTH)

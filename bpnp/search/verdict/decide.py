@@ -28,7 +28,7 @@ from bpnp.search.verdict.competitors import Seen, misfit, other_pose, rough_resi
 from bpnp.search.verdict.completeness import log10_missed
 from bpnp.search.verdict.false_alarms import alarms_of
 from bpnp.search.verdict.reasons import CLAUSES, CONFIDENT, Objection, focal_length_not_fixed, objection
-from bpnp.search.verdict.uncertainty import focal_bound, is_redundant, linearised, rotation_bound
+from bpnp.search.verdict.uncertainty import error_bounds, is_redundant, linearised
 
 Verdict = Literal["confident", "ambiguous", "failed"]
 HALF_TURN = 180.0  # degrees; a larger bound does not constrain a rotation
@@ -246,10 +246,10 @@ def judge(
     if certain and all(one is None or one.margin >= rule.lead for one in against):
         count = match_count(candidates)
         linear = linearised(problem, candidates.rotation[0], candidates.translation[0], float(candidates.scale[0]))
-        off = math.degrees(rotation_bound(problem, linear, count))
+        turned, share = error_bounds(problem, linear, count)
+        off = math.degrees(turned)
         if off >= HALF_TURN or not (rig or is_redundant(problem, count)):
             return result.add_objection(objection("rotation_not_fixed", count=count, what="the rotation"))
-        share = 0.0 if problem.focal is None else focal_bound(problem, linear, count)
         if share > (rule.focal_few if is_object(problem, rule) else rule.focal):
             return result.add_objection(focal_length_not_fixed(share))
         against += [misfit(linear, count, rule), unrelated_competitor(seen, rule)]

@@ -34,13 +34,16 @@ STRAINS = np.array(
 POSE = 6  # parameters of a pose
 
 
-def rotation_bound(problem: Problem, linear: "Linearised | None", count: float) -> float:
-    """Return the 99.9 % bound of the rotation error, radians; see `exceeded_once`.
+def error_bounds(problem: Problem, linear: "Linearised | None", count: float) -> tuple[float, float]:
+    """Return the 99.9 % bounds of the rotation error and of the relative error of the focal length.
 
     Args:
         problem: Points of the problem.
-        linear: Pose from `linearised` with the standard deviation of the residuals; None gives an infinite bound.
+        linear: Pose from `linearised` with the standard deviation of the residuals; None gives infinite bounds.
         count: Number of matches that the standard deviation was estimated from.
+
+    Returns:
+        Bound of the rotation in radians, see `exceeded_once`. Bound of the focal length as a fraction; 0 if it is given.
 
     >>> import numpy as np
     >>> rng = np.random.default_rng(0)
@@ -48,12 +51,16 @@ def rotation_bound(problem: Problem, linear: "Linearised | None", count: float) 
     >>> seen = points + [0, 0, 6]
     >>> problem = Problem(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
     >>> linear = linearised(problem, np.eye(3), np.array([0.0, 0, 6]), 1e-3)
-    >>> bounds = [rotation_bound(problem, linear, count) for count in (4.0, 12.0)]
-    >>> [round(math.degrees(bound), 1) for bound in bounds]
-    [7.8, 0.7]
+    >>> bounds = [error_bounds(problem, linear, count) for count in (4.0, 12.0)]
+    >>> [(round(math.degrees(rotation), 1), focal) for rotation, focal in bounds]
+    [(7.8, 0.0), (0.7, 0.0)]
     """
     covariance = local_covariance(linear)
-    return math.inf if covariance is None else exceeded_once(covariance[:3, :3], 2 * count - problem.fitted)
+    if covariance is None:
+        return math.inf, math.inf
+    free = 2 * count - problem.fitted
+    focal = 0.0 if problem.focal is None else share_bound(covariance[POSE:, POSE:], free)
+    return exceeded_once(covariance[:3, :3], free), focal
 
 
 def is_redundant(problem: Problem, count: float) -> bool:
@@ -68,12 +75,6 @@ def is_redundant(problem: Problem, count: float) -> bool:
     [False, True]
     """
     return 2 * (round(count) - 1) > problem.fitted
-
-
-def focal_bound(problem: Problem, linear: "Linearised | None", count: float) -> float:
-    """Return the 99.9 % bound of the focal length, as a fraction; arguments as for `rotation_bound`."""
-    covariance = local_covariance(linear)
-    return math.inf if covariance is None else share_bound(covariance[POSE:, POSE:], 2 * count - problem.fitted)
 
 
 def share_bound(covariance: Array, free: float) -> float:
