@@ -360,6 +360,9 @@ class InputSettings:
         widest_row: Largest number of columns of an array of keypoints whose first two columns are positions. [columns;
             convention]
         floor_pixels: Smallest noise of an image point; no point detector is more accurate. [pixels; convention]
+        least_focal: Smallest focal length in pixels. With a smaller one, such as that of an identity matrix, the unit
+            of the image points is no pixel, and the smallest noise is unknown. [pixels; convention]
+        off_axis_deg: Largest median angle of image points from the axis of a pinhole camera. [degrees; convention]
     """
 
     rounding: float = 1e-12
@@ -369,6 +372,8 @@ class InputSettings:
     one_pixel: float = 3.0
     widest_row: int = 8
     floor_pixels: float = 0.1
+    least_focal: float = 10.0
+    off_axis_deg: float = 80.0
 
 
 INPUTS = InputSettings()

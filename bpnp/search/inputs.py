@@ -1,10 +1,11 @@
 """Construction of a `Problem` from a user's arrays: checks and undistortion."""
 
+import math
 from typing import Any
 
 import numpy as np
 
-from bpnp.cameras import Camera, in_front
+from bpnp.cameras import Camera, in_front, is_pinhole
 from bpnp.poses import MIN_POINTS
 from bpnp.search.arguments import (
     Array,
@@ -61,6 +62,7 @@ def problem_from(
     image = bearings if unit == "rad" else image
     usable = np.flatnonzero(np.isfinite(bearings).all(-1))
     check_seen(usable, image, fewest)
+    in_pixels = camera if camera is not None and camera.focal >= INPUTS.least_focal else None
     known = prior if isinstance(prior, (PosePrior, GravityPrior)) else None
     problem = Problem.of(
         bearings,
@@ -71,7 +73,7 @@ def problem_from(
         cosines3d=cosines3d,
         scores2d=checked_scores("scores2d", scores2d, len(image)),
         scores3d=checked_scores("scores3d", scores3d, len(scene)),
-        floor=None if camera is None else INPUTS.floor_pixels / units_per_radian(plane[usable], unit, camera),
+        floor=None if in_pixels is None else INPUTS.floor_pixels / units_per_radian(plane[usable], unit, in_pixels),
         focal=focal,
         points2d=None if unit == "rad" else image,
         camera=camera,
@@ -92,6 +94,7 @@ def bearings_of(image: Array, camera: Camera | None) -> tuple[Array, Array]:
         return bearings, in_front(bearings)[:, :2]
     check_unit(image, camera)
     plane = image if camera is None else camera.normalise(image)
+    check_view(plane, camera)
     rays = np.column_stack([plane, np.ones(len(plane))])
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True), plane
 
@@ -99,6 +102,18 @@ def bearings_of(image: Array, camera: Camera | None) -> tuple[Array, Array]:
 def unit_of(image: Array, camera: Camera | None) -> Unit:
     """Return the unit in which the residuals of such image points are measured."""
     return "rad" if image.shape[1] == 3 else "normalised" if camera is None else "px"
+
+
+def check_view(plane: Array, camera: Camera | None) -> None:
+    """Raise ValueError if normalised image points (m, 2) lie far from the axis of a pinhole camera."""
+    if camera is None or not is_pinhole(camera):
+        return
+    off = math.degrees(math.atan(float(np.median(np.linalg.norm(plane, axis=-1)))))
+    if off > INPUTS.off_axis_deg:
+        raise ValueError(
+            f"`points2d` lie {off:.0f} degrees from the axis of the `camera` (median), whose focal length is "
+            f"{camera.focal:.4g} pixels; give the focal length and the points in the same unit"
+        )
 
 
 def check_seen(usable: Labels, image: Array, fewest: int) -> None:

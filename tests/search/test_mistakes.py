@@ -54,6 +54,7 @@ CALLS: dict[str, Any] = {
         ("points", {"points2d": None}, "`points2d` is .*; an array of numbers is needed"),
         ("points", {"points2d": PIXELS}, "look like pixels; try camera=K"),
         ("points", {"camera": K}, "look normalised"),
+        ("points", {"points2d": PIXELS, "camera": np.eye(3)}, "lie 90 degrees from the axis .* length is 1 pixels"),
         ("points", {"points2d": PIXELS, "camera": np.diag([500.0, 0, 1])}, "`camera` matrix is singular"),
         ("points", {"inlier_threshold": 0.0}, "`inlier_threshold` is .*; it must be a positive number"),
         ("points", {"time_limit": -1.0}, "`time_limit` is -1.0; it must be a positive number"),

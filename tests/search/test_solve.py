@@ -51,6 +51,14 @@ def test_an_exact_problem_is_solved_to_the_last_digits() -> None:
     assert all(other.score <= first.score for other in solution.candidates)
 
 
+def test_a_camera_matrix_of_normalised_coordinates_says_nothing_about_the_noise() -> None:
+    """A tenth of its unit would be six degrees."""
+    planted = plant(1, 60)
+    solution = solve(planted.points2d[0].numpy(), planted.points3d[0].numpy(), np.eye(3))
+    assert solution.verdict == "confident"
+    np.testing.assert_allclose(solution.rotation, planted.rotation[0], atol=1e-9)
+
+
 def test_a_problem_with_noise_and_outliers_is_solved_and_reported() -> None:
     """200 true pairs with normal noise of 0.001, and a quarter of clutter on each side."""
     planted = plant(1, 200, noise=0.001, outliers2d=50, outliers3d=50, seed=3)

@@ -31,7 +31,7 @@ from bpnp.search.config import DEFAULT, INFINITY, MATCHES, InfinitySettings
 from bpnp.search.focal_length import FocalSweep, UnknownCamera
 from bpnp.search.infinity.evidence import how_well_known, noise_of, prior_information, uncertainty_of
 from bpnp.search.infinity.search import search_rotation
-from bpnp.search.inputs import bearings_of, check_seen, unit_of
+from bpnp.search.inputs import bearings_of, check_seen, check_view, unit_of
 from bpnp.search.matching import angles_between, count_one_to_one, one_to_one
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem, UnknownFocal
@@ -330,6 +330,7 @@ def _bearings(image: Array, camera: Camera | None) -> tuple[Array, Array, Array]
         return bearings, plane, np.ones(len(bearings))
     check_unit(image, camera)
     bearings = camera.bearings(image)
+    check_view(in_front(bearings)[:, :2], camera)
     step = INFINITY.pixel_step
     steps = ((camera.bearings(image + shift) - bearings) / step for shift in ([step, 0.0], [0.0, step]))
     pixel = np.sqrt(sum((step**2).sum(-1) for step in steps) / 2)

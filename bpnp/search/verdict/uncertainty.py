@@ -43,7 +43,7 @@ def error_bounds(problem: Problem, linear: "Linearised | None", count: float) ->
         count: Number of matches that the standard deviation was estimated from.
 
     Returns:
-        Bound of the rotation in radians, see `exceeded_once`. Bound of the focal length as a fraction; 0 if it is given.
+        Bound of the rotation in radians, see `exceeded_once`; bound of the focal length as a fraction, 0 if given.
 
     >>> import numpy as np
     >>> rng = np.random.default_rng(0)
