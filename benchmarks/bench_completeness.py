@@ -19,10 +19,10 @@ from scipy.spatial.transform import Rotation
 from bpnp.poses import Tolerance
 from bpnp.search.config import DEFAULT
 from bpnp.search.inputs import problem_from
+from bpnp.search.plan import Plan
 from bpnp.search.pool import Pool
 from bpnp.search.propose.repetitions import competing_poses, registered
-from bpnp.search.scene import Scene
-from bpnp.search.schedule import Plan
+from bpnp.search.search_frame import Scene
 from bpnp.search.verdict.decide import count_starts, no_pose
 
 TURNS = 8

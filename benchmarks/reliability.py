@@ -42,7 +42,7 @@ from view_problems import LEAST_MATCHES, REPORTED, Against, ViewProblem, scene_p
 from bpnp import Solution, solve
 from bpnp.cameras import camera_from
 from bpnp.search.inputs import problem_from
-from bpnp.search.sources import Options, solve_problems
+from bpnp.search.solvers import Options, solve_problems
 
 FACTORS = (0.67, 0.8, 0.9, 0.95, 1.05, 1.1, 1.2, 1.33)
 RIGHT_DEG, RIGHT_MOVED, RIGHT_CENTRE = 3.0, 0.1, 0.05

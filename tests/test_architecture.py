@@ -39,7 +39,7 @@ MAY_IMPORT = {
 # Files of the search that reach a trained network, a picture or a COLMAP model, each imported at its first use.
 BRIDGES = {
     "bpnp/search/arguments.py": {"models"},
-    "bpnp/search/sources.py": {"models"},
+    "bpnp/search/solvers.py": {"models"},
     "bpnp/search/propose/networks.py": {"models", "robust"},
     "bpnp/search/solution.py": {"report", "datamodules"},
 }

@@ -26,7 +26,7 @@ from bpnp.search.problem import Problem
 from bpnp.search.propose.density_map import search_around, search_near
 from bpnp.search.propose.repetitions import repeated_poses, repetition_margins
 from bpnp.search.refine.annealing import anneal_to_end, finish
-from bpnp.search.scene import Scene
+from bpnp.search.search_frame import Scene
 from bpnp.search.solution import Candidate, Solution, add_objection, candidates_of
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict.decide import rank_poses

@@ -11,6 +11,7 @@ from bpnp.maps.viewed_points import Region
 from bpnp.maps.views import Array
 from bpnp.poses import MIN_POINTS
 from bpnp.runtime import one_blas_thread
+from bpnp.search.competing_poses import other_lens, settle
 from bpnp.search.config import DEFAULT, MAPS, Evidence
 from bpnp.search.focal_length import AROUND, UnknownCamera, fit_camera
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
@@ -18,8 +19,7 @@ from bpnp.search.matching import finished
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.propose.density_map import search_around
 from bpnp.search.refine.annealing import anneal_to_end, finish
-from bpnp.search.scene import Scene
-from bpnp.search.settle import other_lens, settle
+from bpnp.search.search_frame import Scene
 from bpnp.search.solution import Solution, add_objection, change_verdict
 from bpnp.search.verdict.competitors import competing_pose
 from bpnp.search.verdict.decide import judge

@@ -24,7 +24,7 @@ from bpnp.search.config import DEFAULT, MAPS, SearchSettings
 from bpnp.search.focal_length import UnknownCamera, solve_with_focal_length
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.solution import Candidate, Solution
-from bpnp.search.sources import Options, solve_problems
+from bpnp.search.solvers import Options, solve_problems
 from bpnp.search.verdict import reasons
 
 # The search stays near the view's pose, not near the best pose of an unsuccessful earlier search.

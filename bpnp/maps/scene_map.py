@@ -36,7 +36,7 @@ from bpnp.search.arguments import (
 from bpnp.search.config import MAPS, TIME
 from bpnp.search.focal_length import UnknownCamera, unknown_camera
 from bpnp.search.solution import Solution
-from bpnp.search.sources import Options
+from bpnp.search.solvers import Options
 
 if TYPE_CHECKING:
     import torch

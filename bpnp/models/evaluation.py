@@ -24,8 +24,8 @@ from bpnp.runtime import Deadline
 from bpnp.search.config import DEFAULT, SearchSettings
 from bpnp.search.problem import Problem
 from bpnp.search.propose.given import anneal_given
-from bpnp.search.scene import Scene, degenerate
 from bpnp.search.search import search_poses
+from bpnp.search.search_frame import Scene, degenerate
 from bpnp.search.verdict.decide import SearchResult, degenerate_points, judge
 from bpnp.types import Batch, Pose, Prediction, SolveStats
 

@@ -30,10 +30,10 @@ from bpnp.search.config import TIME
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.focal_length import solve_with_focal_length, unknown_camera
 from bpnp.search.inputs import problem_from
-from bpnp.search.modes import Mode, prepare_mode
 from bpnp.search.problem import Problem, UnknownFocal
+from bpnp.search.rig_and_directions import Mode, prepare_mode
 from bpnp.search.solution import Solution
-from bpnp.search.sources import Options, Progress, solve_problems
+from bpnp.search.solvers import Options, Progress, solve_problems
 
 if TYPE_CHECKING:
     import torch

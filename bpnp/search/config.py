@@ -111,7 +111,7 @@ class Repetitions:
 
 @dataclass(frozen=True)
 class OtherFocal:
-    """Search for another focal length near a confident pose (`bpnp.search.settle`).
+    """Search for another focal length near a confident pose (`bpnp.search.competing_poses`).
 
     Attributes:
         step: Factor from one focal length to the next. [factor; calibration]
@@ -426,7 +426,7 @@ PROBLEM = ProblemSettings()
 
 @dataclass(frozen=True)
 class MatchSettings:
-    """Correspondences of a pose, and the last fit to them (`bpnp.search.correspondences`, `matching`, `known_matches`).
+    """Correspondences of a pose, and the last fit to them (`bpnp.search.possible_matches`, `matching`).
 
     Attributes:
         reach: Distance within which an image point has a match, and default inlier threshold; 98.9 % of the errors of
@@ -480,7 +480,7 @@ MATCHES = MatchSettings()
 
 @dataclass(frozen=True)
 class NetworkSettings:
-    """Poses from the assignment of a network (`bpnp.search.propose.networks`, `bpnp.search.sources`).
+    """Poses from the assignment of a network (`bpnp.search.propose.networks`, `bpnp.search.solvers`).
 
     Attributes:
         far: Largest distance from the origin at which float32 is precise enough. [sizes of the scene; numerics]
@@ -1148,7 +1148,7 @@ class DensitySearch:
 
 @dataclass(frozen=True)
 class Schedule:
-    """Order and number of the steps of a search (`bpnp.search.schedule`).
+    """Order and number of the steps of a search (`bpnp.search.plan`).
 
     Attributes:
         turns: Number of iterations, at most. [iterations; convention]

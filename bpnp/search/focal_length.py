@@ -34,9 +34,9 @@ from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.propose.lens import fit_lens
 from bpnp.search.refine.annealing import anneal_to_end
-from bpnp.search.scene import Scene
+from bpnp.search.search_frame import Scene
 from bpnp.search.solution import FOCAL_LENGTH, ROTATION_PARAMETERS, Solution, add_objection
-from bpnp.search.sources import Options, solve_problems
+from bpnp.search.solvers import Options, solve_problems
 from bpnp.search.verdict.decide import match_count, rank_poses
 from bpnp.search.verdict.reasons import objection
 from bpnp.search.verdict.uncertainty import is_within

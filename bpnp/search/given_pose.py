@@ -17,18 +17,18 @@ from numpy.typing import NDArray
 
 from bpnp.poses import rotation_angle
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
+from bpnp.search.competing_poses import settle
 from bpnp.search.config import DEFAULT, PRECISION, PROBLEM, Evidence
-from bpnp.search.correspondences import score_pose
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.pose_model import log10_tests
+from bpnp.search.possible_matches import score_pose
 from bpnp.search.problem import Problem, in_bulk
 from bpnp.search.propose.density_map import perturb_each
 from bpnp.search.propose.repetitions import competing_poses, registered
 from bpnp.search.propose.symmetries import mirror_pose
 from bpnp.search.refine.annealing import anneal_on_points, anneal_to_end, finish
-from bpnp.search.scene import Scene
-from bpnp.search.settle import settle
+from bpnp.search.search_frame import Scene
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict.decide import SearchResult, Verdict, add_false_alarms, judge
 from bpnp.search.verdict.false_alarms import likeliest_scale

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.poses import close_poses, distinct
-from bpnp.search.scene import Scene
+from bpnp.search.search_frame import Scene
 
 SIGNIFICANT = 1e3  # nats per bearing, more than any log-likelihood
 

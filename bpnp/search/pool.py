@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.poses import close_poses
+from bpnp.search.competing_poses import settle
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.loop import Step
 from bpnp.search.pose_model import log10_tests
 from bpnp.search.problem import Problem
 from bpnp.search.refine.annealing import finish
-from bpnp.search.scene import Scene
-from bpnp.search.settle import settle
+from bpnp.search.search_frame import Scene
 from bpnp.search.verdict.decide import SearchResult, add_false_alarms, judge, missed, rank_poses
 
 

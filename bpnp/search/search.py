@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
+from bpnp.search.competing_poses import SceneOf, settle
 from bpnp.search.config import DEFAULT, SearchSettings
 from bpnp.search.enumeration.plan import EnumeratedPoses, EnumerationPlan
 from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.infinity.search import search_rotation
 from bpnp.search.loop import Progress, run, teller
+from bpnp.search.plan import Plan, Proposals
 from bpnp.search.pool import Pool
 from bpnp.search.problem import Problem
 from bpnp.search.propose.density_map import preselect
@@ -23,9 +25,7 @@ from bpnp.search.propose.known_matches import known_matches, poses_of_matches
 from bpnp.search.propose.minimal_solvers import p3p_poses
 from bpnp.search.propose.symmetries import self_motions
 from bpnp.search.refine.annealing import run_batch
-from bpnp.search.scene import Scene, degenerate
-from bpnp.search.schedule import Plan, Proposals
-from bpnp.search.settle import SceneOf, settle
+from bpnp.search.search_frame import Scene, degenerate
 from bpnp.search.starts import Prior
 from bpnp.search.verdict.decide import SearchResult, degenerate_points, judge, no_pose
 

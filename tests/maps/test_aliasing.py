@@ -14,7 +14,7 @@ from bpnp.maps.localize import ONCE, ViewSolution, judge_in_map, search_near
 from bpnp.maps.photo_problem import Photo
 from bpnp.maps.viewed_points import Place
 from bpnp.maps.views import View
-from bpnp.search.sources import Options
+from bpnp.search.solvers import Options
 
 pytestmark = pytest.mark.slow
 

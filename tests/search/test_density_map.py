@@ -15,8 +15,8 @@ from scipy.stats import kstest, truncnorm
 from bpnp.search.config import DEFAULT
 from bpnp.search.problem import Problem
 from bpnp.search.propose.density_map import draw_around, search_near
-from bpnp.search.scene import Scene
 from bpnp.search.search import search_poses
+from bpnp.search.search_frame import Scene
 from bpnp.search.starts import PosePrior
 
 Array = NDArray[np.float64]

@@ -14,7 +14,7 @@ from bpnp.models import Matcher
 from bpnp.search.config import DEFAULT
 from bpnp.search.inputs import problem_from
 from bpnp.search.propose import networks
-from bpnp.search.sources import Options, solve_problems
+from bpnp.search.solvers import Options, solve_problems
 from bpnp.types import Batch, Prediction
 
 VIEW = Rotation.from_euler("xyz", [100, -35, 60], degrees=True).as_matrix()

@@ -19,7 +19,7 @@ from bpnp import GravityPrior, PosePrior, Solution, solve
 from bpnp.cli import main
 from bpnp.search.arguments import checked_prior, scene_points
 from bpnp.search.config import DEFAULT
-from bpnp.search.sources import Options
+from bpnp.search.solvers import Options
 
 Array = NDArray[np.float64]
 RNG = np.random.default_rng(5)

@@ -15,7 +15,7 @@ from bpnp import PosePrior, Solution, solve, solve_many
 from bpnp.examples import load
 from bpnp.models import Search
 from bpnp.runtime import Deadline
-from bpnp.search import sources
+from bpnp.search import solvers
 from bpnp.search.inputs import problem_from
 from bpnp.search.search import search_poses
 
@@ -271,7 +271,7 @@ def test_the_reason_names_the_time_limit_that_left_a_pose_undecided(monkeypatch:
     planted = plant(2, 40)
     points = planted.points2d[0].numpy(), planted.points3d[0].numpy()
     result = replace(search_poses(problem_from(*points, None)), verdict="ambiguous", settled=False)
-    monkeypatch.setattr(sources, "search_poses", lambda *_, **__: result)
+    monkeypatch.setattr(solvers, "search_poses", lambda *_, **__: result)
     assert "not decided" not in solve(*points, time_limit=60).reason
-    monkeypatch.setattr(sources.Options, "deadline", lambda *_: Deadline.after(-1.0))
+    monkeypatch.setattr(solvers.Options, "deadline", lambda *_: Deadline.after(-1.0))
     assert "not decided in 7 s" in solve(*points, time_limit=7).reason

@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 from scipy.special import stdtrit
 
 from bpnp.runtime import NEVER, Deadline
+from bpnp.search.competing_poses import AtZoom, likeliest_zoom, other_lens
 from bpnp.search.config import DEFAULT
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, UnknownFocal
-from bpnp.search.scene import Scene
-from bpnp.search.settle import AtZoom, likeliest_zoom, other_lens
+from bpnp.search.search_frame import Scene
 from bpnp.search.verdict.decide import SearchResult, judge
 
 Array = NDArray[np.float64]

@@ -12,15 +12,15 @@ from functools import partial
 import numpy as np
 
 from bpnp.runtime import Deadline
+from bpnp.search.competing_poses import SceneOf, settle
 from bpnp.search.config import ENUMERATION, SearchSettings
-from bpnp.search.correspondences import score_pose
 from bpnp.search.enumeration.points import predicted_pose
 from bpnp.search.enumeration.search import Enumeration, margin
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.loop import Step
+from bpnp.search.possible_matches import score_pose
 from bpnp.search.problem import Problem
 from bpnp.search.propose.repetitions import competing_poses, registered
-from bpnp.search.settle import SceneOf, settle
 from bpnp.search.starts import GravityPrior
 from bpnp.search.verdict.decide import REFINED, SearchResult, add_false_alarms, is_certain, judge, rank_poses
 

@@ -37,7 +37,7 @@ from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.refine.gauss_newton import ImageMatches, Iteration, image_equations, image_rows, refine
 from bpnp.search.solution import FOCAL_LENGTH, ROTATION_PARAMETERS, Solution, SolutionStats, add_pose
-from bpnp.search.sources import Options
+from bpnp.search.solvers import Options
 from bpnp.search.starts import PosePrior, Prior
 
 FIRST = replace(INFINITY, least_share=INFINITY.first_share)  # of the first search with each focal length

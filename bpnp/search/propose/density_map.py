@@ -29,7 +29,7 @@ from bpnp.search.config import SMOOTHING, DensitySearch, DensityShape
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.kernels.density_map import DensityMap, add_up
 from bpnp.search.refine.annealing import anneal_on_points, perturb_about_centroid
-from bpnp.search.scene import Scene
+from bpnp.search.search_frame import Scene
 from bpnp.search.starts import PosePrior, Prior, aim_of, draw_poses
 
 

@@ -11,7 +11,7 @@ from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_fram
 from bpnp.search.kernels.sides import FORWARD
 from bpnp.search.propose.density_map import perturb_each
 from bpnp.search.refine.annealing import anneal_on_clusters, anneal_on_points, finish
-from bpnp.search.scene import Scene
+from bpnp.search.search_frame import Scene
 
 Array = NDArray[np.float64]
 

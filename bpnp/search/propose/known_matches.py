@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from bpnp.poses import SAME, distinct, polar_coordinates
 from bpnp.search.config import MATCHES
-from bpnp.search.correspondences import score_pose
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.pose_model import PoseModel
+from bpnp.search.possible_matches import score_pose
 from bpnp.search.problem import Problem
 from bpnp.search.propose.minimal_solvers import p3p_poses
 from bpnp.search.refine.gauss_newton import match_equations, refine

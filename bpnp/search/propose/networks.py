@@ -10,11 +10,11 @@ from torch import Tensor, nn
 
 from bpnp.runtime import Deadline
 from bpnp.search.arguments import Array
+from bpnp.search.competing_poses import settle
 from bpnp.search.config import DEFAULT, NETWORKS
 from bpnp.search.problem import Problem
 from bpnp.search.propose.given import score_given
-from bpnp.search.scene import Scene
-from bpnp.search.settle import settle
+from bpnp.search.search_frame import Scene
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict.decide import SearchResult, judge, no_pose
 from bpnp.types import Batch

@@ -12,7 +12,7 @@ from bpnp.search.config import Stages
 from bpnp.search.hypotheses import Hypotheses, select_distinct, to_problem_frame
 from bpnp.search.kernels.dense import dense_scratch, descend
 from bpnp.search.kernels.sparse import descend_sparse, sparse_scratch
-from bpnp.search.scene import Scene, Sides
+from bpnp.search.search_frame import Scene, Sides
 from bpnp.search.starts import Array, Prior, draw_poses
 
 

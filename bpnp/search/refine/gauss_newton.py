@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.search.config import MATCHES, REFINER
-from bpnp.search.correspondences import facing, possible_matches
 from bpnp.search.pose_model import PoseModel, PoseState, Sight
+from bpnp.search.possible_matches import facing, possible_matches
 from bpnp.search.problem import Problem
 
 Array = NDArray[np.float64]

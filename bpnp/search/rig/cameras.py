@@ -23,7 +23,7 @@ from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.refine.gauss_newton import refine, soft_equations, steps
-from bpnp.search.scene import Scene
+from bpnp.search.search_frame import Scene
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
 from bpnp.search.verdict.covariance import covariance_of, join
 from bpnp.search.verdict.false_alarms import Terms, camera_terms, directions_of, log10_nfa

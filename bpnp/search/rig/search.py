@@ -16,21 +16,21 @@ from numpy.typing import NDArray
 
 from bpnp.poses import distinct, polar_coordinates
 from bpnp.runtime import NEVER, Clock, Deadline, one_blas_thread
+from bpnp.search.competing_poses import fitted_lens
 from bpnp.search.config import DEFAULT, ENUMERATION, RIG, SearchSettings
 from bpnp.search.enumeration.points import predicted_pose
 from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.loop import Progress, Step, run, teller
+from bpnp.search.plan import Plan
 from bpnp.search.pool import Pool
 from bpnp.search.problem import Problem
 from bpnp.search.propose.density_map import search_around
 from bpnp.search.propose.known_matches import known_matches, poses_of_matches
 from bpnp.search.propose.repetitions import repeated_poses
 from bpnp.search.rig.cameras import Array, Pose, Rig
-from bpnp.search.scene import Scene
-from bpnp.search.schedule import Plan
 from bpnp.search.search import lacks_partners
-from bpnp.search.settle import fitted_lens
+from bpnp.search.search_frame import Scene
 from bpnp.search.verdict.decide import SearchResult, is_object, judge, match_count, missed, no_pose
 from bpnp.search.verdict.reasons import focal_length_not_fixed, objection
 from bpnp.search.verdict.uncertainty import linearised, share_bound

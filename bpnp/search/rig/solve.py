@@ -21,7 +21,7 @@ from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.rig.cameras import Pose, Rig
 from bpnp.search.rig.search import search_rig
 from bpnp.search.solution import FOCAL_LENGTH, POSE_PARAMETERS, SCALE, Solution, add_pose
-from bpnp.search.sources import Options
+from bpnp.search.solvers import Options
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
 from bpnp.search.verdict.covariance import student_factor
 from bpnp.search.verdict.decide import SearchResult, no_pose

@@ -350,7 +350,7 @@ def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = 
       their probabilities. The pose is eliminated, and the principal directions of the strains with a significant F
       statistic count (level 0.001).
     - The log of the focal length is fitted and tested likewise (level `rule.focal_chance`, 0.01). The correspondences
-      of the pose bias it towards the given one; `bpnp.search.settle` fits a significant one with new ones.
+      of the pose bias it towards the given one; `bpnp.search.competing_poses` fits a significant one with new ones.
 
     Args:
         linear: Pose from `linearised`, or None for no change.

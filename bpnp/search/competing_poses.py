@@ -21,7 +21,7 @@ from bpnp.search.propose.density_map import search_around
 from bpnp.search.propose.lens import LensFit, fit_lens
 from bpnp.search.propose.repetitions import repeated_poses, repetition_margins
 from bpnp.search.refine.annealing import anneal_to_end
-from bpnp.search.scene import Scene
+from bpnp.search.search_frame import Scene
 from bpnp.search.verdict.competitors import of_misfit
 from bpnp.search.verdict.decide import SearchResult, add_false_alarms, is_symmetric, judge, match_count
 from bpnp.search.verdict.false_alarms import alarms_of, likeliest_scale

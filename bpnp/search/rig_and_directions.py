@@ -9,7 +9,7 @@ from bpnp.search.focal_length import unknown_camera
 from bpnp.search.infinity.solve import prepare_directions
 from bpnp.search.rig.solve import mount_from, prepare_rig
 from bpnp.search.solution import Solution
-from bpnp.search.sources import Options
+from bpnp.search.solvers import Options
 from bpnp.search.starts import GravityPrior, PosePrior
 
 PER_CAMERA = "labels2d", "scores2d"

@@ -11,9 +11,9 @@ from bpnp.search.arguments import Array
 from bpnp.search.config import DEFAULT, NETWORKS, TIME, SearchSettings
 from bpnp.search.enumeration.search import exceeds_enumeration
 from bpnp.search.matching import failed_solution, finished
+from bpnp.search.plan import Proposals
 from bpnp.search.problem import Problem
 from bpnp.search.propose.mirror import mirrored_alarms
-from bpnp.search.schedule import Proposals
 from bpnp.search.search import search_poses
 from bpnp.search.solution import Solution
 from bpnp.search.starts import PosePrior
