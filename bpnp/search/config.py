@@ -796,6 +796,11 @@ class FocalSettings:
         fewest_bent: Least number of matches for a fit of the distortion, that of `OtherFocal`. [matches; derived]
         centre_sigma: Standard deviation of the principal point, as a fraction of the distance to the image corner:
             about a quarter of a per cent of the larger image side. [fraction; not tuned]
+        tangential_sigma: Standard deviation of the displacement at the image corner by a tangential coefficient, as a
+            fraction of the distance to the corner. It was chosen on statue_of_liberty, whose map has one camera for
+            photos of many. [fraction; calibration]
+        quartic_sigma: Standard deviation of the displacement at the image corner by the second radial coefficient, as a
+            fraction of the distance to the corner. [fraction; not tuned]
         least_reach: Smallest distance from the principal point to the image corner. [focal lengths; numerics]
         least_limit: Smallest time limit of a search. [seconds; numerics]
     """
@@ -817,6 +822,8 @@ class FocalSettings:
     most_bend: float = OtherFocal.bend
     fewest_bent: int = OtherFocal.fewest
     centre_sigma: float = 0.004
+    tangential_sigma: float = 0.002
+    quartic_sigma: float = 0.01
     least_reach: float = 1e-3
     least_limit: float = 1e-3
 

@@ -102,6 +102,8 @@ class UnknownCamera(NamedTuple):
             radial_sigma=sigma / self.outermost(zoom) ** 2,
             radial_range=0.0 if radial is None else 2 * FOCAL.most_bend / self.outermost(zoom) ** 2,
             centre_sigma=FOCAL.centre_sigma * self.outermost(zoom),
+            tangential_sigma=FOCAL.tangential_sigma / self.outermost(zoom),
+            quartic_sigma=FOCAL.quartic_sigma / self.outermost(zoom) ** 4,
         )
 
     def focal_steps(self, step: float) -> list[Camera]:

@@ -394,9 +394,36 @@ def lens_columns(seen: Array, radial: float) -> Array:
     return _lens_columns(seen, radial, None, radial)
 
 
-def centre_columns(seen: Array) -> Array:
-    """Return the derivatives (..., 3, 2) of unit directions (..., 3) by the principal point, in focal lengths."""
-    return np.asarray(across(seen)[..., :2] * np.maximum(seen[..., 2], 0.0)[..., None, None])
+def lens_error_columns(seen: Array, radial: float) -> Array:
+    """Return the derivatives of directions by parameters of the camera model that are not fitted.
+
+    These are the principal point, the tangential coefficients p1 and p2 (Brown 1966) and the second radial coefficient
+    k2, as in OpenCV's camera model. A step of them moves the image y = (1 + k r^2) x of x = (X, Y), Z = 1, r = |x|, by
+
+        (1, 0), (0, 1), (2 X Y, r^2 + 2 Y^2), (r^2 + 2 X^2, 2 X Y), r^4 x.
+
+    A motion dy of the image moves x by (dy - 2 k x (x^T dy) / (1 + 3 k r^2)) / (1 + k r^2).
+
+    Args:
+        seen: (..., 3) unit directions.
+        radial: Radial coefficient k of the camera with which their bearings were undistorted.
+
+    Returns:
+        (..., 3, 5) derivatives, 0 behind the camera; the principal point is in focal lengths.
+
+    Source: D. C. Brown, Decentering distortion of lenses, Photogrammetric Engineering 1966.
+    """
+    ahead = seen[..., 2:] > 0
+    x = np.where(ahead, seen[..., :2] / np.where(ahead, seen[..., 2:], 1.0), 0.0)
+    squared, slope = (each[..., None, None] for each in _radii(seen, radial))
+    both = 2 * x[..., :1] * x[..., 1:]
+    own = squared[..., 0] + 2 * x**2
+    tangential = np.stack([np.concatenate(pair, -1) for pair in ((both, own[..., 1:]), (own[..., :1], both))], -1)
+    centre = np.broadcast_to(np.eye(2), tangential.shape)
+    moved = np.concatenate([centre, tangential, squared**2 * x[..., None]], -1)
+    outwards = x[..., :, None] * (x[..., None, :] @ moved)
+    moved = (moved - 2 * radial / slope * outwards) / (1 + radial * squared)
+    return np.asarray(across(seen)[..., :2] @ moved * np.maximum(seen[..., 2], 0.0)[..., None, None])
 
 
 def undistort(bearings: Array, zoom: float, radial: float) -> Array:

@@ -37,6 +37,8 @@ class UnknownFocal(NamedTuple):
         radial_sigma: Standard deviation of k; 0 if the distortion is given, infinite if k is fitted.
         radial_range: Range of possible k; 0 if k is not fitted.
         centre_sigma: Standard deviation of the principal point, in focal lengths. It is not fitted.
+        tangential_sigma: Standard deviation of the tangential coefficients. They are not fitted.
+        quartic_sigma: Standard deviation of the second radial coefficient, of r^4. It is not fitted.
     """
 
     log_range: float
@@ -46,6 +48,8 @@ class UnknownFocal(NamedTuple):
     radial_sigma: float = 0.0
     radial_range: float = 0.0
     centre_sigma: float = 0.0
+    tangential_sigma: float = 0.0
+    quartic_sigma: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

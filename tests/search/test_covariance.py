@@ -51,13 +51,38 @@ def test_an_image_point_that_stands_for_several_counts_as_often() -> None:
     np.testing.assert_allclose(covariance_of(twice, fitted=3), inverse_of(rows(0)) / 2, rtol=1e-9)
 
 
-def test_a_parameter_that_is_not_fitted_adds_what_it_moves() -> None:
-    """An offset with a standard deviation of 0.3 adds the outer product of the shift of the estimate that it causes."""
+def test_a_parameter_that_no_residual_shows_adds_all_that_it_moves() -> None:
+    """It moves the image points as a step of the fitted numbers does."""
+    jacobian, moved = rows(0), np.array([0.3, -0.1, 0.2])
+    matches = of_sure_matches(np.zeros((60, 2)), jacobian)
+    found = covariance_of(matches, fitted=3, considered=jacobian @ moved[:, None])
+    np.testing.assert_allclose(found, inverse_of(jacobian) + np.outer(moved, moved), rtol=1e-9)
+
+
+def test_a_parameter_that_is_not_fitted_adds_as_much_as_if_it_were() -> None:
+    """Without residuals the covariance is that of a fit of all numbers."""
     jacobian, offset = rows(0), np.tile([[[0.3], [0.0]]], (60, 1, 1))
-    moved = np.linalg.lstsq(jacobian.reshape(-1, 3), offset.ravel(), rcond=None)[0]
     matches = of_sure_matches(np.zeros((60, 2)), jacobian)
     found = covariance_of(matches, fitted=3, considered=offset)
-    np.testing.assert_allclose(found, inverse_of(jacobian) + np.outer(moved, moved), rtol=1e-9)
+    both = np.concatenate([jacobian, offset], -1).reshape(-1, 4)
+    expected = np.linalg.inv(both.T @ both + np.diag([0.0, 0, 0, 1]))[:3, :3]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_the_covariance_allows_for_the_parameters_that_are_not_fitted() -> None:
+    """Fits without two parameters of the measurements, which are drawn anew each time."""
+    jacobian, considered, rng = rows(0), 0.3 * rows(1, size=2), np.random.default_rng(2)
+    flat, squared, alone = jacobian.reshape(-1, 3), [], []
+    for _ in range(300):
+        offset = (considered @ rng.standard_normal((2, 1)))[..., 0]
+        measured = rng.standard_normal((60, 2)) + offset
+        step = np.linalg.lstsq(flat, measured.ravel(), rcond=None)[0]
+        matches = of_sure_matches(measured - jacobian @ step, jacobian)
+        for found, known in ((squared, considered), (alone, None)):
+            covariance = covariance_of(matches, fitted=3, considered=known)
+            assert covariance is not None
+            found.append(step @ np.linalg.solve(covariance, step))
+    assert 0.6 * 3 < np.mean(squared) < 1.1 * 3 < np.mean(alone)
 
 
 def test_parameters_that_the_matches_do_not_fix_have_no_covariance() -> None:

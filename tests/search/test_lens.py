@@ -10,7 +10,7 @@ from planted import degrees_between, directions
 from scipy.spatial.transform import Rotation
 
 from bpnp.cameras import camera_from
-from bpnp.search.pose_model import centre_columns, lens_columns, log10_lenses
+from bpnp.search.pose_model import lens_columns, lens_error_columns, log10_lenses
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.propose.lens import fit_lens, lens_model
 from bpnp.search.verdict.uncertainty import linearised, local_covariance
@@ -60,20 +60,20 @@ def test_derivatives_by_camera_parameters_are_finite_differences_of_undistorted_
     points, pixels = planted(radial, seed=4, count=20)
     step = 1e-5
 
-    def seen(log_zoom: float = 0.0, change: float = 0.0, centre: tuple[float, float] = (0.0, 0.0)) -> Array:
+    def seen(log_zoom: float = 0.0, change: float = 0.0, errors: Array | None = None) -> Array:
         """Where points that the changed camera sees are, as the first camera undistorts them."""
-        moved = radial_camera(FOCAL * math.exp(log_zoom), radial + change, centre).project(points)
+        focal, (x, y, p1, p2, k2) = FOCAL * math.exp(log_zoom), np.zeros(5) if errors is None else errors
+        lens = camera_from(("OPENCV", [focal, focal, FOCAL * x, FOCAL * y, radial + change, k2, p1, p2]))
+        moved = lens.project(points)
         return directions(np.c_[radial_camera(FOCAL, radial).normalise(moved), np.ones(len(points))])
 
     columns = lens_columns(directions(points), radial)
     np.testing.assert_allclose(columns[..., 0], (seen(step) - seen(-step)) / (2 * step), atol=1e-5)
     np.testing.assert_allclose(columns[..., 1], (seen(change=step) - seen(change=-step)) / (2 * step), atol=1e-5)
-    if radial == 0:
-        for k, axis in enumerate(np.eye(2)):
-            ends = (seen(centre=tuple(sign * step * FOCAL * axis)) for sign in (1, -1))
-            np.testing.assert_allclose(
-                centre_columns(directions(points))[..., k], np.subtract(*ends) / (2 * step), atol=1e-5
-            )
+    for k, axis in enumerate(np.eye(5)):
+        ends = (seen(errors=sign * step * axis) for sign in (1, -1))
+        column = lens_error_columns(directions(points), radial)[..., k]
+        np.testing.assert_allclose(column, np.subtract(*ends) / (2 * step), atol=1e-5)
 
 
 def test_the_nfa_counts_each_unknown_of_the_camera_model() -> None:
@@ -117,12 +117,25 @@ def test_the_covariance_of_the_focal_length_allows_for_correlated_residuals() ->
     assert np.median([sigma for _, sigma in off]) < 0.01  # a bound that says something
 
 
-def test_a_principal_point_off_the_image_centre_widens_the_covariance() -> None:
+SIGMAS = {"centre_sigma": 0.004, "tangential_sigma": 0.004, "quartic_sigma": 0.05}
+
+
+@pytest.mark.parametrize("name", SIGMAS)
+def test_a_lens_parameter_that_is_not_fitted_widens_the_covariance(name: str) -> None:
+    """A camera that is off by one standard deviation. Residuals show that the first one is not."""
     points, pixels = planted(0.0, seed=6)
-    pixels = pixels + np.random.default_rng(7).normal(0, 0.3, pixels.shape)
-    problem = Problem(directions(np.c_[pixels / FOCAL, np.ones(len(pixels))]), points)
-    fixed, loose = (focal_sigmas(problem, UnknownFocal(2.0, centre_sigma=sigma), 3e-4)[1] for sigma in (0.0, 0.004))
-    moved = directions(np.c_[(pixels + 0.004 * FOCAL) / FOCAL, np.ones(len(pixels))])
-    error, _ = focal_sigmas(Problem(moved, points), UnknownFocal(2.0), 3e-4)
-    assert fixed < loose
-    assert abs(error) < 2 * math.sqrt(2) * loose
+    off = {"centre_sigma": (1, 1, 0, 0, 0), "tangential_sigma": (0, 0, 1, 1, 0), "quartic_sigma": (0, 0, 0, 0, 1)}[name]
+    x, y, p1, p2, k2 = SIGMAS[name] * np.array(off)
+    lens = camera_from(("OPENCV", [FOCAL, FOCAL, FOCAL * x, FOCAL * y, 0.0, k2, p1, p2]))
+    noise = np.random.default_rng(7).normal(0, 0.3, pixels.shape)
+    right, moved = (
+        Problem(directions(np.c_[(image + noise) / FOCAL, np.ones(len(points))]), points)
+        for image in (pixels, lens.project(points))
+    )
+    prior = UnknownFocal(2.0, **{name: SIGMAS[name]})
+    (alone, fixed), (_, loose) = (focal_sigmas(right, each, 3e-4) for each in (UnknownFocal(2.0), prior))
+    error, sigma = focal_sigmas(moved, prior, 3e-4)
+    assert loose > 1.003 * fixed
+    assert abs(error) < 3 * sigma
+    if name == "centre_sigma":
+        assert math.sqrt(loose**2 - fixed**2) < abs(error - alone)

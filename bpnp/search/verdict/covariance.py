@@ -81,7 +81,7 @@ def covariance_of(
             overdetermined without it.
         blocks: (g,) block of each image point; the jackknife leaves out one block at a time. None: one point.
         considered: (k, d, c) derivative of the predicted image points by parameters that are not fitted, times their
-            standard deviations. With S = H^-1 sum_k p_k J_k^T J_c,k, S S^T is added.
+            standard deviations. `_add_considered` adds what their errors move.
 
     Returns:
         (p, p), or None where the information is not positive definite.
@@ -124,10 +124,44 @@ def covariance_of(
     ratio, axes = np.linalg.eigh((weight[:, None] * steps).T @ steps + root.T @ matches.known @ root)
     along = root @ axes
     covariance = np.asarray(along * np.maximum(ratio, 1.0) @ along.T)
-    if considered is None:
-        return covariance
-    moved = root @ root.T @ np.einsum("k,kia,kib->ab", counted, matches.jacobian, considered)
-    return np.asarray(covariance + moved @ moved.T)
+    return covariance if considered is None else _add_considered(covariance, matches, counted, considered)
+
+
+def _add_considered(covariance: Array, matches: Linearisation, counted: Array, considered: Array) -> Array:
+    """Add the errors of an estimate that come from parameters which are not fitted.
+
+    The residuals r tell something of these parameters q, whose prior has the mean 0 and the covariance 1. Let J and K
+    be the derivatives by the fitted parameters and by q, and P = A^-1 J^T with A = J^T J + `known`. The posterior of q
+    has the covariance V = (1 + K^T K - K^T J P K)^-1 and the mean m = V (K^T - K^T J P) r. An error of q moves the
+    estimate by S = -P K times it, so that the mean square of the error that q causes is
+
+        S (V + m m^T) S^T.
+
+    Its mean over all residuals is S S^T, that of a parameter of which the residuals tell nothing (Schmidt 1966).
+    Matches tell less than independent certain ones. J^T J, K^T K and J^T K are divided by the largest factor by which
+    the covariance exceeds A^-1.
+
+    Args:
+        covariance: (p, p) of the fitted parameters with q = 0.
+        matches: Linearised about the estimate.
+        counted: (k,) weight of each match.
+        considered: (k, d, c) derivatives by the parameters q, in their standard deviations.
+
+    Source: S. F. Schmidt, Application of state-space methods to navigation problems, 1966.
+    """
+    size = len(covariance)
+    columns = np.concatenate([matches.jacobian, considered, matches.residual[..., None]], -1)
+    products = np.einsum("k,kia,kib->ab", counted, columns, columns)
+    root = np.linalg.cholesky(products[:size, :size] + matches.known)
+    factor = max(float(np.linalg.eigvalsh(root.T @ covariance @ root)[-1]), 1.0)
+    products = products / factor
+    own = products[:size, :size] + matches.known
+    moved = np.linalg.solve(own, products[:size, size:])
+    posterior = products[size:, size:] - products[:size, size:].T @ moved
+    spread = np.linalg.inv(np.eye(considered.shape[-1]) + posterior[:-1, :-1])
+    mean = spread @ posterior[:-1, -1]
+    shift = moved[:, :-1]
+    return np.asarray(covariance + shift @ (spread + np.outer(mean, mean)) @ shift.T)
 
 
 def student_factor(free: float | int) -> float:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc, fdtri
 
 from bpnp.search.config import DEFAULT, PRECISION, Evidence
-from bpnp.search.pose_model import PoseModel, PoseState, Sight, centre_columns, crossed, lens_columns
+from bpnp.search.pose_model import PoseModel, PoseState, Sight, crossed, lens_columns, lens_error_columns
 from bpnp.search.problem import Problem
 from bpnp.search.refine.gauss_newton import soft_matches
 from bpnp.search.verdict.covariance import Linearisation, covariance_of, student_factor
@@ -197,13 +197,13 @@ def local_covariance(linear: "Linearised | None") -> Array | None:
     Sources: T. A. Louis, Finding the observed information matrix when using the EM algorithm, J. R. Stat. Soc. B 1982;
     J. G. MacKinnon, H. White, Some heteroskedasticity-consistent covariance matrix estimators with improved finite
     sample properties, J. Econometrics 1985; B. Efron, C. Stein, The jackknife estimate of variance, Annals of
-    Statistics 1981; S. F. Schmidt, Application of state-space methods to navigation problems, 1966.
+    Statistics 1981.
 
     With an unknown focal length, the jackknife leaves out blocks of neighbouring image points. Errors of the lens
     model and of the map are similar for neighbours, and they add up in the focal length. The radial coefficient
-    is eliminated. Its expected standard deviation counts as a prior unless it was fitted. The principal point is a
-    considered parameter: with c its standard deviation and J_c the derivatives by it, C becomes C + c^2 S S^T,
-    S = H^-1 sum_ij p_ij J_ij^T J_c / s^2.
+    is eliminated. Its expected standard deviation counts as a prior unless it was fitted. The principal point,
+    tangential distortion and the second radial coefficient are not fitted. What their errors move is added, as far as
+    the residuals leave them open (`bpnp.search.verdict.covariance`).
 
     Returns:
         (6, 6), or (7, 7) with the logarithm of a fitted focal length; None if the points do not fix the pose.
@@ -233,8 +233,10 @@ def _of_louis(linear: "Linearised") -> Array | None:
         return covariance_of(matches, fitted=problem.fitted)
     matched = np.asarray(np.bincount(linear.image, linear.probability, len(problem.image.chosen)), np.float64)
     blocks = _blocks(problem, matched)
-    centre = problem.focal.centre_sigma / linear.scale * centre_columns(linear.sight.directions)
-    covariance = covariance_of(matches, fitted=problem.fitted, blocks=blocks, considered=centre)
+    lens, seen = problem.focal, linear.sight.directions
+    sigmas = np.repeat([lens.centre_sigma, lens.tangential_sigma, lens.quartic_sigma], [2, 2, 1])
+    considered = sigmas / linear.scale * lens_error_columns(seen, lens.radial)
+    covariance = covariance_of(matches, fitted=problem.fitted, blocks=blocks, considered=considered)
     return None if covariance is None else covariance[: POSE + 1, : POSE + 1]
 
 
