@@ -248,6 +248,7 @@ class ViewedPoints:
             views: Names of views, in the order of the result; None for all views of the map.
             camera: Camera of the photo.
             keypoints: (m, 2) pixels.
+            rank_views: Function that scores the views, as for `SceneMap.localize`; None for their point density.
         """
         if views is not None:
             order = self.named(views)

@@ -156,8 +156,8 @@ def shorten(names: Sequence[str], width: int) -> list[str]:
 def format_fixed(values: Sequence[float | int]) -> list[str]:
     """Write numbers of one kind, such as coordinates, without exponents: three decimals, more if all are small.
 
-    >>> from bpnp.report.terminal import fixed
-    >>> fixed([500000.25, 5123456.789, 0]), fixed([0.02, -1.5, 0])
+    >>> from bpnp.report.terminal import format_fixed
+    >>> format_fixed([500000.25, 5123456.789, 0]), format_fixed([0.02, -1.5, 0])
     (['500000.250', '5123456.789', '0.000'], ['0.02000', '-1.50000', '0.00000'])
     """
     largest = max([abs(value) for value in values if math.isfinite(value)], default=0.0)
