@@ -7,6 +7,7 @@ from types import ModuleType
 import finetune
 import numpy as np
 import paper_tables
+import paper_weights
 import pytest
 import results
 import table1
@@ -56,7 +57,8 @@ def test_a_training_goes_on_from_its_own_checkpoint_and_a_branch_from_anothers(
 def test_the_weights_with_the_pose_loss_go_on_from_those_without_and_switch_once(tmp_path: Path) -> None:
     """Each stage starts where the one before ends, with more steps; the pose loss joins after the first weights."""
     chain = list(trainings(tmp_path))
-    assert [(stage.name, stage.pose_loss) for stage, _ in chain] == [("paper-lc", False), ("paper-lclp", True)]
+    packaged = [(stage.name, stage.pose_loss, stage.loss) for stage, _ in chain if stage.packaged]
+    assert packaged == [("paper-lc", False, "correspondence"), ("paper-lclp", True, "correspondence")]
     assert [training.start for _, training in chain] == [None, *(training.checkpoint for _, training in chain[:-1])]
     steps = [0]
     for stage, training in chain:
@@ -64,10 +66,21 @@ def test_the_weights_with_the_pose_loss_go_on_from_those_without_and_switch_once
         switch = EPOCH * int(options["--pose_loss.start_epoch"])
         steps.append(training.steps)
         assert stage.pose_loss == (steps[-1] > switch) == (steps[-2] >= switch)
+        assert options["--model.matching_loss"] == stage.loss
         assert (steps[-1] - steps[-2], steps[-1] % EPOCH) == (stage.steps, 0)
         assert int(options["--model.decay_start"]) == steps[-2]
         assert int(options["--model.decay_steps"]) == stage.steps
     assert steps[-1] == sum(stage.steps for stage in STAGES)
+
+
+def test_the_stages_between_the_weights_are_not_packed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trained, packed = [], []
+    monkeypatch.setattr(Training, "run", lambda training: trained.append(training.folder.name) or training.checkpoint)
+    monkeypatch.setattr(paper_weights, "pack_weights", lambda _, target: packed.append(target))
+    monkeypatch.setattr("sys.argv", ["paper_weights", "--run", str(tmp_path), "--output", str(tmp_path / "packed")])
+    paper_weights.main()
+    assert trained == [stage.name for stage in STAGES]
+    assert packed == [tmp_path / "packed" / "paper-lc.ckpt", tmp_path / "packed" / "paper-lclp.ckpt"]
 
 
 class Known(nn.Module):
