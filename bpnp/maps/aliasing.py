@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.maps.photo_problem import Photo, in_picture
+from bpnp.maps.photo_problem import Photo
 from bpnp.maps.viewed_points import Region
 from bpnp.maps.views import Array
 from bpnp.poses import rotation_angle, same_pose
@@ -173,7 +173,9 @@ def _other_regions(regions: Iterable[Region], place: Region, problem: Problem, s
     """Yield the first regions with mostly points that are not visible from the pose of a solution."""
     if len(solution.matches) < ALIASING.fewest:
         return
-    seen, count = place.point_ids[in_picture(problem, solution)], 0
+    assert problem.camera is not None
+    pose = solution.rotation, solution.translation
+    seen, count = place.point_ids[place.in_view(*pose, problem.camera, problem.image_points)], 0
     for region in regions:
         other = ~np.isin(region.point_ids, seen)
         if other.sum() >= ALIASING.fewest and other.mean() >= ALIASING.least_other:

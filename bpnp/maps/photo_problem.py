@@ -4,16 +4,13 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from bpnp.cameras import Camera, camera_from
 from bpnp.maps.viewed_points import RankViews, Region
 from bpnp.maps.views import Array
 from bpnp.search.focal_length import UnknownCamera
 from bpnp.search.inputs import problem_from
 from bpnp.search.problem import Problem, UnknownFocal
-from bpnp.search.solution import Candidate, Solution
+from bpnp.search.solution import Solution
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,10 +51,3 @@ class Photo:
 def with_ids(solution: Solution, region: Region) -> Solution:
     """Return a solution with the point ids of a region and the name of its view."""
     return replace(solution, view=region.view.name, point_ids=region.point_ids)
-
-
-def in_picture(problem: Problem, pose: Solution | Candidate) -> NDArray[np.bool_]:
-    """Return a mask (n,) of the scene points visible from a pose, within the bounding box of the image points."""
-    projected, image = problem.project_scene(*problem.from_user(pose.rotation, pose.translation)), problem.image_points
-    inside = (projected >= image.min(0)) & (projected <= image.max(0))  # not NaN
-    return np.asarray(inside.all(-1))

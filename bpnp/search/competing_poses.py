@@ -22,7 +22,7 @@ from bpnp.search.propose.lens import LensFit, fit_lens
 from bpnp.search.propose.repetitions import repeated_poses, repetition_margins
 from bpnp.search.refine.annealing import anneal_to_end
 from bpnp.search.search_frame import Scene
-from bpnp.search.verdict.competitors import of_misfit
+from bpnp.search.verdict.competitors import other_camera
 from bpnp.search.verdict.decide import SearchResult, add_false_alarms, is_symmetric, judge, match_count
 from bpnp.search.verdict.false_alarms import alarms_of, likeliest_scale
 from bpnp.search.verdict.reasons import Objection, objection
@@ -149,7 +149,7 @@ def other_lens(result: SearchResult, problem: Problem, scene_of: SceneOf, rule: 
         alarms = [_alarms(problem, other, rule) for other in others]
         if min(alarms, default=math.inf) >= result.log10_false_alarms + math.log10(rule.focal_chance):
             return None
-        return of_misfit(misfit_of(rotation, middle, others[int(np.argmin(alarms))]), rule)
+        return other_camera(misfit_of(rotation, middle, others[int(np.argmin(alarms))]), rule)
 
     leader = AtZoom(1.0, problem, result.candidates[:1])
     other = better(leader)
@@ -174,7 +174,7 @@ def fitted_lens(linear: Linearised | None, count: float, rule: Evidence) -> Obje
         return None
     rotation, middle = linear.state.rotation, linear.state.centroid
     fit = fit_lens(linear.problem, rotation, middle, linear.scale)
-    return None if fit is None else of_misfit(misfit_of(rotation, middle, fit), rule)
+    return None if fit is None else other_camera(misfit_of(rotation, middle, fit), rule)
 
 
 def misfit_of(rotation: Array, middle: Array, other: LensFit) -> Misfit:

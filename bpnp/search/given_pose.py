@@ -21,7 +21,7 @@ from bpnp.search.competing_poses import settle
 from bpnp.search.config import DEFAULT, PRECISION, PROBLEM, Evidence
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
-from bpnp.search.pose_model import log10_tests
+from bpnp.search.pose_model import PoseModel
 from bpnp.search.possible_matches import score_pose
 from bpnp.search.problem import Problem, in_bulk
 from bpnp.search.propose.density_map import perturb_each
@@ -86,7 +86,7 @@ def judge_given_pose(
             rotation, translation, math.degrees(scale) / PROBLEM.sigmas, scale * distance / PROBLEM.sigmas
         )
         near = replace(problem, prior=prior).log10_prior_fraction(optimum.rotation[0], optimum.translation[0])
-        one = replace(problem, log10_tried=max(log10_tests(problem) + near, 0.0))
+        one = replace(problem, log10_tried=max(PoseModel.of(problem).log10_tests([problem]) + near, 0.0))
         claim = optimum
     competing = others[~same & (others.log10_false_alarms <= 0)]  # insignificant poses do not compete
     candidates = _with_new_false_alarms(Hypotheses.concatenate([claim, competing]), one)

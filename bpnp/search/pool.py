@@ -10,7 +10,7 @@ from bpnp.poses import close_poses
 from bpnp.search.competing_poses import settle
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.loop import Step
-from bpnp.search.pose_model import log10_tests
+from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem
 from bpnp.search.refine.annealing import finish
 from bpnp.search.search_frame import Scene
@@ -35,7 +35,7 @@ class Pool:
         self.scene, self.problem, self.enumerated = scene, problem, enumerated
         self.turns, self._judged_alarms = 0, 0.0
         self._is_thinned = len(problem.bearings) > scene.settings.fine.bearings
-        self._tests = log10_tests(problem)
+        self._tests = PoseModel.of(problem).log10_tests([problem])
         self.forget()
         if len(enumerated.candidates):
             self.candidates = to_scene_frame(enumerated.candidates, scene)

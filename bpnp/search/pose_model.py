@@ -494,11 +494,6 @@ def _lens_columns(seen: Array, reference: float, squared: Array | None, radial: 
     ]
 
 
-def log10_tests(problem: Problem) -> float:
-    """Return log10 of the number of tests with the points of one camera; see `PoseModel.log10_tests`."""
-    return PoseModel.of(problem).log10_tests([problem])
-
-
 def log10_lenses(lens: UnknownFocal | None, spread: float, scales: Array) -> Array:
     """Return log10 (S,) of the number of distinguishable lenses at each scale s of an image, 0 for a given lens.
 

@@ -113,7 +113,7 @@ def packaged_matcher(weights: str) -> "Matcher":
     return Matcher.from_pretrained(weights)
 
 
-class View(NamedTuple):
+class NetworkFrame(NamedTuple):
     """Coordinates R s p + t, in the user's unit, that a network expects for the points p of a problem of size s."""
 
     rotation: Array
@@ -129,7 +129,7 @@ class View(NamedTuple):
         return rotation @ self.rotation, (rotation @ self.translation + translation) / self.size
 
 
-def view_for(net: nn.Module, problem: Problem) -> View:
+def view_for(net: nn.Module, problem: Problem) -> NetworkFrame:
     """Return the coordinates in which a network expects the 3D points: the user's, or those of the view of the prior.
 
     A prior without a translation gets one at which the points appear as large as the image points.
@@ -138,7 +138,7 @@ def view_for(net: nn.Module, problem: Problem) -> View:
         ValueError: The network has the frame "view" and there is no `PosePrior`.
     """
     if getattr(net, "frame", "any") == "any":
-        return View(np.eye(3), _near_origin(problem), problem.size)
+        return NetworkFrame(np.eye(3), _near_origin(problem), problem.size)
     if not isinstance(problem.prior, PosePrior):
         raise ValueError(
             "this network was trained in the coordinates of a view near the photo, and there is no `prior`; give "
@@ -146,12 +146,12 @@ def view_for(net: nn.Module, problem: Problem) -> View:
         )
     rotation = np.asarray(problem.prior.rotation, np.float64)
     if problem.prior.translation is not None:
-        return View(rotation, problem.size * np.asarray(problem.prior.translation), problem.size)
+        return NetworkFrame(rotation, problem.size * np.asarray(problem.prior.translation), problem.size)
     turned, image = problem.size * problem.points3d @ rotation.T, _seen(problem)
     centre, middle = np.median(turned, 0), np.median(image, 0)
     across = np.median(np.linalg.norm((turned - centre)[:, :2], axis=1))
     depth = across / max(float(np.median(np.linalg.norm(image - middle, axis=1))), 1e-6)
-    return View(rotation, depth * np.append(middle, 1.0) - centre, problem.size)
+    return NetworkFrame(rotation, depth * np.append(middle, 1.0) - centre, problem.size)
 
 
 def _near_origin(problem: Problem) -> Array:
@@ -166,7 +166,7 @@ def _seen(problem: Problem) -> Array:
     return points2d[np.isfinite(points2d).all(-1)]
 
 
-def _given(net: nn.Module, members: list[Problem]) -> tuple[list[View], Batch]:
+def _given(net: nn.Module, members: list[Problem]) -> tuple[list[NetworkFrame], Batch]:
     """Return the coordinates that the network expects for each problem, and the batch of problems in them."""
     views = [view_for(net, problem) for problem in members]
     batch = Batch.from_arrays(

@@ -19,7 +19,7 @@ from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, label_groups
 from bpnp.search.verdict.false_alarms import directions_of, own_evidence
 from bpnp.search.verdict.reasons import Objection, objection
-from bpnp.search.verdict.uncertainty import Linearised, Misfit, systematic_misfit
+from bpnp.search.verdict.uncertainty import Misfit
 
 Array = NDArray[np.float64]
 Seen = Sequence[tuple[Hypotheses, Problem]]
@@ -69,22 +69,14 @@ def rough_residuals(candidates: Hypotheses) -> Objection | None:
     return objection("rough_residuals", decades)
 
 
-def misfit(linear: Linearised | None, count: float, rule: Evidence) -> Objection | None:
-    """Return another focal length or other proportions of the scene that fit significantly better, or None.
-
-    They compete only if the pose fitted with them is a different one (`rule.same`). If the points do not determine the
-    focal length, the given one is accepted.
+def other_camera(off: Misfit, rule: Evidence) -> Objection | None:
+    """Return another camera or other proportions of the scene as an objection, or None if their pose is the same.
 
     Args:
-        linear: Pose from `linearised`, or None.
-        count: Number of matches.
-        rule: Constants of the verdict.
+        off: Difference between a pose and the pose fitted with them.
+        rule: Constants of the verdict; poses that differ by more than `rule.same`, or with a radial distortion by more
+            than the limits of `rule.zoomed`, are different.
     """
-    return of_misfit(systematic_misfit(linear, count, rule), rule)
-
-
-def of_misfit(off: Misfit, rule: Evidence) -> Objection | None:
-    """Return the objection of a misfit, or None if its pose is the same."""
     limits = (rule.zoomed.bend_deg, rule.zoomed.bend_shift) if off.radial else (rule.same.degrees, rule.same.shift)
     if math.degrees(off.turn) <= limits[0] and off.shift <= limits[1]:
         return None

@@ -24,11 +24,11 @@ from bpnp.search.problem import Problem
 from bpnp.search.propose.repetitions import registered
 from bpnp.search.propose.symmetries import Motions
 from bpnp.search.verdict import reasons
-from bpnp.search.verdict.competitors import Seen, misfit, other_pose, rough_residuals, unrelated_competitor
+from bpnp.search.verdict.competitors import Seen, other_camera, other_pose, rough_residuals, unrelated_competitor
 from bpnp.search.verdict.completeness import log10_missed
 from bpnp.search.verdict.false_alarms import alarms_of
 from bpnp.search.verdict.reasons import CLAUSES, CONFIDENT, Objection, focal_length_not_fixed, objection
-from bpnp.search.verdict.uncertainty import error_bounds, is_redundant, linearised
+from bpnp.search.verdict.uncertainty import error_bounds, is_redundant, linearised, systematic_misfit
 
 Verdict = Literal["confident", "ambiguous", "failed"]
 HALF_TURN = 180.0  # degrees; a larger bound does not constrain a rotation
@@ -252,7 +252,7 @@ def judge(
             return result.add_objection(objection("rotation_not_fixed", count=count, what="the rotation"))
         if share > (rule.focal_few if is_object(problem, rule) else rule.focal):
             return result.add_objection(focal_length_not_fixed(share))
-        against += [misfit(linear, count, rule), unrelated_competitor(seen, rule)]
+        against += [other_camera(systematic_misfit(linear, count, rule), rule), unrelated_competitor(seen, rule)]
     objections = [one for one in against if one is not None and one.margin < rule.lead]
     if certain and not objections:
         return replace(result, reason=reasons.confident(alarms, rule.lead, off, share), settled=True)
