@@ -11,7 +11,7 @@ from bpnp.maps.viewed_points import Region
 from bpnp.maps.views import Array
 from bpnp.poses import MIN_POINTS
 from bpnp.runtime import one_blas_thread
-from bpnp.search.competing_poses import other_lens, settle
+from bpnp.search.competing_poses import judge_with_competitors, other_lens
 from bpnp.search.config import DEFAULT, MAPS, Evidence
 from bpnp.search.focal_length import AROUND, UnknownCamera, fit_camera
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
@@ -116,7 +116,7 @@ def judge_on_all_points(solution: Solution, refined: Refined | None) -> Solution
     problem, rule, confident = refined.problem, DEFAULT.evidence, solution.verdict == "confident"
 
     alone = judge(refined.poses, problem, batches=1, exhaustive=True, rule=rule)
-    result = settle(alone, problem, lambda: refined.scene, rule, exhaustive=True)
+    result = judge_with_competitors(alone, problem, lambda: refined.scene, rule, exhaustive=True)
     rotations, shifts = (np.stack(both) for both in zip(refined.pose, result.best, strict=True))
     behind = result.log10_false_alarms - solution.log10_false_alarms
     if confident and not problem.same_pose(rotations, shifts, rule.same)[1]:

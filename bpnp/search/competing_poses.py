@@ -1,7 +1,7 @@
 """Competing poses of a confident pose: those of a repeated structure, and those of other lenses.
 
 They are proposed from the leader and from the scene, refined and scored like any other pose, and the verdict is then
-computed again with them among the candidates (`settle`).
+computed again with them among the candidates (`judge_with_competitors`).
 """
 
 import math
@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 SceneOf = Callable[[], Scene]
 
 
-def settle(
+def judge_with_competitors(
     result: SearchResult,
     problem: Problem,
     scene_of: SceneOf,

@@ -5,8 +5,8 @@ poses that are as near to the given one as this optimum.
 
 The competing poses are proposed from the pose and from the scene; no search is run. Some are the optima that annealing
 reaches from the pose, from perturbed copies, and from its mirror image in front of a flat scene. Others come from the
-motions that map the scene onto itself, and from other focal lengths (`settle`). A better pose elsewhere is not
-tested for.
+motions that map the scene onto itself, and from other focal lengths (`bpnp.search.competing_poses`). A better pose
+elsewhere is not searched for.
 """
 
 import math
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from bpnp.poses import rotation_angle
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
-from bpnp.search.competing_poses import settle
+from bpnp.search.competing_poses import judge_with_competitors
 from bpnp.search.config import DEFAULT, PRECISION, PROBLEM, Evidence
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
@@ -91,7 +91,7 @@ def judge_given_pose(
     competing = others[~same & (others.log10_false_alarms <= 0)]  # insignificant poses do not compete
     candidates = _with_new_false_alarms(Hypotheses.concatenate([claim, competing]), one)
     result = judge(candidates, one, batches=0, exhaustive=True, rule=rule)
-    result = settle(result, one, lambda: scene, rule, exhaustive=True, enumerated=few)
+    result = judge_with_competitors(result, one, lambda: scene, rule, exhaustive=True, enumerated=few)
     result = _of_claim(result, candidates[:1])
     if result.verdict == "confident":
         result = replace(result, reason=f"{result.reason}; {ONE_POSE}")

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.poses import close_poses
-from bpnp.search.competing_poses import settle
+from bpnp.search.competing_poses import judge_with_competitors
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.loop import Step
 from bpnp.search.pose_model import PoseModel
@@ -154,4 +154,4 @@ class Pool:
         result = judge(leaders, problem, batches=self.turns, local_searches=local_searches, rule=rule)
         if self.enumerated.log10_false_alarms < result.log10_false_alarms:
             return replace(self.enumerated, batches=self.turns)
-        return settle(result, problem, lambda: scene, rule, local_searches=local_searches)
+        return judge_with_competitors(result, problem, lambda: scene, rule, local_searches=local_searches)

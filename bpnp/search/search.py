@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
-from bpnp.search.competing_poses import SceneOf, settle
+from bpnp.search.competing_poses import SceneOf, judge_with_competitors
 from bpnp.search.config import DEFAULT, SearchSettings
 from bpnp.search.enumeration.plan import EnumeratedPoses, EnumerationPlan
 from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
@@ -124,7 +124,7 @@ def _of_known_matches(
     """Compute the verdict on the poses that known matches, indices (k,) of image and of scene points, fit best."""
     found, rule = poses_of_matches(problem, i, j, seed), settings.evidence
     result = judge(found, problem, batches=0, exhaustive=True, rule=rule)
-    return settle(result, problem, scene_of, rule, exhaustive=True)
+    return judge_with_competitors(result, problem, scene_of, rule, exhaustive=True)
 
 
 def lacks_partners(scene: Scene) -> bool:

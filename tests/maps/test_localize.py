@@ -196,6 +196,10 @@ def test_the_pose_is_fitted_to_all_points_that_its_camera_sees(planted: tuple[Sc
     assert solution.log10_false_alarms < of_view.log10_false_alarms
 
 
+def another(result: SearchResult, *_: object, **__: object) -> SearchResult:
+    return replace(result, verdict="ambiguous", reason="another")
+
+
 def elsewhere(result: SearchResult, *_: object, **__: object) -> SearchResult:
     """With the best pose turned by 10 degrees and far from chance."""
     turn, poses = Rotation.from_euler("z", 10, degrees=True).as_matrix(), result.candidates
@@ -214,8 +218,8 @@ def not_sure(*known: Any, **options: Any) -> SearchResult:
 @pytest.mark.parametrize(
     ("stages", "reason"),
     [
-        ({"settle": lambda result, *_, **__: replace(result, verdict="ambiguous", reason="another")}, "another"),
-        ({"settle": elsewhere}, "A competing pose 10 deg away fits about as well"),
+        ({"judge_with_competitors": another}, "another"),
+        ({"judge_with_competitors": elsewhere}, "A competing pose 10 deg away fits about as well"),
         ({"judge": not_sure, "other_lens": of_another_lens}, "With 1.30 times the focal length"),
     ],
     ids=["competing pose", "other pose", "other camera of an ambiguous pose"],

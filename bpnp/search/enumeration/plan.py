@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 
 from bpnp.runtime import Deadline
-from bpnp.search.competing_poses import SceneOf, settle
+from bpnp.search.competing_poses import SceneOf, judge_with_competitors
 from bpnp.search.config import ENUMERATION, SearchSettings
 from bpnp.search.enumeration.points import predicted_pose
 from bpnp.search.enumeration.search import Enumeration, margin
@@ -139,7 +139,7 @@ class EnumeratedPoses:
             problem, rule, exhaustive = self.problem, self.settings.evidence, self.is_exhausted
             scene_of, count = self._scene_of, REFINED
             result = judge(self.candidates, problem, batches=0, local_searches=count, exhaustive=exhaustive, rule=rule)
-            self._result = settle(
+            self._result = judge_with_competitors(
                 result, problem, scene_of, rule, local_searches=count, exhaustive=exhaustive, enumerated=True
             )
         return self._result

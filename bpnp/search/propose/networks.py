@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from bpnp.runtime import Deadline
 from bpnp.search.arguments import Array
-from bpnp.search.competing_poses import settle
+from bpnp.search.competing_poses import judge_with_competitors
 from bpnp.search.config import DEFAULT, NETWORKS
 from bpnp.search.problem import Problem
 from bpnp.search.propose.given import score_given
@@ -78,7 +78,7 @@ def _judge(problem: Problem, rotation: Array, translation: Array, deadline: Dead
     if not len(poses):
         return no_pose("the module found no pose")
     result = judge(poses, problem, batches=len(rotation), rule=DEFAULT.evidence)
-    return settle(result, problem, lambda: scene, DEFAULT.evidence)
+    return judge_with_competitors(result, problem, lambda: scene, DEFAULT.evidence)
 
 
 def proposed(net: "Matcher", problem: Problem, seed: int) -> tuple[Array, Array]:
