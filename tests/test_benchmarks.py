@@ -53,7 +53,7 @@ def _threads() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def problem() -> SimpleNamespace:
     """40 points in float64: the plan at its optimum and the pose from which RANSAC starts the layer."""
-    batch, cost = (x.to(torch.float64) for x in bench_layers.planted(2, 40, kind="independent", level=0.9, seed=3))
+    batch, cost = (x.to(torch.float64) for x in bench_layers.plant(2, 40, kind="independent", level=0.9, seed=3))
     plan, _ = sinkhorn(cost, tolerance=1e-13)
     rotation, translation, _ = ransac_pnp(plan, batch.points2d, batch.points3d)
     start = torch.cat([roma.rotmat_to_rotvec(rotation), translation], -1)
@@ -295,7 +295,7 @@ def test_photos_of_a_city_are_seen_where_their_poses_put_them(tmp_path: Path) ->
         first, second = (-rotation.T @ translation for rotation, translation in photo.poses)
         assert np.linalg.norm(first - second) > photo.distance
     (tmp_path / "written").mkdir()
-    bench_city.written(scene, tmp_path / "written")
+    bench_city.write_map(scene, tmp_path / "written")
     again = SceneMap.from_colmap(tmp_path / "written")
     np.testing.assert_array_equal(again.points3d, scene.points3d)
     for one, other in zip(again.views, scene.views, strict=True):
