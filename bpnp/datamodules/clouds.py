@@ -60,7 +60,7 @@ def _check_cloud(values: NDArray[Any], source: object) -> NDArray[np.float64]:
 
 
 def is_cloud(path: Path) -> bool:
-    """Return True for a file of `read_cloud`: by its suffix, or a .ply whose header declares no faces."""
+    """Return True if `read_cloud` reads the file: by its suffix, or for a .ply file without faces in its header."""
     suffix = path.suffix.lower()
     if suffix != ".ply":
         return suffix in CLOUD_SUFFIXES

@@ -260,7 +260,7 @@ def strongest_of(scores: Any, shape: tuple[int, ...]) -> NDArray[np.int64]:
 
 
 def among_all(solution: Solution, used: NDArray[np.int64], keypoints: Any) -> Solution:
-    """Return a solution of some keypoints (`used`) with its matches and points expressed among all keypoints."""
+    """Return a solution that was found with some keypoints, `used`, with its matches as indices of all keypoints."""
     matches = np.column_stack([used[solution.matches[:, 0]], solution.matches[:, 1]])
     points2d = camera_from(solution.camera).normalise(np.asarray(keypoints, np.float64))
     return replace(solution, matches=matches, points2d=points2d)

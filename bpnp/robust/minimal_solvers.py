@@ -10,7 +10,7 @@ from bpnp.search.propose.minimal_solvers import p3p_poses
 
 
 class P3P(NamedTuple):
-    """Up to four poses a sample, camera = R p + t.
+    """Poses of three matches, camera = R p + t; up to four for each sample.
 
     Attributes:
         rotation: (*b, 4, 3, 3); NaN in an empty slot.

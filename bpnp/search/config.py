@@ -117,7 +117,7 @@ class OtherFocal:
         step: Factor from one focal length to the next. [factor; calibration]
         widest: Largest factor on the given focal length; its inverse is the smallest. [factor; calibration]
         bearings: Largest number of bearings that most steps are fitted to. [bearings; cost]
-        fewest: Smallest number of matches; a seventh unknown explains too much of fewer. [matches; calibration]
+        fewest: Smallest number of matches; with fewer, a seventh unknown fits their noise. [matches; calibration]
         bend: Largest radial distortion, as a fraction of the distance of the outermost image point from the axis.
             [fraction; convention]
         bend_deg: Rotation, degrees, from which poses with radial distortion are different. [degrees; convention]

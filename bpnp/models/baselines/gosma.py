@@ -260,7 +260,7 @@ def log_z(k: Tensor) -> Tensor:
 
 
 def overlap(k: Tensor, other: Tensor, cosine: Tensor) -> Tensor:
-    """Return E of two von Mises-Fisher densities whose directions enclose an angle of this cosine."""
+    """Return the integral of the product of two von Mises-Fisher densities with this cosine between their axes."""
     together = (k.square() + other.square() + 2 * k * other * cosine).clamp_min(0).sqrt()
     return torch.exp(log_z(together) - log_z(k) - log_z(other))
 

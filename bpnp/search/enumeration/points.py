@@ -144,13 +144,12 @@ class SceneSide:
 
 
 class ImageSide:
-    """Image of one problem.
+    """Image points of one problem, with what the enumeration looks up about them.
 
     Attributes:
         turn: R, which maps a bearing f to R f in the frame of the arrays.
         arrays: Bearings and their grid.
-        density: Probability that a scene point, seen anywhere among the image points, is within one radius of a given
-            one.
+        density: Probability that a point drawn uniformly in the view is within one radius of a given image point.
         nearest: (m, k) nearest points of each point.
     """
 

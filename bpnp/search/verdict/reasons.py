@@ -22,8 +22,8 @@ CLAUSES = {
     "the image points better (by {better:.1f} decades)",
     "better_pose": "a pose {degrees:.0f} deg away fits better (by {margin:.1f} decades)",
     "better_nearby": "the nearest optimum, {degrees:.2g} deg away, fits better (by {margin:.1f} decades)",
-    "other_points": "a pose {degrees:.0f} deg away explains other points, as many as two unrelated poses do by chance",
-    "rough_residuals": "the points agree with it better at residuals far larger than those of its matches",
+    "other_points": "a pose {degrees:.0f} deg away explains other points, and the difference may be chance",
+    "rough_residuals": "the points fit better with residuals far larger than those of the matches",
     "untested": "not decided in {seconds:.3g} s: its competing poses were not tested",
     "incomplete": "a better {what} may exist (miss probability up to {probability})",
     # Another camera, or another scene, may be the right one.
