@@ -26,7 +26,7 @@ SHARP = 16.0  # mass per sum of the degrees above which float32 loses the fifth 
 
 
 # b with S b = rhs and weighted mean zero; P b / rows; True for samples that met their tolerance
-Solution = tuple[Float[Tensor, "b n"], Float[Tensor, "b m"], Bool[Tensor, " b"]]
+LinearSolution = tuple[Float[Tensor, "b n"], Float[Tensor, "b m"], Bool[Tensor, " b"]]
 
 
 def solve_laplacian(
@@ -36,7 +36,7 @@ def solve_laplacian(
     degree: Float[Tensor, "b n"],
     rhs: Float[Tensor, "b n"],
     tolerance: Float[Tensor, " b"],
-) -> Solution:
+) -> LinearSolution:
     """Solve S b = rhs by preconditioned conjugate gradients; in float64, factorise the samples that stall.
 
     The tolerance limits the residual per unit of mass, sqrt(sum r_j^2 / cols_j), relative to that of the right-hand
@@ -67,7 +67,7 @@ def solve_laplacian(
 
 def conjugate_gradients(
     plan: Plan, rows: Tensor, cols: Tensor, degree: Tensor, rhs: Tensor, tolerance: Float[Tensor, " b"], limit: int
-) -> Solution:
+) -> LinearSolution:
     """Solve S x = rhs by preconditioned conjugate gradients.
 
     Args:
@@ -106,7 +106,7 @@ def conjugate_gradients(
     return x, mean, solved
 
 
-def _solve_by_cholesky(plan: Float[Tensor, "b m n"], rows: Tensor, cols: Tensor, rhs: Tensor) -> Solution:
+def _solve_by_cholesky(plan: Float[Tensor, "b m n"], rows: Tensor, cols: Tensor, rhs: Tensor) -> LinearSolution:
     """Solve S b = rhs by a Cholesky factorisation and one refinement, in float64.
 
     A diagonal entry is computed as the sum of the other entries of its row: as a difference from `cols` it would be

@@ -18,7 +18,7 @@ from bpnp.layers.assignment import Sinkhorn
 from bpnp.layers.implicit import first_derivative
 from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import Backend, RansacPnP
-from bpnp.models.evaluation import Clock, Refinement, match_again, pnp_pose, ransac_pose, round_widths
+from bpnp.models.evaluation import Refinement, StageClock, match_again, pnp_pose, ransac_pose, round_widths
 from bpnp.models.nets import ImageFeatures, SceneFeatures
 from bpnp.models.weights import AnyModule, TrainedNet, module_or_default
 from bpnp.precision import full_precision
@@ -112,7 +112,7 @@ class BPnPNet(TrainedNet):
         Returns:
             Prediction with the assignment P (b, m, n), its stats and the poses.
         """
-        clock = Clock()
+        clock = StageClock()
         cost = self.cost(batch)
         assignment, stats = self.transport(cost, batch.mask2d, batch.mask3d)
         ransac = ransac_pose(self.ransac, assignment, batch)

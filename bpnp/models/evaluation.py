@@ -30,7 +30,7 @@ from bpnp.search.verdict.decide import SearchResult, degenerate_points, judge
 from bpnp.types import Batch, Pose, Prediction, SolveStats
 
 
-class Clock:
+class StageClock:
     """Stopwatch of the estimates of a batch, started at construction."""
 
     def __init__(self) -> None:

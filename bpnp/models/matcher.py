@@ -13,7 +13,7 @@ from bpnp.layers.implicit import BackwardStats
 from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import RansacPnP
 from bpnp.models.bpnpnet import pairwise_distance
-from bpnp.models.evaluation import Clock, Refinement, pnp_pose, ransac_pose
+from bpnp.models.evaluation import Refinement, StageClock, pnp_pose, ransac_pose
 from bpnp.models.nets import ExchangeBlock, Neighbourhood, subtract_mean
 from bpnp.models.weights import AnyModule, TrainedNet, module_or_default
 from bpnp.types import Batch, Prediction, SolveStats
@@ -103,7 +103,7 @@ class Matcher(TrainedNet):
         Returns:
             Prediction with P (b, m, n), `unmatched2d` (b, m), `unmatched3d` (b, n), the stats and the poses.
         """
-        clock = Clock()
+        clock = StageClock()
         prediction = self.match(batch)
         assert prediction.assignment is not None
         ransac = ransac_pose(self.ransac, prediction.assignment, batch)

@@ -985,7 +985,7 @@ INFINITY = InfinitySettings()
 
 
 @dataclass(frozen=True)
-class Recipe:
+class StartSampling:
     """Sampling of initial poses around the weak-perspective pose.
 
     Attributes:
@@ -1218,7 +1218,7 @@ class SearchSettings:
             until it is full. [starts; calibration]
         least_kept: Least number of poses that a stage keeps. A small batch keeps the square root of its fraction of a
             full one. [poses; calibration]
-        recipes: Sampling of the batches, in turn. [`Recipe`; calibration]
+        recipes: Sampling of the batches, in turn. [`StartSampling`; calibration]
         coarse: First stages on clusters. [`ClusterStage`; calibration]
         middle: Stages on finer clusters. [`ClusterStage`; calibration]
         fine: Annealing on all points.
@@ -1265,7 +1265,7 @@ class SearchSettings:
     starts: int = 1200
     first_starts: int = 48
     least_kept: int = 3
-    recipes: tuple[Recipe, ...] = (Recipe(0.0, 0.5), Recipe(1.0, 0.8), Recipe(0.5, 1.2))
+    recipes: tuple[StartSampling, ...] = (StartSampling(0.0, 0.5), StartSampling(1.0, 0.8), StartSampling(0.5, 1.2))
     coarse: Stages = (ClusterStage(64, 0.3, 0.1, iterations=10, kept=48, apart_deg=3.0, halvings=(6, 8)),)
     middle: Stages = (
         ClusterStage(128, 0.1, 0.065, iterations=7, kept=24, apart_deg=1.0),

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.search.config import PROBLEM, Recipe
+from bpnp.search.config import PROBLEM, StartSampling
 
 Array = NDArray[np.float32]
 
@@ -103,7 +103,7 @@ def draw_poses(
     spread: float,
     points3d: Array,
     count: int,
-    recipe: Recipe,
+    recipe: StartSampling,
     prior: Prior | None,
     rng: np.random.Generator,
     aim: NDArray[np.float64] | None = None,

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from bpnp.datamodules.synthetic_maps.scene import (
     Array,
     Blobs,
-    Scene,
+    DrawnScene,
     Surface,
     Viewpoint,
     Walls,
@@ -218,7 +218,7 @@ CROSS_SECTION = 0.9  # half width of a pedestal, relative to the radius of its s
 EYE = (1.2, 2.0)  # smallest and largest height of the camera, metres
 
 
-def facades(count: int, half: float, rng: np.random.Generator) -> tuple[Scene, Viewpoint]:
+def facades(count: int, half: float, rng: np.random.Generator) -> tuple[DrawnScene, Viewpoint]:
     """Draw a scene of one to three walls in a line with corners, mostly at right angles; columns, trees and boxes.
 
     Args:
@@ -248,7 +248,7 @@ def facades(count: int, half: float, rng: np.random.Generator) -> tuple[Scene, V
     return assemble(surfaces, walls, rng), view
 
 
-def street(count: int, half: float, rng: np.random.Generator) -> tuple[Scene, Viewpoint]:
+def street(count: int, half: float, rng: np.random.Generator) -> tuple[DrawnScene, Viewpoint]:
     """Draw a scene of houses on both sides of a street, some of them identical; cars, trees and poles.
 
     The camera is within the scene: depths vary strongly, and other photos are near.
@@ -291,7 +291,7 @@ def street(count: int, half: float, rng: np.random.Generator) -> tuple[Scene, Vi
     return assemble(surfaces, walls, rng), view
 
 
-def statue(count: int, half: float, rng: np.random.Generator) -> tuple[Scene, Viewpoint]:
+def statue(count: int, half: float, rng: np.random.Generator) -> tuple[DrawnScene, Viewpoint]:
     """Draw a figure of stacked parts, often on a pedestal, before distant houses; 1 to 40 metres high.
 
     Args:

@@ -18,13 +18,13 @@ from bpnp.datamodules.problem import Counts, Problem, stack_problems
 from bpnp.datamodules.synthetic_maps.kinds import facades, statue, street
 from bpnp.datamodules.synthetic_maps.scene import (
     Array,
-    Camera,
-    Scene,
+    DrawnCamera,
+    DrawnScene,
     Viewpoint,
     camera_at,
     details,
+    find_visible,
     image_shape,
-    look,
     nearby_camera,
 )
 from bpnp.poses import MIN_POINTS
@@ -119,7 +119,7 @@ def _draw(name: str, kind: str, half: float, options: MapOptions, rng: np.random
     noise_px = _log_uniform(options.noise_px, rng)
     focal = LONG_SIDE / 2 / half
 
-    sight = look(scene, photo, reach, rng, alone=True)
+    sight = find_visible(scene, photo, reach, rng, alone=True)
     keypoints = sight.image + noise_px / focal * rng.standard_normal(sight.image.shape)
     cameras = [nearby_camera(view, shape, rng) for _ in range(rng.integers(*options.views, endpoint=True))]
     map_index, map_points = triangulate(scene, view, cameras, reach, noise_px / focal, rng)
@@ -153,7 +153,7 @@ def _draw(name: str, kind: str, half: float, options: MapOptions, rng: np.random
 
 
 def triangulate(
-    scene: Scene, view: Viewpoint, cameras: list[Camera], reach: Array, noise: float, rng: np.random.Generator
+    scene: DrawnScene, view: Viewpoint, cameras: list[DrawnCamera], reach: Array, noise: float, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], Array]:
     """Return the scene points in the map, and their map positions.
 
@@ -165,7 +165,7 @@ def triangulate(
         scene: Scene.
         view: Viewpoint.
         cameras: Cameras whose points are taken.
-        reach: As in `look`.
+        reach: As in `find_visible`.
         noise: Standard deviation of a keypoint, radians.
         rng: Random generator.
 
@@ -179,7 +179,7 @@ def triangulate(
     index, points = [], []
     in_map = np.zeros(len(scene.points), bool)
     for camera in cameras:
-        sight = look(scene, camera, reach, rng, alone=False)
+        sight = find_visible(scene, camera, reach, rng, alone=False)
         track = rng.binomial(photos, scene.repeatability[sight.of])
         is_new = (track >= least) & ~in_map[sight.of]
         added = sight.of[is_new]
@@ -194,7 +194,7 @@ def triangulate(
 
 
 def _draw_matches(
-    photo: Camera, other: Camera, points: Array, keypoints: Array, most: float, rng: np.random.Generator
+    photo: DrawnCamera, other: DrawnCamera, points: Array, keypoints: Array, most: float, rng: np.random.Generator
 ) -> NDArray[np.bool_]:
     """Draw which keypoints (k, 2) are matched with their map points (k, 3).
 

@@ -50,7 +50,7 @@ class Blobs(NamedTuple):
     to_sphere: Array
 
 
-class Scene(NamedTuple):
+class DrawnScene(NamedTuple):
     """Feature points of a scene, metres, third axis upwards.
 
     Attributes:
@@ -107,7 +107,9 @@ class Surface(NamedTuple):
 NO_BLOBS = Blobs(np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
 
-def assemble(surfaces: Sequence[Surface], walls: Walls, rng: np.random.Generator, blobs: Blobs = NO_BLOBS) -> Scene:
+def assemble(
+    surfaces: Sequence[Surface], walls: Walls, rng: np.random.Generator, blobs: Blobs = NO_BLOBS
+) -> DrawnScene:
     """Combine surfaces to a scene; the repeatability of repeatable points is drawn from Beta(3, 2).
 
     Their fraction varies in waves over the scene, up to four of them, so that some parts are hardly ever in a map.
@@ -116,7 +118,7 @@ def assemble(surfaces: Sequence[Surface], walls: Walls, rng: np.random.Generator
     points = np.concatenate([part.points for part in surfaces])
     wave = rng.standard_normal(3) * rng.uniform(1, 12) / np.median(np.abs(points - np.median(points, 0)))
     fractions = np.minimum(1, fractions * (1 + np.cos(points @ wave + rng.uniform(0, 2 * np.pi))))
-    return Scene(
+    return DrawnScene(
         points=points,
         normals=np.concatenate([part.normals for part in surfaces]),
         repeatability=rng.beta(3.0, 2.0, len(fractions)) * (rng.random(len(fractions)) < fractions),
@@ -162,7 +164,7 @@ def hidden_by_blobs(blobs: Blobs, centre: Array, points: Array) -> NDArray[np.bo
     return np.asarray(((inside > 0) & (enters > 0) & (enters < REACHED)).any(1))
 
 
-class Camera(NamedTuple):
+class DrawnCamera(NamedTuple):
     """Pinhole camera; camera = rotation p + translation, metres.
 
     Attributes:
@@ -178,7 +180,7 @@ class Camera(NamedTuple):
     half: Array
 
 
-class Sight(NamedTuple):
+class VisiblePoints(NamedTuple):
     """Keypoints of a photo.
 
     Attributes:
@@ -203,7 +205,7 @@ def image_shape(half: float, rng: np.random.Generator) -> Array:
     return shape if rng.random() < 0.75 else shape[::-1]
 
 
-def camera_at(centre: Array, target: Array, half: Array, rng: np.random.Generator) -> Camera:
+def camera_at(centre: Array, target: Array, half: Array, rng: np.random.Generator) -> DrawnCamera:
     """Return a camera that looks at a target (3,), held level to within a few degrees, rarely more."""
     ahead = (target - centre) / np.linalg.norm(target - centre)
     level = math.hypot(ahead[0], ahead[1])
@@ -212,10 +214,10 @@ def camera_at(centre: Array, target: Array, half: Array, rng: np.random.Generato
     down = np.cross(ahead, right)
     cos, sin = math.cos(roll), math.sin(roll)
     rotation = np.array([cos * right - sin * down, sin * right + cos * down, ahead])
-    return Camera(rotation, -rotation @ centre, centre, half)
+    return DrawnCamera(rotation, -rotation @ centre, centre, half)
 
 
-def nearby_camera(view: Viewpoint, half: Array, rng: np.random.Generator) -> Camera:
+def nearby_camera(view: Viewpoint, half: Array, rng: np.random.Generator) -> DrawnCamera:
     """Draw another photo of the same part: from around the target, and not quite directed at it."""
     from_target = view.centre - view.target
     distance = float(np.linalg.norm(from_target))
@@ -227,7 +229,9 @@ def nearby_camera(view: Viewpoint, half: Array, rng: np.random.Generator) -> Cam
     return camera_at(centre, view.target + view.heading * distance * rng.standard_normal(3), half, rng)
 
 
-def look(scene: Scene, camera: Camera, reach: Array, rng: np.random.Generator, *, alone: bool) -> Sight:
+def find_visible(
+    scene: DrawnScene, camera: DrawnCamera, reach: Array, rng: np.random.Generator, *, alone: bool
+) -> VisiblePoints:
     """Draw the keypoints of a photo, among points in the image, in front of their surface and not hidden.
 
     Args:
@@ -249,10 +253,10 @@ def look(scene: Scene, camera: Camera, reach: Array, rng: np.random.Generator, *
     near = near[detected]
     way = camera.centre, scene.points[near]
     near = near[~(hidden_by_walls(scene.walls, *way) | hidden_by_blobs(scene.blobs, *way))]
-    return Sight(near, np.stack([x[near], y[near]], -1) / depth[near, None], depth[near])
+    return VisiblePoints(near, np.stack([x[near], y[near]], -1) / depth[near, None], depth[near])
 
 
-def details(scene: Scene, view: Viewpoint, half: float, rng: np.random.Generator) -> Array:
+def details(scene: DrawnScene, view: Viewpoint, half: float, rng: np.random.Generator) -> Array:
     """Draw the largest distance (n,) from which a camera of unit `half` resolves the details at each point, metres.
 
     Sizes follow a power law, so that the number of resolved points falls with the square of the distance; all are

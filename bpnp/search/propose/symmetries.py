@@ -137,7 +137,7 @@ def self_motions(
     distance, index = tree.query(points, count)
     labels = np.full(len(points), -1) if labels3d is None else np.asarray(labels3d, np.int64)
     normals = np.empty((0, 3)) if normals3d is None else np.ascontiguousarray(normals3d, np.float64)
-    scene = Scene(points, hashed(points, 2 * tolerance), distance, index.astype(np.int64), labels, normals)
+    scene = SceneIndex(points, hashed(points, 2 * tolerance), distance, index.astype(np.int64), labels, normals)
     least = max(least, SYMMETRIES.fewest / len(moved))
     chosen, sample = _bases(points, moved, bases), _sample(moved)
     room = SYMMETRIES.most_found
@@ -194,7 +194,7 @@ def matching_tolerance(points3d: Array, sources: Indices, noise: float) -> float
     return min(2.0**steps * least, SYMMETRIES.spacing * spacing)
 
 
-class Scene(NamedTuple):
+class SceneIndex(NamedTuple):
     """Inputs of the compiled loops.
 
     Attributes:
@@ -302,7 +302,7 @@ def _register(
     """Find the motions that map a base onto a congruent one and that enough sampled points confirm.
 
     Args:
-        scene: A `Scene`.
+        scene: A `SceneIndex`.
         bases: (b, 3) indices of points.
         sample: Indices of sampled points.
         tolerance: Largest distance of a moved point from a scene point.
