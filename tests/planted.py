@@ -68,11 +68,11 @@ class Answering(torch.nn.Module):
 
     def __init__(self, rotation: Any, translation: Any, frame: str = "any") -> None:
         super().__init__()
-        self.frame, self.given = frame, list[Batch]()
+        self.frame, self.batches = frame, list[Batch]()
         self.pose = posed(torch.as_tensor(rotation)[None], torch.as_tensor(translation)[None])
 
     def forward(self, batch: Batch) -> Prediction:
-        self.given.append(batch)
+        self.batches.append(batch)
         return Prediction(poses={"fixed": self.pose})
 
 

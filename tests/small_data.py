@@ -75,8 +75,8 @@ def quiet_trainer(folder: Path, **settings: Any) -> Trainer:
 
 def small_meshes(cache: Path, **settings: object) -> MeshDataModule:
     """The data of MESHES, or with other settings."""
-    given = (option.removeprefix("--data.").split("=") for option in SMALL_MESHES)
-    numbers = {name: int(value) for name, value in given}
+    pairs = (option.removeprefix("--data.").split("=") for option in SMALL_MESHES)
+    numbers = {name: int(value) for name, value in pairs}
     return MeshDataModule(**(numbers | {"cache_dir": str(cache)} | settings))  # type: ignore[arg-type]
 
 

@@ -17,21 +17,21 @@ RAYS = np.random.default_rng(0).uniform((-0.6, -0.5, 1), (0.6, 0.5, 1), (50, 3))
 
 
 @pytest.mark.parametrize(
-    "given",
+    "camera_like",
     [
         np.array([[900.0, 0, 320], [0, 400, 240], [0, 0, 1]]),
         ("PINHOLE", [900.0, 400.0, 320.0, 240.0]),
         ("OPENCV_FISHEYE", [900.0, 400.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0]),
     ],
 )
-def test_the_focal_length_is_the_geometric_mean_of_both_axes(given: Any) -> None:
+def test_the_focal_length_is_the_geometric_mean_of_both_axes(camera_like: Any) -> None:
     """A square pixel of the same area has it: sqrt(900 * 400) = 600."""
-    assert camera_from(given).focal == pytest.approx(600, rel=1e-12)
+    assert camera_from(camera_like).focal == pytest.approx(600, rel=1e-12)
 
 
-@pytest.mark.parametrize("given", [K, K.tolist(), torch.tensor(K), 2 * K, K.astype(np.float32)])
-def test_a_matrix_is_the_projection_of_opencv(given: object) -> None:
-    camera = camera_from(given)
+@pytest.mark.parametrize("camera_like", [K, K.tolist(), torch.tensor(K), 2 * K, K.astype(np.float32)])
+def test_a_matrix_is_the_projection_of_opencv(camera_like: object) -> None:
+    camera = camera_from(camera_like)
     expected = (RAYS @ K.T)[:, :2]
     np.testing.assert_allclose(camera.project(3.5 * RAYS), expected, rtol=1e-6)
     np.testing.assert_allclose(camera.normalise(expected), RAYS[:, :2], atol=1e-6)
@@ -39,7 +39,7 @@ def test_a_matrix_is_the_projection_of_opencv(given: object) -> None:
 
 
 @pytest.mark.parametrize(
-    "given",
+    "camera_like",
     [
         OPENCV,
         ("OPENCV", 800, 600, OPENCV[1]),
@@ -47,8 +47,8 @@ def test_a_matrix_is_the_projection_of_opencv(given: object) -> None:
         pycolmap.Camera(model="OPENCV", width=800, height=600, params=OPENCV[1]),
     ],
 )
-def test_distortion_is_removed_and_applied_as_in_opencv(given: object) -> None:
-    camera = camera_from(given)
+def test_distortion_is_removed_and_applied_as_in_opencv(camera_like: object) -> None:
+    camera = camera_from(camera_like)
     fx, fy, cx, cy, *distortion = OPENCV[1]
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     expected, _ = cv2.projectPoints(RAYS, np.zeros(3), np.zeros(3), matrix, np.array(distortion))
@@ -87,7 +87,7 @@ def test_pixels_that_no_ray_reaches_are_none() -> None:
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("camera_like", "message"),
     [
         (np.diag([500.0, 0.0, 1.0]), "`camera` matrix is singular"),
         (np.ones((3, 3)), r"last row of the `camera` matrix .* instead of \(0, 0, 1\)"),
@@ -109,9 +109,9 @@ def test_pixels_that_no_ray_reaches_are_none() -> None:
         ({"model": "PINHOLE"}, "`model` and `params`"),
     ],
 )
-def test_a_broken_camera_is_refused(given: object, message: str) -> None:
+def test_a_broken_camera_is_refused(camera_like: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        camera_from(given)
+        camera_from(camera_like)
 
 
 @pytest.mark.parametrize("params", [(-800, 800, 320, 240), (800, -800, 320, 240), (800, 0, 320, 240)])

@@ -28,11 +28,11 @@ def lists(*pairs: dict[str, Any]) -> dict[str, Any]:
 
 def test_lists_of_pairs_are_padded_and_masked() -> None:
     sizes = [(5, 7), (9, 2), (1, 1)]
-    given = [pair(m, n, seed=i) for i, (m, n) in enumerate(sizes)]
-    one = Batch.from_arrays(**given[0])
+    samples = [pair(m, n, seed=i) for i, (m, n) in enumerate(sizes)]
+    one = Batch.from_arrays(**samples[0])
     assert (len(one), one.ids, one.focal.tolist()) == (1, ("0",), [500])
-    np.testing.assert_allclose(one.translation, given[0]["translation"][None], rtol=1e-6)
-    batch = Batch.from_arrays(**lists(*given), index=[4, 0, 9], ids=["a", "b", "c"])
+    np.testing.assert_allclose(one.translation, samples[0]["translation"][None], rtol=1e-6)
+    batch = Batch.from_arrays(**lists(*samples), index=[4, 0, 9], ids=["a", "b", "c"])
     assert (batch.count2d.tolist(), batch.count3d.tolist()) == ([5, 9, 1], [7, 2, 1])
     assert (batch.points2d.shape, batch.points3d.shape) == ((3, 9, 2), (3, 7, 3))
     assert (batch.index.tolist(), batch.ids) == ([4, 0, 9], ("a", "b", "c"))
@@ -40,9 +40,9 @@ def test_lists_of_pairs_are_padded_and_masked() -> None:
     for i, (m, n) in enumerate(sizes):
         assert batch.mask2d[i].tolist() == [True] * m + [False] * (9 - m)
         assert batch.mask3d[i].tolist() == [True] * n + [False] * (7 - n)
-        assert np.array_equal(batch.points2d[i, :m].numpy(), given[i]["points2d"])
-        assert np.array_equal(batch.points3d[i, :n].numpy(), given[i]["points3d"])
-        assert np.array_equal(batch.match3d[i, :n].numpy(), given[i]["match3d"])
+        assert np.array_equal(batch.points2d[i, :m].numpy(), samples[i]["points2d"])
+        assert np.array_equal(batch.points3d[i, :n].numpy(), samples[i]["points3d"])
+        assert np.array_equal(batch.match3d[i, :n].numpy(), samples[i]["match3d"])
         assert not batch.points2d[i, m:].any()
         assert not batch.points3d[i, n:].any()
         assert (batch.match3d[i, n:] == -1).all()

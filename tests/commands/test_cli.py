@@ -27,19 +27,19 @@ def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("part", "told"),
+    ("part", "sentence"),
     [
         ("solver.help=bpnp.models.BPnPNet", "cost (b, m, n) and both masks to the assignment"),
         ("solver.transport.help=bpnp.layers.Sinkhorn", "Entropy weight of the transport"),
     ],
 )
 def test_options_of_the_network_and_its_parts_are_explained(
-    part: str, told: str, capsys: pytest.CaptureFixture[str]
+    part: str, sentence: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit):
         main(["fit", "--model.solver=bpnp.models.BPnPNet", f"--model.{part}"])
     printed = capsys.readouterr().out
-    assert told in " ".join(printed.split())
+    assert sentence in " ".join(printed.split())
     assert len(printed.splitlines()) < 70
     assert "torch.nn" not in printed
 
@@ -124,8 +124,8 @@ def test_help_explains_every_option(name: str, capsys: pytest.CaptureFixture[str
     command = COMMANDS.get(name)
     if callable(command):
         options = [p.name for p in inspect.signature(command).parameters.values() if p.name != "overrides"]
-        told = {parameter.arg_name for parameter in docstring_parser.parse(command.__doc__ or "").params}
-        assert told == set(options)
+        documented = {parameter.arg_name for parameter in docstring_parser.parse(command.__doc__ or "").params}
+        assert documented == set(options)
         assert all(option in text for option in options)
 
 

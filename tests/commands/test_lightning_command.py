@@ -58,8 +58,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def loss_of_test(folder: Path, name: str, *options: str) -> float:
     """The loss of a test of the trained checkpoint."""
-    given = [f"--ckpt_path={folder}/run/checkpoints/last.ckpt", f"--results.folder={folder}/{name}", *options]
-    main(words("test", folder, *given))
+    test_options = [f"--ckpt_path={folder}/run/checkpoints/last.ckpt", f"--results.folder={folder}/{name}", *options]
+    main(words("test", folder, *test_options))
     loss = read_results(folder / name).correspondence_loss
     assert loss is not None
     return loss
@@ -86,14 +86,14 @@ def test_a_test_runs_the_network_of_the_checkpoint(trained: Path, tmp_path: Path
 
 def test_an_option_that_contradicts_the_checkpoint_is_an_error(trained: Path, fails: Callable[..., str]) -> None:
     checkpoint = f"--ckpt_path={trained}/run/checkpoints/last.ckpt"
-    for option, told in (
+    for option, message in (
         ("--model.solver.features2d.scale=1", "features2d.scale=1.0 (saved: 4.0)"),
         ("--model.solver.features2d.centre=false", "features2d.centre=False (saved: True)"),
         ("--model.solver.features3d.channels=32", "features3d.channels=32 (saved: 16)"),
     ):
-        assert told in fails(*words("test", trained, checkpoint, "--model.solver=bpnp.models.BPnPNet", option))
+        assert message in fails(*words("test", trained, checkpoint, "--model.solver=bpnp.models.BPnPNet", option))
         weights = checkpoint.replace("ckpt_path", "model.weights")
-        assert told in fails(*words("test", trained, weights, "--model.solver=bpnp.models.BPnPNet", option))
+        assert message in fails(*words("test", trained, weights, "--model.solver=bpnp.models.BPnPNet", option))
     assert "a checkpoint of BPnPNet, not of Matcher" in fails(
         *words("test", trained, checkpoint, "--model.solver=bpnp.models.Matcher")
     )
@@ -142,8 +142,8 @@ def test_a_part_of_the_users_is_named_by_the_configuration(tmp_path: Path, fails
     main(words("fit", tmp_path, *part, "--model.solver.features2d.channels=16", *SHORT))
     checkpoint = f"--ckpt_path={tmp_path}/run/checkpoints/last.ckpt"
     main(words("test", tmp_path, checkpoint, *part))
-    told = fails(*words("test", tmp_path, checkpoint))
-    assert "last.ckpt has a test_lightning_command.Flat, which is not a class of bpnp. Name it" in told
+    message = fails(*words("test", tmp_path, checkpoint))
+    assert "last.ckpt has a test_lightning_command.Flat, which is not a class of bpnp. Name it" in message
 
 
 class Flat(nn.Module):
@@ -161,8 +161,8 @@ class Flat(nn.Module):
 def test_a_training_is_continued_and_never_overwritten(tmp_path: Path, fails: Callable[..., str]) -> None:
     main(words("fit", tmp_path, *SMALL_NET, *SHORT))
     files = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*.*") if path.is_file()}
-    told = fails(*words("fit", tmp_path, *SMALL_NET, *SHORT))
-    assert "run holds a training. Continue it with --ckpt_path last, or set --trainer.default_root_dir" in told
+    message = fails(*words("fit", tmp_path, *SMALL_NET, *SHORT))
+    assert "run holds a training. Continue it with --ckpt_path last, or set --trainer.default_root_dir" in message
     assert "holds a training" in fails(*words("fit", tmp_path, "--ckpt_path=procedural-so3", *SHORT))
     main(words("fit", tmp_path, *SMALL_NET, *SHORT, "--trainer.fast_dev_run=true"))
     assert {path: path.read_bytes() for path in files} == files

@@ -108,7 +108,7 @@ def rebuilt(place: Place) -> dict[str, int]:
 
 
 @pytest.mark.parametrize(
-    ("change", "more", "told"),
+    ("change", "more", "reason"),
     [
         (overwritten, (), "with another photo: a.png"),
         (taken_elsewhere, (), "with another photo, other keypoints: a.png"),
@@ -117,14 +117,14 @@ def rebuilt(place: Place) -> dict[str, int]:
     ],
 )
 def test_a_photo_is_solved_again_where_anything_is_another(
-    change: Callable[[Place], dict[str, int]] | None, more: tuple[str, ...], told: str, place: Place,
+    change: Callable[[Place], dict[str, int]] | None, more: tuple[str, ...], reason: str, place: Place,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     place.run("a.png", "b.png")
     views = {} if change is None else change(place)
     place.run("a.png", more=more)
     shown = capsys.readouterr().out
-    assert f"solved again, {told}" in shown
+    assert f"solved again, {reason}" in shown
     assert all(place.is_right(photo, view) for photo, view in views.items())
     assert ("not in poses.txt: 1 solutions in another map, such as b.png" in shown) == (change is rebuilt)
     assert list(place.poses()) == (["a.png"] if change is rebuilt else ["a.png", "b.png"])
@@ -211,10 +211,10 @@ def test_the_camera_of_views_of_the_same_size_is_taken_and_named(
     Image.new("L", (WIDTH // 2, HEIGHT // 2)).save(place.folder / "half.png")
     assert scene.camera_for(place.folder / "half.png") == (None, "unknown focal length")
     assert "no keypoints of half.png" in fails(*place.command("half.png"))
-    for given in ("MAP", str(place.folder / "map"), str(place.folder / "map/cameras.bin")):
+    for keypoint_source in ("MAP", str(place.folder / "map"), str(place.folder / "map/cameras.bin")):
         camera, source = scene.camera_for(place.folder / "half.png", exif=False)
         assert (camera.focal, source) == (260, "view photo 0.jpg of the map")
-        assert "no keypoints of half.png" in fails(*place.command("half.png", more=("--camera", given)))
+        assert "no keypoints of half.png" in fails(*place.command("half.png", more=("--camera", keypoint_source)))
 
 
 def test_a_focal_length_is_found_with_the_pose(place: Place, capsys: pytest.CaptureFixture[str]) -> None:

@@ -88,7 +88,7 @@ def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, 
     Image.new("RGB", (64, 48)).save(tmp_path / "plain.jpg")
     plain = ("localize", str(model), str(tmp_path / "plain.jpg"))
     # What no photo can be localised with is said once, before the first photo.
-    for given, message in (
+    for wrong_arguments, message in (
         (("--camera", "PINHOLE,1"), "a PINHOLE camera has 4 parameters, not [1.0]"),
         (("--keypoints", "nothing.h5"), "--keypoints nothing.h5 does not exist; give"),
         (("--solver", "nothing"), "name of packaged weights"),
@@ -97,7 +97,7 @@ def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, 
         (("--views", "nothing.txt"), "--views needs a text file of lines `photo view`"),
         (("--output", str(tmp_path / "plain.jpg")), ": it is a file, or lies in one"),
     ):
-        error = fails(*plain, *out, *given)
+        error = fails(*plain, *out, *wrong_arguments)
         assert message in error
         assert "could not be tried" not in error
         assert not (tmp_path / "out").exists()
@@ -127,8 +127,8 @@ def test_photos_in_folders_within_are_named_by_their_path_and_results_are_no_pho
         (tmp_path / name).parent.mkdir(parents=True)
         (tmp_path / name).touch()
     assert list(photo_files([tmp_path], besides=tmp_path / "found")) == ["day/0004.jpg", "night/0004.jpg"]
-    given = tmp_path / "found/pictures/0005.jpg"  # by itself it is a photo, wherever it lies
-    assert photo_files([given], besides=tmp_path / "found") == {"0005.jpg": given}
+    picture = tmp_path / "found/pictures/0005.jpg"  # by itself it is a photo, wherever it lies
+    assert photo_files([picture], besides=tmp_path / "found") == {"0005.jpg": picture}
 
 
 def test_ctrl_c_while_a_picture_is_drawn_ends_the_run_and_keeps_the_photo(

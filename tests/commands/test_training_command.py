@@ -87,11 +87,11 @@ def test_a_task_by_class_path_trains(tmp_path: Path) -> None:
     config = tmp_path / "own.yaml"
     config.write_text("model:\n  class_path: test_training_command.OwnTask\n  init_args:\n    rate: 0.5\n")
     options = ["--model=test_training_command.OwnTask", "--model.rate=0.5"]
-    for given, own in (("options", options), ("file", [f"--config={config}"])):
+    for way, own in (("options", options), ("file", [f"--config={config}"])):
         seen.clear()
-        main(["fit", *MESHES, *own, *SHORT, *folders(tmp_path / given)])
+        main(["fit", *MESHES, *own, *SHORT, *folders(tmp_path / way)])
         assert seen == [0.5, 0.5]
-        assert (tmp_path / given / "run/checkpoints/last.ckpt").is_file()
+        assert (tmp_path / way / "run/checkpoints/last.ckpt").is_file()
 
 
 def test_a_task_whose_test_step_returns_nothing_is_tested(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -156,11 +156,11 @@ def test_a_packaged_configuration_in_the_place_of_a_file_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    for given, told in (("configs/quickstart.yaml", True), ("quickstart", False), ("presets/debug", False)):
+    for config, is_reported in (("configs/quickstart.yaml", True), ("quickstart", False), ("presets/debug", False)):
         with pytest.raises(SystemExit):
-            main(["fit", "--config=quickstart", f"--config={given}", "--print_config"])
-        line = f"{given} is not in this folder; using the packaged {CONFIGS}"
-        assert (line in capsys.readouterr().err) == told
+            main(["fit", "--config=quickstart", f"--config={config}", "--print_config"])
+        line = f"{config} is not in this folder; using the packaged {CONFIGS}"
+        assert (line in capsys.readouterr().err) == is_reported
 
 
 def test_ctrl_c_prints_the_command_that_resumes(
@@ -170,11 +170,11 @@ def test_ctrl_c_prints_the_command_that_resumes(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(cli, "parse_arguments", interrupted)
-    for command, told in (("localize", "interrupted; run it again to continue"), ("solve", "interrupted")):
+    for command, message in (("localize", "interrupted; run it again to continue"), ("solve", "interrupted")):
         with pytest.raises(SystemExit) as ended:
             main([command])
         assert ended.value.code == 130
-        assert capsys.readouterr().err == f"bpnp: {told}\n"
+        assert capsys.readouterr().err == f"bpnp: {message}\n"
 
 
 class Watch(Callback):
@@ -222,14 +222,14 @@ def test_a_weight_without_an_epoch_is_refused(tmp_path: Path, capsys: pytest.Cap
     assert "--pose_loss.weight needs --pose_loss.start_epoch" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("given", "policy"), [(None, "PASSIVE"), ("active", "ACTIVE")])
-def test_threads_of_the_command_sleep_while_they_wait(given: str | None, policy: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("user_policy", "policy"), [(None, "PASSIVE"), ("active", "ACTIVE")])
+def test_threads_of_the_command_sleep_while_they_wait(user_policy: str | None, policy: str, tmp_path: Path) -> None:
     """OpenMP prints its settings when torch loads it."""
     environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
-    environment |= {"OMP_DISPLAY_ENV": "true"} | ({"OMP_WAIT_POLICY": given} if given else {})
+    environment |= {"OMP_DISPLAY_ENV": "true"} | ({"OMP_WAIT_POLICY": user_policy} if user_policy else {})
     line = [sys.executable, "-m", "bpnp", "fit", "--config=quickstart", "--print_config"]
     done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
     assert f"OMP_WAIT_POLICY = '{policy}'" in done.stderr
     program = [sys.executable, "-c", "import bpnp, os; bpnp.Batch; print('OMP_WAIT_POLICY' in os.environ)"]
     done = subprocess.run(program, env=environment, capture_output=True, text=True, check=True)
-    assert done.stdout == f"{given is not None}\n"
+    assert done.stdout == f"{user_policy is not None}\n"

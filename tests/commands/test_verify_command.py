@@ -55,7 +55,7 @@ def test_options_reach_the_verdict_as_they_are_written(files: list[str], monkeyp
     """Pass all options to `verify`; their effects are tested in tests/search/test_verify.py."""
     asked, solution = list[dict[str, Any]](), bpnp.solve(X, P)
 
-    def noted(*given: Any, **options: Any) -> Solution:
+    def noted(*arguments: Any, **options: Any) -> Solution:
         asked.append(options)
         return solution
 

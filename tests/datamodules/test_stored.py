@@ -76,11 +76,11 @@ WRONG = [
 @pytest.mark.parametrize(("change", "message"), WRONG)
 def test_arrays_that_do_not_fit_are_named(change: dict[str, np.ndarray], message: str) -> None:
     points = np.ones((4, 3))
-    given = {"points2d": points[:, :2], "points3d": points, "rotation": np.eye(3), "translation": np.zeros(3)}
+    arrays = {"points2d": points[:, :2], "points3d": points, "rotation": np.eye(3), "translation": np.zeros(3)}
     create = Problem.from_matches.__func__
     create = getattr(create, "__wrapped__", create)  # past the type checks of the tests, which users do not have
     with pytest.raises(ValueError, match=message):
-        create(Problem, "a/1", **({"match3d": np.arange(4), "focal": 1.0} | given | change))
+        create(Problem, "a/1", **({"match3d": np.arange(4), "focal": 1.0} | arrays | change))
 
 
 def test_problems_with_too_few_points_are_left_out(store: Store) -> None:

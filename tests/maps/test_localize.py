@@ -381,13 +381,13 @@ def test_a_competing_pose_of_one_view_competes_on_all_points(planted: tuple[Scen
     right = scene.localize(keypoints, PINHOLE, views=["photo 1.jpg"], solver="search", time_limit=1e5)
     turn = Rotation.from_euler("y", 10, degrees=True).as_matrix()
     wrong = replace(right.candidates[0], rotation=turn @ right.rotation, translation=turn @ right.translation)
-    given = replace(
+    few_matches = replace(
         right, rotation=wrong.rotation, translation=wrong.translation, verdict="ambiguous",
         log10_false_alarms=-5.0, candidates=(wrong, right.candidates[0]),
     )  # fmt: skip
-    given = replace(given, matches=given.matches[:4])
+    few_matches = replace(few_matches, matches=few_matches.matches[:4])
     photo = Photo(keypoints, camera_from(PINHOLE))
-    solution = judge_on_all_points(given, refine_on_all_points(given, photo, scene.region(scene.views[1])))
+    solution = judge_on_all_points(few_matches, refine_on_all_points(few_matches, photo, scene.region(scene.views[1])))
     assert degrees_between(solution.rotation, right.rotation) < 0.5
     assert solution.verdict == "confident"
 

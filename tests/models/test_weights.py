@@ -82,7 +82,7 @@ def test_a_checkpoint_cannot_name_an_unknown_class(name: str, tmp_path: Path) ->
 
 
 def test_every_part_of_the_package_is_described_by_its_arguments() -> None:
-    given = [
+    modules = [
         ImageFeatures(channels=8, depth=1, centre=True, scale=2.0),
         SceneFeatures(channels=8, depth=1, normalise=True),
         Sinkhorn(mu=0.3, learn_mu=True, tolerance=1e-5, max_iterations=7),
@@ -91,21 +91,21 @@ def test_every_part_of_the_package_is_described_by_its_arguments() -> None:
         Refinement(hypotheses=3, enabled=False),
         Matcher(channels=8, depth=1, heads=2, neighbours=0, mu=0.2, tolerance=1e-5, ransac=RansacPnP(threshold=0.2)),
     ]
-    for module in given:
+    for module in modules:
         description = describe_module(module)
         again = build_module(description, (*PARTS, BPnPNet, Matcher))
         assert describe_module(again) == description
         assert type(again) is type(module)
-    assert describe_module(given[2])["settings"]["mu"] == 0.3
-    assert describe_module(given[-1])["settings"]["ransac"]["settings"]["threshold"] == 0.2
+    assert describe_module(modules[2])["settings"]["mu"] == 0.3
+    assert describe_module(modules[-1])["settings"]["ransac"]["settings"]["threshold"] == 0.2
 
 
 def test_a_checkpoint_of_another_shape_is_refused_with_what_differs() -> None:
     saved, own = small_net(8, 1, normalise=True), small_net(16, 2)
-    told = (
+    expected = (
         r"features2d.channels=16 \(saved: 8\), .*features3d.normalise=False \(saved: True\). Leave these settings out"
     )
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=expected):
         fitting_state(content(saved), own)
     # The shapes agree; the assignment would be another one.
     with pytest.raises(ValueError, match=r"another BPnPNet: features3d.normalise=True \(saved: False\)\."):

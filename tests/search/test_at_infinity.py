@@ -106,8 +106,8 @@ def test_a_rough_focal_length_gives_the_verdict_of_the_exact_one(error: float, f
         image = focal * camera[:, :2] / camera[:, 2:] + size / 2
         image = image[(camera[:, 2] > 0) & (image > 0).all(1) & (image < size).all(1)][:10]
         image = np.concatenate([image + 0.1 * rng.standard_normal(image.shape), rng.uniform(0, size, (25, 2))])
-        given = np.array([[factor * focal, 0, 512], [0, factor * focal, 384], [0, 0, 1]])
-        solution = look(image, directions, given, focal_error=error)
+        assumed = np.array([[factor * focal, 0, 512], [0, factor * focal, 384], [0, 0, 1]])
+        solution = look(image, directions, assumed, focal_error=error)
         assert solution.verdict == "confident", solution.reason
         assert degrees_between(solution.rotation, rotation) < 0.02
         assert solution.focal_length == pytest.approx(focal, rel=2e-3)

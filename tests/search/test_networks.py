@@ -38,7 +38,7 @@ def test_a_network_for_views_gets_the_points_in_its_coordinates_and_its_pose_is_
     net = Answering(rotation @ VIEW.T, translation - rotation @ VIEW.T @ shift, "view").eval()
     prior = PosePrior(VIEW, shift - VIEW @ np.full(3, far), 20.0, 2.0)
     solution = solve(image, points, solver=net, prior=prior)
-    np.testing.assert_allclose(net.given[0].points3d[0], turned + shift, atol=1e-4)
+    np.testing.assert_allclose(net.batches[0].points3d[0], turned + shift, atol=1e-4)
     np.testing.assert_allclose(solution.rotation, rotation, atol=1e-6)
     np.testing.assert_allclose(solution.translation, translation - rotation @ np.full(3, far), atol=1e-5 * (1 + far))
 
@@ -47,9 +47,9 @@ def test_a_prior_without_translation_places_the_points_where_the_image_shows_the
     image, points, rotation, translation = scene()
     net = Answering(np.eye(3), np.zeros(3), "view").eval()
     solve(image, points, solver=net, prior=PosePrior(VIEW, None, 20.0))
-    given = net.given[0].points3d[0].numpy()
-    np.testing.assert_allclose(given - given[0], (points - points[0]) @ VIEW.T, atol=1e-4)
-    seen = given[:, :2] / given[:, 2:]
+    entered = net.batches[0].points3d[0].numpy()
+    np.testing.assert_allclose(entered - entered[0], (points - points[0]) @ VIEW.T, atol=1e-4)
+    seen = entered[:, :2] / entered[:, 2:]
     np.testing.assert_allclose(np.median(seen, 0), np.median(image, 0), atol=0.05)
     assert np.linalg.norm(seen.std(0)) == pytest.approx(np.linalg.norm(image.std(0)), rel=0.25)
 

@@ -257,11 +257,11 @@ def test_keypoints_of_opencv_count_from_the_centre_of_the_first_pixel() -> None:
 @pytest.mark.parametrize("form", ["opencv", "rows"])
 def test_arrays_of_opencv_detectors_are_accepted(form: str) -> None:
     example = load("mesh")
-    given = {
+    keypoints = {
         "opencv": example.points2d[:, None].astype(np.float32),
         "rows": np.c_[example.points2d, np.full(200, 2.5), np.zeros(200)],
     }[form]
-    solution = solve(given, example.points3d[:, None] if form == "opencv" else example.points3d, example.camera)
+    solution = solve(keypoints, example.points3d[:, None] if form == "opencv" else example.points3d, example.camera)
     assert example.rotation_error_deg(solution.rotation) < 0.2
     assert solution.points2d.shape == (200, 2)
 

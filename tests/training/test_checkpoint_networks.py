@@ -138,7 +138,7 @@ def test_parts_and_networks_of_a_user_come_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changed", "told"),
+    ("changed", "message"),
     [
         ({"centre": False}, r"features2d.centre=False \(saved: True\), features3d.centre=False \(saved: True\)"),
         ({"scale": 1.0}, r"features2d.scale=1.0 \(saved: 4.0\)"),
@@ -146,15 +146,15 @@ def test_parts_and_networks_of_a_user_come_back(tmp_path: Path) -> None:
         ({"transport": Sinkhorn(mu=0.3)}, r"transport.mu=0.3 \(saved: 0.1\)"),
     ],
 )
-def test_a_network_that_contradicts_its_checkpoint_is_refused(changed: Any, told: str, tmp_path: Path) -> None:
+def test_a_network_that_contradicts_its_checkpoint_is_refused(changed: Any, message: str, tmp_path: Path) -> None:
     own: dict[str, Any] = {"centre": True, "scale": 4.0}
     file = str(save(BlindPnPTask(small_net(**own)), tmp_path / "own.ckpt"))
     other, run = small_net(**own | changed), quiet_trainer(tmp_path)
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=message):
         BlindPnPTask(other, weights=file)
-    with pytest.raises(ValueError, match=f"own.ckpt: .*{told}"):
+    with pytest.raises(ValueError, match=f"own.ckpt: .*{message}"):
         BlindPnPTask.load_from_checkpoint(file, solver=other)
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=message):
         run.test(BlindPnPTask(other), datamodule=small_meshes(tmp_path), ckpt_path=file)
 
 
