@@ -150,8 +150,8 @@ def of_classes(kind: str, options: argparse.Namespace) -> Iterator[Problem]:
 
 def problem(name: str, run: Callable[[], Solution], poses: Sequence[Pose], points3d: Array) -> Problem:
     """Return the problem of a frame; the error of the centre is in distances of the centroid of the scene."""
-    middle = np.median(points3d, 0)
-    distance = float(np.linalg.norm(poses[0][0] @ middle + poses[0][1])) if poses else 1.0
+    centroid = np.median(points3d, 0)
+    distance = float(np.linalg.norm(poses[0][0] @ centroid + poses[0][1])) if poses else 1.0
     return Problem(name, run, poses, points3d, distance)
 
 

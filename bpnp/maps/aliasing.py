@@ -126,7 +126,7 @@ def judge_against(solution: Solution, competitor: Competitor | None) -> Solution
 
     An ambiguous solution has both poses as its first candidates.
     """
-    least_margin = DEFAULT.evidence.lead
+    least_margin = DEFAULT.evidence.margin
     if competitor is None or competitor.margin >= least_margin:
         return solution
     other, margin = competitor.pose, competitor.margin

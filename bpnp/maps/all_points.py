@@ -113,15 +113,15 @@ def judge_on_all_points(solution: Solution, refined: Refined | None) -> Solution
     """
     if refined is None:
         return solution
-    problem, rule, confident = refined.problem, DEFAULT.evidence, solution.verdict == "confident"
+    problem, settings, confident = refined.problem, DEFAULT.evidence, solution.verdict == "confident"
 
-    alone = judge(refined.poses, problem, batches=1, exhaustive=True, rule=rule)
-    result = judge_with_competitors(alone, problem, lambda: refined.scene, rule, exhaustive=True)
+    alone = judge(refined.poses, problem, batches=1, exhaustive=True, settings=settings)
+    result = judge_with_competitors(alone, problem, lambda: refined.scene, settings, exhaustive=True)
     rotations, shifts = (np.stack(both) for both in zip(refined.pose, result.best, strict=True))
     behind = result.log10_false_alarms - solution.log10_false_alarms
-    if confident and not problem.same_pose(rotations, shifts, rule.same)[1]:
+    if confident and not problem.same_pose(rotations, shifts, settings.same)[1]:
         other = competing_pose(rotations[0], rotations[1], behind)
-        return solution if behind >= rule.lead else add_objection(solution, other)
+        return solution if behind >= settings.margin else add_objection(solution, other)
     if behind < 0 or (not confident and result.verdict == "confident"):
         found = finished(problem, result, solution.seconds, None)
         stats = replace(found.stats, iterations=solution.stats.iterations)
@@ -130,14 +130,14 @@ def judge_on_all_points(solution: Solution, refined: Refined | None) -> Solution
     if not confident:
         return solution
     if alone.verdict != "confident":  # other cameras have not been tested for it
-        lens_objection = other_lens(alone, problem, lambda: refined.scene, rule)
+        lens_objection = other_lens(alone, problem, lambda: refined.scene, settings)
         return solution if lens_objection is None else add_objection(solution, lens_objection)
     if result.verdict == "confident":
         return solution
     return change_verdict(solution, result.verdict, result.reason, result.code)
 
 
-def local_searches_for_certainty(rule: Evidence) -> int:
+def local_searches_for_certainty(settings: Evidence) -> int:
     """Return the number of local searches that exclude a better pose nearby, whatever its initial poses were."""
-    again = (rule.missed - math.log10(rule.look_fails)) / math.log10(rule.again_fails)
+    again = (settings.missed - math.log10(settings.look_fails)) / math.log10(settings.again_fails)
     return 1 + max(math.ceil(again), 0)

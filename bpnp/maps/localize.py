@@ -174,7 +174,7 @@ def judge_in_map(
 ) -> ViewSolution:
     """Refine and judge a pose on all map points in view and, if it is confident, against poses elsewhere in the map.
 
-    If a pose elsewhere is more likely by the margin `lead`, it is refined and judged in the same way, and used instead
+    If a pose elsewhere is more likely by `Evidence.margin`, it is refined and judged in the same way, and used instead
     if it is confident. With a prior, which excludes poses elsewhere, these are not tested.
 
     Args:
@@ -192,7 +192,7 @@ def judge_in_map(
     if photo.prior is None and solution.verdict == "confident":
         earlier = [*earlier, *significant(own)]
         competitor = find_competitor(scene, photo, views, place, solution, earlier)
-        if competitor is not None and competitor.margin <= -DEFAULT.evidence.lead:
+        if competitor is not None and competitor.margin <= -DEFAULT.evidence.margin:
             better = _judge_competitor(scene, photo, views, solution, competitor.pose)
             if better.verdict == "confident":
                 earlier = [*earlier, *significant(solution)]

@@ -46,5 +46,5 @@ def verify_pose(
         return solution
     competitor = best_competitor(photo, place, solution, [], regions(explained_keypoints(photo, solution)))
     compared = judge_against(solution, competitor)
-    refuted = competitor is not None and competitor.margin <= -DEFAULT.evidence.lead
+    refuted = competitor is not None and competitor.margin <= -DEFAULT.evidence.margin
     return change_verdict(compared, "failed", compared.reason, compared.reason_code) if refuted else compared

@@ -100,7 +100,7 @@ def _refine(problem: Problem, rotation: NDArray[np.float64], translation: NDArra
     if degenerate(problem.bearings) or degenerate(problem.points3d):
         return degenerate_points("too few points, or all on one line")
     poses = anneal_given(Scene(problem, 0, DEFAULT), rotation, translation)
-    return judge(poses, problem, batches=int(np.isfinite(rotation).all((-2, -1)).sum()), rule=DEFAULT.evidence)
+    return judge(poses, problem, batches=int(np.isfinite(rotation).all((-2, -1)).sum()), settings=DEFAULT.evidence)
 
 
 def problems_of(batch: Batch) -> list[Problem]:

@@ -36,7 +36,7 @@ def judge_with_competitors(
     result: SearchResult,
     problem: Problem,
     scene_of: SceneOf,
-    rule: Evidence,
+    settings: Evidence,
     *,
     local_searches: float | int = 0,
     exhaustive: bool = False,
@@ -46,13 +46,13 @@ def judge_with_competitors(
 
     A better pose of a repeated structure becomes the best one, and its competing poses are proposed in turn. The given
     camera is accepted unless another lens, whose parameters count as unknowns, has fewer false alarms by the factor
-    `rule.focal_chance`.
+    `settings.focal_chance`.
 
     Args:
         result: Verdict; returned unchanged unless it is confident.
         problem: Points of the problem.
         scene_of: Function that returns the scene for refinements; it is called only if one is needed.
-        rule: Constants of the verdict.
+        settings: Constants of the verdict.
         local_searches: Number of local searches around the best pose that found no better one.
         exhaustive: True if every pose was tried.
         enumerated: True if the competing poses of a repeated structure are among the candidates already.
@@ -61,21 +61,26 @@ def judge_with_competitors(
         The verdict, with the competing poses among its candidates.
     """
     while result.verdict == "confident":
-        competitors = repeated_competitors(result, problem, scene_of, rule, enumerated=enumerated)
+        competitors = repeated_competitors(result, problem, scene_of, settings, enumerated=enumerated)
         if not len(competitors):
             break
         candidates, leader = Hypotheses.concatenate([result.candidates, competitors]), result.best[1]
         result = judge(
-            candidates, problem, batches=result.batches, local_searches=local_searches, exhaustive=exhaustive, rule=rule
+            candidates,
+            problem,
+            batches=result.batches,
+            local_searches=local_searches,
+            exhaustive=exhaustive,
+            settings=settings,
         )
         if np.array_equal(result.best[1], leader):
             break
-    other = other_lens(result, problem, scene_of, rule) if result.verdict == "confident" else None
+    other = other_lens(result, problem, scene_of, settings) if result.verdict == "confident" else None
     return result if other is None else result.add_objection(other)
 
 
 def repeated_competitors(
-    result: SearchResult, problem: Problem, scene_of: SceneOf, rule: Evidence, *, enumerated: bool = False
+    result: SearchResult, problem: Problem, scene_of: SceneOf, settings: Evidence, *, enumerated: bool = False
 ) -> Hypotheses:
     """Return the competing poses of a repeated structure, refined, with their NFA.
 
@@ -87,23 +92,23 @@ def repeated_competitors(
         result: Confident verdict.
         problem: Points of the problem.
         scene_of: Function that returns the scene for the refinement.
-        rule: Constants of the verdict.
+        settings: Constants of the verdict.
         enumerated: True if they are among the candidates already.
 
     Returns:
         Competing poses; none if the verdict does not depend on them.
     """
-    if enumerated and not is_symmetric(result.candidates, problem, rule):
+    if enumerated and not is_symmetric(result.candidates, problem, settings):
         return Hypotheses.empty()
     best = result.best
     # The scale at which the annealing ended may be coarser than that of the residuals.
     scale = result.residual if enumerated else min(result.residual, likeliest_scale(problem, *best))
     scale = max(scale, problem.image.scales[0])
-    least = rule.repetitions.symmetric if enumerated else 0.0
-    repeated, motions = repeated_poses(problem, *best, scale, rule, least=least)
+    least = settings.repetitions.symmetric if enumerated else 0.0
+    repeated, motions = repeated_poses(problem, *best, scale, settings, least=least)
     if not len(repeated):
         return repeated
-    poses, limits = (repeated.rotation, repeated.translation), rule.repetitions
+    poses, limits = (repeated.rotation, repeated.translation), settings.repetitions
     if enumerated:
         refined, limits = repeated, replace(limits, most_missing=1e-12)
     else:
@@ -111,13 +116,13 @@ def repeated_competitors(
     others, fraction = (refined.rotation, refined.translation), float(motions.fraction.min(initial=1.0))
     behind = repetition_margins(problem, best, poses, others, scale, limits, fraction=fraction)
     behind = np.maximum(behind, 0) if motions.complete else np.zeros(len(refined))
-    if enumerated and (behind >= rule.lead).all():
+    if enumerated and (behind >= settings.margin).all():
         return Hypotheses.empty()
     alarms = np.minimum(refined.log10_false_alarms, result.log10_false_alarms + behind)
     return replace(refined, log10_false_alarms=alarms)
 
 
-def other_lens(result: SearchResult, problem: Problem, scene_of: SceneOf, rule: Evidence) -> Objection | None:
+def other_lens(result: SearchResult, problem: Problem, scene_of: SceneOf, settings: Evidence) -> Objection | None:
     """Return another lens with which a different pose fits better than the best one, or None.
 
     Better means fewer false alarms by the factor `focal_chance`, with focal length and radial coefficient counted as
@@ -128,64 +133,64 @@ def other_lens(result: SearchResult, problem: Problem, scene_of: SceneOf, rule: 
         result: Confident verdict on the best pose.
         problem: Points of the problem.
         scene_of: Function that returns the scene, whose settings and deadline are used.
-        rule: Constants of the verdict.
+        settings: Constants of the verdict.
     """
     if problem.focal is not None:
         return None
     count, (rotation, translation) = match_count(result.candidates), result.best
     linear = linearised(problem, rotation, translation, result.residual)
-    other = fitted_lens(linear, count, rule)
-    if other is not None or count < rule.zoomed.fewest:
+    other = fitted_lens(linear, count, settings)
+    if other is not None or count < settings.other_focal.fewest:
         return other
     if result.residual < problem.image.scales[0]:
         linear = linearised(problem, rotation, translation, problem.image.scales[0])
-    middle = rotation @ problem.middle + translation
-    starts = (None, 0.0) if bends_significantly(linear, count, rule) else (None,)
+    centre = rotation @ problem.centre3d + translation
+    starts = (None, 0.0) if bends_significantly(linear, count, settings) else (None,)
 
     def better(found: AtZoom) -> Objection | None:
         least = max(float(found.pose.scale[0]), found.problem.image.scales[0])
-        fits = (fit_lens(found.problem, found.pose.rotation[0], found.middle, least, start) for start in starts)
+        fits = (fit_lens(found.problem, found.pose.rotation[0], found.centre3d, least, start) for start in starts)
         others = [fit._replace(zoom=found.zoom * fit.zoom) for fit in fits if fit is not None]
-        alarms = [_alarms(problem, other, rule) for other in others]
-        if min(alarms, default=math.inf) >= result.log10_false_alarms + math.log10(rule.focal_chance):
+        alarms = [_alarms(problem, other, settings) for other in others]
+        if min(alarms, default=math.inf) >= result.log10_false_alarms + math.log10(settings.focal_chance):
             return None
-        return other_camera(misfit_of(rotation, middle, others[int(np.argmin(alarms))]), rule)
+        return other_camera(misfit_of(rotation, centre, others[int(np.argmin(alarms))]), settings)
 
     leader = AtZoom(1.0, problem, result.candidates[:1])
     other = better(leader)
-    if other is not None or rule.independent * result.log10_false_alarms / count <= rule.missed:
+    if other is not None or settings.independent * result.log10_false_alarms / count <= settings.missed:
         return other
     scene = scene_of()
-    likeliest = likeliest_zoom(leader, scene, rule.zoomed)
+    likeliest = likeliest_zoom(leader, scene, settings.other_focal)
     if scene.deadline.passed():
         return objection("camera_untested")
     return better(likeliest)
 
 
-def fitted_lens(linear: Linearised | None, count: float, rule: Evidence) -> Objection | None:
+def fitted_lens(linear: Linearised | None, count: float, settings: Evidence) -> Objection | None:
     """Return a focal length that the residuals of a pose support significantly, if its pose is a different one.
 
     Args:
         linear: Pose of a given camera from `linearised`, at the standard deviation of its residuals; or None.
         count: Number of its matches.
-        rule: Constants of the verdict.
+        settings: Constants of the verdict.
     """
-    if linear is None or systematic_misfit(linear, count, rule).zoom == 1:
+    if linear is None or systematic_misfit(linear, count, settings).zoom == 1:
         return None
-    rotation, middle = linear.state.rotation, linear.state.centroid
-    fit = fit_lens(linear.problem, rotation, middle, linear.scale)
-    return None if fit is None else other_camera(misfit_of(rotation, middle, fit), rule)
+    rotation, centre = linear.state.rotation, linear.state.centroid
+    fit = fit_lens(linear.problem, rotation, centre, linear.scale)
+    return None if fit is None else other_camera(misfit_of(rotation, centre, fit), settings)
 
 
-def misfit_of(rotation: Array, middle: Array, other: LensFit) -> Misfit:
+def misfit_of(rotation: Array, centre: Array, other: LensFit) -> Misfit:
     """Return the difference between a pose and the pose of another lens.
 
     Args:
         rotation: (3, 3) of the pose.
-        middle: (3,) scene centroid in its camera's frame.
+        centre: (3,) scene centroid in its camera's frame.
         other: Fitted lens with its pose.
     """
-    shift = float(np.linalg.norm(other.middle - middle)) / max(float(np.linalg.norm(middle)), 1e-300)
+    shift = float(np.linalg.norm(other.centre3d - centre)) / max(float(np.linalg.norm(centre)), 1e-300)
     return Misfit(rotation_angle(rotation, other.rotation), shift, other.zoom, other.radial or 0.0)
 
 
@@ -203,9 +208,9 @@ class AtZoom(NamedTuple):
     pose: Hypotheses
 
     @property
-    def middle(self) -> Array:
+    def centre3d(self) -> Array:
         """Scene centroid (3,) in the camera's frame."""
-        return np.asarray(self.pose.rotation[0] @ self.problem.middle + self.pose.translation[0])
+        return np.asarray(self.pose.rotation[0] @ self.problem.centre3d + self.pose.translation[0])
 
     @property
     def likelihood(self) -> float:
@@ -213,7 +218,7 @@ class AtZoom(NamedTuple):
         return float(self.pose.log_likelihood[0]) + math.log(self.problem.image.solid_angle)
 
 
-def likeliest_zoom(start: AtZoom, scene: Scene, rule: OtherFocal) -> AtZoom:
+def likeliest_zoom(start: AtZoom, scene: Scene, settings: OtherFocal) -> AtZoom:
     """Return the likeliest pose at other focal lengths.
 
     One step is tried to either side. The likelier side is followed while the likelihood grows.
@@ -221,11 +226,11 @@ def likeliest_zoom(start: AtZoom, scene: Scene, rule: OtherFocal) -> AtZoom:
     Args:
         start: Pose at the given focal length.
         scene: Scene whose settings and deadline are used.
-        rule: Constants of the steps.
+        settings: Constants of the steps.
     """
-    steps = [(step, search_at_zoom(start, step, scene)) for step in (1 / rule.step, rule.step)]
+    steps = [(step, search_at_zoom(start, step, scene)) for step in (1 / settings.step, settings.step)]
     step, best = max(steps, key=lambda one: one[1].likelihood)
-    while 1 / rule.widest < best.zoom * step < rule.widest:
+    while 1 / settings.widest < best.zoom * step < settings.widest:
         further = search_at_zoom(best, step, scene)
         if further.likelihood <= best.likelihood:
             break
@@ -245,23 +250,23 @@ def search_at_zoom(found: AtZoom, zoom: float, scene: Scene) -> AtZoom:
     """
     problem = at_focal_length(found.problem, zoom)
     there = Scene(problem, 0, scene.settings, scene.deadline)
-    shift = found.middle * (1, 1, zoom) - found.pose.rotation[0] @ problem.middle
+    shift = found.centre3d * (1, 1, zoom) - found.pose.rotation[0] @ problem.centre3d
     start = Hypotheses.from_poses(*there.enter(found.pose.rotation, shift[None]))
-    poses = to_problem_frame(search_around(there, start, scene.settings.zoomed)[:1], there)
+    poses = to_problem_frame(search_around(there, start, scene.settings.focal_step)[:1], there)
     return AtZoom(zoom * found.zoom, problem, poses) if len(poses) else found
 
 
-def _alarms(problem: Problem, other: LensFit, rule: Evidence) -> float:
+def _alarms(problem: Problem, other: LensFit, settings: Evidence) -> float:
     """Return log10 NFA of a pose with its lens counted as unknown."""
-    lens = UnknownFocal(2 * math.log(rule.zoomed.widest))
-    zoomed = replace(at_focal_length(problem, other.zoom), focal=lens)
+    lens = UnknownFocal(2 * math.log(settings.other_focal.widest))
+    rescaled = replace(at_focal_length(problem, other.zoom), focal=lens)
     if other.radial is not None:
         bearings = undistort(problem.bearings, other.zoom, other.radial)
         outermost = float(((bearings[:, :2] / bearings[:, 2:]) ** 2).sum(-1).max())
-        lens = lens._replace(radial_sigma=math.inf, radial_range=2 * rule.zoomed.bend / outermost)
-        zoomed = replace(problem, bearings=bearings, focal=lens)
-    translation = other.middle - other.rotation @ problem.middle
-    return float(alarms_of(zoomed, other.rotation[None], translation[None]).own[0])
+        lens = lens._replace(radial_sigma=math.inf, radial_range=2 * settings.other_focal.bend / outermost)
+        rescaled = replace(problem, bearings=bearings, focal=lens)
+    translation = other.centre3d - other.rotation @ problem.centre3d
+    return float(alarms_of(rescaled, other.rotation[None], translation[None]).own[0])
 
 
 def at_focal_length(problem: Problem, zoom: float) -> Problem:

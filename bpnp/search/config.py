@@ -141,8 +141,8 @@ class Evidence:
     Attributes:
         false_alarms: Largest log of the number of false alarms (NFA). The NFA is an upper bound: on unrelated points,
             an exhaustive search stayed above 1 in 999 of 1000 cases and never fell below 0.1. [decades; derived]
-        lead: Smallest margin to every competing pose; by chance a wrong pose has it once in a thousand cases. [decades;
-            convention]
+        margin: Smallest margin to every competing pose; by chance a wrong pose has it once in a thousand cases.
+            [decades; convention]
         same: Tolerance within which two poses are the same. [`Tolerance`; convention]
         missed: Largest log of the miss probability of a better optimum (`bpnp.search.verdict.competitors`). [decades;
             convention]
@@ -159,7 +159,7 @@ class Evidence:
             by a tenth are accepted 1.5 times as often. [probability; calibration]
         contested: Constants of the competing far poses.
         repetitions: Constants of the competing poses of a repeated structure.
-        zoomed: Constants of the competing focal lengths.
+        other_focal: Constants of the competing focal lengths.
         focal: Largest 99.9 % bound of a fitted focal length, as a fraction. The distance has the same error, and from
             `same.shift` on the pose is a different one. [fraction; derived]
         focal_few: Bound as `focal` for an object: a scene of at most `Repetitions.whole` points that is no map, such as
@@ -168,7 +168,7 @@ class Evidence:
     """
 
     false_alarms: float = -2.0
-    lead: float = 3.0
+    margin: float = 3.0
     same: Tolerance = SAME
     missed: float = -3.0
     independent: int = 3
@@ -179,7 +179,7 @@ class Evidence:
     focal_chance: float = 0.01
     contested: Contested = Contested()
     repetitions: Repetitions = Repetitions()
-    zoomed: OtherFocal = OtherFocal()
+    other_focal: OtherFocal = OtherFocal()
     focal: float = 0.05
     focal_few: float = 1.0
     scale: float = 0.2
@@ -781,7 +781,7 @@ class FocalSettings:
             [factor; not tuned]
         step_few: Factor between successive focal lengths, for few points and for photos in maps. [factor; not tuned]
         sigmas: Half width of the range of an approximate focal length. [standard deviations; convention]
-        turns: Iterations of the first search with each focal length. [iterations; not tuned]
+        iterations: Iterations of the first search with each focal length. [iterations; not tuned]
         alternations: Largest number of alternations of search and refinement from each focal length. [rounds; not
             tuned]
         promising: Largest log10 NFA of a failed search whose poses are refined. [decades; not tuned]
@@ -811,7 +811,7 @@ class FocalSettings:
     step: float = 1.57
     step_few: float = 1.25
     sigmas: float = 3.0
-    turns: int = 8
+    iterations: int = 8
     alternations: int = 3
     promising: float = -math.inf
     divides_time: bool = True
@@ -921,7 +921,7 @@ class InfinitySettings:
         contests: Smallest evidence on the sample of a rotation that is fitted to all points, as a fraction of that of
             the best one. [fraction; cost]
         power: Fraction of the true matches that propose their rotation. [fraction; not tuned]
-        turns: Largest number of image points that are tried. [points; cost]
+        iterations: Largest number of image points that are tried. [points; cost]
         rougher: Largest noise of the matches, in multiples of the tried one, before the next one is tried. [factor; not
             tuned]
         strained: Largest number of matches that are tested for an error of the camera model. [matches; cost]
@@ -961,7 +961,7 @@ class InfinitySettings:
     last_rounds: int = 3
     contests: float = 0.7
     power: float = 0.9
-    turns: int = 200
+    iterations: int = 200
     rougher: float = 1.2
     strained: int = 1000
     least_share: float = 0.25
@@ -1158,7 +1158,7 @@ class Schedule:
     """Order and number of the steps of a search (`bpnp.search.plan`).
 
     Attributes:
-        turns: Number of iterations, at most. [iterations; convention]
+        iterations: Number of iterations, at most. [iterations; convention]
         enumerated: Number of iterations, at most, for points few enough to be enumerated. Clusters keep every one of so
             small a set, and further iterations end at the same poses. [iterations; calibration]
         around: Number of batches around a guess of the pose, before all others. [batches; calibration]
@@ -1177,7 +1177,7 @@ class Schedule:
         proposed_after: Number of steps near a prior after which proposals are requested. [steps; not tuned]
     """
 
-    turns: int = 400
+    iterations: int = 400
     enumerated: int = 12
     around: int = 4
     near: int = 12
@@ -1225,7 +1225,7 @@ class SearchSettings:
         near: Density-map searches around a prior. [`DensitySearch`; chosen on photos of south_building, which
             docs/results.md reports too]
         local: Density-map search around a pose that the search has found.
-        zoomed: Density-map search around a pose at the next step of the focal length.
+        focal_step: Density-map search around a pose at the next step of the focal length.
         proposed: Density-map search from proposed poses.
         everywhere: Density-map search over all rotations.
         facing: Visibility of points with normals.
@@ -1283,7 +1283,7 @@ class SearchSettings:
         Narrowing(0.08, 0.015, points=600),
         annealed=12,
     )
-    zoomed: DensitySearch = DensitySearch(
+    focal_step: DensitySearch = DensitySearch(
         Draws(2**10, 3.0, 0.04, 2**10),
         Preselection((300,), (2**5,)),
         Narrowing(0.04, 0.015, steps=3, points=600),
@@ -1317,19 +1317,19 @@ class SearchSettings:
     warming: int = 8
 
     def __post_init__(self) -> None:
-        if min(self.schedule.turns, self.starts, self.first_starts) < 1 or not self.recipes:
+        if min(self.schedule.iterations, self.starts, self.first_starts) < 1 or not self.recipes:
             raise ValueError(
-                f"`turns` is {self.schedule.turns}, `starts` {self.starts}, `first_starts` {self.first_starts} and the "
-                f"number of `recipes` {len(self.recipes)}; each must be 1 or more"
+                f"`iterations` is {self.schedule.iterations}, `starts` {self.starts}, `first_starts` "
+                f"{self.first_starts} and the number of `recipes` {len(self.recipes)}; each must be 1 or more"
             )
         if not all(0 < share < 1 for share in (self.outliers, *self.end_outliers)):
             raise ValueError(
                 f"`outliers` is {self.outliers} and `end_outliers` {self.end_outliers}; all must be between 0 and 1"
             )
 
-    def limited(self, turns: int) -> "SearchSettings":
+    def limited(self, iterations: int) -> "SearchSettings":
         """Return a copy of these settings with at most this number of iterations."""
-        return replace(self, schedule=replace(self.schedule, turns=turns))
+        return replace(self, schedule=replace(self.schedule, iterations=iterations))
 
     def expecting(self, clutter: float) -> "SearchSettings":
         """Return a copy of these settings for a given outlier fraction.

@@ -203,14 +203,14 @@ class FocalSweep(ABC):
     Attributes:
         unknown: Camera with an unknown focal length.
         options: Options of the searches.
-        rule: Constants of the sweep.
+        constants: Constants of the sweep.
         begun: Time at which the sweep began, seconds of `Clock`.
         ends: Final solution of each focal length so far.
     """
 
     unknown: UnknownCamera
     options: Options
-    rule: FocalSettings = FOCAL
+    constants: FocalSettings = FOCAL
     begun: float = 0.0
     ends: list[Solution] = field(default_factory=list)
 
@@ -228,12 +228,17 @@ class FocalSweep(ABC):
 
     def sweep(self, *, few: bool = False) -> Solution:
         """Return the solution with the fewest false alarms; `few` is True for points that are enumerated."""
-        most, rule, self.begun = self.options.settings.schedule.turns, self.rule, Clock.now()
-        for camera in (focal_steps := self.unknown.focal_steps(rule.step_few if few else rule.step)):
-            self.search_from(self.preselect(camera), min(rule.turns, most), len(focal_steps))
+        most, constants, self.begun = self.options.settings.schedule.iterations, self.constants, Clock.now()
+        for camera in (focal_steps := self.unknown.focal_steps(constants.step_few if few else constants.step)):
+            self.search_from(self.preselect(camera), min(constants.iterations, most), len(focal_steps))
             if (self.best.verdict == "confident" and not few) or self.time_left(1) == 0:
                 break
-        if self.best.verdict != "confident" and not few and most > rule.turns and self.best.camera is not None:
+        if (
+            self.best.verdict != "confident"
+            and not few
+            and most > constants.iterations
+            and self.best.camera is not None
+        ):
             self.search_from(self.best.camera, most, 1)
         return replace(self.contested(), seconds=Clock.now() - self.begun)
 
@@ -241,18 +246,18 @@ class FocalSweep(ABC):
     def best(self) -> Solution:
         return min(self.ends, key=lambda end: end.log10_false_alarms)
 
-    def search_from(self, camera: Camera, turns: int, steps: int) -> None:
+    def search_from(self, camera: Camera, iterations: int, steps: int) -> None:
         """Search with a camera, then with cameras that fit the found poses better."""
-        found = self._search(camera, turns, steps)
-        for _ in range(self.rule.alternations):
-            if found.verdict == "failed" and found.log10_false_alarms > self.rule.promising:
+        found = self._search(camera, iterations, steps)
+        for _ in range(self.constants.alternations):
+            if found.verdict == "failed" and found.log10_false_alarms > self.constants.promising:
                 break
             better, settled = self._refined(found, camera)
             if settled:  # a better optimum may lie at a slightly different focal length
                 better, settled = self._refined(found, camera, AROUND)
             if settled:
                 break
-            again = self._search(better, turns, steps)
+            again = self._search(better, iterations, steps)
             if again.log10_false_alarms >= found.log10_false_alarms:
                 break
             found, camera = again, better
@@ -260,13 +265,13 @@ class FocalSweep(ABC):
 
     def time_left(self, steps: int) -> float | None:
         """Return the seconds for the next one of a number of focal lengths; None without a time limit."""
-        limit, waiting = self.options.time_limit, max(steps - len(self.ends), 1) if self.rule.divides_time else 1
+        limit, waiting = self.options.time_limit, max(steps - len(self.ends), 1) if self.constants.divides_time else 1
         return None if limit is None else max(limit - (Clock.now() - self.begun), 0.0) / waiting
 
-    def _search(self, camera: Camera, turns: int, steps: int) -> Solution:
+    def _search(self, camera: Camera, iterations: int, steps: int) -> Solution:
         limit = self.time_left(steps)
-        limit = None if limit is None else max(limit, self.rule.least_limit)
-        options = self.options._replace(settings=self.options.settings.limited(turns), time_limit=limit)
+        limit = None if limit is None else max(limit, self.constants.least_limit)
+        options = self.options._replace(settings=self.options.settings.limited(iterations), time_limit=limit)
         return self.solve_with(camera, options)
 
     def _refined(self, solution: Solution, camera: Camera, zooms: Sequence[float] = (1.0,)) -> tuple[Camera, bool]:
@@ -274,26 +279,26 @@ class FocalSweep(ABC):
         fitted = self.refine(solution, camera, zooms)
         (zoom, radial), (before, old) = self.unknown.parts(fitted), self.unknown.parts(camera)
         bend = abs((radial or 0.0) - (old or 0.0)) * self.unknown.outermost(zoom) ** 2
-        return fitted, max(abs(math.log(zoom / before)), bend) < self.rule.same
+        return fitted, max(abs(math.log(zoom / before)), bend) < self.constants.same
 
     def contested(self) -> Solution:
         """Return the best solution, "ambiguous" if another focal length has a different pose that fits about as well.
 
         A pose within the uncertainty of the best solution does not count as different.
         """
-        best, rule = self.best, DEFAULT.evidence
+        best, settings = self.best, DEFAULT.evidence
         if best.verdict != "confident":
             return best
-        middle = np.median(best.points3d, 0)
+        centre = np.median(best.points3d, 0)
         for end in self.ends:
             for other in end.candidates if end is not best else ():
                 behind = other.log10_false_alarms - best.log10_false_alarms
                 rotations = np.stack([best.rotation, other.rotation])
-                moved = rotations @ middle + np.stack([best.translation, other.translation])
+                moved = rotations @ centre + np.stack([best.translation, other.translation])
                 zoom = end.focal_length / best.focal_length
                 if (
-                    behind < rule.lead
-                    and not same_pose(rotations, moved, 0, rule.same)[1]
+                    behind < settings.margin
+                    and not same_pose(rotations, moved, 0, settings.same)[1]
                     and not is_within_bound(best, other.rotation, zoom)
                 ):
                     away = math.degrees(rotation_angle(best.rotation, other.rotation))
@@ -320,8 +325,8 @@ def is_within_bound(solution: Solution, rotation: Array, zoom: float) -> bool:
 
     A rotation difference of more than `Contested.far` times the limit of the same pose is outside, whatever the bound.
     """
-    turn, rule = Rotation.from_matrix(rotation @ solution.rotation.T).as_rotvec(), DEFAULT.evidence
-    if math.degrees(float(np.linalg.norm(turn))) > rule.contested.far * rule.same.degrees:
+    turn, settings = Rotation.from_matrix(rotation @ solution.rotation.T).as_rotvec(), DEFAULT.evidence
+    if math.degrees(float(np.linalg.norm(turn))) > settings.contested.far * settings.same.degrees:
         return False
     chosen = [solution.parameters.index(name) for name in (*ROTATION_PARAMETERS, FOCAL_LENGTH)]
     unit = np.array([1.0, 1.0, 1.0, 1 / solution.focal_length])  # covariance of the logarithm of the focal length
@@ -406,14 +411,14 @@ def _fit_track(
     zoom, camera = first, unknown.at(*start)
     problem = problem_at(camera, unknown.focal(camera))
     rotation, translation = problem.from_user(*pose)
-    middle = (rotation @ problem.middle + translation) * (1, 1, farther)
-    translation = middle - rotation @ problem.middle
+    centre = (rotation @ problem.centre3d + translation) * (1, 1, farther)
+    translation = centre - rotation @ problem.centre3d
     end = _anneal_pose(problem, rotation, translation, scale, seed)
     for _ in range(FOCAL.rounds):
         pinhole = unknown.at(zoom)
         flat = problem if radial is None else problem_at(pinhole, unknown.focal(pinhole))
-        middle = rotation @ flat.middle + translation
-        fitted = fit_lens(flat, rotation, middle, scale, radial)
+        centre = rotation @ flat.centre3d + translation
+        fitted = fit_lens(flat, rotation, centre, scale, radial)
         if fitted is None or not 1 / FOCAL.step < zoom * fitted.zoom / first < FOCAL.step:
             break
         bend = abs((fitted.radial or 0.0) - (radial or 0.0)) * unknown.outermost(zoom) ** 2
@@ -422,7 +427,7 @@ def _fit_track(
         zoom, radial, camera = zoom * fitted.zoom, fitted.radial, unknown.at(zoom * fitted.zoom, fitted.radial)
         problem = problem_at(camera, unknown.focal(camera))
         rotation = fitted.rotation
-        end = _anneal_pose(problem, rotation, fitted.middle - rotation @ problem.middle, scale, seed)
+        end = _anneal_pose(problem, rotation, fitted.centre3d - rotation @ problem.centre3d, scale, seed)
         rotation, scale = end.rotation[0], min(scale, float(end.scale[0]))
         translation = end.translation[0]
         if max(abs(math.log(fitted.zoom)), bend) < FOCAL.same:

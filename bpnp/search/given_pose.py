@@ -64,24 +64,24 @@ def judge_given_pose(
         The verdict, with the judged pose as the first candidate; and the optimum (1,) near the given pose, or (0,)
         if there is none.
     """
-    rule = DEFAULT.evidence
+    settings = DEFAULT.evidence
     one = replace(problem, log10_tried=0.0)
     claim = _unrefined(one, rotation, translation)
     scene, few = Scene(one, seed, DEFAULT, deadline), is_enumerable(problem)
     others = _proposed(problem, claim, scene)
     if few:  # as in an enumeration, whose candidates are refined
-        motions = registered(one, rotation, translation, float(claim.scale[0]), rule)
-        copies = competing_poses(one, rotation, translation, motions, rule)
+        motions = registered(one, rotation, translation, float(claim.scale[0]), settings)
+        copies = competing_poses(one, rotation, translation, motions, settings)
         if len(copies[0]):
             others = Hypotheses.concatenate([others, anneal_to_end(scene, *copies, float(claim.scale[0]))])
     others = _with_new_false_alarms(others, one)
     others = others[np.argsort(others.log10_false_alarms, kind="stable")]
-    same = np.array([_is_same(one, claim, others[k : k + 1], rule) for k in range(len(others))], np.bool_)
+    same = np.array([_is_same(one, claim, others[k : k + 1], settings) for k in range(len(others))], np.bool_)
     optimum = others[same][:1]
     better = len(optimum) and optimum.log10_false_alarms[0] <= claim.log10_false_alarms[0]
     if refine and better:
         scale = float(optimum.scale[0])
-        distance = float(np.linalg.norm(rotation @ problem.middle + translation))
+        distance = float(np.linalg.norm(rotation @ problem.centre3d + translation))
         prior = PosePrior(
             rotation, translation, math.degrees(scale) / PROBLEM.sigmas, scale * distance / PROBLEM.sigmas
         )
@@ -90,15 +90,15 @@ def judge_given_pose(
         claim = optimum
     competing = others[~same & (others.log10_false_alarms <= 0)]  # insignificant poses do not compete
     candidates = _with_new_false_alarms(Hypotheses.concatenate([claim, competing]), one)
-    result = judge(candidates, one, batches=0, exhaustive=True, rule=rule)
-    result = judge_with_competitors(result, one, lambda: scene, rule, exhaustive=True, enumerated=few)
+    result = judge(candidates, one, batches=0, exhaustive=True, settings=settings)
+    result = judge_with_competitors(result, one, lambda: scene, settings, exhaustive=True, enumerated=few)
     result = _of_claim(result, candidates[:1])
     if result.verdict == "confident":
         result = replace(result, reason=f"{result.reason}; {ONE_POSE}")
-    lead = float(claim.log10_false_alarms[0] - optimum.log10_false_alarms[0]) if better else 0.0
-    if not refine and result.verdict == "confident" and 2 * math.log(10) * lead > PRECISION.far:  # see Wilks 1938
+    margin = float(claim.log10_false_alarms[0] - optimum.log10_false_alarms[0]) if better else 0.0
+    if not refine and result.verdict == "confident" and 2 * math.log(10) * margin > PRECISION.far:  # see Wilks 1938
         off = math.degrees(rotation_angle(rotation, optimum.rotation[0]))
-        result = result.add_objection(objection("better_nearby", lead, degrees=off))
+        result = result.add_objection(objection("better_nearby", margin, degrees=off))
     refined = refine and result.verdict == "confident"
     return replace(result, batches=int(refined)), optimum  # 0 batches: no last fit to the matches
 
@@ -140,22 +140,22 @@ def _unrefined(problem: Problem, rotation: Array, translation: Array) -> Hypothe
     return add_false_alarms(pose, problem)
 
 
-def _is_same(problem: Problem, claim: Hypotheses, pose: Hypotheses, rule: Evidence) -> bool:
+def _is_same(problem: Problem, claim: Hypotheses, pose: Hypotheses, settings: Evidence) -> bool:
     """Return whether a pose (1,) is the given one, within the tolerance or within its uncertainty."""
     rotations = np.concatenate([claim.rotation, pose.rotation])
     translations = np.concatenate([claim.translation, pose.translation])
-    if problem.same_pose(rotations, translations, rule.same)[1]:
+    if problem.same_pose(rotations, translations, settings.same)[1]:
         return True
     turn = claim.rotation[0] @ pose.rotation[0].T
-    if pose.log10_false_alarms[0] > rule.false_alarms or np.trace(turn) <= 1:  # over 90 degrees away
+    if pose.log10_false_alarms[0] > settings.false_alarms or np.trace(turn) <= 1:  # over 90 degrees away
         return False
     linear = linearised(problem, pose.rotation[0], pose.translation[0], float(pose.scale[0]))
     covariance = local_covariance(linear)
     if covariance is None:
         return False
     vector = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    middles = rotations @ problem.middle + translations
-    step = np.r_[vector, middles[0] - middles[1]]
+    centres = rotations @ problem.centre3d + translations
+    step = np.r_[vector, centres[0] - centres[1]]
     return bool(step @ np.linalg.solve(covariance, step) < PRECISION.far)
 
 

@@ -23,12 +23,12 @@ class ImageStatistics:
         solid_angle: Area of this rectangle, steradians, at most 4 pi.
         scales: (S,) scales of residuals, radians, from the noise floor to a fraction of the mean distance of the
             points.
-        chosen: (k,) indices of the image points that are used, at most `rule.most`.
-        together: (k, S) number of used points within `rule.together` scales of each.
+        chosen: (k,) indices of the image points that are used, at most `settings.most`.
+        together: (k, S) number of used points within `settings.together` scales of each.
         weights: (k, S, S) weights of the evidence, see `_weights`.
     """
 
-    def __init__(self, bearings: Array, floor: float | None, rule: ImageSettings = IMAGE) -> None:
+    def __init__(self, bearings: Array, floor: float | None, settings: ImageSettings = IMAGE) -> None:
         m = len(bearings)
         self.centre = bearings.mean(0)
         centred = bearings - self.centre
@@ -37,17 +37,17 @@ class ImageStatistics:
         self.half_widths, self.axes = np.sqrt(3 * np.maximum(variance[1:], 1e-24)), axes[:, 1:]
         area = 12 * math.sqrt(max(float(variance[1:].prod()), 0.0))
         self.solid_angle = float(np.clip(area, 1e-24, 4 * math.pi))
-        smallest = max(floor or 0.0, rule.floor * self.spread)
-        largest = max(rule.coarsest * math.sqrt(self.solid_angle / m), 2 * smallest)
-        steps = max(3, 1 + math.ceil(math.log(largest / smallest) / math.log(rule.scale_step)))
+        smallest = max(floor or 0.0, settings.floor * self.spread)
+        largest = max(settings.coarsest * math.sqrt(self.solid_angle / m), 2 * smallest)
+        steps = max(3, 1 + math.ceil(math.log(largest / smallest) / math.log(settings.scale_step)))
         self.scales = np.geomspace(smallest, largest, steps)
-        self.chosen = np.arange(m) if m <= rule.most else np.linspace(0, m - 1, rule.most).astype(np.int64)
-        within = rule.together * self.scales
+        self.chosen = np.arange(m) if m <= settings.most else np.linspace(0, m - 1, settings.most).astype(np.int64)
+        within = settings.together * self.scales
         looked_at = bearings[self.chosen]
         together = sums_near(looked_at, looked_at, self.axes, within, np.zeros(steps))
         self.together = together.astype(np.int64)
         expected = 1 + (len(looked_at) - 1) * math.pi * within**2 / self.solid_angle
-        self.weights = _weights(self.together, expected, rule.crowded)
+        self.weights = _weights(self.together, expected, settings.crowded)
 
 
 def _weights(together: NDArray[np.int64], expected: Array, crowded_sigmas: float) -> Array:

@@ -45,7 +45,7 @@ class Poses(Protocol):
     """Poses that a search has found so far."""
 
     @property
-    def turns(self) -> int:
+    def iterations(self) -> int:
         """Number of iterations so far."""
 
     def add(self, step: Step, found: Hypotheses) -> None:
@@ -79,7 +79,7 @@ def run(
     *,
     most: int,
     deadline: Deadline,
-    tell: Callable[[int], None] = lambda turns: None,
+    tell: Callable[[int], None] = lambda iterations: None,
 ) -> SearchResult:
     """Run the steps of a plan until the verdict is final or the budget is spent.
 
@@ -93,9 +93,9 @@ def run(
     Returns:
         Distinct poses with the verdict.
     """
-    while poses.turns < most and not deadline.passed() and (step := plan.next_step()) is not None:
+    while poses.iterations < most and not deadline.passed() and (step := plan.next_step()) is not None:
         poses.add(step, step.propose())
-        tell(poses.turns)
+        tell(poses.iterations)
         if poses.may_be_decided():
             result = poses.result(ended=False)
             if result.verdict == "confident" or result.settled:

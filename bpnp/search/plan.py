@@ -240,11 +240,14 @@ class Plan:
         """Return the step that reduces the larger miss probability: a local search around the best pose, or a start."""
         pool = self.pool
         leaders, settings = pool.leaders(), pool.scene.settings
-        local_searches, rule = pool.local_searches(leaders), settings.evidence
-        symmetric = bool(pool.problem.registered) and is_symmetric(leaders, pool.problem, rule)
-        basin_count = count_starts(leaders, pool.problem, rule, symmetric=symmetric)
-        far = far_missed(basin_count, rule, symmetric=symmetric)
-        if local_searches < settings.schedule.local_searches and near_missed(basin_count, local_searches, rule) > far:
+        local_searches, verdict_settings = pool.local_searches(leaders), settings.evidence
+        symmetric = bool(pool.problem.registered) and is_symmetric(leaders, pool.problem, verdict_settings)
+        basin_count = count_starts(leaders, pool.problem, verdict_settings, symmetric=symmetric)
+        far = far_missed(basin_count, verdict_settings, symmetric=symmetric)
+        if (
+            local_searches < settings.schedule.local_searches
+            and near_missed(basin_count, local_searches, verdict_settings) > far
+        ):
             return self._local_search()
         return next_start()
 

@@ -25,7 +25,7 @@ class Pool:
         problem: Points in the frame of the problem.
         enumerated: Result of the enumeration of few points, whose poses are the first candidates.
         candidates: Best poses in the frame of the scene, at most `settings.kept`.
-        turns: Number of iterations so far.
+        iterations: Number of iterations so far.
         missed: log10 of the probability that the search missed a better optimum.
         surrounded: Significant poses whose local search found nothing better.
         searched: Other poses whose surroundings were searched.
@@ -33,7 +33,7 @@ class Pool:
 
     def __init__(self, scene: Scene, problem: Problem, enumerated: SearchResult) -> None:
         self.scene, self.problem, self.enumerated = scene, problem, enumerated
-        self.turns, self._judged_alarms = 0, 0.0
+        self.iterations, self._judged_alarms = 0, 0.0
         self._is_thinned = len(problem.bearings) > scene.settings.fine.bearings
         self._tests = PoseModel.of(problem).log10_tests([problem])
         self.forget()
@@ -50,28 +50,32 @@ class Pool:
         """Add the poses of an iteration.
 
         Their NFA is computed first: a significant pose may be close to a likelier one that is not significant. A local
-        search was unsuccessful if the best NFA does not fall by `Evidence.lead` decades.
+        search was unsuccessful if the best NFA does not fall by `Evidence.margin` decades.
 
         Args:
             step: Step that found them.
             found: Poses in the frame of the scene.
         """
-        rule, before = self.scene.settings.evidence, self.alarms
-        self.turns += 1
+        verdict_settings, before = self.scene.settings.evidence, self.alarms
+        self.iterations += 1
         self.candidates = self._with_false_alarms(
             merge_hypotheses([self.candidates, self._with_false_alarms(found)], self.scene), 1
         )
-        if step.around is not None and self.alarms > before - rule.lead and not self.scene.deadline.passed():
+        if (
+            step.around is not None
+            and self.alarms > before - verdict_settings.margin
+            and not self.scene.deadline.passed()
+        ):
             self.surrounded = Hypotheses.concatenate([self.surrounded, step.around])
         self.missed = self._missed()
-        if self.missed > rule.missed:  # otherwise `result` computes the NFA of the others
+        if self.missed > verdict_settings.missed:  # otherwise `result` computes the NFA of the others
             self.candidates = self._with_false_alarms(self.candidates)
             self.candidates = self.candidates[np.argsort(-self.candidates.sort_key, kind="stable")]
             self.missed = self._missed()
 
     def may_be_decided(self) -> bool:
         """Return True if the verdict on the best pose may be final, or more points may be matched by it."""
-        bettered = self._is_thinned and self.alarms < self._judged_alarms - self.scene.settings.evidence.lead
+        bettered = self._is_thinned and self.alarms < self._judged_alarms - self.scene.settings.evidence.margin
         return bettered or self.missed <= self.scene.settings.evidence.missed
 
     def _with_false_alarms(self, candidates: Hypotheses, count: int | None = None) -> Hypotheses:
@@ -119,10 +123,10 @@ class Pool:
         """
         if not len(leaders) or not len(self.surrounded):
             return 0
-        rule, around = self.scene.settings.evidence, to_problem_frame(self.surrounded, self.scene)
+        verdict_settings, around = self.scene.settings.evidence, to_problem_frame(self.surrounded, self.scene)
         rotation = np.concatenate([leaders.rotation[:1], around.rotation])
         translation = np.concatenate([leaders.translation[:1], around.translation])
-        return int(self.problem.same_pose(rotation, translation, rule.same).sum()) - 1
+        return int(self.problem.same_pose(rotation, translation, verdict_settings.same).sum()) - 1
 
     def is_searched(self, pose: Hypotheses) -> bool:
         """Return True if the surroundings of a pose (1,), or of one equal to it, were searched before."""
@@ -142,16 +146,18 @@ class Pool:
             ended: True after the last iteration, where the `settings.finished` best candidates are annealed on all
                 points; False to anneal only the best one.
         """
-        scene, problem, rule = self.scene, self.problem, self.scene.settings.evidence
+        scene, problem, verdict_settings = self.scene, self.problem, self.scene.settings.evidence
         self._judged_alarms = min(self._judged_alarms, self.alarms)
         annealed = scene.settings.finished if ended else 1
         ends = finish(scene, self.candidates, annealed) if len(self.candidates) else self.candidates
         if len(ends) and problem.prior is not None:  # keep the version of each pose with the smaller NFA
             ends = self._with_false_alarms(ends)
             ends = merge_hypotheses([ends, self.candidates.as_dependent()], scene)
-        leaders = rank_poses(to_problem_frame(ends, scene), problem, rule)
+        leaders = rank_poses(to_problem_frame(ends, scene), problem, verdict_settings)
         local_searches = self.local_searches(leaders)
-        result = judge(leaders, problem, batches=self.turns, local_searches=local_searches, rule=rule)
+        result = judge(
+            leaders, problem, batches=self.iterations, local_searches=local_searches, settings=verdict_settings
+        )
         if self.enumerated.log10_false_alarms < result.log10_false_alarms:
-            return replace(self.enumerated, batches=self.turns)
-        return judge_with_competitors(result, problem, lambda: scene, rule, local_searches=local_searches)
+            return replace(self.enumerated, batches=self.iterations)
+        return judge_with_competitors(result, problem, lambda: scene, verdict_settings, local_searches=local_searches)

@@ -116,7 +116,7 @@ class PoseModel:
     @classmethod
     def of(cls, problem: Problem) -> "PoseModel":
         """Return the model of one camera with the points and the priors of a problem."""
-        return cls(problem.middle, problem.focal, prior=problem.prior)
+        return cls(problem.centre3d, problem.focal, prior=problem.prior)
 
     @cached_property
     def columns(self) -> dict[str, slice]:

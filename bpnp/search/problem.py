@@ -307,19 +307,19 @@ class Problem:
         return []
 
     @cached_property
-    def middle(self) -> Array:
+    def centre3d(self) -> Array:
         """(3,) median of the scene points."""
         return np.median(self.points3d, 0)
 
     @property
-    def middle_of_user(self) -> Array:
+    def centre3d_of_user(self) -> Array:
         """(3,) median of the scene points in the user's coordinates."""
-        middle = self.size * self.middle
-        return middle if self.origin is None else middle + self.origin
+        centre = self.size * self.centre3d
+        return centre if self.origin is None else centre + self.origin
 
     def same_pose(self, rotation: Array, translation: Array, tolerance: Tolerance = SAME) -> NDArray[np.bool_]:
         """Return a mask of the poses (c, 3, 3), (c, 3) that are equal to the first one."""
-        return same_pose(rotation, rotation @ self.middle + translation, 0, tolerance)
+        return same_pose(rotation, rotation @ self.centre3d + translation, 0, tolerance)
 
     @property
     def has_known_rotation(self) -> bool:
@@ -384,8 +384,8 @@ class Problem:
         known, sigma = np.asarray(prior.rotation, np.float64), math.radians(prior.rotation_sigma_deg)
         far, has_position = max(rotation_angle(rotation, known) / sigma, sigmas), False
         if prior.translation is not None and math.isfinite(prior.translation_sigma):
-            expected, has_position = known @ self.middle + np.asarray(prior.translation), True
-            shift = float(np.linalg.norm(rotation @ self.middle + translation - expected))
+            expected, has_position = known @ self.centre3d + np.asarray(prior.translation), True
+            shift = float(np.linalg.norm(rotation @ self.centre3d + translation - expected))
             far = max(far, shift / prior.translation_sigma)
         off = min(far * sigma, math.pi)
         fraction = max((off - math.sin(off)) / math.pi, 1e-15)

@@ -77,7 +77,7 @@ def prepare_mode(
             unknown,
             arrays,
             options,
-            turns=None if mounts is None else [turn for turn, _ in mounts],
+            camera_rotations=None if mounts is None else [turn for turn, _ in mounts],
             prior=rough,
             distortion=distortion,
         )

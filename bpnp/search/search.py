@@ -89,7 +89,7 @@ def search_poses(
     if matches is not None and (problem.prior is None or not is_enumerable(problem)):
         return _of_known_matches(problem, *matches, scene_of, seed, settings)
     if not many:
-        settings = settings.limited(min(settings.schedule.turns, settings.schedule.enumerated))
+        settings = settings.limited(min(settings.schedule.iterations, settings.schedule.enumerated))
     if not only_proposals and is_enumerable(problem) and not deadline.passed():
         poses = EnumeratedPoses(problem, scene_of, settings)
         enumerated = run(EnumerationPlan(poses, deadline), poses, most=1, deadline=NEVER)
@@ -110,7 +110,7 @@ def search_poses(
     pool = Pool(scene, problem, enumerated)
     is_asked = many or only_proposals
     plan = Plan.of(pool, around, proposals if is_asked else None, only_proposals=only_proposals)
-    return run(plan, pool, most=settings.schedule.turns, deadline=deadline, tell=tell)
+    return run(plan, pool, most=settings.schedule.iterations, deadline=deadline, tell=tell)
 
 
 def _of_known_matches(
@@ -122,9 +122,9 @@ def _of_known_matches(
     settings: SearchSettings,
 ) -> SearchResult:
     """Compute the verdict on the poses that known matches, indices (k,) of image and of scene points, fit best."""
-    found, rule = poses_of_matches(problem, i, j, seed), settings.evidence
-    result = judge(found, problem, batches=0, exhaustive=True, rule=rule)
-    return judge_with_competitors(result, problem, scene_of, rule, exhaustive=True)
+    found, verdict_settings = poses_of_matches(problem, i, j, seed), settings.evidence
+    result = judge(found, problem, batches=0, exhaustive=True, settings=verdict_settings)
+    return judge_with_competitors(result, problem, scene_of, verdict_settings, exhaustive=True)
 
 
 def lacks_partners(scene: Scene) -> bool:

@@ -127,15 +127,15 @@ def draw_poses(
         Rotations (count, 3, 3) and translations (count, 3), float32.
     """
     rotation = draw_rotations(count, prior, rng)
-    middle = points3d.mean(0)
+    centroid = points3d.mean(0)
     covariance = np.cov(points3d.T, bias=True)
     along = np.einsum("si,ij,sj->s", rotation[:, 2], covariance, rotation[:, 2])  # variance along the view
     extent = np.sqrt(np.maximum(np.trace(covariance) - along, 0))
     depth = extent / spread * np.exp(recipe.log_depth * rng.uniform(-1, 1, count))
     if spread > PROBLEM.all_around:  # the camera is among the points
         depth *= rng.random(count)
-    seen = middle + recipe.off_centre * rng.random((count, 1)) * (
-        points3d[rng.integers(len(points3d), size=count)] - middle
+    seen = centroid + recipe.off_centre * rng.random((count, 1)) * (
+        points3d[rng.integers(len(points3d), size=count)] - centroid
     )
     towards = np.tile((0.0, 0.0, 1.0), (count, 1))
     if aim is not None:

@@ -75,8 +75,8 @@ def test_views_with_different_focal_lengths_give_no_camera(tmp_path: Path) -> No
     """A zoom lens: no view says at which length the photo was taken."""
     plant_model(tmp_path / "map", camera=PINHOLE)
     scene = SceneMap.from_colmap(tmp_path / "map")
-    zoomed = replace(scene.views[1], camera=camera_from(("PINHOLE", WIDTH, HEIGHT, [900, 900, 400, 300])))
-    scene = replace(scene, views=(scene.views[0], zoomed))
+    enlarged = replace(scene.views[1], camera=camera_from(("PINHOLE", WIDTH, HEIGHT, [900, 900, 400, 300])))
+    scene = replace(scene, views=(scene.views[0], enlarged))
     assert scene.camera_for(photo_with(tmp_path / "b.jpg", (WIDTH, HEIGHT))) == (None, "unknown focal length")
     with pytest.raises(
         ValueError, match=r"the 2 cameras of this shape have focal lengths of 520 to 900 pixels; give --camera"

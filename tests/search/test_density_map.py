@@ -34,8 +34,8 @@ def off(rotation: Array, translation: Array, points: Array, rng: np.random.Gener
     """A prior 4 degrees off, and 4 % of the distance, of that size."""
     axis, shift = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
     turned = Rotation.from_rotvec(np.radians(4) * axis).as_matrix() @ rotation
-    middle = points.mean(0)
-    moved = rotation @ middle + translation + 0.04 * 5 * shift - turned @ middle
+    centroid = points.mean(0)
+    moved = rotation @ centroid + translation + 0.04 * 5 * shift - turned @ centroid
     return PosePrior(turned, moved, 4.0, 0.2)
 
 
@@ -122,9 +122,9 @@ def test_poses_drawn_from_a_prior_are_normal_and_cut_to_the_view(reach: float) -
     prior = scene.enter_prior(problem.prior)
     assert isinstance(prior, PosePrior)
     drawn = draw_around(scene, prior, 4000, reach)
-    middle, sigma = scene.bulk3d.mean(0), prior.translation_sigma
-    centroids = (drawn.rotation @ middle + drawn.translation)[1:]
-    mean = np.asarray(prior.rotation) @ middle + np.asarray(prior.translation)
+    centroid, sigma = scene.bulk3d.mean(0), prior.translation_sigma
+    centroids = (drawn.rotation @ centroid + drawn.translation)[1:]
+    mean = np.asarray(prior.rotation) @ centroid + np.asarray(prior.translation)
     for k, bound in enumerate((reach, reach, math.inf)):
         expected = truncnorm((-bound - mean[k]) / sigma, (bound - mean[k]) / sigma, loc=mean[k], scale=sigma)
         assert kstest(centroids[:, k], expected.cdf).pvalue > 1e-3

@@ -29,8 +29,8 @@ def test_a_confident_pose_is_right(draw: Callable[[np.random.Generator], hard_sc
             assert poses, "nothing is right"
             rotation, translation = poses[0]
             assert degrees_between(found.rotation, rotation) < 3
-            middle = np.median(scene, 0)
-            seen, true = found.rotation @ middle + found.translation, rotation @ middle + translation
+            centroid = np.median(scene, 0)
+            seen, true = found.rotation @ centroid + found.translation, rotation @ centroid + translation
             assert np.linalg.norm(seen - true) < 0.1 * np.linalg.norm(true)
 
 

@@ -36,9 +36,9 @@ def test_pose_focal_length_and_distortion_are_fitted_together(radial: float) -> 
     pixels += np.random.default_rng(2).normal(0, 0.3, pixels.shape)
     problem = Problem(directions(np.c_[pixels / FOCAL, np.ones(len(pixels))]), points)
     turn = Rotation.from_rotvec([0.002, -0.002, 0.003]).as_matrix()
-    fit = fit_lens(problem, turn, turn @ problem.middle * 0.99, 5e-3, radial=0.0)
+    fit = fit_lens(problem, turn, turn @ problem.centre3d * 0.99, 5e-3, radial=0.0)
     assert fit is not None
-    fit = fit_lens(problem, fit.rotation, fit.middle, 3e-4, radial=fit.radial)
+    fit = fit_lens(problem, fit.rotation, fit.centre3d, 3e-4, radial=fit.radial)
     assert fit is not None
     assert fit.radial == pytest.approx(radial, abs=0.01)
     assert fit.zoom == pytest.approx(1.03, rel=2e-3)
@@ -48,7 +48,7 @@ def test_pose_focal_length_and_distortion_are_fitted_together(radial: float) -> 
 def test_without_a_radial_coefficient_only_the_focal_length_is_fitted() -> None:
     points, pixels = planted(0.0, seed=3, zoom=0.95)
     problem = Problem(directions(np.c_[pixels / FOCAL, np.ones(len(pixels))]), points)
-    fit = fit_lens(problem, np.eye(3), problem.middle, 2e-3)
+    fit = fit_lens(problem, np.eye(3), problem.centre3d, 2e-3)
     assert fit is not None
     assert fit.radial is None
     assert fit.zoom == pytest.approx(0.95, rel=1e-5)
@@ -91,10 +91,10 @@ def test_the_nfa_counts_each_unknown_of_the_camera_model() -> None:
 
 def focal_sigmas(problem: Problem, lens: UnknownFocal, scale: float) -> tuple[float, float]:
     """Error of log f of a fit with distortion that starts at the truth (f = 1), and its standard deviation."""
-    fit = fit_lens(problem, np.eye(3), problem.middle, scale, radial=0.0)
+    fit = fit_lens(problem, np.eye(3), problem.centre3d, scale, radial=0.0)
     assert fit is not None
     fitted = replace(problem, focal=lens._replace(radial_sigma=math.inf))
-    linear = linearised(fitted, fit.rotation, fit.middle - fit.rotation @ problem.middle, scale)
+    linear = linearised(fitted, fit.rotation, fit.centre3d - fit.rotation @ problem.centre3d, scale)
     covariance = local_covariance(linear)
     assert covariance is not None
     return math.log(fit.zoom), math.sqrt(covariance[6, 6])

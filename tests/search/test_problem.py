@@ -76,8 +76,8 @@ def test_a_search_gives_the_same_digits_in_any_unit(count: int) -> None:
     problem = Problem.of(rays, points)
     turn, shift = problem.to_user(*results[1].best)
     assert np.degrees(Rotation.from_matrix(turn.T @ rotation).magnitude()) < 0.5
-    middle = points.mean(0)
-    assert np.linalg.norm(turn @ middle + shift - rotation @ middle - translation) < 0.05
+    centroid = points.mean(0)
+    assert np.linalg.norm(turn @ centroid + shift - rotation @ centroid - translation) < 0.05
 
 
 def test_far_points_decide_neither_the_origin_nor_the_size() -> None:

@@ -25,13 +25,13 @@ def test_a_pose_is_the_same_up_to_two_degrees_and_a_twentieth_of_the_distance(
 ) -> None:
     """Five units away, whatever these are; turned about the middle of the scene, which lies off its origin."""
     points = unit * (np.random.default_rng(0).uniform(-1, 1, (30, 3)) + [30, 0, 0])
-    middle = np.median(points, 0)
+    centroid = np.median(points, 0)
     turn = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
     seen = unit * np.array([0.0, 0, 5])
     rotations = np.stack([np.eye(3), turn])
-    translations = np.stack([seen - middle, seen + unit * np.array(shift) - turn @ middle])
-    assert same_pose(rotations, rotations @ middle + translations).tolist() == [True, expected]
-    bearings = (points - middle + seen) / np.linalg.norm(points - middle + seen, axis=1, keepdims=True)
+    translations = np.stack([seen - centroid, seen + unit * np.array(shift) - turn @ centroid])
+    assert same_pose(rotations, rotations @ centroid + translations).tolist() == [True, expected]
+    bearings = (points - centroid + seen) / np.linalg.norm(points - centroid + seen, axis=1, keepdims=True)
     problem = Problem.of(bearings, points)
     assert problem.same_pose(*problem.from_user(rotations, translations)).tolist() == [True, expected]
     assert problem.same_pose(*problem.from_user(rotations, translations), SAME.times(2)).all()

@@ -48,7 +48,7 @@ def test_a_guess_from_the_same_points_is_tried_first_and_is_no_prior(problem, of
     [
         (lambda: Search(time_limit=0.0), "`time_limit` is 0.0; it must be above 0"),
         (lambda: DEFAULT.expecting(1.0), "`clutter` is 1.0; it is a fraction of the points"),
-        (lambda: SearchSettings(Schedule(turns=0)), "`turns` is 0"),
+        (lambda: SearchSettings(Schedule(iterations=0)), "`iterations` is 0"),
         (lambda: SearchSettings(starts=0), "`starts` 0"),
         (lambda: SearchSettings(first_starts=0), "`first_starts` 0"),
         (lambda: SearchSettings(recipes=()), "number of `recipes` 0"),

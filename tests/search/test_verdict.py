@@ -159,12 +159,12 @@ def test_a_focal_length_sweep_reaches_the_true_focal_length(factor: float) -> No
     exact = directions(points + shift) + 4e-3 * rng.standard_normal((1500, 3))
     problem = Problem(directions(exact / (factor, factor, 1)), points)
     turned = Rotation.from_euler("x", 3, degrees=True).as_matrix()
-    away = shift * (1, 1, factor) - turned @ problem.middle
+    away = shift * (1, 1, factor) - turned @ problem.centre3d
     met = AtZoom(1.0, problem, Hypotheses.from_poses(turned[None], away[None], scale=np.array([4e-3])))
-    climbed = likeliest_zoom(met, Scene(problem, 0, DEFAULT), DEFAULT.evidence.zoomed)
+    climbed = likeliest_zoom(met, Scene(problem, 0, DEFAULT), DEFAULT.evidence.other_focal)
     assert climbed.zoom == pytest.approx(1 / factor, rel=0.09 if factor == 1 else 0.045)  # half a step; never none
     assert np.degrees(Rotation.from_matrix(climbed.pose.rotation[0]).magnitude()) < 0.5
-    seen = verdict_on(problem, np.eye(3)[None], met.middle[None], 4e-3, 0.6)
+    seen = verdict_on(problem, np.eye(3)[None], met.centre3d[None], 4e-3, 0.6)
     scenes = [Scene(problem, 0, DEFAULT, end) for end in (NEVER, Deadline(0.0))]
     other, untried = (other_lens(seen, problem, lambda one=one: one, DEFAULT.evidence) for one in scenes)
     assert untried is not None

@@ -35,10 +35,10 @@ class EnumeratedPoses:
         candidates: Poses of the earlier enumerations, and of the current one once it has ended or is certain.
         is_certain: True if the best pose passes the cheap tests of the verdict.
         is_exhausted: True if the last enumeration tried every hypothesis.
-        turns: 0, since an enumeration does not count as an iteration.
+        iterations: 0, since an enumeration does not count as an iteration.
     """
 
-    turns = 0
+    iterations = 0
 
     def __init__(self, problem: Problem, scene_of: SceneOf, settings: SearchSettings) -> None:
         self.problem, self._scene_of, self.settings = problem, scene_of, settings
@@ -76,20 +76,20 @@ class EnumeratedPoses:
         """Refine the competing poses of the best pose, and return all poses."""
         leader = self.found[:1]
         self._leaders.append(leader)
-        pose, rule = (leader.rotation[0], leader.translation[0]), self.settings.evidence
+        pose, verdict_settings = (leader.rotation[0], leader.translation[0]), self.settings.evidence
         scale = max(float(leader.scale[0]), self.problem.floor or ENUMERATION.smallest_scale)
-        motions = registered(self.problem, *pose, scale, rule)
-        for one in zip(*competing_poses(self.problem, *pose, motions, rule), strict=True):
+        motions = registered(self.problem, *pose, scale, verdict_settings)
+        for one in zip(*competing_poses(self.problem, *pose, motions, verdict_settings), strict=True):
             self.run.propose(*one, self.run.reach)
         return self.run.poses()
 
     def may_be_decided(self) -> bool:
         """Return True if the best pose leads by a safe margin and passes the cheap tests of the verdict."""
-        run, rule = self.run, self.settings.evidence
+        run, verdict_settings = self.run, self.settings.evidence
         if not (run.is_significant and self.has_competitors and margin(self.found, run.problem) >= run.safe_margin):
             return False
-        candidates = rank_poses(self._candidates(), self.enumerated, rule)
-        self.is_certain = is_certain(candidates, self.enumerated, rule)
+        candidates = rank_poses(self._candidates(), self.enumerated, verdict_settings)
+        self.is_certain = is_certain(candidates, self.enumerated, verdict_settings)
         if self.is_certain:
             self._keep(candidates)
         return self.is_certain
@@ -125,10 +125,10 @@ class EnumeratedPoses:
 
     def is_better_without_prior(self) -> bool:
         """Return True if the enumeration that has ended shall be repeated without the prior."""
-        prior, rule = self.problem.prior, self.settings.evidence
+        prior, verdict_settings = self.problem.prior, self.settings.evidence
         if isinstance(prior, GravityPrior):
             self.candidates = add_false_alarms(self.candidates, self.enumerated)
-            return float(self.candidates.log10_false_alarms.min(initial=math.inf)) > rule.false_alarms
+            return float(self.candidates.log10_false_alarms.min(initial=math.inf)) > verdict_settings.false_alarms
         if predicted_pose(prior) is None:
             return False
         return self.problem.fixing_matches == 2 or margin(self.found, self.enumerated) < 0
@@ -136,11 +136,24 @@ class EnumeratedPoses:
     def result(self, *, ended: bool = True) -> SearchResult:
         """Compute the verdict on the best pose and its competing poses."""
         if self._result is None:
-            problem, rule, exhaustive = self.problem, self.settings.evidence, self.is_exhausted
+            problem, verdict_settings, exhaustive = self.problem, self.settings.evidence, self.is_exhausted
             scene_of, count = self._scene_of, REFINED
-            result = judge(self.candidates, problem, batches=0, local_searches=count, exhaustive=exhaustive, rule=rule)
+            result = judge(
+                self.candidates,
+                problem,
+                batches=0,
+                local_searches=count,
+                exhaustive=exhaustive,
+                settings=verdict_settings,
+            )
             self._result = judge_with_competitors(
-                result, problem, scene_of, rule, local_searches=count, exhaustive=exhaustive, enumerated=True
+                result,
+                problem,
+                scene_of,
+                verdict_settings,
+                local_searches=count,
+                exhaustive=exhaustive,
+                enumerated=True,
             )
         return self._result
 

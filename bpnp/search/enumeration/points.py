@@ -98,14 +98,14 @@ class Heading(NamedTuple):
     Attributes:
         rays: (m, 3); empty without a prior.
         points: (n, 3); empty without a prior.
-        turns: (3, 3, 3) terms of R: the first plus the others times cosine and sine of the angle about the direction.
+        terms: (3, 3, 3) terms of R: the first plus the others times cosine and sine of the angle about the direction.
             With a prior rotation this angle is 0.
         sine2: Squared sine of the largest rotation from the prior rotation, or 1.
     """
 
     rays: Array
     points: Array
-    turns: Array
+    terms: Array
     sine2: float
 
 

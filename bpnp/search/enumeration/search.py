@@ -318,8 +318,8 @@ def margin(poses: Hypotheses, problem: Problem) -> float:
     if poses.evidence is None or not len(poses):
         return -math.inf
     other = poses.evidence[~problem.same_pose(poses.rotation, poses.translation)]
-    lead = float(poses.evidence[0] - other.max()) if len(other) else math.inf
-    return min(float(poses.evidence[0]), lead)
+    margin = float(poses.evidence[0] - other.max()) if len(other) else math.inf
+    return min(float(poses.evidence[0]), margin)
 
 
 def _log_choose(n: int, k: int) -> float:

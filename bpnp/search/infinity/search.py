@@ -158,14 +158,14 @@ def search_rotation(
     Returns:
         Verdict and rotations, with translations of 0; `batches` is the number of image points that were tried.
     """
-    result, turns, tell = no_pose("no rotation was found"), 0, teller(progress)
+    result, iterations, tell = no_pose("no rotation was found"), 0, teller(progress)
     for is_near in (False,) if problem.prior is None else (True, False):
-        new = _at_each_noise(problem, pixel, noise, seed, deadline, settings, _after(turns, tell), is_near=is_near)
-        turns += new.batches
+        new = _at_each_noise(problem, pixel, noise, seed, deadline, settings, _after(iterations, tell), is_near=is_near)
+        iterations += new.batches
         result = min(new, result, key=lambda one: one.log10_false_alarms)
         if result.log10_false_alarms <= DEFAULT.evidence.false_alarms or deadline.passed():
             break
-    return replace(result, batches=turns)
+    return replace(result, batches=iterations)
 
 
 def _at_each_noise(
@@ -188,9 +188,9 @@ def _at_each_noise(
     catalogue = catalogue_of(directions, None if unlabelled or problem.odds2d is not None else labels3d)
     sample = np.random.default_rng(seed).permutation(len(image.bearings))
     density = float(np.median(catalogue.density[0]))
-    result, turns = no_pose("no rotation was found"), 0
+    result, iterations = no_pose("no rotation was found"), 0
     for scale in settings.noise if noise is None else (noise,):
-        if turns and deadline.passed():
+        if iterations and deadline.passed():
             break
         reach = settings.reach * scale
         # A writable copy has the type of other look-up points, so that the loops are compiled once.
@@ -208,18 +208,20 @@ def _at_each_noise(
             is_near,
         )
         poses = RotationPoses(sight)
-        new = run(RotationPlan(poses, seed), poses, most=settings.turns, deadline=deadline, tell=_after(turns, tell))
-        turns += new.batches
+        new = run(
+            RotationPlan(poses, seed), poses, most=settings.iterations, deadline=deadline, tell=_after(iterations, tell)
+        )
+        iterations += new.batches
         if new.log10_false_alarms <= result.log10_false_alarms:
             result = new
         if result.verdict != "failed" and noise_of(*_matches(sight, result.candidates)) < settings.rougher * scale:
             break
-    return replace(result, batches=turns)
+    return replace(result, batches=iterations)
 
 
-def _after(turns: int, tell: Callable[[int], None]) -> Callable[[int], None]:
+def _after(iterations: int, tell: Callable[[int], None]) -> Callable[[int], None]:
     """Return a function that calls `tell` with its argument plus the number of earlier iterations."""
-    return lambda new: tell(turns + new)
+    return lambda new: tell(iterations + new)
 
 
 def _matches(sight: Sight, found: Hypotheses) -> tuple[Array, Array, Array]:
@@ -240,15 +242,15 @@ class RotationPoses:
     Attributes:
         sight: The problem.
         found: Rotations.
-        turns: Number of image points that were tried.
+        iterations: Number of image points that were tried.
     """
 
     def __init__(self, sight: Sight) -> None:
-        self.sight, self.found, self.turns = sight, Hypotheses.empty(), 0
+        self.sight, self.found, self.iterations = sight, Hypotheses.empty(), 0
 
     def add(self, step: Step, found: Hypotheses) -> None:
         """Add the rotations that an image point proposed."""
-        self.turns += 1
+        self.iterations += 1
         for k in range(len(found)):
             self.found = _merge(self.found, found[k : k + 1], self.sight)
 
@@ -259,9 +261,9 @@ class RotationPoses:
     def result(self, *, ended: bool = True) -> SearchResult:
         """Compute the verdict; a failed one is settled if a rotation of enough points would have been found."""
         settings, count = self.sight.settings, len(self.sight.image.bearings)
-        result = _judge(self.found, self.sight, self.turns)
+        result = _judge(self.found, self.sight, self.iterations)
         least = min(max(math.ceil(self.sight.least_share * count), FIXING_ROTATION + 1), count)
-        hopeless = log10_missed(self.turns, count, least, settings.power) <= DEFAULT.evidence.missed
+        hopeless = log10_missed(self.iterations, count, least, settings.power) <= DEFAULT.evidence.missed
         return replace(result, settled=result.verdict == "failed" and hopeless)
 
 
@@ -479,27 +481,27 @@ def _merge(found: Hypotheses, new: Hypotheses, sight: Sight) -> Hypotheses:
     return every[(every.log10_false_alarms <= 0) | (np.arange(len(every)) == 0)][: DEFAULT.kept]
 
 
-def _judge(found: Hypotheses, sight: Sight, turns: int) -> SearchResult:
+def _judge(found: Hypotheses, sight: Sight, iterations: int) -> SearchResult:
     """Judge rotations, best first, by the rules of `bpnp.search.verdict.decide`."""
-    rule = DEFAULT.evidence
+    verdict_settings = DEFAULT.evidence
     if found.matches is None or found.point_evidence is None:
-        return no_pose("no rotation was found", turns)
+        return no_pose("no rotation was found", iterations)
     alarms = float(found.log10_false_alarms[0])
-    result = SearchResult(found, "confident", "", turns, CONFIDENT)
+    result = SearchResult(found, "confident", "", iterations, CONFIDENT)
     if alarms > 0:
         return result.add_objection(objection("chance", what="no rotation fits"), "failed")
-    if alarms > rule.false_alarms:
-        return result.as_insignificant(rule.false_alarms)
-    lead = float(found.log10_false_alarms[1]) - alarms if len(found) > 1 else math.inf
-    if lead < rule.lead:
-        return result.add_objection(objection("competing_rotation", lead))
+    if alarms > verdict_settings.false_alarms:
+        return result.as_insignificant(verdict_settings.false_alarms)
+    margin = float(found.log10_false_alarms[1]) - alarms if len(found) > 1 else math.inf
+    if margin < verdict_settings.margin:
+        return result.add_objection(objection("competing_rotation", margin))
     hit = np.flatnonzero(found.matches[0] >= 0)
     worth = found.point_evidence[0, hit] / math.log(10)
     most = float(worth.mean() + 2 * worth.std() / math.sqrt(len(hit)))  # largest for a competing rotation
-    least = max(math.ceil((float(worth.sum()) - rule.lead) / most), FIXING_ROTATION + 1)
+    least = max(math.ceil((float(worth.sum()) - verdict_settings.margin) / most), FIXING_ROTATION + 1)
     count = len(sight.image.bearings)
-    missed = log10_missed(turns, count, min(least, count), sight.settings.power)
-    if missed > rule.missed:
+    missed = log10_missed(iterations, count, min(least, count), sight.settings.power)
+    if missed > verdict_settings.missed:
         return result.add_objection(objection("incomplete", what="rotation", probability=reasons.number(missed)))
     seen, bearings, pixel = _matches(sight, found)
     some = np.linspace(0, len(hit) - 1, min(len(hit), sight.settings.strained)).astype(np.int64)
@@ -509,4 +511,4 @@ def _judge(found: Hypotheses, sight: Sight, turns: int) -> SearchResult:
     bound = how_well_known(seen, bearings, pixel, information=prior_information(sight.problem)).bound
     if not math.isfinite(bound):
         return result.add_objection(objection("rotation_not_fixed", count=len(hit), what="it"))
-    return replace(result, reason=reasons.confident(alarms, rule.lead, math.degrees(bound)))
+    return replace(result, reason=reasons.confident(alarms, verdict_settings.margin, math.degrees(bound)))

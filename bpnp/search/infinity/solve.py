@@ -49,7 +49,7 @@ class Sky(NamedTuple):
 
     Attributes:
         images: Pixels (m_k, 2), normalised coordinates or bearings (m_k, 3) of each camera.
-        turns: (3, 3) rotations rig = C^T camera of the cameras, as C; None for a single camera.
+        camera_rotations: (3, 3) rotations rig = C^T camera of the cameras, as C; None for a single camera.
         lenses: Cameras; None for normalised coordinates and bearings.
         unknown: Cameras with an unknown focal length; None if it is known.
         problem: Annotations and prior of all points, with empty bearings.
@@ -57,7 +57,7 @@ class Sky(NamedTuple):
     """
 
     images: list[Array]
-    turns: list[Array] | None
+    camera_rotations: list[Array] | None
     lenses: list[Camera | None]
     unknown: list[UnknownCamera] | None
     problem: Problem
@@ -83,7 +83,7 @@ def prepare_directions(
     known: Mapping[str, Any],
     options: Options,
     *,
-    turns: list[Array] | None = None,
+    camera_rotations: list[Array] | None = None,
     prior: Prior | None = None,
     distortion: bool = False,
 ) -> Callable[[], Solution]:
@@ -97,7 +97,7 @@ def prepare_directions(
             of their reference.
         known: Lists of `labels2d` and `scores2d`, one array or None per camera; `labels3d` and `scores3d`.
         options: Options of the search.
-        turns: (3, 3) rotations cam_from_rig of the cameras of a rig; None for one camera.
+        camera_rotations: (3, 3) rotations cam_from_rig of the cameras of a rig; None for one camera.
         prior: Prior of the rotation. Its translation is ignored.
         distortion: Fit a radial coefficient with an unknown focal length. Default False.
 
@@ -113,9 +113,11 @@ def prepare_directions(
         DEFAULT.expecting(options.clutter)  # raises for one that is out of range
     images, annotations = [], []
     for k, (points, lens) in enumerate(zip(points2d, lenses, strict=True)):
-        with about(None if turns is None else f"camera {k}"):
+        with about(None if camera_rotations is None else f"camera {k}"):
             image = image_points(points)
-            check_points("points2d", image, (2, 3) if lens is None else (2,), INFINITY.fewest if turns is None else 1)
+            check_points(
+                "points2d", image, (2, 3) if lens is None else (2,), INFINITY.fewest if camera_rotations is None else 1
+            )
             images.append(image)
             annotations.append(
                 checked_labels(known["labels2d"][k], known["labels3d"], (len(image), len(scene)))
@@ -138,7 +140,7 @@ def prepare_directions(
         prior=prior._replace(translation=None) if isinstance(prior, PosePrior) else prior,
         **joined,
     )
-    sky = Sky(images, turns, lenses, unknown, problem, distortion)
+    sky = Sky(images, camera_rotations, lenses, unknown, problem, distortion)
     return partial(_solve, sky, options) if unknown is None else _SkySweep(sky, options).sweep
 
 
@@ -168,7 +170,7 @@ class _SkySweep(FocalSweep):
         return camera if found.verdict == "failed" else self.refine(found, camera)
 
     def solve_with(self, camera: Camera, options: Options) -> Solution:
-        settings = FIRST if options.settings.schedule.turns <= self.rule.turns else INFINITY
+        settings = FIRST if options.settings.schedule.iterations <= self.constants.iterations else INFINITY
         return _solve(self.sky.at(*self.unknown.parts(camera)), options, settings)
 
     def refine(self, solution: Solution, camera: Camera, zooms: Sequence[float] = (1.0,)) -> Camera:
@@ -196,7 +198,7 @@ def _parts(sky: Sky, matches: Labels) -> list[tuple[int, Array, Array]]:
 
 def _to_rig(sky: Sky, k: int, bearings: Array) -> Array:
     """Return bearings (m, 3) of camera k in the axes of the rig."""
-    return bearings if sky.turns is None else bearings @ sky.turns[k]
+    return bearings if sky.camera_rotations is None else bearings @ sky.camera_rotations[k]
 
 
 def _model(sky: Sky) -> PoseModel:
@@ -206,7 +208,7 @@ def _model(sky: Sky) -> PoseModel:
     lens = UnknownFocal(
         math.inf, sky.unknown[0].sigma, math.log(zoom), radial or 0.0, math.inf if sky.is_distorted else 0.0
     )
-    mounts = None if sky.turns is None else [(turn, np.zeros(3)) for turn in sky.turns]
+    mounts = None if sky.camera_rotations is None else [(turn, np.zeros(3)) for turn in sky.camera_rotations]
     return PoseModel(np.zeros(3), lens, moves=False, mounts=mounts, prior=sky.problem.prior)
 
 
@@ -249,10 +251,12 @@ def _solve(sky: Sky, options: Options, settings: InfinitySettings = INFINITY) ->
     if lens is None:
         spread = math.sqrt(((every - every.mean(0)) ** 2).sum(-1).mean())
         pixel = np.full(len(every), max(INFINITY.nominal * spread, 1e-12))
-    middle = np.array([np.median(pixel[owner == k]) if (owner == k).any() else np.nan for k in range(len(parts))])
-    per_radian = np.ones(len(parts)) if lens is None else 1 / middle
-    one = int(np.nanargmin(middle))  # camera in whose pixels the noise is
-    noise = None if inlier_threshold is None else inlier_threshold / per_radian[one] / middle[one] / settings.reach
+    median_pixel = np.array([np.median(pixel[owner == k]) if (owner == k).any() else np.nan for k in range(len(parts))])
+    per_radian = np.ones(len(parts)) if lens is None else 1 / median_pixel
+    one = int(np.nanargmin(median_pixel))  # camera in whose pixels the noise is
+    noise = (
+        None if inlier_threshold is None else inlier_threshold / per_radian[one] / median_pixel[one] / settings.reach
+    )
     with one_blas_thread:
         result = search_rotation(
             replace(problem, bearings=every),
@@ -276,7 +280,7 @@ def _solve(sky: Sky, options: Options, settings: InfinitySettings = INFINITY) ->
         stats=SolutionStats(result.batches, dropped2d=problem.dropped2d),
         points2d=np.concatenate(planes),
         points3d=scene,
-        camera=lens if sky.turns is None or sky.unknown is not None else None,
+        camera=lens if sky.camera_rotations is None or sky.unknown is not None else None,
     )
     found = result.candidates
     if found.matches is None:
@@ -284,7 +288,7 @@ def _solve(sky: Sky, options: Options, settings: InfinitySettings = INFINITY) ->
     seen = [scene @ rotation.T for rotation in found.rotation]
     hit = np.flatnonzero(found.matches[0] >= 0)
     residual = noise_of(seen[0][found.matches[0, hit]], every[hit], pixel[hit])
-    threshold = inlier_threshold or MATCHES.reach * residual * float(middle[one] * per_radian[one])
+    threshold = inlier_threshold or MATCHES.reach * residual * float(median_pixel[one] * per_radian[one])
     pairs, counts = [], np.zeros(len(seen), np.int64)
     for k in np.unique(owner).tolist():
         own = np.flatnonzero(owner == k)
@@ -314,7 +318,7 @@ def _solve(sky: Sky, options: Options, settings: InfinitySettings = INFINITY) ->
         angles,
         most=sum(min(len(image), len(scene)) for image in sky.images),
         threshold=threshold,
-        residual=residual * float(middle[one]),
+        residual=residual * float(median_pixel[one]),
         covariance=np.full_like(covariance, math.nan) if result.verdict == "failed" else covariance,
     )
     return replace(solution, seconds=Clock.now() - begun)

@@ -33,48 +33,52 @@ from bpnp.search.search_frame import Scene
 from bpnp.search.starts import PosePrior, Prior, aim_of, draw_poses
 
 
-def search_near(scene: Scene, prior: PosePrior, rule: DensitySearch | None = None) -> Hypotheses:
+def search_near(scene: Scene, prior: PosePrior, density: DensitySearch | None = None) -> Hypotheses:
     """Run density-map searches from initial poses drawn from a prior.
 
     Args:
         scene: Points, settings and deadline.
         prior: Prior with a translation, in the frame of the scene.
-        rule: Settings of one search; None for all of `settings.near`.
+        density: Settings of one search; None for all of `settings.near`.
 
     Returns:
         Distinct annealed poses of all searches.
     """
-    rules = scene.settings.near if rule is None else (rule,)
-    starts = (draw_around(scene, prior, starts_of(scene, prior, one), reach_across(scene, prior, one)) for one in rules)
-    return Hypotheses.concatenate([search_density(scene, *each) for each in zip(starts, rules, strict=True)])
+    searches = scene.settings.near if density is None else (density,)
+    starts = (
+        draw_around(scene, prior, starts_of(scene, prior, one), reach_across(scene, prior, one)) for one in searches
+    )
+    return Hypotheses.concatenate([search_density(scene, *each) for each in zip(starts, searches, strict=True)])
 
 
-def search_density(scene: Scene, poses: Hypotheses, rule: DensitySearch) -> Hypotheses:
+def search_density(scene: Scene, poses: Hypotheses, density: DensitySearch) -> Hypotheses:
     """Preselect initial poses on a density map, narrow the scale, and anneal the best.
 
     Args:
         scene: Points, settings and deadline.
         poses: Initial poses in the frame of the scene.
-        rule: Settings of the search.
+        density: Settings of the search.
 
     Returns:
         Distinct annealed poses. Copies of one initial pose count once for the basin counts.
     """
-    for points, kept in zip(rule.preselection.points, rule.preselection.kept, strict=True):
-        poses, _ = preselect(scene, poses, rule.density_map, rule.narrowing.first_scale, points, kept)
-    steps, scale = rule.narrowing, rule.narrowing.first_scale
+    for points, kept in zip(density.preselection.points, density.preselection.kept, strict=True):
+        poses, _ = preselect(scene, poses, density.density_map, density.narrowing.first_scale, points, kept)
+    steps, scale = density.narrowing, density.narrowing.first_scale
     origin = np.arange(len(poses))  # the start that each pose is a copy of
     for step in range(1, steps.steps + 1):
         if scene.deadline.passed():
             break
         scale = steps.first_scale * (steps.last_scale / steps.first_scale) ** (step / steps.steps)
         copies = perturb(scene, poses, scale, steps.copies)
-        poses, chosen = preselect(scene, copies, rule.density_map, scale, steps.points, rule.preselection.kept[-1])
+        poses, chosen = preselect(
+            scene, copies, density.density_map, scale, steps.points, density.preselection.kept[-1]
+        )
         origin = origin[chosen // steps.copies]
-    poses, origin = poses[: rule.annealed], origin[: rule.annealed]
+    poses, origin = poses[: density.annealed], origin[: density.annealed]
     once = np.isin(np.arange(len(poses)), np.unique(origin, return_index=True)[1])
     poses = replace(poses, basin_count=np.where(once, poses.basin_count, 0))
-    outliers = max(scene.settings.outliers, rule.density_map.outliers)
+    outliers = max(scene.settings.outliers, density.density_map.outliers)
     return anneal_on_points(scene, poses, scale * scene.spread, outliers=outliers)
 
 
@@ -92,25 +96,25 @@ def search_everywhere(scene: Scene, number: int, prior: Prior | None) -> Hypothe
         Distinct annealed poses.
     """
     settings = scene.settings
-    rule, aim = settings.everywhere, aim_of(number)
-    drawn = draw_poses(scene.spread, scene.bulk3d, rule.draws.starts, settings.recipes[0], prior, scene.rng, aim)
-    return search_density(scene, Hypotheses.from_poses(*drawn, basin_count=1), rule)
+    density, aim = settings.everywhere, aim_of(number)
+    drawn = draw_poses(scene.spread, scene.bulk3d, density.draws.starts, settings.recipes[0], prior, scene.rng, aim)
+    return search_density(scene, Hypotheses.from_poses(*drawn, basin_count=1), density)
 
 
-def search_around(scene: Scene, pose: Hypotheses, rule: DensitySearch) -> Hypotheses:
+def search_around(scene: Scene, pose: Hypotheses, density: DensitySearch) -> Hypotheses:
     """Run a local search around a pose.
 
     Args:
         scene: Points, settings and deadline.
-        pose: One pose in the frame of the scene; the widest prior of the rule is centred on it.
-        rule: Settings of the search.
+        pose: One pose in the frame of the scene; the widest prior of the settings is centred on it.
+        density: Settings of the search.
 
     Returns:
         Distinct annealed poses with basin counts of 0.
     """
-    prior = PosePrior(pose.rotation[0], pose.translation[0], rule.draws.wide_deg)
-    sigma = rule.draws.wide_shift * distance_of(scene, prior)
-    return search_near(scene, prior._replace(translation_sigma=sigma), rule).as_dependent()
+    prior = PosePrior(pose.rotation[0], pose.translation[0], density.draws.wide_deg)
+    sigma = density.draws.wide_shift * distance_of(scene, prior)
+    return search_near(scene, prior._replace(translation_sigma=sigma), density).as_dependent()
 
 
 def is_near(scene: Scene, prior: PosePrior) -> bool:
@@ -120,24 +124,24 @@ def is_near(scene: Scene, prior: PosePrior) -> bool:
     )
 
 
-def starts_of(scene: Scene, prior: PosePrior, rule: DensitySearch) -> int:
+def starts_of(scene: Scene, prior: PosePrior, density: DensitySearch) -> int:
     """Return the number of starts that covers a narrow prior as densely as `Draws.starts` cover a wide one."""
-    share = min(_volume(scene, prior, rule), 1.0)
-    return int(np.clip(rule.draws.starts * share, rule.draws.least_starts, rule.draws.starts))
+    share = min(_volume(scene, prior, density), 1.0)
+    return int(np.clip(density.draws.starts * share, density.draws.least_starts, density.draws.starts))
 
 
-def _volume(scene: Scene, prior: PosePrior, rule: DensitySearch) -> float:
-    """Return the volume of the poses that a prior allows in this view, in multiples of the wide prior of the rule."""
-    distance, draws = distance_of(scene, prior), rule.draws
+def _volume(scene: Scene, prior: PosePrior, density: DensitySearch) -> float:
+    """Return the volume of the poses that a prior allows in this view, in multiples of the wide prior."""
+    distance, draws = distance_of(scene, prior), density.draws
     turn = math.radians(prior.rotation_sigma_deg) / math.radians(draws.wide_deg)
     across = min(
-        prior.translation_sigma, reach_across(scene, prior, rule) / math.sqrt(3)
+        prior.translation_sigma, reach_across(scene, prior, density) / math.sqrt(3)
     )  # of a uniform distribution, where cut
     across /= draws.wide_across * scene.spread * distance
     return turn**3 * across**2 * prior.translation_sigma / (draws.wide_shift * distance)
 
 
-def reach_across(scene: Scene, prior: PosePrior, rule: DensitySearch) -> float:
+def reach_across(scene: Scene, prior: PosePrior, density: DensitySearch) -> float:
     """Return how far from the centre of the view the centroid of the points may lie, across the view.
 
     Farther away, most of the points are outside the view. A telephoto view is much narrower than most priors.
@@ -149,7 +153,7 @@ def reach_across(scene: Scene, prior: PosePrior, rule: DensitySearch) -> float:
         return math.inf
     covariance, axis = np.cov(scene.bulk3d.T, bias=True), np.asarray(prior.rotation)[2]
     width = math.sqrt(max(float(np.trace(covariance) - axis @ covariance @ axis), 0.0))
-    return rule.draws.reach * math.hypot(scene.spread * distance_of(scene, prior), width)
+    return density.draws.reach * math.hypot(scene.spread * distance_of(scene, prior), width)
 
 
 def draw_around(scene: Scene, prior: PosePrior, count: int, reach: float = math.inf) -> Hypotheses:
@@ -167,9 +171,9 @@ def draw_around(scene: Scene, prior: PosePrior, count: int, reach: float = math.
     mean = np.asarray(prior.rotation, np.float32)[None], np.asarray(prior.translation, np.float32)[None]
     vectors = math.radians(prior.rotation_sigma_deg) * scene.rng.standard_normal((count, 3), np.float32)
     shifts = scene.rng.standard_normal((count, 3), np.float32)
-    middle = np.asarray(prior.rotation) @ scene.bulk3d.mean(0) + np.asarray(prior.translation)
+    centroid = np.asarray(prior.rotation) @ scene.bulk3d.mean(0) + np.asarray(prior.translation)
     for k in range(2):
-        offset, sigma = float(middle[k]), float(prior.translation_sigma)
+        offset, sigma = float(centroid[k]), float(prior.translation_sigma)
         low, high = min(-reach, offset) - offset, max(reach, offset) - offset
         shifts[:, k] = _truncated(shifts[:, k], low / sigma, high / sigma)
     shifts *= np.float32(prior.translation_sigma)
@@ -195,11 +199,11 @@ def select_admitted(scene: Scene, poses: Hypotheses, prior: Prior | None) -> Hyp
         return poses
     mean = scene.enter_prior(prior)
     assert isinstance(mean, PosePrior)
-    middle, rotation = scene.bulk3d.mean(0), np.asarray(mean.rotation)
+    centroid, rotation = scene.bulk3d.mean(0), np.asarray(mean.rotation)
     cosine = (np.einsum("sij,ij->s", poses.rotation, rotation) - 1) / 2
     off = np.square(np.degrees(np.arccos(np.clip(cosine, -1, 1))) / mean.rotation_sigma_deg)
     if mean.translation is not None:
-        shift = poses.rotation @ middle + poses.translation - (rotation @ middle + np.asarray(mean.translation))
+        shift = poses.rotation @ centroid + poses.translation - (rotation @ centroid + np.asarray(mean.translation))
         off = off + np.square(shift / mean.translation_sigma).sum(-1)
     return poses[off <= scene.settings.admitted**2]
 
@@ -301,8 +305,8 @@ def _draw_density_map(scene: Scene, shape: DensityShape, scale: float) -> Densit
 
 def distance_of(scene: Scene, prior: PosePrior) -> float:
     """Return the distance of the centroid of the points from the camera of the prior, at least 1e-6."""
-    middle = scene.bulk3d.mean(0)
-    return max(float(np.linalg.norm(np.asarray(prior.rotation) @ middle + np.asarray(prior.translation))), 1e-6)
+    centroid = scene.bulk3d.mean(0)
+    return max(float(np.linalg.norm(np.asarray(prior.rotation) @ centroid + np.asarray(prior.translation))), 1e-6)
 
 
 def _smoothed(values: NDArray[np.float32], cells: float) -> NDArray[np.float32]:

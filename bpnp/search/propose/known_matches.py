@@ -58,8 +58,8 @@ def poses_of_matches(problem: Problem, i: Labels, j: Labels, seed: int = 0) -> H
         first; empty if no triple has a pose.
     """
     rays, points = problem.bearings[i], problem.points3d[j]
-    middle = points.mean(0)
-    points = points - middle  # rotation and translation are nearly independent about the centroid
+    centroid = points.mean(0)
+    points = points - centroid  # rotation and translation are nearly independent about the centroid
     rng = np.random.default_rng(seed)
     triples = _triples(len(i), rng)
     poses = p3p_poses(rays[triples], points[triples]).reshape(-1, 4, 3)
@@ -92,7 +92,7 @@ def poses_of_matches(problem: Problem, i: Labels, j: Labels, seed: int = 0) -> H
             ends.append(group[np.argsort(np.median(left, 1) if group is fitted else left.sum(1), kind="stable")])
     poses = np.concatenate(ends) if ends else poses[:0]
     rotation = poses[:, :3]
-    translation = poses[:, 3] - rotation @ middle
+    translation = poses[:, 3] - rotation @ centroid
     return _scored(problem, i, j, rotation, translation, scales)
 
 
@@ -166,5 +166,5 @@ def _scored(problem: Problem, i: Labels, j: Labels, rotation: Array, translation
     found = [score_pose(problem, *each) for each in zip(rotation, translation, scale, strict=True)]
     score, count = (np.array([one[k] for one in found]) for k in (0, 1))
     hypotheses = Hypotheses.from_poses(rotation, translation, log_likelihood=score, match_count=count, scale=scale)
-    seen, order = polar_coordinates(rotation @ problem.middle + translation), -np.arange(float(len(score)))
+    seen, order = polar_coordinates(rotation @ problem.centre3d + translation), -np.arange(float(len(score)))
     return hypotheses[distinct(rotation, seen, order, len(score), *SAME.times(MATCHES.converged))]

@@ -22,13 +22,13 @@ class LensFit(NamedTuple):
 
     Attributes:
         rotation: (3, 3).
-        middle: (3,) centroid of the scene in the camera's frame.
+        centre3d: (3,) centroid of the scene in the camera's frame.
         zoom: Scale factor: focal length over that of the bearings.
         radial: Radial coefficient k; None if only the focal length is fitted.
     """
 
     rotation: Array
-    middle: Array
+    centre3d: Array
     zoom: float
     radial: float | None
 
@@ -41,11 +41,11 @@ def lens_model(problem: Problem, *, bends: bool) -> PoseModel:
         bends: True if a radial coefficient is unknown too; it has no prior.
     """
     lens = UnknownFocal(0.0) if problem.focal is None else problem.focal
-    return PoseModel(problem.middle, lens._replace(radial=0.0, radial_sigma=math.inf if bends else 0.0))
+    return PoseModel(problem.centre3d, lens._replace(radial=0.0, radial_sigma=math.inf if bends else 0.0))
 
 
 def fit_lens(
-    problem: Problem, rotation: Array, middle: Array, scale: float, radial: float | None = None
+    problem: Problem, rotation: Array, centre3d: Array, scale: float, radial: float | None = None
 ) -> LensFit | None:
     """Fit pose, focal length and optionally the radial coefficient to soft matches by Gauss-Newton steps.
 
@@ -55,7 +55,7 @@ def fit_lens(
     Args:
         problem: Points; the bearings are those of a camera without distortion.
         rotation: (3, 3) initial rotation.
-        middle: (3,) initial centroid of the scene in the camera's frame.
+        centre3d: (3,) initial centroid of the scene in the camera's frame.
         scale: Scale of the residuals, radians.
         radial: Initial radial coefficient; None to fit no distortion.
 
@@ -67,7 +67,7 @@ def fit_lens(
     >>> x = points[:, :2] / points[:, 2:]
     >>> seen = np.c_[1.05 * (1 - 0.1 * (x**2).sum(1, keepdims=True)) * x, np.ones(80)]
     >>> problem = Problem(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
-    >>> fit = fit_lens(problem, np.eye(3), problem.middle, 1e-3, radial=0.0)
+    >>> fit = fit_lens(problem, np.eye(3), problem.centre3d, 1e-3, radial=0.0)
     >>> round(fit.zoom, 3), round(fit.radial, 3)
     (1.05, -0.1)
     """
@@ -81,7 +81,7 @@ def fit_lens(
     chosen = problem.image.chosen
     some = chosen[:: max(len(chosen) // OtherFocal.bearings, 1)]
     linearise = soft_equations(model, [problem], chosen=some, most=LENS.correspondences)
-    state = PoseState(rotation, middle, radial=radial or 0.0)
+    state = PoseState(rotation, centre3d, radial=radial or 0.0)
     for widths in (LENS.first + LENS.widths, *[LENS.widths] * (LENS.most_rounds - 1)):
         scales = [width * scale for width in widths]
         end = refine(model, state, linearise, scales, damping=LENS.damping, largest=largest)

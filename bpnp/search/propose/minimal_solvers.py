@@ -26,7 +26,7 @@ class Triangles(NamedTuple):
         triples: (t, 3) indices of the points, in cyclic order so that the longest side is 12.
         sides: (t, 3) |p_0 - p_1|^2 / s^2, |p_2 - p_0|^2 / s^2 and s = |p_1 - p_2|.
         frames: (t, 3, 3), rows along the longest side, across it, and the normal.
-        middles: (t, 3) centroids.
+        centroids: (t, 3) centroids.
         orientation: (t,), 1 where a camera can see the points in the order of the triangle's normal, 2 in the other
             order, 3 either, 0 where the points lie on a line or are not finite.
     """
@@ -34,7 +34,7 @@ class Triangles(NamedTuple):
     triples: NDArray[np.int64]
     sides: Array
     frames: Array
-    middles: Array
+    centroids: Array
     orientation: NDArray[np.int64]
 
 
@@ -113,7 +113,7 @@ def solve_p3p(rays: Any, seen: Any, chords: Any, triangles: Any, t: int, poses: 
         The number of poses.
     """
     i, j, k = seen
-    sides, frame, middle = triangles.sides[t], triangles.frames[t], triangles.middles[t]
+    sides, frame, centroid = triangles.sides[t], triangles.frames[t], triangles.centroids[t]
     count = 0
     for s in range(p3p_depths(chords, sides[0], sides[1], poses)):
         pose = poses[count]  # one of those whose depths were read
@@ -135,7 +135,7 @@ def solve_p3p(rays: Any, seen: Any, chords: Any, triangles: Any, t: int, poses: 
             pose[0, c] = ax * along + bx * aside + nx * above
             pose[1, c] = ay * along + by * aside + ny * above
             pose[2, c] = az * along + bz * aside + nz * above
-        x, y, z = rotated(pose, middle[0], middle[1], middle[2])
+        x, y, z = rotated(pose, centroid[0], centroid[1], centroid[2])
         pose[3, 0], pose[3, 1], pose[3, 2] = (x0 + x1 + x2) / 3 - x, (y0 + y1 + y2) / 3 - y, (z0 + z1 + z2) / 3 - z
         count += 1
     return count
@@ -378,10 +378,10 @@ def solve_p2p(i: int, j: int, a: int, b: int, heading: Any, rays: Any, points: A
         way0, way1 = d * g[0] - c * f[0], d * g[1] - c * f[1]
         cosine, sine = (along0 * way0 + along1 * way1) / length2, (along0 * way1 - along1 * way0) / length2
         size = 1 / math.sqrt(cosine * cosine + sine * sine)
-        cosine, sine, turns, pose = cosine * size, sine * size, heading.turns, poses[count]
+        cosine, sine, terms, pose = cosine * size, sine * size, heading.terms, poses[count]
         for r in range(3):
             for s in range(3):
-                pose[r, s] = turns[0, r, s] + cosine * turns[1, r, s] + sine * turns[2, r, s]
+                pose[r, s] = terms[0, r, s] + cosine * terms[1, r, s] + sine * terms[2, r, s]
         turned = rotated(pose, points[a, 0], points[a, 1], points[a, 2])
         for r in range(3):
             pose[3, r] = c * rays[i, r] - turned[r]

@@ -77,7 +77,7 @@ def _judge(problem: Problem, rotation: Array, translation: Array, deadline: Dead
     poses = score_given(scene, rotation, translation)
     if not len(poses):
         return no_pose("the module found no pose")
-    result = judge(poses, problem, batches=len(rotation), rule=DEFAULT.evidence)
+    result = judge(poses, problem, batches=len(rotation), settings=DEFAULT.evidence)
     return judge_with_competitors(result, problem, lambda: scene, DEFAULT.evidence)
 
 
@@ -148,10 +148,10 @@ def view_for(net: nn.Module, problem: Problem) -> NetworkFrame:
     if problem.prior.translation is not None:
         return NetworkFrame(rotation, problem.size * np.asarray(problem.prior.translation), problem.size)
     turned, image = problem.size * problem.points3d @ rotation.T, _seen(problem)
-    centre, middle = np.median(turned, 0), np.median(image, 0)
+    centre, image_centre = np.median(turned, 0), np.median(image, 0)
     across = np.median(np.linalg.norm((turned - centre)[:, :2], axis=1))
-    depth = across / max(float(np.median(np.linalg.norm(image - middle, axis=1))), 1e-6)
-    return NetworkFrame(rotation, depth * np.append(middle, 1.0) - centre, problem.size)
+    depth = across / max(float(np.median(np.linalg.norm(image - image_centre, axis=1))), 1e-6)
+    return NetworkFrame(rotation, depth * np.append(image_centre, 1.0) - centre, problem.size)
 
 
 def _near_origin(problem: Problem) -> Array:

@@ -19,7 +19,7 @@ Pose = tuple[Array, Array]
 DEFAULT = Repetitions()
 
 
-def registered(problem: Problem, rotation: Array, translation: Array, scale: float, rule: Evidence) -> Motions:
+def registered(problem: Problem, rotation: Array, translation: Array, scale: float, settings: Evidence) -> Motions:
     """Return the rigid motions that map the matched points of a pose onto other scene points.
 
     If a pose is wrong because of a symmetry or a repetition, one of these motions maps nearly all of its matched points
@@ -30,13 +30,13 @@ def registered(problem: Problem, rotation: Array, translation: Array, scale: flo
         rotation: (3, 3) of the pose.
         translation: (3,) of the pose.
         scale: Standard deviation of its residuals, radians.
-        rule: Constants of the verdict.
+        settings: Constants of the verdict.
 
     Returns:
         Motions with the fraction of the matched points that each maps, the largest first; none if there are too few
         matched points.
     """
-    limits, points = rule.repetitions, problem.points3d
+    limits, points = settings.repetitions, problem.points3d
     camera = points @ rotation.T + translation
     depth = np.linalg.norm(camera, axis=-1)
     away, nearest = cKDTree(camera / np.maximum(depth, 1e-300)[:, None]).query(problem.bearings)
@@ -49,8 +49,8 @@ def registered(problem: Problem, rotation: Array, translation: Array, scale: flo
         tolerance = matching_tolerance(points, np.arange(len(points)), noise)
         motions = _of_scene(*(_frozen(x) for x in (points, labels, normals)), tolerance)
         return motions.of(points, matched, tolerance, limits.share)
-    middle = np.median(points[matched], 0)
-    near = np.sort(np.argsort(np.linalg.norm(points - middle, axis=-1), kind="stable")[: limits.around])
+    centre = np.median(points[matched], 0)
+    near = np.sort(np.argsort(np.linalg.norm(points - centre, axis=-1), kind="stable")[: limits.around])
     sources = np.flatnonzero(np.isin(near, matched))
     if len(sources) < limits.fewest:
         return Motions.none()
@@ -89,7 +89,9 @@ def _of_scene(points: Frozen, labels: Frozen, normals: Frozen, tolerance: float)
     )
 
 
-def competing_poses(problem: Problem, rotation: Array, translation: Array, motions: Motions, rule: Evidence) -> Pose:
+def competing_poses(
+    problem: Problem, rotation: Array, translation: Array, motions: Motions, settings: Evidence
+) -> Pose:
     """Return the competing poses of a pose due to motions and to the mirror image of a flat scene.
 
     Args:
@@ -97,10 +99,10 @@ def competing_poses(problem: Problem, rotation: Array, translation: Array, motio
         rotation: (3, 3) of the pose.
         translation: (3,) of the pose.
         motions: Motions that map the scene onto itself.
-        rule: Constants of the verdict.
+        settings: Constants of the verdict.
 
     Returns:
-        Rotations (c, 3, 3) and translations (c, 3) of poses that differ from the given one by over `rule.same`.
+        Rotations (c, 3, 3) and translations (c, 3) of poses that differ from the given one by over `settings.same`.
     """
     poses = motions.competitors(rotation, translation)
     every = [rotation[None], poses[0]], [translation[None], poses[1]]
@@ -108,12 +110,12 @@ def competing_poses(problem: Problem, rotation: Array, translation: Array, motio
         for parts, one in zip(every, mirrored, strict=True):
             parts.append(one[None])
     rotations, translations = (np.concatenate(parts) for parts in every)
-    other = np.flatnonzero(~problem.same_pose(rotations, translations, rule.same))
+    other = np.flatnonzero(~problem.same_pose(rotations, translations, settings.same))
     return rotations[other], translations[other]
 
 
 def repeated_poses(
-    problem: Problem, rotation: Array, translation: Array, scale: float, rule: Evidence, *, least: float = 0.0
+    problem: Problem, rotation: Array, translation: Array, scale: float, settings: Evidence, *, least: float = 0.0
 ) -> tuple[Hypotheses, Motions]:
     """Return the competing poses of a pose due to the motions of the scene, and these motions.
 
@@ -122,7 +124,7 @@ def repeated_poses(
         rotation: (3, 3) of the pose.
         translation: (3,) of the pose.
         scale: Standard deviation of its residuals, radians.
-        rule: Constants of the verdict.
+        settings: Constants of the verdict.
         least: Smallest fraction of the matched points that a motion maps, default 0.
 
     Returns:
@@ -139,14 +141,14 @@ def repeated_poses(
         >>> sorted(repeated.translation[:2, 0].round(6).tolist())
         [-4.0, -2.0]
     """
-    motions = registered(problem, rotation, translation, scale, rule).mapping(least)
-    rotations, translations = competing_poses(problem, rotation, translation, motions, rule)
+    motions = registered(problem, rotation, translation, scale, settings).mapping(least)
+    rotations, translations = competing_poses(problem, rotation, translation, motions, settings)
     scales = np.full(len(rotations), scale)
     alarms = alarms_of(problem, rotations, translations, scales).own
     poses = Hypotheses.from_poses(
         rotations, translations, scale=scales, log10_false_alarms=alarms, log10_rough=alarms.copy()
     )
-    return poses[np.argsort(alarms, kind="stable")[: rule.repetitions.kept]], motions
+    return poses[np.argsort(alarms, kind="stable")[: settings.repetitions.kept]], motions
 
 
 def repetition_margins(

@@ -84,15 +84,15 @@ def mirror_pose(points3d: Array, rotation: Array, translation: Array) -> tuple[A
 
     Source: D. Oberkampf, D. DeMenthon, L. Davis, Iterative pose estimation using coplanar feature points, CVIU 1996.
     """
-    middle = points3d.mean(0)
-    _, extents, axes = np.linalg.svd(points3d - middle, full_matrices=False)
+    centroid = points3d.mean(0)
+    _, extents, axes = np.linalg.svd(points3d - centroid, full_matrices=False)
     if len(points3d) < 3 or extents[2] > SYMMETRIES.flat * extents[1]:
         return None
-    seen = rotation @ middle + translation
+    seen = rotation @ centroid + translation
     sight = seen / max(float(np.linalg.norm(seen)), 1e-300)
     across, flipped = (np.eye(3) - 2 * np.outer(axis, axis) for axis in (sight, axes[2]))
     turned = across @ rotation @ flipped
-    return turned, seen - turned @ middle
+    return turned, seen - turned @ centroid
 
 
 def self_motions(
@@ -148,9 +148,9 @@ def self_motions(
     )
     kept = min(total, room)
     rotation, shift, score = found.rotation[:kept], found.shift[:kept], found.score[:kept]
-    middle = np.median(points[moved], 0)
+    median_point = np.median(points[moved], 0)
     size = extent(points[moved])
-    offsets = rotation @ middle + shift
+    offsets = rotation @ median_point + shift
     unique = distinct(
         rotation, offsets / size, score, SYMMETRIES.refined, SYMMETRIES.same_deg, max(4 * tolerance / size, 1e-6)
     )
@@ -160,7 +160,7 @@ def self_motions(
         return Motions.none()
     motions.sort(key=lambda one: -one[2])
     rotation, shift, fraction = (np.array(part) for part in zip(*motions, strict=True))
-    offsets = rotation @ middle + shift
+    offsets = rotation @ median_point + shift
     unique = distinct(
         rotation, offsets / size, fraction, SYMMETRIES.refined, SYMMETRIES.same_deg, max(4 * tolerance / size, 1e-6)
     )

@@ -139,11 +139,11 @@ def perturb_about_centroid(
     Returns:
         (s,) hypotheses; the copies of a pose are adjacent.
     """
-    middle, copies = scene.bulk3d.mean(0), len(vectors) // max(len(rotation), 1)
-    turns = Rotation.from_rotvec(vectors).as_matrix().astype(np.float32)
-    turned = (turns.reshape(len(rotation), 3 * copies, 3) @ rotation).reshape(-1, 3)
-    seen = np.repeat(rotation @ middle + translation, copies, 0)
-    shifted = seen + shifts - (turned @ middle).reshape(-1, 3)
+    centroid, copies = scene.bulk3d.mean(0), len(vectors) // max(len(rotation), 1)
+    perturbations = Rotation.from_rotvec(vectors).as_matrix().astype(np.float32)
+    turned = (perturbations.reshape(len(rotation), 3 * copies, 3) @ rotation).reshape(-1, 3)
+    seen = np.repeat(rotation @ centroid + translation, copies, 0)
+    shifted = seen + shifts - (turned @ centroid).reshape(-1, 3)
     return Hypotheses.from_poses(turned.reshape(-1, 3, 3), shifted.astype(np.float32), basin_count=basin_count)
 
 

@@ -64,7 +64,7 @@ class Rig:
             replace(each, prior=_prior_of(mount, prior)) for each, mount in zip(problems, self.mounts, strict=True)
         ]
         self.floor = max(each.floor or float(each.image.scales[0]) for each in self.problems)
-        self.model = PoseModel(problems[0].middle, lens, mounts=self.mounts, scale=not is_metric, prior=prior)
+        self.model = PoseModel(problems[0].centre3d, lens, mounts=self.mounts, scale=not is_metric, prior=prior)
         self.unknowns = self.model.size
         centres = np.array([-turn.T @ shift for turn, shift in mounts])
         least = RIG.same_centre * np.abs(centres).max()
@@ -100,8 +100,8 @@ class Rig:
 
     def seen(self, k: int, poses: Hypotheses) -> Hypotheses:
         """Convert poses of the rig to poses of camera k, for tests of competing explanations in one camera."""
-        turns, shifts = self.pose_of(k, poses.rotation, poses.translation)
-        return replace(poses, rotation=turns, translation=shifts)
+        rotations, shifts = self.pose_of(k, poses.rotation, poses.translation)
+        return replace(poses, rotation=rotations, translation=shifts)
 
     def refined(self, rotation: Array, translation: Array) -> Iterator[tuple[Array, Array, float, float]]:
         """Refine a pose at decreasing scales.

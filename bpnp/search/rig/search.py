@@ -80,7 +80,7 @@ def search_rig(
     tell(0)
     if poses.may_be_decided() and (result := poses.result(ended=False)).verdict == "confident":
         return result
-    return run(RigPlan(poses), poses, most=settings.schedule.turns, deadline=deadline, tell=tell)
+    return run(RigPlan(poses), poses, most=settings.schedule.iterations, deadline=deadline, tell=tell)
 
 
 def _of_few_points(
@@ -140,15 +140,15 @@ class RigPoses:
     """
 
     def __init__(self, rig: Rig) -> None:
-        self.rig, self.rule, self.exhaustive = rig, DEFAULT.evidence, True
+        self.rig, self.verdict_settings, self.exhaustive = rig, DEFAULT.evidence, True
         self.found = [Hypotheses.empty() for _ in rig.problems]
         self.starts = Hypotheses.empty(4)
         self.best, self.searched, self.pools = self.starts, self.starts, dict[int, Pool]()
 
     @property
-    def turns(self) -> int:
+    def iterations(self) -> int:
         """Number of iterations of all cameras."""
-        return sum(pool.turns for pool in self.pools.values())
+        return sum(pool.iterations for pool in self.pools.values())
 
     def add(self, step: Step, found: Hypotheses) -> None:
         """Add the poses of one camera, in the frame of its scene."""
@@ -207,9 +207,9 @@ class RigPoses:
         """Return the indices of the best poses that are pairwise different in at least one camera."""
         seen = []
         for k, problem in enumerate(self.rig.problems):
-            turns, shifts = self.rig.pose_of(k, poses.rotation, poses.translation)
-            seen.append(turns @ problem.middle + shifts)
-        return distinct(poses.rotation, polar_coordinates(np.stack(seen, 1)), score, count, *self.rule.same)
+            rotations_of_camera, shifts = self.rig.pose_of(k, poses.rotation, poses.translation)
+            seen.append(rotations_of_camera @ problem.centre3d + shifts)
+        return distinct(poses.rotation, polar_coordinates(np.stack(seen, 1)), score, count, *self.verdict_settings.same)
 
     def _local_searches(self) -> int:
         """Return the number of local searches around the best pose that found no better one."""
@@ -221,18 +221,21 @@ class RigPoses:
         """Return which poses of camera k are the same as the best pose."""
         turn, shift = self.rig.pose_of(k, self.best.rotation[:1], self.best.translation[:1])
         both = np.concatenate([turn, poses.rotation]), np.concatenate([shift, poses.translation])
-        return self.rig.problems[k].same_pose(*both, self.rule.same)[1:]
+        return self.rig.problems[k].same_pose(*both, self.verdict_settings.same)[1:]
 
     def is_significant(self) -> bool:
         """Return whether the number of false alarms of the best pose is small enough."""
-        return bool((self.best.log10_false_alarms[:1] <= self.rule.false_alarms).any())
+        return bool((self.best.log10_false_alarms[:1] <= self.verdict_settings.false_alarms).any())
 
     def may_be_decided(self) -> bool:
         """Return whether the best pose is significant and its miss probability is low enough."""
         if not self.is_significant():
             return False
         strongest, seen = self._strongest()
-        return missed(seen, self.rig.problems[strongest], self._local_searches(), self.rule) <= self.rule.missed
+        return (
+            missed(seen, self.rig.problems[strongest], self._local_searches(), self.verdict_settings)
+            <= self.verdict_settings.missed
+        )
 
     def _strongest(self) -> tuple[int, Hypotheses]:
         """Return the index of the camera with the most evidence for the best pose, and the poses in that camera."""
@@ -247,7 +250,7 @@ class RigPoses:
         if result.verdict == "confident":
             strongest, seen = self._strongest()
             known = seen.rotation[0], seen.translation[0], float(seen.scale[0])
-            repeated, _ = repeated_poses(self.rig.problems[strongest], *known, self.rule)
+            repeated, _ = repeated_poses(self.rig.problems[strongest], *known, self.verdict_settings)
             unit = self.best.translation[0, 3]
             copies = self.rig.rig_of(strongest, repeated.rotation, repeated.translation, unit)
             self.add_refined(self.rig.candidates(*copies))
@@ -256,15 +259,19 @@ class RigPoses:
             strongest, seen = self._strongest()
             pose = seen.rotation[0], seen.translation[0], float(seen.scale[0])
             linear = linearised(self.rig.problems[strongest], *pose)
-            other = fitted_lens(linear, match_count(seen), self.rule)
+            other = fitted_lens(linear, match_count(seen), self.verdict_settings)
             result = result if other is None else result.add_objection(other)
         if result.verdict == "confident" and self.rig.unknowns > 6:
             best = self.best.rotation[0], self.best.translation[0], float(self.best.scale[0])
             covariance = self.rig.covariance(*best)
             free = 2 * float(self.best.match_count[0]) - self.rig.unknowns
-            few = is_object(self.rig.problems[0], self.rule)
-            limits = {"focal": self.rule.focal_few if few else self.rule.focal} if self.rig.model.lens else {}
-            limits |= {"scale": self.rule.scale} if self.rig.model.scale else {}
+            few = is_object(self.rig.problems[0], self.verdict_settings)
+            limits = (
+                {"focal": self.verdict_settings.focal_few if few else self.verdict_settings.focal}
+                if self.rig.model.lens
+                else {}
+            )
+            limits |= {"scale": self.verdict_settings.scale} if self.rig.model.scale else {}
             for k, (name, limit) in enumerate(limits.items(), 6):
                 bound = math.inf if covariance is None else share_bound(covariance[k : k + 1, k : k + 1], free)
                 if bound > limit and name == "scale":
@@ -279,10 +286,10 @@ class RigPoses:
         return judge(
             seen,
             self.rig.problems[strongest],
-            batches=self.turns,
+            batches=self.iterations,
             local_searches=self._local_searches(),
             exhaustive=self.exhaustive,
-            rule=self.rule,
+            settings=self.verdict_settings,
             rig=[(self.rig.seen(k, self.best), problem) for k, problem in enumerate(self.rig.problems)],
         )
 
@@ -318,19 +325,19 @@ def _agreeing_poses(rig: Rig, pair: tuple[int, int], first: Hypotheses, second: 
         second: Poses of the second camera.
     """
     (turn, shift), (other, moved) = (rig.mounts[k] for k in pair)
-    middle = rig.problems[0].middle
-    turns, others = (turn.T @ first.rotation).reshape(-1, 9), (other.T @ second.rotation).reshape(-1, 9)
-    traces = turns.astype(np.float32) @ others.T.astype(np.float32)
+    centre = rig.problems[0].centre3d
+    first_rotations, others = (turn.T @ first.rotation).reshape(-1, 9), (other.T @ second.rotation).reshape(-1, 9)
+    traces = first_rotations.astype(np.float32) @ others.T.astype(np.float32)
     near = np.flatnonzero(traces.ravel() > 1 + 2 * math.cos(math.radians(RIG.agree_deg)))
     i, j = np.divmod(near[np.argsort(-traces.ravel()[near], kind="stable")[: RIG.pairs]], max(len(others), 1))
     rotation = turn.T @ first.rotation[i]
-    seen = (first.rotation[i] @ middle + first.translation[i]) @ turn  # from the first camera, in the rig's axes
-    way = seen - (second.rotation[j] @ middle + second.translation[j]) @ other
+    seen = (first.rotation[i] @ centre + first.translation[i]) @ turn  # from the first camera, in the rig's axes
+    way = seen - (second.rotation[j] @ centre + second.translation[j]) @ other
     apart = shift @ turn - moved @ other
     distance, length = np.linalg.norm(seen, axis=-1), float(np.linalg.norm(apart))
     unit = np.maximum(way @ apart / length, RIG.least_apart * distance)[:, None] / length
     translation = np.concatenate(
-        [seen - unit * (shift @ turn) - (way - unit * apart) / 2 - rotation @ middle, unit], -1
+        [seen - unit * (shift @ turn) - (way - unit * apart) / 2 - rotation @ centre, unit], -1
     )
     agree = np.linalg.norm(way - unit * apart, axis=-1) < RIG.agree_shift * distance
     return rotation[agree], translation[agree]
@@ -340,8 +347,8 @@ def _agreement(rig: Rig, rotations: Array, translations: Array) -> Array:
     """Score poses (p, 3, 3), (p, 4) cheaply: robust log-likelihood (p,) of all bearings at a wide scale, nats."""
     total, scale = np.zeros(len(rotations)), RIG.wide * rig.floor
     for k, problem in enumerate(rig.problems):
-        turns, shifts = rig.pose_of(k, rotations, translations)
-        seen = problem.points3d @ turns.transpose(0, 2, 1) + shifts[:, None]
+        rotations_of_camera, shifts = rig.pose_of(k, rotations, translations)
+        seen = problem.points3d @ rotations_of_camera.transpose(0, 2, 1) + shifts[:, None]
         seen /= np.maximum(np.linalg.norm(seen, axis=-1, keepdims=True), 1e-300)
         nearest = (problem.bearings @ seen.transpose(0, 2, 1)).max(-1)
         total += np.logaddexp((nearest - 1) / scale**2, -4.0).sum(-1)

@@ -196,10 +196,10 @@ def _finished(rig: Rig, problems: Sequence[Problem], result: SearchResult, inlie
         count += len(problem.all2d)
     covariance = None if result.verdict == "failed" else rig.covariance(rotation, translation, result.residual)
     if covariance is not None:
-        middle = rotation @ first.middle_of_user
+        centre = rotation @ first.centre3d_of_user
         _, shift = first.to_user(rotation, translation[:3])
         free = max(2 * int(counts[0]) - rig.unknowns, 1)
-        moved_by = _about_origin(rig, first.size, middle, shift, 1 / translation[3])
+        moved_by = _about_origin(rig, first.size, centre, shift, 1 / translation[3])
         covariance = student_factor(free) * moved_by @ covariance @ moved_by.T
     _, moved = first.to_user(found.rotation, found.translation[:, :3])
     points2d = np.concatenate([problem.all2d for problem in problems])
@@ -219,7 +219,7 @@ def _finished(rig: Rig, problems: Sequence[Problem], result: SearchResult, inlie
     )
 
 
-def _about_origin(rig: Rig, size: float, middle: Array, shift: Array, scale: float) -> Array:
+def _about_origin(rig: Rig, size: float, centre: Array, shift: Array, scale: float) -> Array:
     """Return the matrix that converts an error about the centroid, in unit size, to one of the user's parameters.
 
     These are the rotation, the translation in units of the rig, the focal length in pixels and the scale.
@@ -227,14 +227,14 @@ def _about_origin(rig: Rig, size: float, middle: Array, shift: Array, scale: flo
     Args:
         rig: Cameras; the covariance is that of `Rig.covariance`.
         size: Size of the scene, user's unit.
-        middle: (3,) centroid of the scene from its origin, in the axes of the rig, user's unit.
+        centre: (3,) centroid of the scene from its origin, in the axes of the rig, user's unit.
         shift: (3,) translation, unit of the scene.
         scale: Units of the rig in one unit of the scene.
     """
     has_focal, camera = rig.model.lens is not None, rig.problems[0].camera
     moved = np.eye(6 + has_focal + rig.model.scale)
     moved[3:6, 3:6] *= scale * size
-    moved[3:6, :3] = scale * crossed(middle)
+    moved[3:6, :3] = scale * crossed(centre)
     if has_focal and camera is not None:
         moved[6, 6] = camera.focal
     if rig.model.scale:

@@ -25,22 +25,22 @@ Array = NDArray[np.float64]
 Seen = Sequence[tuple[Hypotheses, Problem]]
 
 
-def other_pose(candidates: Hypotheses, problem: Problem, rule: Evidence) -> Objection | None:
+def other_pose(candidates: Hypotheses, problem: Problem, settings: Evidence) -> Objection | None:
     """Return the competing pose with the fewest false alarms, or None.
 
     Args:
         candidates: Poses, best first.
         problem: Points of the problem.
-        rule: Constants of the verdict; a competing pose differs from the best one by more than `rule.same`.
+        settings: Constants of the verdict; a competing pose differs from the best one by more than `settings.same`.
     """
-    same = problem.same_pose(candidates.rotation, candidates.translation, rule.same)
+    same = problem.same_pose(candidates.rotation, candidates.translation, settings.same)
     others = np.flatnonzero(~same)
     if not len(others):
         return None
     k = int(others[np.argmin(candidates.log10_false_alarms[others])])
     decades = float(candidates.log10_false_alarms[k] - candidates.log10_false_alarms[0])
-    middle = candidates.rotation[[0, k]] @ problem.middle + candidates.translation[[0, k]]
-    shift = float(np.linalg.norm(middle[1] - middle[0]) / max(float(np.linalg.norm(middle[0])), 1e-300))
+    centres = candidates.rotation[[0, k]] @ problem.centre3d + candidates.translation[[0, k]]
+    shift = float(np.linalg.norm(centres[1] - centres[0]) / max(float(np.linalg.norm(centres[0])), 1e-300))
     return competing_pose(candidates.rotation[0], candidates.rotation[k], decades, shift)
 
 
@@ -69,26 +69,30 @@ def rough_residuals(candidates: Hypotheses) -> Objection | None:
     return objection("rough_residuals", decades)
 
 
-def other_camera(off: Misfit, rule: Evidence) -> Objection | None:
+def other_camera(off: Misfit, settings: Evidence) -> Objection | None:
     """Return another camera or other proportions of the scene as an objection, or None if their pose is the same.
 
     Args:
         off: Difference between a pose and the pose fitted with them.
-        rule: Constants of the verdict; poses that differ by more than `rule.same`, or with a radial distortion by more
-            than the limits of `rule.zoomed`, are different.
+        settings: Constants of the verdict; poses that differ by more than `settings.same`, or with a radial distortion
+            by more than the limits of `settings.other_focal`, are different.
     """
-    limits = (rule.zoomed.bend_deg, rule.zoomed.bend_shift) if off.radial else (rule.same.degrees, rule.same.shift)
+    limits = (
+        (settings.other_focal.bend_deg, settings.other_focal.bend_shift)
+        if off.radial
+        else (settings.same.degrees, settings.same.shift)
+    )
     if math.degrees(off.turn) <= limits[0] and off.shift <= limits[1]:
         return None
     other = f"{off.zoom:.2f} times the focal length" if off.zoom != 1 else "other proportions of the scene"
     if off.radial:
-        zoomed = f" and {off.zoom:.2f} times the focal length" if abs(off.zoom - 1) > REASONS.zoom else ""
-        other = f"a radial distortion of {off.radial:.2g}{zoomed}"
+        also_zoom = f" and {off.zoom:.2f} times the focal length" if abs(off.zoom - 1) > REASONS.zoom else ""
+        other = f"a radial distortion of {off.radial:.2g}{also_zoom}"
     return objection("other_camera", camera=other, degrees=math.degrees(off.turn), percent=100 * off.shift)
 
 
-def unrelated_competitor(seen: Seen, rule: Evidence) -> Objection | None:
-    """Return a far candidate over which the lead of the first one is not significant, or None.
+def unrelated_competitor(seen: Seen, settings: Evidence) -> Objection | None:
+    """Return a far candidate whose likelihood is not significantly below that of the first one, or None.
 
     The number of false alarms assumes independent image points. Points on lines or curves are dependent: a pose that
     aligns one line with another explains all its points. A pose may then explain more points than another one by
@@ -97,7 +101,7 @@ def unrelated_competitor(seen: Seen, rule: Evidence) -> Objection | None:
 
         P(sum_i d_i >= z sqrt(sum_i d_i^2)) <= exp(-z^2 / 2).
 
-    If even equal signs of all d_i would not reach the required lead, the points are too few for this test.
+    If even equal signs of all differences would not reach the required margin, the points are too few for this test.
 
     A pose is compared by its false alarms alone if half of its correspondences coincide with those of the first pose.
     It is then that pose, its mirror image, or a repetition of it. The exception is a pose that explains other points as
@@ -105,18 +109,18 @@ def unrelated_competitor(seen: Seen, rule: Evidence) -> Objection | None:
 
     Args:
         seen: Candidates, best first, and points of each camera of a rig; cameras with too few points are left out.
-        rule: Constants of the verdict.
+        settings: Constants of the verdict.
 
     Source: W. Hoeffding, Probability inequalities for sums of bounded random variables, JASA 1963.
     """
-    limits, least = rule.contested, 2 * math.log(10) * rule.lead
+    limits, least = settings.contested, 2 * math.log(10) * settings.margin
     seen = [(candidates, problem) for candidates, problem in seen if len(problem.image.chosen) >= least]
     if not seen:
         return None
     candidates, problem = seen[0]
     poses, chosen = (candidates.rotation, candidates.translation), sum(len(each.image.chosen) for _, each in seen)
-    others = np.flatnonzero(~problem.same_pose(*poses, rule.same.times(limits.far)))
-    # A lead that is significant even with the largest possible gaps needs no test.
+    others = np.flatnonzero(~problem.same_pose(*poses, settings.same.times(limits.far)))
+    # A margin that is significant even with the largest possible gaps needs no test.
     decisive = limits.most * math.sqrt(least * chosen) / math.log(10)
     others = others[candidates.log10_false_alarms[others] - candidates.log10_false_alarms[0] < decisive]
     if not len(others):
@@ -134,7 +138,9 @@ def unrelated_competitor(seen: Seen, rule: Evidence) -> Objection | None:
         alone, others_alone = int((first.near & ~other.near).sum()), int((other.near & ~first.near).sum())
         apart = others_alone >= limits.alone * alone and alone + others_alone >= least
         decades = max(float(gap.sum()), 0.0) ** 2 / max(squared, 1e-300) / (2 * math.log(10))
-        if decades < rule.lead and (apart or (same & first.near & other.near).sum() < limits.same * other.near.sum()):
+        if decades < settings.margin and (
+            apart or (same & first.near & other.near).sum() < limits.same * other.near.sum()
+        ):
             degrees = math.degrees(rotation_angle(candidates.rotation[0], candidates.rotation[k]))
             return objection("other_points", decades, degrees=degrees)
     return None

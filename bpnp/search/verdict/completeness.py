@@ -6,7 +6,12 @@ from bpnp.search.config import Evidence
 
 
 def log10_missed(
-    basin_count: int, decades_a_match: float, local_searches: float | int, rule: Evidence, *, symmetric: bool = False
+    basin_count: int,
+    decades_a_match: float,
+    local_searches: float | int,
+    settings: Evidence,
+    *,
+    symmetric: bool = False,
 ) -> float:
     """Return log10 of the probability that a better optimum than the best pose exists and was missed.
 
@@ -34,26 +39,26 @@ def log10_missed(
         basin_count: Number k of independent initial poses that ended at the best pose or at one that is not different.
         decades_a_match: Evidence e of a match; 0 if matches do not confirm each other, as in repeated structures.
         local_searches: Number L of local searches around the best pose that found no better one.
-        rule: Constants; mu1 is `rule.look_fails`, mu2 is `rule.again_fails`, q is `rule.another`.
-        symmetric: Use `rule.uncompared` as q of a far optimum, since the scene's motions were tried.
+        settings: Constants; mu1 is `settings.look_fails`, mu2 is `settings.again_fails`, q is `settings.another`.
+        symmetric: Use `settings.uncompared` as q of a far optimum, since the scene's motions were tried.
 
-    >>> rule = Evidence()
-    >>> [round(log10_missed(*seen, rule), 2) for seen in ((0, 0.0, 0), (7, 0.0, 0), (7, 0.0, 1), (1, 1.0, 0))]
+    >>> settings = Evidence()
+    >>> [round(log10_missed(*basins, settings), 2) for basins in ((0, 0.0, 0), (7, 0.0, 0), (7, 0.0, 1), (1, 1.0, 0))]
     [0.0, -2.0, -3.24, -3.3]
     """
-    unseen = near_missed(basin_count, local_searches, rule) + far_missed(basin_count, rule, symmetric=symmetric)
-    return min(math.log10(unseen) - rule.independent * max(decades_a_match, 0.0), 0.0)
+    unseen = near_missed(basin_count, local_searches, settings) + far_missed(basin_count, settings, symmetric=symmetric)
+    return min(math.log10(unseen) - settings.independent * max(decades_a_match, 0.0), 0.0)
 
 
-def near_missed(basin_count: int, local_searches: float | int, rule: Evidence) -> float:
+def near_missed(basin_count: int, local_searches: float | int, settings: Evidence) -> float:
     """Return the probability that a better optimum near the best pose was missed; arguments as for `log10_missed`."""
-    overlooked = rule.look_fails * rule.again_fails ** (local_searches - 1) if local_searches else 1.0
-    return max(0.5**basin_count, rule.another) * overlooked
+    overlooked = settings.look_fails * settings.again_fails ** (local_searches - 1) if local_searches else 1.0
+    return max(0.5**basin_count, settings.another) * overlooked
 
 
-def far_missed(basin_count: int, rule: Evidence, *, symmetric: bool = False) -> float:
+def far_missed(basin_count: int, settings: Evidence, *, symmetric: bool = False) -> float:
     """Return the probability that a better optimum far from the best pose was missed.
 
-    The prior probability is `rule.uncompared` in a symmetric scene, else `rule.another`.
+    The prior probability is `settings.uncompared` in a symmetric scene, else `settings.another`.
     """
-    return (rule.uncompared if symmetric else rule.another) * 0.5**basin_count
+    return (settings.uncompared if symmetric else settings.another) * 0.5**basin_count

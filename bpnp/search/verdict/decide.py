@@ -4,7 +4,7 @@ The criterion is the number of false alarms (NFA, `bpnp.search.verdict.false_ala
 that fit as well if image and scene are unrelated.
 
 - "confident": log10 NFA is at most `Evidence.false_alarms`. The margin to every competing pose is at least
-  `Evidence.lead` decades. log10 of the probability that the search missed a better optimum is at most
+  `Evidence.margin` decades. log10 of the probability that the search missed a better optimum is at most
   `Evidence.missed` (`bpnp.search.verdict.completeness`).
 - "ambiguous": The best pose fits better than chance (log10 NFA at most 0), but one of the three conditions does not
   hold. Points that do not fix the rotation or the focal length give this verdict too.
@@ -102,16 +102,16 @@ def add_false_alarms(candidates: Hypotheses, problem: Problem) -> Hypotheses:
     return replace(candidates, log10_false_alarms=alarms, log10_rough=rough)
 
 
-def rank_poses(candidates: Hypotheses, problem: Problem, rule: Evidence = DEFAULT.evidence) -> Hypotheses:
+def rank_poses(candidates: Hypotheses, problem: Problem, settings: Evidence = DEFAULT.evidence) -> Hypotheses:
     """Compute the NFA of the candidates and move the best one to the front.
 
-    The best is the first one in the order of the search whose log10 NFA is within `Evidence.lead` of the smallest. The
-    order of the search is that of the likelihood. It decides among poses that the NFA cannot separate.
+    The best is the first one in the order of the search whose log10 NFA is within `Evidence.margin` of the smallest.
+    The order of the search is that of the likelihood. It decides among poses that the NFA cannot separate.
 
     Args:
         candidates: Poses in the frame of the problem, best first.
         problem: Points of the problem.
-        rule: Constants of the verdict.
+        settings: Constants of the verdict.
 
     Returns:
         Candidates with their NFA; the others keep their order.
@@ -120,7 +120,7 @@ def rank_poses(candidates: Hypotheses, problem: Problem, rule: Evidence = DEFAUL
         return candidates
     candidates = add_false_alarms(candidates, problem)
     alarms = candidates.log10_false_alarms
-    first = int(np.flatnonzero(alarms <= alarms.min() + rule.lead)[0])
+    first = int(np.flatnonzero(alarms <= alarms.min() + settings.margin)[0])
     order = np.r_[first, np.delete(np.arange(len(alarms)), first)]
     return candidates[order]
 
@@ -131,7 +131,12 @@ def match_count(candidates: Hypotheses) -> float:
 
 
 def missed(
-    candidates: Hypotheses, problem: Problem, local_searches: float | int, rule: Evidence, *, independent: bool = True
+    candidates: Hypotheses,
+    problem: Problem,
+    local_searches: float | int,
+    settings: Evidence,
+    *,
+    independent: bool = True,
 ) -> float:
     """Return log10 of the probability that the search missed a better optimum.
 
@@ -140,7 +145,7 @@ def missed(
         problem: Points of the problem.
         local_searches: Number of local searches around the first candidate that found nothing better. `REFINED` for an
             enumeration, whose exact refinement leaves no better pose nearby.
-        rule: Constants of the verdict.
+        settings: Constants of the verdict.
         independent: False to leave out the evidence of the matches.
 
     Returns:
@@ -151,16 +156,16 @@ def missed(
     if alarms > 0:
         return 0.0
     decades = -alarms / max(match_count(candidates), 1.0) if independent else 0.0
-    value = log10_missed(count_starts(candidates, problem, rule), decades, local_searches, rule)
-    if value > rule.missed or not is_symmetric(candidates, problem, rule):
+    value = log10_missed(count_starts(candidates, problem, settings), decades, local_searches, settings)
+    if value > settings.missed or not is_symmetric(candidates, problem, settings):
         return value
-    basin_count = count_starts(candidates, problem, rule, symmetric=True)
+    basin_count = count_starts(candidates, problem, settings, symmetric=True)
     # A prior reduces the probability of a better pose elsewhere.
     fraction = problem.log10_prior_fraction(candidates.rotation[0], candidates.translation[0])
-    return min(log10_missed(basin_count, 0.0, local_searches, rule, symmetric=True) + fraction, 0.0)
+    return min(log10_missed(basin_count, 0.0, local_searches, settings, symmetric=True) + fraction, 0.0)
 
 
-def motions_of(candidates: Hypotheses, problem: Problem, rule: Evidence) -> Motions:
+def motions_of(candidates: Hypotheses, problem: Problem, settings: Evidence) -> Motions:
     """Return the motions that map the matched points of the first candidate onto other scene points.
 
     The result is stored in `Problem.registered` and reused for equal poses.
@@ -168,40 +173,40 @@ def motions_of(candidates: Hypotheses, problem: Problem, rule: Evidence) -> Moti
     pose = candidates.rotation[:1], candidates.translation[:1]
     for rotation, translation, motions in problem.registered:
         poses = np.concatenate([pose[0], rotation[None]]), np.vstack([pose[1], translation])
-        if problem.same_pose(*poses, rule.same)[1]:
+        if problem.same_pose(*poses, settings.same)[1]:
             return motions
     scale = max(float(candidates.scale[0]), float(problem.image.scales[0]))
-    motions = registered(problem, pose[0][0], pose[1][0], scale, rule)
+    motions = registered(problem, pose[0][0], pose[1][0], scale, settings)
     problem.registered.append((pose[0][0], pose[1][0], motions))
     return motions
 
 
-def is_symmetric(candidates: Hypotheses, problem: Problem, rule: Evidence) -> bool:
+def is_symmetric(candidates: Hypotheses, problem: Problem, settings: Evidence) -> bool:
     """Return True if a motion maps a large part of the matched points onto other scene points.
 
     The motion could by itself explain a better pose. The fraction is compared with `Evidence.repetitions`.
     """
-    return float(motions_of(candidates, problem, rule).fraction.max(initial=0)) >= rule.repetitions.symmetric
+    return float(motions_of(candidates, problem, settings).fraction.max(initial=0)) >= settings.repetitions.symmetric
 
 
-def count_starts(candidates: Hypotheses, problem: Problem, rule: Evidence, *, symmetric: bool = False) -> int:
+def count_starts(candidates: Hypotheses, problem: Problem, settings: Evidence, *, symmetric: bool = False) -> int:
     """Return the basin count of the first candidate and of all poses equal to it.
 
     Args:
         candidates: Poses in the frame of the problem, best first.
         problem: Points of the problem.
-        rule: Constants of the verdict.
+        settings: Constants of the verdict.
         symmetric: Also count the poses that the motions of the scene confuse with the first one. Each is compared with
             it separately; a better pose elsewhere has the same number of copies.
     """
     first = candidates.rotation[:1], candidates.translation[:1]
     if symmetric:
-        copies = motions_of(candidates, problem, rule).competitors(first[0][0], first[1][0])
+        copies = motions_of(candidates, problem, settings).competitors(first[0][0], first[1][0])
         first = np.concatenate([first[0], copies[0]]), np.concatenate([first[1], copies[1]])
     counted = np.zeros(len(candidates), bool)
     for rotation, translation in zip(*first, strict=True):
         poses = np.concatenate([rotation[None], candidates.rotation]), np.vstack([translation, candidates.translation])
-        counted |= problem.same_pose(*poses, rule.same)[1:]
+        counted |= problem.same_pose(*poses, settings.same)[1:]
     return int(candidates.basin_count[counted].sum())
 
 
@@ -212,7 +217,7 @@ def judge(
     batches: int,
     local_searches: float | int = 0,
     exhaustive: bool = False,
-    rule: Evidence = DEFAULT.evidence,
+    settings: Evidence = DEFAULT.evidence,
     rig: Seen = (),
 ) -> SearchResult:
     """Compute the verdict on the candidates.
@@ -223,7 +228,7 @@ def judge(
         batches: Number of iterations of the search.
         local_searches: Number of local searches around the best pose that found nothing better.
         exhaustive: True if every pose that fits some points was examined; the miss probability is then 0.
-        rule: Constants of the verdict.
+        settings: Constants of the verdict.
         rig: Candidates, best first, and points of every camera of a rig; empty for a single camera.
 
     Returns:
@@ -231,57 +236,60 @@ def judge(
     """
     if not len(candidates):
         return no_pose(batches=batches, settled=exhaustive)
-    candidates = rank_poses(candidates, problem, rule)
+    candidates = rank_poses(candidates, problem, settings)
     alarms = float(candidates.log10_false_alarms[0])
-    settled = exhaustive or missed(candidates, problem, local_searches, rule, independent=False) <= rule.missed
+    settled = exhaustive or missed(candidates, problem, local_searches, settings, independent=False) <= settings.missed
     result = SearchResult(candidates, "confident", "", batches, CONFIDENT, settled)
     if alarms > 0:
         return result.add_objection(objection("chance", what="no pose fits"), "failed")
-    unseen = -math.inf if exhaustive else missed(candidates, problem, local_searches, rule)
+    unseen = -math.inf if exhaustive else missed(candidates, problem, local_searches, settings)
     # Costly tests run only if the verdict depends on them.
     seen = rig or [(candidates, problem)]
-    against = [*(other_pose(*each, rule) for each in seen), rough_residuals(candidates)]
-    certain = alarms <= rule.false_alarms and unseen <= rule.missed
+    against = [*(other_pose(*each, settings) for each in seen), rough_residuals(candidates)]
+    certain = alarms <= settings.false_alarms and unseen <= settings.missed
     off = share = math.nan
-    if certain and all(one is None or one.margin >= rule.lead for one in against):
+    if certain and all(one is None or one.margin >= settings.margin for one in against):
         count = match_count(candidates)
         linear = linearised(problem, candidates.rotation[0], candidates.translation[0], float(candidates.scale[0]))
         turned, share = error_bounds(problem, linear, count)
         off = math.degrees(turned)
         if off >= HALF_TURN or not (rig or is_redundant(problem, count)):
             return result.add_objection(objection("rotation_not_fixed", count=count, what="the rotation"))
-        if share > (rule.focal_few if is_object(problem, rule) else rule.focal):
+        if share > (settings.focal_few if is_object(problem, settings) else settings.focal):
             return result.add_objection(focal_length_not_fixed(share))
-        against += [other_camera(systematic_misfit(linear, count, rule), rule), unrelated_competitor(seen, rule)]
-    objections = [one for one in against if one is not None and one.margin < rule.lead]
+        against += [
+            other_camera(systematic_misfit(linear, count, settings), settings),
+            unrelated_competitor(seen, settings),
+        ]
+    objections = [one for one in against if one is not None and one.margin < settings.margin]
     if certain and not objections:
-        return replace(result, reason=reasons.confident(alarms, rule.lead, off, share), settled=True)
+        return replace(result, reason=reasons.confident(alarms, settings.margin, off, share), settled=True)
     if objections:
         return result.add_objection(min(objections))
-    if alarms > rule.false_alarms:
-        return result.as_insignificant(rule.false_alarms)
+    if alarms > settings.false_alarms:
+        return result.as_insignificant(settings.false_alarms)
     return result.add_objection(objection("incomplete", what="pose", probability=reasons.miss_probability(unseen)))
 
 
-def is_object(problem: Problem, rule: Evidence) -> bool:
+def is_object(problem: Problem, settings: Evidence) -> bool:
     """Return True if the scene points are those of an object.
 
     An object has few points, and they have no viewing cones, unlike those of a map.
     """
-    return problem.cosines3d is None and len(problem.points3d) <= rule.repetitions.whole
+    return problem.cosines3d is None and len(problem.points3d) <= settings.repetitions.whole
 
 
-def is_certain(candidates: Hypotheses, problem: Problem, rule: Evidence = DEFAULT.evidence) -> bool:
+def is_certain(candidates: Hypotheses, problem: Problem, settings: Evidence = DEFAULT.evidence) -> bool:
     """Return True if the first candidate of an enumeration passes the cheap tests of the verdict.
 
     The tests are the NFA, the margin to the best different pose, rough residuals and the miss probability.
     """
-    if not len(candidates) or float(candidates.log10_false_alarms[0]) > rule.false_alarms:
+    if not len(candidates) or float(candidates.log10_false_alarms[0]) > settings.false_alarms:
         return False
-    other = other_pose(candidates, problem, rule)
-    if (other is not None and other.margin < rule.lead) or rough_residuals(candidates) is not None:
+    other = other_pose(candidates, problem, settings)
+    if (other is not None and other.margin < settings.margin) or rough_residuals(candidates) is not None:
         return False
-    return missed(candidates, problem, REFINED, rule) <= rule.missed
+    return missed(candidates, problem, REFINED, settings) <= settings.missed
 
 
 def no_pose(

@@ -79,12 +79,12 @@ def focal_length_not_fixed(bound: float) -> Objection:
     return objection("focal_length_not_fixed", off=f"{100 * bound:.0f} % off" if bound < 10 else "anything")
 
 
-def confident(log10_false_alarms: float, lead: float, bound_deg: float, focal: float = 0.0) -> str:
+def confident(log10_false_alarms: float, margin: float, bound_deg: float, focal: float = 0.0) -> str:
     """Return the reason of a confident pose.
 
     Args:
         log10_false_alarms: of the pose.
-        lead: decades within which no competing pose lies.
+        margin: decades within which no competing pose lies.
         bound_deg: 99.9 % bound of the rotation, degrees.
         focal: 99.9 % bound of the focal length, as a fraction; 0 if it is given.
 
@@ -97,7 +97,7 @@ def confident(log10_false_alarms: float, lead: float, bound_deg: float, focal: f
     known = f"rotation known to {rounded(bound_deg)} deg"
     if focal:
         known += f", focal length to {rounded(100 * focal)} %"
-    return f"No competing pose within {lead:g} decades; {nfa(log10_false_alarms)}; {known} (99.9 %)"
+    return f"No competing pose within {margin:g} decades; {nfa(log10_false_alarms)}; {known} (99.9 %)"
 
 
 def insignificant(log10_false_alarms: float, most: float) -> str:

@@ -154,7 +154,7 @@ def pose_covariance(problem: Problem, linear: "Linearised | None", count: float)
     free = max(2 * count - problem.fitted, 1.0)
     moved = np.eye(len(covariance))  # from the shift s of the centroid to that of the origin: v = s + (R m) x w
     moved[3:POSE, 3:POSE] *= problem.size
-    moved[3:POSE, :3] = crossed(linear.state.rotation @ problem.middle_of_user)
+    moved[3:POSE, :3] = crossed(linear.state.rotation @ problem.centre3d_of_user)
     return np.asarray(student_factor(free) * moved @ covariance @ moved.T)
 
 
@@ -345,19 +345,20 @@ class Misfit(NamedTuple):
     radial: float = 0.0
 
 
-def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = DEFAULT.evidence) -> Misfit:
+def systematic_misfit(linear: Linearised | None, count: float, settings: Evidence = DEFAULT.evidence) -> Misfit:
     """Return the largest change of a pose that its residuals support significantly.
 
     - Five strains of the scene are fitted to the residuals together with the pose. Correspondences are weighted with
       their probabilities. The pose is eliminated, and the principal directions of the strains with a significant F
       statistic count (level 0.001).
-    - The log of the focal length is fitted and tested likewise (level `rule.focal_chance`, 0.01). The correspondences
-      of the pose bias it towards the given one; `bpnp.search.competing_poses` fits a significant one with new ones.
+    - The log of the focal length is fitted and tested likewise (level `settings.focal_chance`, 0.01). The
+      correspondences of the pose bias it towards the given one; `bpnp.search.competing_poses` fits a
+      significant one with new ones.
 
     Args:
         linear: Pose from `linearised`, or None for no change.
         count: Number of matches.
-        rule: Constants of the verdict.
+        settings: Constants of the verdict.
 
     >>> import numpy as np
     >>> rng = np.random.default_rng(0)
@@ -380,7 +381,7 @@ def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = 
     pose = np.linalg.pinv(products[:POSE, :POSE], hermitian=True)
     found = []
     strains = slice(POSE + 1, POSE + 1 + len(STRAINS))
-    for fitted, chance in ((slice(POSE, POSE + 1), rule.focal_chance), (strains, PRECISION.exceeded)):
+    for fitted, chance in ((slice(POSE, POSE + 1), settings.focal_chance), (strains, PRECISION.exceeded)):
         moved, step = _moved(products, pose, fitted, free, chance)
         zoom = math.exp(float(step[0])) if len(step) == 1 else 1.0
         found.append(Misfit(float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:])), zoom))
@@ -391,7 +392,7 @@ def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = 
     )
 
 
-def bends_significantly(linear: Linearised | None, count: float, rule: Evidence = DEFAULT.evidence) -> bool:
+def bends_significantly(linear: Linearised | None, count: float, settings: Evidence = DEFAULT.evidence) -> bool:
     """Return whether radial distortion explains the residuals of a pose significantly better than a focal length.
 
     An F test of the radial coefficient at the level `focal_chance`, with pose and focal length eliminated.
@@ -399,7 +400,7 @@ def bends_significantly(linear: Linearised | None, count: float, rule: Evidence 
     Args:
         linear: The pose and its possible matches.
         count: Number of matches.
-        rule: Constants of the verdict.
+        settings: Constants of the verdict.
     """
     if linear is None or not (linear.problem.bearings[:, 2] > 0).all():
         return False
@@ -410,7 +411,7 @@ def bends_significantly(linear: Linearised | None, count: float, rule: Evidence 
     # The last column of R ends with the gain of the radial coefficient and the remaining residual.
     triangle = np.asarray(np.linalg.qr(rows, mode="r"))
     gain, rest = float(triangle[-2, -1] ** 2), float(triangle[-1, -1] ** 2)
-    return bool(free > 0 and fdtrc(1, free, gain * free / max(rest, free, 1.0)) < rule.focal_chance)
+    return bool(free > 0 and fdtrc(1, free, gain * free / max(rest, free, 1.0)) < settings.focal_chance)
 
 
 def _moved(products: Array, pose: Array, fitted: slice, free: float, chance: float) -> tuple[Array, Array]:
