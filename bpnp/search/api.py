@@ -155,7 +155,7 @@ def solve(
     >>> bool(np.allclose(solution.translation, [0, 0, 6], atol=1e-6))
     True
     """
-    known: dict[str, Any] = {
+    point_options: dict[str, Any] = {
         "normals3d": normals3d,
         "labels2d": labels2d,
         "labels3d": labels3d,
@@ -170,7 +170,7 @@ def solve(
             points2d,
             points3d,
             camera,
-            known,
+            point_options,
             Options(
                 inlier_threshold=positive("inlier_threshold", inlier_threshold, finite=True),
                 clutter=None if clutter is None else float(clutter),
@@ -183,7 +183,7 @@ def solve(
         )
         return solve_one()
     points: dict[str, Any] = {"points2d": points2d, "points3d": points3d}
-    arrays: dict[str, Any] = {name: [values] for name, values in (points | known).items()}
+    arrays: dict[str, Any] = {name: [values] for name, values in (points | point_options).items()}
     return solve_many(
         camera=camera,
         image_size=image_size,
@@ -289,7 +289,7 @@ def solve_many(
     )
     if scale and rig is None and not at_infinity:
         raise ValueError(NO_RIG)
-    known = {
+    point_options = {
         "normals3d": each_set("normals3d", normals3d, count),
         "labels2d": each_set("labels2d", labels2d, count, _axes_of_labels(labels2d)),
         "labels3d": each_set("labels3d", labels3d, count, _axes_of_labels(labels3d)),
@@ -302,7 +302,7 @@ def solve_many(
         one_each = [camera] * count if rig is not None else each_camera(camera, count)
         ready = []
         for i, each in enumerate(each_of("prior", prior, count)):
-            arrays = {name: values[i] for name, values in known.items()}
+            arrays = {name: values[i] for name, values in point_options.items()}
             with about(f"problem {i}" if count > 1 else None):
                 ready.append(prepare_mode(images[i], scenes[i], one_each[i], arrays, options.numbered(i), mode, each))
         return [solve_one() for solve_one in ready]
@@ -311,7 +311,7 @@ def solve_many(
     pixels = [pixels_from(points, image_size or one) for points, one in zip(images, cameras, strict=True)]
 
     def problem(i: int, lens: Camera | None, focal: UnknownFocal | None = None) -> Problem:
-        arrays = {name: values[i] for name, values in known.items()}
+        arrays = {name: values[i] for name, values in point_options.items()}
         with about(f"problem {i}" if count > 1 else None):
             return problem_from(pixels[i], scenes[i], lens, prior=priors[i], focal=focal, **arrays)
 

@@ -387,8 +387,8 @@ def compact_labels(labels2d: Labels, labels3d: Labels) -> tuple[Labels, Labels]:
     """
     values = np.unique(labels3d[labels3d >= 0])
     places = [np.searchsorted(values, side) for side in (labels2d, labels3d)]
-    known = np.isin(labels2d, values)
-    image = np.where(labels2d < 0, -1, np.where(known, places[0], len(values)))
+    is_shared = np.isin(labels2d, values)
+    image = np.where(labels2d < 0, -1, np.where(is_shared, places[0], len(values)))
     return image.astype(np.int64), np.where(labels3d < 0, -1, places[1]).astype(np.int64)
 
 

@@ -63,12 +63,12 @@ def problem_from(
     usable = np.flatnonzero(np.isfinite(bearings).all(-1))
     check_seen(usable, image, fewest)
     in_pixels = camera if camera is not None and camera.focal >= INPUTS.least_focal else None
-    known = prior if isinstance(prior, (PosePrior, GravityPrior)) else None
+    pose_prior = prior if isinstance(prior, (PosePrior, GravityPrior)) else None
     problem = Problem.of(
         bearings,
         scene,
-        prior=known,
-        network=prior if known is None else None,
+        prior=pose_prior,
+        network=prior if pose_prior is None else None,
         normals3d=checked_normals(normals3d, len(scene)),
         cosines3d=cosines3d,
         scores2d=checked_scores("scores2d", scores2d, len(image)),

@@ -127,14 +127,14 @@ def _fitted(problem: Problem, rotation: Array, translation: Array, threshold: fl
     """
     image = problem.image_points
     for _ in range(MATCHES.fit_rounds):
-        seen = problem.project_scene(rotation, translation)
-        i, j = mutual_nearest(image, seen, threshold, problem.may_match).T
+        projected = problem.project_scene(rotation, translation)
+        i, j = mutual_nearest(image, projected, threshold, problem.may_match).T
         if len(i) < MIN_POINTS:
             break
         target, points = image[i], problem.points3d[j]
         trial = fit_pose(problem.project, points, target, rotation, translation, scale=threshold)
         after = problem.project(points @ trial[0].T + trial[1])
-        squares = [float(((each - target) ** 2).sum()) for each in (seen[j], after)]
+        squares = [float(((each - target) ** 2).sum()) for each in (projected[j], after)]
         if not squares[0] > squares[1] * math.exp(PRECISION.far / target.size):
             break
         rotation, translation = trial

@@ -48,14 +48,14 @@ class Source:
 
     Attributes:
         pool: Poses found so far.
-        known: Prior in the frame of the scene; None for none.
+        scene_prior: Prior in the frame of the scene; None for none.
         batches: Number of batches so far.
         searches: Number of density-map searches so far.
         waiting: Number of density-map searches until the next batch.
     """
 
     pool: Pool
-    known: Prior | None
+    scene_prior: Prior | None
     batches: int = 0
     searches: int = 0
     waiting: int = 0
@@ -65,10 +65,10 @@ class Source:
         scene = self.pool.scene
         if self.waiting:
             number, self.searches, self.waiting = self.searches, self.searches + 1, self.waiting - 1
-            return Step(partial(search_everywhere, scene, number, self.known))
+            return Step(partial(search_everywhere, scene, number, self.scene_prior))
         number, self.batches = self.batches, self.batches + 1
         self.waiting = scene.settings.batch(number) // scene.settings.schedule.starts_a_search
-        return Step(partial(multistart, scene, number, None if number % 3 == 2 else self.known))
+        return Step(partial(multistart, scene, number, None if number % 3 == 2 else self.scene_prior))
 
 
 @dataclass
@@ -152,11 +152,11 @@ class Plan:
         """
         if only_proposals:
             return cls(pool, None, proposals, None, None)
-        guess, known = (
+        guess, scene_prior = (
             None if prior is None else pool.scene.enter_prior(prior) for prior in (around, pool.problem.prior)
         )
-        near = known if isinstance(known, PosePrior) and is_near(pool.scene, known) else None
-        return cls(pool, guess, proposals, near, Source(pool, None if near is not None else known))
+        near = scene_prior if isinstance(scene_prior, PosePrior) and is_near(pool.scene, scene_prior) else None
+        return cls(pool, guess, proposals, near, Source(pool, None if near is not None else scene_prior))
 
     def next_step(self) -> Step | None:
         """Return the next step; None if there is none."""

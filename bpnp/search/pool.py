@@ -102,8 +102,8 @@ class Pool:
 
     def leaders(self) -> Hypotheses:
         """Return the candidates with an NFA, in the frame of the problem, the best one first."""
-        known = self.candidates[~np.isnan(self.candidates.log10_false_alarms)]
-        return rank_poses(to_problem_frame(known, self.scene), self.problem, self.scene.settings.evidence)
+        judged = self.candidates[~np.isnan(self.candidates.log10_false_alarms)]
+        return rank_poses(to_problem_frame(judged, self.scene), self.problem, self.scene.settings.evidence)
 
     @property
     def best_key(self) -> float:

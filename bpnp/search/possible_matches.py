@@ -29,7 +29,7 @@ def facing(problem: Problem, camera: Array, rotation: Array) -> Labels:
 
 
 def possible_matches(
-    problem: Problem, seen: Array, places: Labels, chosen: Labels, scale: float, most: int = MATCHES.neighbours
+    problem: Problem, directions: Array, indices: Labels, chosen: Labels, scale: float, most: int = MATCHES.neighbours
 ) -> tuple[Any, Any, Array, Array]:
     """Return the possible matches of chosen image points and scene points near them.
 
@@ -37,39 +37,39 @@ def possible_matches(
 
     Args:
         problem: Points of the problem.
-        seen: (n, 3) unit directions of the scene points.
-        places: (n,) indices of these scene points.
+        directions: (n, 3) unit directions of the scene points.
+        indices: (n,) indices of these scene points.
         chosen: (m,) indices of the image points.
         scale: Standard deviation of the residuals, radians.
         most: Largest number of neighbours of an image point.
 
     Returns:
-        Index (k,) into `chosen`, index (k,) into `seen` and density (k,) of each match; and the total density (m,) of
-        each image point, which includes that of no correspondence.
+        Index (k,) into `chosen`, index (k,) into `directions` and density (k,) of each match; and the total density (m,)
+        of each image point, which includes that of no correspondence.
     """
     bearings, reach = problem.bearings[chosen], MATCHES.farthest * scale
-    if len(bearings) * len(seen) <= MATCHES.dense:
-        squared = ((bearings[:, None] - seen) ** 2).sum(-1)
+    if len(bearings) * len(directions) <= MATCHES.dense:
+        squared = ((bearings[:, None] - directions) ** 2).sum(-1)
         i, j = np.nonzero(squared < reach**2)
         squared = squared[i, j]
     else:
-        tree, counts = cKDTree(seen), range(1, min(most, len(seen)) + 1)
+        tree, counts = cKDTree(directions), range(1, min(most, len(directions)) + 1)
         for count in (counts[: MATCHES.few_neighbours][-1], counts[-1]):  # few are enough unless all of them are near
             distance, nearest = tree.query(bearings, counts[:count], distance_upper_bound=reach)
             if count == len(counts) or not np.isfinite(distance[:, -1]).any():
                 break
         i, nth = np.nonzero(np.isfinite(distance))
         j, squared = nearest[i, nth].astype(np.int64), distance[i, nth] ** 2
-    candidates = np.full(len(bearings), len(seen))
+    candidates = np.full(len(bearings), len(directions))
     odds = np.ones(len(i))
     if problem.odds2d is not None and problem.classes3d is not None:
-        odds = (problem.odds2d[chosen[i]] * problem.classes3d[places[j]]).sum(-1)
+        odds = (problem.odds2d[chosen[i]] * problem.classes3d[indices[j]]).sum(-1)
     elif problem.labels2d is not None and problem.labels3d is not None:
-        label, others = problem.labels2d[chosen], problem.labels3d[places]
+        label, others = problem.labels2d[chosen], problem.labels3d[indices]
         agree = (label[i] == others[j]) | (label[i] < 0) | (others[j] < 0)
         i, j, squared, odds = i[agree], j[agree], squared[agree], odds[agree]
         of_label = np.bincount(others + 1, minlength=int(label.max(initial=0)) + 2)
-        candidates = np.where(label < 0, len(seen), of_label[label + 1] + of_label[0])
+        candidates = np.where(label < 0, len(directions), of_label[label + 1] + of_label[0])
     density = (
         odds * np.exp(squared * (-0.5 / scale**2)) * (1 - DEFAULT.outliers) / (candidates[i] * 2 * math.pi * scale**2)
     )
@@ -91,11 +91,11 @@ def score_pose(problem: Problem, rotation: Array, translation: Array, scale: flo
         point is seen. Number of matches, at most that of the image points or scene points.
     """
     camera, chosen = problem.points3d @ rotation.T + translation, problem.image.chosen
-    places = facing(problem, camera, rotation)
-    if not len(places):
+    indices = facing(problem, camera, rotation)
+    if not len(indices):
         return -math.inf, 0.0
-    seen = camera[places] / np.linalg.norm(camera[places], axis=-1, keepdims=True)
-    i, _, density, every = possible_matches(problem, seen, places, chosen, scale)
+    directions = camera[indices] / np.linalg.norm(camera[indices], axis=-1, keepdims=True)
+    i, _, density, every = possible_matches(problem, directions, indices, chosen, scale)
     matched = float((density / every[i]).sum()) * len(problem.bearings) / len(chosen)
     return float(np.log(2 * math.pi * every).mean()), min(
         matched, float(min(len(problem.bearings), len(problem.points3d)))

@@ -131,20 +131,20 @@ class Problem:
     network: Any = None
 
     @classmethod
-    def of(cls, bearings: Array, points3d: Array, *, prior: Prior | None = None, **known: Any) -> "Problem":
+    def of(cls, bearings: Array, points3d: Array, *, prior: Prior | None = None, **attributes: Any) -> "Problem":
         """Make a problem from points and a prior in the user's coordinates.
 
         Args:
             bearings: (m, 3) unit vectors.
             points3d: (n, 3) scene points, in any unit.
             prior: Prior of the pose, in the user's coordinates.
-            **known: The other attributes.
+            **attributes: The other attributes.
         """
         bulk = points3d[in_bulk(points3d)]
         bulk = bulk if np.ptp(bulk, axis=0).any() else points3d
         origin = bulk.mean(0)
         size = float(np.sqrt(((bulk - origin) ** 2).sum(-1).mean())) or 1.0
-        problem = cls(bearings, points3d, origin=origin, size=size, given3d=points3d, **known)
+        problem = cls(bearings, points3d, origin=origin, size=size, given3d=points3d, **attributes)
         known_pose = None if prior is None else problem.prior_from_user(prior)
         return replace(problem, points3d=problem.points_from_user(points3d), prior=known_pose)
 
@@ -179,9 +179,9 @@ class Problem:
             scene: Indices or slice of the scene points; all by default.
         """
         rows = dict.fromkeys(OF_IMAGE, image) | dict.fromkeys(OF_SCENE, scene)
-        known = {name: values[rows[name]] for name in rows if (values := getattr(self, name)) is not None}
+        selected = {name: values[rows[name]] for name in rows if (values := getattr(self, name)) is not None}
         given3d = None if self.given3d is None else self.given3d[scene]
-        return replace(self, indices2d=self.usable[image], given3d=given3d, given2d=self.all2d, **known)
+        return replace(self, indices2d=self.usable[image], given3d=given3d, given2d=self.all2d, **selected)
 
     def without(self, taken: Labels) -> "Problem":
         """Return the problem without the image points that have these indices among the user's."""
@@ -381,10 +381,10 @@ class Problem:
             off = math.atan2(float(np.linalg.norm(np.cross(up, camera))), float(up @ camera))
             off = min(max(off, math.radians(sigmas * prior.sigma_deg)), math.pi)
             return math.log10(max((1 - math.cos(off)) / 2, 1e-12))
-        known, sigma = np.asarray(prior.rotation, np.float64), math.radians(prior.rotation_sigma_deg)
-        far, has_position = max(rotation_angle(rotation, known) / sigma, sigmas), False
+        prior_rotation, sigma = np.asarray(prior.rotation, np.float64), math.radians(prior.rotation_sigma_deg)
+        far, has_position = max(rotation_angle(rotation, prior_rotation) / sigma, sigmas), False
         if prior.translation is not None and math.isfinite(prior.translation_sigma):
-            expected, has_position = known @ self.centre3d + np.asarray(prior.translation), True
+            expected, has_position = prior_rotation @ self.centre3d + np.asarray(prior.translation), True
             shift = float(np.linalg.norm(rotation @ self.centre3d + translation - expected))
             far = max(far, shift / prior.translation_sigma)
         off = min(far * sigma, math.pi)

@@ -29,7 +29,13 @@ class Mode(NamedTuple):
 
 
 def prepare_mode(
-    points2d: Any, points3d: Any, camera: Any, known: Mapping[str, Any], options: Options, mode: Mode, prior: Any
+    points2d: Any,
+    points3d: Any,
+    camera: Any,
+    point_options: Mapping[str, Any],
+    options: Options,
+    mode: Mode,
+    prior: Any,
 ) -> Callable[[], Solution]:
     """Check the arguments of one problem with a rig or with directions, and return the function that solves it.
 
@@ -37,8 +43,8 @@ def prepare_mode(
         points2d: Points of the image, or with a `rig` a list with those of each camera.
         points3d: (n, 3) scene points or directions.
         camera: Camera, or with a `rig` one for all or a list.
-        known: `normals3d`, `labels2d`, `labels3d`, `scores2d` and `scores3d`; with a `rig` those of the image points
-            are lists with one array per camera.
+        point_options: `normals3d`, `labels2d`, `labels3d`, `scores2d`, `scores3d`; with a `rig` those of the image
+            points are lists with one array per camera.
         options: Options of the search.
         mode: Arguments that are common to all problems.
         prior: As for `bpnp.solve`.
@@ -47,18 +53,22 @@ def prepare_mode(
         ValueError: An argument is invalid, or has no meaning in this mode.
     """
     at_infinity, rig, scale, image_size, focal_error, distortion, solver, device = mode
-    _refuse(known, at_infinity=at_infinity, scale=scale, prior=prior, solver=solver, device=device)
+    _refuse(point_options, at_infinity=at_infinity, scale=scale, prior=prior, solver=solver, device=device)
     mounts = None if rig is None else [mount_from(f"rig[{k}]", mount) for k, mount in enumerate(rig)]
     count = 1 if mounts is None else len(mounts)
-    images, each = [points2d], {name: [known[name]] for name in PER_CAMERA}
+    images, each = [points2d], {name: [point_options[name]] for name in PER_CAMERA}
     if mounts is not None:
         images = each_set("points2d", points2d, None)
-        for name, values in (("points2d", images), ("camera", camera), *((name, known[name]) for name in PER_CAMERA)):
+        for name, values in (
+            ("points2d", images),
+            ("camera", camera),
+            *((name, point_options[name]) for name in PER_CAMERA),
+        ):
             if isinstance(values, list) and len(values) != count:
                 raise ValueError(
                     f"`{name}` has the length {len(values)}, but the `rig` has {count} cameras; give one per camera"
                 )
-        each = {name: each_set(name, known[name], count, 1) for name in PER_CAMERA}
+        each = {name: each_set(name, point_options[name], count, 1) for name in PER_CAMERA}
     cameras = each_camera(camera, count) if mounts is not None else [camera]
     unknown = None
     if distortion or image_size is not None or focal_error is not None:
@@ -67,7 +77,7 @@ def prepare_mode(
     if image_size is not None:
         for image in images:
             check_inside(image, image_size)
-    arrays, rough = dict(known) | each, checked_prior(prior)
+    arrays, rough = dict(point_options) | each, checked_prior(prior)
     assert rough is None or isinstance(rough, (PosePrior, GravityPrior))
     if at_infinity:
         return prepare_directions(
@@ -84,7 +94,9 @@ def prepare_mode(
     return prepare_rig(images, points3d, cameras, unknown, mounts or [], arrays, options, prior=rough, scale=scale)
 
 
-def _refuse(known: Mapping[str, Any], *, at_infinity: bool, scale: bool, prior: Any, solver: Any, device: Any) -> None:
+def _refuse(
+    point_options: Mapping[str, Any], *, at_infinity: bool, scale: bool, prior: Any, solver: Any, device: Any
+) -> None:
     """Raise ValueError for an option that cannot be used with a rig or with directions."""
     networks = "networks are trained for the points of one camera, not for a `rig` or directions `at_infinity`"
     if solver not in ("auto", "search"):
@@ -93,7 +105,7 @@ def _refuse(known: Mapping[str, Any], *, at_infinity: bool, scale: bool, prior: 
         raise ValueError(f"`prior` is the network {prior!r:.60}, but {networks}; give a pose or a GravityPrior")
     if device is not None:
         raise ValueError(f"`device` is {device!r:.60}, but no network runs: {networks}; leave `device` out")
-    if at_infinity and known["normals3d"] is not None:
+    if at_infinity and point_options["normals3d"] is not None:
         raise ValueError(
             "`normals3d` has no meaning with `at_infinity=True`: a direction has no surface that could face away; "
             "leave the normals out"

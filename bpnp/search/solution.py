@@ -416,8 +416,8 @@ def add_pose(
 
 def _largest(covariance: Array) -> float:
     """Return the root of the largest eigenvalue; NaN if the covariance is not finite."""
-    known = np.isfinite(covariance).all()
-    return math.sqrt(float(np.linalg.eigvalsh(covariance)[-1])) if known else math.nan
+    is_finite = np.isfinite(covariance).all()
+    return math.sqrt(float(np.linalg.eigvalsh(covariance)[-1])) if is_finite else math.nan
 
 
 def _plain(value: Any) -> Any:

@@ -149,7 +149,7 @@ def test_the_fraction_of_poses_as_near_to_a_prior_is_a_p_value() -> None:
     rng, count = np.random.default_rng(0), 8000
     problem = Problem(scattered(rng, 400, 0.4), rng.uniform(-1, 1, (41, 3)))
     turns = Rotation.random(count, random_state=rng).as_matrix()
-    shifts = scattered(rng, count, 0.4) * 6 * 30 ** rng.uniform(-0.5, 0.5, (count, 1)) - turns @ problem.middle
+    shifts = scattered(rng, count, 0.4) * 6 * 30 ** rng.uniform(-0.5, 0.5, (count, 1)) - turns @ problem.centre3d
     for prior in wide_priors(rng):
         known = replace(problem, prior=prior)
         fractions = np.array([known.log10_prior_fraction(*pose) for pose in zip(turns, shifts, strict=True)])

@@ -98,8 +98,8 @@ def sweep(row: int, first: int, budget: int, stop: float, block: Any, problem: A
                 fits(labels2d[i], labels3d[a]) and fits(labels2d[j], labels3d[b]) and fits(labels2d[k], labels3d[c])
             ):
                 continue
-            known = kept.point[best[0]]
-            own = known[i] == a and known[j] == b and known[k] == c
+            its_points = kept.point[best[0]]
+            own = its_points[i] == a and its_points[j] == b and its_points[k] == c
             if own and kept.counts[best[0]] >= RULES.skipped and kept.basin_count[best[0]] >= RULES.counted:
                 continue
             solved += 1
@@ -259,10 +259,10 @@ def tightened(pose: Any, reach: float, last: float, problem: Any, matches: Any, 
     Returns:
         False for too few matches, a singular step, or a pose that the prior excludes.
     """
-    left, known = RULES.final, len(problem.prior.in_scene)
+    left, directions = RULES.final, len(problem.prior.in_scene)
     while left > 0:
         count, _, _ = match(pose, reach, problem.scene, problem.image.grid, matches)
-        if count < 3 and count + known < 3:
+        if count < 3 and count + directions < 3:
             return False
         if not step(pose, matches.point, problem, system):
             return False

@@ -320,8 +320,8 @@ def prior_arrays(
         in_scene, in_camera, off = up[None], (image.turn @ camera)[None], math.radians(prior.sigma_deg)
         from_camera, from_scene = turned_to(in_camera[0]), turned_to(up)
     else:
-        known, sigma = np.asarray(prior.rotation, np.float64), math.radians(prior.rotation_sigma_deg)
-        rotation = image.turn @ known
+        prior_rotation, sigma = np.asarray(prior.rotation, np.float64), math.radians(prior.rotation_sigma_deg)
+        rotation = image.turn @ prior_rotation
         from_camera, from_scene = np.eye(3), rotation
         in_scene, in_camera, off = np.eye(3), np.ascontiguousarray(rotation.T), math.sqrt(2) * sigma
         if (predicted := predicted_pose(prior)) is not None:

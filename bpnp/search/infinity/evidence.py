@@ -89,28 +89,28 @@ def background_of(problem: Problem, pixel: Array, noise: float) -> Background:
 
 
 def log10_false_alarms(
-    squared: Array, density: Array, known: Background, log10_fraction: float = 0.0
+    squared: Array, density: Array, background: Background, log10_fraction: float = 0.0
 ) -> tuple[float, Array]:
     """Compute the logarithm of the number of false alarms of a rotation.
 
     Args:
         squared: (m,) squared distances to the nearest directions, in squared pixels; infinite beyond reach.
         density: (m,) density around these directions, per steradian.
-        known: Constants from `background_of`.
+        background: Constants from `background_of`.
         log10_fraction: `Problem.log10_prior_fraction` of the rotation; default 0, without a prior.
 
     Returns:
         log10 NFA, and the log x_i / c_i (m,) of each image point at the scale and fraction with the largest sum.
     """
-    width = known.scales * known.pixel[:, None]
-    ratio = np.exp(-0.5 * squared[:, None] / known.scales**2) / (2 * math.pi * width**2 * density[:, None])
-    logs = np.log(1 - known.shares + known.shares * ratio[:, :, None]) / known.together[:, :, None]
-    every, tests = np.ones(len(known.scales), np.bool_), known.log_tests
+    width = background.scales * background.pixel[:, None]
+    ratio = np.exp(-0.5 * squared[:, None] / background.scales**2) / (2 * math.pi * width**2 * density[:, None])
+    logs = np.log(1 - background.shares + background.shares * ratio[:, :, None]) / background.together[:, :, None]
+    every, tests = np.ones(len(background.scales), np.bool_), background.log_tests
     if log10_fraction:  # a prior leaves at least one test
         tests = np.maximum(tests + math.log(10) * log10_fraction, 0.0)
     most = float(tests.max())
-    terms = Terms(logs, known.together, every, ~every, len(every) * known.shares.shape[-1], tests - most)
-    return log10_nfa([terms], most / math.log(10), [[known.fixing]])[0], terms.of_points()
+    terms = Terms(logs, background.together, every, ~every, len(every) * background.shares.shape[-1], tests - most)
+    return log10_nfa([terms], most / math.log(10), [[background.fixing]])[0], terms.of_points()
 
 
 class Known(NamedTuple):
@@ -125,16 +125,16 @@ class Known(NamedTuple):
     bound: float
 
 
-def noise_of(seen: Array, bearings: Array, pixel: Array) -> float:
+def noise_of(directions: Array, bearings: Array, pixel: Array) -> float:
     """Return the standard deviation of matches, pixels; NaN if the matches are too few.
 
     Args:
-        seen: (k, 3) directions in the camera's frame.
+        directions: (k, 3) directions in the camera's frame.
         bearings: (k, 3) of the image points.
         pixel: (k,) angle of a pixel, radians.
     """
-    free = 2 * len(seen) - 3
-    return float(np.linalg.norm((bearings - seen) / pixel[:, None])) / math.sqrt(free) if free > 0 else math.nan
+    free = 2 * len(directions) - 3
+    return float(np.linalg.norm((bearings - directions) / pixel[:, None])) / math.sqrt(free) if free > 0 else math.nan
 
 
 def prior_information(problem: Problem) -> Array:
@@ -143,11 +143,11 @@ def prior_information(problem: Problem) -> Array:
     return model.information(model.state(np.eye(3)))
 
 
-def how_well_known(seen: Array, bearings: Array, pixel: Array, information: Array | None = None) -> Known:
+def how_well_known(directions: Array, bearings: Array, pixel: Array, information: Array | None = None) -> Known:
     """Compute the uncertainty of a rotation that was fitted to matches.
 
     Args:
-        seen: (k, 3) directions in the camera.
+        directions: (k, 3) directions in the camera.
         bearings: (k, 3) of the image points.
         pixel: (k,) angle of a pixel, radians.
         information: (3, 3) of a prior of the rotation; None without.
@@ -156,7 +156,7 @@ def how_well_known(seen: Array, bearings: Array, pixel: Array, information: Arra
         Covariance (3, 3), NaN if the matches do not fix the rotation, and its bound.
     """
     unit = pixel[:, None]
-    return uncertainty_of((bearings - seen) / unit, _by_rotation(seen) / unit[:, None], information)
+    return uncertainty_of((bearings - directions) / unit, _by_rotation(directions) / unit[:, None], information)
 
 
 def uncertainty_of(residual: Array, jacobian: Array, information: Array | None = None) -> Known:
@@ -182,19 +182,19 @@ def uncertainty_of(residual: Array, jacobian: Array, information: Array | None =
     return Known(student_factor(free) * covariance, exceeded_once(covariance[:3, :3], float(free)))
 
 
-def _by_rotation(seen: Array) -> Array:
+def _by_rotation(directions: Array) -> Array:
     """Return the derivatives (k, 3, 3) of directions (k, 3) by a rotation."""
     state = ROTATION.state(np.eye(3))
-    return ROTATION.jacobian(state, ROTATION.sight(state, seen))
+    return ROTATION.jacobian(state, ROTATION.sight(state, directions))
 
 
-def strain_of(seen: Array, bearings: Array, pixel: Array, all_bearings: Array) -> float:
+def strain_of(directions: Array, bearings: Array, pixel: Array, all_bearings: Array) -> float:
     """Return the largest shift of an image point by the strain that the residuals of matches show, pixels.
 
     A strain, f ~ (I + S) f, is another focal length or another error of the camera model.
 
     Args:
-        seen: (k, 3) directions of the matches in the camera's frame.
+        directions: (k, 3) directions of the matches in the camera's frame.
         bearings: (k, 3) of their image points.
         pixel: (k,) angle of a pixel, radians.
         all_bearings: (m, 3) of all image points.
@@ -203,19 +203,19 @@ def strain_of(seen: Array, bearings: Array, pixel: Array, all_bearings: Array) -
         Shift in pixels; 0 if no strain is significant.
     """
     weight = np.repeat(1 / pixel, 3)[:, None]
-    cross = _by_rotation(seen).reshape(-1, 3)
-    residual = (bearings - seen).ravel() * weight[:, 0]
+    cross = _by_rotation(directions).reshape(-1, 3)
+    residual = (bearings - directions).ravel() * weight[:, 0]
 
     def moved(points: Array) -> Array:
         """Return the derivatives (k, 3, 5) of points by each strain."""
         stretched = np.einsum("sab,kb->kas", STRAINS, points)
         return stretched - points[:, :, None] * np.einsum("ka,kas->ks", points, stretched)[:, None]
 
-    design = np.concatenate([cross, moved(seen).reshape(-1, len(STRAINS))], 1) * weight
+    design = np.concatenate([cross, moved(directions).reshape(-1, len(STRAINS))], 1) * weight
     size = np.linalg.norm(design, axis=0)
     solution, _, rank, _ = np.linalg.lstsq(design / size, residual, 1e-6)
     before, after = float(residual @ residual), float(((residual - design / size @ solution) ** 2).sum())
-    added, free = int(rank) - 3, 2 * len(seen) - int(rank)
+    added, free = int(rank) - 3, 2 * len(directions) - int(rank)
     if not (added > 0 and free > 0 and after > 0):
         return 0.0
     if fdtrc(added, free, (before - after) / added / (after / free)) >= PRECISION.exceeded:

@@ -58,7 +58,7 @@ class Sight(NamedTuple):
         image: Image points.
         catalogue: Directions with their neighbours.
         sky: Directions for look-up.
-        known: Constants of the number of false alarms.
+        background: Constants of the number of false alarms.
         reach: Largest distance of a match, pixels.
         density: Median density of the directions, per steradian.
         sample: Indices of the sample of image points.
@@ -70,7 +70,7 @@ class Sight(NamedTuple):
     image: Image
     catalogue: Catalogue
     sky: Sky
-    known: Background
+    background: Background
     reach: float
     density: float
     sample: Labels
@@ -232,8 +232,8 @@ def _matches(sight: Sight, found: Hypotheses) -> tuple[Array, Array, Array]:
     """
     assert found.matches is not None
     matched = np.flatnonzero(found.matches[0] >= 0)
-    seen = sight.catalogue.directions[found.matches[0, matched]] @ found.rotation[0].T
-    return seen, sight.image.bearings[matched], sight.image.pixel[matched]
+    directions = sight.catalogue.directions[found.matches[0, matched]] @ found.rotation[0].T
+    return directions, sight.image.bearings[matched], sight.image.pixel[matched]
 
 
 class RotationPoses:
@@ -431,8 +431,8 @@ def _fitted(
     """
     image, settings, m = sight.image, sight.settings, len(sight.image.bearings)
     two, weight = image.bearings[[near[0], farthest]], image.pixel[[near[0], farthest]] ** -2.0
-    known = weight.sum() * np.eye(3) - (weight[:, None] * two).T @ two
-    state, scratch = Fit(rotation, known, np.full(m, -1), np.full(m, np.inf)), np.empty((4, 3))
+    background = weight.sum() * np.eye(3) - (weight[:, None] * two).T @ two
+    state, scratch = Fit(rotation, background, np.full(m, -1), np.full(m, np.inf)), np.empty((4, 3))
     fit(image, near, sight.sky, sight.reach, settings.rounds, state, scratch)
     nats = fit(image, some, sight.sky, sight.reach, settings.last_rounds, state, scratch)
     best = 0.0 if found.evidence is None else max(settings.contests * float(found.evidence[0]) * len(some) / m, 0.0)
@@ -448,7 +448,7 @@ def _fitted(
     squared = np.where(match >= 0, state.squared, np.inf)
     fraction = sight.problem.log10_prior_fraction(rotation, np.zeros(3))
     density = sight.densities(match) / sight.odds(match)
-    alarms, nats_of_points = log10_false_alarms(squared, density, sight.known, fraction)
+    alarms, nats_of_points = log10_false_alarms(squared, density, sight.background, fraction)
     return Hypotheses.from_poses(
         rotation[None],
         np.zeros((1, 3)),
@@ -503,12 +503,12 @@ def _judge(found: Hypotheses, sight: Sight, iterations: int) -> SearchResult:
     missed = log10_missed(iterations, count, min(least, count), sight.settings.power)
     if missed > verdict_settings.missed:
         return result.add_objection(objection("incomplete", what="rotation", probability=reasons.number(missed)))
-    seen, bearings, pixel = _matches(sight, found)
+    directions, bearings, pixel = _matches(sight, found)
     some = np.linspace(0, len(hit) - 1, min(len(hit), sight.settings.strained)).astype(np.int64)
-    strain = strain_of(seen[some], bearings[some], pixel[some], sight.image.bearings)
+    strain = strain_of(directions[some], bearings[some], pixel[some], sight.image.bearings)
     if strain > sight.reach:
         return result.add_objection(objection("other_camera_by_pixels", pixels=strain))
-    bound = how_well_known(seen, bearings, pixel, information=prior_information(sight.problem)).bound
+    bound = how_well_known(directions, bearings, pixel, information=prior_information(sight.problem)).bound
     if not math.isfinite(bound):
         return result.add_objection(objection("rotation_not_fixed", count=len(hit), what="it"))
     return replace(result, reason=reasons.confident(alarms, verdict_settings.margin, math.degrees(bound)))

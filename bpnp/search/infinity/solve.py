@@ -80,7 +80,7 @@ def prepare_directions(
     directions: Any,
     cameras: Sequence[Any],
     unknown: list[UnknownCamera] | None,
-    known: Mapping[str, Any],
+    point_options: Mapping[str, Any],
     options: Options,
     *,
     camera_rotations: list[Array] | None = None,
@@ -95,7 +95,7 @@ def prepare_directions(
         cameras: Camera of each of them; None without one.
         unknown: Cameras with an unknown focal length; None if it is known. All have the same factor of the focal length
             of their reference.
-        known: Lists of `labels2d` and `scores2d`, one array or None per camera; `labels3d` and `scores3d`.
+        point_options: Lists of `labels2d` and `scores2d`, one array or None per camera; `labels3d` and `scores3d`.
         options: Options of the search.
         camera_rotations: (3, 3) rotations cam_from_rig of the cameras of a rig; None for one camera.
         prior: Prior of the rotation. Its translation is ignored.
@@ -120,8 +120,8 @@ def prepare_directions(
             )
             images.append(image)
             annotations.append(
-                checked_labels(known["labels2d"][k], known["labels3d"], (len(image), len(scene)))
-                | {"scores2d": checked_scores("scores2d", known["scores2d"][k], len(image))}
+                checked_labels(point_options["labels2d"][k], point_options["labels3d"], (len(image), len(scene)))
+                | {"scores2d": checked_scores("scores2d", point_options["scores2d"][k], len(image))}
             )
     check_points("points3d", scene, (3,), INFINITY.fewest)
     hint = "divide by the lengths, or leave out `at_infinity` for points of a scene"
@@ -135,7 +135,7 @@ def prepare_directions(
         scene,
         labels3d=annotations[0].get("labels3d"),
         classes3d=annotations[0].get("classes3d"),
-        scores3d=checked_scores("scores3d", known["scores3d"], len(scene)),
+        scores3d=checked_scores("scores3d", point_options["scores3d"], len(scene)),
         clutter=options.clutter,
         prior=prior._replace(translation=None) if isinstance(prior, PosePrior) else prior,
         **joined,
@@ -285,11 +285,11 @@ def _solve(sky: Sky, options: Options, settings: InfinitySettings = INFINITY) ->
     found = result.candidates
     if found.matches is None:
         return solution
-    seen = [scene @ rotation.T for rotation in found.rotation]
+    rotated = [scene @ rotation.T for rotation in found.rotation]
     hit = np.flatnonzero(found.matches[0] >= 0)
-    residual = noise_of(seen[0][found.matches[0, hit]], every[hit], pixel[hit])
+    residual = noise_of(rotated[0][found.matches[0, hit]], every[hit], pixel[hit])
     threshold = inlier_threshold or MATCHES.reach * residual * float(median_pixel[one] * per_radian[one])
-    pairs, counts = [], np.zeros(len(seen), np.int64)
+    pairs, counts = [], np.zeros(len(rotated), np.int64)
     for k in np.unique(owner).tolist():
         own = np.flatnonzero(owner == k)
 
@@ -297,17 +297,17 @@ def _solve(sky: Sky, options: Options, settings: InfinitySettings = INFINITY) ->
             return problem.may_match(own[i], j)
 
         radius = threshold / float(per_radian[k])
-        i, j = one_to_one(every[own], seen[0], radius, may_match).T
+        i, j = one_to_one(every[own], rotated[0], radius, may_match).T
         pairs.append(np.stack([own[i], j], -1))
-        counts += [len(i), *(count_one_to_one(every[own], each, radius, may_match) for each in seen[1:])]
+        counts += [len(i), *(count_one_to_one(every[own], each, radius, may_match) for each in rotated[1:])]
     i, j = np.concatenate(pairs).T
     matches = np.stack([usable[i], j], -1)
     if sky.unknown is None:
         information = prior_information(problem)
-        covariance = how_well_known(seen[0][j], every[i], pixel[i], information=information).covariance
+        covariance = how_well_known(rotated[0][j], every[i], pixel[i], information=information).covariance
     else:
         covariance = _with_focal_length(sky, found.rotation[0], matches)
-    angles = angles_between(every[i], seen[0][j])
+    angles = angles_between(every[i], rotated[0][j])
     solution = add_pose(
         solution,
         result,

@@ -296,8 +296,8 @@ def image_equations(
                 weight = 1 / np.sqrt(1 + (residual**2).sum(-1) / robust**2)
             parts.append(normal_equations(np.nan_to_num(jacobian, nan=0.0), residual, weight))
         products, gradient, cost, matched = (sum(each[1:], each[0]) for each in zip(*parts, strict=True))
-        known, pull = model.lens_prior(state)
-        return Equations(products + scale**2 * known, gradient + scale**2 * pull, cost, matched)
+        information, pull = model.lens_prior(state)
+        return Equations(products + scale**2 * information, gradient + scale**2 * pull, cost, matched)
 
     return linearise
 
@@ -392,8 +392,8 @@ def soft_equations(
             count += float(weight.sum()) * len(problem.bearings) / len(used)
         if count <= fewest:
             return None
-        known, pull = model.lens_prior(state)
-        return Equations(products + scale**2 * known, gradient + scale**2 * pull, math.nan, count)
+        information, pull = model.lens_prior(state)
+        return Equations(products + scale**2 * information, gradient + scale**2 * pull, math.nan, count)
 
     return linearise
 

@@ -170,10 +170,10 @@ class RigPoses:
             best = np.argsort(-_agreement(self.rig, rotation, translation), kind="stable")[: RIG.compared]
             rotation, translation = rotation[best], translation[best]
         score = np.array([self.rig.evidence(*pose).sum() for pose in zip(rotation, translation, strict=True)])
-        poses, known = Hypotheses.from_poses(rotation, translation, log_likelihood=score), len(self.starts)
+        poses, earlier = Hypotheses.from_poses(rotation, translation, log_likelihood=score), len(self.starts)
         every = Hypotheses.concatenate([self.starts, poses])
-        order = self._distinct(every, np.r_[np.full(known, BEFORE), score], known + most)[known:]
-        self.starts = every[np.r_[:known, order]]
+        order = self._distinct(every, np.r_[np.full(earlier, BEFORE), score], earlier + most)[earlier:]
+        self.starts = every[np.r_[:earlier, order]]
         self.add_refined(self.rig.candidates(every.rotation[order], every.translation[order]))
 
     def next_local_search(self) -> Step | None:
@@ -249,8 +249,8 @@ class RigPoses:
         result = self._judge()
         if result.verdict == "confident":
             strongest, seen = self._strongest()
-            known = seen.rotation[0], seen.translation[0], float(seen.scale[0])
-            repeated, _ = repeated_poses(self.rig.problems[strongest], *known, self.verdict_settings)
+            pose_and_scale = seen.rotation[0], seen.translation[0], float(seen.scale[0])
+            repeated, _ = repeated_poses(self.rig.problems[strongest], *pose_and_scale, self.verdict_settings)
             unit = self.best.translation[0, 3]
             copies = self.rig.rig_of(strongest, repeated.rotation, repeated.translation, unit)
             self.add_refined(self.rig.candidates(*copies))

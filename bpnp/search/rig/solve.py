@@ -33,7 +33,7 @@ def prepare_rig(
     cameras: Sequence[Any],
     unknown: Sequence[UnknownCamera] | None,
     mounts: Sequence[Pose],
-    known: Mapping[str, Any],
+    point_options: Mapping[str, Any],
     options: Options,
     *,
     prior: Prior | None = None,
@@ -47,7 +47,8 @@ def prepare_rig(
         cameras: Camera of each of them; None for normalised coordinates and bearings.
         unknown: Cameras with an unknown focal length; None if it is known.
         mounts: Extrinsics cam_from_rig of each camera.
-        known: Lists of `labels2d` and `scores2d`, one array or None per camera; `normals3d`, `labels3d`, `scores3d`.
+        point_options: Lists of `labels2d` and `scores2d`, one array or None per camera; `normals3d`, `labels3d` and
+            `scores3d`.
         options: Options of the search.
         prior: Prior of the pose of the rig.
         scale: Estimate the scale of the scene too. Default False.
@@ -60,7 +61,9 @@ def prepare_rig(
         )
     if options.clutter is not None:
         DEFAULT.expecting(options.clutter)  # raises for one that is out of range
-    points = RigPoints(list(points2d), points3d, list(mounts), dict(known), options.clutter, prior, is_metric=not scale)
+    points = RigPoints(
+        list(points2d), points3d, list(mounts), dict(point_options), options.clutter, prior, is_metric=not scale
+    )
     lenses = [None if camera is None else camera_from(camera) for camera in cameras]
     if unknown is None:
         return partial(_solve, points.rig(lenses), options)
@@ -78,7 +81,7 @@ class RigPoints:
     points2d: list[Any]
     points3d: Any
     mounts: list[Pose]
-    known: dict[str, Any]
+    point_options: dict[str, Any]
     clutter: float | None
     prior: Prior | None
     is_metric: bool
@@ -87,7 +90,7 @@ class RigPoints:
         """Return the rig with these cameras, and with the prior of a focal length that is fitted."""
         problems = []
         for k, (image, lens) in enumerate(zip(self.points2d, lenses, strict=True)):
-            arrays = {name: values[k] if name.endswith("2d") else values for name, values in self.known.items()}
+            arrays = {name: values[k] if name.endswith("2d") else values for name, values in self.point_options.items()}
             vertical = self.prior if isinstance(self.prior, GravityPrior) else None  # with it, three points fix a pose
             with about(f"camera {k}"):
                 problem = problem_from(image, self.points3d, lens, prior=vertical, **arrays)

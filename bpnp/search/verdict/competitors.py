@@ -22,7 +22,7 @@ from bpnp.search.verdict.reasons import Objection, objection
 from bpnp.search.verdict.uncertainty import Misfit
 
 Array = NDArray[np.float64]
-Seen = Sequence[tuple[Hypotheses, Problem]]
+CandidatesOfCameras = Sequence[tuple[Hypotheses, Problem]]
 
 
 def other_pose(candidates: Hypotheses, problem: Problem, settings: Evidence) -> Objection | None:
@@ -91,7 +91,7 @@ def other_camera(off: Misfit, settings: Evidence) -> Objection | None:
     return objection("other_camera", camera=other, degrees=math.degrees(off.turn), percent=100 * off.shift)
 
 
-def unrelated_competitor(seen: Seen, settings: Evidence) -> Objection | None:
+def unrelated_competitor(cameras: CandidatesOfCameras, settings: Evidence) -> Objection | None:
     """Return a far candidate whose likelihood is not significantly below that of the first one, or None.
 
     The number of false alarms assumes independent image points. Points on lines or curves are dependent: a pose that
@@ -108,17 +108,17 @@ def unrelated_competitor(seen: Seen, settings: Evidence) -> Objection | None:
     well, at least half as many as it leaves unexplained: both poses then slide along a curve.
 
     Args:
-        seen: Candidates, best first, and points of each camera of a rig; cameras with too few points are left out.
+        cameras: Candidates, best first, and points of each camera of a rig; cameras with too few points are left out.
         settings: Constants of the verdict.
 
     Source: W. Hoeffding, Probability inequalities for sums of bounded random variables, JASA 1963.
     """
     limits, least = settings.contested, 2 * math.log(10) * settings.margin
-    seen = [(candidates, problem) for candidates, problem in seen if len(problem.image.chosen) >= least]
-    if not seen:
+    cameras = [(candidates, problem) for candidates, problem in cameras if len(problem.image.chosen) >= least]
+    if not cameras:
         return None
-    candidates, problem = seen[0]
-    poses, chosen = (candidates.rotation, candidates.translation), sum(len(each.image.chosen) for _, each in seen)
+    candidates, problem = cameras[0]
+    poses, chosen = (candidates.rotation, candidates.translation), sum(len(each.image.chosen) for _, each in cameras)
     others = np.flatnonzero(~problem.same_pose(*poses, settings.same.times(limits.far)))
     # A margin that is significant even with the largest possible gaps needs no test.
     decisive = limits.most * math.sqrt(least * chosen) / math.log(10)
@@ -126,9 +126,9 @@ def unrelated_competitor(seen: Seen, settings: Evidence) -> Objection | None:
     if not len(others):
         return None
     scales = np.maximum(candidates.scale, problem.image.scales[0])
-    best, first = _explained(seen, 0, scales[0], MATCHES.reach)
+    best, first = _explained(cameras, 0, scales[0], MATCHES.reach)
     for k in others.tolist():
-        evidence, other = _explained(seen, k, scales[k], MATCHES.reach)
+        evidence, other = _explained(cameras, k, scales[k], MATCHES.reach)
         gap = best - evidence
         squared = float((gap**2).sum())
         if float(np.abs(gap).sum()) ** 2 < least * squared:
@@ -160,36 +160,36 @@ class _Partners(NamedTuple):
     near: NDArray[np.bool_]
 
 
-def _explained(seen: Seen, k: int, scale: float, near: float) -> tuple[Array, _Partners]:
+def _explained(cameras: CandidatesOfCameras, k: int, scale: float, near: float) -> tuple[Array, _Partners]:
     """Return the evidence of the image points of all cameras for candidate k, and their correspondences.
 
     Args:
-        seen: Candidates and points of each camera.
+        cameras: Candidates and points of each camera.
         k: Index of the candidate.
         scale: Scale of the residuals, radians.
         near: Reach of a correspondence, in scales.
     """
-    poses = [(problem, candidates.rotation[k], candidates.translation[k], scale) for candidates, problem in seen]
+    poses = [(problem, candidates.rotation[k], candidates.translation[k], scale) for candidates, problem in cameras]
     parts = zip(*(_partners(near, *pose) for pose in poses), strict=True)
     return np.concatenate([own_evidence(*pose) for pose in poses]), _Partners(*map(np.concatenate, parts))
 
 
 def _partners(near: float, problem: Problem, rotation: Array, translation: Array, scale: float) -> _Partners:
-    seen, chosen = directions_of(problem, rotation, translation), problem.image.chosen
+    directions, chosen = directions_of(problem, rotation, translation), problem.image.chosen
     chord, points = np.full(len(chosen), np.inf), np.full(len(chosen), -1)
     if problem.labelled_pairs is not None:
         i, j = problem.labelled_pairs
-        distance = np.linalg.norm(problem.bearings[chosen[i]] - seen[j], axis=-1)
+        distance = np.linalg.norm(problem.bearings[chosen[i]] - directions[j], axis=-1)
         distance = np.where(distance < near * scale, distance, np.inf)  # infinite for unseen points too
         order = np.lexsort((distance, i))
         rows, first = np.unique(i[order], return_index=True)
         chord[rows] = distance[order][first]
         points[rows] = np.where(np.isfinite(chord[rows]), j[order][first], -1)
         return _Partners(points, problem.points3d[points] @ rotation.T + translation, np.isfinite(chord))
-    for rows, columns in label_groups(chosen, problem.labels2d, problem.labels3d, len(seen)):
-        ahead = columns[np.isfinite(seen[columns, 0])]
+    for rows, columns in label_groups(chosen, problem.labels2d, problem.labels3d, len(directions)):
+        ahead = columns[np.isfinite(directions[columns, 0])]
         if len(ahead):
             bearings = problem.bearings[chosen[rows]]
-            chord[rows], nearest = cKDTree(seen[ahead]).query(bearings, distance_upper_bound=near * scale)
+            chord[rows], nearest = cKDTree(directions[ahead]).query(bearings, distance_upper_bound=near * scale)
             points[rows] = np.r_[ahead, -1][nearest]
     return _Partners(points, problem.points3d[points] @ rotation.T + translation, np.isfinite(chord))

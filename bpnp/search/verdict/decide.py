@@ -24,7 +24,13 @@ from bpnp.search.problem import Problem
 from bpnp.search.propose.repetitions import registered
 from bpnp.search.propose.symmetries import Motions
 from bpnp.search.verdict import reasons
-from bpnp.search.verdict.competitors import Seen, other_camera, other_pose, rough_residuals, unrelated_competitor
+from bpnp.search.verdict.competitors import (
+    CandidatesOfCameras,
+    other_camera,
+    other_pose,
+    rough_residuals,
+    unrelated_competitor,
+)
 from bpnp.search.verdict.completeness import log10_missed
 from bpnp.search.verdict.false_alarms import alarms_of
 from bpnp.search.verdict.reasons import CLAUSES, CONFIDENT, Objection, focal_length_not_fixed, objection
@@ -218,7 +224,7 @@ def judge(
     local_searches: float | int = 0,
     exhaustive: bool = False,
     settings: Evidence = DEFAULT.evidence,
-    rig: Seen = (),
+    rig: CandidatesOfCameras = (),
 ) -> SearchResult:
     """Compute the verdict on the candidates.
 
@@ -244,8 +250,8 @@ def judge(
         return result.add_objection(objection("chance", what="no pose fits"), "failed")
     unseen = -math.inf if exhaustive else missed(candidates, problem, local_searches, settings)
     # Costly tests run only if the verdict depends on them.
-    seen = rig or [(candidates, problem)]
-    against = [*(other_pose(*each, settings) for each in seen), rough_residuals(candidates)]
+    per_camera = rig or [(candidates, problem)]
+    against = [*(other_pose(*each, settings) for each in per_camera), rough_residuals(candidates)]
     certain = alarms <= settings.false_alarms and unseen <= settings.missed
     off = share = math.nan
     if certain and all(one is None or one.margin >= settings.margin for one in against):
@@ -259,7 +265,7 @@ def judge(
             return result.add_objection(focal_length_not_fixed(share))
         against += [
             other_camera(systematic_misfit(linear, count, settings), settings),
-            unrelated_competitor(seen, settings),
+            unrelated_competitor(per_camera, settings),
         ]
     objections = [one for one in against if one is not None and one.margin < settings.margin]
     if certain and not objections:

@@ -115,7 +115,7 @@ def log10_nfa(
     counts = {count for way in fixing for count in way}
     none = np.zeros(2)
     each = [{count: none if one is None else one.evidence(count) for count in counts} for one in cameras]
-    ways = [sum((known[count] for known, count in zip(each, way, strict=True)), none) for way in fixing]
+    ways = [sum((logs_of[count] for logs_of, count in zip(each, way, strict=True)), none) for way in fixing]
     own, rough = log10_tests - np.min(ways, 0) / math.log(10)
     return float(own), float(rough)
 
@@ -141,8 +141,8 @@ def alarms_of(problem: Problem, rotations: Array, translations: Array, scales: A
 
     >>> import numpy as np
     >>> points = np.random.default_rng(0).uniform(-1, 1, (12, 3))
-    >>> seen = points + [0, 0, 6]
-    >>> problem = Problem(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
+    >>> in_camera = points + [0, 0, 6]
+    >>> problem = Problem(in_camera / np.linalg.norm(in_camera, axis=1, keepdims=True), points)
     >>> alarms = alarms_of(problem, np.stack([np.eye(3)] * 2), np.array([[0.0, 0, 6], [0.3, 0, 5]])).own
     >>> bool(alarms[0] < -10), bool(alarms[1] > 0)
     (True, True)
@@ -155,11 +155,11 @@ def alarms_of(problem: Problem, rotations: Array, translations: Array, scales: A
     none = np.maximum(tests + fraction, 0.0)
     result = Alarms(none, none.copy())
     for k in range(len(none)):
-        seen = directions_of(problem, rotations[k], translations[k])
+        directions = directions_of(problem, rotations[k], translations[k])
         # Fewer tests at a scale add evidence by their ratio to all tests; a prior leaves at least one test.
         fewer = math.log(10) * (np.maximum(cells + fraction[k], 0.0) - none[k])
         scale = None if scales is None else float(scales[k])
-        terms = camera_terms(problem, seen, scale, fewer=fewer)
+        terms = camera_terms(problem, directions, scale, fewer=fewer)
         result.own[k], result.rough[k] = log10_nfa([terms], float(none[k]), model.fixing_ways())
     return Alarms(result.own + problem.log10_views, result.rough + problem.log10_views)
 
@@ -168,32 +168,32 @@ def directions_of(problem: Problem, rotation: Array, translation: Array) -> Arra
     """Return unit directions (n, 3) in the camera's frame; NaN for points at the camera centre or facing away."""
     camera = problem.points3d @ rotation.T + translation
     length = np.linalg.norm(camera, axis=-1, keepdims=True)
-    seen = np.divide(camera, length, out=np.full_like(camera, np.nan), where=length > 0)
+    directions = np.divide(camera, length, out=np.full_like(camera, np.nan), where=length > 0)
     if problem.normals3d is not None:
-        seen[~faces(problem.normals3d, problem.cosines3d, camera, rotation)] = np.nan
-    return seen
+        directions[~faces(problem.normals3d, problem.cosines3d, camera, rotation)] = np.nan
+    return directions
 
 
 def camera_terms(
-    problem: Problem, seen: Array, scale: float | None = None, *, fewer: Array | float = 0.0
+    problem: Problem, directions: Array, scale: float | None = None, *, fewer: Array | float = 0.0
 ) -> Terms | None:
     """Return the evidence of one camera.
 
     Args:
         problem: Points of the problem.
-        seen: (n, 3) unit directions of the scene points, NaN for those that are not seen.
+        directions: (n, 3) unit directions of the scene points, NaN for those that are not seen.
         scale: Scale of the residuals, radians; None counts all scales as the pose's own.
         fewer: (S,) log of the number of tests at each scale of the image, over the number of all.
 
     Returns:
         Terms from the finest own scale on; None if no more points are seen than fix the pose.
     """
-    if min(len(problem.bearings), int(np.isfinite(seen[:, 0]).sum())) <= PoseModel.of(problem).fixing:
+    if min(len(problem.bearings), int(np.isfinite(directions[:, 0]).sum())) <= PoseModel.of(problem).fixing:
         return None
     ratio = np.ones(len(problem.image.scales)) if scale is None else _ratio(problem.image, scale)
     own, rough = _is_own(ratio), ratio >= ALARMS.rough
     finest = int(own.argmax())
-    logs, less = _terms(problem, seen, finest), np.broadcast_to(fewer, own.shape)[finest:]
+    logs, less = _terms(problem, directions, finest), np.broadcast_to(fewer, own.shape)[finest:]
     pairs = len(own) * logs.shape[2]
     return Terms(logs, problem.image.together[:, finest:], own[finest:], rough[finest:], pairs, less)
 
@@ -248,11 +248,12 @@ def _shares(problem: Problem) -> Array:
     return np.asarray(np.clip(shares, ALARMS.least_inliers, ALARMS.most_inliers))
 
 
-def _terms(problem: Problem, seen: Array, finest: int) -> Array:
+def _terms(problem: Problem, directions: Array, finest: int) -> Array:
     """Return log x_i / c_i (k, S', W), clumps weighted, at the scales from index `finest` on."""
     image = problem.image
     return np.asarray(
-        image.weights[:, finest:, finest:] @ point_evidence(problem, seen, image.scales[finest:], _shares(problem))
+        image.weights[:, finest:, finest:]
+        @ point_evidence(problem, directions, image.scales[finest:], _shares(problem))
     )
 
 
@@ -269,30 +270,30 @@ def sum_of_largest(values: Array, count: int) -> Array:
     return total
 
 
-def point_evidence(problem: Problem, seen: Array, scales: Array, shares: Array, *, even: bool = False) -> Array:
+def point_evidence(problem: Problem, directions: Array, scales: Array, shares: Array, *, even: bool = False) -> Array:
     """Return log x_i (k, S, W) of each chosen image point.
 
     Args:
         problem: Points of the problem.
-        seen: (n, 3) unit directions of the scene points, NaN for those that are not seen.
+        directions: (n, 3) unit directions of the scene points, NaN for those that are not seen.
         scales: (S,) scales s of the residuals, radians.
         shares: (W,) fractions w of image points with a correspondence, or (k, 1, W).
-        even: Assume that unrelated image points fall evenly over the view instead of with the density of `seen`.
+        even: Assume that unrelated image points fall evenly over the view instead of with the density of `directions`.
     """
     image = problem.image
-    predicted, smooth, inside, every = _sums(problem, seen, scales, even)
+    predicted, smooth, inside, every = _sums(problem, directions, scales, even)
     # A point without possible correspondences has no density; it counts as one with no scene point near.
     density = (np.where(every > 0, every, 1) if even else np.maximum(inside, 1)) / image.solid_angle
     ratio = predicted / (2 * math.pi * scales**2 * np.maximum(density, smooth)[:, None])
     return np.asarray(np.log1p(shares * (ratio - 1)[:, :, None]))
 
 
-def _sums(problem: Problem, seen: Array, scales: Array, even: bool) -> tuple[Array, Array, Array, Array]:
+def _sums(problem: Problem, directions: Array, scales: Array, even: bool) -> tuple[Array, Array, Array, Array]:
     """Sum kernels and counts over the possible correspondences of each chosen image point.
 
     Args:
         problem: Points of the problem, with k chosen image points.
-        seen: (n, 3) directions in which the scene points are seen; NaN for those that are not.
+        directions: (n, 3) directions in which the scene points are seen; NaN for those that are not.
         scales: (S,) standard deviations of the kernels, radians.
         even: Leave the outline out.
 
@@ -300,18 +301,18 @@ def _sums(problem: Problem, seen: Array, scales: Array, even: bool) -> tuple[Arr
         Kernels (k, S); density of the outline (k,), 0 if `even`; number in view (k,) and of all (k,).
     """
     image, count = problem.image, len(problem.image.chosen)
-    weight = np.ones(len(seen)) if problem.scores3d is None else problem.scores3d / problem.scores3d.mean()
-    in_view, ahead = np.zeros(len(seen), np.bool_), np.flatnonzero(np.isfinite(seen[:, 0]))
-    across = (np.abs((seen[ahead] - image.centre) @ image.axes) <= image.half_widths).all(-1)
-    in_view[ahead] = across & (seen[ahead] @ image.centre > 0)
+    weight = np.ones(len(directions)) if problem.scores3d is None else problem.scores3d / problem.scores3d.mean()
+    in_view, ahead = np.zeros(len(directions), np.bool_), np.flatnonzero(np.isfinite(directions[:, 0]))
+    across = (np.abs((directions[ahead] - image.centre) @ image.axes) <= image.half_widths).all(-1)
+    in_view[ahead] = across & (directions[ahead] @ image.centre > 0)
     if problem.labelled_pairs is not None:
-        return _sums_of_pairs(problem, *problem.labelled_pairs, seen, weight, in_view, scales, even)
+        return _sums_of_pairs(problem, *problem.labelled_pairs, directions, weight, in_view, scales, even)
     predicted, smooth, inside, every = np.zeros((count, len(scales))), np.zeros(count), np.zeros(count), np.zeros(count)
     for rows, columns, odds, share in _partners(problem, weight):
-        ahead = np.isfinite(seen[columns, 0])
+        ahead = np.isfinite(directions[columns, 0])
         every[rows] += odds * share.sum()
         inside[rows] += odds * share[in_view[columns]].sum()
-        used, share, bearings = seen[columns][ahead], share[ahead], problem.bearings[image.chosen[rows]]
+        used, share, bearings = directions[columns][ahead], share[ahead], problem.bearings[image.chosen[rows]]
         near = sums_near(bearings, used, image.axes, ALARMS.farthest * scales, 0.5 / scales**2, share)
         predicted[rows] += odds[:, None] * near
         if not even:
@@ -323,7 +324,7 @@ def _sums_of_pairs(
     problem: Problem,
     i: Labels,
     j: Labels,
-    seen: Array,
+    directions: Array,
     weight: Array,
     in_view: NDArray[np.bool_],
     scales: Array,
@@ -332,9 +333,9 @@ def _sums_of_pairs(
     """Compute `_sums` over given pairs (p,) of a chosen image point and a scene point."""
     count = len(problem.image.chosen)
     every, inside = (np.asarray(np.bincount(i, of[j], count), np.float64) for of in (weight, weight * in_view))
-    ahead = np.isfinite(seen[j, 0])
+    ahead = np.isfinite(directions[j, 0])
     i, j = i[ahead], j[ahead]
-    squared = ((problem.bearings[problem.image.chosen[i]] - seen[j]) ** 2).sum(-1)
+    squared = ((problem.bearings[problem.image.chosen[i]] - directions[j]) ** 2).sum(-1)
     near = (np.where(squared < (ALARMS.farthest * s) ** 2, np.exp(-0.5 * squared / s**2), 0.0) for s in scales.tolist())
     predicted = np.stack([np.bincount(i, weight[j] * kernel, count) for kernel in near], -1)
     width2 = (ALARMS.outline * problem.image.spread) ** 2

@@ -94,10 +94,10 @@ def confident(log10_false_alarms: float, margin: float, bound_deg: float, focal:
         >>> confident(-9.1, 3.0, 5.2, 0.634)
         'No competing pose within 3 decades; log10 NFA -9.1; rotation known to 5 deg, focal length to 63 % (99.9 %)'
     """
-    known = f"rotation known to {rounded(bound_deg)} deg"
+    precision = f"rotation known to {rounded(bound_deg)} deg"
     if focal:
-        known += f", focal length to {rounded(100 * focal)} %"
-    return f"No competing pose within {margin:g} decades; {nfa(log10_false_alarms)}; {known} (99.9 %)"
+        precision += f", focal length to {rounded(100 * focal)} %"
+    return f"No competing pose within {margin:g} decades; {nfa(log10_false_alarms)}; {precision} (99.9 %)"
 
 
 def insignificant(log10_false_alarms: float, most: float) -> str:
