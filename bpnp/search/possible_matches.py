@@ -44,8 +44,8 @@ def possible_matches(
         most: Largest number of neighbours of an image point.
 
     Returns:
-        Index (k,) into `chosen`, index (k,) into `directions` and density (k,) of each match; and the total density (m,)
-        of each image point, which includes that of no correspondence.
+        Index (k,) into `chosen`, index (k,) into `directions` and density (k,) of each match; and the total density
+        (m,) of each image point, which includes that of no correspondence.
     """
     bearings, reach = problem.bearings[chosen], MATCHES.farthest * scale
     if len(bearings) * len(directions) <= MATCHES.dense:
