@@ -431,8 +431,8 @@ def _fitted(
     """
     image, settings, m = sight.image, sight.settings, len(sight.image.bearings)
     two, weight = image.bearings[[near[0], farthest]], image.pixel[[near[0], farthest]] ** -2.0
-    background = weight.sum() * np.eye(3) - (weight[:, None] * two).T @ two
-    state, scratch = Fit(rotation, background, np.full(m, -1), np.full(m, np.inf)), np.empty((4, 3))
+    information = weight.sum() * np.eye(3) - (weight[:, None] * two).T @ two
+    state, scratch = Fit(rotation, information, np.full(m, -1), np.full(m, np.inf)), np.empty((4, 3))
     fit(image, near, sight.sky, sight.reach, settings.rounds, state, scratch)
     nats = fit(image, some, sight.sky, sight.reach, settings.last_rounds, state, scratch)
     best = 0.0 if found.evidence is None else max(settings.contests * float(found.evidence[0]) * len(some) / m, 0.0)
