@@ -48,8 +48,8 @@ class Pinhole:
 
     @property
     def focal(self) -> float:
-        """Focal length in pixels: the geometric mean of both axes."""
-        return float(np.sqrt(abs(np.linalg.det(self.matrix[:2, :2]))))
+        """Focal length in pixels: the mean of both axes."""
+        return float(np.abs(np.diag(self.matrix)[:2]).mean())
 
     def normalise(self, pixels: Array) -> Array:
         """Convert pixels (k, 2) to normalised image coordinates (k, 2)."""
@@ -76,13 +76,12 @@ class Lens:
 
     @property
     def focal(self) -> float:
-        """Focal length in pixels: the geometric mean of both axes, as for a `Pinhole`.
+        """Focal length in pixels: the mean of both axes, as in pycolmap.
 
         For a model without focal length (equirectangular) it is the scale at the principal ray.
         """
-        focals = np.asarray(self.camera.params, np.float64)[list(self.camera.focal_length_idxs())]
-        if len(focals):
-            return float(np.prod(np.abs(focals)) ** (1 / len(focals)))
+        if len(self.camera.focal_length_idxs()):
+            return float(self.camera.mean_focal_length())
         step = 1e-4
         axis, off_axis = self.camera.img_from_cam(np.array([[0.0, 0.0, 1.0], [step, 0.0, 1.0]]))
         return float(np.linalg.norm(off_axis - axis) / step)

@@ -182,7 +182,7 @@ class Solution:
 
     @property
     def focal_length(self) -> float:
-        """Focal length of `camera`, pixels: the geometric mean of both axes; NaN without a camera."""
+        """Focal length of `camera`, pixels: the mean of both axes; NaN without a camera."""
         return math.nan if self.camera is None else self.camera.focal
 
     @property
