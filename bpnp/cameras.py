@@ -484,3 +484,20 @@ def _pinhole(values: Any) -> Pinhole:
             "of the scene with z forward and y down in the camera"
         )
     return Pinhole(matrix)
+
+
+def check_single_camera(points_per_camera: Sequence[int] | None, what: str) -> None:
+    """Refuse the solution of a rig.
+
+    Args:
+        points_per_camera: Number of 2D points of each camera of a rig; None for a single camera.
+        what: What would be made of the solution, for the message.
+
+    Raises:
+        ValueError: The solution is that of a rig.
+    """
+    if points_per_camera is not None:
+        raise ValueError(
+            f"the solution of a rig of {len(points_per_camera)} cameras cannot become {what}; pass the pose of each "
+            "camera, which is cam_from_rig times the pose of the rig, to `bpnp.verify`, and use those solutions"
+        )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from bpnp.cameras import in_front
+from bpnp.cameras import check_single_camera, in_front
 from bpnp.report.figures import plot_matches
 from bpnp.report.points import ProblemPoints
 from bpnp.report.terminal import VERDICTS
@@ -32,8 +32,9 @@ def solution_points(solution: Solution, *, title: str | None = None) -> ProblemP
         title: First line of the caption; None for a caption without title.
 
     Raises:
-        ValueError: A match has no point.
+        ValueError: A match has no point, or the solution is that of a rig, which has several images.
     """
+    check_single_camera(solution.points_per_camera, "a picture of one image")
     shown = "no match"
     if len(solution.matches):
         share, error = f"{100 * solution.inlier_ratio:.0f} %", f"{solution.reprojection_error:.3g} {solution.unit}"
@@ -94,6 +95,9 @@ def draw_solution(solution: Solution, *, title: str | None = None, photo: Any = 
 
     Returns:
         The figure.
+
+    Raises:
+        ValueError: The solution is that of a rig, which has several images.
     """
     points, colour = solution_points(solution, title=title), VERDICTS[solution.verdict]
     return plot_matches(points, colour=colour, photo=photo, competing=competing_points(solution, points))
@@ -102,7 +106,7 @@ def draw_solution(solution: Solution, *, title: str | None = None, photo: Any = 
 def solution_html(solution: Solution) -> str:
     """Return the text of a solution as HTML, followed by its picture if it has an image point."""
     text = f"<pre style='white-space: pre-wrap'>{escape(repr(solution))}</pre>"
-    if not np.isfinite(solution.points2d).all(-1).any():
+    if solution.points_per_camera is not None or not np.isfinite(solution.points2d).all(-1).any():
         return text
     content = io.BytesIO()
     draw_solution(solution).savefig(content, format="png", dpi=80)

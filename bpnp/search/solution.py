@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 import numpy.typing as npt
 
-from bpnp.cameras import Camera, CameraLike, camera_from, camera_to_json
+from bpnp.cameras import Camera, CameraLike, camera_from, camera_to_json, check_single_camera
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Unit
 from bpnp.search.verdict.decide import SearchResult, Verdict
@@ -116,7 +116,9 @@ class Solution:
         seconds: Run time of this problem. Problems that were solved together count equal parts of their time.
         view: Name of the view of a `SceneMap` near which the pose was found; None without a map.
         point_ids: (n,) ids of `points3d` in the map; None without a map. See `matched_point_ids`.
-        points2d: (m, 2) normalised image coordinates; NaN for an input point that has none.
+        points2d: (m, 2) normalised image coordinates; NaN for an input point that has none. Those of a rig are those of
+            its cameras, one camera after the other.
+        points_per_camera: Number of 2D points of each camera of a rig; None for a single camera.
         points3d: (n, 3) input points.
         normals3d: (n, 3) input normals; None without.
         camera: Input or estimated camera; None for normalised coordinates and bearings.
@@ -148,6 +150,7 @@ class Solution:
     camera: Camera | None = field(default=None, repr=False)
     view: str | None = None
     point_ids: npt.NDArray[np.int64] | None = field(default=None, repr=False)
+    points_per_camera: tuple[int, ...] | None = field(default=None, repr=False)
 
     @property
     def matched_point_ids(self) -> npt.NDArray[np.int64] | None:
@@ -274,12 +277,14 @@ class Solution:
             The folder.
 
         Raises:
-            ValueError: The solution has no pose, the folder has files, the name has spaces, or the camera has skew.
+            ValueError: The solution has no pose or is that of a rig, the folder has files, the name has spaces, or the
+                camera has skew.
         """
         from bpnp.datamodules.colmap.reconstruction import write_image
 
         if not self.found:
             raise ValueError(f"a solution without a pose cannot be exported: {self.reason}")
+        check_single_camera(self.points_per_camera, "a model of one image")
         pose = self.rotation, self.translation / self.scale  # in the unit of the scene
         lens = self.camera if camera is None else camera
         points = self.points2d, self.points3d, self.matches
@@ -470,6 +475,7 @@ READERS: dict[str, Callable[[Any], Any]] = {  # of the fields with another form 
     "points3d": partial(_array, shape=(-1, 3)),
     "normals3d": lambda values: None if values is None else _array(values, shape=(-1, 3)),
     "parameters": tuple,
+    "points_per_camera": lambda values: None if values is None else tuple(values),
     "matches": lambda values: np.array(values, np.int64).reshape(-1, 2),
     "camera": lambda value: None if value is None else camera_from(value),
     "point_ids": lambda values: None if values is None else np.array(values, np.int64),

@@ -1,5 +1,6 @@
 """Rigs: planted poses of two and three cameras that see too little on their own."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -169,3 +170,23 @@ def test_the_prior_of_a_rig_counts_once() -> None:
     assert twice.rotation_std_deg == pytest.approx(sigma, rel=0.05)
     rough = bpnp.solve([images[0]] * 2, scene, CAMERA, rig=[mounts[0]] * 2, time_limit=60)
     assert rough.rotation_std_deg > 10 * sigma
+
+
+def test_a_solution_of_a_rig_is_neither_drawn_nor_exported_as_one_image(tmp_path: Path) -> None:
+    """Each camera alone can be: its pose is cam_from_rig times that of the rig."""
+    images, scene, mounts, _, _ = planted_rig(1, (9, 8))
+    solution = bpnp.solve(images, scene, [CAMERA] * 2, rig=mounts, time_limit=60)
+    assert solution.points_per_camera == (9, 8)
+    assert bpnp.Solution.from_json(solution.to_json()).points_per_camera == (9, 8)
+    with pytest.raises(ValueError, match="a rig of 2 cameras cannot become a model of one image"):
+        solution.to_colmap(tmp_path / "model")
+    assert not (tmp_path / "model").exists()
+    with pytest.raises(ValueError, match="a rig of 2 cameras cannot become a picture of one image"):
+        solution.plot()
+    assert "<img" not in solution._repr_html_()
+    for image, (rotation, translation) in zip(images, mounts, strict=True):
+        pose = rotation @ solution.rotation, rotation @ solution.translation + translation
+        alone = bpnp.verify(image, scene, *pose, CAMERA)
+        assert degrees_between(alone.rotation, pose[0]) < 2
+        alone.to_colmap(tmp_path / f"{len(image)}")
+    assert {folder.name for folder in tmp_path.iterdir()} == {"9", "8"}

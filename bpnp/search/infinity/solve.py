@@ -279,6 +279,7 @@ def _solve(sky: Sky, options: Options, settings: InfinitySettings = INFINITY) ->
         inlier_threshold=math.nan if inlier_threshold is None else inlier_threshold,
         stats=SolutionStats(result.batches, dropped2d=problem.dropped2d),
         points2d=np.concatenate(planes),
+        points_per_camera=None if sky.camera_rotations is None else tuple(map(len, planes)),
         points3d=scene,
         camera=lens if sky.camera_rotations is None or sky.unknown is not None else None,
     )

@@ -181,7 +181,14 @@ def _finished(rig: Rig, problems: Sequence[Problem], result: SearchResult, inlie
     if rig.model.scale:
         parameters = (*parameters, SCALE)
         solution = replace(solution, scale=math.nan)
-    solution = replace(solution, covariance=np.full((len(parameters),) * 2, math.nan), parameters=parameters)
+    solution = replace(
+        solution,
+        covariance=np.full((len(parameters),) * 2, math.nan),
+        parameters=parameters,
+        points2d=np.concatenate([problem.all2d for problem in problems]),
+        points_per_camera=tuple(len(problem.all2d) for problem in problems),
+        stats=replace(solution.stats, dropped2d=sum(problem.dropped2d for problem in problems)),
+    )
     if not len(found):
         return solution
     rotation, translation = found.rotation[0], found.translation[0]
@@ -205,10 +212,8 @@ def _finished(rig: Rig, problems: Sequence[Problem], result: SearchResult, inlie
         moved_by = _about_origin(rig, first.size, centre, shift, 1 / translation[3])
         covariance = student_factor(free) * moved_by @ covariance @ moved_by.T
     _, moved = first.to_user(found.rotation, found.translation[:, :3])
-    points2d = np.concatenate([problem.all2d for problem in problems])
-    dropped = sum(problem.dropped2d for problem in problems)
     return add_pose(
-        replace(solution, points2d=points2d, stats=replace(solution.stats, dropped2d=dropped)),
+        solution,
         result,
         replace(found, translation=np.column_stack([moved, found.translation[:, 3]])),
         counts.tolist(),
