@@ -355,8 +355,8 @@ class InputSettings:
         unit: Largest error of a unit length, of a rotation, and of a sum of probabilities. [1; convention]
         sure: Probability of a class from which on points match only within the class. [probability; not tuned]
         prior_deg: Default standard deviation of a given rotation about each axis. [degrees; convention]
-        one_pixel: Largest coordinate of image points that are refused as normalised coordinates beside a camera in
-            pixels. [pixels; convention]
+        one_pixel: Largest coordinate of image points that are refused as normalised coordinates if a camera in
+            pixels is given. [pixels; convention]
         widest_row: Largest number of columns of an array of keypoints whose first two columns are positions. [columns;
             convention]
         floor_pixels: Smallest noise of an image point; no point detector is more accurate. [pixels; convention]
@@ -446,7 +446,7 @@ class MatchSettings:
         scored: Number of given matches on which the poses of the triples are compared. [matches; cost]
         refined: Number of poses of triples that are refined. [poses; not tuned]
         steps: Steps of a refinement to given matches. [steps; numerics]
-        reweighted: Number of times that the given matches are weighted anew. [rounds; not tuned]
+        reweighted: Number of reweightings of the given matches. [rounds; not tuned]
         wrong: Expected fraction of wrong given matches; `SearchSettings.outliers` is that of points without matches.
             [fraction; not tuned]
         converged: Difference within which refined poses are one optimum, in tolerances of equal poses. [fraction; not

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 Progress = Callable[[int, int, float], None]  # problem index, batches of initial poses so far, seconds
 VIEW_MATCHER, SCENE_MATCHER = "matcher-maps", "matcher-sfm"  # packaged weights for the frames "view" and "any"
-# Seconds, and seconds per 2D or 3D point, of verdict and matching after the search; at most half of a limit.
 
 
 class Options(NamedTuple):

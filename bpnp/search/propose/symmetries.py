@@ -28,8 +28,6 @@ from bpnp.search.kernels.vectors import compiled, part
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-# Neighbours of a point that a base and its matches come from, in scenes up to MANY points, and in larger ones.
-
 
 class Motions(NamedTuple):
     """Rigid motions p -> rotation p + shift of a scene, those that map the largest fraction first.
