@@ -2,6 +2,7 @@
 
 from bpnp.training.callbacks import PoseLossWarmup, ResultsWriter, TrainingMonitor
 from bpnp.training.checkpoints import BestCheckpoint, SafeCheckpointIO
+from bpnp.training.muon import Muon
 from bpnp.training.predictions import PredictionWriter
 from bpnp.training.reprojection import ReprojectionLoss
 from bpnp.training.task import BlindPnPTask
@@ -9,6 +10,7 @@ from bpnp.training.task import BlindPnPTask
 __all__ = [
     "BestCheckpoint",
     "BlindPnPTask",
+    "Muon",
     "PoseLossWarmup",
     "PredictionWriter",
     "ReprojectionLoss",

@@ -1,0 +1,115 @@
+"""Muon: gradient steps with orthogonal matrices, for the hidden layers of a network (Jordan et al., 2024)."""
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.optim import Adam
+
+from bpnp.checks import check_within
+
+SMALLEST_SIDE = 16  # matrices with a shorter side are inputs or outputs; Adam trains them
+MOMENTUM = 0.95
+# a x + b x^3 + c x^5 maps singular values in (0, 1] to about 1 (0.7 to 1.2) within five steps (Jordan et al.).
+POLYNOMIAL, STEPS = (3.4445, -4.7750, 2.0315), 5
+SMALLEST = 1e-7  # added to the norm of a gradient, which may be zero
+
+
+def orthogonalise(matrices: Float[Tensor, "k r c"]) -> Float[Tensor, "k r c"]:
+    """Return approximately the nearest matrices with orthonormal rows or columns, by Newton-Schulz iteration.
+
+    Singular vectors are kept; singular values become 0.7 to 1.2, in bfloat16, those near zero less. For a matrix
+    U S V^T, the exact result is U V^T.
+
+    Args:
+        matrices: k matrices of one shape.
+
+    Returns:
+        Matrices (k, r, c) of the same dtype.
+    """
+    a, b, c = POLYNOMIAL
+    tall = matrices.shape[-2] > matrices.shape[-1]
+    x = matrices.mT if tall else matrices
+    x = (x / (torch.linalg.matrix_norm(x, keepdim=True) + SMALLEST)).bfloat16()
+    for _ in range(STEPS):
+        gram = x @ x.mT
+        x = a * x + (b * gram + c * gram @ gram) @ x
+    return (x.mT if tall else x).to(matrices.dtype)
+
+
+class Muon(Adam):
+    """Muon for the matrices of the hidden layers, Adam for all other parameters.
+
+    Each step moves a matrix by an orthogonal one: by the momentum of its gradient with all singular values set to
+    about one. The packaged `paper-lc` and `paper-lclp` were trained with it (docs/model-card.md).
+
+    Args:
+        params: Parameters of a module. Those with two dimensions of 16 or more count as matrices.
+        lr: Learning rate of the matrices, the largest singular value of a step.
+        adam_lr: Learning rate of the others.
+
+    Raises:
+        ValueError: A learning rate is negative.
+
+    Example:
+        >>> from torch import nn
+        >>> from bpnp.training import Muon
+        >>> optimizer = Muon(nn.Linear(32, 32).parameters(), lr=0.01)
+        >>> [len(group["params"]) for group in optimizer.param_groups]  # the weight; the bias
+        [1, 1]
+
+    With the command line: `bpnp fit --config procedural --optimizer bpnp.training.Muon --optimizer.lr 0.01`.
+    """
+
+    def __init__(self, params: Iterable[nn.Parameter], lr: float = 0.01, adam_lr: float = 1e-3) -> None:
+        check_within(0, math.inf, lr=lr, adam_lr=adam_lr)
+        parameters = [parameter for parameter in params if parameter.requires_grad]
+        matrices = [one for one in parameters if one.ndim == 2 and min(one.shape) >= SMALLEST_SIDE]
+        chosen = {id(one) for one in matrices}
+        others = [one for one in parameters if id(one) not in chosen]
+        groups = [{"params": matrices, "lr": lr, "muon": True}, {"params": others, "lr": adam_lr, "muon": False}]
+        super().__init__([group for group in groups if group["params"]], lr=adam_lr)
+
+    @torch.no_grad()
+    def step(self, closure: Callable[[], Any] | None = None) -> Any:
+        """Perform one step: of Muon for the matrices, of Adam for the others.
+
+        Args:
+            closure: Function that computes the gradients again and returns the loss.
+
+        Returns:
+            Its result, or None without one.
+        """
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        matrices = [(group, one) for group in self.param_groups if group["muon"] for one in group["params"]]
+        gradients = [(group, one, one.grad) for group, one in matrices if one.grad is not None]
+        by_shape: dict[tuple[Any, ...], list[tuple[dict[str, Any], Tensor, Tensor]]] = {}
+        for group, one, gradient in gradients:
+            by_shape.setdefault((one.shape, one.dtype, one.device, id(group)), []).append((group, one, gradient))
+            one.grad = None  # Adam leaves it out
+        for same in by_shape.values():
+            self._move(same)
+        super().step()
+        for _, one, gradient in gradients:
+            one.grad = gradient
+        return loss
+
+    def _move(self, same: list[tuple[dict[str, Any], Tensor, Tensor]]) -> None:
+        """Move matrices of one shape and one group."""
+        directions = []
+        for _, one, gradient in same:
+            if not (state := self.state[one]):
+                state.update(step=torch.zeros(()), momentum=torch.zeros_like(one))  # Adam expects a step
+            momentum = state["momentum"]
+            momentum.lerp_(gradient, 1 - MOMENTUM)
+            directions.append(torch.lerp(gradient, momentum, MOMENTUM))  # Nesterov's
+        rows, columns = same[0][1].shape
+        scale = max(1.0, rows / columns) ** 0.5
+        for (group, one, _), direction in zip(same, orthogonalise(torch.stack(directions)), strict=True):
+            one.sub_(direction, alpha=group["lr"] * scale)
