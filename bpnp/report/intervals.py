@@ -1,14 +1,15 @@
 """Bootstrap intervals of test statistics, and of the difference of two estimates on the same problems."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.text import Text
 
-from bpnp.report.results import ProblemRow, Results
-from bpnp.report.tables import lines_of, tested_problems
+from bpnp.report.results import Results
+from bpnp.report.tables import Line, lines_of, tested_problems
 from bpnp.report.terminal import SplitTable, number
 
 LEVEL = 0.95
@@ -18,16 +19,16 @@ FINITE = 1e12  # replaces infinity, so that interpolation is defined
 JOINT = (15.0, 0.5)  # degrees, scene units
 HEADERS = (
     "rotation\nmedian",
-    "95 %\ninterval",
+    "rotation\ndifference",
+    "translation\nmedian",
+    "translation\ndifference",
     "% within\n15deg 0.5",
-    "95 %\ninterval",
-    "rotation\n- first",
-    "95 %\ninterval",
+    "% within\ndifference",
     "sec",
 )
 CAPTION = (
-    "Medians in degrees. Intervals: 95 %, bootstrap over the problems. - first: difference of the medians to the first "
-    "row, paired over the same problems; it is significant if its interval excludes zero."
+    "Rotation in degrees, translation in scene units; below each number its 95 % interval (bootstrap over the "
+    "problems). Differences are paired over the same problems, and significant if their interval excludes zero."
 )
 Statistic = Callable[[NDArray[np.float64]], NDArray[np.float64]]  # reduces the last axis
 
@@ -126,7 +127,7 @@ def _interval(value: float, drawn: NDArray[np.float64]) -> Interval:
 
 
 def interval_table(runs: Mapping[str, Results]) -> SplitTable:
-    """Return a table of medians and recalls with intervals, differences to the first row, and seconds.
+    """Return a table of medians and recalls with intervals, paired differences to the first run, and seconds.
 
     It has one row per run and estimate.
 
@@ -137,30 +138,85 @@ def interval_table(runs: Mapping[str, Results]) -> SplitTable:
     shown = [
         (Text(line.label), list(map(Text, cells))) for line, cells in zip(lines, interval_cells(runs), strict=True)
     ]
-    return SplitTable("Intervals and differences", HEADERS, (shown, []), CAPTION)
+    return SplitTable(interval_title(runs), HEADERS, (shown, []), interval_caption(runs))
+
+
+def interval_title(runs: Mapping[str, Results]) -> str:
+    """Return the title of `interval_table`, which names what each row is compared with."""
+    first, *others = lines_of(runs)
+    if len(runs) == 1:
+        return f"Intervals, and differences to {first.estimate}" if others else "Intervals"
+    return f"Intervals, and differences to the same estimate of {first.run}"
+
+
+def interval_caption(runs: Mapping[str, Results]) -> str:
+    """Return the text below `interval_table`."""
+    first, known = lines_of(runs)[0], next(iter(runs.values())).estimates
+    if all(results.estimates.keys() <= known.keys() for results in runs.values()):
+        return CAPTION
+    return f"{CAPTION} Estimates that {first.run} does not have are compared with its {first.estimate}."
+
+
+def baseline_of(line: Line, lines: Sequence[Line]) -> Line | None:
+    """Return the line that another is compared with.
+
+    It is the same estimate of the first run, or the first line where that run has no such estimate. In a single run it
+    is the first line.
+
+    Args:
+        line: Estimate of a run.
+        lines: Estimates of all runs.
+
+    Returns:
+        The line, None for the lines of the first of several runs, and for the first line.
+    """
+    first = lines[0]
+    if line == first or (line.run == first.run and lines[-1].run != first.run):
+        return None
+    return next((each for each in lines if each.run == first.run != line.run and each.estimate == line.estimate), first)
 
 
 def interval_cells(runs: Mapping[str, Results]) -> list[list[str]]:
-    """Return the texts of `interval_table`: a row per run and estimate, a cell per header."""
-    lines = lines_of(runs)
-    first, rows = lines[0], []
+    """Return the texts of `interval_table`: a row per run and estimate, a cell per header.
+
+    A cell has the number and, below it, its interval.
+    """
+    lines, rows = lines_of(runs), []
     for line in lines:
-        tested = runs[line.run].of(line.estimate)
-        angles = _angles(tested)
-        rotation = bootstrap(angles)
-        within = [row.rotation_error_deg < JOINT[0] and row.translation_error < JOINT[1] for row in tested]
-        recall = bootstrap(100 * np.array(within, float), fraction)
-        paired = ["", ""]
-        if line != first and tested_problems(runs[line.run]) == tested_problems(runs[first.run]):
-            difference = paired_difference(_angles(runs[first.run].of(first.estimate)), angles)
-            paired = [f"{difference.value:+.2g}", f"{difference.low:+.2g} to {difference.high:+.2g}"]
-        seconds = runs[line.run].estimates[line.estimate]["seconds_mean"]
-        rows.append([
-            number(rotation.value), f"{number(rotation.low)} to {number(rotation.high)}",
-            f"{recall.value:.0f}", f"{recall.low:.0f} to {recall.high:.0f}", *paired, number(seconds),
-        ])  # fmt: skip
+        values, baseline = _values(runs, line), baseline_of(line, lines)
+        alike = baseline is not None and tested_problems(runs[line.run]) == tested_problems(runs[baseline.run])
+        others = _values(runs, baseline) if baseline is not None and alike else [None] * len(values)
+        cells = []
+        for own, other, (statistic, text) in zip(values, others, STATISTICS, strict=True):
+            cells.append(_shown(bootstrap(own, statistic), text))
+            cells.append(
+                "" if other is None else _shown(paired_difference(other, own, statistic), partial(_signed, text))
+            )
+        rows.append([*cells, number(runs[line.run].estimates[line.estimate]["seconds_mean"])])
     return rows
 
 
-def _angles(rows: list[ProblemRow]) -> NDArray[np.float64]:
-    return np.array([row.rotation_error_deg for row in rows])
+def _percent(value: float) -> str:
+    return f"{value:.0f}"
+
+
+STATISTICS: tuple[tuple[Statistic, Callable[[float], str]], ...] = (
+    (median, number),  # rotation
+    (median, number),  # translation
+    (fraction, _percent),  # within both limits
+)
+
+
+def _values(runs: Mapping[str, Results], line: Line) -> list[NDArray[np.float64]]:
+    """Return a number per problem for each of `STATISTICS`."""
+    errors = runs[line.run].errors(line.estimate)
+    rotation, translation = errors.rotation_deg.numpy(), errors.translation.numpy()
+    return [rotation, translation, 100.0 * ((rotation < JOINT[0]) & (translation < JOINT[1]))]
+
+
+def _signed(text: Callable[[float], str], value: float) -> str:
+    return f"{'+' if value > 0 else ''}{text(value)}"
+
+
+def _shown(interval: Interval, text: Callable[[float], str]) -> str:
+    return f"{text(interval.value)}\n{text(interval.low)} to {text(interval.high)}"

@@ -23,8 +23,7 @@ from scipy.spatial.transform import Rotation
 from bpnp.files import write_text
 from bpnp.report.charts import CONFIG, RECALLS, chart_text, figures, look, recall_chart
 from bpnp.report.groups import differences, group_rows
-from bpnp.report.intervals import CAPTION as INTERVALS
-from bpnp.report.intervals import HEADERS, interval_cells
+from bpnp.report.intervals import HEADERS, interval_caption, interval_cells, interval_title
 from bpnp.report.points import Array, ProblemPoints, read_points, utf8
 from bpnp.report.results import (
     CAUSES,
@@ -130,7 +129,8 @@ def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None) -> str
         caption=CAPTION,
         interval_heads=HEADERS,
         intervals=list(zip(lines, interval_cells(runs), strict=True)),
-        interval_caption=INTERVALS,
+        interval_title=interval_title(runs),
+        interval_caption=interval_caption(runs),
         trainings=training_pictures(folders),
         groups=group_rows(runs),
         differences=differences(runs),

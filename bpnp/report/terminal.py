@@ -101,7 +101,7 @@ class SplitTable:
     Attributes:
         title: Title.
         headers: Headers of the number columns.
-        groups: Groups of rows (name, cells), with a line between groups.
+        groups: Groups of rows (name, cells), with a line between groups. Cells may have several lines.
         caption: Text below the table.
     """
 
@@ -116,7 +116,9 @@ class SplitTable:
         parts: list[list[int]] = [[]]
         left = options.max_width - name - 2
         for i, header in enumerate(self.headers):
-            width = 1 + max([*map(len, header.split("\n")), *(len(cells[i]) for _, cells in rows)])
+            width = 1 + max(
+                len(text) for it in (header, *(cells[i].plain for _, cells in rows)) for text in it.split("\n")
+            )
             if width > left and parts[-1]:
                 parts.append([])
                 left = options.max_width - name - 2

@@ -1,15 +1,26 @@
 """Bootstrap intervals against scipy's bootstrap, laws of chance, and pairs whose difference is known."""
 
+import io
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from report_data import rows
+from rich.console import Console
 from scipy import stats
 
 from bpnp.report import ProblemRow, Results
-from bpnp.report.intervals import bootstrap, fraction, interval_cells, paired_difference, quantile
+from bpnp.report.intervals import (
+    bootstrap,
+    fraction,
+    interval_caption,
+    interval_cells,
+    interval_table,
+    interval_title,
+    paired_difference,
+    quantile,
+)
 from bpnp.report.results import summarise
 
 
@@ -60,15 +71,74 @@ def test_an_interval_of_nan_or_unequal_lists_is_refused() -> None:
         paired_difference(np.ones(2), np.ones(3))
 
 
-def test_the_table_pairs_runs_of_the_same_problems_with_the_first_row() -> None:
-    """Every rotation error of the second run is 1 degree less; a run of other problems has no difference."""
-    first = [replace(row, rotation_error_deg=10.0 + row.index) for row in rows(40, seed=0, estimates=("pnp",))]
-    better = [replace(row, rotation_error_deg=row.rotation_error_deg - 1) for row in first]
-    runs = {"first": results(first), "better": results(better), "other": results(better[:30])}
+def rows_of(estimates: dict[str, float], **shift: float) -> list[ProblemRow]:
+    """40 problems with rotation errors of 10, 11, ... degrees plus a number for each estimate, and translation errors
+    of 0, 0.02, ...; shifted."""
+    return [
+        replace(
+            row,
+            rotation_error_deg=10.0 + row.index + estimates[row.estimate] + shift.get("rotation", 0),
+            translation_error=0.02 * row.index + shift.get("translation", 0),
+        )
+        for row in rows(40, seed=0, estimates=tuple(estimates))
+    ]
+
+
+def differences(cells: list[str]) -> list[str]:
+    return [cells[i] for i in (1, 3, 5)]
+
+
+def test_each_row_is_paired_with_the_same_estimate_of_the_first_run() -> None:
+    """The second run turns each problem by 1 degree less and misses it by 0.25 more. Of the 40 problems of `pnp`, those
+    with index 0 to 4 are within 15 degrees and 0.5; of the second run 0 to 5; `ransac` is 3 degrees worse."""
+    estimates = {"ransac": 3.0, "pnp": 0.0}
+    first, second = results(rows_of(estimates)), results(rows_of(estimates, rotation=-1, translation=0.25))
+    runs = {"Lc": first, "test": second, "other": results(rows_of(estimates)[:60])}
     cells = interval_cells(runs)
-    assert cells[0][4:6] == ["", ""]
-    assert cells[1][4:6] == ["-1", "-1 to -1"]
-    assert cells[2][4:6] == ["", ""]
-    assert [row[0] for row in cells] == ["29.5", "28.5", "23.5"]
-    low, high = (float(x) for x in cells[0][1].split(" to "))
-    assert 10 < low < 29.5 < high < 50
+    assert [row[0].split("\n")[0] for row in cells] == ["32.5", "29.5", "31.5", "28.5", "27.5", "24.5"]
+    assert [row[2].split("\n")[0] for row in cells[:4]] == ["0.390", "0.390", "0.640", "0.640"]
+    assert [row[4].split("\n")[0] for row in cells[:4]] == ["5", "12", "8", "15"]
+    assert differences(cells[0]) == differences(cells[1]) == ["", "", ""]  # the first run itself
+    for row in cells[2:4]:  # against its own kind: neither 3 - 1 nor -3 - 1
+        assert differences(row)[:2] == ["-1.00\n-1.00 to -1.00", "+0.250\n+0.250 to +0.250"]
+        value, low, high = (float(x) for x in differences(row)[2].replace("\n", " to ").split(" to "))
+        assert value == 2
+        assert low <= 0 < value < high
+    assert differences(cells[4]) == differences(cells[5]) == ["", "", ""]  # other problems
+    assert interval_title(runs) == "Intervals, and differences to the same estimate of Lc"
+    low, high = (float(x) for x in cells[0][0].split("\n")[1].split(" to "))
+    assert 13 < low < 32.5 < high < 53
+
+
+def test_the_estimates_of_one_run_are_paired_with_its_first() -> None:
+    runs = {"run": results(rows_of({"ransac": 3.0, "pnp": 0.0}))}
+    cells = interval_cells(runs)
+    assert differences(cells[0]) == ["", "", ""]
+    assert differences(cells[1])[:2] == ["-3.00\n-3.00 to -3.00", "0\n0 to 0"]
+    assert interval_title(runs) == "Intervals, and differences to ransac"
+    assert interval_title({"run": results(rows_of({"pnp": 0.0}))}) == "Intervals"
+
+
+def test_an_estimate_that_the_first_run_lacks_is_paired_with_its_first() -> None:
+    runs = {"softposit": results(rows_of({"softposit": 3.0})), "net": results(rows_of({"pnp": 0.0}))}
+    assert differences(interval_cells(runs)[1])[0] == "-3.00\n-3.00 to -3.00"
+    assert interval_caption(runs).endswith("Estimates that softposit does not have are compared with its softposit.")
+
+
+def test_problems_without_a_pose_have_no_finite_translation_interval() -> None:
+    lost = [replace(row, translation_error=np.inf) for row in rows_of({"pnp": 0.0})]
+    cells = interval_cells({"a": results(rows_of({"pnp": 0.0})), "b": results(lost)})
+    assert cells[1][2:4] == ["inf\ninf to inf", "+inf\n+inf to +inf"]
+
+
+def test_the_terminal_shows_each_interval_below_its_number_within_80_columns() -> None:
+    estimates = {"ransac": 3.0, "pnp": 0.0}
+    runs = {"Lc": results(rows_of(estimates)), "test": results(rows_of(estimates, rotation=-1))}
+    text = io.StringIO()
+    Console(file=text, width=80).print(interval_table(runs))
+    lines = text.getvalue().splitlines()
+    assert max(map(len, lines)) <= 80
+    assert "the same estimate of Lc" in lines[0]
+    (number,) = (i for i, line in enumerate(lines) if "test: pnp" in line and "28.5" in line)
+    assert lines[number + 1].split()[1] == "to"
+    assert sum("-1.00 to -1.00" in line for line in lines) == 2
