@@ -4,6 +4,7 @@ with intervals, and the tables of a page."""
 import argparse
 import json
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -82,6 +83,7 @@ class Training:
     """A `bpnp fit` of a number of steps, in epochs of `epoch` steps with a checkpoint each.
 
     start: checkpoint to go on from where the folder has none of its own.
+    forks: whether branches start from here; a copy of the checkpoint at exactly `steps` is kept for them.
     """
 
     folder: Path
@@ -89,17 +91,36 @@ class Training:
     steps: int
     epoch: int
     start: Path | None = None
+    forks: bool = False
 
     @property
     def checkpoint(self) -> Path:
         return self.folder / "checkpoints" / "last.ckpt"
 
+    @property
+    def switch(self) -> Path:
+        """The checkpoint at exactly `steps`, which a longer training leaves as it is."""
+        return self.folder.with_name(f"{self.folder.name}-{self.steps}.ckpt")
+
     def run(self) -> Path:
         """Train what is missing and return the checkpoint."""
-        done = trained_steps(self.checkpoint)
-        if done >= self.steps:
+        if (done := trained_steps(self.checkpoint)) < self.steps:
+            self._train(done)
+            if (done := trained_steps(self.checkpoint)) != self.steps:
+                sys.exit(f"{self.folder} has {done} steps instead of {self.steps}; was it begun with another --epoch?")
+        else:
             print(f"{self.folder}: {done} steps are there", flush=True)
-            return self.checkpoint
+        if self.forks and done == self.steps and not self.switch.is_file():
+            with write_atomically(self.switch) as temporary:
+                shutil.copyfile(self.checkpoint, temporary)
+        return self.checkpoint
+
+    def _train(self, done: int) -> None:
+        if not done and self.start and not self.start.is_file():
+            sys.exit(
+                f"{self.start} is missing, from which {self.folder.name} starts; if the training before it is longer "
+                "already, give --steps as many as that has, or another --run"
+            )
         start = ["--ckpt_path", "last"] if done else ["--ckpt_path", str(self.start)] if self.start else []
         command = [
             sys.executable, "-m", "bpnp", "fit", *self.arguments,
@@ -109,7 +130,6 @@ class Training:
         ]  # fmt: skip
         print(f"{self.folder}: {done} of {self.steps} steps\n  {' '.join(command[1:])}", flush=True)
         subprocess.run(command, check=True)
-        return self.checkpoint
 
 
 def trained_steps(checkpoint: str | Path) -> int:
@@ -175,13 +195,13 @@ def solve_problems(
 def branches(
     folder: Path, arguments: tuple[str, ...], *, steps: int, pose_steps: int, epoch: int
 ) -> dict[str, Training]:
-    """A training with L_c, and two that go on from it: with L_c, and with L_c + L_p."""
-    first, end = Training(folder / "lc", arguments, steps, epoch), steps + pose_steps
+    """A training with L_c, and two that go on from it at the switch for as many steps: with L_c, and with L_c + L_p."""
+    first, end = Training(folder / "lc", arguments, steps, epoch, forks=True), steps + pose_steps
     posed = (*arguments, f"--pose_loss.start_epoch={steps // epoch}")
     return {
         "first": first,
-        "Lc": Training(folder / f"lc-from{steps}", arguments, end, epoch, first.checkpoint),
-        "Lc Lp": Training(folder / f"lclp-from{steps}", posed, end, epoch, first.checkpoint),
+        "Lc": Training(folder / f"lc-from{steps}", arguments, end, epoch, first.switch),
+        "Lc Lp": Training(folder / f"lclp-from{steps}", posed, end, epoch, first.switch),
     }
 
 
@@ -213,6 +233,9 @@ def measure(
     record: dict[str, Any] = json.loads(options.output.read_text()) if options.output.is_file() else {}
     record = {key: record.get(key, {}) for key in ("rows", "effects", "training")}
     steps = {label: trained_steps(one.checkpoint) for label, one in trained.items()}
+    if not options.only_test and len({steps[label] for label in BRANCHES}) > 1:
+        lengths = ", ".join(f"{label} {steps[label]:,}" for label in BRANCHES)
+        sys.exit(f"the branches differ in their steps ({lengths}); give a larger --pose_steps to train the shorter one")
     if any(steps[label] for label in BRANCHES):
         facts = {"learning_rate": options.learning_rate, "switch": options.steps}
         record["training"][f"seed {options.seed}"] = steps | facts
@@ -294,6 +317,8 @@ def markdown(table: Table, record: Mapping[str, Any]) -> dict[str, str]:
             if (one := record["effects"].get(f"{name}|{lowest}|{group}|{estimate}")) is not None:
                 before, after = one["steps"]
                 label = f"{second}{suffix} ({after:,} steps) minus {first}{suffix} ({before:,} steps)"
+                if before != after:
+                    label += ", unequal training"
                 texts.append(effect_text(label, one))
         if texts:
             title = f"{name}-effect" if group == "paper" else f"{name}-{group}-effect"
@@ -344,6 +369,8 @@ def run(
     if chosen.check:
         fill_pages(pages, table.name, markdown(table, json.loads(chosen.output.read_text())), check=True)
         return
+    if not chosen.only_test and (chosen.steps % chosen.epoch or chosen.pose_steps % chosen.epoch):
+        parser.error(f"--steps and --pose_steps must be multiples of --epoch, {chosen.epoch}")
     torch.set_num_threads(1)
     if chosen.quick:
         chosen.run = chosen.run.with_name(f"{chosen.run.name}-quick")

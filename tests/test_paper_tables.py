@@ -1,6 +1,7 @@
 """The benchmarks of the paper's tables: what was stopped goes on, figures are those of the rows, pages are filled."""
 
 import json
+import shutil
 from pathlib import Path
 from types import ModuleType
 
@@ -52,6 +53,57 @@ def test_a_training_goes_on_from_its_own_checkpoint_and_a_branch_from_anothers(
     assert (tmp_path / "packed.ckpt").stat().st_size < branch.checkpoint.stat().st_size / 4
     for name, value in net.state_dict().items():
         torch.testing.assert_close(packed.state_dict()[name], value, rtol=1e-3, atol=1e-4)
+
+
+def plant_steps(checkpoint: Path, steps: int) -> None:
+    """Write a checkpoint of so many steps."""
+    checkpoint.parent.mkdir(parents=True, exist_ok=True)
+    torch.save({"global_step": steps, "state_dict": {}}, checkpoint)
+
+
+def test_both_branches_start_at_the_switch_and_have_equal_lengths(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    starts = {}
+
+    def train(command: list[str], check: bool) -> None:
+        options = dict(word.split("=", 1) for word in command if word.startswith("--") and "=" in word)
+        folder, start = Path(options["--trainer.default_root_dir"]), command[-1]
+        if not (folder / "checkpoints" / "last.ckpt").is_file() and "from" in folder.name:
+            starts[folder.name] = paper_tables.trained_steps(start)
+        steps = int(options["--trainer.limit_train_batches"]) * int(options["--trainer.max_epochs"])
+        plant_steps(folder / "checkpoints" / "last.ckpt", steps)
+
+    monkeypatch.setattr(paper_tables.subprocess, "run", train)
+
+    def run(**schedule: int) -> dict[str, int]:
+        trained = paper_tables.branches(tmp_path, (), epoch=10, **schedule)
+        return {label: paper_tables.trained_steps(one.run()) for label, one in trained.items()}
+
+    assert run(steps=20, pose_steps=10) == {"first": 20, "Lc": 30, "Lc Lp": 30}
+    assert run(steps=50, pose_steps=20) == {"first": 50, "Lc": 70, "Lc Lp": 70}
+    assert starts == {"lc-from20": 20, "lclp-from20": 20, "lc-from50": 50, "lclp-from50": 50}
+    assert run(steps=20, pose_steps=30) == {"first": 50, "Lc": 50, "Lc Lp": 50}  # goes on with its own checkpoints
+    shutil.rmtree(tmp_path / "lclp-from20")
+    run(steps=20, pose_steps=30)  # from the checkpoint that was kept
+    assert starts["lclp-from20"] == 20
+    with pytest.raises(SystemExit, match="lc-30.ckpt is missing, from which lc-from30 starts"):
+        run(steps=30, pose_steps=10)
+    monkeypatch.setattr(paper_tables.subprocess, "run", lambda *_, **__: None)
+    with pytest.raises(SystemExit, match="lc-from50 has 70 steps instead of 90; was it begun with another --epoch"):
+        run(steps=50, pose_steps=40)
+
+
+def test_branches_of_unequal_lengths_are_refused_or_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, steps in {"lc": 700, "lc-from700": 900, "lclp-from700": 800}.items():
+        plant_steps(tmp_path / "seed0" / name / "checkpoints" / "last.ckpt", steps)
+    command = ["table1", "--run", str(tmp_path), "--output", str(tmp_path / "record.json"), "--steps", "700"]
+    monkeypatch.setattr("sys.argv", [*command, "--pose_steps", "100"])
+    with pytest.raises(SystemExit, match=r"the branches differ in their steps \(Lc 900, Lc Lp 800\)"):
+        table1.main()
+    monkeypatch.setattr("sys.argv", [*command, "--pose_steps", "150"])
+    with pytest.raises(SystemExit, match="2"):
+        table1.main()
 
 
 def test_the_weights_with_the_pose_loss_go_on_from_those_without_and_switch_once(tmp_path: Path) -> None:
@@ -177,8 +229,10 @@ def test_a_record_becomes_the_tables_of_the_page() -> None:
     assert "| Lc, refined |" in tables["modelnet10-paper-our-inference"]
     assert "| *paper: GOSMA* |" in tables["modelnet10-baselines"]
     assert "| seed 0 | 400 | 500 | 500 | 0.0001 |" in tables["training"]
-    assert "| Lc Lp (400 steps) minus Lc (500 steps) | 10 | +0 [+0, +0]" in tables["modelnet10-effect"]
-    assert "| paper-lclp (400 steps) minus paper-lc (500 steps) |" in tables["modelnet10-training-effect"]
+    row_of_effect = "| Lc Lp (400 steps) minus Lc (500 steps), unequal training | 10 | +0 [+0, +0]"
+    assert row_of_effect in tables["modelnet10-effect"]
+    row_of_effect = "| paper-lclp (400 steps) minus paper-lc (500 steps), unequal training |"
+    assert row_of_effect in tables["modelnet10-training-effect"]
 
 
 def test_the_picture_has_a_curve_a_row_and_the_papers_quartiles() -> None:
