@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from bpnp.training.comparison import MethodTest
 
 LINES: Mapping[str, "Lines | None"] = {"true": "match3d", "assigned": "assigned3d", "none": None}
-PAPERS: dict[str, Paper] = {"MeshDataModule": "modelnet40", "ColmapDataModule": "megadepth"}
 
 
 def report(
@@ -42,19 +41,22 @@ def report(
         curves: write losses and validation of the first run's training as .png, .jpg, .svg or .pdf.
     """
     from bpnp.report.figures import recall_curve
+    from bpnp.report.groups import differences, training_configs
     from bpnp.report.images import save_figure
     from bpnp.report.intervals import interval_table
     from bpnp.report.page import write_page
     from bpnp.report.tables import named_runs, read_runs, results_table
 
     if curves is not None:
-        from bpnp.report.training_curves import training_curves, training_folder
+        from bpnp.report.training_curves import training_curves
+        from bpnp.report.training_run import training_folder
 
         folder = training_folder(runs[0])
         if folder is None:
             raise ValueError(f"{runs[0]} and the folder above it have no logs of a training; give the folder of a run")
         say(f"wrote {save_figure(training_curves(folder), curves)}")
-    paths = list(named_runs(runs).values())
+    named = named_runs(runs)
+    paths = list(named.values())
     if html is not None:
         say(f"wrote {write_page(paths, html, paper=paper)}")
     if recall is not None:
@@ -62,6 +64,8 @@ def report(
     results = read_runs(paths)
     console().print(results_table(results, paper=paper))
     console().print(interval_table(results))
+    for line in differences(results, training_configs(named, results)):
+        say(line)
 
 
 def view(
@@ -215,7 +219,16 @@ def table(
     from bpnp.datamodules import Outliers
     from bpnp.report.figures import outlier_curves
     from bpnp.report.images import save_figure
-    from bpnp.report.tables import CAPTION, FILE_COLUMNS, as_latex, note, paper_rows, table_frame, table_of_rows
+    from bpnp.report.tables import (
+        CAPTION,
+        FILE_COLUMNS,
+        PAPERS,
+        as_latex,
+        note,
+        paper_rows,
+        table_frame,
+        table_of_rows,
+    )  # fmt: skip
     from bpnp.training.comparison import MethodTest, parse_methods, read_data
 
     at_least(1, limit=limit)

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.files import write_text
 from bpnp.report.charts import CONFIG, RECALLS, chart_text, figures, look, recall_chart
-from bpnp.report.groups import differences, group_rows
+from bpnp.report.groups import differences, group_rows, training_configs
 from bpnp.report.intervals import HEADERS, interval_caption, interval_cells, interval_title
 from bpnp.report.points import Array, ProblemPoints, read_points, utf8
 from bpnp.report.results import (
@@ -37,7 +37,8 @@ from bpnp.report.results import (
 from bpnp.report.tables import CAPTION, LOADING, RESULT_COLUMNS, Line, best_texts, cell, lines_of, named_runs, run_rows
 from bpnp.report.templates import render_page
 from bpnp.report.terminal import DASHES, INKS, Paper
-from bpnp.report.training_curves import training_curves, training_folder
+from bpnp.report.training_curves import training_curves
+from bpnp.report.training_run import training_of
 
 FACTS = ("written", "bpnp_version", "correspondence_loss", "settings")  # facts of a run that the page shows
 SCRIPTS = ("page.js", "problem.js")
@@ -131,9 +132,9 @@ def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None) -> str
         intervals=list(zip(lines, interval_cells(runs), strict=True)),
         interval_title=interval_title(runs),
         interval_caption=interval_caption(runs),
-        trainings=training_pictures(folders),
+        trainings=training_pictures(folders, runs),
         groups=group_rows(runs),
-        differences=differences(runs),
+        differences=differences(runs, training_configs(folders, runs)),
         charts=list(map(chart_text, charts)),
         causes=CAUSES,
         shares=[(line, *_shares(runs[line.run], line.estimate)) for line in lines],
@@ -144,11 +145,11 @@ def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None) -> str
     )
 
 
-def training_pictures(folders: Mapping[str, Path]) -> dict[str, str]:
+def training_pictures(folders: Mapping[str, Path], runs: Mapping[str, Results]) -> dict[str, str]:
     """Draw each training that has logs, once for all its tests, as SVG in base64 by the names of these."""
     tests: dict[Path, list[str]] = {}
     for name, folder in folders.items():
-        if (run := training_folder(folder)) is not None:
+        if (run := training_of(folder, runs[name])) is not None:
             tests.setdefault(run, []).append(name)
     pictures = {}
     for run, names in tests.items():

@@ -22,6 +22,7 @@ CAPTION = (
     "rot, repr: errors in degrees; trans: in scene units; quartiles Q1, Q2, Q3. 15deg 0.5, 10deg 1.0: % of problems "
     "with both rotation and translation error within. sec: mean seconds a problem. No pose counts as 180 deg and inf."
 )
+PAPERS: dict[str, Paper] = {"MeshDataModule": "modelnet40", "ColmapDataModule": "megadepth"}  # by data module
 # Options of the data that do not change the problems of a test.
 LOADING = {"batch_size", "eval_batch_size", "max_cells", "num_workers", "max_points", "fresh_subsets", "val_fraction"}
 
@@ -219,6 +220,13 @@ def tested_problems(results: Results) -> Hashable:
         options = {key: value for key, value in data["init_args"].items() if key not in LOADING}
         data = {**data, "init_args": options}
     return json.dumps(data, sort_keys=True), frozenset((row.index, row.id, row.m, row.n) for row in results.rows)
+
+
+def paper_of(results: Results) -> Paper | None:
+    """Return the table of the paper with data of the kind that was tested: shapes or photos; None for others."""
+    data = results.settings.get("data")
+    kind = str(data.get("class_path")).rpartition(".")[2] if isinstance(data, Mapping) else ""
+    return PAPERS.get(kind)
 
 
 def paper_rows(paper: Paper | None) -> list[MethodRow]:

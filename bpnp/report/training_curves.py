@@ -7,12 +7,12 @@ import numpy as np
 
 from bpnp.report.figures import line_style, shown_text
 from bpnp.report.terminal import QUIET
+from bpnp.report.training_run import METRICS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-METRICS = "metrics.csv"
 LOSSES = {
     "train/loss": "loss",
     "train/correspondence_loss": "$L_c$",
@@ -23,15 +23,6 @@ LOSSES = {
 }
 SWITCH = "train/pose_loss"
 SMOOTH = 0.05  # fraction of the steps in a moving average
-
-
-def training_folder(path: Path | str) -> Path | None:
-    """Return the folder of a run with the logs of a training, given it or its test folder; None if there is none."""
-    start = Path(path).absolute()
-    for folder in (start, start.parent):
-        if any((folder / "logs").glob(f"version_*/{METRICS}")):
-            return folder
-    return None
 
 
 def read_curves(run: Path | str) -> "DataFrame":

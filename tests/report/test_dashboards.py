@@ -4,9 +4,10 @@ from typing import Any
 
 import pytest
 import wandb
-from report_data import write_run
+from report_data import rows, write_run
 from small_data import is_written
 
+from bpnp.report import read_results, write_results
 from bpnp.report.charts import recall_chart
 from bpnp.report.dashboards import log_results, scalars
 
@@ -52,8 +53,9 @@ def test_a_run_is_written_to_a_folder_with_its_tables_and_pictures(tmp_path: Pat
     assert is_written(next(run.glob("*.wandb")), b"test/pnp/rotation_q2_deg")
 
 
-def test_a_test_is_logged_with_the_settings_of_its_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_run(tmp_path, 20, 0)
+@pytest.fixture
+def trained(tmp_path: Path) -> Path:
+    """Folder of a training that was logged to W&B as "first", and a later W&B run of a resumed training."""
     logger = {"class_path": "lightning.pytorch.loggers.WandbLogger"}
     training = {"model": {"learning_rate": 0.25}, "data": "planted", "trainer": {"logger": [logger]}, "ckpt_path": None}
     for number, config in enumerate((training, training | {"verbose": False, "model": {}})):
@@ -63,11 +65,37 @@ def test_a_test_is_logged_with_the_settings_of_its_training(tmp_path: Path, monk
     (tmp_path / "logs" / "version_0" / "metrics.csv").write_text("step,train/loss\n1,0.5\n")
     for name in ("offline-run-20260102_000000-later", "offline-run-20260101_000000-first"):
         (tmp_path / "wandb" / name).mkdir(parents=True)
+    return tmp_path
+
+
+def test_a_test_joins_the_run_of_its_training(trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two tests of one training are in its run, under the names of their folders; its name and group stay."""
+    write_run(trained, 20, 0)
+    (trained / "test").rename(trained / "Lc")
+    write_run(trained, 20, 1)
     started: list[dict[str, Any]] = []
     real = wandb.init
     monkeypatch.setattr(wandb, "init", lambda **options: started.append(options) or real(**options))
+    for name in ("Lc", "test"):
+        run = log_results(trained / name, name="planted")
+        assert (run.parent, run.name.rsplit("-", 1)[1]) == (trained / "wandb", "first")
+        (file,) = run.glob("*.wandb")
+        assert file.name == "run-first.wandb"
+        assert is_written(file, f"{name}/pnp/rotation_q2_deg".encode())
+        assert is_written(file, b"learning_rate")
+    for options in started:
+        assert (options["id"], options["resume"]) == ("first", "allow")
+        assert not {"name", "group", "job_type"} & options.keys()
+
+
+def test_the_charts_have_the_rings_of_the_table_of_their_data(tmp_path: Path) -> None:
+    """Table 2 of the paper: L_c L_p has 1.32, 3.31 and 8.84 degrees."""
+    settings = {"data": {"class_path": "bpnp.datamodules.ColmapDataModule", "init_args": {}}}
+    write_results(tmp_path / "test", rows(9, 0), settings=settings)
     run = log_results(tmp_path / "test", name="planted")
-    assert run.parent == tmp_path / "wandb"
-    assert started[0]["group"] == "first"
-    assert started[0]["config"]["model"] == {"learning_rate": 0.25}
-    assert started[0]["config"]["training"] == "first"
+    (path,) = (run / "files" / "media" / "plotly" / "test" / "recall_curve").glob("rotation_deg*.json")
+    traces = {trace["name"]: trace for trace in json.loads(path.read_text())["data"]}
+    assert "paper: Lc Lp" in traces
+    chart = recall_chart({"test": read_results(tmp_path / "test")}, "rotation_deg", paper="megadepth")
+    assert chart is not None
+    assert json.loads(path.read_text())["data"] == json.loads(chart.to_json())["data"]

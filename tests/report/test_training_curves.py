@@ -9,7 +9,8 @@ from report_data import rows
 from bpnp.cli import main
 from bpnp.report import write_results
 from bpnp.report.page import page_html
-from bpnp.report.training_curves import read_curves, switch_step, training_curves, training_folder
+from bpnp.report.training_curves import read_curves, switch_step, training_curves
+from bpnp.report.training_run import training_folder
 
 HEAD = "epoch,step,train/loss,train/correspondence_loss,train/rotation_loss,train/translation_loss,train/pose_loss"
 VALIDATED = ",val/ransac/rotation_q2_deg,val/ransac/translation_q2\n"
