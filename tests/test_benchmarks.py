@@ -225,6 +225,22 @@ def test_tables_are_filled_and_checked(tmp_path: Path, monkeypatch: pytest.Monke
         run("--quick", "--check")
 
 
+@pytest.mark.parametrize("part", ["quick", "full"])
+def test_the_record_has_every_row_and_no_other(part: str) -> None:
+    """`results --check` would report the others as never measured."""
+    recorded = json.loads(results.FILE.read_text())[part]
+    assert set(recorded) == {results.key(row) for row in results.ROWS}
+    for row in results.ROWS:
+        assert 0 < recorded[results.key(row)]["problems"] <= row.problems[part == "quick"]
+
+
+@pytest.mark.parametrize("document", results.DOCUMENTS, ids=lambda file: file.name)
+def test_the_tables_of_the_pages_are_those_of_the_record(document: Path) -> None:
+    text, recorded = document.read_text(encoding="utf-8"), json.loads(results.FILE.read_text())["full"]
+    assert "<!-- results: " in text
+    assert results.fill_tables(text, recorded) == text
+
+
 def test_models_of_the_same_views_are_aligned() -> None:
     """Another frame and unit, and views that only one of the models has."""
     rng, lens, seen = np.random.default_rng(0), camera_from(np.eye(3)), np.arange(4, dtype=np.int32)
