@@ -1,6 +1,8 @@
 """The baselines as solvers of batches."""
 
+import inspect
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -39,6 +41,12 @@ def test_a_pose_depends_neither_on_neighbours_nor_on_padding_nor_on_the_modules_
     torch.testing.assert_close(of_two.rotation[1], of_one.rotation[0], rtol=0, atol=0, equal_nan=True)
     torch.testing.assert_close(of_two.translation[1], of_one.translation[0], rtol=0, atol=0, equal_nan=True)
     assert of_two.stats.iterations[1] == of_one.stats.iterations[0]
+
+
+@pytest.mark.parametrize("baseline", [GOPAC, GOSMA, Hungarian, RandomRansac, SoftPOSIT])
+def test_the_reference_lists_what_differs_from_the_paper(baseline: type) -> None:
+    """docs/results.md and docs/paper.md refer to it."""
+    assert re.search(r"^Differences from the paper[^:]*:\n\n- ", inspect.getdoc(baseline) or "", re.MULTILINE)
 
 
 @each_solver

@@ -22,6 +22,15 @@ class RandomRansac(SingleSolver):
     the best pose were the true ones. With m = n = 1000 that takes about 10^9 triples. The random numbers depend only on
     the seed and on the index of the problem.
 
+    Differences from the paper, which names the minimal solver, the confidence and the time limit only:
+
+    - P3P is that of Ding et al. (CVPR 2023) instead of Kneip et al. (CVPR 2011). All of its poses are candidates, so
+      that three matches suffice where the paper counts four.
+    - The score is the number of points of both sides with a point of the other side nearby, not only that of image
+      points.
+    - Of the poses of 256 triples, the 8 best on about 32 image points are scored on all points, so that more triples
+      fit into the time limit.
+
     Args:
         threshold: Largest distance of matching points in the normalised image, default 0.01.
         confidence: Probability at which to stop, default 0.9; 1 for never.

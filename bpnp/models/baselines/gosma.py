@@ -64,10 +64,23 @@ class SceneMixture(NamedTuple):
 class GOSMA(BranchAndBound):
     """Branch and bound on the distance between the mixtures of both point sets, without matches or an initial pose.
 
-    Camera centres are no closer to the scene's centroid than half the weak-perspective distance. `residual` of the pose
-    is its distance as a fraction of the image mixture's squared norm (0 for mixtures that coincide). `converged`
-    certifies that no pose of the domain is better by more than 0.1 of this norm. This is a certificate of the mixtures'
-    alignment, which need not be that of the points.
+    `residual` of the pose is its distance as a fraction of the image mixture's squared norm (0 for mixtures that
+    coincide). `converged` certifies that no pose of the domain is better by more than 0.1 of this norm. This is a
+    certificate of the mixtures' alignment, which need not be that of the points.
+
+    Differences from the paper (Campbell et al., CVPR 2019):
+
+    - The search uses the processor, the authors' program a GPU. Fewer boxes are searched in the same time.
+    - Clusters are limited in root mean square radii of the points (`cluster2d`, `cluster3d`) instead of an angle and a
+      length, and camera centres lie in a cube of 1.5 weak-perspective distances. Neither depends on the unit of the
+      scene.
+    - Camera centres are at least half the weak-perspective distance from the centroid of the scene; in the paper they
+      have a least distance from the points.
+    - The angle between two clusters, seen from the camera centre, changes by at most |mu - mu'| / (d d') for each unit
+      that the centre moves. This bounds the terms of pairs of scene clusters more tightly than two independent
+      directions.
+    - Local optimisation starts from the best box centres of each iteration, not only from those that are better than
+      the best pose.
 
     Args:
         cluster2d: Largest angle from the mean of an image cluster, in root mean square angles of all rays to their

@@ -17,6 +17,12 @@ class Hungarian(nn.Module):
     RANSAC uses all of these matches, and weighted PnP refines its pose. All matches have the same weight. The
     assignment has no gradient.
 
+    Differences from the paper, which names the algorithm as the exact and slower alternative to Sinkhorn (section 3.3)
+    and has no figures for it:
+
+    - The network is trained with Sinkhorn, and the Hungarian algorithm is used in tests only.
+    - RANSAC is PoseLib's by default; `ransac_backend="opencv"` is the paper's.
+
     Args:
         checkpoint: Checkpoint of a BPnPNet, written by `bpnp fit`; None to use `net`.
         net: Network; None with a checkpoint of None for untrained weights with the default settings.

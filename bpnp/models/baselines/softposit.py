@@ -34,8 +34,17 @@ WELL_POSED = 1e-10  # smallest eigenvalue of the points' second moments, per tra
 class SoftPOSIT(SingleSolver):
     """SoftPOSIT (David et al., IJCV 2004), a local solver whose result depends on its initial pose.
 
-    Of several results, the one with the most inliers is returned, accepted results first. `residual` of the pose is the
-    root mean square distance of the matched points in pixels.
+    `residual` of the pose is the root mean square distance of the matched points in pixels. `converged` is the
+    acceptance test of the authors' program: a residual below half the acceptance radius. It holds for wrong poses too.
+
+    Differences from the paper:
+
+    - Distances are in pixels of a camera with a focal length of 800, as the authors' constants are, and the scene is
+      rotated about its centroid.
+    - Annealing always ends at the last temperature. The authors' program ends at the first accepted pose, and their
+      search from random initial poses at the first accepted result. Here all initial poses are annealed, and the result
+      with the most inliers is returned, accepted results first.
+    - Where the matched points span no volume, the last pose is returned, not accepted.
 
     Args:
         start: Initial pose. "mean", the default: a fixed pose (the paper's for ModelNet40: its mean pose).
