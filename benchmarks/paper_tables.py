@@ -1,15 +1,22 @@
 """Shared parts of the benchmarks of the paper's tables: trainings and tests that go on where they were stopped, rows
-with intervals, and the tables of a page."""
+with intervals, and the tables of a page.
+
+A record has rows and paired effects. Each row has its own settings (the options of the command that it depends on) and
+the commit, the date and the processor of its measurement, which a later measurement of other rows leaves as they are.
+"""
 
 import argparse
+import hashlib
 import json
 import re
+import shlex
 import shutil
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -18,12 +25,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from lightning import LightningDataModule
-from record import DATA, ROOT, write
+from record import DATA, ROOT, commit, processor, write_json
 from torch import nn
 
 from bpnp.files import fingerprint, write_atomically
 from bpnp.layers import RansacPnP, WeightedPnP
-from bpnp.models import BPnPNet, TrainedNet
+from bpnp.models import BPnPNet, Search, TrainedNet
 from bpnp.models.evaluation import round_widths
 from bpnp.models.weights import read_checkpoint
 from bpnp.report.figures import line_style
@@ -48,9 +55,26 @@ PRINTED_STEPS = {"Lc": "300,000", "Lc Lp": "350,000 to 500,000"}
 PICTURES = ROOT / "docs" / "images"
 
 
+SEARCH_SECONDS = 10.0
+
 ESTIMATES = {"pnp": "", "ransac": " R", "refined": ", refined"}
 BRANCHES = ("Lc", "Lc Lp")
-PAIRS = {"paper": BRANCHES, "training": ("paper-lc", "paper-lclp")}  # of a group, the rows without and with L_p
+LONGER = "paper-lc, as many steps of L_c"  # a name for `--weights`
+PAIRS = {  # of a group, the rows without and with L_p
+    "paper": (BRANCHES,),
+    "training": (("paper-lc", "paper-lclp"), (LONGER, "paper-lclp")),
+}
+DEFAULTS = {
+    "seed": 0,
+    "test_seed": 0,
+    "epoch": 100,
+    "learning_rate": 1e-4,
+    "problems": 500,
+    "our_problems": 500,
+    "baseline_problems": 60,
+}
+LIMITS = ("problems", "our_problems", "baseline_problems")
+QUICK = {"steps": 150, "pose_steps": 50, "epoch": 50, "problems": 20, "our_problems": 5, "baseline_problems": 1}
 
 
 @dataclass(frozen=True)
@@ -65,17 +89,38 @@ class Table:
 
 @dataclass(frozen=True)
 class Method:
-    """A solver of a table: its group, its label, how many problems it gets, and what its results depend on."""
+    """A solver of a table.
+
+    limit: how many problems it gets.
+    identity: what its results depend on, besides the problems.
+    settings: options of the command that these results depend on.
+    """
 
     group: str
     label: str
     build: Callable[[], nn.Module]
     limit: int
     identity: dict[str, Any]
+    settings: dict[str, Any]
 
     @property
     def file(self) -> str:
-        return f"{self.group}-{self.label}".replace(" ", "_").replace(",", "")
+        return re.sub(r"[^\w-]+", "_", f"{self.group}-{self.label}") + ".jsonl"
+
+    @property
+    def seed(self) -> int:
+        """The seed of its training; 0 for a method that the command does not train."""
+        return int(self.settings.get("seed", 0))
+
+
+@dataclass(frozen=True)
+class Weights:
+    """A checkpoint of a table, by group and label, and the options of the command that it depends on."""
+
+    group: str
+    label: str
+    checkpoint: Path
+    settings: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -156,25 +201,38 @@ def network(checkpoint: str | Path, *, ours: bool = False) -> BPnPNet:
 
 
 def solve_problems(
-    file: Path, build: Callable[[], nn.Module], data: LightningDataModule, limit: int, identity: Mapping[str, Any]
+    file: Path,
+    build: Callable[[], nn.Module],
+    data: LightningDataModule,
+    limit: int,
+    identity: Mapping[str, Any],
+    *,
+    solve: bool = True,
 ) -> list[ProblemRow]:
     """Test a solver on the first `limit` problems of a fixed random order, each by itself, and return the rows.
 
     Rows are appended to a file as they come. Those of the same `identity` and the same problems that are there already
-    are not measured again; others are dropped. Seconds are of one thread's CPU time.
+    are not measured again; others are dropped. Seconds are of one thread's CPU time. Without `solve`, nothing is
+    measured or dropped, and there are no rows unless the file has all of them.
     """
     data.setup("test")
     problems = data.datasets["test"]  # type: ignore[attr-defined]
     order = problem_order(len(problems))[:limit]
     drawn = fingerprint(problems.problem(order[0]).points2d.tolist()) if order else ""
-    head = json.dumps({"identity": dict(identity), "problems": drawn}, sort_keys=True)
+    head = {"identity": dict(identity), "problems": drawn}
     lines = file.read_text().splitlines() if file.is_file() else []
-    if not lines or lines[0] != head:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(head + "\n")
-        lines = [head]
-    rows = [ProblemRow(**json.loads(line)) for line in lines[1:]]
+    found = json.loads(lines[0]) if lines else {}
+    same = all(found.get(name) == value for name, value in head.items())
+    rows = [ProblemRow(**json.loads(line)) for line in lines[1:]] if same else []
     missing = [i for i in order if i not in {row.index for row in rows}]
+    if missing and not solve:
+        return []
+    if not same:
+        if lines:
+            print(f"{file}: other weights, settings or problems; measured again", flush=True)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        today = {"commit": commit(), "date": f"{datetime.now(UTC):%Y-%m-%d}", "cpu": processor()}
+        file.write_text(json.dumps(head | {"measured": today}, sort_keys=True) + "\n")
     solver = build() if missing else nn.Identity()
     with file.open("a") as out:
         for i in missing:
@@ -192,6 +250,14 @@ def solve_problems(
     return sorted((row for row in rows if row.index in chosen), key=lambda row: row.index)
 
 
+def provenance(file: Path) -> dict[str, str]:
+    """Return commit, date and processor of the rows that `solve_problems` wrote; the date alone for an older file."""
+    with file.open() as lines:
+        head = json.loads(lines.readline())
+    date = datetime.fromtimestamp(file.stat().st_mtime, UTC)
+    return head.get("measured", {"date": f"{date:%Y-%m-%d}"})
+
+
 def branches(
     folder: Path, arguments: tuple[str, ...], *, steps: int, pose_steps: int, epoch: int
 ) -> dict[str, Training]:
@@ -205,68 +271,109 @@ def branches(
     }
 
 
-def network_methods(weights: Iterable[tuple[str, str, Path]], *, problems: int, our_problems: int) -> Iterator[Method]:
-    """Networks, given as group, label and checkpoint, with the paper's inference and with ours."""
-    existing = [(group, label, checkpoint) for group, label, checkpoint in weights if checkpoint.is_file()]
+def branch_weights(trained: Mapping[str, Training], options: argparse.Namespace) -> list[Weights]:
+    """The checkpoints of the branches that exist."""
+    shared = {name: getattr(options, name) for name in ("seed", "steps", "epoch", "learning_rate")}
+    found = {label: trained_steps(trained[label].checkpoint) - options.steps for label in BRANCHES}
+    return [
+        Weights("paper", label, trained[label].checkpoint, shared | {"pose_steps": steps})
+        for label, steps in found.items()
+        if steps > 0
+    ]
+
+
+def network_methods(weights: Iterable[Weights], options: argparse.Namespace) -> Iterator[Method]:
+    """Networks with the paper's inference, then with ours."""
+    listed = [(one, trained_steps(one.checkpoint), digest(one.checkpoint)) for one in weights]
     for ours in (False, True):
-        for group, label, checkpoint in existing:
-            identity = {"steps": trained_steps(checkpoint), "bytes": checkpoint.stat().st_size, "ours": ours}
-            limit = min(problems, our_problems) if ours else problems
-            name = f"{group}, our inference" if ours else group
-            yield Method(name, label, partial(network, checkpoint, ours=ours), limit, identity)
+        for one, steps, content in listed:
+            identity = {"steps": steps, "weights": content, "ours": ours}
+            limit = min(options.problems, options.our_problems) if ours else options.problems
+            settings = one.settings | {"our_problems" if ours else "problems": limit}
+            group = f"{one.group}, our inference" if ours else one.group
+            yield Method(group, one.label, partial(network, one.checkpoint, ours=ours), limit, identity, settings)
+
+
+def other_methods(baselines: Mapping[str, Callable[[], nn.Module]], options: argparse.Namespace) -> Iterator[Method]:
+    """The baselines, 30 seconds a problem, and the search, 10."""
+    for name, baseline in baselines.items():
+        limit = options.baseline_problems
+        yield Method("baselines", name, baseline, limit, {"time_limit": 30}, {"baseline_problems": limit})
+    limit = options.our_problems
+    search = partial(Search, time_limit=SEARCH_SECONDS)
+    yield Method("baselines", "search", search, limit, {"time_limit": SEARCH_SECONDS}, {"our_problems": limit})
+
+
+def digest(file: Path) -> str:
+    """Return the first 16 digits of the SHA-256 sum of a file."""
+    return hashlib.sha256(file.read_bytes()).hexdigest()[:16]
+
+
+def read_record(file: Path) -> dict[str, Any]:
+    """Return the rows and the effects of a record; none if there is no file."""
+    record = json.loads(file.read_text()) if file.is_file() else {}
+    return {key: record.get(key, {}) for key in ("rows", "effects")}
 
 
 def measure(
     table: Table,
     trained: Mapping[str, Training],
-    methods: Callable[[str], Iterable[Method]],
+    methods: Callable[[], Iterable[Method]],
     data: Callable[[str], LightningDataModule],
     options: argparse.Namespace,
 ) -> dict[str, Any]:
-    """Train what is missing, test all methods on all sets, and return the record, which is written after each set.
+    """Train what is missing, test the chosen methods on all sets, and return the record, written after each set.
 
-    methods, data: of the name of a test set.
+    data: of the name of a test set.
     """
+    record = read_record(options.output)
+    seeds = {row["settings"]["test_seed"] for row in record["rows"].values()}
+    if seeds - {options.test_seed}:
+        sys.exit(f"{options.output} has rows of the test seed {min(seeds)}; give another --output for another")
     for one in trained.values():
         if not options.only_test:
             one.run()
-    record: dict[str, Any] = json.loads(options.output.read_text()) if options.output.is_file() else {}
-    record = {key: record.get(key, {}) for key in ("rows", "effects", "training")}
-    steps = {label: trained_steps(one.checkpoint) for label, one in trained.items()}
-    if not options.only_test and len({steps[label] for label in BRANCHES}) > 1:
-        lengths = ", ".join(f"{label} {steps[label]:,}" for label in BRANCHES)
+    steps = {label: trained_steps(trained[label].checkpoint) for label in BRANCHES}
+    if not options.only_test and len(set(steps.values())) > 1:
+        lengths = ", ".join(f"{label} {number:,}" for label, number in steps.items())
         sys.exit(f"the branches differ in their steps ({lengths}); give a larger --pose_steps to train the shorter one")
-    if any(steps[label] for label in BRANCHES):
-        facts = {"learning_rate": options.learning_rate, "switch": options.steps}
-        record["training"][f"seed {options.seed}"] = steps | facts
+    tests = f"tests-{options.test_seed}" if options.test_seed else "tests"
     for name in options.sets:
-        found: dict[str, list[ProblemRow]] = {}
-        for method in methods(name):
-            if not any(part in f"{method.group} {method.label}" for part in options.only):
-                continue
-            file = options.run / f"seed{options.seed}" / "tests" / name / f"{method.file}.jsonl"
-            rows = solve_problems(file, method.build, data(name), method.limit, method.identity)
+        problems = data(name)
+        found: dict[tuple[str, str, str], tuple[Method, list[ProblemRow]]] = {}
+        chosen = set()
+        for method in methods():
+            solve = any(part in f"{method.group} {method.label}" for part in options.only)
+            file = options.run / f"seed{method.seed}" / tests / name / method.file
+            rows = solve_problems(file, method.build, problems, method.limit, method.identity, solve=solve)
             for estimate in dict.fromkeys(row.estimate for row in rows):
-                key = f"{name}|{options.seed}|{method.group}|{method.label}|{estimate}"
-                chosen = [row for row in rows if row.estimate == estimate]
-                found[f"{method.group}|{method.label}|{estimate}"] = chosen
-                record["rows"][key] = figures(chosen, table.recall) | {"steps": method.identity.get("steps")}
-                print(f"{key}: {record['rows'][key]}", flush=True)
-        for (group, pair), estimate in product(PAIRS.items(), ("pnp", "ransac")):
-            before, after = (found.get(f"{group}|{label}|{estimate}") for label in pair)
-            if before and after:
-                keys = (f"{name}|{options.seed}|{group}|{label}|{estimate}" for label in pair)
-                compared = [record["rows"][key]["steps"] for key in keys]
-                found_effect = effect(before, after, table.recall) | {"steps": compared}
-                record["effects"][f"{name}|{options.seed}|{group}|{estimate}"] = found_effect
-        write(options.output, record)
+                key = (method.group, method.label, estimate)
+                found[key] = method, [row for row in rows if row.estimate == estimate]
+                if solve:
+                    chosen.add(key)
+                    text = "|".join((name, str(method.seed), *key))
+                    record["rows"][text] = figures(found[key][1], table.recall) | {
+                        "steps": method.identity.get("steps"),
+                        "settings": method.settings | {"test_seed": options.test_seed},
+                        "measured": provenance(file),
+                    }
+                    print(f"{text}: {record['rows'][text]}", flush=True)
+        for group, pairs in PAIRS.items():
+            for pair, estimate in product(pairs, ("pnp", "ransac")):
+                keys = [(group, label, estimate) for label in pair]
+                if all(key in found for key in keys) and chosen.intersection(keys):
+                    (before, first), (after, second) = (found[key] for key in keys)
+                    compared = {"steps": [before.identity["steps"], after.identity["steps"]]}
+                    text = "|".join((name, str(before.seed), group, *pair, estimate))
+                    record["effects"][text] = effect(first, second, table.recall) | compared
+        write_json(options.output, record)
         curves = {
-            label + ESTIMATES[estimate]: found[f"paper|{label}|{estimate}"]
-            for label in BRANCHES
-            for estimate in ("pnp", "ransac")
-            if f"paper|{label}|{estimate}" in found
+            label + ESTIMATES[estimate]: found["paper", label, estimate][1]
+            for label, estimate in product(BRANCHES, ("pnp", "ransac"))
+            if ("paper", label, estimate) in found
         }
-        if curves and name == table.sets[0] and not options.quick:
+        lowest = min((int(key.split("|")[1]) for key in record["rows"]), default=0)
+        if curves and name == table.sets[0] and options.seed == lowest and not options.quick:
             save_figure(recall_picture(curves, table), PICTURES / f"{table.name}.png")
     return record
 
@@ -295,42 +402,91 @@ def recall_picture(rows: Mapping[str, Sequence[ProblemRow]], table: Table) -> "F
 
 
 def markdown(table: Table, record: Mapping[str, Any]) -> dict[str, str]:
-    """By name, the Markdown of the tables: the rows of a set and a group, the effect of L_p, the trainings."""
+    """By name, the Markdown of the tables.
+
+    These are the rows of a set and a group (of several seeds, the lowest), the rows of all seeds, the effects of L_p,
+    the trainings, and the commands.
+    """
     result: dict[str, str] = {}
-    lowest = min((int(key.split("|")[1]) for key in record["rows"]), default=0)
     lines: dict[str, list[tuple[int, str]]] = {}
+    spreads: dict[str, list[tuple[int, str, int, str]]] = {}
+    split = {key: key.split("|") for key in record["rows"]}
+    lowest: dict[tuple[str, str], int] = {}
+    for name, seed, group, _, _ in split.values():
+        lowest[name, group] = min(int(seed), lowest.get((name, group), int(seed)))
     for key, found in record["rows"].items():
-        name, seed, group, label, estimate = key.split("|")
-        if int(seed) == lowest:
-            place = list(ESTIMATES).index(estimate) if estimate in ESTIMATES else 0
-            title = f"{name}-{group}".replace(", ", "-").replace(" ", "-")
-            lines.setdefault(title, []).append((place, row_text(label + ESTIMATES.get(estimate, ""), found)))
+        name, seed, group, label, estimate = split[key]
+        place = list(ESTIMATES).index(estimate) if estimate in ESTIMATES else 0
+        title, label = f"{name}-{group}".replace(", ", "-").replace(" ", "-"), label + ESTIMATES.get(estimate, "")
+        if int(seed) == lowest[name, group]:
+            lines.setdefault(title, []).append((place, row_text(label, found)))
+        if group == "paper":
+            row = (place, label, int(seed), row_text(f"{label}, seed {seed}", found))
+            spreads.setdefault(f"{name}-spread", []).append(row)
     printed = list(printed_rows(table.paper))
     for title, rows in lines.items():
         local = printed[3:] if title.endswith("-paper") else printed[:3] if title.endswith("-baselines") else []
         ours = [text for _, text in sorted(rows, key=lambda row: row[0])]
         result[title] = "".join([head(table.recall), *ours, *local])
-    named = {"pnp": "", "ransac": " R"}
-    for name, (group, (first, second)) in product(table.sets, PAIRS.items()):
-        texts = []
-        for estimate, suffix in named.items():
-            if (one := record["effects"].get(f"{name}|{lowest}|{group}|{estimate}")) is not None:
-                before, after = one["steps"]
-                label = f"{second}{suffix} ({after:,} steps) minus {first}{suffix} ({before:,} steps)"
-                if before != after:
-                    label += ", unequal training"
-                texts.append(effect_text(label, one))
-        if texts:
-            title = f"{name}-effect" if group == "paper" else f"{name}-{group}-effect"
-            result[title] = effect_head(table.recall) + "".join(texts)
+    for title, several in spreads.items():
+        many = len({seed for _, _, seed, _ in several}) > 1
+        texts = [head(table.recall), *(text for *_, text in sorted(several))]
+        result[title] = "".join(texts) if many else "Measured with one seed.\n"
+    for title, texts in effect_lines(record["effects"]).items():
+        result[title] = effect_head(table.recall) + "".join(texts)
+    result["commands"] = "```\n" + "".join(f"{line}\n" for line in commands(table, record)) + "```\n"
     names = ("training", "steps until the switch", "steps of Lc", "steps of Lc Lp", "learning rate")
-    trained = [
-        (seed, one["switch"], *(one.get(label, 0) for label in BRANCHES), f"{one['learning_rate']:g}")
-        for seed, one in record["training"].items()
-    ]
+    trained: dict[tuple[str, int, float], dict[str, int]] = {}
+    for key, found in record["rows"].items():
+        _, seed, group, label, _ = split[key]
+        if group == "paper":
+            settings = found["settings"]
+            trained.setdefault((seed, settings["steps"], settings["learning_rate"]), {})[label] = found["steps"]
     if trained:
-        lines_of_trainings = (names, ["---"] * len(names), *trained)
+        cells = [
+            (f"seed {seed}", switch, *(steps.get(label, "") for label in BRANCHES), f"{rate:g}")
+            for (seed, switch, rate), steps in trained.items()
+        ]
+        lines_of_trainings = (names, ["---"] * len(names), *cells)
         result["training"] = "".join(f"| {' | '.join(map(str, cells))} |\n" for cells in lines_of_trainings)
+    return result
+
+
+def effect_lines(effects: Mapping[str, Any]) -> dict[str, list[str]]:
+    """By name of the table, a line for each pair, seed and estimate."""
+    seeds = {key.split("|")[1] for key in effects}
+    result: dict[str, list[str]] = {}
+    for key in sorted(effects, key=lambda key: (*key.split("|")[:2], list(ESTIMATES).index(key.split("|")[-1]))):
+        name, seed, group, first, second, estimate = key.split("|")
+        before, after = effects[key]["steps"]
+        label = f"{second}{ESTIMATES[estimate]} ({after:,} steps) minus {first}{ESTIMATES[estimate]} ({before:,} steps)"
+        label += f", seed {seed}" if len(seeds) > 1 and group == "paper" else ""
+        label += ", unequal training" if before != after else ""
+        title = f"{name}-effect" if group == "paper" else f"{name}-{group}-effect"
+        result.setdefault(title, []).append(effect_text(label, effects[key]))
+    return result
+
+
+def commands(table: Table, record: Mapping[str, Any]) -> list[str]:
+    """The commands that give the rows of a record, one for each training; DATA stands for the folder of the data."""
+    settings = [row["settings"] for row in record["rows"].values()]
+    limits = {name: max((one.get(name, 0) for one in settings), default=0) for name in LIMITS}
+    weights = sorted({one["weights"] for one in settings if "weights" in one})
+    trainings = [
+        {name: value for name, value in one.items() if name not in LIMITS} for one in settings if "steps" in one
+    ]
+    distinct = [one for i, one in enumerate(trainings) if one not in trainings[:i]]
+    result = []
+    for one in distinct or [{"only_test": None}]:
+        words = [
+            word
+            for name, value in (one | limits).items()
+            if name not in DEFAULTS or DEFAULTS[name] != value
+            for word in (f"--{name}", *([] if value is None else [f"{value:g}"]))
+        ]
+        if weights:
+            words += ["--weights", *(f"{name}=CHECKPOINT" for name in weights)]
+        result.append(shlex.join(["python", "-m", "benchmarks", table.name, "--data", "DATA", *words]))
     return result
 
 
@@ -341,20 +497,22 @@ def options(
     found = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     found.add_argument("--data", type=Path, default=DATA, help="folder of the data sets")
     found.add_argument("--run", type=Path, default=run, help="(default: %(default)s)")
-    found.add_argument("--seed", type=int, default=0, help="of training and tests (default: %(default)s)")
+    found.add_argument("--seed", type=int, help="of the training (default: %(default)s)")
+    found.add_argument("--test_seed", type=int, help="of the test problems (default: %(default)s)")
     found.add_argument("--steps", type=int, default=steps, help="until the switch (default: %(default)s)")
     found.add_argument("--pose_steps", type=int, default=pose_steps, help="after it (default: %(default)s)")
-    found.add_argument("--epoch", type=int, default=100, help="steps between checkpoints (default: %(default)s)")
-    found.add_argument("--learning_rate", type=float, default=1e-4, help="the paper has 1e-5 (default: %(default)s)")
+    found.add_argument("--epoch", type=int, help="steps between checkpoints (default: %(default)s)")
+    found.add_argument("--learning_rate", type=float, help="the paper has 1e-5 (default: %(default)s)")
     found.add_argument("--sets", nargs="*", default=list(sets), help="test sets (default: %(default)s)")
     found.add_argument("--only", nargs="*", default=[""], help="parts of names: only methods with one of them")
-    found.add_argument("--problems", type=int, default=500, help="of a set, at most (default: %(default)s)")
-    found.add_argument("--our_problems", type=int, default=500, help="with our inference, and of the search")
-    found.add_argument("--baseline_problems", type=int, default=60, help="of a set (default: %(default)s)")
+    found.add_argument("--problems", type=int, help="of a set, at most (default: %(default)s)")
+    found.add_argument("--our_problems", type=int, help="with our inference, and of the search (default: %(default)s)")
+    found.add_argument("--baseline_problems", type=int, help="of a set (default: %(default)s)")
     found.add_argument("--only_test", action="store_true", help="no training")
     found.add_argument("--output", type=Path, default=file, help="(default: %(default)s)")
     found.add_argument("--quick", action="store_true", help="150 + 50 steps, 20 problems, its own folder")
     found.add_argument("--check", action="store_true", help="compare the pages with the record, measure nothing")
+    found.set_defaults(**DEFAULTS)
     return found
 
 
@@ -363,11 +521,12 @@ def run(
     parser: argparse.ArgumentParser,
     pages: Iterable[Path],
     measured: Callable[[argparse.Namespace], dict[str, Any]],
+    quick: Mapping[str, Any] = QUICK,
 ) -> None:
-    """Parse the options, measure, and fill the pages; a quick run prints its tables."""
+    """Parse the options, measure, and fill the pages; a quick run, with the options `quick`, prints its tables."""
     chosen = parser.parse_args()
     if chosen.check:
-        fill_pages(pages, table.name, markdown(table, json.loads(chosen.output.read_text())), check=True)
+        fill_pages(pages, table.name, markdown(table, read_record(chosen.output)), check=True)
         return
     if not chosen.only_test and (chosen.steps % chosen.epoch or chosen.pose_steps % chosen.epoch):
         parser.error(f"--steps and --pose_steps must be multiples of --epoch, {chosen.epoch}")
@@ -375,8 +534,7 @@ def run(
     if chosen.quick:
         chosen.run = chosen.run.with_name(f"{chosen.run.name}-quick")
         chosen.output = chosen.run / "record.json"
-        chosen.steps, chosen.pose_steps, chosen.epoch = 150, 50, 50
-        chosen.problems, chosen.our_problems, chosen.baseline_problems = 20, 5, 1
+        vars(chosen).update(quick)
     found = markdown(table, measured(chosen))
     if chosen.quick:
         print("\n\n".join(f"{name}\n{text}" for name, text in found.items()))

@@ -240,13 +240,21 @@ def run(rows: Callable[[argparse.Namespace], Iterable[Row]], options: argparse.A
 
 def write(path: Path, record: dict[str, Any]) -> None:
     """Write a JSON file of the measurements, with the machine, the commit and the command."""
-    commit = subprocess.run(
+    write_json(path, {"commit": commit(), "command": command(sys.argv), "machine": machine()} | record)
+
+
+def write_json(path: Path, record: dict[str, Any]) -> None:
+    """Write a JSON file."""
+    with write_atomically(path) as temporary:
+        temporary.write_text(json.dumps(record, indent=1) + "\n")
+
+
+def commit() -> str:
+    """Return the commit of this checkout; it ends in "-dirty" if files differ from it."""
+    described = subprocess.run(
         ["git", "-C", ROOT, "describe", "--always", "--dirty"], capture_output=True, text=True, check=False
     )
-    head = {"commit": commit.stdout.strip() or "unknown", "command": command(sys.argv), "machine": machine()}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with write_atomically(path) as temporary:
-        temporary.write_text(json.dumps(head | record, indent=1) + "\n")
+    return described.stdout.strip() or "unknown"
 
 
 def command(words: Sequence[str]) -> str:
@@ -258,14 +266,19 @@ def command(words: Sequence[str]) -> str:
     return " ".join(Path(word).name if word.startswith("/") else word for word in words)
 
 
-def machine() -> dict[str, Any]:
-    """Return the machine on which the figures were measured, and its load."""
+def processor() -> str:
+    """Return the name of the processor."""
     information = Path("/proc/cpuinfo")
     lines = information.read_text().splitlines() if information.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor()
+
+
+def machine() -> dict[str, Any]:
+    """Return the machine on which the figures were measured, and its load."""
     return {
         "kind": f"cpu-{os.cpu_count()}core",
-        "cpu": names[0] if names else platform.processor(),
+        "cpu": processor(),
         "threads": torch.get_num_threads(),
         "load_average": [round(x, 2) for x in os.getloadavg()],
         "torch": torch.__version__,

@@ -1,28 +1,30 @@
 """Table 1 of the paper: trains L_c and its fork L_c + L_p on ModelNet10, and tests them and the baselines.
 
-    python -m benchmarks table1                            # hours; a run that was stopped goes on
-    python -m benchmarks table1 --steps 5000               # a longer training goes on from a shorter one
-    python -m benchmarks table1 --quick                    # 20 minutes, another folder, no page
-    python -m benchmarks table1 --check                    # whether docs/table1.md is what the record says
+    python -m benchmarks table1 --data DATA                 # hours; a run that was stopped goes on
+    python -m benchmarks table1 --data DATA --steps 5000    # a longer training goes on from a shorter one
+    python -m benchmarks table1 --data DATA --seed 1        # another training, tested on the same problems
+    python -m benchmarks table1 --data DATA --quick         # 20 minutes, another folder, no page
+    python -m benchmarks table1 --check                     # whether docs/table1.md is what the record says
 
-The training is configs/paper/modelnet40.yaml but for data, steps and learning rate. At step `--steps` it forks: one
-branch goes on with L_c, the other with L_c + L_p, `--pose_steps` each. Tests keep every problem's result in the folder
-of the run; the figures go to benchmarks/table1.json and from there to docs/table1.md.
+DATA is a folder with the data sets `modelnet10` and `psb` (docs/data.md). The training is configs/paper/modelnet40.yaml
+but for data, steps and learning rate. At step `--steps` it forks: one branch goes on with L_c, the other with
+L_c + L_p, `--pose_steps` each. Tests keep every problem's result in the folder of the run; the figures go to
+benchmarks/table1.json, each row with its settings, and from there to docs/table1.md, with the commands that give them.
 """
 
 import argparse
+import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import paper_tables
-from paper_tables import BRANCHES, Method, Table, Training
+from paper_tables import LONGER, Method, Table, Training, Weights
 from record import ROOT
 from torch import nn
 
 from bpnp.datamodules import MeshDataModule
-from bpnp.models import Search
 from bpnp.models.baselines import GOSMA, RandomRansac, SoftPOSIT
 from bpnp.models.weights import checkpoint_path, pretrained_names
 
@@ -32,7 +34,6 @@ FILE = ROOT / "benchmarks" / "table1.json"
 PAGES = (ROOT / "README.md", ROOT / "docs" / "index.md", ROOT / "docs" / "table1.md")
 PACKAGED = ("procedural-euler", "paper-lc", "paper-lclp")
 BASELINES: dict[str, Callable[[], nn.Module]] = {"SoftPOSIT": SoftPOSIT, "RANSAC": RandomRansac, "GOSMA": GOSMA}
-SEARCH_SECONDS = 10.0
 
 
 def data_module(root: Path, seed: int, name: str) -> MeshDataModule:
@@ -52,25 +53,38 @@ def trainings(options: argparse.Namespace) -> dict[str, Training]:
     return paper_tables.branches(folder, arguments, epoch=options.epoch, **schedule)
 
 
-def methods(options: argparse.Namespace, trained: dict[str, Training], _: str) -> Iterator[Method]:
-    """Networks with the paper's inference and with ours, then baselines."""
-    weights = [("paper", label, trained[label].checkpoint) for label in BRANCHES]
-    weights += [("training", name, checkpoint_path(name)) for name in PACKAGED if name in pretrained_names()]
-    yield from paper_tables.network_methods(weights, problems=options.problems, our_problems=options.our_problems)
-    for name, baseline in BASELINES.items():
-        yield Method("baselines", name, baseline, options.baseline_problems, {"time_limit": 30})
-    search = partial(Search, time_limit=SEARCH_SECONDS)
-    limit = min(options.problems, options.our_problems)
-    yield Method("baselines", "search", search, limit, {"time_limit": SEARCH_SECONDS})
+def methods(options: argparse.Namespace, trained: dict[str, Training]) -> Iterator[Method]:
+    """Networks with the paper's inference and with ours, then other methods."""
+    known = {
+        name: Weights("training", name, checkpoint_path(name), {}) for name in PACKAGED if name in pretrained_names()
+    }
+    weights = [*paper_tables.branch_weights(trained, options), *(known | given_weights(options.weights)).values()]
+    yield from paper_tables.network_methods(weights, options)
+    yield from paper_tables.other_methods(BASELINES, options)
+
+
+def given_weights(words: list[str]) -> dict[str, Weights]:
+    """Parse `NAME=CHECKPOINT` words; a packaged name is tested with this file instead."""
+    found = {}
+    for word in words:
+        name, _, file = word.partition("=")
+        if not Path(file).is_file():
+            sys.exit(f"--weights {word}: {file or word} is no file; write NAME=CHECKPOINT")
+        found[name] = Weights("training", name, Path(file), {"weights": name})
+    return found
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     trained = trainings(options)
-    data = partial(data_module, options.data, options.seed)
+    data = partial(data_module, options.data, options.test_seed)
     return paper_tables.measure(TABLE, trained, partial(methods, options, trained), data, options)
 
 
 def main() -> None:
     run = ROOT / "runs" / "table1"
     parser = paper_tables.options(__doc__, file=FILE, run=run, sets=TABLE.sets, steps=3000, pose_steps=600)
+    parser.add_argument(
+        "--weights", nargs="*", default=[], metavar="NAME=CHECKPOINT",
+        help=f"more rows beside the packaged weights; {LONGER!r} is compared with paper-lclp",
+    )  # fmt: skip
     paper_tables.run(TABLE, parser, PAGES, measure)

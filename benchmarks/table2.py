@@ -1,12 +1,13 @@
 """Table 2 of the paper: trains L_c and its fork L_c + L_p on photos of COLMAP models, and tests them on other scenes.
 
-    python -m benchmarks table2            # hours; a run that was stopped goes on
-    python -m benchmarks table2 --quick    # 20 minutes, another folder, no page
-    python -m benchmarks table2 --check    # whether docs/table2.md is what the record says
+    python -m benchmarks table2 --data DATA            # hours; a run that was stopped goes on
+    python -m benchmarks table2 --data DATA --quick    # 20 minutes, another folder, no page
+    python -m benchmarks table2 --check                # whether docs/table2.md is what the record says
 
-The training is configs/paper/megadepth.yaml but for data, steps, learning rate and normalised scene points (the scenes
-have different units): first on drawn maps, `--drawn_steps`, then on the photos of `TRAINED`. The landmarks that are
-tested are apart from those that are trained on. Photos have up to 1,000 of the points that they see.
+DATA is a folder with a folder `colmap` of COLMAP models, those of `TRAINED` and `TESTED` (docs/data.md). The training
+is configs/paper/megadepth.yaml but for data, steps, learning rate and normalised scene points (the scenes have
+different units): first on drawn maps, `--drawn_steps`, then on the photos of `TRAINED`. The landmarks that are tested
+are apart from those that are trained on. Photos have up to 1,000 of the points that they see.
 """
 
 import argparse
@@ -17,12 +18,11 @@ from pathlib import Path
 from typing import Any
 
 import paper_tables
-from paper_tables import BRANCHES, Method, Table, Training
+from paper_tables import QUICK, Method, Table, Training, Weights
 from record import ROOT
 from torch import nn
 
 from bpnp.datamodules import ColmapDataModule
-from bpnp.models import Search
 from bpnp.models.baselines import GOSMA, RandomRansac, SoftPOSIT
 
 TRAINED = ("castle-P30", "statue_of_liberty", "sceaux_castle_txt", "walkthrough", "walk_2", "walk_4", "walk_6")
@@ -35,7 +35,6 @@ BASELINES: dict[str, Callable[[], nn.Module]] = {
     "RANSAC": RandomRansac,
     "GOSMA": GOSMA,
 }
-SEARCH_SECONDS = 10.0
 DRAWN = ("num_points=128", "outliers=0.0", "frame=upright", "train_problems=1600", "val_problems=16", "batch_size=16")
 
 
@@ -61,20 +60,18 @@ def trainings(options: argparse.Namespace) -> dict[str, Training]:
     return {"drawn": start} | paper_tables.branches(folder, arguments, epoch=options.epoch, **schedule)
 
 
-def methods(options: argparse.Namespace, trained: dict[str, Training], _: str) -> Iterator[Method]:
-    """Networks with the paper's inference and with ours, then baselines."""
-    weights = [("paper", label, trained[label].checkpoint) for label in BRANCHES]
-    yield from paper_tables.network_methods(weights, problems=options.problems, our_problems=options.our_problems)
-    for name, baseline in BASELINES.items():
-        yield Method("baselines", name, baseline, options.baseline_problems, {"time_limit": 30})
-    search = partial(Search, time_limit=SEARCH_SECONDS)
-    limit = min(options.problems, options.our_problems)
-    yield Method("baselines", "search", search, limit, {"time_limit": SEARCH_SECONDS})
+def methods(options: argparse.Namespace, trained: dict[str, Training]) -> Iterator[Method]:
+    """Networks with the paper's inference and with ours, then other methods."""
+    drawn = {"drawn_steps": options.drawn_steps}
+    branches = paper_tables.branch_weights(trained, options)
+    weights = [Weights(one.group, one.label, one.checkpoint, one.settings | drawn) for one in branches]
+    yield from paper_tables.network_methods(weights, options)
+    yield from paper_tables.other_methods(BASELINES, options)
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     trained = trainings(options)
-    data = partial(data_module, options.data, options.seed)
+    data = partial(data_module, options.data, options.test_seed)
     return paper_tables.measure(TABLE, trained, partial(methods, options, trained), data, options)
 
 
@@ -82,4 +79,4 @@ def main() -> None:
     run = ROOT / "runs" / "table2"
     parser = paper_tables.options(__doc__, file=FILE, run=run, sets=TABLE.sets, steps=2000, pose_steps=400)
     parser.add_argument("--drawn_steps", type=int, default=2000, help="on drawn maps (default: %(default)s)")
-    paper_tables.run(TABLE, parser, PAGES, measure)
+    paper_tables.run(TABLE, parser, PAGES, measure, QUICK | {"drawn_steps": 100})

@@ -1,9 +1,13 @@
 """The benchmarks of the paper's tables: what was stopped goes on, figures are those of the rows, pages are filled."""
 
 import json
+import shlex
 import shutil
+from argparse import Namespace
+from functools import partial
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import finetune
 import numpy as np
@@ -14,7 +18,18 @@ import results
 import table1
 import table2
 import torch
-from paper_tables import Training, effect, figures, fill_tables, network, printed_rows, row_text, solve_problems
+from paper_tables import (
+    Method,
+    Table,
+    Training,
+    effect,
+    figures,
+    fill_tables,
+    network,
+    printed_rows,
+    row_text,
+    solve_problems,
+)
 from paper_weights import EPOCH, STAGES, trainings
 from report_data import row
 from small_data import SMALL_FEATURES
@@ -208,18 +223,30 @@ def test_tables_stand_between_their_markers_and_a_page_that_differs_is_found(tmp
     paper_tables.fill_pages([tmp_path / "page.md"], "t", {"one": "new\n"}, check=True)
 
 
+def settings(**other: float) -> dict[str, float]:
+    return {"seed": 0, "steps": 400, "pose_steps": 100, "epoch": 100, "learning_rate": 1e-4, "test_seed": 0} | other
+
+
 def test_a_record_becomes_the_tables_of_the_page() -> None:
     rng = np.random.default_rng(0)
     rows = [row(i, rotation_error_deg=float(rng.gamma(2, 5))) for i in range(10)]
-    one = figures(rows, table1.TABLE.recall)
-    keys = ("paper|Lc|ransac", "paper|Lc|pnp", "paper, our inference|Lc|refined", "baselines|search|search")
+    one = figures(rows, table1.TABLE.recall) | {"steps": 500}
+    other = figures(rows, table1.TABLE.recall) | {"settings": {"our_problems": 40, "test_seed": 0}}
     record = {
-        "rows": {f"modelnet10|0|{key}": one for key in keys},
-        "effects": {
-            f"modelnet10|0|{group}|pnp": effect(rows, rows, table1.TABLE.recall) | {"steps": [500, 400]}
-            for group in ("paper", "training")
+        "rows": {
+            "modelnet10|0|paper|Lc|ransac": one | {"settings": settings(problems=500)},
+            "modelnet10|0|paper|Lc|pnp": one | {"settings": settings(problems=500)},
+            "modelnet10|0|paper, our inference|Lc|refined": one | {"settings": settings(our_problems=40)},
+            "modelnet10|0|baselines|search|search": other,
         },
-        "training": {"seed 0": {"Lc": 500, "Lc Lp": 500, "learning_rate": 1e-4, "switch": 400}},
+        "effects": {
+            f"modelnet10|0|{key}|pnp": effect(rows, rows, table1.TABLE.recall) | {"steps": steps}
+            for key, steps in {
+                "paper|Lc|Lc Lp": [500, 400],
+                "training|paper-lc|paper-lclp": [500, 400],
+                f"training|{paper_tables.LONGER}|paper-lclp": [500, 500],
+            }.items()
+        },
     }
     tables = paper_tables.markdown(table1.TABLE, record)
     lines = tables["modelnet10-paper"].splitlines()
@@ -228,11 +255,155 @@ def test_a_record_becomes_the_tables_of_the_page() -> None:
     ]  # fmt: skip
     assert "| Lc, refined |" in tables["modelnet10-paper-our-inference"]
     assert "| *paper: GOSMA* |" in tables["modelnet10-baselines"]
-    assert "| seed 0 | 400 | 500 | 500 | 0.0001 |" in tables["training"]
+    assert "| seed 0 | 400 | 500 |  | 0.0001 |" in tables["training"]
     row_of_effect = "| Lc Lp (400 steps) minus Lc (500 steps), unequal training | 10 | +0 [+0, +0]"
     assert row_of_effect in tables["modelnet10-effect"]
     row_of_effect = "| paper-lclp (400 steps) minus paper-lc (500 steps), unequal training |"
     assert row_of_effect in tables["modelnet10-training-effect"]
+    row_of_effect = f"| paper-lclp (500 steps) minus {paper_tables.LONGER} (500 steps) |"
+    assert row_of_effect in tables["modelnet10-training-effect"]
+    assert tables["modelnet10-spread"] == "Measured with one seed.\n"
+
+
+def test_the_page_has_the_commands_of_its_rows_and_a_line_for_each_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The printed command, given to the benchmark, has the options that the rows were measured with."""
+    one = figures([row(i) for i in range(3)], table1.TABLE.recall)
+    record: dict[str, dict[str, object]] = {"rows": {}, "effects": {}}
+    for seed, steps in ((0, 700), (1, 300)):
+        for label in ("Lc", "Lc Lp"):
+            found = one | {
+                "steps": steps + 200,
+                "settings": settings(seed=seed, steps=steps, pose_steps=200, problems=500),
+            }
+            record["rows"][f"psb|{seed}|paper|{label}|pnp"] = found
+    record["rows"]["psb|0|baselines|GOSMA|pose"] = one | {"settings": {"baseline_problems": 20, "test_seed": 0}}
+    longer = one | {"steps": 9, "settings": {"weights": paper_tables.LONGER, "problems": 500, "test_seed": 0}}
+    record["rows"][f"psb|0|training|{paper_tables.LONGER}|pnp"] = longer
+    tables = paper_tables.markdown(table1.TABLE, record)
+    assert [line.split(" | ")[0] for line in tables["psb-spread"].splitlines()[2:]] == [
+        "| Lc, seed 0", "| Lc, seed 1", "| Lc Lp, seed 0", "| Lc Lp, seed 1",
+    ]  # fmt: skip
+    assert len(tables["psb-paper"].splitlines()) == 2 + 2 + 4  # the lowest seed and the paper's rows
+    parsed = []
+    monkeypatch.setattr(table1, "measure", lambda options: parsed.append(options) or record)
+    monkeypatch.setattr(paper_tables, "fill_pages", lambda *_, **__: None)
+    for line in tables["commands"].splitlines()[1:-1]:
+        words = shlex.split(line)
+        assert words[:4] == ["python", "-m", "benchmarks", "table1"]
+        monkeypatch.setattr("sys.argv", words[3:])
+        table1.main()
+    names = ("seed", "steps", "pose_steps", "problems", "our_problems", "baseline_problems")
+    found = [[getattr(options, name) for name in names] for options in parsed]
+    assert found == [[0, 700, 200, 500, 0, 20], [1, 300, 200, 500, 0, 20]]
+    assert parsed[0].weights == [f"{paper_tables.LONGER}=CHECKPOINT"]
+
+
+def test_a_row_keeps_its_provenance_and_is_compared_with_rows_that_are_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = partial(MeshDataModule, **SHAPES, cache_dir=str(tmp_path))
+    for label, steps in {"Lc": 900, "Lc Lp": 900, "first": 700}.items():
+        plant_steps(tmp_path / label / "checkpoints" / "last.ckpt", steps)
+    trained = {label: Training(tmp_path / label, (), 1, 1) for label in ("first", "Lc", "Lc Lp")}
+    file, calls = tmp_path / "record.json", []
+
+    def known(name: str) -> Known:
+        calls.append(name)
+        return Known(10)
+
+    def measure(*only: str, **other: int) -> dict[str, Any]:
+        options = {"seed": 0, "test_seed": 0, "only": only, "sets": ("toy",), "quick": True, "only_test": True}
+        chosen = Namespace(**(options | other), run=tmp_path, output=file)
+        methods = [
+            Method("paper", label, partial(known, label), 4, {"steps": 900}, {"seed": chosen.seed})
+            for label in ("Lc", "Lc Lp")
+        ]
+        return paper_tables.measure(
+            table1.TABLE, trained, lambda: methods, lambda _: data(seed=chosen.test_seed), chosen
+        )
+
+    monkeypatch.setattr(paper_tables, "commit", lambda: "early")
+    early = measure("paper Lc")["rows"]
+    assert calls == ["Lc", "Lc Lp"]
+    (tmp_path / "seed0" / "tests" / "toy" / "paper-Lc_Lp.jsonl").unlink()
+    monkeypatch.setattr(paper_tables, "commit", lambda: "late")
+    record = measure("Lc Lp")
+    assert calls == ["Lc", "Lc Lp", "Lc Lp"]
+    assert record["rows"]["toy|0|paper|Lc|pnp"] == early["toy|0|paper|Lc|pnp"]
+    assert [one["measured"]["commit"] for one in record["rows"].values()] == ["early", "late"]
+    assert record["effects"]["toy|0|paper|Lc|Lc Lp|pnp"]["steps"] == [900, 900]
+    text = file.read_text()
+    measure("zzz")
+    measure("paper Lc")
+    assert (file.read_text(), len(calls)) == (text, 3)
+    other = measure("paper", seed=1)["rows"]
+    assert other["toy|1|paper|Lc|pnp"]["rotation"] == early["toy|0|paper|Lc|pnp"]["rotation"]  # the same problems
+    with pytest.raises(SystemExit, match="record.json has rows of the test seed 0; give another --output"):
+        measure("paper", test_seed=1)
+
+
+@pytest.mark.parametrize("benchmark", [table1, table2], ids=lambda module: module.__name__)
+def test_the_seed_of_the_training_does_not_choose_the_test_problems(
+    benchmark: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seeds, trainings = [], []
+    monkeypatch.setattr(benchmark, "data_module", lambda root, seed, name: seeds.append(seed))
+    monkeypatch.setattr(paper_tables, "fill_pages", lambda *_, **__: None)
+
+    def measure(table: Table, trained: dict[str, Training], methods: object, data: Any, options: object) -> Any:
+        data(table.sets[0])
+        trainings.append(trained["Lc"])
+        return {"rows": {}, "effects": {}}
+
+    monkeypatch.setattr(paper_tables, "measure", measure)
+    for seed, test_seed in (("5", "0"), ("0", "3")):
+        words = ["--run", str(tmp_path), "--seed", seed, "--test_seed", test_seed]
+        monkeypatch.setattr("sys.argv", ["benchmark", *words])
+        benchmark.main()
+    assert seeds == [0, 3]
+    assert [one.folder.parent.name for one in trainings] == ["seed5", "seed0"]
+    assert ["--data.seed=5" in one.arguments for one in trainings] == [True, False]
+
+
+@pytest.mark.parametrize("benchmark", [table1, table2], ids=lambda module: module.__name__)
+def test_a_quick_run_is_short_in_every_part_and_leaves_the_record_alone(
+    benchmark: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chosen = []
+    monkeypatch.setattr(benchmark, "measure", lambda options: chosen.append(options) or {"rows": {}, "effects": {}})
+    monkeypatch.setattr("sys.argv", ["benchmark", "--quick"])
+    benchmark.main()
+    (options,) = chosen
+    trained = benchmark.trainings(options)
+    folders = {one.folder: one.steps for one in trained.values()}
+    assert sum(folders.values()) <= 700  # at 1 to 4 seconds a step; the branches have those of the common part too
+    assert all(one.steps % one.epoch == 0 for one in trained.values())
+    assert all(f"{options.run.name}/" in str(folder) and "quick" in options.run.name for folder in folders)
+    assert options.output.parent == options.run
+    assert options.problems * 3 + options.our_problems * 3 + options.baseline_problems * 3 * 30 <= 300  # seconds
+
+
+def test_weights_from_a_file_stand_beside_the_packaged_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = shutil.copy(str(table1.checkpoint_path("procedural-euler")), tmp_path / "longer.ckpt")
+    found = []
+    monkeypatch.setattr(paper_tables, "fill_pages", lambda *_, **__: None)
+
+    def measure(table: Table, trained: dict[str, Training], methods: Any, data: object, options: object) -> Any:
+        found.extend(methods())
+        return {"rows": {}, "effects": {}}
+
+    monkeypatch.setattr(paper_tables, "measure", measure)
+    command = ["table1", "--run", str(tmp_path), "--only_test", "--weights"]
+    monkeypatch.setattr("sys.argv", [*command, f"{paper_tables.LONGER}={file}", f"paper-lc={file}"])
+    table1.main()
+    rows = {method.label: method for method in found if method.group == "training"}
+    assert {paper_tables.LONGER, "paper-lc", "paper-lclp", "procedural-euler"} == set(rows)
+    assert rows[paper_tables.LONGER].identity == rows["procedural-euler"].identity == rows["paper-lc"].identity
+    assert rows["paper-lclp"].identity["weights"] != rows["paper-lc"].identity["weights"]
+    assert (paper_tables.LONGER, "paper-lclp") in paper_tables.PAIRS["training"]
+    monkeypatch.setattr("sys.argv", [*command, "longer"])
+    with pytest.raises(SystemExit, match="--weights longer: longer is no file; write NAME=CHECKPOINT"):
+        table1.main()
 
 
 def test_the_picture_has_a_curve_a_row_and_the_papers_quartiles() -> None:
