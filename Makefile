@@ -5,7 +5,7 @@ RUN := runs/quickstart
 # Percent of lines and branches that the tests run; compiled loops are not counted.
 FLOOR := 88
 
-.PHONY: quickstart check test coverage results lint docs notebooks wheel install clean
+.PHONY: quickstart show-report check test coverage results lint docs notebooks wheel install clean
 
 install: $(VENV)/.installed
 
@@ -20,6 +20,13 @@ quickstart: install
 	$(BIN)/bpnp test --config quickstart --ckpt_path $(RUN)/checkpoints/before_pose_loss.ckpt --results.folder $(RUN)/Lc
 	$(BIN)/bpnp test --config quickstart --ckpt_path $(RUN)/checkpoints/best.ckpt
 	$(BIN)/bpnp report $(RUN)/Lc $(RUN)/test --html $(RUN)/report.html --curves $(RUN)/curves.png
+	@$(MAKE) --no-print-directory show-report
+
+# In the browser where there is a display, and not in continuous integration, which sets CI.
+show-report:
+	@echo "report: $(CURDIR)/$(RUN)/report.html"
+	@if [ -n "$$DISPLAY$$WAYLAND_DISPLAY" ] && [ -z "$$CI" ]; then \
+		$(PYTHON) -m webbrowser "file://$(CURDIR)/$(RUN)/report.html" > /dev/null 2>&1 || true; fi
 
 lint: install
 	$(BIN)/ruff check .

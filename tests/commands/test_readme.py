@@ -1,7 +1,10 @@
 """Commands, options and files in the README and the documentation exist."""
 
+import os
 import re
 import shlex
+import subprocess
+import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -81,14 +84,40 @@ def test_the_code_of_the_readme_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    network, search = blocks(ROOT / "README.md", "python")
-    exec(network, {})
+    search, network = blocks(ROOT / "README.md", "python")
     names: dict[str, Any] = {}
     exec(search, names)
+    exec(network, {})
     assert names["example"].rotation_error_deg(names["solution"].rotation) < 0.5  # the map is off by depth noise
     assert (tmp_path / "pose.png").stat().st_size > 5000
-    expected = [line.split("# ")[-1] for code in (network, search) for line in code.splitlines() if "print(" in line]
+    expected = [line.split("# ")[-1] for code in (search, network) for line in code.splitlines() if "print(" in line]
     assert capsys.readouterr().out.split() == expected
+
+
+@pytest.mark.parametrize(
+    ("settings", "is_opened"),
+    [
+        ({"DISPLAY": ":0"}, True),
+        ({"WAYLAND_DISPLAY": "wayland-0"}, True),
+        ({}, False),
+        ({"DISPLAY": ":0", "CI": "1"}, False),
+    ],
+)
+def test_the_quickstart_opens_its_report_where_there_is_a_display(
+    settings: dict[str, str], is_opened: bool, tmp_path: Path
+) -> None:
+    """A browser of the environment gets the page; its path is always printed."""
+    browser = tmp_path / "browser"
+    browser.write_text(f'#!/bin/sh\necho "$1" > "{tmp_path}/opened"\n')
+    browser.chmod(0o755)
+    line = ["make", "--no-print-directory", "-f", str(ROOT / "Makefile"), "show-report", f"PYTHON={sys.executable}"]
+    environment = {"PATH": os.environ["PATH"], "BROWSER": f"{browser} %s", **settings}
+    done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    page = tmp_path / "runs" / "quickstart" / "report.html"
+    assert done.stdout == f"report: {page}\n"
+    opened = tmp_path / "opened"
+    assert (opened.read_text().strip() if opened.exists() else None) == (f"file://{page}" if is_opened else None)
+    assert "show-report" in (ROOT / "Makefile").read_text().split("\nquickstart:")[1].split("\n\n")[0]
 
 
 def test_the_code_of_the_data_guide_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
