@@ -16,10 +16,12 @@ from bpnp.report.terminal import Paper, console, say
 if TYPE_CHECKING:
     from bpnp.cameras import Camera
     from bpnp.report.figures import Lines
+    from bpnp.report.photos import PhotoSource
     from bpnp.report.points import ProblemPoints
     from bpnp.report.tables import MethodRow
     from bpnp.training.comparison import MethodTest
 
+VIEW_SIDE = 1000  # longer side of a photo in a figure, pixels
 LINES: Mapping[str, "Lines | None"] = {"true": "match3d", "assigned": "assigned3d", "none": None}
 
 
@@ -30,6 +32,7 @@ def report(
     html: Path | None = None,
     recall: Path | None = None,
     curves: Path | None = None,
+    photos: Path | None = None,
 ) -> None:
     """Show results side by side as tables; optionally write a page, recall curves and training curves.
 
@@ -39,6 +42,7 @@ def report(
         html: write a page that needs no network.
         recall: write the recall curves as .png, .jpg, .svg or .pdf.
         curves: write losses and validation of the first run's training as .png, .jpg, .svg or .pdf.
+        photos: folder of the photos of COLMAP models, for the page; `images` of each scene by default.
     """
     from bpnp.report.figures import recall_curve
     from bpnp.report.groups import differences, training_configs
@@ -58,7 +62,8 @@ def report(
     named = named_runs(runs)
     paths = list(named.values())
     if html is not None:
-        say(f"wrote {write_page(paths, html, paper=paper)}")
+        sources = {name: source for name, folder in named.items() if (source := photo_source(folder, photos))}
+        say(f"wrote {write_page(paths, html, paper=paper, photos=sources)}")
     if recall is not None:
         say(f"wrote {save_figure(recall_curve(paths, paper=paper), recall)}")
     results = read_runs(paths)
@@ -77,19 +82,22 @@ def view(
     lines: Literal["true", "assigned", "none"] = "true",
     photo: Path | None = None,
     camera: str | None = None,
+    photos: Path | None = None,
 ) -> None:
     """Draw a problem of a test, or a solution: points and cameras in space, and points in the image.
 
-    With a photo, the 3D points are drawn over it as each pose projects them.
+    With a photo, the 3D points are drawn over it as each pose projects them. Of several tests, such as those of
+    `bpnp table`, the poses of all are drawn.
 
     Args:
-        run: folder that `bpnp test` wrote, or its run; or the JSON of a solution.
+        run: folder that `bpnp test` or `bpnp table` wrote, or its run; or the JSON of a solution.
         problems: name of a problem, or part of it; the worst by default.
         output: .png, .jpg, .svg or .pdf; RUN/views/PROBLEM.png by default.
         estimate: estimate whose pose projects the 3D points; the first by default.
         lines: which matches to draw.
         photo: photo of the problem; needs --camera.
         camera: camera of the photo: a 3x3 matrix in a file, MODEL,PARAMETERS, or a COLMAP model that has the photo.
+        photos: folder of the photos of the COLMAP models that were tested, in place of --photo and --camera.
     """
     from bpnp.report.figures import plot_photo, plot_problem
     from bpnp.report.images import read_photo, save_figure
@@ -104,21 +112,56 @@ def view(
         raise ValueError(f"{run} does not exist; give the folder of a test or the JSON of a solution")
     if run.is_file() and names:
         raise ValueError(f"{run} is one solution, which has no problem {names[0]!r}")
+    if photos is not None and (photo is not None or run.is_file()):
+        raise ValueError("--photos finds the photos of a test; leave out --photo and --camera")
+    source = None
     if run.is_file():
         drawn, folder = [_solution(run)], run.absolute().parent
     else:
-        folder, *others = named_runs([run]).values()
-        if others:
-            raise ValueError(f"{run} holds the results of several tests; give one, such as {folder}")
-        drawn = read_problems(folder, names)
+        folders = named_runs([run])
+        first = next(iter(folders.values()))
+        folder = first if len(folders) == 1 else run
+        drawn = read_problems(first, names)
+        if len(folders) > 1:
+            drawn = merge_estimates(drawn, folders)
+        source = None if photos is None else photo_source(first, photos, side=VIEW_SIDE)
     for problem in drawn:
         name = run.stem if run.is_file() else re.sub(r"[^A-Za-z0-9._-]+", "_", problem.id) or str(problem.index)
-        if photo is None or camera is None:
+        estimates = None if estimate is None else [estimate]
+        if source is not None:
+            found = source(problem)
+            if found is None:
+                raise ValueError(f"{photos} has no photo of {problem.id}")
+            figure = plot_photo(replace(problem, camera=found.camera), found.pixels, estimates=estimates)
+        elif photo is None or camera is None:
             figure = plot_problem(problem, estimate=estimate, lines=LINES[lines])
         else:
             with_camera = replace(problem, camera=_camera_of(camera, photo))
-            figure = plot_photo(with_camera, read_photo(photo), estimates=None if estimate is None else [estimate])
+            figure = plot_photo(with_camera, read_photo(photo), estimates=estimates)
         say(f"wrote {save_figure(figure, output or folder / 'views' / f'{name}.png')}")
+
+
+def merge_estimates(problems: "Sequence[ProblemPoints]", folders: Mapping[str, Path]) -> "list[ProblemPoints]":
+    """Return problems with the poses of several tests, by the names of the tests and estimates.
+
+    Args:
+        problems: Problems of the first test.
+        folders: Results folders by name; those of other problems are left out.
+    """
+    from bpnp.report.points import read_points
+
+    tests = {name: {problem.id: problem for problem in read_points(folder)} for name, folder in folders.items()}
+    merged = []
+    for problem in problems:
+        estimates = {}
+        for name, known in tests.items():
+            other = known.get(problem.id)
+            if other is None or other.points3d.tobytes() != problem.points3d.tobytes():
+                continue
+            for estimate, pose in other.estimates.items():
+                estimates[name if len(other.estimates) == 1 else f"{name}: {estimate}"] = pose
+        merged.append(replace(problem, estimates=estimates))
+    return merged
 
 
 def _camera_of(text: str, photo: Path) -> "Camera":
@@ -171,19 +214,47 @@ def read_problems(folder: Path, names: Sequence[str]) -> list["ProblemPoints"]:
     return chosen
 
 
-def wandb_results(runs: list[Path], *, project: str = "bpnp", directory: Path | None = None) -> None:
+def photo_source(folder: Path, photos: Path | None, *, side: int | None = None) -> "PhotoSource | None":
+    """Return the source of the photos of a results folder, None if there is none.
+
+    Args:
+        folder: Results folder.
+        photos: Folder of the photos, None for those of the COLMAP models.
+        side: Longer side of the photos, pixels; None for the default.
+
+    Raises:
+        ValueError: `photos` is given, and has no photo of the problems.
+    """
+    from bpnp.commands.photo_files import find_photos
+    from bpnp.report.photos import SIDE
+    from bpnp.report.points import read_points
+    from bpnp.report.results import read_results
+
+    source = find_photos(read_results(folder), photos, side=side or SIDE)
+    if source is not None and photos is not None:
+        problems = read_points(folder)
+        if problems and all(source(problem) is None for problem in problems):
+            raise ValueError(f"{photos} has no photo of the problems in {folder}, such as {problems[0].id}")
+    return source
+
+
+def wandb_results(
+    runs: list[Path], *, project: str = "bpnp", directory: Path | None = None, photos: Path | None = None
+) -> None:
     """Log results to Weights & Biases: to folders for `wandb sync` unless WANDB_MODE=online.
 
     Args:
         runs: folders that `bpnp test` wrote, or their runs.
         project: name of the project.
         directory: parent of the folders of offline runs; that of the results by default.
+        photos: folder of the photos of COLMAP models, under their points; `images` of each scene by default.
     """
     from bpnp.report.dashboards import log_results
     from bpnp.report.tables import named_runs
 
     for name, folder in named_runs(runs).items():
-        written = log_results(folder, project=project, name=name, directory=directory)
+        source = photo_source(folder, photos, side=VIEW_SIDE)
+        written = log_results(folder, project=project, name=name, directory=directory, photos=source)
         say(f"logged {name} to {written}")
 
 

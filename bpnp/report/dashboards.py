@@ -6,21 +6,33 @@ the only module that imports `wandb`, and only when it is used.
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from bpnp.report.charts import RECALLS, recall_chart
-from bpnp.report.figures import plot_problem, recall_curve
+from bpnp.report.figures import plot_photo, plot_problem, recall_curve
+from bpnp.report.photos import PhotoSource
 from bpnp.report.points import ProblemPoints, read_points, utf8
 from bpnp.report.results import Results, cause_fractions, read_results
 from bpnp.report.tables import paper_of
 from bpnp.report.training_run import training_config, training_of, wandb_id
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 TRAINING = ("model", "data", "trainer", "optimizer", "lr_scheduler", "seed_everything")  # settings of a training
 MOST_PICTURES = 12  # largest number of pictures of problems
 
 
-def log_results(folder: Path | str, *, name: str, project: str = "bpnp", directory: Path | str | None = None) -> Path:
+def log_results(
+    folder: Path | str,
+    *,
+    name: str,
+    project: str = "bpnp",
+    directory: Path | str | None = None,
+    photos: PhotoSource | None = None,
+) -> Path:
     """Log a results folder to W&B.
 
     The run has scalars "test/<estimate>/rotation_q1_deg" and so on; tables "quartiles", "causes" and "problems"; recall
@@ -33,6 +45,7 @@ def log_results(folder: Path | str, *, name: str, project: str = "bpnp", directo
         name: Name of the W&B run; that of a training keeps its own.
         project: W&B project.
         directory: Parent of the folder `wandb` for the run. Default: the parent of `folder`.
+        photos: Source of the photos under the points of the pictures. Default: None, no photos.
 
     Returns:
         The folder of the W&B run.
@@ -65,7 +78,7 @@ def log_results(folder: Path | str, *, name: str, project: str = "bpnp", directo
     )
     try:
         run.config.update(config, allow_val_change=True)
-        run.log(scalars(results, part) | _media(results, problems, part))
+        run.log(scalars(results, part) | _media(results, problems, part, photos))
         return Path(run.settings.sync_dir)
     finally:
         run.finish()
@@ -84,7 +97,9 @@ def scalars(results: Results, part: str = "test") -> dict[str, float]:
     return values if loss is None else values | {f"{part}/correspondence_loss": loss}
 
 
-def _media(results: Results, problems: Sequence[ProblemPoints], part: str) -> dict[str, Any]:
+def _media(
+    results: Results, problems: Sequence[ProblemPoints], part: str, photos: PhotoSource | None
+) -> dict[str, Any]:
     """Return tables, recall curves and pictures of the worst problems."""
     import wandb
     from pandas import DataFrame
@@ -102,6 +117,14 @@ def _media(results: Results, problems: Sequence[ProblemPoints], part: str) -> di
             media[f"{part}/recall_curve/{error}"] = chart
     media[f"{part}/recall"] = wandb.Image(recall_curve({part: results}, paper=paper))
     worst = sorted(problems, key=lambda problem: -problem.error)[:MOST_PICTURES]
-    if drawn := [wandb.Image(plot_problem(problem), caption=utf8(problem.id)) for problem in worst]:
+    if drawn := [wandb.Image(_picture(problem, photos), caption=utf8(problem.id)) for problem in worst]:
         media[f"{part}/worst_problems"] = drawn
     return media
+
+
+def _picture(problem: ProblemPoints, photos: PhotoSource | None) -> "Figure":
+    """Draw a problem, over its photo if there is one."""
+    photo = None if photos is None else photos(problem)
+    if photo is None:
+        return plot_problem(problem)
+    return plot_photo(replace(problem, camera=photo.camera), photo.pixels)

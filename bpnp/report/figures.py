@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from bpnp.cameras import in_front
 from bpnp.report.charts import RECALLS, Error, recall_of
@@ -18,13 +19,14 @@ from bpnp.report.images import size_in_camera
 from bpnp.report.points import Array, ProblemPoints, utf8
 from bpnp.report.results import Results
 from bpnp.report.tables import lines_of, paper_quartiles, read_runs
-from bpnp.report.terminal import DASHES, LIGHT, QUIET, Paper
+from bpnp.report.terminal import DASHES, INKS, LIGHT, QUIET, Paper, number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
+TRUE_POSE = INKS["text"][0]  # colour of the true camera; that of no estimate is near it
 POINTS = 981  # points of a curve
 NUMBERED = 40  # largest number of 3D points whose indices are drawn
 MARGIN = 0.15  # margin around the image points, relative to their extent
@@ -134,6 +136,8 @@ def plot_problem(problem: ProblemPoints, *, estimate: str | None = None, lines: 
 def plot_photo(problem: ProblemPoints, photo: Array, *, estimates: Sequence[str] | None = None) -> "Figure":
     """Draw the 3D points over the photo as each pose projects them, an image per estimate (paper Fig. 4).
 
+    Rings are the image points. The titles have the errors of the poses, if the true pose is known.
+
     Args:
         problem: Problem with the camera of the photo.
         photo: Photo (h, w, 3), uint8.
@@ -148,10 +152,20 @@ def plot_photo(problem: ProblemPoints, photo: Array, *, estimates: Sequence[str]
     figure = Figure(figsize=(min(4 * WIDTH, WIDTH * len(names) / 2), 4.2), layout="constrained")
     for axes, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
         plot_image(axes, problem, estimate=name, lines=None, photo=photo)
-        found = np.isfinite(np.c_[problem.estimates[name]]).all()
-        axes.set_title(shown_text(name if found else f"{name}: no pose"), fontsize=10)
+        axes.set_title(shown_text(f"{name}: {_outcome(problem, name)}"), fontsize=10)
     figure.suptitle(shown_text(problem.id), fontsize=10)
     return figure
+
+
+def _outcome(problem: ProblemPoints, estimate: str) -> str:
+    """Describe the pose of an estimate by its errors."""
+    rotation, translation = problem.estimates[estimate]
+    if not np.isfinite(np.c_[rotation, translation]).all():
+        return "no pose"
+    if problem.pose is None:
+        return "a pose"
+    angle = np.degrees((Rotation.from_matrix(problem.pose[0]).inv() * Rotation.from_matrix(rotation)).magnitude())
+    return f"{number(float(angle))} deg, {number(float(np.linalg.norm(translation - problem.pose[1])))}"
 
 
 def plot_scene(axes: Any, problem: ProblemPoints) -> Any:
@@ -167,7 +181,7 @@ def plot_scene(axes: Any, problem: ProblemPoints) -> Any:
     colours = dict(zip(problem.estimates, cycle(LIGHT), strict=False))
     poses = {name: pose for name, pose in problem.estimates.items() if np.isfinite(np.c_[pose]).all()}
     frame = problem.pose or next(iter(poses.values()), (np.eye(3), np.zeros(3)))
-    cameras = {"true pose": (problem.pose, "black")} if problem.pose is not None else {}
+    cameras = {"true pose": (problem.pose, TRUE_POSE)} if problem.pose is not None else {}
     cameras |= {name: (pose, colours[name]) for name, pose in poses.items()}
     points = _upright(problem.points3d, frame)
     axes.scatter(*points.T, s=4, color=QUIET, depthshade=False)
@@ -247,12 +261,12 @@ def plot_image(
         axes.plot(*projected[away].T, ".", color=QUIET, ms=size / 2, label="3D points, facing away", zorder=1)
     if len(projected) <= NUMBERED:
         shown = matched if photo is not None else visible
-        for number in np.flatnonzero(
+        for index in np.flatnonzero(
             shown & (projected >= (left, top)).all(-1) & (projected <= (right, bottom)).all(-1)
         ):
-            ink = QUIET if away[number] else LIGHT[3] if free[number] else rim
-            text = str(problem.numbers()[1][number])
-            axes.annotate(text, projected[number], (4, 4), textcoords="offset points", fontsize=7, color=ink, zorder=5)
+            ink = QUIET if away[index] else LIGHT[3] if free[index] else rim
+            text = str(problem.numbers()[1][index])
+            axes.annotate(text, projected[index], (4, 4), textcoords="offset points", fontsize=7, color=ink, zorder=5)
     unit = _unit(problem)
     axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel=unit, ylabel=unit)
     axes.tick_params(labelsize=8)
@@ -348,8 +362,8 @@ def _prepare_drawing(
     if lines == "match3d" and (problem.match3d < 0).all():
         lines = "assigned3d"
     targets = np.full(len(projected), -1) if lines is None else getattr(problem, lines)
-    number = [*problem.estimates].index(name) if name else 0
-    return image, projected, targets, LIGHT[number % len(LIGHT)]
+    order = [*problem.estimates].index(name) if name else 0
+    return image, projected, targets, LIGHT[order % len(LIGHT)]
 
 
 def _facing_away(problem: ProblemPoints, estimate: str | None) -> Array:

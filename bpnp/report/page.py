@@ -1,7 +1,8 @@
 """Results as one HTML file that needs neither network nor server.
 
 It contains plotly's script, compressed: 2.0 MB of text. Numbers and points are compressed JSON: eight runs of ten
-thousand problems stay under 20 MB. The template and the scripts that draw in the browser are in `assets`.
+thousand problems stay under 20 MB. Photos add up to 4 MB. The template and the scripts that draw in the browser are in
+`assets`.
 """
 
 import base64
@@ -24,6 +25,7 @@ from bpnp.files import write_text
 from bpnp.report.charts import CONFIG, RECALLS, chart_text, figures, look, recall_chart
 from bpnp.report.groups import differences, group_rows, training_configs
 from bpnp.report.intervals import HEADERS, interval_caption, interval_cells, interval_title
+from bpnp.report.photos import PhotoSource
 from bpnp.report.points import Array, ProblemPoints, read_points, utf8
 from bpnp.report.results import (
     CAUSES,
@@ -56,6 +58,7 @@ COLUMNS = {  # columns of the table of problems: head and hover text
     "seconds": ("sec", "seconds, an equal part of those of its batch"),
 }
 PROBLEMS = 500  # number of problems whose points are on the page
+PHOTO_BYTES = 4_000_000  # text of the photos on the page
 DIGITS = 5  # significant digits of errors; for points and poses, relative to their extent
 ERRORS = ("rotation_error_deg", "translation_error", "centre_error", "reprojection_error_deg", "seconds")
 COUNTS = ("inliers", "m", "n", "matches", "iterations")
@@ -75,13 +78,20 @@ class TableRow(NamedTuple):
     cells: list[tuple[str, Any, bool]]
 
 
-def write_page(paths: Sequence[Path | str], output: Path | str, *, paper: Paper | None = None) -> Path:
+def write_page(
+    paths: Sequence[Path | str],
+    output: Path | str,
+    *,
+    paper: Paper | None = None,
+    photos: Mapping[str, PhotoSource] | None = None,
+) -> Path:
     """Write the page of one or several results folders atomically.
 
     Args:
         paths: Results folders.
         output: HTML file; an existing one is replaced.
         paper: Data set whose published rows are added, "modelnet40" or "megadepth". Default: None, no rows.
+        photos: Sources of the photos of problems, by the names of `named_runs`. Default: None, no photos.
 
     Returns:
         Path of the file.
@@ -89,10 +99,12 @@ def write_page(paths: Sequence[Path | str], output: Path | str, *, paper: Paper 
     Raises:
         ValueError: A folder or its points cannot be read.
     """
-    return write_text(Path(output), page_html(paths, paper=paper))
+    return write_text(Path(output), page_html(paths, paper=paper, photos=photos))
 
 
-def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None) -> str:
+def page_html(
+    paths: Sequence[Path | str], *, paper: Paper | None = None, photos: Mapping[str, PhotoSource] | None = None
+) -> str:
     """Return the page as text; arguments and errors are those of `write_page`."""
     folders = named_runs(paths)
     runs = {name: read_results(path) for name, path in folders.items()}
@@ -112,7 +124,7 @@ def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None) -> str
         "page.html",
         script=Markup("\n".join(map(_asset, SCRIPTS))),
         data=compress_text(json.dumps(numbers)),
-        points=page_points(runs, points),
+        points=page_points(runs, points, photos),
         plotly=plotly_script(),
         runs={
             name: (
@@ -236,11 +248,15 @@ def page_numbers(runs: Mapping[str, Results]) -> dict[str, Any]:
     return {"series": series, "columns": list(columns)}
 
 
-def page_points(runs: Mapping[str, Results], points: Mapping[str, Sequence[ProblemPoints]]) -> str:
+def page_points(
+    runs: Mapping[str, Results],
+    points: Mapping[str, Sequence[ProblemPoints]],
+    photos: Mapping[str, PhotoSource] | None = None,
+) -> str:
     """Return the points of the `PROBLEMS` worst problems of all runs: compressed lines of JSON.
 
     The first line has, by run, the number of the following line for each of the run's problems, -1 for none. Runs on
-    the same points share lines.
+    the same points share lines. The worst problems have their photos, `PHOTO_BYTES` in all.
     """
     keys = {name: {problem.index: _key(problem) for problem in points[name]} for name in runs}
     shared: dict[Hashable, dict[str, ProblemPoints]] = {}
@@ -254,7 +270,13 @@ def page_points(runs: Mapping[str, Results], points: Mapping[str, Sequence[Probl
         name: [number.get(keys[name].get(row.index), -1) for row in results.of(next(iter(results.estimates)))]
         for name, results in runs.items()
     }
-    lines = [json.dumps(_line(shared[key]), separators=(",", ":")) for key in worst]
+    lines, left = [], PHOTO_BYTES
+    for key in worst:
+        line = _line(shared[key])
+        if left > 0 and (photo := _photo(shared[key], photos or {})) is not None:
+            line["photo"] = photo
+            left -= len(photo["jpeg"])
+        lines.append(json.dumps(line, separators=(",", ":")))
     return compress_text("\n".join([json.dumps(line_numbers), *lines]))
 
 
@@ -298,6 +320,13 @@ def _line(runs: Mapping[str, ProblemPoints]) -> dict[str, Any]:
             for name, problem in runs.items()
         },
     }
+
+
+def _photo(runs: Mapping[str, ProblemPoints], photos: Mapping[str, PhotoSource]) -> dict[str, Any] | None:
+    """Return the photo of a problem and its extent in normalised coordinates."""
+    found = (photos[name](problem) for name, problem in runs.items() if name in photos)
+    photo = next((photo for photo in found if photo is not None), None)
+    return None if photo is None else {"jpeg": photo.jpeg, "extent": [round(x, DIGITS) for x in photo.extent]}
 
 
 def _decimals(points: Array) -> int:

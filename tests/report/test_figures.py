@@ -1,9 +1,11 @@
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from matplotlib.colors import to_rgb
 from PIL import Image
 from report_data import HOSTILE, drawn_problem, planted, write_run
 
@@ -15,6 +17,7 @@ from bpnp.report.figures import plot_photo, plot_problem, recall_curve
 from bpnp.report.images import save_figure
 from bpnp.report.points import points_from, write_points
 from bpnp.report.results import rows_from
+from bpnp.report.terminal import DARK, INKS, LIGHT
 
 
 def points_of(axes: object, marker: str) -> np.ndarray:
@@ -54,6 +57,37 @@ def test_recall_curves_show_the_quartiles_that_the_paper_prints(tmp_path: Path) 
     assert len(recall_curve({"run": write_run(tmp_path, 9, 0)}).axes[0].get_lines()) == 2
 
 
+def lab(colours: Iterable[str]) -> np.ndarray:
+    """CIE Lab of sRGB colours, white point D65, from the definition (IEC 61966-2-1 and CIE 15)."""
+    rgb = np.array([to_rgb(colour) for colour in colours])
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    matrix = [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
+    xyz = linear @ np.transpose(matrix) / [0.95047, 1, 1.08883]
+    x, y, z = np.where(xyz > (6 / 29) ** 3, np.cbrt(xyz), xyz / (3 * (6 / 29) ** 2) + 4 / 29).T
+    return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], -1)
+
+
+@pytest.mark.parametrize(("palette", "scheme"), [(LIGHT, 0), (DARK, 1)])
+def test_no_estimate_has_nearly_the_colour_of_another_or_of_the_true_pose(
+    palette: tuple[str, ...], scheme: int
+) -> None:
+    np.testing.assert_allclose(lab(["#ffffff", "#ff0000"]), [[100, 0, 0], [53.24, 80.09, 67.2]], atol=0.02)
+    colours = lab([*palette, INKS["text"][scheme]])
+    apart = np.linalg.norm(colours[:, None] - colours, axis=-1)
+    assert apart[~np.eye(len(colours), dtype=bool)].min() >= 27
+
+
+def test_the_eighth_camera_of_a_scene_is_not_the_true_one() -> None:
+    problem = drawn_problem(3, "eight")
+    names = [f"run {i}" for i in range(8)]
+    many = replace(problem, estimates=dict.fromkeys(names, problem.estimates["ransac"]))
+    (axes,) = (axes for axes in plot_problem(many).axes if axes.name == "3d")
+    colours = {str(line.get_label()): line.get_color() for line in axes.get_lines()}
+    assert set(colours) == {"true pose", *names}
+    apart = np.linalg.norm(lab(colours[name] for name in names) - lab([colours["true pose"]]), axis=-1)
+    assert apart.min() >= 27
+
+
 def test_the_true_pose_reprojects_each_point_onto_its_match() -> None:
     planted = drawn_problem(3, "<b>$x_1$</b>")
     figure = plot_problem(planted)
@@ -89,7 +123,9 @@ def test_a_photo_shows_the_points_where_the_camera_projects_them(tmp_path: Path)
     (problem,) = points_from(prediction, batch)
     photo = np.full((480, 640, 3), 200, np.uint8)
     figure = plot_photo(replace(problem, camera=camera_from(matrix)), photo)
-    assert [axes.get_title() for axes in figure.axes] == ["pnp", "search"]
+    titles = [axes.get_title() for axes in figure.axes]
+    assert [title.split(":")[0] for title in titles] == ["pnp", "search"]
+    assert titles[1].endswith(" deg, 0.300")  # the translation is moved by 0.3
     for axes, pose in zip(figure.axes, (true, moved), strict=True):
         crosses = next(line for line in axes.lines if line.get_marker() == "x")
         camera = problem.points3d @ pose.rotation[0].numpy().T + pose.translation[0].numpy()

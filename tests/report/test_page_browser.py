@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 from report_data import HOSTILE, drawn_problem, write_run
 
 from bpnp.report import Results, write_page
@@ -212,6 +213,37 @@ OVERLAPS = """return [...document.querySelectorAll('.js-plotly-plot')].flatMap((
 
 CUT = """return [...document.querySelectorAll('thead th')].filter((head) => head.scrollWidth > head.clientWidth + 1
     || getComputedStyle(head).overflowWrap != 'normal').map((head) => head.textContent)"""  # heads broken within a word
+
+
+@pytest.fixture(scope="module")
+def eight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A page of four runs with two estimates each."""
+    folder = tmp_path_factory.mktemp("eight")
+    names = ("a", "b", "c", "d")
+    for seed, name in enumerate(names):
+        write_run(folder / name, 20, seed)
+    return write_page([folder / name for name in names], folder / "report.html")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_no_line_of_eight_has_the_colour_of_the_true_pose(browser: Any, eight: Path, scheme: str) -> None:
+    features = [{"name": "prefers-color-scheme", "value": scheme}]
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
+    try:
+        opened(browser, eight.as_uri())
+        press(browser.execute_script, "#problem-table button.link")
+        true, *cameras = browser.execute_script(
+            "return document.getElementById('scene').data.slice(2).map((trace) => [trace.name, trace.line.color])"
+        )
+        lines = browser.execute_script("return SERIES.map((own) => ink(own.colour))")
+    finally:
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+    assert true[0] == "true pose"
+    assert {colour for _, colour in cameras} < set(lines)
+    assert len(set(lines)) == 8
+    for colour in lines:  # far from it in red, green or blue
+        apart = [abs(x - y) for x, y in zip(to_rgb(colour), to_rgb(true[1]), strict=True)]
+        assert max(apart) > 0.2
 
 
 @pytest.mark.parametrize(("width", "scheme"), [(390, "dark"), (1280, "light")])

@@ -57,9 +57,10 @@ function drawProblem() {
   if (!assigned && byId("lines").value === "assigned") byId("lines").value = "true";
   open.targets = { true: drawn.match3d, assigned }[byId("lines").value] ?? [];
   byId("picked").textContent = "Click a point to see its number and its match.";
+  byId("photo-label").hidden = !drawn.photo;
   drawScene(drawn);
   open.ends = drawn.points3d.map((p) => camera && projected(camera.pose, p));
-  draw(byId("image"), image(drawn, camera, open.targets), { scrollZoom: true },
+  draw(byId("image"), image(byId("photo").checked ? drawn : { ...drawn, photo: null }, camera, open.targets), { scrollZoom: true },
     ({ curveNumber, pointNumber }) => {
       if (curveNumber === 2) pick(pointNumber, open.targets.indexOf(pointNumber));
       if (curveNumber === 3) pick(open.targets[pointNumber] ?? -1, pointNumber);
@@ -110,8 +111,9 @@ function drawScene({ points3d, ids2d, ids3d, match3d, box: [left, top, width, he
   byId("scene").show = () => {};
 }
 
-// Image points, 3D points where a camera reprojects them, lines to their targets, dotted where these are wrong.
-function image({ points2d, points3d, ids2d, ids3d, match3d, box: [left, top, width, height] }, camera, targets) {
+// Image points, 3D points where a camera reprojects them, lines to their targets, dotted where these are wrong. The
+// photo below them is pale, so that the colours of the points stay legible.
+function image({ points2d, points3d, ids2d, ids3d, match3d, photo, box: [left, top, width, height] }, camera, targets) {
   const ends = points3d.map((p) => camera && projected(camera.pose, p));
   const lines = (right) => xyz(ends.flatMap((end, j) => (end && targets[j] >= 0 &&
     (targets === match3d || match3d[j] === targets[j]) === right ? [points2d[targets[j]], end, null] : [])));
@@ -122,6 +124,11 @@ function image({ points2d, points3d, ids2d, ids3d, match3d, box: [left, top, wid
     marker: { ...data[k].marker, size: size * small, color, line: { width: 1.8 * small, color } } });
   marks(2, "2D", ids2d, 9, ink("text"));
   marks(3, "3D", ids3d, 7, camera?.colour ?? ink("focus"));
+  if (photo) {
+    const [x, y, right, bottom] = photo.extent;
+    layout.images = [{ source: `data:image/jpeg;base64,${photo.jpeg}`, xref: "x", yref: "y", x, y, sizex: right - x,
+      sizey: bottom - y, sizing: "stretch", layer: "below", opacity: 0.6 }];
+  }
   Object.assign(layout.xaxis, { range: [left - 0.15 * width, left + 1.15 * width] });
   Object.assign(layout.yaxis, { range: [top + 1.15 * height, top - 0.15 * height] });
   return { data, layout: { ...layout, uirevision: open.i } };
