@@ -69,8 +69,8 @@ def report(
     results = read_runs(paths)
     console().print(results_table(results, paper=paper))
     console().print(interval_table(results))
-    for line in differences(results, training_configs(named, results)):
-        say(line)
+    if lines := differences(results, training_configs(named, results)):
+        say("The runs differ in:\n" + "\n".join(lines))
 
 
 def view(

@@ -30,6 +30,7 @@ TRUE_POSE = INKS["text"][0]  # colour of the true camera; that of no estimate is
 POINTS = 981  # points of a curve
 NUMBERED = 40  # largest number of 3D points whose indices are drawn
 MARGIN = 0.15  # margin around the image points, relative to their extent
+ACROSS, PANEL = 3, 4.5  # photos in a row, and width of each, inches
 WIDTH, CLOSE_UP, CAPTIONS = 10.0, 3.5, 1.6  # width of an image, of its residuals, and height of the captions, inches
 LIMITS: dict[Error, float] = {"rotation_deg": 20.0, "translation": 1.0, "joint": 20.0, "reprojection_deg": 2.0}
 Lines = Literal["match3d", "assigned3d"]
@@ -149,8 +150,15 @@ def plot_photo(problem: ProblemPoints, photo: Array, *, estimates: Sequence[str]
     from matplotlib.figure import Figure
 
     names = list(problem.estimates) if estimates is None else list(estimates)
-    figure = Figure(figsize=(min(4 * WIDTH, WIDTH * len(names) / 2), 4.2), layout="constrained")
-    for axes, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
+    columns = min(len(names), ACROSS)
+    rows = -(-len(names) // columns)
+    width, height = size_in_camera(photo, problem.camera)
+    size = (PANEL * columns, rows * (PANEL * height / width + 0.5) + 0.4)
+    figure = Figure(figsize=size, layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes in panels[len(names) :]:
+        axes.remove()
+    for axes, name in zip(panels[: len(names)], names, strict=True):
         plot_image(axes, problem, estimate=name, lines=None, photo=photo)
         axes.set_title(shown_text(f"{name}: {_outcome(problem, name)}"), fontsize=10)
     figure.suptitle(shown_text(problem.id), fontsize=10)
