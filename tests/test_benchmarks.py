@@ -190,7 +190,7 @@ def test_tables_are_filled_and_checked(tmp_path: Path, monkeypatch: pytest.Monke
         made.seeds.append(seed)
         return [made.outcome] * limit
 
-    rows = [here.Row("leds", "two rings", measure, (2, 1), 3.0)]
+    rows = [here.Row("leds", "two rings", measure, (2, 1), 3.0, seed=506)]
     made.outcome = record.Outcome("", 0.25, 0.0, "confident", 0.5)
     monkeypatch.setattr(here, "ROWS", rows)
     monkeypatch.setattr(here, "DOCUMENTS", (guide,))
@@ -204,16 +204,20 @@ def test_tables_are_filled_and_checked(tmp_path: Path, monkeypatch: pytest.Monke
     run()
     text = guide.read_text()
     assert "| two rings | 2 | 0.25 / 0.25 / 0.25 | 100.0% (3 deg) | 100.0% | 0 | 0.5 |" in text
+    assert "`python -m benchmarks results --only leds:`, seed 506.\n<!-- end" in text
     assert text.startswith("before\n")
     assert text.endswith("after\n")
     assert "old" not in text
     written = json.loads(file.read_text())
     assert written["full"]["leds: two rings"]["seed"] == 506
+    assert written["full"]["leds: two rings"]["commit"] == written["commit"]
     assert written["commit"]
     run("--check")
     run("--seed", "7")
     run("--check")
     assert made.seeds == [506, 506, 7, 7], "a check draws the problems of the file"
+    assert "seed 7." in guide.read_text()
+    text = guide.read_text()
     guide.write_text(text.replace("0.25 /", "0.24 /"))
     with pytest.raises(SystemExit, match=r"guide\.md: a table is not that of results\.json"):
         run("--check")
@@ -223,15 +227,43 @@ def test_tables_are_filled_and_checked(tmp_path: Path, monkeypatch: pytest.Monke
         run("--check")
     with pytest.raises(SystemExit, match="leds: two rings: never measured"):
         run("--quick", "--check")
+    assert made.seeds[-1] == 9
+    rows[0] = replace(rows[0], problems=(2, 0))
+    run("--quick", "--check")  # a row without quick problems is not measured
+
+
+def test_lines_of_reliability_and_deviations_sum_up_their_rows() -> None:
+    """Numbers are sums, fractions are means over problems; standard deviations over correct poses."""
+    one = {"problems": 3, "right": 1.0, "confident": 0.3333, "confident_and_wrong": 0, "sigmas": [0.6, 0.9, 1.0]}
+    found = {results.key(row): one | {"seed": 5} for row in results.ROWS}
+    found["reliability: devices, with normals"] |= {"problems": 1200, "right": 0.5, "confident_and_wrong": 2}
+    (line,) = (line for line in results.reliability_table(found) if line[0].endswith("with normals"))
+    assert line[1:] == ("1,200", "50.0%", "400", "2")
+    (line,) = (line for line in results.reliability_table(found) if line[0].startswith("LEDs of rings"))
+    assert line[1:] == ("54", "100.0%", "18", "0")
+    (line,) = (line for line in results.reliability_table(found) if line[0].startswith("exactly symmetric"))
+    assert line[1:] == ("39", "", "13", "0")
+    found["search: shapes, any rotation, 0.5 outliers a match"] |= {
+        "problems": 18,
+        "right": 0.5,
+        "sigmas": [0.2, 0.5, 0.6],
+    }
+    (line,) = (line for line in results.sigmas_table(found) if "shapes" in line[0])
+    assert line == ("12 of shapes among outliers", "30.0%", "60.0%", "70.0%")
+    assert "`python -m benchmarks results --only search: maps: leds:`, seed 5." in (
+        results.table("sigmas", found) or ""
+    )
 
 
 @pytest.mark.parametrize("part", ["quick", "full"])
 def test_the_record_has_every_row_and_no_other(part: str) -> None:
     """`results --check` would report the others as never measured."""
     recorded = json.loads(results.FILE.read_text())[part]
-    assert set(recorded) == {results.key(row) for row in results.ROWS}
-    for row in results.ROWS:
-        assert 0 < recorded[results.key(row)]["problems"] <= row.problems[part == "quick"]
+    rows = {results.key(row): row for row in results.ROWS if row.problems[part == "quick"]}
+    assert set(recorded) == set(rows)
+    seeds = {key: results.QUICK_SEED if part == "quick" else row.seed for key, row in rows.items()}
+    assert {key: result["seed"] for key, result in recorded.items()} == seeds, "the default seed is that of the record"
+    assert all(result["problems"] and result["commit"] for result in recorded.values())
 
 
 @pytest.mark.parametrize("document", results.DOCUMENTS, ids=lambda file: file.name)

@@ -219,7 +219,7 @@ def split(boxes: Boxes, rotating: Bool[Tensor, " b"]) -> Boxes:
 
 
 class GOPAC(BranchAndBound):
-    """Branch and bound on the number of inlier image points; exact, feasible for small problems only.
+    """Branch and bound on the number of inlier image points; exact where `converged`.
 
     `residual` of the pose is the fraction of image points that are no inliers. `converged` certifies that no pose of
     the domain has more inliers.
@@ -227,7 +227,8 @@ class GOPAC(BranchAndBound):
     Differences from the paper (Campbell et al., ICCV 2017):
 
     - A better pose is refined by the weighted PnP layer, in the paper by SoftPOSIT.
-    - The search is written in torch, for small problems; the authors' program is compiled and parallel.
+    - The search is written in torch and uses one thread; the authors' program is compiled and parallel. Over the whole
+      domain, 12 million boxes, 20 CPU seconds, certify nothing even for 8 points.
     - Camera centres lie in a cube of 1.5 weak-perspective distances around the centroid of the scene. Boxes of a half
       side under 0.001 root mean square radii of the scene are not split.
 
