@@ -308,7 +308,7 @@ def in_table(row: Row, name: str) -> bool:
 
 
 def rows_table(name: str, results: dict[str, Any]) -> list[tuple[str, ...]]:
-    lines = [COLUMNS]
+    lines: list[tuple[str, ...]] = [COLUMNS]
     for row in (row for row in ROWS if in_table(row, name)):
         result = results[key(row)]
         quartiles = " / ".join(f"{q:.2g}" if q < 10 else f"{q:.0f}" for q in result["rotation_q_deg"])
