@@ -1,79 +1,189 @@
-"""Fine-tuning without labels (section 5 of the paper): packaged weights before and after 120 steps on a scene.
+"""Fine-tuning without labels (section 5 of the paper): packaged weights before and after 120 steps on new data.
 
-    python -m benchmarks finetune            # minutes
-    python -m benchmarks finetune --check    # whether docs/train.md is what the record says
+    python -m benchmarks finetune --data DATA    # 10 CPU minutes
+    python -m benchmarks finetune --check        # whether docs/train.md is what the record says
 
-The loss is the reprojection error of the pose that the network finds (configs/paper/finetune_reprojection.yaml). Poses
-and matches of the photos only measure.
+DATA is a folder with the COLMAP models `colmap/<scene>` and the shapes of `modelnet10` (docs/data.md). The loss is the
+reprojection error of the pose that the network finds (configs/paper/finetune_reprojection.yaml). Poses and matches only
+measure. Every second photo of a scene is tuned on, the others are tested too. On ModelNet10, shapes of the training
+split are tuned on, those of the test split are tested.
 """
 
 import argparse
 import json
 import subprocess
 import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
-from paper_tables import figures, fill_pages, head, network, row_text, solve_problems, trained_steps
-from record import DATA, ROOT, write
+from lightning import LightningDataModule
+from paper_tables import (
+    PICTURES,
+    digest,
+    figures,
+    fill_pages,
+    head,
+    network,
+    provenance,
+    row_text,
+    solve_problems,
+    trained_steps,
+)
+from record import DATA, ROOT, write_json
 
-from bpnp.datamodules import ColmapDataModule
+from bpnp.datamodules import ColmapDataModule, MeshDataModule
+from bpnp.datamodules.colmap.model_files import find_scenes
+from bpnp.datamodules.colmap.module import ColmapSource
+from bpnp.datamodules.colmap.reconstruction import read_reconstruction
+from bpnp.datamodules.stored import write_problems
 from bpnp.models.weights import checkpoint_path
+from bpnp.report.figures import line_style
+from bpnp.report.images import save_figure
+from bpnp.report.results import ProblemRow
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 WEIGHTS = "procedural-so3"
 SCENES = ("fountain-P11", "statue_of_liberty")
+SHAPES = "modelnet10"
 POINTS = 128
+TEST_SHAPES = 100
+STEPS = 120
 RECALL = (10.0, 1.0)  # degrees, scene units
 FILE, PAGES = ROOT / "benchmarks" / "finetune.json", (ROOT / "docs" / "train.md",)
+PICTURE = PICTURES / "finetune.png"
+TUNED, HELD_OUT = "tuned on", "not tuned on"
+Rows = Mapping[str, Sequence[ProblemRow]]  # by "<data>|<part>|<before or after>|<estimate>"
 
 
-def fine_tune(scene: Path, folder: Path) -> Path:
-    """Fine-tune the weights to the photos of a scene, unless that was done, and return the checkpoint."""
+@dataclass(frozen=True)
+class Target:
+    """Data to tune to: options of `bpnp fit`, and a data module for each part that is tested."""
+
+    name: str
+    arguments: tuple[str, ...]
+    parts: dict[str, Callable[[], LightningDataModule]]
+
+
+def scene_target(model: Path, folder: Path) -> Target:
+    """Every second photo of a COLMAP model to tune on, and all to test, in two parts of a store in `folder`."""
+    store, parts = folder / "photos", (TUNED, HELD_OUT)
+    if not store.is_dir():
+        (models,) = find_scenes(model).values()
+        source = ColmapSource([read_reconstruction(path, name=name) for name, path in models.items()])
+        write_problems(store, ((parts[i % 2], source.problem(i)) for i in range(len(source.images))))
+    arguments = (f"--data.root={store}", f"--data.train_scenes={json.dumps([TUNED])}")
+    root = str(store)
+    tests: dict[str, Callable[[], LightningDataModule]] = {
+        part: partial(ColmapDataModule, root, test_scenes=[part], val_fraction=0.0, eval_max_points=POINTS)
+        for part in parts
+    }
+    return Target(model.name, arguments, tests)
+
+
+def shape_target(root: Path) -> Target:
+    """Shapes of the training split to tune on, those of the test split to test, in the paper's protocol."""
+    options = {"root": str(root), "num_points": POINTS, "pool_size": 1000, "test_problems": TEST_SHAPES}
+    arguments = (
+        "--data=bpnp.datamodules.MeshDataModule", f"--data.root={root}", f"--data.num_points={POINTS}",
+        "--data.pool_size=1000", "--data.fresh_views=true", "--data.train_problems=480", "--data.val_fraction=0.05",
+        "--data.batch_size=4",
+    )  # fmt: skip
+    return Target(root.name, arguments, {HELD_OUT: partial(MeshDataModule, **options)})  # type: ignore[arg-type]
+
+
+def targets(options: argparse.Namespace) -> Iterator[Target]:
+    for name in options.scenes:
+        yield scene_target(options.data / "colmap" / name, options.run / name)
+    for name in options.shapes:
+        yield shape_target(options.data / name)
+
+
+def fine_tune(target: Target, folder: Path) -> Path:
+    """Fine-tune the weights to the data, as far as that was not done, and return the checkpoint."""
     checkpoint = folder / "checkpoints" / "last.ckpt"
-    if not checkpoint.is_file():
+    if (done := trained_steps(checkpoint)) < STEPS:
+        resumed = ["--ckpt_path", "last"] if done else []
         command = [
-            sys.executable, "-m", "bpnp", "fit", "--config=paper/finetune_reprojection", f"--data.root={scene}",
-            f"--trainer.default_root_dir={folder}", "--trainer.enable_progress_bar=false",
+            sys.executable, "-m", "bpnp", "fit", "--config=paper/finetune_reprojection", *target.arguments,
+            f"--trainer.max_steps={STEPS}", f"--trainer.default_root_dir={folder}",
+            "--trainer.enable_progress_bar=false", *resumed,
         ]  # fmt: skip
         print(" ".join(command[1:]), flush=True)
         subprocess.run(command, check=True)
     return checkpoint
 
 
+def measure(options: argparse.Namespace, record: dict[str, Any]) -> dict[str, list[ProblemRow]]:
+    """Fine-tune to each target, test before and after, and write the record; return the rows of all problems."""
+    found: dict[str, list[ProblemRow]] = {}
+    for target in targets(options):
+        folder = options.run / target.name
+        after = fine_tune(target, folder)
+        for part, data in target.parts.items():
+            for when, checkpoint in {"before": checkpoint_path(WEIGHTS), "after": after}.items():
+                file = folder / f"{part}-{when}.jsonl".replace(" ", "_")
+                identity = {"weights": digest(checkpoint)}
+                rows = solve_problems(file, partial(network, checkpoint), data(), sys.maxsize, identity)
+                steps = 0 if when == "before" else trained_steps(after)
+                for estimate in ("ransac", "pnp"):
+                    key = f"{target.name}|{part}|{when}|{estimate}"
+                    found[key] = [row for row in rows if row.estimate == estimate]
+                    measured = {"steps": steps, "measured": provenance(file)}
+                    record["rows"][key] = figures(found[key], RECALL) | measured
+                    print(f"{key}: {record['rows'][key]}", flush=True)
+        write_json(options.output, record)
+    return found
+
+
 def table(record: dict[str, Any]) -> str:
-    """The rows of all scenes, before and after."""
+    """The rows of all data, before and after."""
     lines = []
     for key, found in record["rows"].items():
-        scene, when, estimate = key.split("|")
-        lines.append(row_text(f"{scene}, `{estimate}`, {when}", found))
+        name, part, when, estimate = key.split("|")
+        lines.append(row_text(f"{name}, {part}, `{estimate}`, {when}", found))
     return head(RECALL) + "".join(lines)
 
 
+def recall_picture(rows: Rows) -> "Figure":
+    """Fraction of the problems that were not tuned on within a rotation error, a plot for each data set."""
+    from matplotlib.figure import Figure
+
+    names = list(dict.fromkeys(key.split("|")[0] for key in rows))
+    figure = Figure(figsize=(9, 3.4), layout="constrained")
+    for axes, name in zip(np.atleast_1d(figure.subplots(1, len(names), sharey=True)), names, strict=True):
+        for i, estimate in enumerate(("pnp", "ransac")):
+            for k, when in enumerate(("after", "before")):
+                errors = np.sort([row.rotation_error_deg for row in rows[f"{name}|{HELD_OUT}|{when}|{estimate}"]])
+                recall = 100 * np.arange(1, len(errors) + 1) / len(errors)
+                axes.step(errors, recall, where="post", label=f"{estimate}, {when}", **line_style(i, k))
+        axes.set(xlabel="rotation error, degrees", xscale="log", xlim=(0.01, 180), ylim=(0, 100), title=name)
+        axes.grid(alpha=0.3)
+    figure.axes[0].set_ylabel("% of problems within")
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right center", frameon=False)
+    return figure
+
+
 def main() -> None:
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    options.add_argument("--data", type=Path, default=DATA, help="folder with colmap")
-    options.add_argument("--run", type=Path, default=ROOT / "runs" / "finetune", help="(default: %(default)s)")
-    options.add_argument("--scenes", nargs="*", default=list(SCENES), help="(default: %(default)s)")
-    options.add_argument("--output", type=Path, default=FILE, help="(default: %(default)s)")
-    options.add_argument("--check", action="store_true", help="compare the page with the record, measure nothing")
-    chosen = options.parse_args()
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=DATA, help="folder with colmap and modelnet10")
+    parser.add_argument("--run", type=Path, default=ROOT / "runs" / "finetune", help="(default: %(default)s)")
+    parser.add_argument("--scenes", nargs="*", default=list(SCENES), help="COLMAP models (default: %(default)s)")
+    parser.add_argument("--shapes", nargs="*", default=[SHAPES], help="folders of shapes (default: %(default)s)")
+    parser.add_argument("--output", type=Path, default=FILE, help="(default: %(default)s)")
+    parser.add_argument("--picture", type=Path, default=PICTURE, help="(default: %(default)s)")
+    parser.add_argument("--check", action="store_true", help="compare the page with the record, measure nothing")
+    chosen = parser.parse_args()
     record: dict[str, Any] = json.loads(chosen.output.read_text()) if chosen.output.is_file() else {}
     record = {"rows": record.get("rows", {})}
     if not chosen.check:
         torch.set_num_threads(1)
-        for name in chosen.scenes:
-            scene = chosen.data / "colmap" / name
-            after = fine_tune(scene, chosen.run / name)
-            for when, checkpoint in {"before": checkpoint_path(WEIGHTS), "after": after}.items():
-                data = ColmapDataModule(str(scene), test_fraction=1.0, eval_max_points=POINTS)
-                file = chosen.run / name / f"{when}.jsonl"
-                identity = {"steps": trained_steps(checkpoint), "bytes": checkpoint.stat().st_size}
-                rows = solve_problems(file, partial(network, checkpoint), data, sys.maxsize, identity)
-                for estimate in ("ransac", "pnp"):
-                    found = figures([row for row in rows if row.estimate == estimate], RECALL)
-                    record["rows"][f"{name}|{when}|{estimate}"] = found | {"steps": 0 if when == "before" else 120}
-                    print(f"{name}, {when}, {estimate}: {found}", flush=True)
-            write(chosen.output, record)
-    fill_pages(PAGES, "finetune", {"scenes": table(record)}, check=chosen.check)
+        if rows := measure(chosen, record):
+            save_figure(recall_picture(rows), chosen.picture)
+    fill_pages(PAGES, "finetune", {"data": table(record)}, check=chosen.check)

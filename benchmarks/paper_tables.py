@@ -2,7 +2,7 @@
 with intervals, and the tables of a page.
 
 A record has rows and paired effects. Each row has its own settings (the options of the command that it depends on) and
-the commit, the date and the processor of its measurement, which a later measurement of other rows leaves as they are.
+the commit, the date and the processor of its measurement. A later measurement of other rows does not change these.
 """
 
 import argparse
@@ -144,7 +144,7 @@ class Training:
 
     @property
     def switch(self) -> Path:
-        """The checkpoint at exactly `steps`, which a longer training leaves as it is."""
+        """The checkpoint at exactly `steps`; a longer training does not change it."""
         return self.folder.with_name(f"{self.folder.name}-{self.steps}.ckpt")
 
     def run(self) -> Path:
@@ -327,9 +327,9 @@ def measure(
     data: of the name of a test set.
     """
     record = read_record(options.output)
-    seeds = {row["settings"]["test_seed"] for row in record["rows"].values()}
-    if seeds - {options.test_seed}:
-        sys.exit(f"{options.output} has rows of the test seed {min(seeds)}; give another --output for another")
+    known = {row["settings"]["test_seed"] for row in record["rows"].values()}
+    if known - {options.test_seed}:
+        sys.exit(f"{options.output} has rows of the test seed {min(known)}; give another --output for another")
     for one in trained.values():
         if not options.only_test:
             one.run()
@@ -361,11 +361,13 @@ def measure(
         for group, pairs in PAIRS.items():
             for pair, estimate in product(pairs, ("pnp", "ransac")):
                 keys = [(group, label, estimate) for label in pair]
-                if all(key in found for key in keys) and chosen.intersection(keys):
-                    (before, first), (after, second) = (found[key] for key in keys)
-                    compared = {"steps": [before.identity["steps"], after.identity["steps"]]}
-                    text = "|".join((name, str(before.seed), group, *pair, estimate))
-                    record["effects"][text] = effect(first, second, table.recall) | compared
+                seeds = {str(found[key][0].seed) for key in chosen.intersection(keys)}
+                for text in ("|".join((name, seed, group, *pair, estimate)) for seed in seeds):
+                    record["effects"].pop(text, None)  # one of its rows is a new one
+                    if all(key in found for key in keys):
+                        (before, first), (after, second) = (found[key] for key in keys)
+                        compared = {"steps": [before.identity["steps"], after.identity["steps"]]}
+                        record["effects"][text] = effect(first, second, table.recall) | compared
         write_json(options.output, record)
         curves = {
             label + ESTIMATES[estimate]: found["paper", label, estimate][1]
@@ -482,7 +484,7 @@ def commands(table: Table, record: Mapping[str, Any]) -> list[str]:
             word
             for name, value in (one | limits).items()
             if name not in DEFAULTS or DEFAULTS[name] != value
-            for word in (f"--{name}", *([] if value is None else [f"{value:g}"]))
+            for word in (f"--{name}", *([] if value is None else [str(value)]))
         ]
         if weights:
             words += ["--weights", *(f"{name}=CHECKPOINT" for name in weights)]

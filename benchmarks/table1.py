@@ -85,6 +85,6 @@ def main() -> None:
     parser = paper_tables.options(__doc__, file=FILE, run=run, sets=TABLE.sets, steps=3000, pose_steps=600)
     parser.add_argument(
         "--weights", nargs="*", default=[], metavar="NAME=CHECKPOINT",
-        help=f"more rows beside the packaged weights; {LONGER!r} is compared with paper-lclp",
+        help=f"more rows of the group of the packaged weights; {LONGER!r} is compared with paper-lclp",
     )  # fmt: skip
     paper_tables.run(TABLE, parser, PAGES, measure)

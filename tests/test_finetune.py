@@ -1,4 +1,4 @@
-"""The benchmark of fine-tuning tests the packaged weights and the tuned ones on the same photos."""
+"""The benchmark of fine-tuning tests the packaged weights and the tuned ones on the same problems."""
 
 import json
 from pathlib import Path
@@ -8,27 +8,63 @@ import finetune
 import paper_tables
 import pytest
 from planted_model import plant_model
+from report_data import row
+from small_data import write_mesh_tree
 
 from bpnp.cli import main
+from bpnp.models import TrainedNet
+from bpnp.models.weights import describe_module
 
 
-def test_photos_are_tested_before_and_after_and_the_page_is_filled(
+def test_photos_and_shapes_are_tested_before_and_after_and_the_page_is_filled(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plant_model(tmp_path / "colmap" / "scene" / "sparse" / "0", seed=0)
+    plant_model(tmp_path / "colmap" / "scene" / "sparse" / "0", seed=0, images=5)
+    write_mesh_tree(tmp_path / "shapes")
     page = tmp_path / "train.md"
-    page.write_text("<!-- finetune: scenes -->\nold\n<!-- end of finetune -->\n")
+    page.write_text("<!-- finetune: data -->\nold\n<!-- end of finetune -->\n")
     monkeypatch.setattr(finetune, "PAGES", (page,))
-    short = ["--trainer.max_steps=2", "--data.batch_size=2"]
-    runner = SimpleNamespace(run=lambda command, check: main([*command[3:], *short]))
+    monkeypatch.setattr(finetune, "TEST_SHAPES", 2)
+    monkeypatch.setenv("BPNP_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(finetune, "STEPS", 2)
+    small = ["--data.batch_size=2"]
+    runner = SimpleNamespace(run=lambda command, check: main([*command[3:], *small]))
     monkeypatch.setattr(finetune, "subprocess", runner)
     paths = ["--data", str(tmp_path), "--run", str(tmp_path / "run"), "--output", str(tmp_path / "record.json")]
-    monkeypatch.setattr("sys.argv", ["finetune", *paths, "--scenes", "scene"])
+    paths += ["--picture", str(tmp_path / "recall.png")]
+    monkeypatch.setattr("sys.argv", ["finetune", *paths, "--scenes", "scene", "--shapes", "shapes"])
     finetune.main()
     rows = json.loads((tmp_path / "record.json").read_text())["rows"]
-    assert list(rows) == [f"scene|{when}|{estimate}" for when in ("before", "after") for estimate in ("ransac", "pnp")]
-    assert rows["scene|before|pnp"]["rotation"] != rows["scene|after|pnp"]["rotation"]
-    assert paper_tables.trained_steps(tmp_path / "run" / "scene" / "checkpoints" / "last.ckpt") == 2
-    assert "| scene, `pnp`, after | 120 |" in page.read_text()
+    parts = ["scene|tuned on", "scene|not tuned on", "shapes|not tuned on"]
+    ends = [f"{when}|{estimate}" for when in ("before", "after") for estimate in ("ransac", "pnp")]
+    assert list(rows) == [f"{part}|{end}" for part in parts for end in ends]
+    assert [rows[f"{part}|after|pnp"]["problems"] for part in parts] == [3, 2, 2]
+    for part in parts:
+        assert rows[f"{part}|before|pnp"]["rotation"] != rows[f"{part}|after|pnp"]["rotation"]
+    for name in ("scene", "shapes"):
+        checkpoint = tmp_path / "run" / name / "checkpoints" / "last.ckpt"
+        assert paper_tables.trained_steps(checkpoint) == 2
+        tested = TrainedNet.from_checkpoint(checkpoint)  # as `bpnp test` does: the paper's inference, as in the table
+        assert describe_module(tested) == describe_module(paper_tables.network(checkpoint))
+        assert tested.estimates == ("ransac", "pnp")
+    assert "| scene, not tuned on, `pnp`, after | 2 | 2 |" in page.read_text()
+    assert (tmp_path / "recall.png").stat().st_size > 0
     monkeypatch.setattr("sys.argv", ["finetune", *paths, "--check"])
     finetune.main()
+
+
+def test_the_picture_has_the_problems_that_were_not_tuned_on() -> None:
+    rows = {
+        f"{name}|{part}|{when}|{estimate}": [row(0, rotation_error_deg=2.0 * factor), row(1, rotation_error_deg=factor)]
+        for name in ("one", "two")
+        for part, factor in ((finetune.TUNED, 100.0), (finetune.HELD_OUT, 3.0))
+        for when in ("before", "after")
+        for estimate in ("ransac", "pnp")
+    }
+    one, two = finetune.recall_picture(rows).axes
+    assert [axes.get_title() for axes in (one, two)] == ["one", "two"]
+    assert {line.get_label() for line in two.lines} == {
+        f"{estimate}, {when}" for estimate in ("pnp", "ransac") for when in ("after", "before")
+    }
+    assert [line.get_xdata().tolist() for line in one.lines] == [[3.0, 6.0]] * 4
+    assert [line.get_ydata().tolist() for line in one.lines] == [[50.0, 100.0]] * 4

@@ -338,6 +338,8 @@ def test_a_row_keeps_its_provenance_and_is_compared_with_rows_that_are_there(
     assert (file.read_text(), len(calls)) == (text, 3)
     other = measure("paper", seed=1)["rows"]
     assert other["toy|1|paper|Lc|pnp"]["rotation"] == early["toy|0|paper|Lc|pnp"]["rotation"]  # the same problems
+    shutil.rmtree(tmp_path / "seed0")
+    assert list(measure("paper Lc Lp")["effects"]) == ["toy|1|paper|Lc|Lc Lp|pnp"]  # its other row is gone
     with pytest.raises(SystemExit, match="record.json has rows of the test seed 0; give another --output"):
         measure("paper", test_seed=1)
 
