@@ -29,7 +29,15 @@ from bpnp.datamodules.keyed_random import (
 )
 from bpnp.datamodules.loader import STAGES, ProblemDataModule, hold_out
 from bpnp.datamodules.problem import Counts
-from bpnp.datamodules.shapes import MeshError, Normalisation, Sampler, Shapes, normalise, procedural_shapes
+from bpnp.datamodules.shapes import (
+    MeshError,
+    Normalisation,
+    ProceduralKind,
+    Sampler,
+    Shapes,
+    normalise,
+    procedural_shapes,
+)
 from bpnp.datamodules.store import JobResult, Recipe, Store, StoreError, StoreRow, is_store, open_or_prepare, open_store
 from bpnp.geometry import project, transform
 from bpnp.poses import MIN_POINTS
@@ -243,6 +251,8 @@ class MeshDataModule(ProblemDataModule):
         train_shapes: Number of procedural training shapes; used without root only, as are val_shapes and test_shapes.
         val_shapes: Number of procedural validation shapes; with root, val_fraction is used.
         test_shapes: Number of procedural test shapes.
+        procedural_kind: "turned" for shapes of turned parts, which have no axes; "aligned" for shapes of parts
+            parallel to the axes, most of them with a plane of symmetry, as furniture.
         cache_dir: Folder for the surface samples; None for BPNP_CACHE, else the user's cache folder.
         **loading: Options of `ProblemDataModule`: train_outliers, test_outliers, batch_size, eval_batch_size,
             max_cells, num_workers and seed.
@@ -272,6 +282,7 @@ class MeshDataModule(ProblemDataModule):
         train_shapes: int = 1000,
         val_shapes: int = 100,
         test_shapes: int = 200,
+        procedural_kind: ProceduralKind = "turned",
         cache_dir: str | None = None,
         **loading: Any,
     ) -> None:
@@ -284,6 +295,7 @@ class MeshDataModule(ProblemDataModule):
         self.root, self.cache_dir = None if root is None else Path(root), cache_dir
         self.problems = {"train": train_problems, "val": val_problems, "test": test_problems}
         self.num_shapes = {"train": train_shapes, "val": val_shapes, "test": test_shapes}
+        self.procedural_kind = procedural_kind
         self.cameras = RandomCameras(rotation, euler_range, translation_range, distance, focal, noise_px)
         self.num_points, self.pool_size, self.normalisation = num_points, pool_size, normalisation
         self._stores: dict[str, Store] = {}
@@ -343,8 +355,9 @@ class MeshDataModule(ProblemDataModule):
 
     def _open_store(self, split: str) -> Store:
         if self.root is None:
-            shapes = procedural_shapes(split, self.num_shapes[split], seed=self.seed)
-            label = f"procedural-{split}"
+            kind = self.procedural_kind
+            shapes = procedural_shapes(split, self.num_shapes[split], seed=self.seed, kind=kind)
+            label = f"{'procedural' if kind == 'turned' else kind}-{split}"
         elif not is_store(self.root):
             shapes, label = open_shapes(self.root), self.root.resolve().name
         else:

@@ -21,6 +21,7 @@ from bpnp.files import fingerprint
 from bpnp.geometry import random_rotations
 
 SUFFIXES = (".glb", ".obj", ".off", ".ply", ".stl")
+ProceduralKind = Literal["turned", "aligned"]
 Normalisation = Literal["unit_sphere", "unit_cube", "none"]
 VERSION = 1  # version of procedural shapes, raised whenever the same seed makes another one
 PARTS = ("train", "val", "test")
@@ -245,7 +246,7 @@ class Shapes:
     identity: str
 
 
-def procedural_shapes(split: str, count: int, *, seed: int) -> Shapes:
+def procedural_shapes(split: str, count: int, *, seed: int, kind: ProceduralKind = "turned") -> Shapes:
     """Return the shapes of a split.
 
     No shape belongs to two splits or two seeds, and shape i does not depend on `count`.
@@ -254,17 +255,25 @@ def procedural_shapes(split: str, count: int, *, seed: int) -> Shapes:
         split: train, val or test.
         count: Number of shapes, at least 1.
         seed: Random seed.
+        kind: "turned" for `procedural_shape`, "aligned" for `aligned_shape`.
+
+    Raises:
+        ValueError: The kind is unknown.
     """
     check_within(1, math.inf, **{f"{split}_shapes": count})
+    if kind not in DRAWN:
+        raise ValueError(f"`procedural_kind` is {kind!r}; it is one of {', '.join(DRAWN)}")
+    name = "procedural" if kind == "turned" else kind
     samplers = {
-        f"procedural/{split}/{i:06d}": partial(_procedural_samples, (seed, PARTS.index(split), i)) for i in range(count)
+        f"{name}/{split}/{i:06d}": partial(_procedural_samples, kind, (seed, PARTS.index(split), i))
+        for i in range(count)
     }
-    return Shapes(samplers, fingerprint(["procedural", VERSION, split, seed, list(range(count))]))
+    return Shapes(samplers, fingerprint([name, VERSION, split, seed, list(range(count))]))
 
 
-def _procedural_samples(seed: tuple[int, ...], count: int) -> NDArray[np.float64]:
+def _procedural_samples(kind: ProceduralKind, seed: tuple[int, ...], count: int) -> NDArray[np.float64]:
     rng = np.random.default_rng(seed)
-    return sample_surface(procedural_shape(rng), count, rng)
+    return sample_surface(DRAWN[kind](rng), count, rng)
 
 
 def procedural_shape(rng: np.random.Generator) -> Mesh:
@@ -277,6 +286,66 @@ def procedural_shape(rng: np.random.Generator) -> Mesh:
         host = parts[rng.integers(len(parts))]
         part = _part(rng, rng.uniform(0.4, 0.9))
         parts.append(Mesh(part.vertices + sample_surface(host, 1, rng), part.faces))
+    return _joined(parts)
+
+
+def aligned_shape(rng: np.random.Generator) -> Mesh:
+    """Draw a shape with axes, as furniture has: 2 to 8 parts parallel to the axes, each flush with an earlier one.
+
+    Most parts are boxes and panels; some are turned about the x axis by up to 25 degrees. Of the shapes, 70 % are
+    mirrored in the plane x = 0. Pairs of parts may be mirrored in y = 0 too, as the legs of a table.
+    """
+    symmetric = rng.random() < 0.7
+    parts = [_aligned_part(rng, 1.0)]
+    for _ in range(rng.integers(1, 8)):
+        host = parts[rng.integers(len(parts))]
+        part = _flush(_aligned_part(rng, rng.uniform(0.3, 1.0)), host, rng)
+        low, high = host.vertices[:, 0].min(), host.vertices[:, 0].max()
+        if symmetric and low < 0 < high and rng.random() < 0.5:
+            low, high = part.vertices[:, 0].min(), part.vertices[:, 0].max()
+            new = [Mesh(part.vertices - [(low + high) / 2, 0, 0], part.faces)]
+        else:
+            new = [part, _mirrored(part, 0)] if symmetric else [part]
+        if host.vertices[:, 1].min() < 0 < host.vertices[:, 1].max() and rng.random() < 0.35:
+            new += [_mirrored(one, 1) for one in new]
+        parts += new
+    return _joined(parts)
+
+
+def _aligned_part(rng: np.random.Generator, size: float) -> Mesh:
+    """Draw a box, a panel or another primitive with its axis along x, y or z."""
+    box = rng.random() < 0.75
+    solid = primitives()[0 if box else rng.integers(1, len(primitives()))]
+    half = size * np.exp(rng.uniform(np.log(0.03 if box else 0.15), 0.0, 3))
+    vertices = half * solid.vertices[:, rng.permutation(3)]
+    if rng.random() < 0.15:
+        angle = np.radians(rng.uniform(-25.0, 25.0))
+        c, s = np.cos(angle), np.sin(angle)
+        vertices = vertices @ np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]])
+    return Mesh(vertices, solid.faces)
+
+
+def _flush(part: Mesh, host: Mesh, rng: np.random.Generator) -> Mesh:
+    """Move a part against a face of the bounding box of another: to its middle, to an edge, or between."""
+    low, high = host.vertices.min(0), host.vertices.max(0)
+    own_low, own_high = part.vertices.min(0), part.vertices.max(0)
+    middle, own_middle = (low + high) / 2, (own_low + own_high) / 2
+    room = np.abs((high - low) - (own_high - own_low)) / 2
+    place = rng.choice([-1.0, 0.0, 1.0, np.nan], 3)
+    place = np.where(np.isnan(place), rng.uniform(-1, 1, 3), place)
+    offset = middle - own_middle + room * place
+    axis = rng.integers(3)
+    inwards = 0.02 * (own_high - own_low)[axis]  # so that they touch
+    outside = high[axis] - own_low[axis] - inwards if rng.random() < 0.5 else low[axis] - own_high[axis] + inwards
+    offset[axis] = outside
+    return Mesh(part.vertices + offset, part.faces)
+
+
+def _mirrored(part: Mesh, axis: int) -> Mesh:
+    return Mesh(part.vertices * np.where(np.arange(3) == axis, -1.0, 1.0), part.faces)
+
+
+def _joined(parts: Sequence[Mesh]) -> Mesh:
     offsets = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
     return Mesh(
         np.concatenate([part.vertices for part in parts]),
@@ -310,6 +379,12 @@ def primitives() -> tuple[Mesh, ...]:
         create.revolve(profile, sections=24),
     ]
     return tuple(Mesh(np.asarray(s.vertices, np.float64), np.asarray(s.faces, np.int64)) for s in solids)
+
+
+DRAWN: dict[ProceduralKind, Callable[[np.random.Generator], Mesh]] = {
+    "turned": procedural_shape,
+    "aligned": aligned_shape,
+}
 
 
 def shape_files(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> dict[str, Path]:
