@@ -212,8 +212,8 @@ def solve_problems(
     """Test a solver on the first `limit` problems of a fixed random order, each by itself, and return the rows.
 
     Rows are appended to a file as they come. Those of the same `identity` and the same problems that are there already
-    are not measured again; others are dropped. Seconds are of one thread's CPU time. Without `solve`, nothing is
-    measured or dropped, and there are no rows unless the file has all of them.
+    are not measured again; a file of others is kept as *.previous.jsonl. Seconds are of one thread's CPU time. Without
+    `solve`, nothing is measured or moved, and there are no rows unless the file has all of them.
     """
     data.setup("test")
     problems = data.datasets["test"]  # type: ignore[attr-defined]
@@ -225,11 +225,12 @@ def solve_problems(
     same = all(found.get(name) == value for name, value in head.items())
     rows = [ProblemRow(**json.loads(line)) for line in lines[1:]] if same else []
     missing = [i for i in order if i not in {row.index for row in rows}]
-    if missing and not solve:
+    if not order or (missing and not solve):
         return []
     if not same:
         if lines:
-            print(f"{file}: other weights, settings or problems; measured again", flush=True)
+            previous = file.replace(file.with_suffix(".previous.jsonl"))
+            print(f"{previous} has other weights, settings or problems; measured again", flush=True)
         file.parent.mkdir(parents=True, exist_ok=True)
         today = {"commit": commit(), "date": f"{datetime.now(UTC):%Y-%m-%d}", "cpu": processor()}
         file.write_text(json.dumps(head | {"measured": today}, sort_keys=True) + "\n")
@@ -493,7 +494,7 @@ def commands(table: Table, record: Mapping[str, Any]) -> list[str]:
 
 
 def options(
-    doc: str | None, *, file: Path, run: Path, sets: Sequence[str], steps: int, pose_steps: int
+    doc: str | None, *, file: Path, run: Path, sets: Sequence[str], steps: int, pose_steps: int, epoch: int
 ) -> argparse.ArgumentParser:
     """The options of a table."""
     found = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -514,7 +515,7 @@ def options(
     found.add_argument("--output", type=Path, default=file, help="(default: %(default)s)")
     found.add_argument("--quick", action="store_true", help="150 + 50 steps, 20 problems, its own folder")
     found.add_argument("--check", action="store_true", help="compare the pages with the record, measure nothing")
-    found.set_defaults(**DEFAULTS)
+    found.set_defaults(**DEFAULTS | {"epoch": epoch})
     return found
 
 

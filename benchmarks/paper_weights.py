@@ -1,12 +1,11 @@
 """The packaged weights `paper-lc` and `paper-lclp`: the paper's losses on drawn shapes, which have no data licence.
 
-    python -m benchmarks paper_weights                     # an hour; a run that was stopped goes on
+    python -m benchmarks paper_weights                     # two hours; a run that was stopped goes on
     python -m benchmarks paper_weights --output elsewhere  # keeps the weights of the package
 
-The settings are those of configs/paper/modelnet40.yaml but for `SETTINGS` and for what each of `STAGES` has: 40,000
-fixed problems of 4,000 drawn shapes. The first stage starts from `procedural-euler`, which was trained on few points
-first (docs/model-card.md). `paper-lclp` goes on from `paper-lc` with the pose loss. A stage with the likelihood comes
-before each. Stages and learning rates were chosen by the errors on 120 of ModelNet10's training shapes.
+The settings are those of configs/paper/modelnet40.yaml but for `SETTINGS` and for what each of `STAGES` has.
+`paper-lclp` goes on from `paper-lc` with the pose loss. Stages and learning rates were chosen by the losses on drawn
+shapes and on training shapes of ModelNet10.
 """
 
 import argparse
@@ -17,64 +16,76 @@ from pathlib import Path
 from paper_tables import Training
 from record import ROOT
 
+from bpnp.datamodules.shapes import ProceduralKind
 from bpnp.models.weights import WEIGHTS, pack_weights
 from bpnp.training.losses import MatchingLoss
 
 EPOCH = 50  # steps between checkpoints
 SOLVER = "--model.solver.init_args"
 SETTINGS = (
-    "--config=paper/modelnet40", "--data.root=null", "--data.train_shapes=4000", "--data.val_shapes=48",
+    "--config=paper/modelnet40", "--data.root=null", "--data.train_shapes=16000", "--data.val_shapes=48",
+    "--data.fresh_views=true",
     f"{SOLVER}.features2d.class_path=bpnp.models.nets.ImageFeatures",
     f"{SOLVER}.features2d.init_args.centre=true", f"{SOLVER}.features2d.init_args.scale=4.0",
     f"{SOLVER}.features3d.class_path=bpnp.models.nets.SceneFeatures",
     f"{SOLVER}.features3d.init_args.centre=true", f"{SOLVER}.features3d.init_args.normalise=true",
-    "--model.weights=procedural-euler", "--model.warmup_steps=10", "--trainer.limit_val_batches=0",
+    "--model.warmup_steps=50", "--trainer.limit_val_batches=0",
     "--trainer.precision=bf16-mixed", "--trainer.gradient_clip_val=5",
+    "--optimizer=bpnp.training.Muon",
 )  # fmt: skip
+ADAM = 0.2  # learning rate of Adam for the parameters that Muon does not train, as a fraction of Muon's
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of the training; it continues the one before.
+    """One stage of the training.
 
+    after: the stage that it continues, None for new weights.
     points: of each problem, out of the 1,000 fixed points of its shape.
-    learning_rate: falls by a half cosine within the stage.
+    kind: of the drawn shapes (`MeshDataModule`).
+    learning_rate: of Muon; constant, or with `decay` falling by a half cosine within the stage.
     packaged: whether its end is one of the packaged weights.
     """
 
     name: str
+    after: str | None
     points: int
-    batch: int
     steps: int
     learning_rate: float
-    loss: MatchingLoss = "correspondence"
+    loss: MatchingLoss = "likelihood"
+    kind: ProceduralKind = "aligned"
     pose_loss: bool = False
-    packaged: bool = True
+    decay: bool = True
+    packaged: bool = False
 
 
 STAGES = (
-    Stage("likelihood", points=500, batch=8, steps=2400, learning_rate=1e-4, loss="likelihood", packaged=False),
-    Stage("paper-lc", points=1000, batch=8, steps=200, learning_rate=3e-5),
-    Stage("likelihood-lp", 500, 8, steps=1900, learning_rate=7e-5, loss="likelihood", pose_loss=True, packaged=False),
-    Stage("paper-lclp", points=1000, batch=8, steps=300, learning_rate=1e-5, pose_loss=True),
+    Stage("few-points", None, points=128, steps=2000, learning_rate=1e-2, kind="turned", decay=False),
+    Stage("turned", "few-points", points=256, steps=3750, learning_rate=1e-2, kind="turned", decay=False),
+    Stage("aligned", "turned", points=256, steps=4250, learning_rate=1e-2, decay=False),
+    Stage("likelihood", "aligned", points=256, steps=3000, learning_rate=1e-2),
+    Stage("paper-lc", "likelihood", 1000, 200, 1e-3, "correspondence", packaged=True),
+    Stage("likelihood-lp", "paper-lc", 256, 1750, 3e-3, pose_loss=True),
+    Stage("paper-lclp", "likelihood-lp", 1000, 700, 2e-3, "correspondence", pose_loss=True, packaged=True),
 )
 
 
 def trainings(folder: Path) -> Iterator[tuple[Stage, Training]]:
-    """Yield each stage with its training, which starts where the one before ends."""
-    switch = sum(stage.steps for stage in STAGES if not stage.pose_loss) // EPOCH
-    end, start = 0, None
+    """Yield each stage with its training, which starts where the stage before it ends."""
+    ends: dict[str | None, int] = {None: 0}
     for stage in STAGES:
-        decay = (f"--model.decay_start={end}", f"--model.decay_steps={stage.steps}")
-        end += stage.steps
+        start = ends[stage.after]
+        end = ends[stage.name] = start + stage.steps
+        decay = (f"--model.decay_start={start}", f"--model.decay_steps={stage.steps}") if stage.decay else ()
+        first = (start if stage.pose_loss else end) // EPOCH  # with the pose loss; `end` is never reached
         arguments = (
-            *SETTINGS, f"--data.num_points={stage.points}", f"--data.batch_size={stage.batch}",
-            f"--model.learning_rate={stage.learning_rate}", f"--model.matching_loss={stage.loss}",
-            f"--pose_loss.start_epoch={switch}", *decay,
+            *SETTINGS, f"--data.num_points={stage.points}", "--data.batch_size=8",
+            f"--data.procedural_kind={stage.kind}",
+            f"--optimizer.lr={stage.learning_rate}", f"--optimizer.adam_lr={ADAM * stage.learning_rate}",
+            f"--model.matching_loss={stage.loss}", f"--pose_loss.start_epoch={first}", *decay,
         )  # fmt: skip
-        training = Training(folder / stage.name, arguments, end, EPOCH, start)
-        yield stage, training
-        start = training.checkpoint
+        checkpoint = None if stage.after is None else folder / stage.after / "checkpoints" / "last.ckpt"
+        yield stage, Training(folder / stage.name, arguments, end, EPOCH, checkpoint)
 
 
 def main() -> None:

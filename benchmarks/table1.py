@@ -82,7 +82,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
 
 def main() -> None:
     run = ROOT / "runs" / "table1"
-    parser = paper_tables.options(__doc__, file=FILE, run=run, sets=TABLE.sets, steps=3000, pose_steps=600)
+    parser = paper_tables.options(__doc__, file=FILE, run=run, sets=TABLE.sets, steps=3000, pose_steps=600, epoch=100)
     parser.add_argument(
         "--weights", nargs="*", default=[], metavar="NAME=CHECKPOINT",
         help=f"more rows of the group of the packaged weights; {LONGER!r} is compared with paper-lclp",

@@ -30,6 +30,8 @@ TESTED = ("fountain-P11", "south_building", "tabletop")
 TABLE = Table("table2", "megadepth", (10.0, 1.0), ("photos",))
 FILE, PAGES = ROOT / "benchmarks" / "table2.json", (ROOT / "docs" / "table2.md",)
 POINTS = 1000
+EPOCH = 18  # batches of the training photos of `TRAINED`; an epoch has no more
+SHORT = {"drawn_steps": 90, "steps": 144, "pose_steps": 54, "epoch": EPOCH}  # of a quick run
 BASELINES: dict[str, Callable[[], nn.Module]] = {
     "SoftPOSIT near the truth": partial(SoftPOSIT, start="near_truth"),
     "RANSAC": RandomRansac,
@@ -77,6 +79,6 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
 
 def main() -> None:
     run = ROOT / "runs" / "table2"
-    parser = paper_tables.options(__doc__, file=FILE, run=run, sets=TABLE.sets, steps=2000, pose_steps=400)
-    parser.add_argument("--drawn_steps", type=int, default=2000, help="on drawn maps (default: %(default)s)")
-    paper_tables.run(TABLE, parser, PAGES, measure, QUICK | {"drawn_steps": 100})
+    parser = paper_tables.options(__doc__, file=FILE, run=run, sets=TABLE.sets, steps=1980, pose_steps=396, epoch=EPOCH)
+    parser.add_argument("--drawn_steps", type=int, default=1980, help="on drawn maps (default: %(default)s)")
+    paper_tables.run(TABLE, parser, PAGES, measure, QUICK | SHORT)

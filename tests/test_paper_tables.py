@@ -126,18 +126,21 @@ def test_the_weights_with_the_pose_loss_go_on_from_those_without_and_switch_once
     chain = list(trainings(tmp_path))
     packaged = [(stage.name, stage.pose_loss, stage.loss) for stage, _ in chain if stage.packaged]
     assert packaged == [("paper-lc", False, "correspondence"), ("paper-lclp", True, "correspondence")]
-    assert [training.start for _, training in chain] == [None, *(training.checkpoint for _, training in chain[:-1])]
-    steps = [0]
+    ends = {None: 0}
+    checkpoints = {None: None}
     for stage, training in chain:
         options = dict(argument.split("=", 1) for argument in training.arguments)
-        switch = EPOCH * int(options["--pose_loss.start_epoch"])
-        steps.append(training.steps)
-        assert stage.pose_loss == (steps[-1] > switch) == (steps[-2] >= switch)
+        start, switch = ends[stage.after], EPOCH * int(options["--pose_loss.start_epoch"])
+        assert training.start == checkpoints[stage.after]
+        assert (training.steps - start, training.steps % EPOCH) == (stage.steps, 0)
+        assert stage.pose_loss == (switch == start)
+        assert stage.pose_loss or switch == training.steps  # which no step reaches
         assert options["--model.matching_loss"] == stage.loss
-        assert (steps[-1] - steps[-2], steps[-1] % EPOCH) == (stage.steps, 0)
-        assert int(options["--model.decay_start"]) == steps[-2]
-        assert int(options["--model.decay_steps"]) == stage.steps
-    assert steps[-1] == sum(stage.steps for stage in STAGES)
+        assert float(options["--optimizer.lr"]) == stage.learning_rate
+        decay = {"--model.decay_start": str(start), "--model.decay_steps": str(stage.steps)}
+        assert {key: value for key, value in options.items() if "decay" in key} == (decay if stage.decay else {})
+        ends[stage.name], checkpoints[stage.name] = training.steps, training.checkpoint
+    assert ends["paper-lclp"] == sum(stage.steps for stage in STAGES)
 
 
 def test_the_stages_between_the_weights_are_not_packed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -179,10 +182,15 @@ def test_a_test_that_was_stopped_measures_what_is_missing_and_another_solver_all
     assert solve_problems(file, lambda: pytest.fail("built again"), data, 4, {"steps": 1}) == [
         r for r in rows if r.index in set(paper_tables.problem_order(6)[:4])
     ]
+    before = file.read_text()
+    assert solve_problems(file, lambda: pytest.fail("built"), data, 0, {"steps": 2}) == []
+    assert file.read_text() == before
     others = MeshDataModule(**SHAPES, cache_dir=str(tmp_path), seed=1)
     for other, steps in ((data, 2), (others, 1)):
         with pytest.raises(KeyboardInterrupt):
             solve_problems(file, lambda: Known(4), other, 5, {"steps": steps})
+        if steps == 2:
+            assert file.with_suffix(".previous.jsonl").read_text() == before
 
 
 def test_the_figures_are_those_of_the_rows() -> None:
