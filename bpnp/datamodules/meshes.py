@@ -30,6 +30,7 @@ from bpnp.datamodules.keyed_random import (
 from bpnp.datamodules.loader import STAGES, ProblemDataModule, hold_out
 from bpnp.datamodules.problem import Counts
 from bpnp.datamodules.shapes import (
+    NAMES,
     MeshError,
     Normalisation,
     ProceduralKind,
@@ -357,7 +358,7 @@ class MeshDataModule(ProblemDataModule):
         if self.root is None:
             kind = self.procedural_kind
             shapes = procedural_shapes(split, self.num_shapes[split], seed=self.seed, kind=kind)
-            label = f"{'procedural' if kind == 'turned' else kind}-{split}"
+            label = f"{NAMES[kind]}-{split}"
         elif not is_store(self.root):
             shapes, label = open_shapes(self.root), self.root.resolve().name
         else:

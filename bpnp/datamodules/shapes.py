@@ -263,7 +263,7 @@ def procedural_shapes(split: str, count: int, *, seed: int, kind: ProceduralKind
     check_within(1, math.inf, **{f"{split}_shapes": count})
     if kind not in DRAWN:
         raise ValueError(f"`procedural_kind` is {kind!r}; it is one of {', '.join(DRAWN)}")
-    name = "procedural" if kind == "turned" else kind
+    name = NAMES[kind]
     samplers = {
         f"{name}/{split}/{i:06d}": partial(_procedural_samples, kind, (seed, PARTS.index(split), i))
         for i in range(count)
@@ -385,6 +385,9 @@ DRAWN: dict[ProceduralKind, Callable[[np.random.Generator], Mesh]] = {
     "turned": procedural_shape,
     "aligned": aligned_shape,
 }
+
+
+NAMES: dict[ProceduralKind, str] = {"turned": "procedural", "aligned": "aligned"}  # of the shapes and their stores
 
 
 def shape_files(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> dict[str, Path]:

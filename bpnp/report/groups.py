@@ -70,9 +70,7 @@ def differences(runs: Mapping[str, Results], trainings: Mapping[str, Mapping[str
         runs: Results by name.
         trainings: Configurations of their trainings, from `training_configs`. Default: None, without.
     """
-    tested = {
-        name: _flat({k: v for k, v in results.settings.items() if k != "method"}) for name, results in runs.items()
-    }
+    tested = {name: _test_settings(results.settings) for name, results in runs.items()}
     trained = {name: _training_settings((trainings or {}).get(name) or {}) for name in runs}
     lines = _differences(tested)
     of_training = {key: line for key, line in _differences(trained).items() if lines.get(key) != line}

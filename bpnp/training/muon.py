@@ -87,29 +87,32 @@ class Muon(Adam):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        matrices = [(group, one) for group in self.param_groups if group["muon"] for one in group["params"]]
-        gradients = [(group, one, one.grad) for group, one in matrices if one.grad is not None]
-        by_shape: dict[tuple[Any, ...], list[tuple[dict[str, Any], Tensor, Tensor]]] = {}
-        for group, one, gradient in gradients:
-            by_shape.setdefault((one.shape, one.dtype, one.device, id(group)), []).append((group, one, gradient))
+        gradients: list[tuple[Tensor, Tensor]] = []
+        for group in (each for each in self.param_groups if each["muon"]):
+            alike: dict[tuple[Any, ...], list[tuple[Tensor, Tensor]]] = {}
+            for one in group["params"]:
+                if one.grad is not None:
+                    alike.setdefault((one.shape, one.dtype, one.device), []).append((one, one.grad))
+            for same in alike.values():
+                self._move(same, group["lr"])
+                gradients += same
+        for one, _ in gradients:
             one.grad = None  # Adam leaves it out
-        for same in by_shape.values():
-            self._move(same)
         super().step()
-        for _, one, gradient in gradients:
+        for one, gradient in gradients:
             one.grad = gradient
         return loss
 
-    def _move(self, same: list[tuple[dict[str, Any], Tensor, Tensor]]) -> None:
-        """Move matrices of one shape and one group."""
+    def _move(self, same: list[tuple[Tensor, Tensor]], lr: float) -> None:
+        """Move matrices of one shape, given with their gradients."""
         directions = []
-        for _, one, gradient in same:
+        for one, gradient in same:
             if not (state := self.state[one]):
                 state.update(step=torch.zeros(()), momentum=torch.zeros_like(one))  # Adam expects a step
             momentum = state["momentum"]
             momentum.lerp_(gradient, 1 - MOMENTUM)
             directions.append(torch.lerp(gradient, momentum, MOMENTUM))  # Nesterov's
-        rows, columns = same[0][1].shape
+        rows, columns = same[0][0].shape
         scale = max(1.0, rows / columns) ** 0.5
-        for (group, one, _), direction in zip(same, orthogonalise(torch.stack(directions)), strict=True):
-            one.sub_(direction, alpha=group["lr"] * scale)
+        for (one, _), direction in zip(same, orthogonalise(torch.stack(directions)), strict=True):
+            one.sub_(direction, alpha=lr * scale)

@@ -44,6 +44,11 @@ def test_the_settings_that_differ_are_named_with_both_values() -> None:
     assert differences({"a": results(one)}) == []
 
 
+def test_a_time_limit_that_differs_is_named_and_what_a_method_repeats_is_not() -> None:
+    one, other = ({"method": {"label": label, "time_limit": limit}} for label, limit in (("a", 10.0), ("b", 30.0)))
+    assert differences({"a": results(one), "b": results(other)}) == ["time_limit: 10.0 (a), 30.0 (b)"]
+
+
 def write_training(run: Path, seed: int = 0, epochs: int = 3, start_epoch: int | None = 2, **model: object) -> None:
     """The files of a training with the configuration that `bpnp fit` writes, shortened."""
     folder = run / "logs" / "version_0"
