@@ -1,19 +1,26 @@
-"""Calibration of the miss probability 2^-h on symmetric objects, without the comparison of poses under their motions.
+"""Calibration of the miss probability 2^-k on symmetric objects, without the comparison of poses under their motions.
 
-    python -m benchmarks completeness --seed 31 --limit 12
+    python -m benchmarks completeness          # 3 CPU minutes; writes benchmarks/completeness.json and docs/verdict.md
+    python -m benchmarks completeness --check  # whether docs/verdict.md is what the record says
 
-Every search runs `TURNS` rounds. After each round the best pose has the basin count h. For each h the table lists how
-many best poses reached it, how many of them were wrong at that moment, and the bound 2^-h. Objects have eight or more
-unique points, so that one pose is correct. The last line counts the problems in which a symmetry rotates the true pose,
-and the motions found from the matches of the rotated pose give the true pose back. --limit: problems of each kind.
+Every search runs `TURNS` rounds. After each round the best pose has the basin count k. For each k the table lists how
+many best poses reached it, how many of them were wrong at that moment, and the bound 2^-k. Objects have eight or more
+unique points, so that one pose is correct. The sentence below the table counts the trials in which a symmetry rotates
+the true pose, and the motions found from the matches of the rotated pose give the true pose back.
 """
 
+import argparse
+import json
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import symmetric
-from record import Problem, parser
+from paper_tables import fill_pages
+from record import ROOT, Problem, write
 from scipy.spatial.transform import Rotation
 
 from bpnp.poses import Tolerance
@@ -25,8 +32,10 @@ from bpnp.search.propose.repetitions import competing_poses, registered
 from bpnp.search.search_frame import Scene
 from bpnp.search.verdict.decide import count_starts, no_pose
 
+FILE, PAGES = ROOT / "benchmarks" / "completeness.json", (ROOT / "docs" / "verdict.md",)
 TURNS = 8
-HITS = (1, 2, 3, 4, 6, 8, 10)
+BASIN_COUNTS = (1, 2, 3, 4, 6, 8, 10)
+UNIQUE = 8  # points at least that no symmetry maps onto others
 RIGHT_DEG = 3.0
 # No motion maps more than all of the points: no competitor is proposed, and no scene counts as symmetric.
 BLIND = replace(
@@ -51,14 +60,14 @@ def reached(problem: Problem) -> dict[int, bool]:
         hits = count_starts(leaders, points, BLIND)
         turn = leaders.rotation[0].T @ problem.poses[0][0]
         right = np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))) < RIGHT_DEG
-        for least in HITS:
+        for least in BASIN_COUNTS:
             if hits >= least and least not in found:
                 found[least] = bool(right)
     return found
 
 
 def leads_back(kind: symmetric.Kind, problem: Problem) -> bool:
-    """Return whether the true pose is among the competitors of the pose rotated by one part of the object."""
+    """Return True if the true pose is among the competing poses of the pose rotated by one part of the object."""
     points2d, points3d = problem.solve.args  # type: ignore[attr-defined]
     points, (rotation, translation) = problem_from(points2d, points3d, None), problem.poses[0]
     one, other = problem.points3d[: kind.each], problem.points3d[kind.each : 2 * kind.each]
@@ -72,22 +81,65 @@ def leads_back(kind: symmetric.Kind, problem: Problem) -> bool:
     return bool(points.same_pose(*poses, Tolerance(RIGHT_DEG))[1:].any())
 
 
-def main() -> None:
-    options = parser(__doc__).parse_args()
-    kinds = [kind for kind in symmetric.KINDS if kind.unique >= 8]
+def measure(seed: int, limit: int, trials: int) -> dict[str, Any]:
+    """Return the settings, how many best poses reached each basin count and were wrong, and the trials of motions.
+
+    Args:
+        seed: seed of the objects and of the searches.
+        limit: objects of each kind that are searched.
+        trials: objects of each kind whose true pose is rotated by a symmetry.
+    """
     counts: Counter[tuple[int, bool]] = Counter()
-    led: list[bool] = []
-    for kind in kinds:
-        for problem in symmetric.problems(kind, options.limit, options.seed):
-            if kind.name != "few":  # these are enumerated
+    searched, led = 0, []
+    for kind in symmetric.KINDS:
+        if kind.unique < UNIQUE:
+            continue
+        for k, problem in enumerate(symmetric.problems(kind, max(limit, trials), seed)):
+            if k < limit and kind.name != "few":  # these are enumerated
                 counts.update(reached(problem).items())
-            led.append(leads_back(kind, problem))
-    print("| basin count | poses that reached it | wrong | fraction | 2^-h |\n| --- | --- | --- | --- | --- |")
-    for least in HITS:
-        right, wrong = counts[least, True], counts[least, False]
-        fraction = wrong / max(right + wrong, 1)
-        print(f"| {least} | {right + wrong} | {wrong} | {fraction:.3f} | {0.5**least:.3f} |")
-    print(f"\nmotions lead back to the true pose: {sum(led)} of {len(led)}")
+                searched += 1
+            if k < trials:
+                led.append(leads_back(kind, problem))
+        print(f"{kind.label}: {searched} objects searched, true pose found in {sum(led)} of {len(led)}", flush=True)
+    basins = {str(k): {"poses": counts[k, True] + counts[k, False], "wrong": counts[k, False]} for k in BASIN_COUNTS}
+    settings = {"seed": seed, "limit": limit, "trials": trials}
+    return {
+        "settings": settings,
+        "searched": searched,
+        "basin_counts": basins,
+        "motions": {"trials": len(led), "led_back": sum(led)},
+    }
+
+
+def table(record: Mapping[str, Any]) -> str:
+    """Return the Markdown of a record: the fraction of wrong poses by basin count, the motions, and the command."""
+    lines = ["| basin count $k$ | poses that reached it | wrong | fraction | $2^{-k}$ |\n", f"|{' --- |' * 5}\n"]
+    for k, found in record["basin_counts"].items():
+        fraction = found["wrong"] / max(found["poses"], 1)
+        lines.append(f"| {k} | {found['poses']} | {found['wrong']} | {fraction:.3f} | {0.5 ** int(k):.3f} |\n")
+    motions = record["motions"]
+    options = " ".join(f"--{name} {value}" for name, value in record["settings"].items())
+    return "".join(
+        [
+            *lines,
+            f"\n{record['searched']:,} objects were searched. The motions gave the true pose back in ",
+            f"{motions['led_back']:,} of {motions['trials']:,} trials.\n",
+            f"\n`python -m benchmarks completeness {options}`.\n",
+        ]
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, default=41, help="of objects and searches (default: %(default)s)")
+    parser.add_argument("--limit", type=int, default=25, help="objects of a kind to search (default: %(default)s)")
+    parser.add_argument("--trials", type=int, default=130, help="of motions for each kind (default: %(default)s)")
+    parser.add_argument("--output", type=Path, default=FILE, help="(default: %(default)s)")
+    parser.add_argument("--check", action="store_true", help="compare the page with the record, measure nothing")
+    chosen = parser.parse_args()
+    if not chosen.check:
+        write(chosen.output, measure(chosen.seed, chosen.limit, chosen.trials))
+    fill_pages(PAGES, "completeness", {"data": table(json.loads(chosen.output.read_text()))}, check=chosen.check)
 
 
 if __name__ == "__main__":
