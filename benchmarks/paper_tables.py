@@ -20,7 +20,7 @@ from datetime import UTC, datetime
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -59,6 +59,8 @@ SEARCH_SECONDS = 10.0
 
 ESTIMATES = {"pnp": "", "ransac": " R", "refined": ", refined"}
 BRANCHES = ("Lc", "Lc Lp")
+Inference = Literal["paper", "ransac", "ours"]
+INFERENCES: dict[Inference, str] = {"paper": "", "ransac": ", our RANSAC", "ours": ", our inference"}
 LONGER = "paper-lc, as many steps of L_c"  # a name for `--weights`
 PAIRS = {  # of a group, the rows without and with L_p
     "paper": (BRANCHES,),
@@ -182,21 +184,23 @@ def trained_steps(checkpoint: str | Path) -> int:
     return int(read_checkpoint(checkpoint)["global_step"]) if Path(checkpoint).is_file() else 0
 
 
-def network(checkpoint: str | Path, *, ours: bool = False) -> BPnPNet:
-    """Load a BPnPNet with the inference of the paper, or with ours.
+def network(checkpoint: str | Path, *, inference: Inference = "paper") -> BPnPNet:
+    """Load a BPnPNet with the inference of the paper, with our RANSAC, or with all of ours.
 
-    The paper's: OpenCV's P3P-RANSAC and EPnP among 1.5 min(m, n) matches within 0.01, L-BFGS on all. Ours: LO-RANSAC
-    among 16 min(m, n) matches within 0.004, eight rounds of matching again under the pose, refinement.
+    The paper's: OpenCV's P3P-RANSAC and EPnP among 1.5 min(m, n) matches within 0.01, L-BFGS on all. Our RANSAC:
+    LO-RANSAC among 16 min(m, n) matches within 0.004, Newton's method on all. Ours: then eight rounds of matching again
+    under the pose, and refinement.
     """
     net = TrainedNet.from_checkpoint(checkpoint)
     assert isinstance(net, BPnPNet)
-    if ours:
-        net.ransac, net.pnp, net.rounds = RansacPnP(threshold=0.004, matches_factor=16.0), WeightedPnP(), 8
-    else:
+    if inference == "paper":
         net.ransac = RansacPnP(backend="opencv")
-        net.pnp, net.rounds = WeightedPnP(solver="lbfgs", tolerance=1e-8, max_iterations=75), 0
+        net.pnp = WeightedPnP(solver="lbfgs", tolerance=1e-8, max_iterations=75)
+    else:
+        net.ransac, net.pnp = RansacPnP(threshold=0.004, matches_factor=16.0), WeightedPnP()
+    net.rounds = 8 if inference == "ours" else 0
     net.widths = round_widths(net.rounds, net.ransac)
-    net.refinement.enabled = ours
+    net.refinement.enabled = inference == "ours"
     return net.eval()
 
 
@@ -284,15 +288,16 @@ def branch_weights(trained: Mapping[str, Training], options: argparse.Namespace)
 
 
 def network_methods(weights: Iterable[Weights], options: argparse.Namespace) -> Iterator[Method]:
-    """Networks with the paper's inference, then with ours."""
+    """Networks with the paper's inference, then with our RANSAC, then with all of ours."""
     listed = [(one, trained_steps(one.checkpoint), digest(one.checkpoint)) for one in weights]
-    for ours in (False, True):
+    for inference, suffix in INFERENCES.items():
         for one, steps, content in listed:
-            identity = {"steps": steps, "weights": content, "ours": ours}
-            limit = min(options.problems, options.our_problems) if ours else options.problems
-            settings = one.settings | {"our_problems" if ours else "problems": limit}
-            group = f"{one.group}, our inference" if ours else one.group
-            yield Method(group, one.label, partial(network, one.checkpoint, ours=ours), limit, identity, settings)
+            identity = {"steps": steps, "weights": content, "inference": inference}
+            papers = inference == "paper"
+            limit = options.problems if papers else min(options.problems, options.our_problems)
+            settings = one.settings | {"problems" if papers else "our_problems": limit}
+            build = partial(network, one.checkpoint, inference=inference)
+            yield Method(one.group + suffix, one.label, build, limit, identity, settings)
 
 
 def other_methods(baselines: Mapping[str, Callable[[], nn.Module]], options: argparse.Namespace) -> Iterator[Method]:

@@ -29,6 +29,7 @@ SETTINGS = (
     f"{SOLVER}.features2d.init_args.centre=true", f"{SOLVER}.features2d.init_args.scale=4.0",
     f"{SOLVER}.features3d.class_path=bpnp.models.nets.SceneFeatures",
     f"{SOLVER}.features3d.init_args.centre=true", f"{SOLVER}.features3d.init_args.normalise=true",
+    f"{SOLVER}.refinement.init_args.enabled=true",  # in a test of the weights; the paper's recipe has none
     "--model.warmup_steps=50", "--trainer.limit_val_batches=0",
     "--trainer.precision=bf16-mixed", "--trainer.gradient_clip_val=5",
     "--optimizer=bpnp.training.Muon",

@@ -209,8 +209,8 @@ ROWS = (
         for count in bench_stars.CATALOGUES for field in bench_stars.FIELDS
     ),
     Row("networks", "`procedural-euler`, PSB meshes, the paper's protocol",
-        pretrained("procedural-euler", {"root": "psb", "rotation": "euler"}), (100, 3), *PAPER, "psb", True,
-        NETWORKS_SEED),
+        pretrained("procedural-euler", {"root": "psb", "rotation": "euler"}), (100, 3), *PAPER, "psb",
+        seed=NETWORKS_SEED),
     Row("networks", "`procedural-so3`, PSB meshes, any rotation",
         pretrained("procedural-so3", {"root": "psb", "rotation": "so3"}), (100, 3), *PAPER, "psb",
         seed=NETWORKS_SEED),

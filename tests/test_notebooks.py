@@ -33,6 +33,17 @@ def test_a_notebook_is_stored_with_its_outputs(notebook: Path) -> None:
             assert "image/png" not in text
 
 
+def test_the_table_of_the_training_begins_with_the_network_before_the_switch() -> None:
+    """For each estimate; RANSAC and the PnP layer have smaller errors of the translation after it."""
+    cells = json.loads((NOTEBOOKS[0].parent / "train.ipynb").read_text(encoding="utf-8"))["cells"]
+    text = "".join(cells[-1]["outputs"][0]["data"]["text/plain"])
+    rows = [line.rsplit(maxsplit=2) for line in text.splitlines()[1:]]
+    names = [label.removeprefix(label.split("$")[0]) for label, *_ in rows]
+    assert names == ["$L_c$", "$L_c + L_p$"] * 3
+    for before, after in zip(rows[:4:2], rows[1:4:2], strict=True):
+        assert float(after[2]) < float(before[2])
+
+
 @pytest.fixture
 def own_logging() -> Iterator[None]:
     """Restore the level of Lightning's messages, which a notebook raises for itself."""

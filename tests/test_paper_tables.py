@@ -59,10 +59,13 @@ def test_a_training_goes_on_from_its_own_checkpoint_and_a_branch_from_anothers(
     assert paper_tables.trained_steps(branch.run()) == 4
     monkeypatch.setattr(paper_tables.subprocess, "run", lambda *_, **__: pytest.fail("trained again"))
     assert branch.run() == branch.checkpoint
-    net, ours = network(branch.checkpoint), network(branch.checkpoint, ours=True)
+    net, ours = network(branch.checkpoint), network(branch.checkpoint, inference="ours")
     assert (net.ransac.backend, net.ransac.threshold, net.pnp.solver, net.widths) == ("opencv", 0.01, "lbfgs", [])
     assert (net.estimates, ours.estimates) == (("ransac", "pnp"), ("ransac", "pnp", "refined"))
     assert len(ours.widths) == 8
+    wide = network(branch.checkpoint, inference="ransac")
+    assert (wide.ransac.backend, wide.ransac.threshold, wide.pnp.solver) == ("auto", 0.004, "newton")
+    assert (wide.estimates, wide.widths) == (("ransac", "pnp"), [])
     pack_weights(branch.checkpoint, tmp_path / "packed.ckpt")
     packed = network(tmp_path / "packed.ckpt")
     assert (tmp_path / "packed.ckpt").stat().st_size < branch.checkpoint.stat().st_size / 4

@@ -209,10 +209,11 @@ def _settings(settings: Mapping[str, Any]) -> Iterable[str]:
         yield f"checkpoint {settings['checkpoint']}"
 
 
-def _shares(results: Results, estimate: str) -> tuple[list[float], float]:
-    """Return the percentages of problems with each cause, and of those that converged."""
-    shares = np.array(list(cause_fractions(results.of(estimate)).values()))
-    return (100 * shares).tolist(), 100 * results.estimates[estimate].get("converged", float("nan"))
+def _shares(results: Results, estimate: str) -> tuple[list[float], float | None]:
+    """Return the percentages of problems with each cause, and of those that converged, None if all are solved."""
+    fractions = cause_fractions(results.of(estimate))
+    converged = 100 * results.estimates[estimate].get("converged", float("nan"))
+    return [100 * fraction for fraction in fractions.values()], None if fractions["solved"] == 1 else converged
 
 
 @cache

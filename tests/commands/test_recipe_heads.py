@@ -12,6 +12,7 @@ import yaml
 import bpnp
 from bpnp.cli import main
 from bpnp.layers import RansacPnP, Sinkhorn, WeightedPnP
+from bpnp.models.evaluation import Refinement
 from bpnp.models.nets import ImageFeatures, SceneFeatures
 
 pytestmark = pytest.mark.slow
@@ -20,13 +21,14 @@ Options = dict[str, Any]
 Parse = Callable[[str], Options]
 
 CONFIGS = Path(bpnp.__file__).parents[1] / "configs"
-RECIPES = sorted(path.stem for path in CONFIGS.glob("*.yaml"))
+RECIPES = [*sorted(path.stem for path in CONFIGS.glob("*.yaml")), "paper/finetune_reprojection"]
 PARTS = {
     "features2d": ImageFeatures,
     "features3d": SceneFeatures,
     "transport": Sinkhorn,
     "ransac": RansacPnP,
     "pnp": WeightedPnP,
+    "refinement": Refinement,
 }
 # Where a run is stored, what it logs, and how fast it loads: no difference of the experiment.
 LOGGED = re.compile(r"trainer\.(default_root_dir|logger|log_every_n_steps)|data\.num_workers")
@@ -34,6 +36,8 @@ LOGGED = re.compile(r"trainer\.(default_root_dir|logger|log_every_n_steps)|data\
 SHAPES = "{data.train_shapes:,} drawn shapes"
 POINTS = "{data.num_points:,} of {data.pool_size:,} points"
 EPOCHS = "{switch.start_epoch} + {switch.rest} epochs"
+STEPS = "{trainer.max_steps} steps in all"
+NO_VALIDATION = "no validation"
 NEWTON = "Newton's method"
 PHRASES = {
     "data.class_path": "drawn maps",
@@ -44,6 +48,7 @@ PHRASES = {
     "data.val_problems": "{data.val_problems} for validation",
     "data.test_problems": "{data.test_problems} for tests",
     "data.train_problems": "{data.train_problems:,} problems an epoch",
+    "data.max_points": "at most {data.max_points} points",
     "data.num_points": POINTS,
     "data.pool_size": POINTS,
     "data.min_points": "at least {data.min_points} matches",
@@ -51,6 +56,7 @@ PHRASES = {
     "data.batch_size": "batches of {data.batch_size}",
     "data.rotation": "any rotation",
     "data.val_fraction": "{data.val_fraction:.0%} of the scenes for validation",
+    "data.test_fraction": "no test",
     "data.train_outliers": "outliers in training",
     "data.outliers": "outliers of up to {data.outliers.1:.0%} of a side",
     "data.frame": "in the axes of a view",
@@ -67,14 +73,19 @@ PHRASES = {
     "model.solver.pnp.tolerance": NEWTON,
     "model.solver.pnp.max_iterations": NEWTON,
     "model.solver.pnp.clip_columns": "no clipping of the derivative's columns",
+    "model.solver.refinement.enabled": "refinement in tests",
     "model.solver.rounds": "{model.solver.rounds} rounds of matching",
     "model.learning_rate": "learning rate {model.learning_rate:.0e}",
     "model.warmup_steps": "warm-up of {model.warmup_steps} steps",
     "model.matching_loss": "likelihood in place of L_c",
+    "model.loss.class_path": "reprojection loss in place of L_c",
+    "model.weights": "packaged weights to start from",
     "switch": "no pose loss",
     "switch.start_epoch": EPOCHS,
     "switch.weight": "pose loss of weight {switch.weight:g}",
     "trainer.max_epochs": EPOCHS,
+    "trainer.max_steps": STEPS,
+    "trainer.limit_val_batches": NO_VALIDATION,
     "trainer.gradient_clip_val": "gradients clipped to {trainer.gradient_clip_val:g}",
     "trainer.check_val_every_n_epoch": "validation every {trainer.check_val_every_n_epoch} epochs",
 }
@@ -99,13 +110,11 @@ def flatten(options: Options, prefix: str = "") -> Options:
 
 
 def fill_defaults(options: Options) -> Options:
-    """Replace each part of a BPnPNet that is None by the options of its constructor."""
-    solver = options["model"]["solver"]
-    if solver["class_path"].endswith("BPnPNet"):
-        for name, kind in PARTS.items():
-            defaults = {key: each.default for key, each in inspect.signature(kind).parameters.items()}
-            given = (solver["init_args"][name] or {}).get("init_args", {})
-            solver["init_args"][name] = defaults | given
+    """Replace each part of a network that is None by the options of its constructor."""
+    arguments = options["model"]["solver"]["init_args"]
+    for name in PARTS.keys() & arguments.keys():
+        defaults = {key: each.default for key, each in inspect.signature(PARTS[name]).parameters.items()}
+        arguments[name] = defaults | (arguments[name] or {}).get("init_args", {})
     return options
 
 
@@ -153,22 +162,59 @@ def fill(phrase: str, options: Options) -> str:
     return text.replace("e-0", "e-").replace("%", " %")
 
 
+def phrases_for(own: Options, differing: set[str]) -> dict[str, str]:
+    """Return the phrases, with those of a recipe that has no switch, no validation or no pool of points."""
+    phrases = dict(PHRASES)
+    if "switch" in differing:
+        phrases["trainer.max_epochs"] = "{trainer.max_epochs} epochs" if own["trainer.max_steps"] < 0 else STEPS
+    if "data.pool_size" not in own:
+        phrases["data.num_points"] = "{data.num_points} points"
+    if own.get("data.val_fraction") == 0:
+        phrases["data.val_fraction"] = NO_VALIDATION
+    return phrases
+
+
+def find_idle_phrases(head: str, needed: set[str]) -> set[str]:
+    """Return the phrases of a head, with any values, that none of the needed ones is an example of."""
+    number = r"[\d.,]+(e-\d+)?( %)?"
+    patterns = {re.sub(r"\\\{.*?\\\}", lambda _: number, re.escape(phrase)) for phrase in PHRASES.values()}
+    idle = {pattern for pattern in patterns if not any(re.search(pattern, phrase) for phrase in needed)}
+    return {found[0] for pattern in idle if (found := re.search(rf"(?<![\w-]){pattern}(?![\w-])", head))}
+
+
 @pytest.mark.parametrize("recipe", RECIPES)
-def test_the_head_of_a_recipe_names_what_differs_from_the_paper(recipe: str, parse: Parse) -> None:
+def test_the_head_of_a_recipe_names_what_differs_from_the_paper_and_nothing_else(recipe: str, parse: Parse) -> None:
     reference, head = read_head(recipe)
     own, paper = parse(recipe), parse(reference)
     explicit = set(flatten(yaml.safe_load((CONFIGS / f"{recipe}.yaml").read_text(encoding="utf-8"))))
     differing = find_differences(own, paper, explicit)
     assert differing <= PHRASES.keys(), f"no words for {differing - PHRASES.keys()}"
     own["switch.rest"] = own["trainer.max_epochs"] - own.get("switch.start_epoch", 0)
-    phrases = dict(PHRASES)
-    if "switch" in differing:
-        phrases["trainer.max_epochs"] = "{trainer.max_epochs} epochs"
-    if "data.pool_size" not in own:
-        phrases["data.num_points"] = "{data.num_points} points"
+    phrases = phrases_for(own, differing)
     expected = {fill(phrases[name], own) for name in differing}
     assert {phrase for phrase in expected if phrase not in head} == set()
+    assert find_idle_phrases(head, expected) == set()
     assert len(differing) > 3
+
+
+def test_a_head_with_a_difference_that_is_none_is_found() -> None:
+    head = "batches of 8, learning rate 1e-4 after a warm-up of 20 steps, no pose loss, refinement in tests"
+    needed = {"batches of 8", "warm-up of 20 steps", "no pose loss"}
+    assert find_idle_phrases(head, needed) == {"learning rate 1e-4", "refinement in tests"}
+    assert find_idle_phrases("validation every 8 epochs, 10 % of the scenes for validation", needed) == {
+        "validation every 8 epochs",
+        "10 % of the scenes for validation",
+    }
+
+
+@pytest.mark.parametrize("name", ["modelnet40", "megadepth"])
+def test_the_experiments_of_the_paper_have_none_of_our_additions(name: str, parse: Parse) -> None:
+    """docs/paper.md lists the additions; a test then computes the paper's two estimates."""
+    paper = parse(f"paper/{name}")
+    assert not paper["model.solver.refinement.enabled"]
+    assert (paper["model.solver.rounds"], paper["model.matching_loss"]) == (0, "correspondence")
+    assert (paper["model.warmup_steps"], paper["trainer.gradient_clip_val"], paper["optimizer"]) == (0, None, None)
+    assert not any(paper[f"model.solver.features{size}d.centre"] for size in (2, 3))
 
 
 def test_the_preset_has_the_loss_and_the_ransac_of_the_paper(parse: Parse) -> None:

@@ -12,7 +12,14 @@ from small_data import small_net
 from bpnp import Batch, BPnPNet, Matcher, solve
 from bpnp.datamodules import MeshDataModule, Outliers, SyntheticMapDataModule
 from bpnp.metrics import rotation_error, translation_error
-from bpnp.models.weights import LEARNED, checkpoint_path, describe_module, pack_weights
+from bpnp.models.weights import (
+    LEARNED,
+    TrainedNet,
+    checkpoint_path,
+    describe_module,
+    pack_weights,
+    pretrained_names,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -34,6 +41,12 @@ def unseen(tmp_path_factory: pytest.TempPathFactory) -> Batch:
 def test_an_unknown_name_of_weights_is_refused_with_the_known_ones() -> None:
     with pytest.raises(ValueError, match="there are no packaged weights '../x'; the names are .*procedural-so3"):
         BPnPNet.from_pretrained("../x")
+
+
+@pytest.mark.parametrize("name", pretrained_names())
+def test_packaged_networks_have_the_refined_pose(name: str) -> None:
+    """Their cards recommend it; the recipes of the paper, which some were trained with, switch it off."""
+    assert TrainedNet.from_pretrained(name).estimates == ("ransac", "pnp", "refined")
 
 
 def medians(name: str, batch: Batch) -> dict[str, float]:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from plotly.offline import get_plotlyjs
-from report_data import HOSTILE, inflated, rows, write_run
+from report_data import HOSTILE, inflated, row, rows, write_run
 
 from bpnp.report import write_page, write_results
 from bpnp.report.charts import chart_text, recall_chart
@@ -83,6 +83,17 @@ def test_the_charts_show_the_quartiles_that_the_paper_prints(tmp_path: Path) -> 
     joint = recall_chart({"run": results}, "joint", paper="megadepth")
     assert joint is not None
     assert len(joint.data) == 2
+
+
+def test_convergence_is_shown_only_where_a_problem_is_not_solved(tmp_path: Path) -> None:
+    """A search that solves all and reports no convergence, and one that solves 8 of 10."""
+    for name, wrong in (("all", 0), ("some", 2)):
+        solved = [row(i, converged=False, rotation_error_deg=90.0 if i < wrong else 1.0) for i in range(10)]
+        write_results(tmp_path / name, solved)
+    page = page_html([tmp_path / "all", tmp_path / "some"])
+    table = page[page.index('id="cause-table"') : page.index('id="problems"')]
+    last = [re.findall("<td>(.*?)</td>", cells)[-1] for cells in re.findall("<tr data-series.*?</tr>", table, re.S)]
+    assert last == ["", "0.0%"]
 
 
 def test_the_page_opens_with_the_outcome_and_folds_the_settings(tmp_path: Path) -> None:
