@@ -90,7 +90,8 @@ def measure(seed: int, limit: int, trials: int) -> dict[str, Any]:
         trials: objects of each kind whose true pose is rotated by a symmetry.
     """
     counts: Counter[tuple[int, bool]] = Counter()
-    searched, led = 0, []
+    searched = 0
+    led: list[bool] = []
     for kind in symmetric.KINDS:
         if kind.unique < UNIQUE:
             continue

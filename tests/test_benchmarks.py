@@ -11,6 +11,7 @@ from types import SimpleNamespace
 from unittest.mock import Mock
 
 import bench_city
+import bench_completeness as completeness
 import bench_layers
 import bench_left_out
 import guard
@@ -271,6 +272,36 @@ def test_the_tables_of_the_pages_are_those_of_the_record(document: Path) -> None
     text, recorded = document.read_text(encoding="utf-8"), json.loads(results.FILE.read_text())["full"]
     assert "<!-- results: " in text
     assert results.fill_tables(text, recorded) == text
+
+
+def test_basin_counts_and_trials_of_motions_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Planted outcomes: poses with one hypothesis are wrong for objects of three parts, and lead back elsewhere."""
+    kinds = [kind for kind in symmetric.KINDS if kind.unique >= 8]
+    searched = [kind for kind in kinds if kind.name != "few"]
+    monkeypatch.setattr(completeness, "reached", lambda problem: {1: ", 3 parts" not in problem.name, 2: True})
+    monkeypatch.setattr(completeness, "leads_back", lambda kind, problem: kind.fold != 3)
+    found = completeness.measure(seed=5, limit=2, trials=3)
+    assert found["settings"] == {"seed": 5, "limit": 2, "trials": 3}
+    assert found["searched"] == 2 * len(searched)
+    wrong = 2 * sum(kind.fold == 3 for kind in searched)
+    assert found["basin_counts"]["1"] == {"poses": 2 * len(searched), "wrong": wrong}
+    assert found["basin_counts"]["2"] == {"poses": 2 * len(searched), "wrong": 0}
+    assert found["basin_counts"]["3"] == {"poses": 0, "wrong": 0}
+    assert found["motions"] == {"trials": 3 * len(kinds), "led_back": 3 * sum(kind.fold != 3 for kind in kinds)}
+    text = completeness.table(found)
+    assert f"\n| 1 | {2 * len(searched)} | {wrong} | {wrong / 2 / len(searched):.3f} | 0.500 |\n" in text
+    assert text.endswith("`python -m benchmarks completeness --seed 5 --limit 2 --trials 3`.\n")
+
+
+def test_the_calibration_on_the_page_is_that_of_its_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pass for the committed page and the default settings, and fail if the record has another figure."""
+    monkeypatch.setattr("sys.argv", ["completeness", "--check"])
+    completeness.main()
+    changed = tmp_path / "record.json"
+    changed.write_text(completeness.FILE.read_text().replace('"wrong": ', '"wrong": 9'))
+    monkeypatch.setattr("sys.argv", ["completeness", "--check", "--output", str(changed)])
+    with pytest.raises(SystemExit, match=r"tables of verdict\.md are not those of the record"):
+        completeness.main()
 
 
 def test_models_of_the_same_views_are_aligned() -> None:
