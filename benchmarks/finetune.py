@@ -25,8 +25,10 @@ from lightning import LightningDataModule
 from paper_tables import (
     PICTURES,
     digest,
+    draw_recall,
     figures,
     fill_pages,
+    finish_recall,
     head,
     network,
     provenance,
@@ -160,14 +162,10 @@ def recall_picture(rows: Rows) -> "Figure":
     for axes, name in zip(np.atleast_1d(figure.subplots(1, len(names), sharey=True)), names, strict=True):
         for i, estimate in enumerate(("pnp", "ransac")):
             for k, when in enumerate(("after", "before")):
-                errors = np.sort([row.rotation_error_deg for row in rows[f"{name}|{HELD_OUT}|{when}|{estimate}"]])
-                recall = 100 * np.arange(1, len(errors) + 1) / len(errors)
-                axes.step(errors, recall, where="post", label=f"{estimate}, {when}", **line_style(i, k))
-        axes.set(xlabel="rotation error, degrees", xscale="log", xlim=(0.01, 180), ylim=(0, 100), title=name)
-        axes.grid(alpha=0.3)
-    figure.axes[0].set_ylabel("% of problems within")
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right center", frameon=False)
-    return figure
+                errors = [row.rotation_error_deg for row in rows[f"{name}|{HELD_OUT}|{when}|{estimate}"]]
+                draw_recall(axes, errors, label=f"{estimate}, {when}", **line_style(i, k))
+        axes.set(xlabel="rotation error, degrees", xscale="log", xlim=(0.01, 180), title=name)
+    return finish_recall(figure)
 
 
 def main() -> None:

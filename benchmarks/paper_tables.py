@@ -42,6 +42,7 @@ from bpnp.report.terminal import Paper
 from bpnp.training.comparison import problem_order
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 ERRORS = {
@@ -397,12 +398,23 @@ def recall_picture(rows: Mapping[str, Sequence[ProblemRow]], table: Table) -> "F
     fields = (("rotation_error_deg", "rotation error, degrees", 30.0), ("translation_error", "translation error", 1.0))
     for k, (axes, (field, label, limit)) in enumerate(zip(figure.subplots(1, 2, sharey=True), fields, strict=True)):
         for place, (name, found) in enumerate(rows.items()):
-            errors = np.sort([getattr(row, field) for row in found])
             style = line_style(place, place)
-            axes.step(errors, 100 * np.arange(1, len(errors) + 1) / len(errors), where="post", label=name, **style)
+            draw_recall(axes, [getattr(row, field) for row in found], label=name, **style)
             quartiles = [float(value) for value in printed[name][3 * k : 3 * k + 3]]
             axes.plot(quartiles, [25, 50, 75], "o", mfc="none", color=style["color"], label=f"paper: {name}")
-        axes.set(xlabel=label, xlim=(0, limit), ylim=(0, 100))
+        axes.set(xlabel=label, xlim=(0, limit))
+    return finish_recall(figure)
+
+
+def draw_recall(axes: "Axes", errors: Sequence[float], **line: Any) -> None:
+    """Draw the percentage of the problems within an error; `line` are matplotlib's options."""
+    axes.step(np.sort(errors), 100 * np.arange(1, len(errors) + 1) / len(errors), where="post", **line)
+
+
+def finish_recall(figure: "Figure") -> "Figure":
+    """Add the grids, the axis of percentages and the legend of the first panel."""
+    for axes in figure.axes:
+        axes.set_ylim(0, 100)
         axes.grid(alpha=0.3)
     figure.axes[0].set_ylabel("% of problems within")
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right center", frameon=False)
