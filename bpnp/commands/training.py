@@ -19,7 +19,7 @@ from jsonargparse import Namespace
 from lightning import Callback, LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, ModelSummary, ProgressBar, RichProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
-from lightning.pytorch.loggers import CSVLogger, Logger
+from lightning.pytorch.loggers import CSVLogger, Logger, WandbLogger
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
 from lightning.pytorch.utilities.types import LRSchedulerTypeUnion
 from torch.optim import Optimizer
@@ -29,6 +29,7 @@ from bpnp.commands.parser import OneLineParser
 from bpnp.files import config_content, lock_folder, write_text
 from bpnp.models.weights import PARTS, class_name, is_description, networks, read_checkpoint
 from bpnp.report.terminal import console, say
+from bpnp.report.training_run import training_of_checkpoint, wandb_run
 from bpnp.training.callbacks import ParameterCount, PoseLossWarmup, ProgressLines, ResultsWriter
 from bpnp.training.checkpoints import (
     BestCheckpoint,
@@ -37,6 +38,7 @@ from bpnp.training.checkpoints import (
     newest_checkpoint,
     raise_on_interrupt,
 )
+from bpnp.training.loggers import TrainingRunLogger, record_wandb_run
 from bpnp.training.predictions import PredictionWriter
 from bpnp.training.task import BlindPnPTask
 
@@ -53,7 +55,10 @@ class _Parser(OneLineParser, LightningArgumentParser):
 
 
 class RunConfig(SaveConfigCallback):
-    """Write the configuration into the numbered folder of the CSV log, and log it to the other loggers."""
+    """Write the configuration into the numbered folder of the CSV log, and log it to the other loggers.
+
+    The W&B run of a training is recorded beside the configuration.
+    """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs | {"save_to_log_dir": False})
@@ -72,6 +77,8 @@ class RunConfig(SaveConfigCallback):
         for logger in trainer.loggers:
             if not isinstance(logger, CSVLogger):
                 logger.log_hyperparams(options)
+            if isinstance(logger, WandbLogger) and numbered and stage == "fit":
+                record_wandb_run(logger, Path(numbered[0]))
 
 
 class BpnpCLI(LightningCLI):
@@ -149,6 +156,8 @@ class BpnpCLI(LightningCLI):
         config["ckpt_path"] = path
         for logger in _as_list(config.get("trainer.logger")):
             _log_in(logger, config["trainer.default_root_dir"])
+            if self.command == "test" and path is not None and Path(path).is_file():
+                join_training(logger, path)
 
     def before_instantiate_classes(self) -> None:
         """Merge `--pose_loss` into the `PoseLossWarmup` of the configuration, or add one.
@@ -302,6 +311,30 @@ def _log_in(logger: Any, root: str) -> None:
         option = signature(_find_class(logger.class_path)).parameters["save_dir"]
         if logger.init_args.save_dir in (None, option.default):
             logger.init_args.save_dir = root
+
+
+def join_training(logger: Any, checkpoint: str) -> None:
+    """Let a WandbLogger log into the W&B run of the training of a checkpoint, and print that.
+
+    A logger that names another id, project or entity has a run of its own.
+
+    Args:
+        logger: Configuration of a logger, changed in place.
+        checkpoint: Checkpoint file.
+    """
+    if not isinstance(logger, Namespace) or _find_class(logger.class_path) is not WandbLogger:
+        return
+    folder, options = training_of_checkpoint(checkpoint), logger.init_args
+    run = None if folder is None else wandb_run(folder)
+    if run is None or options.version or any(options.get(key) not in (None, name) for key, name in run.items()):
+        return
+    logger.class_path = f"{TrainingRunLogger.__module__}.{TrainingRunLogger.__qualname__}"
+    step = read_checkpoint(checkpoint)["global_step"]
+    options.update(Namespace(**run, resume="allow", name=None, step=step))  # otherwise the parser passes resume=None
+    rank_zero_info(
+        f"W&B: the results go into run {run['id']} of the training in {folder}; set --trainer.logger.id to a new name "
+        "for a run of their own"
+    )
 
 
 def _as_list(value: Any) -> list[Any]:

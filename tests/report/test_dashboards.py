@@ -55,7 +55,7 @@ def test_a_run_is_written_to_a_folder_with_its_tables_and_pictures(tmp_path: Pat
 
 @pytest.fixture
 def trained(tmp_path: Path) -> Path:
-    """Folder of a training that was logged to W&B as "first", and a later W&B run of a resumed training."""
+    """Folder of a training that was logged to W&B as "first", and of a test with a W&B run of its own."""
     logger = {"class_path": "lightning.pytorch.loggers.WandbLogger"}
     training = {"model": {"learning_rate": 0.25}, "data": "planted", "trainer": {"logger": [logger]}, "ckpt_path": None}
     for number, config in enumerate((training, training | {"verbose": False, "model": {}})):
@@ -63,8 +63,7 @@ def trained(tmp_path: Path) -> Path:
         folder.mkdir(parents=True)
         (folder / "config.yaml").write_text(json.dumps(config))
     (tmp_path / "logs" / "version_0" / "metrics.csv").write_text("step,train/loss\n1,0.5\n")
-    for name in ("offline-run-20260102_000000-later", "offline-run-20260101_000000-first"):
-        (tmp_path / "wandb" / name).mkdir(parents=True)
+    (tmp_path / "logs" / "version_0" / "wandb.yaml").write_text("id: first\nproject: trainings\n")
     return tmp_path
 
 
@@ -84,7 +83,7 @@ def test_a_test_joins_the_run_of_its_training(trained: Path, monkeypatch: pytest
         assert is_written(file, f"{name}/pnp/rotation_q2_deg".encode())
         assert is_written(file, b"learning_rate")
     for options in started:
-        assert (options["id"], options["resume"]) == ("first", "allow")
+        assert (options["id"], options["project"], options["resume"]) == ("first", "trainings", "allow")
         assert not {"name", "group", "job_type"} & options.keys()
 
 

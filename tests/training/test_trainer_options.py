@@ -1,6 +1,7 @@
 """Options of Lightning's Trainer on the quickstart, at two steps: each changes a number that is known without it."""
 
 import csv
+import json
 import os
 import subprocess
 import sys
@@ -10,6 +11,8 @@ from typing import Any
 
 import pytest
 import torch
+import wandb
+from jsonargparse import Namespace
 from lightning import Callback, Trainer
 from small_data import SMALL_FEATURES
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -18,6 +21,7 @@ from trainer_observer import Observer, command, fit, flat
 
 from bpnp import Batch, BPnPNet
 from bpnp.cli import main
+from bpnp.commands.training import join_training
 from bpnp.models.weights import read_checkpoint
 from bpnp.report import read_results
 from bpnp.training import BlindPnPTask, SafeCheckpointIO
@@ -193,6 +197,80 @@ def test_the_wandb_logger_has_the_loss_of_the_last_step(tmp_path: Path, monkeypa
     assert run.summary["trainer/global_step"] == 1
     assert run.summary["train/loss"] == pytest.approx(float(Observer.trainer.callback_metrics["train/loss"]))
     run.finish()
+
+
+def read_wandb(folder: Path) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+    """Run, hyperparameters and last metrics of a W&B folder, as W&B reads them."""
+    command = [sys.executable, "-m", "wandb", "leet", "inspect", str(folder), "--json"]
+    lines = subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
+    found: dict[str, dict[str, Any]] = {"run": {}, "config": {}, "summary": {}}
+    for record in map(json.loads, lines):
+        if (kind := record["type"]) in found:
+            found[kind] |= record[kind] if kind == "run" else record[kind]["update"]
+    return found["run"], found["config"], found["summary"]
+
+
+def test_a_test_is_logged_into_the_wandb_run_of_its_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Offline, it is another folder with the id of the training's run."""
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    options = ["--trainer.logger=WandbLogger", "--data.test_shapes=1"]
+    main(command(tmp_path, *TWO_STEPS, *options, "--model.learning_rate=0.25", "--trainer.log_every_n_steps=1"))
+    wandb.finish()
+    (trained,) = (tmp_path / "run" / "wandb").glob("offline-run-*")
+    last = f"{tmp_path}/run/checkpoints/last.ckpt"
+    main(command(tmp_path, *options, "--trainer.logger.name=other", f"--ckpt_path={last}", word="test"))
+    wandb.finish()
+    (tested,) = set((tmp_path / "run" / "wandb").glob("offline-run-*")) - {trained}
+    name = trained.name.rsplit("-", 1)[1]
+    assert tested.name.rsplit("-", 1)[1] == name
+    assert f"W&B: the results go into run {name} of the training in {tmp_path}/run;" in caplog.text
+    trained_run, hyperparameters, losses = read_wandb(trained)
+    run, config, metrics = read_wandb(tested)
+    assert hyperparameters["learning_rate"] == 0.25
+    assert config.keys() == {"test"}  # the training keeps its hyperparameters
+    assert config["test"]["ckpt_path"] == last
+    assert run["resume"] is True  # so that `wandb sync` adds it to the run of the training
+    assert run["project"] == trained_run["project"]
+    assert "display_name" not in run  # that of the training stays
+    logged = read_results(tmp_path / "run" / "test").estimates["pnp"]["rotation_q2_deg"]
+    assert metrics["test/pnp/rotation_q2_deg"] == pytest.approx(logged, rel=1e-5)
+    assert "train/loss" in losses
+    assert metrics["trainer/global_step"] == 2  # steps of the checkpoint; a test itself counts from 0
+    assert "epoch" not in metrics
+
+
+@pytest.mark.parametrize(
+    ("options", "joined"),
+    [
+        ({}, True),
+        ({"project": "bpnp"}, True),
+        ({"project": "another"}, False),
+        ({"id": "own"}, False),
+        ({"version": "own"}, False),
+    ],
+)
+def test_a_test_has_a_wandb_run_of_its_own_if_its_logger_names_one(
+    options: dict[str, str], *, joined: bool, tmp_path: Path
+) -> None:
+    log = tmp_path / "logs" / "version_0"
+    log.mkdir(parents=True)
+    (log / "metrics.csv").write_text("step,train/loss\n1,0.5\n")
+    (log / "config.yaml").write_text("seed_everything: 0\n")
+    (log / "wandb.yaml").write_text("id: first\nproject: bpnp\n")
+    (tmp_path / "checkpoints").mkdir()
+    torch.save({"state_dict": {}, "global_step": 7}, tmp_path / "checkpoints" / "last.ckpt")
+    given = Namespace(name="a", save_dir=".", version=None, id=None, project=None)
+    logger = Namespace(class_path="lightning.pytorch.loggers.WandbLogger", init_args=given)
+    given.update(Namespace(**options))
+    unchanged = logger.clone()
+    join_training(logger, str(tmp_path / "checkpoints" / "last.ckpt"))
+    if joined:
+        assert (given.id, given.project, given.resume) == ("first", "bpnp", "allow")
+        assert (given.name, given.step) == (None, 7)
+    else:
+        assert logger == unchanged
 
 
 class Stop(Callback):
