@@ -16,7 +16,6 @@ from bpnp.report.terminal import Paper, console, say
 if TYPE_CHECKING:
     from bpnp.cameras import Camera
     from bpnp.report.figures import Lines
-    from bpnp.report.photos import PhotoSource
     from bpnp.report.points import ProblemPoints
     from bpnp.report.tables import MethodRow
     from bpnp.training.comparison import MethodTest
@@ -62,8 +61,9 @@ def report(
     named = named_runs(runs)
     paths = list(named.values())
     if html is not None:
-        sources = {name: source for name, folder in named.items() if (source := photo_source(folder, photos))}
-        say(f"wrote {write_page(paths, html, paper=paper, photos=sources)}")
+        from bpnp.commands.photo_files import photo_finder
+
+        say(f"wrote {write_page(paths, html, paper=paper, photos=photo_finder(photos))}")
     if recall is not None:
         say(f"wrote {save_figure(recall_curve(paths, paper=paper), recall)}")
     results = read_runs(paths)
@@ -124,7 +124,11 @@ def view(
         drawn = read_problems(first, names)
         if len(folders) > 1:
             drawn = merge_estimates(drawn, folders)
-        source = None if photos is None else photo_source(first, photos, side=VIEW_SIDE)
+        if photos is not None:
+            from bpnp.commands.photo_files import photo_finder
+            from bpnp.report.results import read_results
+
+            source = photo_finder(photos, side=VIEW_SIDE)(read_results(first), drawn)
     for problem in drawn:
         name = run.stem if run.is_file() else re.sub(r"[^A-Za-z0-9._-]+", "_", problem.id) or str(problem.index)
         estimates = None if estimate is None else [estimate]
@@ -214,30 +218,6 @@ def read_problems(folder: Path, names: Sequence[str]) -> list["ProblemPoints"]:
     return chosen
 
 
-def photo_source(folder: Path, photos: Path | None, *, side: int | None = None) -> "PhotoSource | None":
-    """Return the source of the photos of a results folder, None if there is none.
-
-    Args:
-        folder: Results folder.
-        photos: Folder of the photos, None for those of the COLMAP models.
-        side: Longer side of the photos, pixels; None for the default.
-
-    Raises:
-        ValueError: `photos` is given, and has no photo of the problems.
-    """
-    from bpnp.commands.photo_files import find_photos
-    from bpnp.report.photos import SIDE
-    from bpnp.report.points import read_points
-    from bpnp.report.results import read_results
-
-    source = find_photos(read_results(folder), photos, side=side or SIDE)
-    if source is not None and photos is not None:
-        problems = read_points(folder)
-        if problems and all(source(problem) is None for problem in problems):
-            raise ValueError(f"{photos} has no photo of the problems in {folder}, such as {problems[0].id}")
-    return source
-
-
 def wandb_results(
     runs: list[Path], *, project: str = "bpnp", directory: Path | None = None, photos: Path | None = None
 ) -> None:
@@ -249,12 +229,13 @@ def wandb_results(
         directory: parent of the folders of offline runs; that of the results by default.
         photos: folder of the photos of COLMAP models, under their points; `images` of each scene by default.
     """
+    from bpnp.commands.photo_files import photo_finder
     from bpnp.report.dashboards import log_results
     from bpnp.report.tables import named_runs
 
+    finder = photo_finder(photos, side=VIEW_SIDE)
     for name, folder in named_runs(runs).items():
-        source = photo_source(folder, photos, side=VIEW_SIDE)
-        written = log_results(folder, project=project, name=name, directory=directory, photos=source)
+        written = log_results(folder, project=project, name=name, directory=directory, photos=finder)
         say(f"logged {name} to {written}")
 
 

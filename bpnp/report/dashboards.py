@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 from bpnp.report.charts import RECALLS, recall_chart
 from bpnp.report.figures import plot_photo, plot_problem, recall_curve
-from bpnp.report.photos import PhotoSource
+from bpnp.report.photos import PhotoFinder, PhotoSource
 from bpnp.report.points import ProblemPoints, read_points, utf8
 from bpnp.report.results import Results, cause_fractions, read_results
 from bpnp.report.tables import paper_of
-from bpnp.report.training_run import training_config, training_of, wandb_id
+from bpnp.report.training_run import training_config, training_of, wandb_run
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,7 +31,7 @@ def log_results(
     name: str,
     project: str = "bpnp",
     directory: Path | str | None = None,
-    photos: PhotoSource | None = None,
+    photos: PhotoFinder | None = None,
 ) -> Path:
     """Log a results folder to W&B.
 
@@ -43,9 +43,9 @@ def log_results(
     Args:
         folder: Folder that `bpnp test` wrote.
         name: Name of the W&B run; that of a training keeps its own.
-        project: W&B project.
+        project: W&B project; the run of a training keeps its own.
         directory: Parent of the folder `wandb` for the run. Default: the parent of `folder`.
-        photos: Source of the photos under the points of the pictures. Default: None, no photos.
+        photos: Function that finds the photos under the points of the pictures. Default: None, no photos.
 
     Returns:
         The folder of the W&B run.
@@ -56,20 +56,20 @@ def log_results(
     import wandb
 
     results, problems = read_results(folder), read_points(folder)
+    source = None if photos is None else photos(results, problems)
     directory = Path(folder).absolute().parent if directory is None else Path(directory)
     directory.mkdir(parents=True, exist_ok=True)
     run_folder = training_of(folder, results)
     training = (None if run_folder is None else training_config(run_folder)) or {}
-    joined = None if run_folder is None else wandb_id(run_folder, training)
+    joined = None if run_folder is None else wandb_run(run_folder)
     part = "test" if joined is None else Path(folder).absolute().name
     config = {part: {"settings": results.settings, "bpnp_version": results.bpnp_version, "written": results.written}}
     config |= {key: training[key] for key in TRAINING if key in training}
     mode: Any = os.environ.get("WANDB_MODE") or "offline"
     identity: dict[str, Any] = (
-        {"name": name, "job_type": "test"} if joined is None else {"id": joined, "resume": "allow"}
+        {"project": project, "name": name, "job_type": "test"} if joined is None else joined | {"resume": "allow"}
     )
     run = wandb.init(
-        project=project,
         dir=str(directory),
         mode=mode,
         reinit="create_new",  # an open run continues
@@ -78,7 +78,7 @@ def log_results(
     )
     try:
         run.config.update(config, allow_val_change=True)
-        run.log(scalars(results, part) | _media(results, problems, part, photos))
+        run.log(scalars(results, part) | _media(results, problems, part, source))
         return Path(run.settings.sync_dir)
     finally:
         run.finish()

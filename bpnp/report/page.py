@@ -25,7 +25,7 @@ from bpnp.files import write_text
 from bpnp.report.charts import CONFIG, RECALLS, chart_text, figures, look, recall_chart
 from bpnp.report.groups import differences, group_rows, training_configs
 from bpnp.report.intervals import HEADERS, interval_caption, interval_cells, interval_title
-from bpnp.report.photos import PhotoSource
+from bpnp.report.photos import PhotoFinder, PhotoSource
 from bpnp.report.points import Array, ProblemPoints, read_points, utf8
 from bpnp.report.results import (
     CAUSES,
@@ -83,7 +83,7 @@ def write_page(
     output: Path | str,
     *,
     paper: Paper | None = None,
-    photos: Mapping[str, PhotoSource] | None = None,
+    photos: PhotoFinder | None = None,
 ) -> Path:
     """Write the page of one or several results folders atomically.
 
@@ -91,7 +91,7 @@ def write_page(
         paths: Results folders.
         output: HTML file; an existing one is replaced.
         paper: Data set whose published rows are added, "modelnet40" or "megadepth". Default: None, no rows.
-        photos: Sources of the photos of problems, by the names of `named_runs`. Default: None, no photos.
+        photos: Function that finds the photos of each test. Default: None, no photos.
 
     Returns:
         Path of the file.
@@ -102,13 +102,13 @@ def write_page(
     return write_text(Path(output), page_html(paths, paper=paper, photos=photos))
 
 
-def page_html(
-    paths: Sequence[Path | str], *, paper: Paper | None = None, photos: Mapping[str, PhotoSource] | None = None
-) -> str:
+def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None, photos: PhotoFinder | None = None) -> str:
     """Return the page as text; arguments and errors are those of `write_page`."""
     folders = named_runs(paths)
     runs = {name: read_results(path) for name, path in folders.items()}
     points = {name: read_points(path) for name, path in folders.items()}
+    found = {} if photos is None else {name: photos(runs[name], points[name]) for name in runs}
+    sources = {name: source for name, source in found.items() if source is not None}
     charts = [chart for error in RECALLS if (chart := recall_chart(runs, error, paper=paper)) is not None]
     numbers = page_numbers(runs) | {
         "keys": list(COLUMNS),
@@ -124,7 +124,7 @@ def page_html(
         "page.html",
         script=Markup("\n".join(map(_asset, SCRIPTS))),
         data=compress_text(json.dumps(numbers)),
-        points=page_points(runs, points, photos),
+        points=page_points(runs, points, sources),
         plotly=plotly_script(),
         runs={
             name: (

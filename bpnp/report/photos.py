@@ -2,7 +2,7 @@
 
 import base64
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from bpnp.cameras import Camera, Pinhole
 from bpnp.report.images import size_in_camera
 from bpnp.report.points import Array, ProblemPoints
+from bpnp.report.results import Results
 
 SIDE = 480  # longer side of a photo, pixels
 MARGIN = 0.15  # margin around the image points, relative to their extent
@@ -47,6 +48,7 @@ class ProblemPhoto:
 
 
 PhotoSource = Callable[[ProblemPoints], ProblemPhoto | None]  # finds the photo of a problem
+PhotoFinder = Callable[[Results, Sequence[ProblemPoints]], PhotoSource | None]  # finds the photos of a test
 
 
 def undistort_photo(photo: Array, camera: Camera, points2d: Array, *, side: int = SIDE) -> ProblemPhoto:

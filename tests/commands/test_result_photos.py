@@ -4,6 +4,7 @@ import base64
 import io
 import json
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,9 @@ from bpnp.cameras import camera_from
 from bpnp.cli import main
 from bpnp.commands.photo_files import find_photos
 from bpnp.datamodules import ColmapDataModule
+from bpnp.datamodules.colmap.module import ColmapSource
+from bpnp.datamodules.colmap.reconstruction import read_reconstruction
+from bpnp.datamodules.stored import write_problems
 from bpnp.report import dashboards, figures, page, read_points, read_results, write_results
 from bpnp.report.photos import undistort_photo
 from bpnp.report.points import points_from, write_points
@@ -108,13 +112,68 @@ def test_photos_of_another_folder_are_found_or_missed_with_a_message(tested: Pat
     main([*arguments, str(output), "--photos", str(tested / "elsewhere")])
     assert all("photo" in line for line in page_lines(output))
     shown = fails(*arguments, str(output), "--photos", str(tested / "table"))
-    assert "has no photo of the problems in" in shown
-    assert "such as castle/photo 0.jpg" in shown
+    assert "has no photo of the problems, such as castle/photo 0.jpg" in shown
     results = read_results(tested / "table" / "search")
     results.settings["data"]["class_path"] = "bpnp.datamodules.MeshDataModule"
     assert find_photos(results, None) is None
     with pytest.raises(ValueError, match="Leave out --photos"):
         find_photos(results, tested)
+
+
+def set_root(store: Path, results: Path) -> None:
+    """Let results be those of a test on a store."""
+    summary = json.loads((results / "summary.json").read_text())
+    summary["settings"]["data"]["init_args"]["root"] = str(store)
+    (results / "summary.json").write_text(json.dumps(summary))
+
+
+def test_a_store_shows_photos_without_its_models(tested: Path) -> None:
+    """The cameras are those of the models: each spot of a photo is at the normalised point of its keypoint."""
+    main(["prepare", "megadepth", str(tested / "castle"), "--output", str(tested / "store"), "--processes", "1"])
+    shutil.rmtree(tested / "castle" / "sparse")
+    results, output = tested / "table" / "search", tested / "report.html"
+    set_root(tested / "store", results)
+    main(["report", str(results), "--html", str(output)])
+    (tested / "castle" / "images").rename(tested / "elsewhere")
+    main(["report", str(results), "--html", str(tested / "other.html"), "--photos", str(tested / "elsewhere")])
+    for page_file in (output, tested / "other.html"):
+        lines = page_lines(page_file)
+        assert len(lines) == 3
+        for line in lines:
+            photo = np.array(Image.open(io.BytesIO(base64.b64decode(line["photo"]["jpeg"]))))
+            assert np.median(brightness(photo, line["photo"]["extent"], np.array(line["points2d"]))) > 150
+
+
+def test_a_store_without_cameras_is_read_and_named(
+    tested: Path, capsys: pytest.CaptureFixture[str], fails: Callable[..., str]
+) -> None:
+    """Of version 0.3: the same columns, but none for photos."""
+    source = ColmapSource([read_reconstruction(tested / "castle" / "sparse" / "0", name="castle")])
+    problems = [("castle", source.problem(i)) for i in range(3)]
+    write_problems(tested / "old", problems, parameters={"min_points": 4, "clutter": 0.0})
+    results, output = tested / "table" / "search", str(tested / "report.html")
+    set_root(tested / "old", results)
+    main(["report", str(results), "--html", output])
+    sentence = f"{tested / 'old'} was prepared by an earlier version, without the cameras of its photos"
+    assert capsys.readouterr().out.replace("\n", " ").count(sentence) == 1
+    assert sentence in fails("report", str(results), "--html", output, "--photos", str(tested / "castle" / "images"))
+    old = ColmapDataModule(str(tested / "old"), test_fraction=1.0, batch_size=3)
+    old.setup("test")
+    (batch,) = old.test_dataloader()
+    assert sorted(batch.ids) == [f"castle/photo {i}.jpg" for i in range(3)]
+
+
+def test_missing_photos_are_counted_once(tested: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tested / "castle" / "images" / "photo 1.jpg").unlink()
+    main(["report", str(tested / "table"), "--html", str(tested / "report.html")])
+    shown = " ".join(capsys.readouterr().out.split())
+    assert shown.count("1 of 3 problems have no photo in the folder images next to sparse") == 1
+    assert "such as castle/photo 1.jpg; give their folder with --photos" in shown
+    assert sum("photo" in line for line in page_lines(tested / "report.html")) == 2
+    (tested / "castle").rename(tested / "moved")
+    main(["report", str(tested / "table"), "--html", str(tested / "report.html")])
+    shown = " ".join(capsys.readouterr().out.split())
+    assert f"the COLMAP models of the test are no longer in {tested / 'castle'}" in shown
 
 
 def test_pictures_for_wandb_have_the_photo(tested: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,5 +1,6 @@
 """Data module of photos with known poses in COLMAP models: MegaDepth, or your own scenes."""
 
+import json
 import logging
 import warnings
 from collections.abc import Mapping, Sequence
@@ -11,11 +12,12 @@ from jaxtyping import Int
 from numpy.typing import NDArray
 from torch import Tensor
 
+from bpnp.cameras import camera_to_json
 from bpnp.datamodules.augment import check_clutter
 from bpnp.datamodules.colmap.model_files import FILES, ColmapError, find_scenes
 from bpnp.datamodules.colmap.reconstruction import ImagePoints, Reconstruction, read_reconstruction
 from bpnp.datamodules.problem import Counts, Problem, ProblemSource, stack_problems
-from bpnp.datamodules.store import JobResult, Recipe, StoreError, is_store
+from bpnp.datamodules.store import JobResult, Recipe, StoreError, StoreRow, is_store
 from bpnp.datamodules.stored import PROBLEMS, WIDTHS, StoredDataModule, has_enough_matches, problem_row
 from bpnp.files import file_states, fingerprint
 from bpnp.types import Batch
@@ -193,6 +195,7 @@ def colmap_recipe(source: Path, *, min_points: int, clutter: float) -> Recipe:
 def model_rows(scene: str, name: str, folder: Path, min_points: int, clutter: float) -> JobResult:
     """Return the problems of one COLMAP model, none if it cannot be used.
 
+    Each row has the name of its image, its camera as JSON and the folder of the model, from which its photo is found.
     Unused parts are listed in the result instead of logged, because there may be hundreds of models.
     """
     disabled = logging.root.manager.disable
@@ -210,4 +213,9 @@ def model_rows(scene: str, name: str, folder: Path, min_points: int, clutter: fl
         skipped[f"{name}/*"] = f"{left_out} of {total} images with fewer than {min_points} points"
     if reconstruction.notable:
         skipped[f"{name}/points"] = reconstruction.notable
-    return [problem_row(scene, source.problem(i)) for i in range(len(source.images))], skipped
+    rows: list[StoreRow] = []
+    for i, (_, image) in enumerate(source.images):
+        row_name, points, columns = problem_row(scene, source.problem(i))
+        photo = {"image": image.name, "camera": json.dumps(camera_to_json(image.camera)), "model": str(folder)}
+        rows.append((row_name, points, {**columns, **photo}))
+    return rows, skipped
