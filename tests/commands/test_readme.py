@@ -1,7 +1,9 @@
 """Commands, options and files in the README and the documentation exist."""
 
+import argparse
 import os
 import re
+import runpy
 import shlex
 import subprocess
 import sys
@@ -22,6 +24,10 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 TEXTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+INLINE = re.compile(r"`([^`]+)`")
+COMMAND = re.compile(r"((bpnp|lightning|make)\s+[a-z]|python\s+-m\s+benchmarks\s+[a-z])")
+# What a reader replaces, and what stands for it here.
+STAND_INS = {"my.module.Solver": "bpnp.models.Search", "harder.yaml": "presets/debug"}
 
 
 def blocks(text: Path, language: str) -> list[str]:
@@ -29,23 +35,54 @@ def blocks(text: Path, language: str) -> list[str]:
 
 
 def command_lines() -> Iterator[tuple[str, str]]:
+    """Commands of the blocks, and those in the text that have arguments."""
     for text in TEXTS:
         for line in "".join(blocks(text, "")).replace("\\\n", " ").splitlines():
-            if line.startswith(("bpnp ", "lightning ", "make ")):
+            if COMMAND.match(line):
                 yield text.name, line.split("#")[0].strip()
+        for span in INLINE.findall(BLOCK.sub("", text.read_text(encoding="utf-8"))):
+            if COMMAND.match(span):
+                yield text.name, " ".join(span.split())
 
 
-COMMAND_LINES = list(command_lines())
+COMMAND_LINES = list(dict.fromkeys(command_lines()))
+
+
+class Parsed(Exception):
+    """Raised in place of running a benchmark whose options were parsed."""
+
+
+def parse_benchmark(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Parse the options of a benchmark with its own parser, and run nothing."""
+    parse_args = argparse.ArgumentParser.parse_args
+
+    def stop(parser: argparse.ArgumentParser, *arguments: Any) -> None:
+        parse_args(parser, *arguments)
+        raise Parsed
+
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", stop)
+    monkeypatch.setattr("sys.argv", words)
+    with pytest.raises(Parsed):
+        runpy.run_path(str(ROOT / "benchmarks" / "__main__.py"))["main"]()
 
 
 @pytest.mark.parametrize(("text", "line"), COMMAND_LINES)
-def test_commands_are_parsed(text: str, line: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_commands_are_parsed(
+    text: str, line: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Every command that the documentation shows is one, with options that it has."""
     words = shlex.split(line)
     if words[0] == "make":
-        assert re.search(rf"^{words[1]}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
+        targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+        assert set(words[1:]) <= set(targets)
         return
-    name, rest = words[1], words[2:]
+    if words[0] == "python":
+        parse_benchmark(words[2:], monkeypatch)
+        return
+    name, rest = words[1], [STAND_INS.get(word, word) for word in words[2:]]
+    assert name in COMMANDS or name in LIGHTNING
+    if not rest:  # the text names the command
+        return
     # An earlier command writes these checkpoints; packaged weights stand for them.
     if name in LIGHTNING:
         rest = ["procedural-so3" if word == "last" or word.endswith(".ckpt") else word for word in rest]
@@ -58,7 +95,15 @@ def test_commands_are_parsed(text: str, line: str, capsys: pytest.CaptureFixture
     command = COMMANDS[name]
     if isinstance(command, Mapping):
         name, command, rest = f"{name} {rest[0]}", command[rest[0]], rest[1:]
+    if not rest or "--help" in rest:
+        return
     assert parse_arguments(name, command, rest)
+
+
+@pytest.mark.parametrize("words", ["benchmarks tables1", "benchmarks table1 --step 3 --dat x --no_such_option"])
+def test_a_wrong_command_of_a_benchmark_is_found(words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(SystemExit):
+        parse_benchmark(words.split(), monkeypatch)
 
 
 @pytest.mark.parametrize("text", TEXTS, ids=lambda path: path.name)
@@ -73,6 +118,12 @@ def test_links_lead_somewhere(text: Path) -> None:
             titles = re.findall(r"^#+ (.*)$", file.read_text(encoding="utf-8"), re.MULTILINE)
             slugs = {re.sub(r"[^\w\- ]", "", title).strip().lower().replace(" ", "-") for title in titles}
             assert heading in slugs, f"{target}#{heading}"
+
+
+def test_the_site_lists_every_page_once() -> None:
+    pages = re.findall(r": (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
+    written = [str(page.relative_to(ROOT / "docs")) for page in (ROOT / "docs").rglob("*.md")]
+    assert sorted(pages) == sorted([*written, "changelog.md"])  # docs/hooks.py adds the last
 
 
 def test_every_picture_is_shown_somewhere() -> None:
