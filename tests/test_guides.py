@@ -6,12 +6,16 @@ import symtable
 from pathlib import Path
 
 import pytest
+from report_data import rows
+
+from bpnp.report import write_results
 
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-RUN = ("index", "model-card", "solve", "verdict")  # other pages need files, or have tests of their own
+# Of the other pages, data.md has a test of its own, and maps.md needs photos.
+RUN = ("index", "layers", "model-card", "report", "solve", "stars", "train", "verdict")
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 
 
@@ -49,6 +53,8 @@ def test_the_examples_run(
 ) -> None:
     """A line that prints shows the output in its comment, or has none."""
     monkeypatch.chdir(tmp_path)
+    if name == "report":  # results that the quickstart writes
+        write_results(tmp_path / "runs" / "quickstart" / "LcLp", rows(8, seed=0))
     codes = [code for code in examples(ROOT / "docs" / f"{name}.md") if not undefined_names(code)]
     assert codes
     for code in codes:
