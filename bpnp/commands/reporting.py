@@ -32,6 +32,7 @@ def report(
     recall: Path | None = None,
     curves: Path | None = None,
     photos: Path | None = None,
+    groups: bool = False,
 ) -> None:
     """Show results side by side as tables; optionally write a page, recall curves and training curves.
 
@@ -42,9 +43,10 @@ def report(
         recall: write the recall curves as .png, .jpg, .svg or .pdf.
         curves: write losses and validation of the first run's training as .png, .jpg, .svg or .pdf.
         photos: folder of the photos of COLMAP models, for the page; `images` of each scene by default.
+        groups: print the intervals of each class, scene or landmark too, as on the page.
     """
     from bpnp.report.figures import recall_curve
-    from bpnp.report.groups import differences, training_configs
+    from bpnp.report.groups import differences, group_table, training_configs
     from bpnp.report.images import save_figure
     from bpnp.report.intervals import interval_table
     from bpnp.report.page import write_page
@@ -68,7 +70,11 @@ def report(
         say(f"wrote {save_figure(recall_curve(paths, paper=paper), recall)}")
     results = read_runs(paths)
     console().print(results_table(results, paper=paper))
-    console().print(interval_table(results))
+    console().print(interval_table(results).split_table())
+    if groups and (grouped := group_table(results)) is not None:
+        console().print(grouped.split_table())
+    elif groups:
+        say("--groups: all problems are of one group, or their names have no group before a slash")
     if lines := differences(results, training_configs(named, results)):
         say("The runs differ in:\n" + "\n".join(lines))
 
@@ -224,7 +230,7 @@ def wandb_results(
     """Log results to Weights & Biases: to folders for `wandb sync` unless WANDB_MODE=online.
 
     Args:
-        runs: folders that `bpnp test` wrote, or their runs.
+        runs: folders that `bpnp test` wrote, or their runs; differences are to the first.
         project: name of the project.
         directory: parent of the folders of offline runs; that of the results by default.
         photos: folder of the photos of COLMAP models, under their points; `images` of each scene by default.
@@ -233,9 +239,12 @@ def wandb_results(
     from bpnp.report.dashboards import log_results
     from bpnp.report.tables import named_runs
 
-    finder = photo_finder(photos, side=VIEW_SIDE)
-    for name, folder in named_runs(runs).items():
-        written = log_results(folder, project=project, name=name, directory=directory, photos=finder)
+    finder, named = photo_finder(photos, side=VIEW_SIDE), named_runs(runs)
+    first = next(iter(named.values()))
+    for name, folder in named.items():
+        written = log_results(
+            folder, project=project, name=name, directory=directory, photos=finder, compare_with=first
+        )
         say(f"logged {name} to {written}")
 
 

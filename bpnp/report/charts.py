@@ -13,7 +13,7 @@ import torch
 
 from bpnp.metrics import joint_error, recall_curve
 from bpnp.report.results import Results
-from bpnp.report.tables import lines_of, paper_quartiles
+from bpnp.report.tables import Line, joint_limits, lines_of, paper_quartiles
 from bpnp.report.terminal import DASHES, INKS, LIGHT, Paper
 
 if TYPE_CHECKING:
@@ -25,10 +25,9 @@ POINTS = 200  # points of a curve
 RECALLS: dict[Error, tuple[str, str, float]] = {
     "rotation_deg": ("Rotation", "rotation error, degrees", 90.0),
     "translation": ("Translation", "translation error, scene units", 10.0),
-    "joint": ("Rotation and translation", "rotation error, degrees, of problems within 0.5 scene units", 90.0),
+    "joint": ("Rotation and translation", "rotation error, degrees, of problems within {:g} scene units", 90.0),
     "reprojection_deg": ("Reprojection", "reprojection error, degrees", 20.0),
 }
-JOINT_TRANSLATION = 0.5
 PAPER_MARKS = ("circle-open", "square-open", "diamond-open", "triangle-up-open")  # of the paper's networks
 INK = {name: light for name, (light, _) in INKS.items()}
 CLEAR = "rgba(0,0,0,0)"
@@ -42,31 +41,36 @@ CONFIG = {  # plotly's options of every figure
 }
 
 
-def errors_of(results: Results, estimate: str, error: Error) -> torch.Tensor:
+def axis_title(runs: Mapping[str, Results], error: Error) -> str:
+    """Return the title of the axis of an error; "joint" has the translation limit of `joint_limits`."""
+    return RECALLS[error][1].format(joint_limits(runs)[1])
+
+
+def errors_of(runs: Mapping[str, Results], line: Line, error: Error) -> torch.Tensor:
     """Return the errors of the problems that have one (not NaN).
 
-    In "joint", the rotation error of a problem beyond the translation limit is infinite.
+    In "joint", the rotation error of a problem beyond the translation limit of `joint_limits` is infinite.
 
     Args:
-        results: Results of a test.
-        estimate: Name of the estimate.
+        runs: Results by name.
+        line: Estimate of a run.
         error: Kind of error.
     """
-    errors = results.errors(estimate)
-    values: torch.Tensor = joint_error(errors, JOINT_TRANSLATION) if error == "joint" else getattr(errors, error)
+    errors = runs[line.run].errors(line.estimate)
+    values: torch.Tensor = joint_error(errors, joint_limits(runs)[1]) if error == "joint" else getattr(errors, error)
     return values[~values.isnan()]
 
 
-def recall_of(results: Results, estimate: str, error: Error, limits: Array) -> Array:
+def recall_of(runs: Mapping[str, Results], line: Line, error: Error, limits: Array) -> Array:
     """Return the fraction of problems with an error up to each limit.
 
     Args:
-        results: Results of a test.
-        estimate: Name of the estimate.
+        runs: Results by name.
+        line: Estimate of a run.
         error: Kind of error.
         limits: Limits (k,).
     """
-    return recall_curve(errors_of(results, estimate, error), limits.tolist()).numpy()
+    return recall_curve(errors_of(runs, line, error), limits.tolist()).numpy()
 
 
 def recall_chart(runs: Mapping[str, Results], error: Error, *, paper: Paper | None = None) -> "Figure | None":
@@ -83,8 +87,8 @@ def recall_chart(runs: Mapping[str, Results], error: Error, *, paper: Paper | No
     """
     from plotly.graph_objects import Figure
 
-    title, unit, most = RECALLS[error]
-    finite = np.concatenate([errors_of(runs[line.run], line.estimate, error).numpy() for line in lines_of(runs)])
+    title, _, most = RECALLS[error]
+    finite = np.concatenate([errors_of(runs, line, error).numpy() for line in lines_of(runs)])
     finite = finite[np.isfinite(finite) & (finite > 0)]
     if not len(finite):
         return None
@@ -95,11 +99,11 @@ def recall_chart(runs: Mapping[str, Results], error: Error, *, paper: Paper | No
     # On one to two decades plotly labels every digit, and the labels overlap; with fewer ticks it labels 1, 2 and 5.
     decades = float(np.log10(limits[-1] / limits[0]))
     few = {"nticks": int(decades / 0.31)} if 1 <= decades < 2.2 else {}  # at least 0.3 decades between labels
-    figure.update_xaxes(title={"text": unit}, hoverformat=".3~g", type="log", tickformat="~g", **few)
+    figure.update_xaxes(title={"text": axis_title(runs, error)}, hoverformat=".3~g", type="log", tickformat="~g", **few)
     for index, line in enumerate(lines_of(runs)):
         dash = ",".join(f"{length:g}px" for length in DASHES[line.dashes % len(DASHES)]) or "solid"
         style = {"color": LIGHT[line.colour % len(LIGHT)], "dash": dash, "width": 2}
-        fractions = recall_of(runs[line.run], line.estimate, error, limits)
+        fractions = recall_of(runs, line, error, limits)
         points = {"x": limits.astype(np.float32), "y": fractions.astype(np.float32)}
         # `meta` identifies the estimate of the line for the page.
         figure.add_scatter(**points, name=line.label, mode="lines", meta=index, line=style, hovertemplate="%{y:.1%}")

@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 from bpnp.report.charts import RECALLS, recall_chart
 from bpnp.report.figures import plot_photo, plot_problem, recall_curve
+from bpnp.report.groups import group_table
+from bpnp.report.intervals import interval_table
 from bpnp.report.photos import PhotoFinder, PhotoSource
 from bpnp.report.points import ProblemPoints, read_points, utf8
 from bpnp.report.results import Results, cause_fractions, read_results
-from bpnp.report.tables import paper_of
+from bpnp.report.tables import paper_of, read_runs
 from bpnp.report.training_run import training_config, training_of, wandb_run
 
 if TYPE_CHECKING:
@@ -32,13 +34,15 @@ def log_results(
     project: str = "bpnp",
     directory: Path | str | None = None,
     photos: PhotoFinder | None = None,
+    compare_with: Path | str | None = None,
 ) -> Path:
     """Log a results folder to W&B.
 
-    The run has scalars "test/<estimate>/rotation_q1_deg" and so on; tables "quartiles", "causes" and "problems"; recall
-    curves as plotly charts and as a picture; and pictures of the worst problems. It has the configuration of the
-    training. If the training was logged to W&B, the results are added to its run, under the name of the folder in place
-    of "test".
+    The run has scalars "test/<estimate>/rotation_q1_deg" and so on; tables "intervals" and "groups" (medians, recall
+    and paired differences with 95 % intervals, of all problems and by class or scene), "quartiles", "causes" and
+    "problems"; recall curves as plotly charts and as a picture; and pictures of the worst problems. It has the
+    configuration of the training. If the training was logged to W&B, the results are added to its run, under the name
+    of the folder in place of "test".
 
     Args:
         folder: Folder that `bpnp test` wrote.
@@ -46,6 +50,8 @@ def log_results(
         project: W&B project; the run of a training keeps its own.
         directory: Parent of the folder `wandb` for the run. Default: the parent of `folder`.
         photos: Function that finds the photos under the points of the pictures. Default: None, no photos.
+        compare_with: Results folder with whose estimates those of `folder` are compared. Default: None, the first
+            estimate of `folder`.
 
     Returns:
         The folder of the W&B run.
@@ -78,7 +84,9 @@ def log_results(
     )
     try:
         run.config.update(config, allow_val_change=True)
-        run.log(scalars(results, part) | _media(results, problems, part, source))
+        tables = _tables(results, folder, compare_with).items()
+        media = {f"{part}/{table}": wandb.Table(dataframe=frame) for table, frame in tables}
+        run.log(scalars(results, part) | media | _media(results, problems, part, source))
         return Path(run.settings.sync_dir)
     finally:
         run.finish()
@@ -97,21 +105,31 @@ def scalars(results: Results, part: str = "test") -> dict[str, float]:
     return values if loss is None else values | {f"{part}/correspondence_loss": loss}
 
 
+def _tables(results: Results, folder: Path | str, compare_with: Path | str | None) -> dict[str, Any]:
+    """Return DataFrames by name; that of groups is absent if there are none."""
+    from pandas import DataFrame
+
+    runs = read_runs([folder if compare_with is None else compare_with, folder])
+    *_, own = runs
+    compared = {"intervals": interval_table(runs), "groups": group_table(runs)}
+    frames = {name: table.frame() for name, table in compared.items() if table is not None}
+    causes = {name: cause_fractions(results.of(name)) for name in results.estimates}
+    tables = {name: frame[frame.run == own].drop(columns="run") for name, frame in frames.items()} | {
+        "quartiles": DataFrame.from_dict(results.estimates, orient="index").reset_index(names="estimate"),
+        "causes": DataFrame.from_dict(causes, orient="index").reset_index(names="estimate"),
+        "problems": results.frame(),
+    }
+    return {name: frame.map(lambda it: utf8(it) if isinstance(it, str) else it) for name, frame in tables.items()}
+
+
 def _media(
     results: Results, problems: Sequence[ProblemPoints], part: str, photos: PhotoSource | None
 ) -> dict[str, Any]:
-    """Return tables, recall curves and pictures of the worst problems."""
+    """Return recall curves and pictures of the worst problems."""
     import wandb
-    from pandas import DataFrame
 
     paper = paper_of(results)
-    causes = {name: cause_fractions(results.of(name)) for name in results.estimates}
-    tables = {
-        "quartiles": DataFrame.from_dict(results.estimates, orient="index").reset_index(names="estimate"),
-        "causes": DataFrame.from_dict(causes, orient="index").reset_index(names="estimate"),
-        "problems": results.frame().map(lambda value: utf8(value) if isinstance(value, str) else value),
-    }
-    media: dict[str, Any] = {f"{part}/{name}": wandb.Table(dataframe=frame) for name, frame in tables.items()}
+    media: dict[str, Any] = {}
     for error in RECALLS:
         if (chart := recall_chart({part: results}, error, paper=paper)) is not None:
             media[f"{part}/recall_curve/{error}"] = chart

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bpnp.cameras import in_front
-from bpnp.report.charts import RECALLS, Error, recall_of
+from bpnp.report.charts import Error, axis_title, recall_of
 from bpnp.report.images import size_in_camera
 from bpnp.report.points import Array, ProblemPoints, utf8
 from bpnp.report.results import Results
@@ -59,11 +59,11 @@ def recall_curve(runs: Sequence[Path | str] | Mapping[str, Results], *, paper: P
     for axes, (key, limit) in zip(figure.subplots(1, 4, sharey=True), LIMITS.items(), strict=True):
         limits = np.linspace(0, limit, POINTS)
         for line in lines_of(runs):
-            fractions = recall_of(runs[line.run], line.estimate, key, limits)
+            fractions = recall_of(runs, line, key, limits)
             axes.plot(limits, fractions, **line_style(line.colour, line.dashes), label=shown_text(line.label))
         for marker, (name, quartiles) in zip("osD^", paper_quartiles(paper, key).items(), strict=False):
             axes.plot(quartiles, [0.25, 0.5, 0.75], marker, mfc="none", color=QUIET, label=f"paper: {name}")
-        axes.set(xlabel=RECALLS[key][1].replace(", of", ",\nof"), ylim=(0, 1.01), xlim=(0, limit))
+        axes.set(xlabel=axis_title(runs, key).replace(", of", ",\nof"), ylim=(0, 1.01), xlim=(0, limit))
         axes.grid(alpha=0.3)
     figure.axes[0].yaxis.set_major_formatter(lambda fraction, _: f"{100 * fraction:.0f} %")
     figure.axes[0].set_ylabel("problems within")

@@ -2,14 +2,12 @@
 
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from bpnp.report.results import Results
-from bpnp.report.tables import lines_of
-from bpnp.report.terminal import number
+from bpnp.report.intervals import IntervalTable, interval_columns, interval_rows
+from bpnp.report.results import ProblemRow, Results
 from bpnp.report.training_run import training_config, training_of
 
 MOST_GROUPS = 60
@@ -23,30 +21,34 @@ def group_of(name: str) -> str:
     return name.partition("/")[0]
 
 
-def group_rows(runs: Mapping[str, Results]) -> list[tuple[str, int, list[str]]]:
-    """Return the group, the number of problems, and the median rotation error of each run and estimate.
-
-    The largest groups come first. The list is empty unless the problems belong to two or more groups.
+def group_table(runs: Mapping[str, Results]) -> IntervalTable | None:
+    """Return the table of intervals of each group of problems, the largest first.
 
     Args:
         runs: Results by name.
+
+    Returns:
+        The table, None if the problems of the first run do not belong to two or more groups.
     """
-    counts = Counter(group_of(row.id) for row in _problems(runs) if "/" in row.id)
-    if len(counts) < 2 or max(counts.values()) < 2:
-        return []
-    rows = []
-    for group, count in counts.most_common(MOST_GROUPS):
-        cells = []
-        for line in lines_of(runs):
-            members = [row for row in runs[line.run].of(line.estimate) if group_of(row.id) == group]
-            cells.append(number(float(np.median([row.rotation_error_deg for row in members]))) if members else "")
-        rows.append((group, count, cells))
-    return rows
+    parts = {name: split_groups(results) for name, results in runs.items()}
+    first = next(iter(parts.values()))
+    counts = Counter({group: results.problems for group, results in first.items()}).most_common(MOST_GROUPS)
+    if len(counts) < 2 or counts[0][1] < 2:
+        return None
+    groups = {}
+    for group, count in counts:
+        members = {name: split[group] for name, split in parts.items() if group in split}
+        groups[f"{group}, {count} problems" if count > 1 else f"{group}, 1 problem"] = interval_rows(runs, members)
+    return IntervalTable("By class or scene", interval_columns(runs), groups)
 
 
-def _problems(runs: Mapping[str, Results]) -> list[Any]:
-    first = next(iter(runs.values()))
-    return first.of(next(iter(first.estimates)))
+def split_groups(results: Results) -> dict[str, Results]:
+    """Return the rows of each group; problems whose names have no "/" are left out."""
+    rows: dict[str, list[ProblemRow]] = {}
+    for row in results.rows:
+        if "/" in row.id:
+            rows.setdefault(group_of(row.id), []).append(row)
+    return {group: replace(results, rows=tuple(members)) for group, members in rows.items()}
 
 
 def training_configs(folders: Mapping[str, Path], runs: Mapping[str, Results]) -> dict[str, dict[str, Any]]:

@@ -1,34 +1,36 @@
 """Bootstrap intervals of test statistics, and of the difference of two estimates on the same problems."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import astuple, dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from rich.text import Text
 
+from bpnp.metrics import joint_error
 from bpnp.report.results import Results
-from bpnp.report.tables import Line, lines_of, tested_problems
-from bpnp.report.terminal import SplitTable, number
+from bpnp.report.tables import Column, Line, cell, joint_limits, lines_of, tested_problems
+from bpnp.report.terminal import SplitTable
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 LEVEL = 0.95
 DRAWS = 2000
 FINITE = 1e12  # replaces infinity, so that interpolation is defined
 
-JOINT = (15.0, 0.5)  # degrees, scene units
-HEADERS = (
-    "rotation\nmedian",
-    "rotation\ndifference",
-    "translation\nmedian",
-    "translation\ndifference",
-    "% within\n15deg 0.5",
-    "% within\ndifference",
-    "sec",
+MEDIANS = (
+    Column("rotation_q2_deg", "rotation\nmedian"),
+    Column("translation_q2", "translation\nmedian"),
+    Column("reprojection_q2_deg", "reprojection\nmedian"),
 )
 CAPTION = (
-    "Rotation in degrees, translation in scene units; below each number its 95 % interval (bootstrap over the "
-    "problems). Differences are paired over the same problems, and significant if their interval excludes zero."
+    "Rotation and reprojection error in degrees, translation error in scene units, % of problems within both limits, "
+    'seconds a problem. Below each number is its 95 % interval (bootstrap over the problems). Rows "minus ..." are '
+    "differences, paired over the same problems, and significant if their interval excludes zero."
 )
 Statistic = Callable[[NDArray[np.float64]], NDArray[np.float64]]  # reduces the last axis
 
@@ -64,9 +66,7 @@ def bootstrap(values: NDArray[np.float64], statistic: Statistic = median, *, see
     Raises:
         ValueError: There are no values, or one is NaN.
     """
-    clean = _check_values(values)
-    drawn = statistic(clean[_draws(len(clean), seed)])
-    return _interval(float(statistic(clean)), drawn)
+    return _interval(*_draw(values, statistic, seed))
 
 
 def paired_difference(
@@ -89,10 +89,8 @@ def paired_difference(
         raise ValueError(
             f"a paired difference needs values of the same problems; there are {len(first)} and {len(second)}"
         )
-    one, other = _check_values(first), _check_values(second)
-    draws = _draws(len(one), seed)
-    drawn = statistic(other[draws]) - statistic(one[draws])
-    return _interval(float(statistic(other) - statistic(one)), drawn)
+    (one, one_drawn), (other, other_drawn) = (_draw(values, statistic, seed) for values in (first, second))
+    return _interval(other - one, other_drawn - one_drawn)
 
 
 def quantile(probability: float) -> Statistic:
@@ -109,15 +107,14 @@ def fraction(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.mean(values, axis=-1))
 
 
-def _draws(count: int, seed: int) -> NDArray[np.int64]:
-    return np.random.default_rng(seed).integers(0, count, (DRAWS, count))
-
-
-def _check_values(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _draw(values: NDArray[np.float64], statistic: Statistic, seed: int = 0) -> tuple[float, NDArray[np.float64]]:
+    """Return the statistic of the values, and that of each draw; draws of as many values are of the same ones."""
     array = np.asarray(values, np.float64)
     if not len(array) or np.isnan(array).any():
         raise ValueError(f"a bootstrap needs numbers; there are {len(array)}, {int(np.isnan(array).sum())} of them NaN")
-    return np.clip(array, -FINITE, FINITE)
+    clean = np.clip(array, -FINITE, FINITE)
+    draws = np.random.default_rng(seed).integers(0, len(clean), (DRAWS, len(clean)))
+    return float(statistic(clean)), statistic(clean[draws])
 
 
 def _interval(value: float, drawn: NDArray[np.float64]) -> Interval:
@@ -126,35 +123,144 @@ def _interval(value: float, drawn: NDArray[np.float64]) -> Interval:
     return Interval(*numbers)
 
 
-def interval_table(runs: Mapping[str, Results]) -> SplitTable:
-    """Return a table of medians and recalls with intervals, paired differences to the first run, and seconds.
+@dataclass(frozen=True)
+class IntervalRow:
+    """Statistics of an estimate, or their difference to those of another estimate, with intervals.
 
-    It has one row per run and estimate.
+    Attributes:
+        line: Estimate.
+        minus: Estimate that is subtracted, None for the statistics of `line` itself.
+        problems: Number of problems.
+        intervals: Interval of each column; None if no problem has its number.
+    """
+
+    line: Line
+    minus: Line | None
+    problems: int
+    intervals: tuple[Interval | None, ...]
+
+    @property
+    def label(self) -> str:
+        """Name of the row."""
+        return self.line.label if self.minus is None else f"minus {self.minus.label}"
+
+
+@dataclass(frozen=True)
+class IntervalTable:
+    """Medians, recall and seconds with intervals, for the terminal, the page and W&B.
+
+    Attributes:
+        title: Title.
+        columns: Columns. Their keys are those of `summarise`.
+        groups: Rows of all problems, or of each group of problems, by the title of the group.
+    """
+
+    title: str
+    columns: tuple[Column, ...]
+    groups: Mapping[str, Sequence[IntervalRow]]
+
+    def cells(self, row: IntervalRow) -> list[str]:
+        """Return the texts of a row: the number and, below it, its interval."""
+        return [
+            _shown(interval, column, signed=row.minus is not None)
+            for interval, column in zip(row.intervals, self.columns, strict=True)
+        ]
+
+    def split_table(self) -> SplitTable:
+        """Return the table for the terminal."""
+        groups = []
+        for name, rows in self.groups.items():
+            head = [(Text(name, "bold"), [Text("")] * len(self.columns))] if name else []
+            shown = [(Text(row.label, "" if row.minus is None else "dim"), row) for row in rows]
+            groups.append([*head, *((label, list(map(Text, self.cells(row)))) for label, row in shown)])
+        return SplitTable(self.title, [column.header for column in self.columns], groups, CAPTION)
+
+    def frame(self) -> "DataFrame":
+        """Return the numbers, fractions from 0 to 1.
+
+        Returns:
+            Columns "group" (absent for all problems), "run", "estimate", "minus" (empty for the statistics of the
+                estimate itself) and "problems"; of each column its number, and "..._low" and "..._high", the ends of
+                its interval, NaN where there is none.
+        """
+        from pandas import DataFrame
+
+        records = []
+        for group, rows in self.groups.items():
+            for row in rows:
+                names = {"group": group} if group else {}
+                names |= {"run": row.line.run, "estimate": row.line.estimate}
+                names |= {"minus": row.minus.label if row.minus else ""}
+                record: dict[str, float | int | str] = {**names, "problems": row.problems}
+                for column, interval in zip(self.columns, row.intervals, strict=True):
+                    ends = (math.nan,) * 3 if interval is None else astuple(interval)
+                    record |= zip((column.key, f"{column.key}_low", f"{column.key}_high"), ends, strict=True)
+                records.append(record)
+        return DataFrame(records)
+
+
+def interval_table(runs: Mapping[str, Results]) -> IntervalTable:
+    """Return medians, recall and seconds of each run and estimate, and their paired differences, with intervals.
+
+    Args:
+        runs: Results by name. Each estimate is compared with that of `baseline_of`.
+    """
+    title = "Medians and recall with 95 % intervals"
+    return IntervalTable(title, interval_columns(runs), {"": interval_rows(runs, runs)})
+
+
+def interval_columns(runs: Mapping[str, Results]) -> tuple[Column, ...]:
+    """Return the columns of a table of intervals; the recall has the limits of `joint_limits`."""
+    degrees, length = joint_limits(runs)
+    recall = Column(f"recall_joint_{degrees:g}deg_{length:g}", f"% within\n{degrees:g}deg {length:g}", percent=True)
+    return (*MEDIANS, recall, Column("seconds_mean", "seconds\nmean"))
+
+
+def interval_rows(runs: Mapping[str, Results], members: Mapping[str, Results]) -> list[IntervalRow]:
+    """Return the rows of each run and estimate: its statistics, then the difference to its baseline, if it has one.
 
     Args:
         runs: Results by name.
+        members: Some problems of the runs, such as a group; a run without any may be absent.
     """
-    lines = lines_of(runs)
-    shown = [
-        (Text(line.label), list(map(Text, cells))) for line, cells in zip(lines, interval_cells(runs), strict=True)
-    ]
-    return SplitTable(interval_title(runs), HEADERS, (shown, []), interval_caption(runs))
+    lines, limits = lines_of(runs), joint_limits(runs)
+    tested = {name: tested_problems(results) for name, results in members.items()}
+    samples: dict[Line, list[Sample]] = {}
+    rows = []
+    for line in (line for line in lines if line.run in members):
+        own, count = _samples(members[line.run], line.estimate, limits), members[line.run].problems
+        rows.append(IntervalRow(line, None, count, tuple(sample.interval() for sample in own)))
+        baseline = baseline_of(line, lines)
+        if baseline is not None and baseline in samples and tested[line.run] == tested[baseline.run]:
+            pairs = zip(own, samples[baseline], strict=True)
+            rows.append(IntervalRow(line, baseline, count, tuple(sample.minus(other) for sample, other in pairs)))
+        samples[line] = own
+    return rows
 
 
-def interval_title(runs: Mapping[str, Results]) -> str:
-    """Return the title of `interval_table`, which names what each row is compared with."""
-    first, *others = lines_of(runs)
-    if len(runs) == 1:
-        return f"Intervals, and differences to {first.estimate}" if others else "Intervals"
-    return f"Intervals, and differences to the same estimate of {first.run}"
+@dataclass(frozen=True)
+class Sample:
+    """Statistic of the problems that have a number, and of draws of them.
 
+    Attributes:
+        known: True for the problems that have a number (k,).
+        value: Statistic, NaN if no problem has a number.
+        drawn: Statistic of each draw (2000,).
+    """
 
-def interval_caption(runs: Mapping[str, Results]) -> str:
-    """Return the text below `interval_table`."""
-    first, known = lines_of(runs)[0], next(iter(runs.values())).estimates
-    if all(results.estimates.keys() <= known.keys() for results in runs.values()):
-        return CAPTION
-    return f"{CAPTION} Estimates that {first.run} does not have are compared with its {first.estimate}."
+    known: NDArray[np.bool_]
+    value: float
+    drawn: NDArray[np.float64]
+
+    def interval(self) -> Interval | None:
+        """Return the statistic with its interval, None if no problem has a number."""
+        return _interval(self.value, self.drawn) if self.known.any() else None
+
+    def minus(self, other: "Sample") -> Interval | None:
+        """Return the difference with its interval, None if not the same problems have a number."""
+        if not np.array_equal(self.known, other.known):
+            return None
+        return replace(self, value=self.value - other.value, drawn=self.drawn - other.drawn).interval()
 
 
 def baseline_of(line: Line, lines: Sequence[Line]) -> Line | None:
@@ -176,47 +282,25 @@ def baseline_of(line: Line, lines: Sequence[Line]) -> Line | None:
     return next((each for each in lines if each.run == first.run != line.run and each.estimate == line.estimate), first)
 
 
-def interval_cells(runs: Mapping[str, Results]) -> list[list[str]]:
-    """Return the texts of `interval_table`: a row per run and estimate, a cell per header.
-
-    A cell has the number and, below it, its interval.
-    """
-    lines, rows = lines_of(runs), []
-    for line in lines:
-        values, baseline = _values(runs, line), baseline_of(line, lines)
-        alike = baseline is not None and tested_problems(runs[line.run]) == tested_problems(runs[baseline.run])
-        others = _values(runs, baseline) if baseline is not None and alike else [None] * len(values)
-        cells = []
-        for own, other, (statistic, text) in zip(values, others, STATISTICS, strict=True):
-            cells.append(_shown(bootstrap(own, statistic), text))
-            cells.append(
-                "" if other is None else _shown(paired_difference(other, own, statistic), partial(_signed, text))
-            )
-        rows.append([*cells, number(runs[line.run].estimates[line.estimate]["seconds_mean"])])
-    return rows
+def _samples(results: Results, estimate: str, limits: tuple[float, float]) -> list[Sample]:
+    """Return the sample of each of `interval_columns`."""
+    errors = results.errors(estimate)
+    within = (joint_error(errors, limits[1]) <= limits[0]).double()
+    seconds = torch.tensor([row.seconds for row in results.of(estimate)], dtype=torch.float64)
+    medians = (errors.rotation_deg, errors.translation, errors.reprojection_deg)
+    columns = [*((values, median) for values in medians), (within, fraction), (seconds, fraction)]
+    samples = []
+    for values, statistic in columns:
+        known = ~values.isnan().numpy()
+        drawn = _draw(values.numpy()[known], statistic) if known.any() else (math.nan, np.full(DRAWS, math.nan))
+        samples.append(Sample(known, *drawn))
+    return samples
 
 
-def _percent(value: float) -> str:
-    return f"{value:.0f}"
-
-
-STATISTICS: tuple[tuple[Statistic, Callable[[float], str]], ...] = (
-    (median, number),  # rotation
-    (median, number),  # translation
-    (fraction, _percent),  # within both limits
-)
-
-
-def _values(runs: Mapping[str, Results], line: Line) -> list[NDArray[np.float64]]:
-    """Return a number per problem for each of `STATISTICS`."""
-    errors = runs[line.run].errors(line.estimate)
-    rotation, translation = errors.rotation_deg.numpy(), errors.translation.numpy()
-    return [rotation, translation, 100.0 * ((rotation < JOINT[0]) & (translation < JOINT[1]))]
-
-
-def _signed(text: Callable[[float], str], value: float) -> str:
-    return f"{'+' if value > 0 else ''}{text(value)}"
-
-
-def _shown(interval: Interval, text: Callable[[float], str]) -> str:
-    return f"{text(interval.value)}\n{text(interval.low)} to {text(interval.high)}"
+def _shown(interval: Interval | None, column: Column, *, signed: bool) -> str:
+    if interval is None:
+        return cell(column, {})
+    value, low, high = (
+        f"{'+' if signed and number > 0 else ''}{cell(column, {column.key: number})}" for number in astuple(interval)
+    )
+    return f"{value}\n{low} to {high}"

@@ -23,8 +23,9 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.files import write_text
 from bpnp.report.charts import CONFIG, RECALLS, chart_text, figures, look, recall_chart
-from bpnp.report.groups import differences, group_rows, training_configs
-from bpnp.report.intervals import HEADERS, interval_caption, interval_cells, interval_title
+from bpnp.report.groups import differences, group_table, training_configs
+from bpnp.report.intervals import CAPTION as INTERVAL_CAPTION
+from bpnp.report.intervals import interval_table
 from bpnp.report.photos import PhotoFinder, PhotoSource
 from bpnp.report.points import Array, ProblemPoints, read_points, utf8
 from bpnp.report.results import (
@@ -140,12 +141,10 @@ def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None, photos
         heads=[column.header for column in RESULT_COLUMNS],
         rows=quartile_rows(runs, paper),
         caption=CAPTION,
-        interval_heads=HEADERS,
-        intervals=list(zip(lines, interval_cells(runs), strict=True)),
-        interval_title=interval_title(runs),
-        interval_caption=interval_caption(runs),
+        intervals=interval_table(runs),
+        interval_caption=INTERVAL_CAPTION,
         trainings=training_pictures(folders, runs),
-        groups=group_rows(runs),
+        groups=group_table(runs),
         differences=differences(runs, training_configs(folders, runs)),
         charts=list(map(chart_text, charts)),
         causes=CAUSES,

@@ -23,6 +23,7 @@ CAPTION = (
     "with both rotation and translation error within. sec: mean seconds a problem. No pose counts as 180 deg and inf."
 )
 PAPERS: dict[str, Paper] = {"MeshDataModule": "modelnet40", "ColmapDataModule": "megadepth"}  # by data module
+JOINT_LIMITS: dict[Paper, tuple[float, float]] = {"modelnet40": (15.0, 0.5), "megadepth": (10.0, 1.0)}
 # Options of the data that do not change the problems of a test.
 LOADING = {"batch_size", "eval_batch_size", "max_cells", "num_workers", "max_points", "fresh_subsets", "val_fraction"}
 
@@ -214,12 +215,15 @@ def run_rows(runs: Mapping[str, Results], paper: Paper | None = None) -> list[Me
 
 
 def tested_problems(results: Results) -> Hashable:
-    """Return a key that is equal for results of the same problems: the same data, names and numbers of points."""
+    """Return a key that is equal for results of the same problems: the same data, names and numbers of points
+    and matches."""
     data = results.settings.get("data")
     if isinstance(data, Mapping) and isinstance(data.get("init_args"), Mapping):
         options = {key: value for key, value in data["init_args"].items() if key not in LOADING}
         data = {**data, "init_args": options}
-    return json.dumps(data, sort_keys=True), frozenset((row.index, row.id, row.m, row.n) for row in results.rows)
+    return json.dumps(data, sort_keys=True), frozenset(
+        (row.index, row.id, row.m, row.n, row.matches) for row in results.rows
+    )
 
 
 def paper_of(results: Results) -> Paper | None:
@@ -227,6 +231,11 @@ def paper_of(results: Results) -> Paper | None:
     data = results.settings.get("data")
     kind = str(data.get("class_path")).rpartition(".")[2] if isinstance(data, Mapping) else ""
     return PAPERS.get(kind)
+
+
+def joint_limits(runs: Mapping[str, Results]) -> tuple[float, float]:
+    """Return the limits of the recall in the paper, degrees and scene units, for the kind of data of the first run."""
+    return JOINT_LIMITS[paper_of(next(iter(runs.values()))) or "modelnet40"]
 
 
 def paper_rows(paper: Paper | None) -> list[MethodRow]:

@@ -1,9 +1,12 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import wandb
+from pandas import DataFrame
 from report_data import rows, write_run
 from small_data import is_written
 
@@ -51,6 +54,35 @@ def test_a_run_is_written_to_a_folder_with_its_tables_and_pictures(tmp_path: Pat
     assert len(list((media / "images" / "test").glob("worst_problems_*.png"))) == 2
     assert len(list((media / "images" / "test").glob("recall_*.png"))) == 1
     assert is_written(next(run.glob("*.wandb")), b"test/pnp/rotation_q2_deg")
+
+
+def test_the_tables_have_intervals_paired_differences_and_groups(tmp_path: Path) -> None:
+    """The second run is 1 degree better in every problem; of its two classes, one has 15 problems, one 5."""
+    chairs = [replace(own, id=f"{'chair' if own.index < 15 else 'desk'}/{own.index}") for own in rows(20, 0)]
+    better = [replace(own, rotation_error_deg=own.rotation_error_deg - 1) for own in chairs]
+    write_results(tmp_path / "Lc", chairs)
+    written = write_results(tmp_path / "LcLp", better)
+    run = log_results(tmp_path / "LcLp", name="planted", compare_with=tmp_path / "Lc")
+
+    def frame(name: str) -> DataFrame:
+        (path,) = (run / "files" / "media" / "table" / "test").glob(f"{name}_*.json")
+        return DataFrame(**json.loads(path.read_text()))
+
+    intervals = frame("intervals")
+    assert list(zip(intervals.estimate, intervals["minus"], strict=True)) == [
+        ("ransac", ""),
+        ("ransac", "Lc: ransac"),
+        ("pnp", ""),
+        ("pnp", "Lc: pnp"),
+    ]
+    own, paired = intervals[intervals["minus"] == ""], intervals[intervals["minus"] != ""]
+    assert own.rotation_q2_deg.tolist() == [written.estimates[name]["rotation_q2_deg"] for name in ("ransac", "pnp")]
+    for ends in ("", "_low", "_high"):
+        np.testing.assert_allclose(paired[f"rotation_q2_deg{ends}"], -1)
+    assert (own["recall_joint_15deg_0.5_low"] < own["recall_joint_15deg_0.5_high"]).all()
+    groups = frame("groups")
+    assert list(groups.columns) == ["group", *intervals.columns]
+    assert groups.group.tolist() == ["chair, 15 problems"] * 4 + ["desk, 5 problems"] * 4
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """Results by group against numbers by hand, and the settings in which two runs differ."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,8 @@ from report_data import rows
 
 from bpnp.cli import main
 from bpnp.report import Results, read_results, write_results
-from bpnp.report.groups import differences, group_rows, training_configs
+from bpnp.report.groups import differences, group_table, training_configs
+from bpnp.report.intervals import interval_table
 from bpnp.report.page import page_html
 from bpnp.report.results import summarise
 
@@ -25,16 +27,50 @@ def results(settings: dict) -> Results:
     return Results(tuple(found), summarise(found), None, settings, "0", "")
 
 
-def test_each_group_has_its_median_and_the_largest_comes_first() -> None:
-    assert group_rows({"a": results({}), "b": results({})}) == [
-        ("chair", 3, ["3.00", "3.00"]),
-        ("desk", 2, ["3.50", "3.50"]),
+def test_each_group_has_the_statistics_of_its_own_problems_and_the_largest_comes_first() -> None:
+    """Of "a" the medians are 3 of (1, 3, 4) and 3.5 of (2, 5), of "b" one less; none of "other" is a desk."""
+    better = [replace(row, rotation_error_deg=row.rotation_error_deg - 1) for row in results({}).rows]
+    other = [row for row in results({}).rows if row.id.startswith("chair")]
+    runs = {"a": results({}), "b": replace(results({}), rows=tuple(better))}
+    runs["other"] = replace(results({}), rows=tuple(other))
+    table = group_table(runs)
+    assert table is not None
+    frame = table.frame()
+    rows = frame[["group", "run", "minus", "problems", "rotation_q2_deg"]].itertuples(index=False, name=None)
+    chair, desk = "chair, 3 problems", "desk, 2 problems"
+    assert list(rows) == [
+        (chair, "a", "", 3, 3.0),
+        (chair, "b", "", 3, 2.0),
+        (chair, "b", "a: pnp", 3, -1.0),
+        (chair, "other", "", 3, 3.0),
+        (chair, "other", "a: pnp", 3, 0.0),
+        (desk, "a", "", 2, 3.5),
+        (desk, "b", "", 2, 2.5),
+        (desk, "b", "a: pnp", 2, -1.0),
     ]
+    assert table.columns == interval_table(runs).columns
+    alone = [row for row in runs["a"].rows if row.id.startswith("desk")]
+    expected = interval_table({"a": replace(runs["a"], rows=tuple(alone)), "b": runs["b"]}).frame()
+    assert frame[frame.group == desk].translation_q2_high.iloc[0] == expected.translation_q2_high[0]
 
 
 def test_problems_without_groups_have_no_table() -> None:
     found = [replace(row, id=f"problem {i}") for i, row in enumerate(rows(5, seed=0))]
-    assert group_rows({"a": Results(tuple(found), summarise(found), None, {}, "0", "")}) == []
+    assert group_table({"a": Results(tuple(found), summarise(found), None, {}, "0", "")}) is None
+
+
+def test_the_terminal_prints_the_groups_on_request(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_results(tmp_path / "a", results({}).rows)
+    main(["report", str(tmp_path / "a")])
+    assert "chair, 3 problems" not in capsys.readouterr().out
+    main(["report", str(tmp_path / "a"), "--groups"])
+    printed = [line.strip() for line in capsys.readouterr().out.splitlines()]
+    heads = [line for line in printed if line.startswith(("chair", "desk"))]
+    assert heads == ["chair, 3 problems", "desk, 2 problems"]
+    assert printed[printed.index(heads[1]) + 1].split()[:2] == ["pnp", "3.50"]
+    write_results(tmp_path / "b", [replace(row, id=str(row.index)) for row in results({}).rows])
+    main(["report", str(tmp_path / "b"), "--groups"])
+    assert "no group before a slash" in capsys.readouterr().out
 
 
 def test_the_settings_that_differ_are_named_with_both_values() -> None:
@@ -126,3 +162,5 @@ def test_the_page_shows_both(tmp_path: Path) -> None:
     assert "<li>solver.rounds: 0 (a), 8 (b)</li>" in page
     assert "<h2>By class or scene</h2>" in page
     assert '<a href="#groups">By class or scene</a>' in page
+    group = page[page.index("chair, 3 problems") : page.index("desk, 2 problems")]
+    assert re.findall('data-head="rotation median">(.*?)\n', group) == ["3.00", "3.00", "0"]

@@ -11,13 +11,11 @@ from rich.console import Console
 from scipy import stats
 
 from bpnp.report import ProblemRow, Results
+from bpnp.report.charts import recall_chart
 from bpnp.report.intervals import (
     bootstrap,
     fraction,
-    interval_caption,
-    interval_cells,
     interval_table,
-    interval_title,
     paired_difference,
     quantile,
 )
@@ -71,6 +69,9 @@ def test_an_interval_of_nan_or_unequal_lists_is_refused() -> None:
         paired_difference(np.ones(2), np.ones(3))
 
 
+COLUMNS = ["rotation_q2_deg", "translation_q2", "reprojection_q2_deg", "recall_joint_15deg_0.5", "seconds_mean"]
+
+
 def rows_of(estimates: dict[str, float], **shift: float) -> list[ProblemRow]:
     """40 problems with rotation errors of 10, 11, ... degrees plus a number for each estimate, and translation errors
     of 0, 0.02, ...; shifted."""
@@ -79,66 +80,128 @@ def rows_of(estimates: dict[str, float], **shift: float) -> list[ProblemRow]:
             row,
             rotation_error_deg=10.0 + row.index + estimates[row.estimate] + shift.get("rotation", 0),
             translation_error=0.02 * row.index + shift.get("translation", 0),
+            reprojection_error_deg=1.0 + 0.1 * row.index + shift.get("reprojection", 0),
+            seconds=0.5 + shift.get("seconds", 0),
         )
         for row in rows(40, seed=0, estimates=tuple(estimates))
     ]
 
 
-def differences(cells: list[str]) -> list[str]:
-    return [cells[i] for i in (1, 3, 5)]
+def texts(runs: dict[str, Results]) -> dict[tuple[str, str], list[str]]:
+    """The cells of each row, by the label of its estimate and that of what is subtracted."""
+    table = interval_table(runs)
+    (shown,) = table.groups.values()
+    return {(row.line.label, row.minus.label if row.minus else ""): table.cells(row) for row in shown}
 
 
 def test_each_row_is_paired_with_the_same_estimate_of_the_first_run() -> None:
     """The second run turns each problem by 1 degree less and misses it by 0.25 more. Of the 40 problems of `pnp`, those
-    with index 0 to 4 are within 15 degrees and 0.5; of the second run 0 to 5; `ransac` is 3 degrees worse."""
+    with index 0 to 5 are within 15 degrees and 0.5; of the second run 0 to 6; `ransac` is 3 degrees worse."""
     estimates = {"ransac": 3.0, "pnp": 0.0}
-    first, second = results(rows_of(estimates)), results(rows_of(estimates, rotation=-1, translation=0.25))
-    runs = {"Lc": first, "test": second, "other": results(rows_of(estimates)[:60])}
-    cells = interval_cells(runs)
-    assert [row[0].split("\n")[0] for row in cells] == ["32.5", "29.5", "31.5", "28.5", "27.5", "24.5"]
-    assert [row[2].split("\n")[0] for row in cells[:4]] == ["0.390", "0.390", "0.640", "0.640"]
-    assert [row[4].split("\n")[0] for row in cells[:4]] == ["5", "12", "8", "15"]
-    assert differences(cells[0]) == differences(cells[1]) == ["", "", ""]  # the first run itself
-    for row in cells[2:4]:  # against its own kind: neither 3 - 1 nor -3 - 1
-        assert differences(row)[:2] == ["-1.00\n-1.00 to -1.00", "+0.250\n+0.250 to +0.250"]
-        value, low, high = (float(x) for x in differences(row)[2].replace("\n", " to ").split(" to "))
-        assert value == 2
+    shift = {"rotation": -1, "translation": 0.25, "reprojection": 0.5, "seconds": 0.25}
+    runs = {"Lc": results(rows_of(estimates)), "test": results(rows_of(estimates, **shift))}
+    runs["other"] = results(rows_of(estimates)[:60])
+    cells = texts(runs)
+    assert list(cells) == [
+        ("Lc: ransac", ""),
+        ("Lc: pnp", ""),
+        ("test: ransac", ""),
+        ("test: ransac", "Lc: ransac"),
+        ("test: pnp", ""),
+        ("test: pnp", "Lc: pnp"),
+        ("other: ransac", ""),  # other problems
+        ("other: pnp", ""),
+    ]
+    values = {label: [text.split("\n")[0] for text in row] for (label, minus), row in cells.items() if not minus}
+    assert values["Lc: ransac"] == ["32.5", "0.390", "2.95", "7.5", "0.500"]
+    assert values["Lc: pnp"] == ["29.5", "0.390", "2.95", "15.0", "0.500"]
+    assert values["test: ransac"] == ["31.5", "0.640", "3.45", "10.0", "0.750"]
+    assert values["test: pnp"] == ["28.5", "0.640", "3.45", "17.5", "0.750"]
+    assert (values["other: ransac"][0], values["other: pnp"][0]) == ("27.5", "24.5")
+    for estimate in estimates:  # against its own kind: neither 3 - 1 nor -3 - 1
+        rotation, translation, reprojection, recall, seconds = cells[f"test: {estimate}", f"Lc: {estimate}"]
+        assert rotation == "-1.00\n-1.00 to -1.00"
+        assert translation == "+0.250\n+0.250 to +0.250"
+        assert reprojection == "+0.500\n+0.500 to +0.500"
+        assert seconds == "+0.250\n+0.250 to +0.250"
+        value, low, high = (float(x) for x in recall.replace("\n", " to ").split(" to "))
+        assert value == 2.5
         assert low <= 0 < value < high
-    assert differences(cells[4]) == differences(cells[5]) == ["", "", ""]  # other problems
-    assert interval_title(runs) == "Intervals, and differences to the same estimate of Lc"
-    low, high = (float(x) for x in cells[0][0].split("\n")[1].split(" to "))
+    low, high = (float(x) for x in cells["Lc: ransac", ""][0].split("\n")[1].split(" to "))
     assert 13 < low < 32.5 < high < 53
 
 
+def test_the_numbers_are_those_of_the_summary() -> None:
+    """Of problems with and without poses and matches; an error at a limit is within it."""
+    found = [*rows(40, seed=3, estimates=("pnp",))]
+    found[2] = replace(found[2], rotation_error_deg=15.0, translation_error=0.5)
+    run = results(found)
+    frame = interval_table({"run": run}).frame()
+    assert run.estimates["pnp"]["without_matches"] == 1
+    for key in COLUMNS:
+        assert frame[key][0] == pytest.approx(run.estimates["pnp"][key], rel=1e-12)
+        assert frame[f"{key}_low"][0] <= frame[key][0] <= frame[f"{key}_high"][0]
+    assert (frame.run[0], frame.estimate[0], frame["minus"][0], frame.problems[0]) == ("run", "pnp", "", 40)
+
+
+@pytest.mark.parametrize(
+    ("kind", "key", "head"),
+    [
+        ("MeshDataModule", "recall_joint_15deg_0.5", "% within\n15deg 0.5"),
+        ("ColmapDataModule", "recall_joint_10deg_1", "% within\n10deg 1"),
+    ],
+)
+def test_the_recall_has_the_limits_of_the_table_of_the_paper(kind: str, key: str, head: str) -> None:
+    """15 degrees and 0.5 for shapes (Table 1), 10 degrees and 1.0 for photos (Table 2)."""
+    found = rows(40, seed=3, estimates=("pnp",))
+    run = replace(results(found), settings={"data": {"class_path": f"bpnp.datamodules.{kind}"}})
+    table = interval_table({"run": run})
+    assert table.columns[3].header == head
+    assert table.frame()[key][0] == pytest.approx(run.estimates["pnp"][key])
+    chart = recall_chart({"run": run}, "joint")
+    assert chart is not None
+    degrees, length = map(float, head.split("\n")[1].replace("deg", "").split())
+    at = next(i for i, x in enumerate(chart.data[0].x) if x > degrees)
+    assert chart.data[0].y[at - 1] <= run.estimates["pnp"][key] <= chart.data[0].y[at]
+    assert chart.layout.xaxis.title.text.endswith(f"within {length:g} scene units")
+
+
 def test_the_estimates_of_one_run_are_paired_with_its_first() -> None:
-    runs = {"run": results(rows_of({"ransac": 3.0, "pnp": 0.0}))}
-    cells = interval_cells(runs)
-    assert differences(cells[0]) == ["", "", ""]
-    assert differences(cells[1])[:2] == ["-3.00\n-3.00 to -3.00", "0\n0 to 0"]
-    assert interval_title(runs) == "Intervals, and differences to ransac"
-    assert interval_title({"run": results(rows_of({"pnp": 0.0}))}) == "Intervals"
+    cells = texts({"run": results(rows_of({"ransac": 3.0, "pnp": 0.0}))})
+    assert list(cells) == [("ransac", ""), ("pnp", ""), ("pnp", "ransac")]
+    assert cells["pnp", "ransac"][:2] == ["-3.00\n-3.00 to -3.00", "0\n0 to 0"]
 
 
 def test_an_estimate_that_the_first_run_lacks_is_paired_with_its_first() -> None:
     runs = {"softposit": results(rows_of({"softposit": 3.0})), "net": results(rows_of({"pnp": 0.0}))}
-    assert differences(interval_cells(runs)[1])[0] == "-3.00\n-3.00 to -3.00"
-    assert interval_caption(runs).endswith("Estimates that softposit does not have are compared with its softposit.")
+    assert texts(runs)["net: pnp", "softposit: softposit"][0] == "-3.00\n-3.00 to -3.00"
 
 
 def test_problems_without_a_pose_have_no_finite_translation_interval() -> None:
     lost = [replace(row, translation_error=np.inf) for row in rows_of({"pnp": 0.0})]
-    cells = interval_cells({"a": results(rows_of({"pnp": 0.0})), "b": results(lost)})
-    assert cells[1][2:4] == ["inf\ninf to inf", "+inf\n+inf to +inf"]
+    cells = texts({"a": results(rows_of({"pnp": 0.0})), "b": results(lost)})
+    assert cells["b: pnp", ""][1] == "inf\ninf to inf"
+    assert cells["b: pnp", "a: pnp"][1] == "+inf\n+inf to +inf"
+
+
+def test_reprojection_errors_of_different_problems_are_not_paired() -> None:
+    """One problem without a match has no error; without any match the cell is empty."""
+    known, none = rows_of({"pnp": 0.0}), [replace(row, reprojection_error_deg=np.nan) for row in rows_of({"pnp": 0.0})]
+    runs = {"all": results(known), "but one": results([*known[:-1], none[-1]]), "none": results(none)}
+    cells = texts(runs)
+    assert [cells[f"{name}: pnp", ""][2].split("\n")[0] for name in runs] == ["2.95", "2.90", "-"]
+    assert [cells[f"{name}: pnp", "all: pnp"][2] for name in ("but one", "none")] == ["-", "-"]
+    assert cells["none: pnp", "all: pnp"][0] == "0\n0 to 0"
 
 
 def test_the_terminal_shows_each_interval_below_its_number_within_80_columns() -> None:
     estimates = {"ransac": 3.0, "pnp": 0.0}
     runs = {"Lc": results(rows_of(estimates)), "test": results(rows_of(estimates, rotation=-1))}
     text = io.StringIO()
-    Console(file=text, width=80).print(interval_table(runs))
+    Console(file=text, width=80).print(interval_table(runs).split_table())
     lines = text.getvalue().splitlines()
     assert max(map(len, lines)) <= 80
-    assert "the same estimate of Lc" in lines[0]
     (number,) = (i for i, line in enumerate(lines) if "test: pnp" in line and "28.5" in line)
     assert lines[number + 1].split()[1] == "to"
     assert sum("-1.00 to -1.00" in line for line in lines) == 2
+    assert sum(line.strip().startswith("minus Lc: pnp") for line in lines) == 1

@@ -85,6 +85,19 @@ def test_the_charts_show_the_quartiles_that_the_paper_prints(tmp_path: Path) -> 
     assert len(joint.data) == 2
 
 
+def test_intervals_and_curves_come_first(tmp_path: Path) -> None:
+    """Before quartiles, groups, failures and problems; the links have the same order."""
+    for seed, name in enumerate("ab"):
+        write_run(tmp_path / name, 20, seed)
+    page = page_html([tmp_path / "a", tmp_path / "b"])
+    order = ["intervals", "recall", "quartiles", "groups", "versus-section", "failures", "problems"]
+    assert re.findall('<section id="(.*?)">', page) == order
+    assert re.findall('<a href="#(.*?)">', page) == order
+    first = page[page.index('<section id="intervals">') : page.index('<section id="recall">')]
+    assert '<th scope="row">minus a: pnp</th>' in first
+    assert first.count('data-head="seconds mean"') == 6  # four estimates, two differences
+
+
 def test_convergence_is_shown_only_where_a_problem_is_not_solved(tmp_path: Path) -> None:
     """A search that solves all and reports no convergence, and one that solves 8 of 10."""
     for name, wrong in (("all", 0), ("some", 2)):

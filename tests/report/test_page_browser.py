@@ -122,6 +122,9 @@ def test_runs_are_switched_off_and_on_and_the_address_keeps_it(browser: Any, pag
     press(page, "#series1")
     assert len(texts(page, lines)) == 3
     assert len(texts(page, "#quartile-table tbody tr:not(.paper):not([hidden])")) == 3
+    rows = "#intervals tbody tr:not([hidden])"  # without "first: pnp"; those of the second run have a difference each
+    assert len(texts(page, rows)) == 5
+    assert len(texts(page, f"{rows}.minus")) == 2
     assert not page("return document.getElementById('series1').checked")
     opened(browser, page("return location.href"))
     assert not page("return document.getElementById('series1').checked")
