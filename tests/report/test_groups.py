@@ -66,7 +66,7 @@ def test_the_terminal_prints_the_groups_on_request(tmp_path: Path, capsys: pytes
     main(["report", str(tmp_path / "a"), "--groups"])
     printed = [line.strip() for line in capsys.readouterr().out.splitlines()]
     heads = [line for line in printed if line.startswith(("chair", "desk"))]
-    assert heads == ["chair, 3 problems", "desk, 2 problems"]
+    assert heads == 2 * ["chair, 3 problems", "desk, 2 problems"]  # the table is split in two
     assert printed[printed.index(heads[1]) + 1].split()[:2] == ["pnp", "3.50"]
     write_results(tmp_path / "b", [replace(row, id=str(row.index)) for row in results({}).rows])
     main(["report", str(tmp_path / "b"), "--groups"])

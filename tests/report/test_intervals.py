@@ -204,4 +204,4 @@ def test_the_terminal_shows_each_interval_below_its_number_within_80_columns() -
     (number,) = (i for i, line in enumerate(lines) if "test: pnp" in line and "28.5" in line)
     assert lines[number + 1].split()[1] == "to"
     assert sum("-1.00 to -1.00" in line for line in lines) == 2
-    assert sum(line.strip().startswith("minus Lc: pnp") for line in lines) == 1
+    assert sum(line.strip().startswith("minus Lc: pnp") for line in lines) == 2  # in both parts of the table
