@@ -18,8 +18,8 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 quickstart: install
 	$(BIN)/bpnp fit --config quickstart
 	$(BIN)/bpnp test --config quickstart --ckpt_path $(RUN)/checkpoints/before_pose_loss.ckpt --results.folder $(RUN)/Lc
-	$(BIN)/bpnp test --config quickstart --ckpt_path $(RUN)/checkpoints/best.ckpt
-	$(BIN)/bpnp report $(RUN)/Lc $(RUN)/test --html $(RUN)/report.html --curves $(RUN)/curves.png
+	$(BIN)/bpnp test --config quickstart --ckpt_path $(RUN)/checkpoints/best.ckpt --results.folder $(RUN)/LcLp
+	$(BIN)/bpnp report $(RUN)/Lc $(RUN)/LcLp --html $(RUN)/report.html --curves $(RUN)/curves.png
 	@$(MAKE) --no-print-directory show-report
 
 # In the browser where there is a display, and not in continuous integration, which sets CI.
