@@ -71,7 +71,7 @@ def test_the_report_draws_the_training_of_a_test(run: Path, capsys: pytest.Captu
     assert (run / "curves.png").read_bytes().startswith(b"\x89PNG")
     assert 'src="data:image/svg+xml;base64,' in (run / "page.html").read_text()
     printed = capsys.readouterr().out
-    assert "Intervals, and differences to ransac" in printed
+    assert "Medians and recall with 95 % intervals" in printed
 
 
 def test_a_training_with_two_tests_is_drawn_once(run: Path) -> None:
