@@ -257,7 +257,10 @@ def plot_image(
     away = _facing_away(problem, estimate) & visible & ~matched
     free = visible & ~matched & ~away
     if matched.any():
-        axes.plot(*projected[matched].T, "x", color=colour, ms=size, mew=0.9, label="3D points, matched", zorder=4)
+        points = projected[matched].T
+        crosses = axes.plot(*points, "x", color=colour, ms=size, mew=0.9, label="3D points, matched", zorder=4)
+        if photo is not None:
+            crosses[0].set_path_effects([withStroke(linewidth=2.2, foreground="white")])  # for photos of its colour
         wrong = linked & (problem.match3d != targets) & (problem.match3d >= 0)
         for some, ink, style in ((linked & ~wrong, colour, "-"), (wrong, LIGHT[3], ":")):
             if some.any():

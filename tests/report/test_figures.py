@@ -131,6 +131,7 @@ def test_a_photo_shows_the_points_where_the_camera_projects_them(tmp_path: Path)
         camera = problem.points3d @ pose.rotation[0].numpy().T + pose.translation[0].numpy()
         pixels = (camera / camera[:, 2:]) @ matrix.T
         np.testing.assert_allclose(crosses.get_xydata(), pixels[:, :2], atol=0.6)  # of half a pixel's offset at most
+        assert crosses.get_path_effects(), "an edge, since a photo may have the colour of the crosses"
     write_results(tmp_path / "test", rows_from(prediction, batch, 1.0))
     write_points(tmp_path / "test", [problem])
     Image.fromarray(photo).save(tmp_path / "photo.png")
