@@ -133,7 +133,6 @@ def test_a_page_that_is_not_the_records_is_found(
     assert len(ran) == 5
 
 
-@pytest.mark.skipif(not tutorial.FILE.is_file(), reason="the tutorial was not measured with these commands yet")
 def test_the_page_is_that_of_the_record_and_says_what_it_shows() -> None:
     record = json.loads(tutorial.FILE.read_text())
     text = tutorial.PAGE.read_text(encoding="utf-8")
