@@ -437,7 +437,8 @@ def markdown(table: Table, record: Mapping[str, Any]) -> dict[str, str]:
     for key, found in record["rows"].items():
         name, seed, group, label, estimate = split[key]
         place = list(ESTIMATES).index(estimate) if estimate in ESTIMATES else 0
-        title, label = f"{name}-{group}".replace(", ", "-").replace(" ", "-"), label + ESTIMATES.get(estimate, "")
+        title = f"{name}-{group}".replace(", ", "-").replace(" ", "-").lower()
+        label += ESTIMATES.get(estimate, "")
         if int(seed) == lowest[name, group]:
             lines.setdefault(title, []).append((place, row_text(label, found)))
         if group == "paper":
@@ -679,10 +680,15 @@ def fill_tables(text: str, marker: str, tables: Mapping[str, str]) -> str:
 
 
 def fill_pages(pages: Iterable[Path], marker: str, tables: Mapping[str, str], *, check: bool) -> None:
-    """Write the tables into the pages, or exit with status 1 if a page differs and `check` is set."""
+    """Write the tables into the pages, or exit with status 1 if a page differs and `check` is set.
+
+    A table of a page that is not in `tables` is kept, and is an error with `check`.
+    """
     stale = []
     for page in pages:
         text = page.read_text(encoding="utf-8")
+        if check and (unknown := set(re.findall(rf"<!-- {marker}: (.+?) -->", text)) - set(tables)):
+            sys.exit(f"{page.name} has tables that are not in the record: {', '.join(sorted(unknown))}")
         if (new := fill_tables(text, marker, tables)) != text:
             stale.append(page.name)
             if not check:

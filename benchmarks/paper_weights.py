@@ -1,6 +1,6 @@
 """The packaged weights `paper-lc` and `paper-lclp`: the paper's losses on drawn shapes, which have no data licence.
 
-    python -m benchmarks paper_weights                     # two hours; a run that was stopped goes on
+    python -m benchmarks paper_weights                     # three hours; a run that was stopped goes on
     python -m benchmarks paper_weights --output elsewhere  # keeps the weights of the package
 
 The settings are those of configs/paper/modelnet40.yaml but for `SETTINGS` and for what each of `STAGES` has.
@@ -63,11 +63,11 @@ class Stage:
 STAGES = (
     Stage("few-points", None, points=128, steps=2000, learning_rate=1e-2, kind="turned", decay=False),
     Stage("turned", "few-points", points=256, steps=3750, learning_rate=1e-2, kind="turned", decay=False),
-    Stage("aligned", "turned", points=256, steps=4250, learning_rate=1e-2, decay=False),
+    Stage("aligned", "turned", points=256, steps=14250, learning_rate=1e-2, decay=False),
     Stage("likelihood", "aligned", points=256, steps=3000, learning_rate=1e-2),
     Stage("paper-lc", "likelihood", 1000, 200, 1e-3, "correspondence", packaged=True),
     Stage("likelihood-lp", "paper-lc", 256, 1750, 3e-3, pose_loss=True),
-    Stage("paper-lclp", "likelihood-lp", 1000, 700, 2e-3, "correspondence", pose_loss=True, packaged=True),
+    Stage("paper-lclp", "likelihood-lp", 1000, 1200, 3e-3, "correspondence", pose_loss=True, packaged=True),
 )
 
 

@@ -31,7 +31,7 @@ from bpnp.models.weights import checkpoint_path, pretrained_names
 SETS = {"modelnet10": 500, "psb": 100}  # test shapes
 TABLE = Table("table1", "modelnet40", (15.0, 0.5), tuple(SETS))
 FILE = ROOT / "benchmarks" / "table1.json"
-PAGES = (ROOT / "README.md", ROOT / "docs" / "index.md", ROOT / "docs" / "table1.md")
+PAGES = tuple(ROOT / page for page in ("README.md", "docs/index.md", "docs/table1.md", "docs/model-card.md"))
 PACKAGED = ("procedural-euler", "paper-lc", "paper-lclp")
 BASELINES: dict[str, Callable[[], nn.Module]] = {"SoftPOSIT": SoftPOSIT, "RANSAC": RandomRansac, "GOSMA": GOSMA}
 

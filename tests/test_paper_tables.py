@@ -229,9 +229,11 @@ def test_tables_stand_between_their_markers_and_a_page_that_differs_is_found(tmp
     assert new == page.replace("old", "new")
     (tmp_path / "page.md").write_text(page)
     with pytest.raises(SystemExit, match="tables of page.md are not those of the record"):
-        paper_tables.fill_pages([tmp_path / "page.md"], "t", {"one": "new\n"}, check=True)
+        paper_tables.fill_pages([tmp_path / "page.md"], "t", {"one": "new\n", "two": "kept\n"}, check=True)
     paper_tables.fill_pages([tmp_path / "page.md"], "t", {"one": "new\n"}, check=False)
-    paper_tables.fill_pages([tmp_path / "page.md"], "t", {"one": "new\n"}, check=True)
+    with pytest.raises(SystemExit, match="page.md has tables that are not in the record: two"):
+        paper_tables.fill_pages([tmp_path / "page.md"], "t", {"one": "new\n"}, check=True)
+    paper_tables.fill_pages([tmp_path / "page.md"], "t", {"one": "new\n", "two": "kept\n"}, check=True)
 
 
 def settings(**other: float) -> dict[str, float]:
@@ -247,6 +249,7 @@ def test_a_record_becomes_the_tables_of_the_page() -> None:
         "rows": {
             "modelnet10|0|paper|Lc|ransac": one | {"settings": settings(problems=500)},
             "modelnet10|0|paper|Lc|pnp": one | {"settings": settings(problems=500)},
+            "modelnet10|0|paper, our RANSAC|Lc|ransac": one | {"settings": settings(our_problems=40)},
             "modelnet10|0|paper, our inference|Lc|refined": one | {"settings": settings(our_problems=40)},
             "modelnet10|0|baselines|search|search": other,
         },
@@ -264,6 +267,7 @@ def test_a_record_becomes_the_tables_of_the_page() -> None:
     assert [line.split(" | ")[0] for line in lines[2:]] == [
         "| Lc", "| Lc R", "| *paper: Lc*", "| *paper: Lc Lp*", "| *paper: Lc R*", "| *paper: Lc Lp R*",
     ]  # fmt: skip
+    assert "| Lc R |" in tables["modelnet10-paper-our-ransac"]
     assert "| Lc, refined |" in tables["modelnet10-paper-our-inference"]
     assert "| *paper: GOSMA* |" in tables["modelnet10-baselines"]
     assert "| seed 0 | 400 | 500 |  | 0.0001 |" in tables["training"]
