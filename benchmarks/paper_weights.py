@@ -30,9 +30,8 @@ SETTINGS = (
     f"{SOLVER}.features3d.class_path=bpnp.models.nets.SceneFeatures",
     f"{SOLVER}.features3d.init_args.centre=true", f"{SOLVER}.features3d.init_args.normalise=true",
     f"{SOLVER}.refinement.init_args.enabled=true",  # in a test of the weights; the paper's recipe has none
-    "--model.warmup_steps=50", "--trainer.limit_val_batches=0",
+    "--trainer.limit_val_batches=0",
     "--trainer.precision=bf16-mixed", "--trainer.gradient_clip_val=5",
-    "--optimizer=bpnp.training.Muon",
 )  # fmt: skip
 ADAM = 0.2  # learning rate of Adam for the parameters that Muon does not train, as a fraction of Muon's
 
@@ -44,7 +43,8 @@ class Stage:
     after: the stage that it continues, None for new weights.
     points: of each problem, out of the 1,000 fixed points of its shape.
     kind: of the drawn shapes (`MeshDataModule`).
-    learning_rate: of Muon; constant, or with `decay` falling by a half cosine within the stage.
+    learning_rate: of the optimizer; constant, or with `decay` falling by a half cosine within the stage.
+    muon: whether Muon is the optimizer, or Adam, as in the paper. Adam begins anew: at step 0, with a warm-up.
     packaged: whether its end is one of the packaged weights.
     """
 
@@ -57,6 +57,7 @@ class Stage:
     kind: ProceduralKind = "aligned"
     pose_loss: bool = False
     decay: bool = True
+    muon: bool = True
     packaged: bool = False
 
 
@@ -67,26 +68,34 @@ STAGES = (
     Stage("likelihood", "aligned", points=256, steps=3000, learning_rate=1e-2),
     Stage("paper-lc", "likelihood", 1000, 200, 1e-3, "correspondence", packaged=True),
     Stage("likelihood-lp", "paper-lc", 256, 1750, 3e-3, pose_loss=True),
-    Stage("paper-lclp", "likelihood-lp", 1000, 1200, 3e-3, "correspondence", pose_loss=True, packaged=True),
+    Stage("both", "likelihood-lp", 1000, 1200, 3e-3, "correspondence", pose_loss=True),
+    Stage("paper-lclp", "both", 1000, 400, 2e-4, "correspondence", pose_loss=True, muon=False, packaged=True),
 )
 
 
-def trainings(folder: Path) -> Iterator[tuple[Stage, Training]]:
-    """Yield each stage with its training, which starts where the stage before it ends."""
-    ends: dict[str | None, int] = {None: 0}
+def trainings(folder: Path) -> Iterator[tuple[Stage, Training, int]]:
+    """Yield each stage, its training, which starts where the stage before it ends, and the steps of all until there."""
+    steps, ends = {None: 0}, {None: 0}  # of all stages, and of the checkpoint
     for stage in STAGES:
-        start = ends[stage.after]
+        start = ends[stage.after] if stage.muon else 0
         end = ends[stage.name] = start + stage.steps
+        steps[stage.name] = steps[stage.after] + stage.steps
+        checkpoint = None if stage.after is None else folder / stage.after / "checkpoints" / "last.ckpt"
+        if stage.muon:
+            rates = (f"--optimizer.lr={stage.learning_rate}", f"--optimizer.adam_lr={ADAM * stage.learning_rate}")
+            optimizer = ("--model.warmup_steps=50", "--optimizer=bpnp.training.Muon", *rates)
+        else:
+            optimizer = ("--model.warmup_steps=20", f"--model.learning_rate={stage.learning_rate}")
         decay = (f"--model.decay_start={start}", f"--model.decay_steps={stage.steps}") if stage.decay else ()
         first = (start if stage.pose_loss else end) // EPOCH  # with the pose loss; `end` is never reached
         arguments = (
             *SETTINGS, f"--data.num_points={stage.points}", "--data.batch_size=8",
-            f"--data.procedural_kind={stage.kind}",
-            f"--optimizer.lr={stage.learning_rate}", f"--optimizer.adam_lr={ADAM * stage.learning_rate}",
-            f"--model.matching_loss={stage.loss}", f"--pose_loss.start_epoch={first}", *decay,
+            f"--data.procedural_kind={stage.kind}", *optimizer, *decay,
+            f"--model.matching_loss={stage.loss}", f"--pose_loss.start_epoch={first}",
         )  # fmt: skip
-        checkpoint = None if stage.after is None else folder / stage.after / "checkpoints" / "last.ckpt"
-        yield stage, Training(folder / stage.name, arguments, end, EPOCH, checkpoint)
+        weights = () if stage.muon else (f"--model.weights={checkpoint}",)
+        start_from = checkpoint if stage.muon else None
+        yield stage, Training(folder / stage.name, (*arguments, *weights), end, EPOCH, start_from), steps[stage.name]
 
 
 def main() -> None:
@@ -94,8 +103,8 @@ def main() -> None:
     options.add_argument("--run", type=Path, default=ROOT / "runs" / "paper_weights", help="(default: %(default)s)")
     options.add_argument("--output", type=Path, default=Path(str(WEIGHTS)), help="folder (default: the package's)")
     chosen = options.parse_args()
-    for stage, training in trainings(chosen.run):
+    for stage, training, steps in trainings(chosen.run):
         checkpoint = training.run()
         if stage.packaged:
-            pack_weights(checkpoint, chosen.output / f"{stage.name}.ckpt")
+            pack_weights(checkpoint, chosen.output / f"{stage.name}.ckpt", steps=steps)
             print(f"wrote {chosen.output / stage.name}.ckpt", flush=True)

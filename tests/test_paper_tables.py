@@ -127,33 +127,40 @@ def test_branches_of_unequal_lengths_are_refused_or_named(tmp_path: Path, monkey
 def test_the_weights_with_the_pose_loss_go_on_from_those_without_and_switch_once(tmp_path: Path) -> None:
     """Each stage starts where the one before ends, with more steps; the pose loss joins after the first weights."""
     chain = list(trainings(tmp_path))
-    packaged = [(stage.name, stage.pose_loss, stage.loss) for stage, _ in chain if stage.packaged]
+    packaged = [(stage.name, stage.pose_loss, stage.loss) for stage, *_ in chain if stage.packaged]
     assert packaged == [("paper-lc", False, "correspondence"), ("paper-lclp", True, "correspondence")]
     ends = {None: 0}
     checkpoints = {None: None}
-    for stage, training in chain:
+    for stage, training, _ in chain:
         options = dict(argument.split("=", 1) for argument in training.arguments)
-        start, switch = ends[stage.after], EPOCH * int(options["--pose_loss.start_epoch"])
-        assert training.start == checkpoints[stage.after]
+        start, switch = ends[stage.after] if stage.muon else 0, EPOCH * int(options["--pose_loss.start_epoch"])
+        assert training.start == (checkpoints[stage.after] if stage.muon else None)
+        assert options.get("--model.weights") == (None if stage.muon else str(checkpoints[stage.after]))
         assert (training.steps - start, training.steps % EPOCH) == (stage.steps, 0)
         assert stage.pose_loss == (switch == start)
         assert stage.pose_loss or switch == training.steps  # which no step reaches
         assert options["--model.matching_loss"] == stage.loss
-        assert float(options["--optimizer.lr"]) == stage.learning_rate
+        assert options.get("--optimizer") == ("bpnp.training.Muon" if stage.muon else None)
+        assert float(options["--optimizer.lr" if stage.muon else "--model.learning_rate"]) == stage.learning_rate
         decay = {"--model.decay_start": str(start), "--model.decay_steps": str(stage.steps)}
         assert {key: value for key, value in options.items() if "decay" in key} == (decay if stage.decay else {})
         ends[stage.name], checkpoints[stage.name] = training.steps, training.checkpoint
-    assert ends["paper-lclp"] == sum(stage.steps for stage in STAGES)
+    assert chain[-1][0].name == "paper-lclp"
+    assert chain[-1][2] == sum(stage.steps for stage in STAGES)
 
 
 def test_the_stages_between_the_weights_are_not_packed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trained, packed = [], []
     monkeypatch.setattr(Training, "run", lambda training: trained.append(training.folder.name) or training.checkpoint)
-    monkeypatch.setattr(paper_weights, "pack_weights", lambda _, target: packed.append(target))
+    monkeypatch.setattr(paper_weights, "pack_weights", lambda _, target, steps: packed.append((target, steps)))
     monkeypatch.setattr("sys.argv", ["paper_weights", "--run", str(tmp_path), "--output", str(tmp_path / "packed")])
     paper_weights.main()
     assert trained == [stage.name for stage in STAGES]
-    assert packed == [tmp_path / "packed" / "paper-lc.ckpt", tmp_path / "packed" / "paper-lclp.ckpt"]
+    before = next(i for i, stage in enumerate(STAGES) if stage.name == "paper-lc")
+    assert packed == [
+        (tmp_path / "packed" / "paper-lc.ckpt", sum(stage.steps for stage in STAGES[: before + 1])),
+        (tmp_path / "packed" / "paper-lclp.ckpt", sum(stage.steps for stage in STAGES)),
+    ]
 
 
 class Known(nn.Module):

@@ -165,12 +165,13 @@ def read_data(path: str | Path, *, map_location: Any = "cpu") -> dict[str, Any]:
     return content
 
 
-def pack_weights(checkpoint: str | Path, out: str | Path) -> None:
+def pack_weights(checkpoint: str | Path, out: str | Path, *, steps: int | None = None) -> None:
     """Write the network of a checkpoint and its settings in half precision, the form of the packaged weights.
 
     Args:
         checkpoint: file that `bpnp fit` wrote.
         out: file to write; `TrainedNet.from_checkpoint` and ``bpnp test --ckpt_path`` read it like any checkpoint.
+        steps: optimiser steps of all trainings that led to it (default: those of the checkpoint).
 
     Raises:
         ValueError: a weight is beyond the range of float16.
@@ -181,8 +182,9 @@ def pack_weights(checkpoint: str | Path, out: str | Path) -> None:
         state[key] = value.half() if value.is_floating_point() else value
         if not state[key].isfinite().all():
             raise ValueError(f"{key} of {checkpoint} has weights beyond the range of float16")
+    kept = {key: content[key] for key in PACKED if key in content} | ({} if steps is None else {"global_step": steps})
     with write_atomically(Path(out)) as temporary, temporary.open("wb") as file:  # a path would be part of the file
-        torch.save({key: content[key] for key in PACKED if key in content} | {"state_dict": state}, file)
+        torch.save(kept | {"state_dict": state}, file)
 
 
 def solver_state(content: Mapping[str, Any]) -> dict[str, Tensor]:

@@ -160,6 +160,8 @@ def test_packing_keeps_the_net_in_half_the_space(tmp_path: Path, unseen: Batch) 
     pack_weights(tmp_path / "whole.ckpt", tmp_path / "out" / "packed.ckpt")
     assert set(torch.load(tmp_path / "out" / "packed.ckpt", weights_only=True)) == {"solver", "state_dict"}
     assert (tmp_path / "out" / "packed.ckpt").stat().st_size < 0.6 * (tmp_path / "whole.ckpt").stat().st_size
+    pack_weights(tmp_path / "whole.ckpt", tmp_path / "out" / "later.ckpt", steps=7)
+    assert torch.load(tmp_path / "out" / "later.ckpt", weights_only=True)["global_step"] == 7
     packed = BPnPNet.from_checkpoint(tmp_path / "out" / "packed.ckpt")
     with torch.no_grad():
         np.testing.assert_allclose(packed.cost(unseen), net.cost(unseen), atol=5e-3)
