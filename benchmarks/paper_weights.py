@@ -69,7 +69,8 @@ STAGES = (
     Stage("paper-lc", "likelihood", 1000, 200, 1e-3, "correspondence", packaged=True),
     Stage("likelihood-lp", "paper-lc", 256, 1750, 3e-3, pose_loss=True),
     Stage("both", "likelihood-lp", 1000, 1200, 3e-3, "correspondence", pose_loss=True),
-    Stage("paper-lclp", "both", 1000, 400, 2e-4, "correspondence", pose_loss=True, muon=False, packaged=True),
+    Stage("both-adam", "both", 1000, 400, 2e-4, "correspondence", pose_loss=True, muon=False),
+    Stage("paper-lclp", "both-adam", 1000, 700, 4e-4, "correspondence", pose_loss=True, muon=False, packaged=True),
 )
 
 
