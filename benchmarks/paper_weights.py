@@ -1,6 +1,6 @@
 """The packaged weights `paper-lc` and `paper-lclp`: the paper's losses on drawn shapes, which have no data licence.
 
-    python -m benchmarks paper_weights                     # three hours; a run that was stopped goes on
+    python -m benchmarks paper_weights                     # 3.5 hours; a run that was stopped goes on
     python -m benchmarks paper_weights --output elsewhere  # keeps the weights of the package
 
 The settings are those of configs/paper/modelnet40.yaml but for `SETTINGS` and for what each of `STAGES` has.
