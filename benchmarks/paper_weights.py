@@ -76,7 +76,8 @@ STAGES = (
 
 def trainings(folder: Path) -> Iterator[tuple[Stage, Training, int]]:
     """Yield each stage, its training, which starts where the stage before it ends, and the steps of all until there."""
-    steps, ends = {None: 0}, {None: 0}  # of all stages, and of the checkpoint
+    steps: dict[str | None, int] = {None: 0}  # of all stages
+    ends: dict[str | None, int] = {None: 0}  # of their checkpoints
     for stage in STAGES:
         start = ends[stage.after] if stage.muon else 0
         end = ends[stage.name] = start + stage.steps
@@ -84,7 +85,7 @@ def trainings(folder: Path) -> Iterator[tuple[Stage, Training, int]]:
         checkpoint = None if stage.after is None else folder / stage.after / "checkpoints" / "last.ckpt"
         if stage.muon:
             rates = (f"--optimizer.lr={stage.learning_rate}", f"--optimizer.adam_lr={ADAM * stage.learning_rate}")
-            optimizer = ("--model.warmup_steps=50", "--optimizer=bpnp.training.Muon", *rates)
+            optimizer: tuple[str, ...] = ("--model.warmup_steps=50", "--optimizer=bpnp.training.Muon", *rates)
         else:
             optimizer = ("--model.warmup_steps=20", f"--model.learning_rate={stage.learning_rate}")
         decay = (f"--model.decay_start={start}", f"--model.decay_steps={stage.steps}") if stage.decay else ()
