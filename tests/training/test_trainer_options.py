@@ -214,8 +214,8 @@ def test_a_test_is_logged_into_the_wandb_run_of_its_training(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Offline, it is another folder with the id of the training's run."""
-    monkeypatch.setenv("WANDB_MODE", "offline")
-    options = ["--trainer.logger=WandbLogger", "--data.test_shapes=1"]
+    monkeypatch.setenv("WANDB_MODE", "offline")  # Lightning's logger sets it too, for the whole process
+    options = ["--trainer.logger=WandbLogger", "--trainer.logger.mode=offline", "--data.test_shapes=1"]
     trained_with = ["--model.learning_rate=0.25", "--trainer.log_every_n_steps=1", "--pose_loss.start_epoch=0"]
     main(command(tmp_path, *TWO_STEPS, *options, *trained_with))
     wandb.finish()
