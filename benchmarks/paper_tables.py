@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import torch
 from lightning import LightningDataModule
-from record import DATA, ROOT, commit, processor, write_json
+from record import DATA, ROOT, measured_today, write_json
 from torch import nn
 
 from bpnp.files import fingerprint, write_atomically
@@ -237,8 +237,7 @@ def solve_problems(
             previous = file.replace(file.with_suffix(".previous.jsonl"))
             print(f"{previous} has other weights, settings or problems; measured again", flush=True)
         file.parent.mkdir(parents=True, exist_ok=True)
-        today = {"commit": commit(), "date": f"{datetime.now(UTC):%Y-%m-%d}", "cpu": processor()}
-        file.write_text(json.dumps(head | {"measured": today}, sort_keys=True) + "\n")
+        file.write_text(json.dumps(head | {"measured": measured_today()}, sort_keys=True) + "\n")
     solver = build() if missing else nn.Identity()
     with file.open("a") as out:
         for i in missing:

@@ -38,18 +38,16 @@ ADAM = 0.2  # learning rate of Adam for the parameters that Muon does not train,
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of the training.
+    """One stage of the training; it continues the one before.
 
-    after: the stage that it continues, None for new weights.
     points: of each problem, out of the 1,000 fixed points of its shape.
     kind: of the drawn shapes (`MeshDataModule`).
     learning_rate: of the optimizer; constant, or with `decay` falling by a half cosine within the stage.
-    muon: whether Muon is the optimizer, or Adam, as in the paper. Adam begins anew: at step 0, with a warm-up.
+    muon: whether Muon is the optimizer, or Adam, as in the paper. Adam starts at step 0, with a warm-up.
     packaged: whether its end is one of the packaged weights.
     """
 
     name: str
-    after: str | None
     points: int
     steps: int
     learning_rate: float
@@ -62,32 +60,32 @@ class Stage:
 
 
 STAGES = (
-    Stage("few-points", None, points=128, steps=2000, learning_rate=1e-2, kind="turned", decay=False),
-    Stage("turned", "few-points", points=256, steps=3750, learning_rate=1e-2, kind="turned", decay=False),
-    Stage("aligned", "turned", points=256, steps=14250, learning_rate=1e-2, decay=False),
-    Stage("likelihood", "aligned", points=256, steps=3000, learning_rate=1e-2),
-    Stage("paper-lc", "likelihood", 1000, 200, 1e-3, "correspondence", packaged=True),
-    Stage("likelihood-lp", "paper-lc", 256, 1750, 3e-3, pose_loss=True),
-    Stage("both", "likelihood-lp", 1000, 1200, 3e-3, "correspondence", pose_loss=True),
-    Stage("both-adam", "both", 1000, 400, 2e-4, "correspondence", pose_loss=True, muon=False),
-    Stage("paper-lclp", "both-adam", 1000, 700, 4e-4, "correspondence", pose_loss=True, muon=False, packaged=True),
+    Stage("few-points", points=128, steps=2000, learning_rate=1e-2, kind="turned", decay=False),
+    Stage("turned", points=256, steps=3750, learning_rate=1e-2, kind="turned", decay=False),
+    Stage("aligned", points=256, steps=14250, learning_rate=1e-2, decay=False),
+    Stage("likelihood", points=256, steps=3000, learning_rate=1e-2),
+    Stage("paper-lc", 1000, 200, 1e-3, "correspondence", packaged=True),
+    Stage("likelihood-lp", 256, 1750, 3e-3, pose_loss=True),
+    Stage("both", 1000, 1200, 3e-3, "correspondence", pose_loss=True),
+    Stage("both-adam", 1000, 400, 2e-4, "correspondence", pose_loss=True, muon=False),
+    Stage("paper-lclp", 1000, 700, 4e-4, "correspondence", pose_loss=True, muon=False, packaged=True),
 )
 
 
 def trainings(folder: Path) -> Iterator[tuple[Stage, Training, int]]:
     """Yield each stage, its training, which starts where the stage before it ends, and the steps of all until there."""
-    steps: dict[str | None, int] = {None: 0}  # of all stages
-    ends: dict[str | None, int] = {None: 0}  # of their checkpoints
+    total, end = 0, 0  # steps of all stages, and those of the checkpoint
+    checkpoint: Path | None = None
     for stage in STAGES:
-        start = ends[stage.after] if stage.muon else 0
-        end = ends[stage.name] = start + stage.steps
-        steps[stage.name] = steps[stage.after] + stage.steps
-        checkpoint = None if stage.after is None else folder / stage.after / "checkpoints" / "last.ckpt"
         if stage.muon:
+            start, initial = end, checkpoint
             rates = (f"--optimizer.lr={stage.learning_rate}", f"--optimizer.adam_lr={ADAM * stage.learning_rate}")
             optimizer: tuple[str, ...] = ("--model.warmup_steps=50", "--optimizer=bpnp.training.Muon", *rates)
         else:
-            optimizer = ("--model.warmup_steps=20", f"--model.learning_rate={stage.learning_rate}")
+            start, initial = 0, None
+            rate = f"--model.learning_rate={stage.learning_rate}"
+            optimizer = ("--model.warmup_steps=20", rate, f"--model.weights={checkpoint}")
+        end, total = start + stage.steps, total + stage.steps
         decay = (f"--model.decay_start={start}", f"--model.decay_steps={stage.steps}") if stage.decay else ()
         first = (start if stage.pose_loss else end) // EPOCH  # with the pose loss; `end` is never reached
         arguments = (
@@ -95,9 +93,9 @@ def trainings(folder: Path) -> Iterator[tuple[Stage, Training, int]]:
             f"--data.procedural_kind={stage.kind}", *optimizer, *decay,
             f"--model.matching_loss={stage.loss}", f"--pose_loss.start_epoch={first}",
         )  # fmt: skip
-        weights = () if stage.muon else (f"--model.weights={checkpoint}",)
-        start_from = checkpoint if stage.muon else None
-        yield stage, Training(folder / stage.name, (*arguments, *weights), end, EPOCH, start_from), steps[stage.name]
+        training = Training(folder / stage.name, arguments, end, EPOCH, initial)
+        yield stage, training, total
+        checkpoint = training.checkpoint
 
 
 def main() -> None:

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -255,6 +256,11 @@ def commit() -> str:
         ["git", "-C", ROOT, "describe", "--always", "--dirty"], capture_output=True, text=True, check=False
     )
     return described.stdout.strip() or "unknown"
+
+
+def measured_today() -> dict[str, str]:
+    """Return the commit, the date (UTC) and the processor of a measurement."""
+    return {"commit": commit(), "date": f"{datetime.now(UTC):%Y-%m-%d}", "cpu": processor()}
 
 
 def command(words: Sequence[str]) -> str:

@@ -16,12 +16,11 @@ import shlex
 import shutil
 import subprocess
 import sys
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from paper_tables import PICTURES, effect, effect_head, effect_text, figures, fill_pages, head, row_text
-from record import ROOT, commit, processor, write_json
+from record import ROOT, measured_today, write_json
 
 from bpnp.report.results import ProblemRow, read_results
 from bpnp.report.tables import named_runs
@@ -49,8 +48,7 @@ def run_commands(lines: list[str], folder: Path) -> dict[str, str]:
     known = list(printed)
     same = next((i for i, line in enumerate(lines) if i >= len(known) or known[i] != line), len(lines))
     printed = {line: printed[line] for line in lines[:same]}
-    measured = {"commit": commit(), "date": f"{datetime.now(UTC):%Y-%m-%d}", "cpu": processor()}
-    measured = before.get("measured", measured) if printed else measured
+    measured = before["measured"] if printed else measured_today()
     environment = os.environ | {"COLUMNS": "80", "OMP_NUM_THREADS": "1", "PYTHONUTF8": "1"}
     for line in lines[same:]:
         print(line, flush=True)

@@ -129,13 +129,12 @@ def test_the_weights_with_the_pose_loss_go_on_from_those_without_and_switch_once
     chain = list(trainings(tmp_path))
     packaged = [(stage.name, stage.pose_loss, stage.loss) for stage, *_ in chain if stage.packaged]
     assert packaged == [("paper-lc", False, "correspondence"), ("paper-lclp", True, "correspondence")]
-    ends = {None: 0}
-    checkpoints = {None: None}
+    end, checkpoint = 0, None
     for stage, training, _ in chain:
         options = dict(argument.split("=", 1) for argument in training.arguments)
-        start, switch = ends[stage.after] if stage.muon else 0, EPOCH * int(options["--pose_loss.start_epoch"])
-        assert training.start == (checkpoints[stage.after] if stage.muon else None)
-        assert options.get("--model.weights") == (None if stage.muon else str(checkpoints[stage.after]))
+        start, switch = end if stage.muon else 0, EPOCH * int(options["--pose_loss.start_epoch"])
+        assert training.start == (checkpoint if stage.muon else None)
+        assert options.get("--model.weights") == (None if stage.muon else str(checkpoint))
         assert (training.steps - start, training.steps % EPOCH) == (stage.steps, 0)
         assert stage.pose_loss == (switch == start)
         assert stage.pose_loss or switch == training.steps  # which no step reaches
@@ -144,7 +143,7 @@ def test_the_weights_with_the_pose_loss_go_on_from_those_without_and_switch_once
         assert float(options["--optimizer.lr" if stage.muon else "--model.learning_rate"]) == stage.learning_rate
         decay = {"--model.decay_start": str(start), "--model.decay_steps": str(stage.steps)}
         assert {key: value for key, value in options.items() if "decay" in key} == (decay if stage.decay else {})
-        ends[stage.name], checkpoints[stage.name] = training.steps, training.checkpoint
+        end, checkpoint = training.steps, training.checkpoint
     assert chain[-1][0].name == "paper-lclp"
     assert chain[-1][2] == sum(stage.steps for stage in STAGES)
 
@@ -344,11 +343,11 @@ def test_a_row_keeps_its_provenance_and_is_compared_with_rows_that_are_there(
             table1.TABLE, trained, lambda: methods, lambda _: data(seed=chosen.test_seed), chosen
         )
 
-    monkeypatch.setattr(paper_tables, "commit", lambda: "early")
+    monkeypatch.setattr("record.commit", lambda: "early")
     early = measure("paper Lc")["rows"]
     assert calls == ["Lc", "Lc Lp"]
     (tmp_path / "seed0" / "tests" / "toy" / "paper-Lc_Lp.jsonl").unlink()
-    monkeypatch.setattr(paper_tables, "commit", lambda: "late")
+    monkeypatch.setattr("record.commit", lambda: "late")
     record = measure("Lc Lp")
     assert calls == ["Lc", "Lc Lp", "Lc Lp"]
     assert record["rows"]["toy|0|paper|Lc|pnp"] == early["toy|0|paper|Lc|pnp"]

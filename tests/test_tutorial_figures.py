@@ -83,7 +83,7 @@ def ran(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setattr(
         "sys.argv", ["tutorial", *(f"--{k}={v}" for k, v in paths.items()), f"--output={tmp_path / 'record.json'}"]
     )
-    monkeypatch.setattr(tutorial, "commit", lambda: f"commit {len(lines)}")
+    monkeypatch.setattr("record.commit", lambda: f"commit {len(lines)}")
     return lines
 
 
