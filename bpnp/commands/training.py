@@ -57,7 +57,7 @@ class _Parser(OneLineParser, LightningArgumentParser):
 class RunConfig(SaveConfigCallback):
     """Write the configuration into the numbered folder of the CSV log, and log it to the other loggers.
 
-    The W&B run of a training is recorded beside the configuration.
+    The W&B run of a training is recorded in the same folder.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 from bpnp.report.results import Results
 
 METRICS = "metrics.csv"
-WANDB = "wandb.yaml"  # id, project and entity of the W&B run of a training, beside its configuration
+WANDB = "wandb.yaml"  # id, project and entity of the W&B run of a training, in its numbered log folder
 
 
 def training_folder(path: Path | str) -> Path | None:

@@ -1,4 +1,4 @@
-"""W&B run of a training: recorded beside its configuration, and continued by tests of its checkpoints."""
+"""W&B run of a training: recorded in its log folder, and continued by tests of its checkpoints."""
 
 from argparse import Namespace
 from collections.abc import Mapping

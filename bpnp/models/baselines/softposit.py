@@ -48,7 +48,7 @@ class SoftPOSIT(SingleSolver):
 
     Args:
         start: Initial pose. "mean", the default: Euler angles of 22.5 degrees and translation (0, 0, 4.5), the mean of
-            the paper's test on ModelNet40, of which it takes the true mean; not comparable with blind solvers there.
+            the paper's test on ModelNet40. The paper starts there too; not comparable with blind solvers on that test.
             "near_truth": the true pose with a perturbation (the paper's for MegaDepth; not comparable with blind
             solvers). "random": uniform rotations.
         starts: Number of random initial poses, default 64; used with "random" only.
