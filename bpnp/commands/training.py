@@ -156,8 +156,9 @@ class BpnpCLI(LightningCLI):
         config["ckpt_path"] = path
         for logger in _as_list(config.get("trainer.logger")):
             _log_in(logger, config["trainer.default_root_dir"])
-            if self.command == "test" and path is not None and Path(path).is_file():
-                join_training(logger, path)
+            continued = self.command == "fit" and path is not None and _is_in(path, folder)
+            if (continued or self.command == "test") and path is not None and Path(path).is_file():
+                join_training(logger, path, self.command)
 
     def before_instantiate_classes(self) -> None:
         """Merge `--pose_loss` into the `PoseLossWarmup` of the configuration, or add one.
@@ -238,8 +239,7 @@ class BpnpCLI(LightningCLI):
             return
         self.held.enter_context(lock_folder(root))
         folder, path = Path(_checkpoint_folder(str(root))), self.config[self.command]["ckpt_path"]
-        continued = path is not None and Path(path).resolve().parent == folder.resolve()
-        if not continued and any(folder.glob("*.ckpt")):
+        if not (path is not None and _is_in(path, folder)) and any(folder.glob("*.ckpt")):
             raise ValueError(
                 f"{root} holds a training. Continue it with --ckpt_path last, or set --trainer.default_root_dir to "
                 "another folder."
@@ -313,7 +313,7 @@ def _log_in(logger: Any, root: str) -> None:
             logger.init_args.save_dir = root
 
 
-def join_training(logger: Any, checkpoint: str) -> None:
+def join_training(logger: Any, checkpoint: str, command: str) -> None:
     """Let a WandbLogger log into the W&B run of the training of a checkpoint, and print that.
 
     A logger that names another id, project or entity has a run of its own.
@@ -321,6 +321,7 @@ def join_training(logger: Any, checkpoint: str) -> None:
     Args:
         logger: Configuration of a logger, changed in place.
         checkpoint: Checkpoint file.
+        command: `fit` to continue the training, or `test`.
     """
     if not isinstance(logger, Namespace) or _find_class(logger.class_path) is not WandbLogger:
         return
@@ -328,11 +329,13 @@ def join_training(logger: Any, checkpoint: str) -> None:
     run = None if folder is None else wandb_run(folder)
     if run is None or options.version or any(options.get(key) not in (None, name) for key, name in run.items()):
         return
-    logger.class_path = f"{TrainingRunLogger.__module__}.{TrainingRunLogger.__qualname__}"
-    step = read_checkpoint(checkpoint)["global_step"]
-    options.update(Namespace(**run, resume="allow", name=None, step=step))  # otherwise the parser passes resume=None
+    options.update(Namespace(**run, resume="allow", name=None))  # otherwise the parser passes resume=None
+    if command == "test":
+        logger.class_path = f"{TrainingRunLogger.__module__}.{TrainingRunLogger.__qualname__}"
+        options.step = read_checkpoint(checkpoint)["global_step"]
+    what = "results" if command == "test" else "next steps"
     rank_zero_info(
-        f"W&B: the results go into run {run['id']} of the training in {folder}; set --trainer.logger.id to a new name "
+        f"W&B: the {what} go into run {run['id']} of the training in {folder}; set --trainer.logger.id to a new name "
         "for a run of their own"
     )
 
@@ -343,6 +346,10 @@ def _as_list(value: Any) -> list[Any]:
 
 def _checkpoint_folder(root: str) -> str:
     return str(Path(root) / "checkpoints")
+
+
+def _is_in(path: str, folder: Path) -> bool:
+    return Path(path).resolve().parent == folder.resolve()
 
 
 def run_training(arguments: Sequence[str]) -> None:

@@ -242,6 +242,29 @@ def test_a_test_is_logged_into_the_wandb_run_of_its_training(
     assert "epoch" not in metrics
 
 
+def test_a_training_that_goes_on_stays_in_its_wandb_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As often as it is continued; from a checkpoint of another folder it has a run of its own."""
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    options = ["--trainer.logger=WandbLogger", "--trainer.logger.mode=offline", "--trainer.limit_train_batches=1"]
+    options += ["--trainer.log_every_n_steps=1", "--pose_loss.start_epoch=0"]
+    last = f"--ckpt_path={tmp_path}/run/checkpoints/last.ckpt"
+    for epochs, start in ((1, []), (2, [last]), (3, [last])):
+        main(command(tmp_path, *options, f"--trainer.max_epochs={epochs}", *start))
+        wandb.finish()
+    folders = sorted((tmp_path / "run" / "wandb").glob("offline-run-*"))
+    assert len(folders) == 3
+    (name,) = {folder.name.rsplit("-", 1)[1] for folder in folders}
+    assert caplog.text.count(f"W&B: the next steps go into run {name} of the training in {tmp_path}/run;") == 2
+    assert sorted(read_wandb(folder)[2]["trainer/global_step"] for folder in folders) == [0, 1, 2]
+    other = f"--trainer.default_root_dir={tmp_path}/other"
+    main(command(tmp_path, *options, "--trainer.max_epochs=4", last, other))
+    wandb.finish()
+    (folder,) = (tmp_path / "other" / "wandb").glob("offline-run-*")
+    assert folder.name.rsplit("-", 1)[1] != name
+
+
 @pytest.mark.parametrize(
     ("options", "joined"),
     [
@@ -266,7 +289,7 @@ def test_a_test_has_a_wandb_run_of_its_own_if_its_logger_names_one(
     logger = Namespace(class_path="lightning.pytorch.loggers.WandbLogger", init_args=given)
     given.update(Namespace(**options))
     unchanged = logger.clone()
-    join_training(logger, str(tmp_path / "checkpoints" / "last.ckpt"))
+    join_training(logger, str(tmp_path / "checkpoints" / "last.ckpt"), "test")
     if joined:
         assert (given.id, given.project, given.resume) == ("first", "bpnp", "allow")
         assert (given.name, given.step) == (None, 7)
