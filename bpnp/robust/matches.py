@@ -63,7 +63,7 @@ def hashed_uniform(size: int, seed: int, device: torch.device, *, skip: int = 0)
         for shift, factor in ((16, 0x21F0AAAD), (15, 0x735A2D97)):
             state = ((state ^ (state >> shift)) * factor) & 0xFFFFFFFF
         state = state ^ (state >> 15)
-    return (state + 0.5) / 2.0**32
+    return (state.double() + 0.5) / 2.0**32
 
 
 class Matches(NamedTuple):
