@@ -50,6 +50,31 @@ def test_a_rig_is_confident_where_no_single_camera_is() -> None:
     assert together > alone
 
 
+@pytest.mark.parametrize(("cameras", "baseline", "count"), [(3, 0.02, 20), (2, 0.02, 8), (2, 0.5, 20)])
+def test_cameras_that_see_the_same_unrelated_objects_are_no_evidence_for_each_other(
+    cameras: int, baseline: float, count: int
+) -> None:
+    """All cameras see ten objects, of which the scene has none; by chance, one NFA in a hundred is below 0.01."""
+    for seed in range(4):
+        rng = np.random.default_rng([41, seed])
+        objects, scene = rng.uniform(-1, 1, (10, 3)) + [0, 0, 6], rng.uniform(-1, 1, (count, 3))
+        shifts = np.outer(np.arange(cameras), [-baseline, 0, 0])
+        seen = [objects + shift for shift in shifts]
+        images = [800 * each[:, :2] / each[:, 2:] + 0.3 * rng.standard_normal((10, 2)) for each in seen]
+        camera = ("SIMPLE_PINHOLE", [800.0, 0.0, 0.0])
+        solution = bpnp.solve(images, scene, camera, rig=[(np.eye(3), shift) for shift in shifts], time_limit=60)
+        assert solution.verdict == "failed"
+        assert solution.log10_false_alarms > -2
+
+
+def test_a_camera_that_is_given_twice_counts_once() -> None:
+    """The second one adds its tests, and another mean over scales and outlier fractions: one decade in all."""
+    images, scene, mounts, _, _ = planted_rig(0, (10,))
+    once, twice = (bpnp.solve(images * k, scene, CAMERA, rig=mounts * k, time_limit=60) for k in (1, 2))
+    assert once.verdict == twice.verdict == "confident"
+    assert 0 < twice.log10_false_alarms - once.log10_false_alarms < 1.5
+
+
 def test_a_rig_of_one_camera_is_that_camera() -> None:
     images, scene, mounts, pose, _ = planted_rig(0, (10,))
     matrix = np.vstack([np.column_stack(mounts[0]), [0, 0, 0, 1]])

@@ -1,6 +1,9 @@
 """Pose of a rig, cameras that are fixed to each other: its evidence, covariance and refinement.
 
-The image points of the cameras are independent, so the logs of their likelihood ratios add up. Three matches fix the
+The logs of the likelihood ratios of all image points add up. Cameras with overlapping views see the same objects, and a
+pose that fits those by chance in one camera also fits them in the others, if the baseline is short. A scene point that
+has an image point near it in several cameras therefore counts as one match, and for its parallax: the depth of an
+unrelated object is any of those in the scene. Image points that fit no scene point count fully. Three matches fix the
 pose of the rig. The three largest terms are left out once, in the camera where they count most. The numbers of tests of
 all cameras add up, since each camera proposes poses from its own triples.
 
@@ -17,8 +20,9 @@ from itertools import combinations, permutations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
-from bpnp.search.config import RIG
+from bpnp.search.config import ALARMS, RIG
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem, UnknownFocal
@@ -26,7 +30,7 @@ from bpnp.search.refine.gauss_newton import refine, soft_equations, steps
 from bpnp.search.search_frame import Scene
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
 from bpnp.search.verdict.covariance import covariance_of, join
-from bpnp.search.verdict.false_alarms import Terms, camera_terms, directions_of, log10_nfa
+from bpnp.search.verdict.false_alarms import Terms, camera_terms, directions_of, log10_nfa, match_shares
 from bpnp.search.verdict.uncertainty import linearise, matches_of
 
 Array = NDArray[np.float64]
@@ -140,28 +144,102 @@ class Rig:
         Three matches of a camera fix the pose. An unknown scale needs one more, of a camera with a non-zero baseline. A
         prior multiplies their number by the largest fraction of the poses of a camera that are as near to it.
         """
-        cameras = self._terms(rotation, translation, scale)
+        directions = self._directions(rotation, translation)
+        cameras = self._counted_once(self._terms(directions, scale), directions, rotation, translation)
         ways = self.model.fixing_ways(len(self.problems), self.apart)
         poses = (self.pose_of(k, rotation, translation) for k in range(len(self.problems)))
         nearest = max(each.log10_prior_fraction(*pose) for each, pose in zip(self.problems, poses, strict=True))
         problems = [replace(each, focal=self.model.lens) for each in self.problems]
         return log10_nfa(cameras, max(self.model.log10_tests(problems) + nearest, 0.0), ways)
 
-    def _terms(self, rotation: Array, translation: Array, scale: float | None) -> list[Terms | None]:
-        seen = (
+    def _directions(self, rotation: Array, translation: Array) -> list[Array]:
+        """Return the directions (n, 3) of the scene points in each camera; NaN for those that it does not see."""
+        return [
             directions_of(problem, *self.pose_of(k, rotation, translation)) for k, problem in enumerate(self.problems)
-        )
-        return [camera_terms(*each, scale) for each in zip(self.problems, seen, strict=True)]
+        ]
+
+    def _terms(self, directions: Sequence[Array], scale: float | None) -> list[Terms | None]:
+        return [camera_terms(*each, scale) for each in zip(self.problems, directions, strict=True)]
+
+    def _counted_once(
+        self, terms: Sequence[Terms | None], directions: Sequence[Array], rotation: Array, translation: Array
+    ) -> list[Terms | None]:
+        """Count the evidence of a scene point once that has an image point near it in several cameras.
+
+        With logs L in g cameras, each counts (L + min(L, e)) / g; e is that of the parallax, a position on a line.
+        """
+        images = [KDTree(problem.bearings) for problem in self.problems]
+        result: list[Terms | None] = []
+        for k, (problem, own, of) in enumerate(zip(self.problems, directions, terms, strict=True)):
+            seen = np.flatnonzero(np.isfinite(own[:, 0]))
+            if of is None or len(self.problems) == 1:
+                result.append(of)
+                continue
+            scales = problem.image.scales[-of.logs.shape[1] :]
+            _, nearest = KDTree(own[seen]).query(problem.bearings[problem.image.chosen])
+            distances = [_distances(image, each[seen[nearest]]) for image, each in zip(images, directions, strict=True)]
+            near = np.array(distances)[:, :, None] <= ALARMS.farthest * scales
+            near[k] = True
+            parallax = self._parallax(k, seen, directions, rotation, translation)
+            widest = (near * parallax[:, None, None]).max(0)  # (points, scales)
+            ratio = (widest / (math.sqrt(2 * math.pi) * scales))[:, :, None]
+            along = np.log1p(match_shares(problem) * np.maximum(ratio - 1, 0))
+            logs = (of.logs + np.minimum(of.logs, along)) / near.sum(0)[:, :, None]
+            logs = np.where((of.logs > 0) & (near.sum(0) > 1)[:, :, None], logs, of.logs)
+            result.append(of._replace(logs=logs, together=of.together * near.sum(0)))
+        return result
+
+    def distinct_fraction(self, rotation: Array, translation: Array, scale: float) -> float:
+        """Return the number of matched scene points over the number of matches of all cameras, 1 without a match."""
+        directions = self._directions(rotation, translation)
+        terms = self._terms(directions, scale)
+        matches, points = 0, 0.0
+        for each, once in zip(terms, self._counted_once(terms, directions, rotation, translation), strict=True):
+            if each is None or once is None:
+                continue
+            matched = each.of_points() > 0
+            cameras = (once.together / each.together)[:, each.own].mean(1)
+            matches, points = matches + int(matched.sum()), points + float((1 / cameras[matched]).sum())
+        return points / matches if matches else 1.0
+
+    def _parallax(
+        self, k: int, seen: NDArray[np.int64], directions: Sequence[Array], rotation: Array, translation: Array
+    ) -> Array:
+        """Return the width (cameras,), radians, over which the depths of the scene spread a bearing of camera k.
+
+        It is that of uniform numbers with the same standard deviation; 0 for cameras with the same centre.
+
+        Args:
+            k: Index of the camera.
+            seen: Indices of the scene points that it sees.
+            directions: Directions (n, 3) of the scene points in each camera.
+            rotation: (3, 3) of the rig.
+            translation: (4,) of the rig, homogeneous.
+        """
+        turn, shift = self.pose_of(k, rotation, translation)
+        depths = np.linalg.norm(self.problems[k].points3d[seen] @ turn.T + shift, axis=1)
+        even = (np.median(depths) * directions[k][seen] - shift) @ turn  # the same bearings at one distance
+        result = np.zeros(len(self.problems))
+        for other, each in enumerate(directions):
+            turn, shift = self.pose_of(other, rotation, translation)
+            there = even @ turn.T + shift
+            moved = each[seen] - there / np.maximum(np.linalg.norm(there, axis=1, keepdims=True), 1e-300)
+            moved = moved[np.isfinite(moved[:, 0])]
+            if len(moved) > 1:
+                result[other] = math.sqrt(12 * moved.var(0).sum())
+        return result
 
     def evidence(self, rotation: Array, translation: Array, scale: float | None = None) -> Array:
-        """Return the log likelihood ratio (cameras,) of the bearings under a pose and by chance.
+        """Return the log likelihood ratio (cameras,) of the bearings of each camera under a pose and by chance.
+
+        A scene point that several cameras see counts in each of them.
 
         Args:
             rotation: (3, 3) of the rig.
             translation: (4,) of the rig, homogeneous.
             scale: Scale of the residuals, radians; None takes the mean over all scales.
         """
-        terms = self._terms(rotation, translation, scale)
+        terms = self._terms(self._directions(rotation, translation), scale)
         return np.array([0.0 if one is None else one.evidence(0)[0] for one in terms])
 
     def covariance(self, rotation: Array, translation: Array, scale: float) -> Array | None:
@@ -209,6 +287,13 @@ class Rig:
             log10_false_alarms=own,
             log10_rough=rough,
         )
+
+
+def _distances(image: KDTree, directions: Array) -> Array:
+    """Return the distance (k,) of each direction (k, 3) from the nearest bearing; infinite for NaN."""
+    seen, result = np.isfinite(directions[:, 0]), np.full(len(directions), math.inf)
+    result[seen] = image.query(directions[seen])[0]
+    return result
 
 
 def _prior_of(mount: Pose, prior: Prior | None) -> Prior | None:

@@ -232,10 +232,9 @@ class RigPoses:
         if not self.is_significant():
             return False
         strongest, seen = self._strongest()
-        return (
-            missed(seen, self.rig.problems[strongest], self._local_searches(), self.verdict_settings)
-            <= self.verdict_settings.missed
-        )
+        problem, searches = self.rig.problems[strongest], self._local_searches()
+        unseen = missed(seen, problem, searches, self.verdict_settings, distinct=self._distinct_fraction())
+        return unseen <= self.verdict_settings.missed
 
     def _strongest(self) -> tuple[int, Hypotheses]:
         """Return the index of the camera with the most evidence for the best pose, and the poses in that camera."""
@@ -291,7 +290,12 @@ class RigPoses:
             exhaustive=self.exhaustive,
             settings=self.verdict_settings,
             rig=[(self.rig.seen(k, self.best), problem) for k, problem in enumerate(self.rig.problems)],
+            distinct=self._distinct_fraction(),
         )
+
+    def _distinct_fraction(self) -> float:
+        """Return the number of matched scene points of the best pose over that of its matches."""
+        return self.rig.distinct_fraction(self.best.rotation[0], self.best.translation[0], float(self.best.scale[0]))
 
 
 def _proposals(rig: Rig, new: Mapping[int, Hypotheses], found: Sequence[Hypotheses]) -> Pose:

@@ -143,6 +143,7 @@ def missed(
     settings: Evidence,
     *,
     independent: bool = True,
+    distinct: float = 1.0,
 ) -> float:
     """Return log10 of the probability that the search missed a better optimum.
 
@@ -153,6 +154,7 @@ def missed(
             enumeration, whose exact refinement leaves no better pose nearby.
         settings: Constants of the verdict.
         independent: False to leave out the evidence of the matches.
+        distinct: Number of matched scene points over that of matches, below 1 if several cameras of a rig see some.
 
     Returns:
         The logarithm; 0 if the first candidate is not significant. If a motion maps the matched points onto others,
@@ -161,7 +163,7 @@ def missed(
     alarms = float(candidates.log10_false_alarms[0]) if len(candidates) else math.inf
     if alarms > 0:
         return 0.0
-    decades = -alarms / max(match_count(candidates), 1.0) if independent else 0.0
+    decades = -alarms / max(distinct * match_count(candidates), 1.0) if independent else 0.0
     value = log10_missed(count_starts(candidates, problem, settings), decades, local_searches, settings)
     if value > settings.missed or not is_symmetric(candidates, problem, settings):
         return value
@@ -225,6 +227,7 @@ def judge(
     exhaustive: bool = False,
     settings: Evidence = DEFAULT.evidence,
     rig: CandidatesOfCameras = (),
+    distinct: float = 1.0,
 ) -> SearchResult:
     """Compute the verdict on the candidates.
 
@@ -236,6 +239,7 @@ def judge(
         exhaustive: True if every pose that fits some points was examined; the miss probability is then 0.
         settings: Constants of the verdict.
         rig: Candidates, best first, and points of every camera of a rig; empty for a single camera.
+        distinct: As for `missed`.
 
     Returns:
         Candidates, best first, with the verdict and its reason.
@@ -248,7 +252,7 @@ def judge(
     result = SearchResult(candidates, "confident", "", batches, CONFIDENT, settled)
     if alarms > 0:
         return result.add_objection(objection("chance", what="no pose fits"), "failed")
-    unseen = -math.inf if exhaustive else missed(candidates, problem, local_searches, settings)
+    unseen = -math.inf if exhaustive else missed(candidates, problem, local_searches, settings, distinct=distinct)
     # Costly tests run only if the verdict depends on them.
     per_camera = rig or [(candidates, problem)]
     against = [*(other_pose(*each, settings) for each in per_camera), rough_residuals(candidates)]

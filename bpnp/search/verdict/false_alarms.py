@@ -104,7 +104,7 @@ def log10_nfa(
     and in the number of matches that fix them, which are no evidence.
 
     Args:
-        cameras: Evidence of each camera; cameras are independent. None for a camera without evidence.
+        cameras: Evidence of each camera; their logs add up. None for a camera without evidence.
         log10_tests: log10 of the number T of tests.
         fixing: Ways to choose the matches that fix the pose, each as their number in each camera. The way that leaves
             the least evidence counts.
@@ -231,7 +231,7 @@ def _is_own(ratio: Array) -> NDArray[np.bool_]:
     return (ratio >= 1 / ALARMS.own) & (ratio <= ALARMS.own)
 
 
-def _shares(problem: Problem) -> Array:
+def match_shares(problem: Problem) -> Array:
     """Return the fractions w of image points with a correspondence that are tried.
 
     Returns:
@@ -253,7 +253,7 @@ def _terms(problem: Problem, directions: Array, finest: int) -> Array:
     image = problem.image
     return np.asarray(
         image.weights[:, finest:, finest:]
-        @ point_evidence(problem, directions, image.scales[finest:], _shares(problem))
+        @ point_evidence(problem, directions, image.scales[finest:], match_shares(problem))
     )
 
 
