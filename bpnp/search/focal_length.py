@@ -294,7 +294,8 @@ class FocalSweep(ABC):
             for other in end.candidates if end is not best else ():
                 behind = other.log10_false_alarms - best.log10_false_alarms
                 rotations = np.stack([best.rotation, other.rotation])
-                moved = rotations @ centre + np.stack([best.translation, other.translation])
+                scales = np.array([[best.scale], [other.scale]])  # to the unit of the translations
+                moved = scales * (rotations @ centre) + np.stack([best.translation, other.translation])
                 zoom = end.focal_length / best.focal_length
                 if (
                     behind < settings.margin

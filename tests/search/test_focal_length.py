@@ -3,6 +3,7 @@
 import json
 import math
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from bpnp import Solution, solve
 from bpnp.cameras import Camera, camera_from, camera_to_json
-from bpnp.search.focal_length import fit_camera, is_within_bound, unknown_camera
+from bpnp.search.focal_length import FocalSweep, fit_camera, is_within_bound, unknown_camera
 from bpnp.search.inputs import problem_from
 from bpnp.search.problem import Problem, UnknownFocal
+from bpnp.search.solution import FOCAL_LENGTH, POSE_PARAMETERS, SCALE, Candidate, SolutionStats
+from bpnp.search.solvers import Options
 
 Array = NDArray[np.float64]
 SIZE = (640, 480)
@@ -178,3 +181,43 @@ def test_a_given_camera_is_kept_and_a_better_camera_model_makes_the_pose_ambiguo
     assert json.loads(solution.to_json())["camera"] == camera_to_json(camera_from(camera))
     known = solve(pixels, scene, ("SIMPLE_RADIAL", (600.0, 320.0, 240.0, radial)), solver="search", time_limit=LIMIT)
     assert known.verdict == "confident"
+
+
+class PlantedSweep(FocalSweep):
+    """A sweep whose solutions are given."""
+
+    def solve_with(self, camera: Camera, options: Options) -> Solution:
+        raise NotImplementedError
+
+    def refine(self, solution: Solution, camera: Camera, zooms: Sequence[float] = (1.0,)) -> Camera:
+        raise NotImplementedError
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-3])
+def test_the_unit_of_a_scene_hides_no_pose_at_another_focal_length(unit: float) -> None:
+    """A rig in metres, 5 and 10 m from a scene in metres or millimetres: two poses that fit equally well."""
+    points = np.random.default_rng(0).uniform(-1, 1, (20, 3)) + [0, 0, 5]
+
+    def end(distance: float, focal: float, log10_nfa: float) -> Solution:
+        pose = Candidate(np.eye(3), np.array([0, 0, distance - 5]), 0.0, 20, log10_nfa, scale=unit)
+        return Solution(
+            rotation=pose.rotation,
+            translation=pose.translation,
+            scale=unit,
+            log10_false_alarms=log10_nfa,
+            candidates=(pose,),
+            matches=np.repeat(np.arange(20)[:, None], 2, 1),
+            covariance=1e-8 * np.eye(8),
+            parameters=(*POSE_PARAMETERS, FOCAL_LENGTH, SCALE),
+            camera=camera_from(("SIMPLE_PINHOLE", (focal, 320.0, 240.0))),
+            unit="px",
+            verdict="confident",
+            reason="",
+            stats=SolutionStats(),
+            points2d=np.zeros((20, 2)),
+            points3d=points / unit,
+        )
+
+    ends = [end(5.0, 800.0, -20.0), end(10.0, 1000.0, -19.0)]
+    best = PlantedSweep(unknown_camera(None, SIZE, None), Options(), ends=ends).contested()
+    assert (best.verdict, best.reason_code) == ("ambiguous", "other_focal_length")
