@@ -178,7 +178,7 @@ class SceneMap(ViewedPoints):
             ValueError: A view is unknown, or `bpnp.solve` rejects the input.
         """
         limit = seconds_from(time_limit, TIME.photo)
-        pixels = pixels_from(keypoints, image_size or camera)
+        pixels = pixels_from(keypoints, camera, image_size)
         lens = self._lens(camera, image_size, focal_error, distortion)
         if image_size is not None:
             check_inside(pixels, image_size)

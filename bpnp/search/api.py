@@ -15,11 +15,12 @@ from bpnp.search.arguments import (
     PriorLike,
     about,
     check_inside,
+    checked_clutter,
     checked_prior,
     checked_seed,
     device_from,
     each_camera,
-    each_of,
+    each_prior,
     each_set,
     pixels_from,
     positive,
@@ -173,7 +174,7 @@ def solve(
             point_options,
             Options(
                 inlier_threshold=positive("inlier_threshold", inlier_threshold, finite=True),
-                clutter=None if clutter is None else float(clutter),
+                clutter=checked_clutter(clutter),
                 seed=checked_seed(seed),
                 time_limit=seconds,
                 progress=progress,
@@ -190,7 +191,7 @@ def solve(
         focal_error=focal_error,
         distortion=distortion,
         solver=solver,
-        prior=prior,
+        prior=[prior],
         inlier_threshold=inlier_threshold,
         clutter=clutter,
         seed=seed,
@@ -246,7 +247,7 @@ def solve_many(
         scores2d: Sequence of k arrays (m_i,), or one array for all problems.
         scores3d: Sequence of k arrays (n_i,), or one array for all problems.
         solver: As for `solve`. On a GPU a module solves problems of similar size in one batch.
-        prior: One prior for all problems, or a list of k priors.
+        prior: One prior for all problems, or a list of k priors. A list of the rows of [R | t] is one prior.
         inlier_threshold: Largest reprojection error of a match, for all problems; as for `solve`.
         clutter: Expected fraction of the image points without a correspondence, for all problems; as for `solve`.
         at_infinity: `points3d` are unit directions; as for `solve`. The problems are then independent.
@@ -280,7 +281,7 @@ def solve_many(
         None if at_infinity or rig is not None else source_from(solver),
         solver == "auto",
         positive("inlier_threshold", inlier_threshold, finite=True),
-        None if clutter is None else float(clutter),
+        checked_clutter(clutter),
         checked_seed(seed),
         seconds,
         device_from(device),
@@ -301,21 +302,21 @@ def solve_many(
         mode = Mode(at_infinity, rig, scale, image_size, focal_error, distortion, solver, device)
         one_each = [camera] * count if rig is not None else each_camera(camera, count)
         ready = []
-        for i, each in enumerate(each_of("prior", prior, count)):
+        for i, each in enumerate(each_prior(prior, count)):
             arrays = {name: values[i] for name, values in point_options.items()}
             with about(f"problem {i}" if count > 1 else None):
                 ready.append(prepare_mode(images[i], scenes[i], one_each[i], arrays, options.numbered(i), mode, each))
         return [solve_one() for solve_one in ready]
     cameras = each_camera(camera, count)
-    priors = [checked_prior(each) for each in each_of("prior", prior, count)]
-    pixels = [pixels_from(points, image_size or one) for points, one in zip(images, cameras, strict=True)]
+    priors = [checked_prior(each) for each in each_prior(prior, count)]
+    pixels = [pixels_from(points, one, image_size) for points, one in zip(images, cameras, strict=True)]
 
     def problem(i: int, lens: Camera | None, focal: UnknownFocal | None = None) -> Problem:
         arrays = {name: values[i] for name, values in point_options.items()}
         with about(f"problem {i}" if count > 1 else None):
             return problem_from(pixels[i], scenes[i], lens, prior=priors[i], focal=focal, **arrays)
 
-    if distortion or (image_size or focal_error) is not None:
+    if distortion or image_size is not None or focal_error is not None:
         unknown = [unknown_camera(one, image_size, focal_error, distortion) for one in cameras]
         for points in pixels if image_size is not None else ():
             check_inside(points, image_size)

@@ -118,17 +118,45 @@ def each_camera(value: Any, count: int) -> list[Any]:
     return each_of("camera", value, count)
 
 
+def each_prior(value: Any, count: int) -> list[Any]:
+    """Return the priors of `count` problems, unchanged, from one prior or a list of priors.
+
+    A list of rows of four numbers is one matrix [R | t].
+    """
+    if isinstance(value, list) and len(value) in (3, 4) and all(map(_is_row, value)):
+        return [value] * count
+    return each_of("prior", value, count)
+
+
+def _is_row(values: Any) -> bool:
+    """Return True for a row of a matrix [R | t]; a PosePrior is also a tuple of four, but not of four numbers."""
+    is_sequence = isinstance(values, (list, tuple)) or getattr(values, "ndim", 0) == 1
+    return is_sequence and len(values) == 4 and all(np.ndim(value) == 0 for value in values)
+
+
 def positive(name: str, value: Any, *, finite: bool = False) -> float | None:
     """Return a positive number as a float; None stays None."""
-    real = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
-    if value is not None and not (real and value > 0 and (value < math.inf or not finite)):
+    if value is not None and not (_is_real(value) and value > 0 and (value < math.inf or not finite)):
         raise ValueError(f"`{name}` is {value!r}; it must be a positive number")
     return None if value is None else float(value)
+
+
+def _is_real(value: Any) -> bool:
+    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
 
 
 def seconds_from(time_limit: Any, default: float) -> float:
     """Return a time limit in seconds: None is the default of the function, math.inf no limit."""
     return positive("time_limit", time_limit) or default
+
+
+def checked_clutter(clutter: Any) -> float | None:
+    """Return an expected outlier fraction as a float; None stays None."""
+    if clutter is None:
+        return None
+    if not (_is_real(clutter) and 0 <= clutter < 1):
+        raise ValueError(f"`clutter` is {clutter!r}; it is a fraction of the points, 0 or more and below 1")
+    return float(clutter)
 
 
 def checked_seed(seed: Any) -> int:
@@ -169,14 +197,12 @@ def checked_prior(prior: Any) -> Prior | None:
         prior = PosePrior(*pose, INPUTS.prior_deg)
     if isinstance(prior, PosePrior):
         rotation, shift = checked_pose("prior.", prior.rotation, prior.translation)
-        for name in ("rotation_sigma_deg", "translation_sigma"):
-            positive(f"prior.{name}", getattr(prior, name))
-        return PosePrior(rotation, shift, float(prior.rotation_sigma_deg), float(prior.translation_sigma))
+        return PosePrior(rotation, shift, _sigma(prior, "rotation_sigma_deg"), _sigma(prior, "translation_sigma"))
     if isinstance(prior, GravityPrior):
         camera, scene = (_finite(f"prior.{name}", getattr(prior, name), (3,)) for name in ("up_camera", "up_scene"))
-        if not (camera.any() and scene.any() and prior.sigma_deg > 0):
-            raise ValueError(f"`prior` is {prior}; its directions must not be zero, and its sigma_deg must be positive")
-        return GravityPrior(camera, scene, float(prior.sigma_deg))
+        if not (camera.any() and scene.any()):
+            raise ValueError(f"`prior` is {short_repr(prior)}; its directions must not be zero")
+        return GravityPrior(camera, scene, _sigma(prior, "sigma_deg"))
     from bpnp.models.weights import LEARNED, TrainedNet  # imports torch, so only if a network is named
 
     if isinstance(prior, (str, Path)):
@@ -186,6 +212,14 @@ def checked_prior(prior: Any) -> Prior | None:
     raise ValueError(
         f"`prior` is {short_repr(prior)}; give a PosePrior, a GravityPrior, a pose, a network or its checkpoint"
     )
+
+
+def _sigma(prior: PosePrior | GravityPrior, name: str) -> float:
+    """Return a standard deviation of a prior."""
+    sigma = positive(f"prior.{name}", getattr(prior, name))
+    if sigma is None:
+        raise ValueError(f"`prior.{name}` is None; it must be a positive number")
+    return sigma
 
 
 def checked_pose(prefix: str, rotation: Any, translation: Any) -> tuple[Array, Any]:
@@ -225,11 +259,16 @@ def _finite(name: str, values: Any, shape: tuple[int, ...]) -> Array:
     return array
 
 
-def pixels_from(values: Any, camera: Any) -> Any:
-    """Return the pixels (m, 2) of a list of cv2.KeyPoint in the convention of their camera; other values unchanged."""
+def pixels_from(values: Any, camera: Any, image_size: Any = None) -> Any:
+    """Return the pixels (m, 2) of a list of cv2.KeyPoint in the convention of their camera; other values unchanged.
+
+    They are shifted by half a pixel, from the convention of OpenCV to that of COLMAP, if the camera has this one or
+    only the `image_size` is known.
+    """
     if not isinstance(values, (list, tuple)) or not len(values) or not all(hasattr(value, "pt") for value in values):
         return values
-    return np.array([value.pt for value in values]) + (0.0 if camera is None or is_opencv(camera) else CENTRE)
+    unshifted = image_size is None if camera is None else is_opencv(camera)
+    return np.array([value.pt for value in values]) + (0.0 if unshifted else CENTRE)
 
 
 def checked_size(image_size: Any) -> tuple[int, int]:
@@ -411,6 +450,8 @@ def _integers(name: str, values: Any, count: int) -> Labels:
         raise ValueError(f"`{name}` has the type {labels.dtype}; labels are integers: use .astype(int)")
     if labels.min(initial=0) < -1:
         raise ValueError(f"`{name}` has the label {labels.min()}; labels are 0 or more, or -1 for any")
+    if labels.max(initial=0) > np.iinfo(np.int64).max:  # these would wrap to negative ones
+        raise ValueError(f"`{name}` has the label {labels.max()}; labels are below 2^63: number them from 0")
     return labels.astype(np.int64)
 
 

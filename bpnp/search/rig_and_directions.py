@@ -73,7 +73,7 @@ def prepare_mode(
     unknown = None
     if distortion or image_size is not None or focal_error is not None:
         unknown = [unknown_camera(one, image_size, focal_error, distortion) for one in cameras]
-    images = [pixels_from(points, image_size or one) for points, one in zip(images, cameras, strict=True)]
+    images = [pixels_from(points, one, image_size) for points, one in zip(images, cameras, strict=True)]
     if image_size is not None:
         for image in images:
             check_inside(image, image_size)

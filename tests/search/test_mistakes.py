@@ -8,7 +8,7 @@ import pytest
 from planted import plant
 
 from bpnp import GravityPrior, PosePrior, solve, solve_many, verify
-from bpnp.search.arguments import check_inside, checked_prior, checked_seed, positive
+from bpnp.search.arguments import check_inside, checked_prior, checked_seed, each_prior, positive
 
 K = np.array([[520.0, 1.5, 405.0], [0.0, 500.0, 290.0], [0.0, 0.0, 1.0]])
 CAMERA = ("SIMPLE_PINHOLE", [500.0, 320.0, 240.0])
@@ -59,6 +59,7 @@ CALLS: dict[str, Any] = {
         ("points", {"inlier_threshold": 0.0}, "`inlier_threshold` is .*; it must be a positive number"),
         ("points", {"time_limit": -1.0}, "`time_limit` is -1.0; it must be a positive number"),
         ("points", {"clutter": 1.5}, "`clutter` is 1.5; it is a fraction of the points"),
+        ("points", {"clutter": 1.5, "points3d": np.zeros((20, 3))}, "`clutter` is 1.5"),  # although nothing is searched
         ("points", {"solver": "serch"}, '`solver` is .serch.; it is "auto", "search"'),
         ("points", {"device": "gpu0"}, "this machine has no `device` gpu0"),
         ("points", {"prior": PosePrior(2 * np.eye(3), None, 5.0)}, "`prior.rotation` is no rotation matrix"),
@@ -76,6 +77,21 @@ CALLS: dict[str, Any] = {
             "points",
             {"prior": GravityPrior(np.zeros(3), np.ones(3), 1.0)},
             "`prior` is GravityPrior.*; its directions must not be zero",
+        ),
+        (
+            "points",
+            {"prior": PosePrior(np.eye(3), None, None)},  # type: ignore[arg-type]
+            "`prior.rotation_sigma_deg` is None; it must be a positive number",
+        ),
+        (
+            "points",
+            {"prior": PosePrior(np.eye(3), np.ones(3), 5.0, None)},  # type: ignore[arg-type]
+            "`prior.translation_sigma` is None; it must be a positive number",
+        ),
+        (
+            "points",
+            {"prior": GravityPrior(np.ones(3), np.ones(3), "2")},  # type: ignore[arg-type]
+            "`prior.sigma_deg` is '2'; it must be a positive number",
         ),
         ("points", {"prior": "nothing.ckpt"}, "nothing.ckpt"),
         ("points", {"solver": "nothing.ckpt"}, "nothing.ckpt"),
@@ -100,6 +116,11 @@ CALLS: dict[str, Any] = {
             [np.zeros(20, int), np.full(20, -2)],
             "`labels3d` has the label -2; labels are 0 or more, or -1 for any",
         ),
+        (
+            "labels",
+            [np.arange(20, dtype=np.uint64) + np.uint64(2**63), np.arange(20)],
+            "`labels2d` has the label 9223372036854775827; labels are below 2.63: number them from 0",
+        ),
         ("labels", [np.full((20, 4), 0.3), EVEN], "`labels2d` is .*; probabilities are 0 or more and add up to 1"),
         (
             "labels",
@@ -120,6 +141,8 @@ CALLS: dict[str, Any] = {
         ("pixels", {"image_size": (320, 200)}, "outside the 320 x 200 pixels .* give the size of the image"),
         ("pixels", {"camera": K * [[-1], [1], [1]]}, "focal lengths -.* and .*, which mirror the image; give positive"),
         ("pixels", {"camera": K * [[-1], [-1], [1]]}, "focal lengths -.* and -.*, which mirror the image"),
+        ("pixels", {"image_size": np.array([480, 640])}, "outside the 480 x 640 pixels"),
+        ("sky", {"image_size": np.array([480, 640]), "camera": None}, "outside the 480 x 640 pixels"),
         ("pixels", {"image_size": (640.5, 480)}, "`image_size` is .640.5, 480.; it is .width, height. in whole pixels"),
         ("pixels", {"image_size": 640}, "`image_size` is 640; it is .width, height. in whole pixels"),
         (
@@ -231,6 +254,15 @@ def test_a_seed_is_a_whole_number(value: Any) -> None:
     with pytest.raises(ValueError, match="`seed` is .*; it is a whole number, 0 or more"):
         checked_seed(value)
     assert checked_seed(np.int64(3)) == 3
+
+
+def test_priors_of_many_problems_are_one_or_a_list_of_them() -> None:
+    """A matrix of lists is one prior, and four poses are four priors."""
+    matrix, pose = np.eye(4)[:3].tolist(), PosePrior(np.eye(3), None, 5.0)
+    assert each_prior(matrix, 3) == [matrix] * 3
+    assert each_prior([np.eye(4)] * 4, 4)[3].shape == (4, 4)
+    assert each_prior([pose] * 4, 4) == [pose] * 4
+    assert each_prior([matrix, None, matrix], 3) == [matrix, None, matrix]
 
 
 def test_a_pose_matrix_has_the_last_row_of_one() -> None:

@@ -98,7 +98,9 @@ def test_every_object_that_holds_a_pose_is_a_prior(likely: int) -> None:
         assert (prior.rotation_sigma_deg, prior.translation_sigma) == (10, math.inf)
         np.testing.assert_allclose(prior.rotation, rotation, atol=1e-6)
         np.testing.assert_allclose(prior.translation, translation, atol=1e-5)
-    assert which(solve(TWO_IN_THE_IMAGE, OBJECT, prior=(rotation, translation))) == likely
+    rows = np.column_stack([rotation, translation]).tolist()
+    for pose in ((rotation, translation), rows):
+        assert which(solve(TWO_IN_THE_IMAGE, OBJECT, prior=pose)) == likely
 
 
 def test_clouds_and_meshes_of_other_libraries_are_points() -> None:

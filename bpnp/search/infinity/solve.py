@@ -27,7 +27,7 @@ from bpnp.search.arguments import (
     scene_points,
     unit_vectors,
 )
-from bpnp.search.config import DEFAULT, INFINITY, MATCHES, InfinitySettings
+from bpnp.search.config import INFINITY, MATCHES, InfinitySettings
 from bpnp.search.focal_length import FocalSweep, UnknownCamera
 from bpnp.search.infinity.evidence import how_well_known, noise_of, prior_information, uncertainty_of
 from bpnp.search.infinity.search import search_rotation
@@ -109,8 +109,6 @@ def prepare_directions(
     lenses: list[Camera | None] = [None if camera is None else camera_from(camera) for camera in cameras]
     if unknown is not None:
         lenses = [one.reference for one in unknown]
-    if options.clutter is not None:
-        DEFAULT.expecting(options.clutter)  # raises for one that is out of range
     images, annotations = [], []
     for k, (points, lens) in enumerate(zip(points2d, lenses, strict=True)):
         with about(None if camera_rotations is None else f"camera {k}"):

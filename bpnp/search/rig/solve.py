@@ -11,7 +11,7 @@ import numpy as np
 from bpnp.cameras import Camera, camera_from
 from bpnp.runtime import Clock, Deadline
 from bpnp.search.arguments import Array, about, checked_pose, pose_of
-from bpnp.search.config import DEFAULT, MATCHES
+from bpnp.search.config import MATCHES
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.focal_length import FocalSweep, UnknownCamera
 from bpnp.search.inputs import problem_from
@@ -59,8 +59,6 @@ def prepare_rig(
             "`prior` has a `translation_sigma`, but with `scale=True` the unit of the scene is unknown, and with it "
             "the distance of the scene from a camera; use PosePrior(rotation, None, rotation_sigma_deg)"
         )
-    if options.clutter is not None:
-        DEFAULT.expecting(options.clutter)  # raises for one that is out of range
     points = RigPoints(
         list(points2d), points3d, list(mounts), dict(point_options), options.clutter, prior, is_metric=not scale
     )
