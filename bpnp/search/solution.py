@@ -480,6 +480,7 @@ READERS: dict[str, Callable[[Any], Any]] = {  # of the fields with another form 
     "camera": lambda value: None if value is None else camera_from(value),
     "point_ids": lambda values: None if values is None else np.array(values, np.int64),
     "log10_false_alarms": partial(_float, missing=math.inf),
+    "score": partial(_float, missing=-math.inf),
     **dict.fromkeys(("inlier_threshold", "reprojection_error", "reprojection_error_deg", "residual", "scale"), _float),
     "candidates": lambda values: tuple(_read(Candidate, value) for value in values),
     "stats": lambda value: _read(SolutionStats, value),

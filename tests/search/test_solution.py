@@ -1,5 +1,7 @@
 """A `Solution` and its JSON."""
 
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +28,13 @@ def test_a_solution_is_the_same_after_its_json(tmp_path: Path) -> None:
             np.testing.assert_array_equal(again.centre_std, solution.centre_std)
             assert (again.verdict, again.stats.iterations) == (solution.verdict, solution.stats.iterations)
             assert len(again.candidates) == len(solution.candidates)
+
+
+def test_a_score_without_likelihood_is_the_same_after_its_json() -> None:
+    planted = plant(1, 30, noise=0.001)
+    solution = solve(planted.points2d[0], planted.points3d[0])
+    changed = replace(solution, candidates=(replace(solution.candidates[0], score=-math.inf),))
+    assert Solution.from_json(changed.to_json()).candidates[0].score == -math.inf
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": 2}', "\0"])
