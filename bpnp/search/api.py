@@ -117,11 +117,11 @@ def solve(
             `scores2d` are tried first. The translation of a `prior` is ignored. `normals3d`, `scale`, `device`, and a
             network as `solver` or `prior`, raise ValueError. Default False. See docs/stars.md.
         rig: Extrinsics cam_from_rig of each camera of a rig, as (R, t), (3, 4), (4, 4) or a pycolmap.Rigid3d.
-            `points2d`, `labels2d` and `scores2d` are then lists with one array per camera; `camera` is a list or one
-            for all. The returned pose is rig_from_world, in the unit of the rig and of the scene, and a `prior` is one
-            of this pose. `matches` index the 2D points of all cameras, concatenated. An unknown focal length is one
-            factor for all cameras, and `Solution.camera` is then the first camera. `device`, and a network as `solver`
-            or `prior`, raise ValueError. None for one camera.
+            `points2d`, `labels2d` and `scores2d` are then lists with one array per camera; `camera` is one for all or a
+            list without None. The returned pose is rig_from_world, in the unit of the rig and of the scene, and a
+            `prior` is one of this pose. `matches` index the 2D points of all cameras, concatenated. An unknown focal
+            length is one factor for all cameras, and `Solution.camera` is then the first camera. `device`, and a
+            network as `solver` or `prior`, raise ValueError. None for one camera.
         scale: With `rig`: also estimate the scale of a scene whose unit differs from the rig's, such as a COLMAP model.
             `Solution.scale` satisfies rig = scale R p + t, with t in the unit of the rig. The rig needs a non-zero
             baseline, and a `prior` has no `translation_sigma`. Default False.

@@ -70,6 +70,12 @@ def prepare_mode(
                 )
         each = {name: each_set(name, point_options[name], count, 1) for name in PER_CAMERA}
     cameras = each_camera(camera, count) if mounts is not None else [camera]
+    lacking = [k for k, one in enumerate(cameras) if one is None]
+    if 0 < len(lacking) < count:
+        raise ValueError(
+            f"`camera` is None for camera {lacking[0]} of the `rig`, but not for all, and all errors have one unit; "
+            "give each its camera, or normalised image coordinates or bearings for all"
+        )
     unknown = None
     if distortion or image_size is not None or focal_error is not None:
         unknown = [unknown_camera(one, image_size, focal_error, distortion) for one in cameras]

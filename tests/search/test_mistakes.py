@@ -171,6 +171,8 @@ CALLS: dict[str, Any] = {
         ("sky", {"scores2d": np.zeros(20)}, "`scores2d` is 0.0 at point 0; scores are above 0"),
         ("sky", {"inlier_threshold": -1}, "`inlier_threshold` is .*; it must be a positive number"),
         # Several cameras.
+        ("rig", {"camera": [CAMERA, None]}, "`camera` is None for camera 1 of the `rig`, but not for all"),
+        ("rig", {"camera": [None, CAMERA], "at_infinity": True}, "`camera` is None for camera 0 of the `rig`"),
         ("rig", {"camera": [CAMERA]}, "`camera` has the length 1, but the `rig` has 2 cameras"),
         ("rig", {"rig": [np.eye(4)]}, "`points2d` has the length 2, but the `rig` has 1 cameras"),
         (
