@@ -12,7 +12,9 @@ from bpnp.geometry import bearings, chords, rotation_angle
 from bpnp.types import Batch, Pose, Prediction
 
 MatchingLoss = Literal["correspondence", "likelihood"]
-SMALLEST = 1e-12  # least probability, which keeps the logarithm of a padded point finite
+# Least probability, which keeps the logarithm of a padded point finite. Float32 ends at 1e-38; the gradient 1 / P has
+# room for a loss scale of training in half precision.
+SMALLEST = 1e-30
 
 
 @dataclass(frozen=True)
@@ -157,7 +159,8 @@ def matching_likelihood_loss(prediction: Prediction, batch: Batch) -> Float[Tens
 
     It is the mean over the true matches, in both directions. With dustbins, the mean of -log P(dustbin | i) over the
     points without a match is added, so that their numbers do not matter. Unlike that of `correspondence_loss`, the
-    gradient does not vanish where the probability of the true match is small.
+    gradient does not vanish where the probability of the true match is small. A probability below 1e-30, such as one
+    that is zero in float32, counts as 1e-30 and has no gradient.
 
     Args:
         prediction: Prediction with an assignment; with dustbins, also `unmatched2d` and `unmatched3d`.

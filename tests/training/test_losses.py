@@ -161,3 +161,33 @@ def test_a_loss_without_its_labels_names_what_is_missing() -> None:
 def test_an_angle_that_is_not_in_radians_is_refused(angle: float) -> None:
     with pytest.raises(ValueError, match="correspondence_angle is .* radians .*above 0 and at most 0.5"):
         BlindPnPTask(correspondence_angle=angle)
+
+
+def test_an_improbable_true_match_has_the_derivative_of_its_logarithm() -> None:
+    """dL/dP = -2 / (2 n P) for n true matches, and a little for the sums of its row and column."""
+    n, smallest = 5, 1e-20
+    batch = plant(1, n).batch()
+    assert batch.match3d is not None
+    planted = torch.full((1, n, n), 0.04).scatter_(1, batch.match3d[:, None], smallest).requires_grad_()
+    matching_likelihood_loss(Prediction(planted), batch).sum().backward()
+    assert planted.grad is not None
+    found = planted.grad.gather(1, batch.match3d[:, None])
+    assert found.flatten().tolist() == pytest.approx([-1 / (n * smallest)] * n, rel=1e-5)
+
+
+@pytest.mark.parametrize("probability", [0.0, 1e-45, 1e-38, 1e-31, 1e-29])
+def test_the_gradient_of_the_likelihood_is_finite_however_small_the_probability(probability: float) -> None:
+    """A loss scale of 2^16, that of training in half precision, included."""
+    batch = plant(1, 5, outliers3d=1).batch()
+    assert batch.match3d is not None
+    assignment = torch.full((1, 5, 6), 0.03)
+    j = int((batch.match3d[0] >= 0).nonzero()[0])
+    assignment[0, int(batch.match3d[0, j]), j] = probability
+    assignment.requires_grad_()
+    bins = torch.zeros(1, 5), torch.zeros(1, 6)
+    loss = matching_likelihood_loss(Prediction(assignment, unmatched2d=bins[0], unmatched3d=bins[1]), batch)
+    (2**16 * loss).sum().backward()
+    assert loss.isfinite().all()
+    assert assignment.grad is not None
+    assert assignment.grad.isfinite().all()
+    assert assignment.grad.any()
