@@ -41,7 +41,8 @@ def sinkhorn(
     Args:
         cost: Cost M (b, m, n); infinite for an impossible match, but not for all matches of a point.
         mu: Entropy weight > 0, a number or a scalar tensor, which receives a gradient.
-        row_marginal: r (b, m), summing to one over the real points; receives a gradient. Default: uniform.
+        row_marginal: r (b, m), summing to one over the real points, of any float type; receives a gradient. Default:
+            uniform.
         col_marginal: c (b, n), as `row_marginal`.
         mask2d: True at real image points (b, m). A padded row gets no mass. Default: all are real.
         mask3d: True at real scene points (b, n). A padded column gets no mass. Default: all are real.
@@ -50,14 +51,16 @@ def sinkhorn(
             image points have the marginal m / (m + n) r, their dustbin n / (m + n), and likewise for c. The dustbins
             are left out of the result, so that P sums to less than one. Default: None, every point is matched.
         tolerance: Largest L1 error of the row sums, and of the column sums, at which a sample stops.
-        max_iterations: Largest number of sweeps of a sample; a sweep scales all rows, then all columns.
+        max_iterations: Largest number of sweeps of a sample; a sweep scales all rows, then all columns. The sweeps at
+            higher temperatures that come first where mu is small against the range of the costs, five at each, are not
+            counted.
         backward_stats: Counts the samples of backward passes and those that did not converge. Default: None, a
             RuntimeWarning reports the latter.
 
     Returns:
-        P (b, m, n), and stats whose `residual` is the L1 error of the marginals and whose `iterations` counts sweeps. A
-            NaN in the cost, or a point without a finite cost and without a dustbin, gives NaN in P and `converged`
-            False.
+        P (b, m, n), and stats whose `residual` is the L1 error of the marginals and whose `iterations` counts sweeps,
+            as `max_iterations` does. A sample with NaN in the cost, or with a point without a finite cost and without a
+            dustbin, has NaN in P and `converged` False.
 
     Raises:
         ValueError: mu is not positive, a sample has no real point on one side, or an argument has a wrong shape or
@@ -82,8 +85,8 @@ def sinkhorn(
     b, m, n = cost.shape
     real2d = cost.new_ones(b, m, dtype=torch.bool) if mask2d is None else mask2d
     real3d = cost.new_ones(b, n, dtype=torch.bool) if mask3d is None else mask3d
-    rows = uniform_marginal(real2d, cost.dtype) if row_marginal is None else row_marginal * real2d
-    cols = uniform_marginal(real3d, cost.dtype) if col_marginal is None else col_marginal * real3d
+    rows = uniform_marginal(real2d, cost.dtype) if row_marginal is None else row_marginal.to(cost.dtype) * real2d
+    cols = uniform_marginal(real3d, cost.dtype) if col_marginal is None else col_marginal.to(cost.dtype) * real3d
     if dustbin is not None:
         bin_cost = torch.as_tensor(dustbin, dtype=cost.dtype, device=cost.device)
         cost = torch.cat([cost, bin_cost.expand(b, m, 1)], 2)

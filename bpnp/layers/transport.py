@@ -184,9 +184,12 @@ def _anneal(
     """Compute potentials u, v from which the plan at `mu` neither over- nor underflows, and that plan, in `kernel`.
 
     Sweeps at falling temperatures, each sample from its own range of costs down to mu. At each temperature the largest
-    entry of every row is one at first. A point without mass has the potential -inf.
+    entry of every row is one at first. A point without mass has the potential -inf. A sample in which a point has no
+    finite cost has no plan: all of it is NaN.
     """
-    warm = torch.maximum(COARSEST * _range(cost, rows, cols), mu)
+    extent = _range(cost, rows, cols)
+    mu = torch.where(extent.isnan(), torch.nan, mu)
+    warm = torch.maximum(COARSEST * extent, mu)
     v = torch.where(cols > 0, 0.0, -math.inf).to(cost.dtype)
     while bool((cooling := warm > mu).any()):
         _, plan = _from_row_minima(cost, rows, v, warm, kernel)
@@ -231,11 +234,16 @@ def _absorb(
 
 
 def _range(cost: Tensor, rows: Tensor, cols: Tensor) -> Float[Tensor, " b"]:
-    """Return the difference of the largest and the smallest finite cost between points with mass (b,)."""
+    """Return the difference of the largest and the smallest finite cost between points with mass (b,).
+
+    It is NaN where a point with mass has no finite cost.
+    """
     highest, lowest = cost.amax(-1), cost.amin(-1)
+    blocked = torch.zeros_like(highest[:, 0], dtype=torch.bool)
     if not bool((cols > 0).all() & highest.isfinite().all()):
-        real = (cols > 0).unsqueeze(-2) & cost.isfinite()
+        real = (cols > 0).unsqueeze(-2) & (rows > 0).unsqueeze(-1) & cost.isfinite()
         highest = torch.where(real, cost, -math.inf).amax(-1)
         lowest = torch.where(real, cost, math.inf).amin(-1)
+        blocked = ((rows > 0) & ~real.any(-1)).any(-1) | ((cols > 0) & ~real.any(-2)).any(-1)
     highest, lowest = torch.where(rows > 0, highest, -math.inf), torch.where(rows > 0, lowest, math.inf)
-    return highest.amax(-1) - lowest.amin(-1)
+    return torch.where(blocked, torch.nan, highest.amax(-1) - lowest.amin(-1))

@@ -119,3 +119,43 @@ def test_scalings_beyond_the_range_of_float32_are_absorbed() -> None:
         assert stats.converged.all()
         expected = plain_sinkhorn(cost.double(), mu, uniform, uniform)
         assert (plan - expected).abs().max() < 1e-5
+
+
+@pytest.mark.parametrize("side", ["image", "scene"])
+@pytest.mark.parametrize("padded", [False, True])
+def test_a_point_without_a_finite_cost_has_no_plan(side: str, padded: bool) -> None:
+    """On either side; a finite cost at a padded point is none. The other samples keep their plans."""
+    cost = random_cost(3, 6, 6)
+    masks = {}
+    if padded:
+        real = torch.ones(3, 6, dtype=torch.bool)
+        real[1, 5] = False
+        masks = {"mask2d": real, "mask3d": real}
+    expected, _ = sinkhorn(cost, **masks)
+    one, other = cost.clone(), 5 if padded else 6
+    one[1, :other, 2] = torch.inf
+    blocked = one.mT.contiguous() if side == "image" else one
+    plan, stats = sinkhorn(blocked, **masks)
+    assert stats.converged.tolist() == [True, False, True]
+    assert plan[1, :other, :other].isnan().all()
+    assert stats.iterations[1] <= 1
+    if side == "scene":
+        assert torch.equal(plan[[0, 2]], expected[[0, 2]])
+    left, stats = sinkhorn(blocked, **masks, dustbin=0.5)
+    assert stats.converged.all()
+    assert left.isfinite().all()
+
+
+def test_marginals_of_another_precision_are_those_of_the_cost() -> None:
+    cost, rows, cols = random_cost(2, 4, 6).float(), marginals(2, 4, seed=1), marginals(2, 6, seed=2)
+    expected, _ = sinkhorn(cost, row_marginal=rows.float(), col_marginal=cols.float())
+    rows.requires_grad_()
+    plan, stats = sinkhorn(cost, row_marginal=rows, col_marginal=cols)
+    assert plan.dtype == cost.dtype
+    assert torch.equal(plan, expected)
+    plan.square().sum().backward()
+    assert rows.grad is not None
+    assert rows.grad.any()
+    again, _ = sinkhorn(cost.double(), row_marginal=rows.float(), col_marginal=cols.float())
+    assert again.dtype == torch.float64
+    assert (again - plan).abs().max() < 1e-6
