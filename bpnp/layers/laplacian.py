@@ -54,7 +54,11 @@ def solve_laplacian(
         b (b, n) with a weighted mean of zero, P b / rows (b, m), and which samples met the tolerance (b,).
     """
     solve = compiled.conjugate_gradients if compiled.applies_to(rhs) else conjugate_gradients
-    x, mean, solved = solve(plan, rows, cols, degree, rhs, tolerance, ITERATIONS)
+    # A power of two brings the largest entry into [1, 2): no digit changes, and no square underflows or overflows.
+    largest = rhs.abs().amax(-1, keepdim=True)
+    size = torch.where(largest > 0, largest / (2 * torch.frexp(largest).mantissa), 1)
+    x, mean, solved = solve(plan, rows, cols, degree, rhs / size, tolerance, ITERATIONS)
+    x, mean = size * x, size * mean
     shift = _mean(x, cols)
     b, mean = torch.where(cols > 0, x - shift, 0), torch.where(rows > 0, mean - shift, 0)
     if rhs.dtype != torch.float64 or bool(solved.all()):

@@ -41,6 +41,22 @@ def test_every_device_solves_the_gradient_to_its_tolerance(compiled: bool, monke
     assert (cost.grad - exact.grad).abs().max() < 5e-5 * exact.grad.abs().max()
 
 
+@pytest.mark.parametrize("compiled", [True, False])
+def test_the_gradient_is_linear_in_that_of_the_loss(compiled: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thousand-millionth of a millionth of a millionth of the loss has that fraction of its gradient."""
+    if not compiled:
+        monkeypatch.setattr("bpnp.layers.compiled.applies_to", lambda _tensor: False)
+    cost = torch.rand(2, 40, 40, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    weights = torch.randn(2, 40, 40, generator=torch.Generator().manual_seed(1))
+    plan = sinkhorn(cost)[0]
+    (expected,) = torch.autograd.grad(plan, cost, weights, retain_graph=True)
+    for factor in (1e-24, 1e-20, 1e-10, 1e10, 1e20):
+        factors = torch.tensor([factor, 1.0])[:, None, None]  # a sample's scale is its own
+        (found,) = torch.autograd.grad(plan, cost, factors * weights, retain_graph=True)
+        error = (found.double() / factors.double() - expected).abs().amax((1, 2))
+        assert (error < 2e-5 * expected.abs().amax((1, 2))).all()
+
+
 @pytest.mark.usefixtures("too_few_iterations")
 def test_a_failed_backward_pass_without_counters_warns() -> None:
     plan = sinkhorn(smooth_cost(60), mu=0.02)[0]
