@@ -65,14 +65,26 @@ def _raise_precision() -> Callable[[], None]:
     except RuntimeError:  # the user has set a single backend, for which torch has no common value
         switches: list[Any] = [getattr(torch.backends, name).matmul for name in ("cuda", "mkldnn")]
         values = [switch.fp32_precision for switch in switches]
-        _set_switches(switches, ["ieee"] * len(switches))
-        return functools.partial(_set_switches, switches, values)
+        _set_switches(switches, "ieee")
+        return functools.partial(_restore_switches, switches, values)
     if before == "highest":
         return lambda: None
     torch.set_float32_matmul_precision("highest")
     return functools.partial(torch.set_float32_matmul_precision, before)
 
 
-def _set_switches(switches: list[Any], values: list[str]) -> None:
-    for switch, value in zip(switches, values, strict=True):
+def _set_switches(switches: list[Any], value: str) -> None:
+    for switch in switches:
         switch.fp32_precision = value
+
+
+def _restore_switches(switches: list[Any], values: list[str]) -> None:
+    """Set the switches back to values that were read from them.
+
+    "none" follows the general switch, `torch.backends.fp32_precision`, and reads as its value. A switch that reads as
+    it did stays so; it then follows later changes of the general switch.
+    """
+    _set_switches(switches, "none")
+    for switch, value in zip(switches, values, strict=True):
+        if switch.fp32_precision != value:
+            switch.fp32_precision = value

@@ -11,6 +11,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from bpnp.layers import sinkhorn, weighted_pnp
 from bpnp.models.bpnpnet import pairwise_distance
+from bpnp.precision import exact_products
 
 pytestmark = pytest.mark.slow
 
@@ -77,3 +78,32 @@ def test_layers_keep_their_digits(compiled: bool, monkeypatch: pytest.MonkeyPatc
     for value, exact in zip(found, expected, strict=True):
         assert (value - exact).abs().max() < 1e-6 * exact.abs().max()
     assert torch.get_float32_matmul_precision() == "high"
+
+
+@pytest.fixture
+def switches() -> Iterator[tuple[Any, Any, Any]]:
+    """The switches of all products, of those on CUDA and of those on the CPU; the last two follow the first."""
+    every, cuda, cpu = torch.backends, torch.backends.cuda.matmul, torch.backends.mkldnn.matmul
+    for one in (cuda, cpu):
+        one.fp32_precision = "none"
+    yield every, cuda, cpu
+    for one in (every, cuda, cpu):
+        one.fp32_precision = "none"
+
+
+def test_a_switch_that_followed_the_general_one_still_does(switches: tuple[Any, Any, Any]) -> None:
+    every, *each = switches
+    every.fp32_precision = "tf32"
+    with exact_products(torch.device("cpu")):
+        assert [one.fp32_precision for one in each] == ["ieee", "ieee"]
+    assert [one.fp32_precision for one in each] == ["tf32", "tf32"]
+    every.fp32_precision = "ieee"
+    assert [one.fp32_precision for one in each] == ["ieee", "ieee"]
+
+
+def test_a_switch_of_its_own_is_restored(switches: tuple[Any, Any, Any]) -> None:
+    every, cuda, cpu = switches
+    every.fp32_precision, cpu.fp32_precision = "tf32", "bf16"
+    with exact_products(torch.device("cpu")):
+        assert (cuda.fp32_precision, cpu.fp32_precision) == ("ieee", "ieee")
+    assert (cuda.fp32_precision, cpu.fp32_precision) == ("tf32", "bf16")
