@@ -98,7 +98,7 @@ def distinct(
     Args:
         rotation: Rotations (c, 3, 3).
         translation: Translations (c, 3).
-        score: Score (c,), larger is better. Poses with NaN or -inf are left out.
+        score: Score (c,), larger is better. Poses with NaN or an infinite score are left out.
         count: Largest number of poses.
         degrees: Angle limit, as in `close_poses`, degrees.
         shift: Distance limit, as in `close_poses`.

@@ -48,7 +48,8 @@ class Muon(Adam):
 
     Args:
         params: Parameters of a module. Those with two dimensions of 16 or more count as matrices.
-        lr: Learning rate of the matrices, the largest singular value of a step.
+        lr: Learning rate of the matrices, about the singular values of a step. A matrix with more rows r than columns c
+            moves by sqrt(r / c) times as much.
         adam_lr: Learning rate of the others.
 
     Raises:
