@@ -229,8 +229,8 @@ def weighted_pnp(
         assignment: P (b, m, n), zero at padded points; its total does not matter.
         bearings: Unit vectors f_i (b, m, 3), `bpnp.geometry.bearings` of image points.
         points3d: p_j (b, n, 3), scene units.
-        rotation: Initial R (b, 3, 3), camera = R p + t, without a gradient. A sample whose initial pose is NaN has no
-            pose.
+        rotation: Initial R (b, 3, 3), camera = R p + t, without a gradient. A sample whose initial pose or other
+            input is not finite has no pose.
         translation: Initial t (b, 3), scene units.
         solver: "newton" (damped Newton steps for the whole batch) or "lbfgs" (L-BFGS with a strong Wolfe line search,
             as in the paper; sample by sample). Both find the same optimum.
@@ -243,10 +243,10 @@ def weighted_pnp(
         clipped: Counts the columns of backward passes, and those that were clipped.
 
     Returns:
-        Rotation (b, 3, 3) and translation (b, 3) in the dtype of the assignment, and stats. `residual` is the gradient
-        norm that is compared with the tolerance. `converged` is False, and the gradient zero, where the initial pose is
-        NaN, the tolerance was not met, the camera is farther than 10^4 scene radii, or the Hessian is not positive
-        definite: leave such samples out of a loss.
+        Rotation (b, 3, 3) and translation (b, 3) in the dtype of the assignment, float32 for half precision, and stats.
+        `residual` is the gradient norm that is compared with the tolerance. `converged` is False, and the gradient
+        zero, where an input is NaN or infinite, the tolerance was not met, the camera is farther than 10^4 scene radii,
+        or the Hessian is not positive definite: leave such samples out of a loss.
 
     Raises:
         ValueError: An argument has a wrong shape or dtype, the solver is unknown, or `clip_columns` is not positive.
@@ -269,15 +269,23 @@ def weighted_pnp(
     bearings = bearings.to(assignment.dtype)
     with torch.no_grad():
         q: Columns = _Aggregate.apply(assignment, bearings).double()
+        usable = q.isfinite().all((-2, -1)) & points3d.isfinite().all((-2, -1))
+    if not bool(usable.all()):
+        # Zeros have a zero gradient; that of NaN would be NaN, and that of the network with it.
+        assignment, bearings, points3d = (
+            torch.where(usable[:, None, None], values, 0) for values in (assignment, bearings, points3d)
+        )
+        q = choose(usable, q, torch.zeros_like(q))
+    with torch.no_grad():
         # The optimum does not depend on a factor of the weights |q_j|; here they sum to one.
         total = _lengths(q).sum(-1, keepdim=True).clamp_min(torch.finfo(q.dtype).tiny)
         q = q / total
         weight = _lengths(q)
     points, centre, scale = _normalise(points3d.double().mT.contiguous(), weight)
     with torch.no_grad():
-        found = is_finite(rotation, translation)
+        found = usable & is_finite(rotation, translation)
         # Project a rounded rotation onto SO(3); samples without a pose get an arbitrary one.
-        r = torch.where(found[:, None, None], rotation.double(), torch.eye(3).to(q))
+        r = torch.where(found[:, None, None], rotation.double(), torch.eye(3, dtype=q.dtype, device=q.device))
         r = roma.special_procrustes(r)
         t = (torch.where(found[:, None], translation.double(), 1) + _rotate(r, centre)) / scale
         r, t, iterations = SOLVERS[solver](q, points, r, t, tolerance=tolerance, max_iterations=max_iterations)
@@ -317,7 +325,7 @@ def _scene_step(rotation: Rotations, centre: Translations, scale: Float[Tensor, 
 
     r = roma.rotmat_to_rotvec(rotation)
     angle = r.norm(dim=-1).clamp_min(1e-6)[:, None, None]
-    turn, eye = hat(r), torch.eye(3).to(rotation)
+    turn, eye = hat(r), torch.eye(3, dtype=r.dtype, device=r.device)
     # (1 / a^2 - cot(a / 2) / (2 a)), which tends to 1 / 12
     bend = 1 / angle**2 - 1 / (2 * angle * torch.tan(angle / 2))
     inverse = eye - turn / 2 + torch.where(angle > 1e-3, bend, 1 / 12) * (turn @ turn)
@@ -342,7 +350,8 @@ def _column_grams(
     x = rotation @ points
     u, inverse, _ = _point_gradient(torch.zeros_like(x), x + translation.unsqueeze(-1))
     x, u, inverse = x.mT, u.mT, inverse.mT.unsqueeze(-1)
-    project = inverse * (torch.eye(3).to(x) - u.unsqueeze(-1) * u.unsqueeze(-2))
+    eye = torch.eye(3, dtype=x.dtype, device=x.device)
+    project = inverse * (eye - u.unsqueeze(-1) * u.unsqueeze(-2))
     rows = torch.cat([hat(x) @ project, project], -2)  # D^T (I - u u^T) / d, D^T = [[x]x; I]
     b, n = rows.shape[:2]
     solved = torch.cholesky_solve(rows.permute(0, 2, 1, 3).reshape(b, 6, 3 * n), factor)
@@ -375,7 +384,7 @@ def _judge(end: Derivatives) -> tuple[Float[Tensor, " b"], Bool[Tensor, " b"], F
 
     The factor is the identity for the other samples.
     """
-    eye = torch.eye(6).to(end.hessian)
+    eye = torch.eye(6, dtype=end.hessian.dtype, device=end.hessian.device)
     trace = end.hessian.diagonal(dim1=-2, dim2=-1).sum(-1)
     # A Cholesky factor of H - c I exists if and only if every eigenvalue of H exceeds c.
     margin = (WELL_POSED * trace)[:, None, None] * eye

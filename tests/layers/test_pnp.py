@@ -71,23 +71,36 @@ def degenerate(kind: str, planted: Planted) -> tuple[Tensor, Tensor, Tensor, Ten
         translation[0, 2] = 1e9
     elif kind == "assignment NaN":
         assignment[0, 0, 0] = torch.nan
+    elif kind == "assignment infinite":
+        assignment[0, 0, 0] = torch.inf
+    elif kind in ("point NaN", "point infinite"):
+        points3d[0, 4, 1] = torch.nan if kind == "point NaN" else torch.inf
     return assignment, points3d, rotation, translation
 
 
-ILL_POSED = "collinear, one place, one point, two points, nothing assigned, no start, start at infinity, assignment NaN"
+ILL_POSED = (
+    "collinear, one place, one point, two points, nothing assigned, no start, start at infinity, assignment NaN, "
+    "assignment infinite, bearing NaN, point NaN, point infinite"
+)
 
 
 @pytest.mark.parametrize("kind", ILL_POSED.split(", "))
 def test_a_sample_without_a_pose_is_flagged_and_affects_no_other(kind: str) -> None:
     planted = plant(3, 12, seed=10)
     assignment, points3d, *start = degenerate(kind, planted)
-    variables = [x.clone().requires_grad_() for x in (assignment, planted.bearings, points3d)]
+    bearings = planted.bearings.clone()
+    if kind == "bearing NaN":
+        bearings[0, 3] = torch.nan
+    variables = [x.clone().requires_grad_() for x in (assignment, bearings, points3d)]
     r, t, stats = weighted_pnp(*variables, *start)
     assert stats.converged.tolist() == [False, True, True]
     assert apart((r[1:], t[1:]), (planted.rotation[1:], planted.translation[1:])) < 1e-6
     torch.nansum(r).add(torch.nansum(t)).backward()
-    if kind != "assignment NaN":  # NaN in, NaN out
-        assert all(x.grad is not None and not x.grad[0].any() for x in variables)
+    assert all(x.grad is not None and not x.grad[0].any() for x in variables)
+    if "NaN" in kind or "infinite" in kind:
+        assert r[0].isnan().all()
+        assert t[0].isnan().all()
+        assert stats.residual[0] == torch.inf
     expected = [x[1:].detach().clone().requires_grad_() for x in variables]
     alone = weighted_pnp(*expected, *(x[1:] for x in start))
     alone[0].sum().add(alone[1].sum()).backward()
