@@ -207,7 +207,7 @@ def round_widths(rounds: int, ransac: nn.Module) -> list[float]:
         raise ValueError(
             f"`rounds` needs the `threshold` of `ransac`, which {type(ransac).__name__} lacks; use rounds 0"
         )
-    return [float(width) for width in np.geomspace(FIRST_WIDTH * last, last, rounds)]
+    return [float(width) for width in np.geomspace(last, FIRST_WIDTH * last, rounds)[::-1]]  # one round has the last
 
 
 def match_again(
@@ -328,8 +328,7 @@ class Refinement(nn.Module):
             )
         hypotheses = hypotheses[0].to(rotation), hypotheses[1].to(translation)
         refined = refine(batch, torch.cat([rotation, hypotheses[0]], 1), torch.cat([translation, hypotheses[1]], 1))
-        unsupported = log_support(prediction, batch, refined) < 0
-        if self.hypotheses and bool(unsupported.any()):
+        if self.hypotheses and bool((unsupported := log_support(prediction, batch, refined) < 0).any()):
             other = refine(batch, rotation, torch.where(unsupported[:, None, None], translation, torch.nan))
             refined = _choose_pose(unsupported & (log_support(prediction, batch, other) > 0), other, refined)
         return replace(prediction, poses=prediction.poses | {REFINED: refined})

@@ -401,7 +401,7 @@ class Neighbourhood(nn.Module):
     """Features of the neighbourhood of each point: the channel-wise maximum over responses to its nearest neighbours.
 
     Offsets are in units of the set's mean distance to the neighbours, so that a denser sample of the same shape has
-    similar features. A point without a neighbour gets zeros.
+    similar features. A point without a neighbour responds with zeros, and gets the bias of the last layer.
 
     Args:
         coordinates: Number of coordinates, 2 or 3.
@@ -424,7 +424,7 @@ class Neighbourhood(nn.Module):
         """
         k = min(self.neighbours, points.shape[1] - 1)
         if k < 1:
-            return points.new_zeros(*points.shape[:2], self.out.out_features)
+            return self.out(points.new_zeros(*points.shape[:2], self.out.in_features))
         far = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist")
         far = far.masked_fill(~mask.unsqueeze(1), torch.inf)
         far.diagonal(dim1=1, dim2=2).fill_(torch.inf)

@@ -1,13 +1,16 @@
+import itertools
+
 import pytest
 import torch
-from planted import padded, plant
+from planted import padded, plant, posed
 from small_data import small_net
 from torch import Tensor
 
-from bpnp import Batch, BPnPNet
-from bpnp.layers import sinkhorn
+from bpnp import Batch, BPnPNet, Prediction
+from bpnp.layers import RansacPnP, sinkhorn
 from bpnp.metrics import rotation_error
 from bpnp.models import Refinement
+from bpnp.models.evaluation import round_widths
 from bpnp.models.nets import PointFeatures
 from bpnp.report.results import rows_from
 from bpnp.search.config import DEFAULT
@@ -74,6 +77,22 @@ def test_refinement_starts_from_hypotheses_too_unless_there_are_none() -> None:
     assert int(alone) <= 2 * (1 + DEFAULT.copies) < int(crowd)
     with pytest.raises(ValueError, match="`hypotheses` is -1; it must be 0 or more"):
         Refinement(hypotheses=-1)
+
+
+def test_refinement_without_hypotheses_needs_no_assignment() -> None:
+    """A pose of a solver without an assignment, 0.05 radians off, is refined to the planted one."""
+    planted = plant(1, 30, outliers2d=5, seed=4)
+    prediction = Refinement(hypotheses=0)(Prediction(poses={"given": posed(*planted.near(0.05))}), planted.batch())
+    assert float(rotation_error(prediction.poses["refined"].rotation, planted.rotation)) < 0.1
+
+
+@pytest.mark.parametrize("rounds", [1, 2, 5])
+def test_the_last_of_any_number_of_rounds_has_the_width_of_ransac(rounds: int) -> None:
+    widths = round_widths(rounds, RansacPnP(threshold=0.02))
+    assert len(widths) == rounds
+    assert widths[-1] == pytest.approx(0.02)
+    ratios = [width / following for width, following in itertools.pairwise(widths)]
+    assert all(ratio == pytest.approx(ratios[0]) and ratio > 1 for ratio in ratios)
 
 
 def test_the_cost_is_the_distance_between_unit_features() -> None:

@@ -48,6 +48,15 @@ def test_neighbourhoods_look_alike_at_every_scale_and_ignore_padding() -> None:
     torch.testing.assert_close(layer(padded, torch.arange(25)[None] < 20)[:, :20], plain)
 
 
+def test_a_point_alone_has_the_same_features_in_a_padded_batch() -> None:
+    torch.manual_seed(0)
+    layer, point = Neighbourhood(2, 8, neighbours=4), torch.randn(1, 1, 2)
+    padded = torch.cat([point, torch.zeros(1, 3, 2)], 1)
+    alone = layer(point, torch.ones(1, 1, dtype=torch.bool))
+    torch.testing.assert_close(alone, layer(padded, torch.tensor([[True, False, False, False]]))[:, :1])
+    assert alone.shape == (1, 1, 8)
+
+
 def test_the_matcher_overfits_matches_and_outliers_of_one_problem() -> None:
     torch.manual_seed(0)
     batch = plant(1, 12, outliers2d=4, outliers3d=4, seed=3, dtype=torch.float32).batch()
