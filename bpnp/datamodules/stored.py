@@ -37,11 +37,13 @@ def write_problems(
         parameters: JSON content for the manifest. None for no additional content.
 
     Raises:
-        StoreError: The folder exists.
+        StoreError: The folder exists, or there are no problems.
     """
     with new_store(folder, PROBLEMS, WIDTHS) as writer:
         for scene, problem in problems:
             writer.add(*problem_row(scene, problem))
+        if not len(writer):
+            raise StoreError(f"there are no problems to write into {folder}; give at least one")
         writer.parameters |= parameters or {}
 
 

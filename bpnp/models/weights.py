@@ -7,8 +7,7 @@ the caller passes. A checkpoint describes its network under "solver", which alon
 """
 
 import inspect
-import pickle
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
@@ -111,14 +110,16 @@ def checkpoint_path(name: str | Path) -> Path:
     """Return the file of a checkpoint.
 
     Args:
-        name: Path of a file, or the name of packaged weights.
+        name: Path of a file, or the name of packaged weights. A string that is such a name is always the packaged
+            weights; a file of that name in the working directory is ``./<name>``.
 
     Raises:
         FileNotFoundError: There is no such file.
     """
-    if Path(name).is_file():
+    packaged = str(name) in pretrained_names()
+    if Path(name).is_file() and not (packaged and isinstance(name, str)):
         return Path(name)
-    if str(name) in pretrained_names():
+    if packaged:
         return Path(str(WEIGHTS / f"{name}.ckpt"))
     raise FileNotFoundError(
         f"there is no checkpoint {name}; give a file such as runs/<name>/checkpoints/last.ckpt, or packaged weights: "
@@ -157,7 +158,7 @@ def read_data(path: str | Path, *, map_location: Any = "cpu") -> dict[str, Any]:
     file = checkpoint_path(path)
     try:
         content = torch.load(file, map_location=map_location, weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, LookupError, OSError) as error:
+    except Exception as error:  # a damaged file makes torch raise almost anything, such as struct.error
         reason = (str(error) or type(error).__name__).splitlines()[0].split(". ")[0]
         raise ValueError(f"{file} is no checkpoint of `bpnp fit`: it cannot be read ({reason})") from error
     if not isinstance(content, dict):
@@ -225,10 +226,11 @@ def fitting_state(
     Args:
         content: Content from `read_checkpoint`.
         solver: Solver that the weights are for.
-        grown: Allow the checkpoint to lack weights that are zero, of parts that add nothing before training.
+        grown: Allow the checkpoint to lack weights that are zero, of parts that add nothing before training, and to
+            differ in the settings that create these parts.
 
     Returns:
-        The weights of the solver, and the `ADJUSTABLE` settings that differ, such as `rounds=0 (saved: 8)`.
+        The weights of the solver, and the settings that may differ and do, such as `rounds=0 (saved: 8)`.
 
     Raises:
         ValueError: The class, another setting, or the shape of a weight differs.
@@ -243,28 +245,46 @@ def fitting_state(
     ]
     adjusted: list[str] = []
     wrong: list[str] = []
+    grows = bool(added) and not misfits
     for place, ours, theirs in differences(wanted, _with_defaults(saved, solver)):
-        changed = adjusted if ADJUSTABLE & set(place.split(".")) else wrong
-        changed.append(f"{place}={_setting_text(ours)} (saved: {_setting_text(theirs)})")
-    if wrong and (misfits or not added):
+        allowed = ADJUSTABLE & set(place.split(".")) or (grows and _creates(added, place, theirs, solver))
+        (adjusted if allowed else wrong).append(f"{place}={_setting_text(ours)} (saved: {_setting_text(theirs)})")
+    if wrong:
         raise ValueError(
             f"the checkpoint is of another {wanted['class']}: {', '.join(wrong)}. Leave these settings out, or give "
             "the saved ones"
         )
     if misfits:
         raise ValueError(f"the checkpoint has no {sorted(misfits)[0]} of the shape that this {wanted['class']} needs")
-    return state | added, [*adjusted, *wrong]
+    return state | added, adjusted
 
 
 def _with_defaults(description: Mapping[str, Any], solver: nn.Module) -> Mapping[str, Any]:
     """Add the settings that a description of an older version lacks, with their defaults."""
+    built = _build_without_weights(description, solver)
+    return description if built is None else describe_module(built)
+
+
+def _creates(part: Iterable[str], place: str, other: Any, solver: nn.Module) -> bool:
+    """Return True if a solver with another value of one setting lacks one of these weights."""
+    built = _build_without_weights(_with_setting(describe_module(solver), place.split("."), other), solver)
+    return built is not None and not set(part) <= built.state_dict().keys()
+
+
+def _with_setting(description: Mapping[str, Any], place: Sequence[str], value: Any) -> dict[str, Any]:
+    name, *rest = place
+    settings = description["settings"]
+    changed = _with_setting(settings[name], rest, value) if rest else value
+    return {"class": description["class"], "settings": {**settings, name: changed}}
+
+
+def _build_without_weights(description: Mapping[str, Any], solver: nn.Module) -> nn.Module | None:
+    """Build a description of a solver's classes without memory for weights; None if it cannot be built."""
     try:
         with torch.device("meta"):
-            return describe_module(
-                build_module(description, (*networks(), *PARTS, *{type(part) for part in solver.modules()}))
-            )
-    except (ValueError, RuntimeError, NotImplementedError):  # of a module that cannot be built from its description
-        return description
+            return build_module(description, (*networks(), *PARTS, *{type(part) for part in solver.modules()}))
+    except (ValueError, RuntimeError, NotImplementedError):
+        return None
 
 
 def _shape(weight: Tensor | None) -> tuple[int, ...] | None:

@@ -39,6 +39,12 @@ def problems(count: int = 12) -> list[tuple[str, Problem]]:
     return result
 
 
+def test_a_store_without_problems_is_not_written(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match=r"there are no problems to write into .*empty; give at least one"):
+        write_problems(tmp_path / "empty", iter(()))
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.fixture
 def store(tmp_path: Path) -> Store:
     write_problems(tmp_path / "store", problems(), parameters={"clutter": 1.0})

@@ -1,5 +1,6 @@
 """Checkpoints: written and read as plain data, of networks made of parts."""
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,17 @@ from bpnp import Batch, BPnPNet, Matcher
 from bpnp.layers import RansacPnP, Sinkhorn, WeightedPnP
 from bpnp.models import Refinement, TrainedNet
 from bpnp.models.nets import ImageFeatures, SceneFeatures
-from bpnp.models.weights import PARTS, build_module, describe_module, differences, fitting_state
+from bpnp.models.weights import (
+    LEARNED,
+    PARTS,
+    build_module,
+    checkpoint_path,
+    describe_module,
+    differences,
+    fitting_state,
+    read_data,
+)
+from bpnp.search.arguments import checked_prior
 
 
 class Flat(nn.Module):
@@ -116,6 +127,42 @@ def test_a_checkpoint_of_another_shape_is_refused_with_what_differs() -> None:
     with pytest.raises(ValueError, match="a checkpoint of another program, not of BPnPNet"):
         fitting_state({"state_dict": {}}, own)
     assert list(differences(describe_module(Flat(2)), describe_module(Flat(3)))) == [("coordinates", 2, 3)]
+
+
+def test_weights_without_a_part_may_differ_only_in_the_setting_that_creates_it() -> None:
+    saved = content(Matcher(channels=16, depth=1, heads=2))
+    view = Matcher(channels=16, depth=1, heads=2, frame="view")
+    state, adjusted = fitting_state(saved, view, grown=True)
+    assert adjusted == ["frame=view (saved: any)"]
+    assert state.keys() == view.state_dict().keys()
+    for option, other in (("heads", 4), ("neighbours", 5)):
+        changed = Matcher(channels=16, depth=1, **({"heads": 2} | {option: other}), frame="view")
+        with pytest.raises(ValueError, match=rf"another Matcher: {option}={other} \(saved: \d\)\. Leave"):
+            fitting_state(saved, changed, grown=True)
+
+
+def test_a_name_of_packaged_weights_is_never_a_file_of_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("matcher-clutter", LEARNED):
+        save(Matcher(channels=16, depth=1, heads=2), Path(name))
+    assert Matcher.from_pretrained("matcher-clutter").channels == 128
+    assert isinstance(checked_prior("learned"), BPnPNet)
+    assert checkpoint_path("./matcher-clutter") == checkpoint_path(Path("matcher-clutter")) == Path("matcher-clutter")
+    assert Matcher.from_checkpoint("./matcher-clutter").channels == 16
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_a_checkpoint_that_is_cut_anywhere_is_named(tmp_path: Path, zipped: bool) -> None:
+    file, whole = tmp_path / "x.ckpt", io.BytesIO()
+    torch.save({"state_dict": {"a": torch.rand(3)}, "epoch": 3}, whole, _use_new_zipfile_serialization=zipped)
+    for end in range(0, len(whole.getvalue()), 5):
+        file.write_bytes(whole.getvalue()[:end])
+        with pytest.raises(ValueError, match=r"x\.ckpt is no checkpoint of `bpnp fit`: it cannot be read \(.+\)$"):
+            read_data(file)
+    file.write_bytes(whole.getvalue())
+    assert read_data(file)["epoch"] == 3
 
 
 OLD_FORM = {"class": "BPnPNet", "settings": {"channels": 16, "blocks": 2, "nonsense": 0.2}}
