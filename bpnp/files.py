@@ -111,6 +111,16 @@ def delay_interrupts() -> Iterator[None]:
             signal.raise_signal(signal.SIGINT)
 
 
+def name_bytes(name: str) -> bytes:
+    r"""Return a name as UTF-8; bytes of a file name that are not UTF-8 become backslash escapes.
+
+    >>> from bpnp.files import name_bytes
+    >>> name_bytes("caf\udce9")
+    b'caf\\udce9'
+    """
+    return name.encode(errors="backslashreplace")
+
+
 def fingerprint(content: Any) -> str:
     """Return a hash of JSON content, 32 hexadecimal digits."""
     return hashlib.blake2b(json.dumps(content, sort_keys=True).encode(), digest_size=16).hexdigest()

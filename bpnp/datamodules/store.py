@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.progress import track
 from torch.utils.data import DataLoader, Dataset
 
-from bpnp.files import cache_folder, delay_interrupts, fingerprint, lock_folder, write_atomically
+from bpnp.files import cache_folder, delay_interrupts, fingerprint, lock_folder, name_bytes, write_atomically
 
 MANIFEST = "manifest.json"
 FORMAT = 4  # raised whenever the meaning of a column changes
@@ -182,8 +182,8 @@ class StoreWriter:
             part = np.ascontiguousarray(points[key], BULK)
             self._files[key].write(part.data)
             self._columns[f"{key}_start"].append(self._columns[f"{key}_start"][-1] + len(part))
-        for key, value in {"name": name.encode(), **columns}.items():
-            self._columns[key].append(value.encode() if isinstance(value, str) else value)
+        for key, value in {"name": name, **columns}.items():
+            self._columns[key].append(name_bytes(value) if isinstance(value, str) else value)
 
     def finish(self, folder: Path, kind: str) -> None:
         """Write the small columns, and the manifest last."""
@@ -264,7 +264,9 @@ class Recipe(Dataset[JobResult]):
         return self.work(*self.jobs[number])
 
 
-def prepare(recipe: Recipe, output: Path, *, processes: int = 1, wait_for_others: bool = False) -> Store:
+def prepare(
+    recipe: Recipe, output: Path, *, processes: int = 1, wait_for_others: bool = False, replace_damaged: bool = False
+) -> Store:
     """Open the store `output`, or make it; an interrupted run leaves no store.
 
     The store is made in the folder `.<output>.unfinished` of the same parent, which only this function writes to. Files
@@ -275,27 +277,52 @@ def prepare(recipe: Recipe, output: Path, *, processes: int = 1, wait_for_others
         output: Folder of the store.
         processes: Number of processes that read the source.
         wait_for_others: Wait for another process that is making the store, instead of raising.
+        replace_damaged: Make a store that cannot be used again, with a warning, instead of raising.
 
     Raises:
-        StoreError: `output` is something else or was made with other parameters, or no job gives a row.
+        StoreError: `output` is something else, is damaged or was made with other parameters, or no job gives a row.
         ValueError: Another process is making the store, and `wait_for_others` is False.
     """
-    if not is_store(output):
+    try:
+        if is_store(output):
+            return _open_made(recipe, output)
+    except (StoreError, FileNotFoundError):  # a file is not found while another process replaces the store
+        if not replace_damaged:
+            raise
+    else:
         if output.exists() and not is_store(output):  # unless another process has just made it
             raise StoreError(f"{output} exists and is no store of bpnp; give a new folder")
-        work = output.with_name(f".{output.name}.unfinished")
-        try:
-            with lock_folder(work, wait=wait_for_others):
-                if not is_store(output):  # another process may have made it
-                    _make(recipe, work / "store", processes)
-                    os.replace(work / "store", output)
-        finally:
-            with suppress(OSError):  # another process uses the folder, or made it
-                work.rmdir()
+    work = output.with_name(f".{output.name}.unfinished")
+    try:
+        with lock_folder(work, wait=wait_for_others):
+            if replace_damaged and is_store(output):
+                _remove_damaged(recipe, output, work / "damaged")
+            if not is_store(output):  # another process may have made it
+                _make(recipe, work / "store", processes)
+                os.replace(work / "store", output)
+    finally:
+        with suppress(OSError):  # another process uses the folder, or made it
+            work.rmdir()
+    return _open_made(recipe, output)
+
+
+def _open_made(recipe: Recipe, output: Path) -> Store:
+    """Open a store and compare its parameters with those of a recipe."""
     store = open_store(output, recipe.kind)
     if different := sorted(key for key, value in recipe.parameters.items() if store.parameters.get(key) != value):
         raise StoreError(f"{output} was made with another {', '.join(different)}; give another --output, or remove it")
     return store
+
+
+def _remove_damaged(recipe: Recipe, output: Path, aside: Path) -> None:
+    """Remove a store, with a warning, if it still cannot be used: another process may have made it again."""
+    try:
+        _open_made(recipe, output)
+    except StoreError as error:
+        warnings.warn(f"the cached store {output} is damaged ({error}); making it again", stacklevel=4)
+        shutil.rmtree(aside, ignore_errors=True)  # left by a killed process
+        os.replace(output, aside)  # at once: a folder without a manifest would never be made again
+        shutil.rmtree(aside)
 
 
 def open_or_prepare(recipe: Recipe, label: str, cache_dir: str | None) -> Store:
@@ -309,15 +336,9 @@ def open_or_prepare(recipe: Recipe, label: str, cache_dir: str | None) -> Store:
         cache_dir: Folder for stores, None for `cache_folder()`.
     """
     folder = Path(cache_dir) if cache_dir is not None else cache_folder()
-    output = folder / f"{label}-{fingerprint([recipe.kind, dict(recipe.parameters)])[:16]}"
-    try:
-        store = prepare(recipe, output, wait_for_others=True)
-    except StoreError as error:
-        if not is_store(output):
-            raise
-        warnings.warn(f"the cached store {output} is damaged ({error}); making it again", stacklevel=2)
-        shutil.rmtree(output)
-        store = prepare(recipe, output, wait_for_others=True)
+    # Versions with other formats have stores of their own, and do not replace each other's.
+    output = folder / f"{label}-{fingerprint([FORMAT, recipe.kind, dict(recipe.parameters)])[:16]}"
+    store = prepare(recipe, output, wait_for_others=True, replace_damaged=True)
     if store.skipped:
         some = "; ".join(list(store.skipped.values())[:3])  # the reasons name the files
         warnings.warn(

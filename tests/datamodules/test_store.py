@@ -5,11 +5,21 @@ import os
 import resource
 import zlib
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
-from bpnp.datamodules.store import Store, StoreError, is_store, new_store, open_store
+from bpnp.datamodules.store import (
+    JobResult,
+    Recipe,
+    Store,
+    StoreError,
+    is_store,
+    new_store,
+    open_or_prepare,
+    open_store,
+)
 from bpnp.files import fingerprint
 
 pytestmark = pytest.mark.slow
@@ -128,3 +138,48 @@ def test_a_full_disk_is_one_error_that_names_the_store(tmp_path: Path) -> None:
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert list(store.parent.iterdir()) == []
+
+
+def one_row(number: int) -> JobResult:
+    return [(str(number), {"points": np.full((3, 3), number)}, {})], {}
+
+
+def toy_recipe() -> tuple[Recipe, Mock]:
+    """A recipe of two rows, and the count of its jobs."""
+    work = Mock(side_effect=one_row)
+    return Recipe("toy", {"points": 3}, {"of": "here"}, [(1,), (2,)], work, "row", "here"), work
+
+
+def test_a_damaged_store_that_another_process_has_mended_meanwhile_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe, work = toy_recipe()
+    made = open_or_prepare(recipe, "toy", str(tmp_path)).folder
+    (made / "points.npy").write_bytes(b"")
+
+    def noticed(*arguments: object) -> Store:
+        """Let another process mend the store after this one has found it damaged."""
+        try:
+            return open_store(*arguments)
+        except StoreError:
+            monkeypatch.setattr("bpnp.datamodules.store.open_store", open_store)
+            open_or_prepare(recipe, "toy", str(tmp_path))
+            raise
+
+    monkeypatch.setattr("bpnp.datamodules.store.open_store", noticed)
+    with pytest.warns(UserWarning, match="is damaged .*; making it again") as warned:
+        store = open_or_prepare(recipe, "toy", str(tmp_path))
+    assert store.row(1)["points"].tolist() == [[2.0] * 3] * 3
+    assert work.call_count == 2 * 2
+    assert len(warned) == 1
+    assert list(tmp_path.iterdir()) == [made]
+
+
+def test_versions_of_two_formats_share_a_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recipe, work = toy_recipe()
+    folders = []
+    for version in (4, 5, 4, 5):
+        monkeypatch.setattr("bpnp.datamodules.store.FORMAT", version)
+        folders.append(open_or_prepare(recipe, "toy", str(tmp_path)).folder)
+    assert folders[:2] == folders[2:]
+    assert work.call_count == 2 * 2
