@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from bpnp.datamodules.shapes import (
@@ -16,10 +15,12 @@ from bpnp.datamodules.shapes import (
     Sampler,
     Shapes,
     mesh_shapes,
+    open_mesh,
+    parse_cloud,
     shape_files,
     training_meshes_first,
 )
-from bpnp.files import file_states, fingerprint
+from bpnp.files import file_states, fingerprint, name_bytes
 
 TEXTS = (".txt", ".xyz")
 CLOUD_SUFFIXES = (".npy", *TEXTS)
@@ -37,14 +38,16 @@ def read_cloud(path: Path) -> NDArray[np.float64]:
     Raises:
         MeshError: The file is empty, truncated or holds something else. The message names the file.
     """
+    if path.suffix.lower() == ".ply":
+        with open_mesh(path) as (content, suffix):
+            points, _ = parse_cloud(content, suffix)
+        return _check_cloud(points, path)
     try:
         if path.suffix.lower() == ".npy":
             values = np.load(path, allow_pickle=False)
-        elif path.suffix.lower() in TEXTS:
+        else:
             text = path.read_text(encoding="utf-8-sig")
             values = np.loadtxt(text.replace(",", " ").splitlines(), np.float64, ndmin=2)
-        else:
-            values = np.asarray(getattr(trimesh.load(path, process=False), "vertices", ()), np.float64).reshape(-1, 3)
     except Exception as error:
         raise MeshError(f"{path}: not a point cloud ({' '.join(str(error).split())})") from error
     return _check_cloud(values, path)
@@ -74,7 +77,7 @@ def is_cloud(path: Path) -> bool:
 
 def draw_points(points: NDArray[np.float64], count: int, name: str) -> NDArray[np.float64]:
     """Return `count` points of a cloud in a random order that depends only on its name; all points if it has fewer."""
-    order = np.random.default_rng(zlib.crc32(name.encode())).permutation(len(points))
+    order = np.random.default_rng(zlib.crc32(name_bytes(name))).permutation(len(points))
     return points[order[:count]]
 
 

@@ -17,7 +17,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from bpnp.checks import check_within
-from bpnp.files import fingerprint
+from bpnp.files import fingerprint, name_bytes
 from bpnp.geometry import random_rotations
 
 SUFFIXES = (".glb", ".obj", ".off", ".ply", ".stl")
@@ -69,7 +69,8 @@ class Mesh:
 def read_mesh(path: Path) -> Mesh:
     """Read an .off, .ply, .obj, .stl or .glb file.
 
-    The parts of a scene become one mesh; polygons become fans of triangles.
+    The parts of a scene become one mesh; polygons become fans of triangles. An .obj file does not declare its number of
+    faces, so that a truncated one is read as far as it goes.
 
     Args:
         path: File.
@@ -78,7 +79,7 @@ def read_mesh(path: Path) -> Mesh:
         MeshError: The file is truncated, foreign or empty, or the mesh has no faces, no area, NaN, or a face of missing
             vertices.
     """
-    with _open_mesh(path) as (content, suffix):
+    with open_mesh(path) as (content, suffix):
         if suffix == ".off":
             return _parse_off(content)
         mesh = _load(content, suffix)
@@ -89,7 +90,7 @@ def read_mesh(path: Path) -> Mesh:
 
 
 @contextmanager
-def _open_mesh(path: Path) -> Iterator[tuple[bytes, str]]:
+def open_mesh(path: Path) -> Iterator[tuple[bytes, str]]:
     """Yield the bytes and the suffix of a file; a MeshError of the block gets its name."""
     try:
         yield path.read_bytes(), path.suffix.lower()
@@ -109,23 +110,36 @@ def read_vertices(path: Path) -> tuple[NDArray[np.float64], dict[str, NDArray[np
     Raises:
         MeshError: The file is truncated, foreign or empty.
     """
-    with _open_mesh(path) as (content, suffix):
+    with open_mesh(path) as (content, suffix):
         mesh = _parse_off(content) if suffix == ".off" else _load(content, suffix)
         vertices = np.asarray(mesh.vertices, np.float64)
         if len(vertices):
             return vertices[np.sort(np.unique(vertices, axis=0, return_index=True)[1])], {}
-        cloud = _load(content, suffix, force=None)  # trimesh reads a point cloud as an empty mesh
-        vertices = np.asarray(getattr(cloud, "vertices", ()), np.float64).reshape(-1, 3)
-        declared = re.search(rb"^element vertex (\d+)", content, re.MULTILINE)
-        expected = 1 if declared is None else int(declared[1])
-        if len(vertices) < expected:  # trimesh reads a truncated text file without an error
-            header = "" if declared is None else f"; its header declares {expected}"
-            raise MeshError(f"the file has {len(vertices)} points{header}")
-        raw = getattr(cloud, "metadata", {}).get("_ply_raw", {}).get("vertex")
-        if raw is None:
-            return vertices, {}
-        names = [name for name, kind in raw["properties"].items() if isinstance(kind, str)]  # a list has a tuple
-        return vertices, {name: np.asarray(raw["data"][name], np.float64).reshape(len(vertices)) for name in names}
+        return parse_cloud(content, suffix)  # trimesh reads a point cloud as an empty mesh
+
+
+def parse_cloud(content: bytes, suffix: str) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
+    """Parse a file of points without faces.
+
+    Args:
+        content: Bytes of the file.
+        suffix: Suffix of the file, such as ".ply".
+
+    Returns:
+        The points (v, 3) in the order of the file, and the properties of the points of a .ply file (v,) by name.
+
+    Raises:
+        MeshError: The file is truncated, foreign or empty.
+    """
+    cloud = _load(content, suffix, force=None)
+    vertices = np.asarray(getattr(cloud, "vertices", ()), np.float64).reshape(-1, 3)
+    if not len(vertices):
+        raise MeshError("the file has 0 points")
+    raw = getattr(cloud, "metadata", {}).get("_ply_raw", {}).get("vertex")
+    if raw is None:
+        return vertices, {}
+    names = [name for name, kind in raw["properties"].items() if isinstance(kind, str)]  # a list has a tuple
+    return vertices, {name: np.asarray(raw["data"][name], np.float64).reshape(len(vertices)) for name in names}
 
 
 def _parse_off(content: bytes) -> Mesh:
@@ -171,12 +185,48 @@ def _load(content: bytes, suffix: str, *, force: Literal["mesh"] | None = "mesh"
     """Return trimesh's mesh, or whatever else trimesh makes of the file."""
     if not content:
         raise MeshError("the file is empty")
+    if suffix == ".ply":
+        _check_ply_rows(content)
     try:
         # force: merge all parts, each at its position in the scene; process: do not merge equal vertices
         file = io.BytesIO(content)
         return trimesh.load(file, file_type=suffix[1:], force=force, process=False, skip_materials=True)
     except Exception as error:
         raise MeshError(f"trimesh cannot read it as a {suffix} mesh ({error})") from error
+
+
+def _check_ply_rows(content: bytes) -> None:
+    """Raise MeshError if a text .ply file has fewer rows than its header declares; trimesh leaves out what is missing.
+
+    The last row may be cut too, but not within its last number, which no count can show.
+    """
+    header, _, body = content.partition(b"end_header")
+    if not re.search(rb"^format\s+ascii", header, re.MULTILINE):
+        return  # trimesh compares the size of a binary file
+    elements: list[tuple[str, int, list[bool]]] = []  # name, rows, and whether each property is a list
+    for line in header.decode(errors="replace").splitlines():
+        match line.split():
+            case ["element", name, count] if count.isdecimal():
+                elements.append((name, int(count), []))
+            case ["property", kind, *_] if elements:
+                elements[-1][2].append(kind == "list")
+    elements = [element for element in elements if element[1]]
+    declared = sum(count for _, count, _ in elements)
+    rows = [row for row in body.splitlines() if row.strip()][:declared]
+    whole = len(rows) - (bool(rows) and len(rows) == declared and not _is_whole(rows[-1].split(), elements[-1][2]))
+    if whole < declared:
+        parts = ", ".join(f"{count} {name}" for name, count, _ in elements)
+        raise MeshError(f"the file is truncated: its header declares {declared} rows ({parts}), and it has {whole}")
+
+
+def _is_whole(row: Sequence[bytes], lists: Sequence[bool]) -> bool:
+    """Return True if a row of a .ply file has a number for each property, and all entries of its lists."""
+    needed = 0
+    for is_list in lists:
+        if is_list and not (needed < len(row) and row[needed].isdigit()):
+            return False
+        needed += 1 + (int(row[needed]) if is_list else 0)
+    return len(row) >= needed
 
 
 def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -416,4 +466,4 @@ def mesh_shapes(files: Mapping[str, Path]) -> dict[str, Sampler]:
 
 
 def _mesh_samples(name: str, path: Path, count: int) -> NDArray[np.float64]:
-    return sample_surface(read_mesh(path), count, np.random.default_rng(zlib.crc32(name.encode())))
+    return sample_surface(read_mesh(path), count, np.random.default_rng(zlib.crc32(name_bytes(name))))

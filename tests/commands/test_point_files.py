@@ -94,7 +94,7 @@ def test_a_mesh_gives_its_corners_or_its_surface(suffix: str, tmp_path: Path) ->
             "a.ply",
             b"ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
             b"end_header\n0 0 0\n1 1 1\n",
-            "a.ply: the file has 2 points; its header declares 4",
+            r"a.ply: the file is truncated: its header declares 4 rows \(4 vertex\), and it has 2",
         ),
         ("a.stl", b"no mesh", "a.stl: the file has 0 points"),
         ("a.off", b"OFF\n3 1 0\n0 0 0\n", "truncated"),

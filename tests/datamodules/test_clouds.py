@@ -1,5 +1,6 @@
 """Point clouds in ModelNet's layouts: fixed or sampled points of the files, and errors that name the file."""
 
+import os
 from pathlib import Path
 from typing import Literal
 
@@ -9,9 +10,9 @@ import pytest
 import trimesh
 
 from bpnp.datamodules.clouds import draw_points, is_cloud, open_shapes, read_cloud
-from bpnp.datamodules.meshes import MeshDataModule
+from bpnp.datamodules.meshes import SURFACES, MeshDataModule
 from bpnp.datamodules.shapes import MeshError, normalise
-from bpnp.datamodules.store import StoreError
+from bpnp.datamodules.store import StoreError, open_store
 
 SIZES = (40, 40, 50, 40, 60, 40)
 
@@ -64,6 +65,9 @@ def test_a_ply_with_faces_is_a_mesh_and_its_surface_is_sampled(tmp_path: Path) -
     assert len(np.unique(samples, axis=0)) == 100  # not the 8 corners
 
 
+XYZ = b"property float x\nproperty float y\nproperty float z\n"
+
+
 @pytest.mark.parametrize(
     ("name", "content"),
     [
@@ -72,6 +76,8 @@ def test_a_ply_with_faces_is_a_mesh_and_its_surface_is_sampled(tmp_path: Path) -
         ("two.xyz", b"1 2\n3 4\n"),
         ("nan.xyz", b"1 2 nan\n"),
         ("cut.npy", b"\x93NUMPY\x01\x00"),
+        ("cut.ply", b"ply\nformat ascii 1.0\nelement vertex 3\n" + XYZ + b"end_header\n1 2 3\n4 5 6\n"),
+        ("within.ply", b"ply\nformat ascii 1.0\nelement vertex 2\n" + XYZ + b"end_header\n1 2 3\n4 5"),
         ("none.ply", b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n"),
     ],
 )
@@ -79,6 +85,16 @@ def test_a_file_that_is_no_cloud_is_one_error_with_its_name(tmp_path: Path, name
     (tmp_path / name).write_bytes(content)
     with pytest.raises(MeshError, match=name):
         read_cloud(tmp_path / name)
+
+
+def test_file_names_that_are_not_utf8_are_escaped(folder: Path) -> None:
+    name = folder / "c0" / "train" / os.fsdecode(b"caf\xe9")
+    write(name.with_suffix(".xyz"), points(7))
+    name.with_suffix(".off").write_text(trimesh.creation.box().export(file_type="off"), encoding="utf-8")
+    module(folder).setup("fit")
+    (cache,) = (folder.parent / "cache").iterdir()
+    store = open_store(cache, SURFACES)
+    assert [store.name(i) for i in range(2)] == [r"c0/train/caf\udce9.off", r"c0/train/caf\udce9.xyz"]
 
 
 @pytest.mark.parametrize("mode", ["unit_sphere", "unit_cube"])

@@ -78,6 +78,27 @@ def test_every_mesh_format_is_read_and_a_truncated_file_refused(tmp_path: Path, 
         read_mesh(path)
 
 
+QUADS = (
+    "ply\nformat ascii 1.0\ncomment from a scanner\nelement vertex 8\nproperty float x\nproperty float y\n"
+    "property float z\nelement face 6\nproperty list uchar int vertex_indices\nend_header\n"
+    "-1 -1 -1\n-1 -1 1\n-1 1 -1\n-1 1 1\n1 -1 -1\n1 -1 1\n1 1 -1\n1 1 1\n"
+    "4 0 1 3 2\n4 4 6 7 5\n4 0 4 5 1\n4 2 3 7 6\n4 0 2 6 4\n4 1 5 7 3\n"
+)
+
+
+def test_a_text_ply_that_is_cut_anywhere_is_refused(tmp_path: Path) -> None:
+    """Six squares, of which trimesh reads as many as are left; only a last number that is cut cannot be noticed."""
+    path = tmp_path / "cube.ply"
+    for text in (QUADS, QUADS.rstrip(), QUADS.replace("\n", "\r\n")):
+        path.write_bytes(text.encode())
+        assert read_mesh(path).areas.sum() == 24
+    body = QUADS.index("end_header") + len("end_header\n")
+    for end in range(body, len(QUADS.rstrip())):
+        path.write_text(QUADS[:end], encoding="utf-8")
+        with pytest.raises(MeshError, match=r"truncated: its header declares 14 rows \(8 vertex, 6 face\), and it has"):
+            read_mesh(path)
+
+
 def test_real_meshes_are_those_that_trimesh_reads(shared_data: Path) -> None:
     files = sorted((shared_data / "psb").glob("*/test/*.off"))[::60]
     assert files
