@@ -11,7 +11,7 @@ import torch
 from lightning import LightningDataModule
 from numpy.typing import NDArray
 from torch import distributed
-from torch.utils.data import DataLoader, Dataset, DistributedSampler, Subset
+from torch.utils.data import DataLoader, Dataset, DistributedSampler, SequentialSampler, Subset
 
 from bpnp.checks import check_within
 from bpnp.datamodules.augment import Augmentation, Outliers, augment
@@ -164,6 +164,20 @@ class BucketSampler(DistributedSampler[list[Key]]):
             yield [(epoch, int(i)) for i in batch[self.rank * size : (self.rank + 1) * size]]
 
 
+class FixedSampler(DistributedSampler[int], SequentialSampler):
+    """Sampler of all batches of this process in their order.
+
+    With `overfit_batches`, Lightning replaces a sampler that is not sequential, and in several processes one that is
+    not distributed, by another that drops batches.
+
+    Args:
+        batches: Batches of this process.
+    """
+
+    def __init__(self, batches: Dataset[Batch]) -> None:
+        super().__init__(batches, num_replicas=1, rank=0, shuffle=False)
+
+
 class ProblemLoader(DataLoader[Batch]):
     """DataLoader of whole batches that resumes exactly, also within an epoch.
 
@@ -289,8 +303,9 @@ class ProblemDataModule(LightningDataModule):
             max_cells=None if training else self.max_cells,
         )
         if self.trainer is not None and self.trainer.overfit_batches > 0:  # type: ignore[attr-defined]
-            batches: list[Any] = list(sampler)  # the same batches in every epoch, in this order
-            return DataLoader(Subset(dataset, batches), batch_size=None, num_workers=self.num_workers)
+            keys: list[Any] = list(sampler)  # the same batches in every epoch, in this order
+            batches = Subset(dataset, keys)
+            return DataLoader(batches, sampler=FixedSampler(batches), batch_size=None, num_workers=self.num_workers)
         return ProblemLoader(
             dataset,
             sampler=sampler,

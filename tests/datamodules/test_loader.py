@@ -2,11 +2,15 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.trainer.connectors.data_connector import _DataConnector, _resolve_overfit_batches
+from lightning.pytorch.trainer.states import RunningStage
+from lightning.pytorch.utilities import CombinedLoader
 from small_data import recorded
 
 from bpnp.datamodules.loader import BucketSampler, ProblemDataModule, ProblemDataset
@@ -96,6 +100,30 @@ def test_evaluation_covers_every_pair(count: int, replicas: int, max_cells: int 
     if max_cells is None:
         alone = [set(step) for step in sampler(sizes, **options)]
         assert [{k for part in parts for k in part} for parts in zip(*shares, strict=True)] == alone
+
+
+def test_overfitting_in_two_processes_uses_all_batches_of_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After Lightning has processed the loaders of both, each of the 20 problems is in one of 5 steps of 2 + 2."""
+    monkeypatch.setattr("torch.distributed.is_initialized", lambda: True)
+    monkeypatch.setattr("torch.distributed.get_world_size", lambda: 2)
+    steps = []
+    for rank in range(2):
+        monkeypatch.setattr("torch.distributed.get_rank", lambda rank=rank: rank)
+        data = Problems(batch_size=4)
+        data.setup("fit")
+        data.trainer = SimpleNamespace(
+            overfit_batches=1.0,
+            distributed_sampler_kwargs={"num_replicas": 2, "rank": rank},
+            state=SimpleNamespace(fn="fit"),
+            _accelerator_connector=SimpleNamespace(use_distributed_sampler=True, is_distributed=True),
+        )
+        combined = CombinedLoader(data.train_dataloader())
+        _resolve_overfit_batches(combined, RunningStage.TRAINING)
+        connector = _DataConnector(data.trainer)
+        loader = connector._prepare_dataloader(combined.flattened[0], shuffle=False, mode=RunningStage.TRAINING)
+        steps.append([batch.ids for batch in loader])
+    assert [len(of_rank) for of_rank in steps] == [5, 5]
+    assert sorted(int(i) for of_rank in steps for ids in of_rank for i in ids) == list(range(20))
 
 
 def test_errors_name_what_is_wrong() -> None:

@@ -142,7 +142,10 @@ def horizon_points(centre: Array, distance: float, count: int, rng: np.random.Ge
 
 
 def blob_points(blobs: Blobs, count: int, rng: np.random.Generator) -> Surface:
-    """Draw `count` points in clusters on the ellipsoids, outside of all others, repeated if there are fewer."""
+    """Draw `count` points in clusters on the ellipsoids.
+
+    Of 1.5 times as many, those outside of all other ellipsoids are taken first, and others only if these are too few.
+    """
     parts = len(blobs.centre)
     drawn = count + count // 2
     on = rng.choice(parts, drawn, p=rng.dirichlet(np.full(parts, 2.0)))

@@ -72,10 +72,11 @@ class GOSMA(BranchAndBound):
 
     - The search uses the processor, the authors' program a GPU. Fewer boxes are searched in the same time.
     - Clusters are limited in root mean square radii of the points (`cluster2d`, `cluster3d`) instead of an angle and a
-      length, and camera centres lie in a cube of 1.5 weak-perspective distances. Neither depends on the unit of the
-      scene.
-    - Camera centres are at least half the weak-perspective distance from the centroid of the scene; in the paper they
-      have a least distance from the points.
+      length, and boxes of camera centres lie in a cube of 1.5 weak-perspective distances. Neither depends on the unit
+      of the scene.
+    - Boxes nearer than half the weak-perspective distance to the centroid of the scene are left out; in the paper,
+      camera centres have a least distance from the points.
+    - Local optimisation is not confined to the boxes: the pose may lie outside of the cube, or nearer to the centroid.
     - The angle between two clusters, seen from the camera centre, changes by at most |mu - mu'| / (d d') for each unit
       that the centre moves. This bounds the terms of pairs of scene clusters more tightly than two independent
       directions.
@@ -125,11 +126,12 @@ class GOSMA(BranchAndBound):
         closest: float = 0.0,
         deadline: Deadline = NEVER,
     ) -> BestPose:
-        """Minimise d(R, c) over a domain with |c| >= `closest`, to within `gap` of the image mixture's squared norm.
+        """Return a pose with d(R, c) at most `gap` times the image mixture's squared norm above the domain's minimum.
 
-        The `batch` boxes of lowest bound are split together, in rotation or in translation, whichever is less certain.
-        Adam descends from their best centres, and L-BFGS refines a better pose. Value and bound are fractions of the
-        image mixture's squared norm.
+        The domain is restricted to |c| >= `closest`. The `batch` boxes of lowest bound are split together, in rotation
+        or in translation, whichever is less certain. Adam descends from their best centres, and L-BFGS refines a better
+        pose; both may leave the domain. Value and bound are fractions of the image mixture's squared norm. At the
+        deadline or the largest number of boxes, the best pose so far is returned, not certified.
 
         Args:
             scene: Mixture of the scene points.
