@@ -6,6 +6,7 @@ import importlib.util
 import logging
 import os
 import re
+import select
 import sys
 import textwrap
 import traceback
@@ -38,7 +39,8 @@ WIDTH = 80  # columns of the help
 def main(args: Sequence[str] | None = None) -> None:
     """Run a command.
 
-    A user's mistake ends in one line on stderr and exit status 2, without a traceback.
+    A user's mistake ends in one line on stderr and exit status 2, without a traceback. If the reader of standard output
+    closes it, as `head` does, the command ends silently.
 
     Args:
         args: Arguments. Default: those of the process.
@@ -55,10 +57,10 @@ def main(args: Sequence[str] | None = None) -> None:
             sys.path.append(os.getcwd())  # for the user's own classes; last, so that they hide no module
         _run(arguments)
         sys.stdout.flush()
-    except BrokenPipeError:  # the reader of a pipe, such as head, closed it
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        raise SystemExit(0) from None
     except Exception as error:
+        if isinstance(error, BrokenPipeError) and _has_no_reader(sys.stdout):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the flush at exit would fail too
+            raise SystemExit(0) from None
         if os.environ.get("BPNP_TRACEBACK") or not _is_mistake(error):
             raise
         # File names that are not UTF-8 contain surrogates, which a terminal cannot show.
@@ -74,11 +76,23 @@ def one_line_warning(message: Warning | str, *_: object, **__: object) -> str:
     return f"bpnp: warning: {plain(str(message))}\n"
 
 
+def _has_no_reader(stream: object) -> bool:
+    """Return True if a stream is a pipe or a socket whose reader has closed it."""
+    try:
+        watched = select.poll()
+        watched.register(stream, 0)  # type: ignore[arg-type]  # hang-ups and errors are always reported
+        return bool(watched.poll(0))
+    except (AttributeError, TypeError, ValueError, OSError):  # not a file, or a system without `poll`
+        return False
+
+
 def _is_mistake(error: Exception) -> bool:
     """Return True for an error that is a message to the user, raised by this package or a library that it uses.
 
     Errors of a user's own class, such as a callback or a data module, keep their traceback.
     """
+    if isinstance(error, BrokenPipeError):
+        return False
     if not isinstance(error, (ValueError, OSError)) and type(error).__name__ not in LIGHTNING_MISTAKES:
         return False
     modules = (frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__))

@@ -1,6 +1,8 @@
 import contextlib
 import inspect
+import os
 import re
+import socket
 import subprocess
 import sys
 from collections.abc import Callable
@@ -24,6 +26,28 @@ def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert listed == [*COMMANDS, "fit", "validate", "test", "predict"]
     assert "quickstart" in text
     assert max(map(len, text.splitlines())) <= 80
+
+
+def write_to_closed_socket() -> None:
+    one, other = socket.socketpair()
+    other.close()
+    with one:
+        one.send(b"x")
+
+
+def test_only_a_closed_standard_output_ends_a_command_silently(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(COMMANDS, "solve", write_to_closed_socket)
+    monkeypatch.setitem(COMMANDS, "report", lambda: sys.stdout.write("a line"))
+    read, write = os.pipe()
+    with os.fdopen(write, "w") as pipe:
+        monkeypatch.setattr(sys, "stdout", pipe)
+        with pytest.raises(BrokenPipeError):
+            main(["solve"])
+        main(["report"])
+        os.close(read)
+        with pytest.raises(SystemExit) as stop:
+            main(["report"])
+        assert stop.value.code == 0
 
 
 @pytest.mark.parametrize(
