@@ -1,6 +1,7 @@
 """Photo files: discovery, camera data of EXIF, and keypoints."""
 
 import importlib
+import math
 import sqlite3
 from collections.abc import Iterable
 from contextlib import closing
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.cameras import CENTRE, outside_image, same_aspect_ratio
+from bpnp.report.images import open_photo
 from bpnp.search.config import MAPS
 
 Array = NDArray[np.float64]
@@ -89,14 +91,14 @@ def focal_from_exif(photo: Path) -> float | None:
         ValueError: The photo cannot be read.
     """
     size, tags = _read_size_and_tags(photo)
-    taken = int(tags.get(PIXELS_X, 0)), int(tags.get(PIXELS_Y, 0))
+    taken = int(_number_of(tags, PIXELS_X)), int(_number_of(tags, PIXELS_Y))
     if all(taken) and not same_aspect_ratio((max(taken), min(taken)), (max(size), min(size))):
         return None
-    equivalent = float(tags.get(FOCAL_LENGTH_35MM, 0))
+    equivalent = _number_of(tags, FOCAL_LENGTH_35MM)
     if equivalent > 0:
         return float(equivalent * np.hypot(*size) / DIAGONAL_35MM)
-    millimetres, resolution = float(tags.get(FOCAL_LENGTH, 0)), float(tags.get(RESOLUTION_X, 0))
-    unit = MILLIMETRES.get(int(tags.get(RESOLUTION_UNIT, 2)))
+    millimetres, resolution = _number_of(tags, FOCAL_LENGTH), _number_of(tags, RESOLUTION_X)
+    unit = MILLIMETRES.get(int(_number_of(tags, RESOLUTION_UNIT, 2)))
     if not (millimetres > 0 and resolution > 0 and unit and all(taken)):
         return None
     return millimetres * resolution / unit * max(size) / max(taken)
@@ -116,14 +118,24 @@ def up_from_exif(photo: Path) -> tuple[float, float, float] | None:
 
 def _read_size_and_tags(photo: Path) -> tuple[Size, dict[int, Any]]:
     """Return the size of a photo and its EXIF tags, with the orientation."""
-    from PIL import Image
+    with open_photo(photo) as image:
+        exif = image.getexif()
+        return image.size, {ORIENTATION: exif.get(ORIENTATION), **exif.get_ifd(IFD_EXIF)}
 
+
+def _number_of(tags: dict[int, Any], tag: int, default: float = 0.0) -> float:
+    """Return the number of an EXIF tag.
+
+    Args:
+        tags: Values by tag.
+        tag: Tag.
+        default: Value if the tag is missing, or is not a number from 0.
+    """
     try:
-        with Image.open(photo) as image:
-            exif = image.getexif()
-            return image.size, {ORIENTATION: exif.get(ORIENTATION), **exif.get_ifd(IFD_EXIF)}
-    except OSError as error:
-        raise ValueError(f"cannot read the photo {photo}: {error}; give a JPEG or PNG file") from error
+        value = float(tags.get(tag, default))
+    except (TypeError, ValueError, OverflowError):
+        return default
+    return value if 0 <= value < math.inf else default
 
 
 def photo_keypoints(photo: Path, file: str | Path | None, name: str) -> Keypoints:
@@ -161,7 +173,10 @@ def detected_keypoints(photo: Path, *, most: int = MAPS.most_detected) -> Keypoi
     import cv2
 
     as_stored = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION  # as COLMAP reads photos
-    image = cv2.imread(str(photo), as_stored)
+    try:
+        image = cv2.imread(str(photo), as_stored)
+    except cv2.error:  # over 2^30 pixels
+        image = None
     if image is None:
         raise ValueError(f"OpenCV cannot read the photo {photo}; give a JPEG or PNG file")
     points = cv2.SIFT.create(contrastThreshold=MAPS.contrast, enable_precise_upscale=True).detect(image)

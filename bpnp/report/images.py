@@ -1,5 +1,7 @@
 """Photos that are read and figures that are written."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +13,7 @@ from bpnp.files import delay_interrupts, write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from PIL.Image import Image
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".svg", ".pdf")
 Array = npt.NDArray[Any]
@@ -35,8 +38,32 @@ def save_figure(figure: "Figure", path: Path | str, *, dpi: int = 110) -> Path:
     return path
 
 
+@contextmanager
+def open_photo(path: Path | str) -> "Iterator[Image]":
+    """Open a photo, whose pixels are read when they are used.
+
+    Args:
+        path: File.
+
+    Yields:
+        Image of Pillow.
+
+    Raises:
+        ValueError: The file cannot be read, or has more pixels than Pillow reads. The message names it.
+    """
+    from PIL import Image
+
+    try:
+        with Image.open(path) as photo:
+            yield photo
+    except Image.DecompressionBombError as error:
+        raise ValueError(f"the photo {path} is too large: {error}; reduce its size") from error
+    except (OSError, SyntaxError) as error:  # Pillow raises SyntaxError for a damaged PNG file
+        raise ValueError(f"cannot read the photo {path}: {error}; give a JPEG or PNG file") from error
+
+
 def read_photo(path: Path | str) -> Array:
-    """Read a picture.
+    """Read a photo.
 
     Args:
         path: File.
@@ -45,15 +72,10 @@ def read_photo(path: Path | str) -> Array:
         Pixels (h, w, 3), uint8.
 
     Raises:
-        ValueError: The file is no picture.
+        ValueError: As `open_photo`.
     """
-    from PIL import Image
-
-    try:
-        with Image.open(path) as photo:
-            return np.asarray(photo.convert("RGB"))
-    except OSError as error:
-        raise ValueError(f"{path} is no picture: {error}") from error
+    with open_photo(path) as photo:
+        return np.asarray(photo.convert("RGB"))
 
 
 def size_in_camera(photo: Array, camera: Camera | None) -> tuple[int, int]:

@@ -10,6 +10,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from bpnp.maps.photos import detected_keypoints, focal_from_exif, photo_size, read_features
+from bpnp.report.images import read_photo
 
 
 @pytest.fixture
@@ -67,9 +68,21 @@ def test_a_file_that_is_no_photo_is_one_clear_error(tmp_path: Path) -> None:
     for read in (detected_keypoints, focal_from_exif, photo_size):
         with pytest.raises(ValueError, match=r"cannot read the photo .*a\.jpg"):
             read(tmp_path / "a.jpg")
+    with pytest.raises(ValueError, match=r"cannot read the photo .*a\.jpg"):
+        read_photo(tmp_path / "a.jpg")
     Image.new("L", (64, 64)).save(tmp_path / "black.png")
     with pytest.raises(ValueError, match=r"no keypoints were found in .*black\.png"):
         detected_keypoints(tmp_path / "black.png")
+
+
+def test_a_photo_with_more_pixels_than_pillow_reads_is_one_clear_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Image.new("L", (64, 64)).save(tmp_path / "large.png")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 64 * 64 // 2 - 1)  # an error from twice as many, 200 megapixels
+    for read in (focal_from_exif, photo_size, read_photo):
+        with pytest.raises(ValueError, match=r"the photo .*large\.png is too large: .*; reduce its size"):
+            read(tmp_path / "large.png")
 
 
 def test_keypoints_of_hloc_are_read_and_wrong_files_named(tmp_path: Path) -> None:

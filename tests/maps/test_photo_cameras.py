@@ -24,7 +24,7 @@ TAGS = {
 TAKEN = {"FocalLength": 5.0, "FocalPlaneXResolution": 25400.0, "PixelXDimension": 4000, "PixelYDimension": 3000}
 
 
-def photo_with(path: Path, size: tuple[int, int] = (400, 300), **tags: float) -> Path:
+def photo_with(path: Path, size: tuple[int, int] = (400, 300), **tags: object) -> Path:
     image = Image.new("RGB", size)
     exif = image.getexif()
     exif.get_ifd(0x8769).update({TAGS[name]: value for name, value in tags.items()})
@@ -45,11 +45,14 @@ def photo_with(path: Path, size: tuple[int, int] = (400, 300), **tags: float) ->
         ((1000, 1000), TAKEN | {"FocalLengthIn35mmFilm": 43}, None),  # cropped, no one knows from what
         ((1000, 750), {"FocalLength": 5.0, "FocalPlaneXResolution": 25400.0}, None),  # at which size is not known
         ((1000, 750), {"FocalLength": 5.0}, None),
+        ((1000, 750), TAKEN | {"FocalLengthIn35mmFilm": "?"}, 1250),  # tags of a wrong type are ignored
+        ((1000, 750), {"FocalLengthIn35mmFilm": 43, "PixelXDimension": (1000, 1000)}, 1250),
+        ((1000, 750), TAKEN | {"PixelXDimension": (4000, 4000)}, None),
         ((1000, 750), {}, None),
     ],
 )
 def test_the_focal_length_is_that_of_the_photo_as_it_is(
-    size: tuple[int, int], tags: dict[str, float], focal: float | None, tmp_path: Path
+    size: tuple[int, int], tags: dict[str, object], focal: float | None, tmp_path: Path
 ) -> None:
     photo = photo_with(tmp_path / "a.jpg", size, **tags)
     assert focal_from_exif(photo) == (None if focal is None else pytest.approx(focal, rel=0.01))
