@@ -16,6 +16,7 @@ from typing import Any, NoReturn
 from docstring_parser import parse as parse_docstring
 from jsonargparse import ArgumentParser
 
+NEGATIVE_NUMBER = re.compile(r"-(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$", re.IGNORECASE)
 OVERRIDES = "overrides"  # name of the parameter that receives the options `--data.NAME=VALUE`
 RENAMED = {f"{part}_pairs": f"{part}_problems" for part in ("train", "val", "test")} | {
     "pairs_factor": "matches_factor",
@@ -125,6 +126,8 @@ def command_parser(name: str, command: Callable[..., None]) -> OneLineParser:
     parser = OneLineParser(
         prog=f"bpnp {name}", description=description, allow_abbrev=False, formatter_class=HelpFormatter
     )
+    # argparse of Python 3.11 takes -2e-05 for an option; it has no public setting for this.
+    parser._negative_number_matcher = NEGATIVE_NUMBER
     hints = typing.get_type_hints(command)
     for parameter in inspect.signature(command).parameters.values():
         if parameter.name == OVERRIDES:
