@@ -163,7 +163,7 @@ def _camera(text: str, map: Path, scene: "SceneMap") -> Any:
     path = Path(text)
     if text == UNKNOWN:
         return UNKNOWN
-    if path.is_file() and path.stem == COLMAP_CAMERAS:
+    if path.is_file() and path.name in COLMAP_CAMERAS:
         path = path.parent
     if text in ("map", "MAP") or (text and path.is_dir()):
         return scene if not path.is_dir() or path.resolve() == map.resolve() else SceneMap.from_colmap(path)

@@ -15,7 +15,7 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]
 ARRAYS = (".npy", ".csv", ".txt", ".xyz")
-COLMAP_POINTS, COLMAP_CAMERAS = "points3D", "cameras"  # files of a COLMAP model, .bin or .txt
+COLMAP_POINTS, COLMAP_CAMERAS = ("points3D.bin", "points3D.txt"), ("cameras.bin", "cameras.txt")
 NORMAL, LABEL = ("nx", "ny", "nz"), "label"
 # Columns after x, y, z in a file that does not name them, by the number of columns.
 COLUMNS: dict[int, tuple[str, ...]] = {3: (), 4: (LABEL,), 6: NORMAL, 7: (*NORMAL, LABEL)}
@@ -59,7 +59,7 @@ def read_points3d(
             a decimal mark if the separator is a semicolon or a tab). The first line may name the columns; otherwise
             they are x, y, z, then nx, ny, nz or label or both. # starts a comment.
             .ply or a mesh (.obj, .off, .stl, .glb): its distinct vertices, or `surface` points drawn from its
-            triangles. A COLMAP model: its folder or its points3D.
+            triangles. A COLMAP model: its folder, or its points3D.bin or points3D.txt.
             `-` or a pipe with the content of a .npy or of a text.
         surface: Number of points to draw from a mesh. Default: its vertices.
         seed: Random seed of these.
@@ -71,7 +71,7 @@ def read_points3d(
     Raises:
         ValueError: The file cannot be read. The message names it and what is wrong in it.
     """
-    if path.is_dir() or path.stem == COLMAP_POINTS:
+    if path.is_dir() or path.name in COLMAP_POINTS:
         from bpnp.datamodules.colmap.model_files import read_records
 
         return read_records(path if path.is_dir() else path.parent).points3d, None, None
@@ -96,14 +96,14 @@ def read_camera(text: str, image: str | None = None) -> Any:
     Args:
         text: A file with a 3x3 matrix; a COLMAP camera model with its parameters, "PINHOLE 500 500 320 240" or
             "PINHOLE,640,480,500,500,320,240" (with width and height, as in cameras.txt); or a COLMAP model, its folder
-            or its file of cameras.
+            or its cameras.bin or cameras.txt.
         image: Name of the image of the COLMAP model whose camera is read. Default: the only camera of the model.
 
     Raises:
         ValueError: The text is something else.
     """
     path = Path(text)
-    if (text and path.is_dir()) or (path.stem == COLMAP_CAMERAS and path.is_file()):
+    if (text and path.is_dir()) or (path.name in COLMAP_CAMERAS and path.is_file()):
         return _camera_of(path, image)
     if image is not None:
         raise ValueError(f"--image needs a COLMAP model as --camera, which is {text!r}")

@@ -179,7 +179,7 @@ def _camera_of(text: str, photo: Path) -> "Camera":
     from bpnp.cameras import camera_from
     from bpnp.commands.point_files import COLMAP_CAMERAS, read_camera
 
-    of_model = Path(text).is_dir() or Path(text).stem == COLMAP_CAMERAS
+    of_model = Path(text).is_dir() or Path(text).name in COLMAP_CAMERAS
     return camera_from(read_camera(text, photo.name if of_model else None))
 
 

@@ -151,6 +151,22 @@ def test_the_camera_of_an_image_is_read_from_a_model_with_several(tmp_path: Path
         read_camera("PINHOLE,500,510,320,240", "a.jpg")
 
 
+def test_files_of_other_formats_with_the_names_of_colmap_are_read(tmp_path: Path) -> None:
+    """Beside a COLMAP model too, whose points and camera are others."""
+    (tmp_path / "cameras.txt").write_text("1 SIMPLE_PINHOLE 640 480 500 320 240\n")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 1 1 a.jpg\n3 4 1\n")
+    (tmp_path / "points3D.txt").write_text("1 0 0 5 0 0 0 0 1 0\n")
+    np.save(tmp_path / "points3D.npy", POINTS)
+    trimesh.PointCloud(POINTS).export(tmp_path / "points3D.ply")
+    for name in ("points3D.npy", "points3D.ply"):
+        np.testing.assert_allclose(points_of(tmp_path / name), POINTS, atol=1e-6)
+    np.testing.assert_array_equal(points_of(tmp_path / "points3D.txt"), [[0, 0, 5]])
+    matrix = np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]])
+    (tmp_path / "cameras.csv").write_text(rows(matrix, ","))
+    np.testing.assert_array_equal(read_camera(str(tmp_path / "cameras.csv")), matrix)
+    assert read_camera(str(tmp_path / "cameras.txt"))[0] == "SIMPLE_PINHOLE"
+
+
 @pytest.mark.parametrize("text", ["k.npy", "PINHOLE", "500,500,320,240", "PINHOLE,wide", ""])
 def test_a_text_that_is_no_camera_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="is neither a file with a 3x3 matrix nor MODEL,PARAMETERS"):
