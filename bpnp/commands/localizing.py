@@ -94,11 +94,13 @@ def localize(
     positive("time_limit", time_limit)
     if focal_error is not None and not 0 < focal_error < 1:
         raise ValueError(f"`focal_error` is {focal_error}; it is a fraction of the focal length, above 0 and below 1")
-    files, scene = photo_files(photos, besides=output), SceneMap.from_colmap(map)
+    files = photo_files(photos, besides=output)
+    map_content = content_of_map(map)  # before it is read: if it changes afterwards, the next run finds another map
+    scene = SceneMap.from_colmap(map)
     attempts, lens = _attempts(cluster), None if camera is None else _camera(camera, map, scene)
     tried = None if views is None else read_views(views)
     with lock_folder(output), count_items("localizing", len(files), quiet=quiet) as done:
-        folder = SolutionFolder(output, content_of_map(map))
+        folder = SolutionFolder(output, map_content)
         outcome = localize_photos(
             scene,
             files,

@@ -30,7 +30,7 @@ class Index(NamedTuple):
     cones: Cones
 
 
-def _stamp(folder: Path) -> str:
+def model_stamp(folder: Path) -> str:
     """Return a fingerprint of the files of a model and of the constants of its index."""
     files = [folder / f"{name}.{suffix}" for name in FILES for suffix in ("bin", "txt")]
     model = file_states(file for file in files if file.is_file())
@@ -42,14 +42,15 @@ def index_file(folder: Path) -> Path:
     return cache_folder() / "maps" / fingerprint(str(folder.resolve())) / "index.npz"
 
 
-def make_index(folder: Path, compute: Callable[[], Index]) -> Index:
+def make_index(folder: Path, stamp: str, compute: Callable[[], Index]) -> Index:
     """Return the index of the model in a folder, and write it to the cache folder.
 
-    One process computes it; others that open the same model wait. Nothing is written if the cache folder is not
-    writable.
+    One process computes it; others that open the same model wait. Nothing is written if the model has changed since it
+    was read, or if the cache folder is not writable.
 
     Args:
         folder: Folder of the COLMAP model.
+        stamp: `model_stamp` of the folder from before the model was read.
         compute: Computes the index from the model.
     """
     with ExitStack() as stack:
@@ -60,16 +61,17 @@ def make_index(folder: Path, compute: Callable[[], Index]) -> Index:
         index = read_index(folder)
         if index is None:
             index = compute()
-            _write_index(folder, index)
+            if stamp == model_stamp(folder):
+                _write_index(folder, stamp, index)
         return index
 
 
-def _write_index(folder: Path, index: Index) -> None:
+def _write_index(folder: Path, stamp: str, index: Index) -> None:
     """Write the index of the model in a folder atomically; write nothing if that fails, such as on a full disk."""
     views = index.views
     cameras = list({id(view.camera): view.camera for view in views}.values())
     number = {id(camera): k for k, camera in enumerate(cameras)}
-    texts = {"stamp": _stamp(folder), "cameras": json.dumps([camera_to_json(camera) for camera in cameras])}
+    texts = {"stamp": stamp, "cameras": json.dumps([camera_to_json(camera) for camera in cameras])}
     texts["names"] = json.dumps([view.name for view in views])
     arrays: dict[str, NDArray[Any]] = {name: np.frombuffer(text.encode(), np.uint8) for name, text in texts.items()}
     arrays |= index.pictures._asdict() | index.cones._asdict()
@@ -95,7 +97,7 @@ def read_index(folder: Path) -> Index | None:
     """Return the index of the model in a folder; None if there is none, or if its files or constants have changed."""
     try:
         with index_file(folder).open("rb") as opened, np.load(opened) as file:
-            if file["stamp"].tobytes().decode() != _stamp(folder):
+            if file["stamp"].tobytes().decode() != model_stamp(folder):
                 return None
             arrays = dict(file)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):

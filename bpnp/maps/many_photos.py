@@ -238,8 +238,9 @@ def content_of(*files: Path) -> str:
 
 
 def content_of_map(folder: Path) -> str:
-    """Return the sizes and a hash of the content of the files of a COLMAP model."""
-    return content_of(*(folder / f"{name}.{model_format(folder)}" for name in FILES))
+    """Return the sizes and a hash of the content of the files of a COLMAP model; nothing for an incomplete one."""
+    suffix = model_format(folder)
+    return "" if suffix is None else content_of(*(folder / f"{name}.{suffix}" for name in FILES))
 
 
 @dataclass

@@ -82,29 +82,36 @@ class SceneMap(ViewedPoints):
             ColmapError: The model cannot be read, or no view sees a point. It is a ValueError.
         """
         if not isinstance(path, (str, Path)):
-            with TemporaryDirectory() as folder:
-                path.write_binary(folder)
-                return cls.from_colmap(folder)
-        stored = index.read_index(Path(path))
+            with TemporaryDirectory() as temporary:
+                path.write_binary(temporary)
+                return cls._read_colmap(Path(temporary))
+        folder = Path(path)
+        stored = index.read_index(folder)
         if stored is not None:
             return cls._from_index(stored)
-        model = read_reconstruction(path, keypoints=False)
+        stamp = index.model_stamp(folder)
+        scene = cls._read_colmap(folder)
+        if len(scene.points3d) < MAPS.indexed:
+            return scene
+        parts = scene.points3d, scene.point_ids, scene.track_lengths, scene.views
+        return cls._from_index(
+            index.make_index(folder, stamp, lambda: index.Index(*parts, scene.pictures, scene.cones)),
+        )
+
+    @classmethod
+    def _read_colmap(cls, folder: Path) -> "SceneMap":
+        """Read a map from the files of a COLMAP model, without an index."""
+        model = read_reconstruction(folder, keypoints=False)
         views = tuple(
             View(image.name, image.camera, image.rotation, image.translation, image.observed.astype(np.int32))
             for image in model.images
         )
         if not any(len(view.points) for view in views):
             raise ColmapError(
-                f"no view of {path} sees a point; it has {len(views)} views and {len(model.point_ids)} points. Give a "
-                "model with registered images"
+                f"no view of {folder} sees a point; it has {len(views)} views and {len(model.point_ids)} points. Give "
+                "a model with registered images"
             )
-        scene = cls(model.points3d, model.point_ids, np.zeros(len(model.point_ids), np.int32), views).seen_by(1)
-        if len(scene.points3d) < MAPS.indexed:
-            return scene
-        parts = scene.points3d, scene.point_ids, scene.track_lengths, scene.views
-        return cls._from_index(
-            index.make_index(Path(path), lambda: index.Index(*parts, scene.pictures, scene.cones)),
-        )
+        return cls(model.points3d, model.point_ids, np.zeros(len(model.point_ids), np.int32), views).seen_by(1)
 
     @classmethod
     def _from_index(cls, stored: index.Index) -> "SceneMap":

@@ -6,6 +6,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -13,6 +14,7 @@ import pytest
 from planted_model import OPENCV, Planted, plant_model
 
 from bpnp import SceneMap
+from bpnp.datamodules.colmap.reconstruction import read_reconstruction
 from bpnp.maps import index, scene_map
 from bpnp.maps.many_photos import read_views
 from bpnp.search.config import MAPS
@@ -77,13 +79,36 @@ def test_a_large_map_is_indexed_once(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert len(SceneMap.from_colmap(folder).views) == 3
 
 
+def test_a_model_that_is_replaced_while_it_is_read_is_read_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("BPNP_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(scene_map, "MAPS", replace(MAPS, indexed=10))
+    folder = tmp_path / "model"
+    plant_model(folder, images=4, points=60, seen=25)
+
+    def read_and_replace(*arguments: Any, **options: Any) -> Any:
+        model = read_reconstruction(*arguments, **options)
+        plant_model(folder, images=3, points=50, seen=20)
+        return model
+
+    with monkeypatch.context() as replaced:
+        replaced.setattr(scene_map, "read_reconstruction", read_and_replace)
+        assert len(SceneMap.from_colmap(folder).views) == 4
+    assert len(SceneMap.from_colmap(folder).views) == 3
+    with monkeypatch.context() as without_model:
+        without_model.setattr(scene_map, "read_reconstruction", None)
+        assert len(SceneMap.from_colmap(folder).views) == 3
+
+
 def test_one_of_several_processes_computes_the_index_of_a_large_map(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The other waits, and reads what the first one wrote."""
     monkeypatch.setenv("BPNP_CACHE", str(tmp_path / "cache"))
-    plant_model(tmp_path / "model", images=4, points=60, seen=25)
-    scene = SceneMap.from_colmap(tmp_path / "model")
+    model = tmp_path / "model"
+    plant_model(model, images=4, points=60, seen=25)
+    scene, stamp = SceneMap.from_colmap(model), index.model_stamp(model)
     parts = scene.points3d, scene.point_ids, scene.track_lengths, scene.views, scene.pictures, scene.cones
     begun, computed = threading.Event(), list[int]()
 
@@ -94,9 +119,9 @@ def test_one_of_several_processes_computes_the_index_of_a_large_map(
         return index.Index(*parts)
 
     with ThreadPoolExecutor() as pool:  # a lock of a file holds threads apart as it does processes
-        first = pool.submit(index.make_index, tmp_path / "model", lambda: compute(1))
+        first = pool.submit(index.make_index, model, stamp, lambda: compute(1))
         begun.wait()
-        second = pool.submit(index.make_index, tmp_path / "model", lambda: compute(2))
+        second = pool.submit(index.make_index, model, stamp, lambda: compute(2))
         np.testing.assert_array_equal(second.result().points3d, first.result().points3d)
     assert computed == [1]
 
@@ -146,9 +171,15 @@ def test_a_real_map_is_that_of_pycolmap(shared_data: Path) -> None:
         assert set(scene.point_ids[view.points].tolist()) == seen
 
 
-def test_a_reconstruction_of_pycolmap_is_a_map(tmp_path: Path) -> None:
+def test_a_reconstruction_of_pycolmap_is_a_map_without_an_index(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("BPNP_CACHE", str(tmp_path / "cache"))
     plant_model(tmp_path, images=4, points=60, seen=25)
-    expected, scene = SceneMap.from_colmap(tmp_path), SceneMap.from_colmap(pycolmap.Reconstruction(str(tmp_path)))
+    expected = SceneMap.from_colmap(tmp_path)
+    monkeypatch.setattr(scene_map, "MAPS", replace(MAPS, indexed=10))
+    scene = SceneMap.from_colmap(pycolmap.Reconstruction(str(tmp_path)))
+    assert not (tmp_path / "cache").exists()
     np.testing.assert_array_equal(scene.points3d, expected.points3d)
     np.testing.assert_array_equal(scene.point_ids, expected.point_ids)
     for view, other in zip(scene.views, expected.views, strict=True):
