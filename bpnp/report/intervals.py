@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 LEVEL = 0.95
 DRAWS = 2000
-FINITE = 1e12  # replaces infinity, so that interpolation is defined
+# Replaces infinity, so that interpolation is defined; what is interpolated or averaged with it is infinite.
+LARGE, LARGEST = 1e200, 1e300
 
 MEDIANS = (
     Column("rotation_q2_deg", "rotation\nmedian"),
@@ -40,9 +41,9 @@ class Interval:
     """Statistic and its 95 % percentile bootstrap interval.
 
     Attributes:
-        value: Statistic of the problems.
-        low: Lower end.
-        high: Upper end.
+        value: Statistic of the problems; NaN for the difference of two infinite ones.
+        low: Lower end, which may be -infinity.
+        high: Upper end, which may be infinity.
     """
 
     value: float
@@ -74,10 +75,12 @@ def paired_difference(
 ) -> Interval:
     """Return statistic(second) - statistic(first) with its bootstrap interval.
 
-    Each draw takes the same problems for both. The difference is significant if the interval excludes zero.
+    Each draw takes the same problems for both. The difference is significant if the interval excludes zero. The
+    difference of two infinite statistics is unknown: the value is NaN, and such a draw widens the interval on both
+    sides.
 
     Args:
-        first: One number per problem (k,).
+        first: One number per problem (k,); infinity for a problem without a pose.
         second: Numbers of the same problems in the same order.
         statistic: Reduces the last axis. Default: median.
         seed: Seed of the draws.
@@ -90,7 +93,7 @@ def paired_difference(
             f"a paired difference needs values of the same problems; there are {len(first)} and {len(second)}"
         )
     (one, one_drawn), (other, other_drawn) = (_draw(values, statistic, seed) for values in (first, second))
-    return _interval(other - one, other_drawn - one_drawn)
+    return _interval(*_difference((other, other_drawn), (one, one_drawn)))
 
 
 def quantile(probability: float) -> Statistic:
@@ -112,15 +115,32 @@ def _draw(values: NDArray[np.float64], statistic: Statistic, seed: int = 0) -> t
     array = np.asarray(values, np.float64)
     if not len(array) or np.isnan(array).any():
         raise ValueError(f"a bootstrap needs numbers; there are {len(array)}, {int(np.isnan(array).sum())} of them NaN")
-    clean = np.clip(array, -FINITE, FINITE)
-    draws = np.random.default_rng(seed).integers(0, len(clean), (DRAWS, len(clean)))
-    return float(statistic(clean)), statistic(clean[draws])
+    draws = np.random.default_rng(seed).integers(0, len(array), (DRAWS, len(array)))
+    value, drawn = (_with_infinity(statistic, values) for values in (array, array[draws]))
+    return float(value), drawn
+
+
+def _with_infinity(statistic: Statistic, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a statistic of numbers with infinite ones, which interpolates between them or averages them."""
+    found = np.asarray(statistic(np.clip(values, -LARGEST, LARGEST)))
+    return np.where(np.abs(found) < LARGE, found, np.copysign(np.inf, found))
+
+
+def _difference(
+    one: tuple[float, NDArray[np.float64]], other: tuple[float, NDArray[np.float64]]
+) -> tuple[float, NDArray[np.float64]]:
+    """Return the difference of two statistics and of their draws, NaN where both are infinite."""
+    with np.errstate(invalid="ignore"):
+        return one[0] - other[0], one[1] - other[1]
 
 
 def _interval(value: float, drawn: NDArray[np.float64]) -> Interval:
-    low, high = np.quantile(drawn, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
-    numbers = (float(x) if abs(x) < FINITE / 2 else float(np.sign(x) * np.inf) for x in (value, low, high))
-    return Interval(*numbers)
+    unknown = np.isnan(drawn)
+    low, high = (
+        float(_with_infinity(quantile(probability), np.where(unknown, end, drawn)))
+        for probability, end in (((1 - LEVEL) / 2, -np.inf), ((1 + LEVEL) / 2, np.inf))
+    )
+    return Interval(value, low, high)
 
 
 @dataclass(frozen=True)
@@ -260,7 +280,8 @@ class Sample:
         """Return the difference with its interval, None if not the same problems have a number."""
         if not np.array_equal(self.known, other.known):
             return None
-        return replace(self, value=self.value - other.value, drawn=self.drawn - other.drawn).interval()
+        value, drawn = _difference((self.value, self.drawn), (other.value, other.drawn))
+        return replace(self, value=value, drawn=drawn).interval()
 
 
 def baseline_of(line: Line, lines: Sequence[Line]) -> Line | None:
@@ -301,6 +322,9 @@ def _shown(interval: Interval | None, column: Column, *, signed: bool) -> str:
     if interval is None:
         return cell(column, {})
     value, low, high = (
-        f"{'+' if signed and number > 0 else ''}{cell(column, {column.key: number})}" for number in astuple(interval)
+        cell(column, {})
+        if math.isnan(number)
+        else f"{'+' if signed and number > 0 else ''}{cell(column, {column.key: number})}"
+        for number in astuple(interval)
     )
     return f"{value}\n{low} to {high}"
