@@ -48,7 +48,7 @@ class Region:
         points3d: (k, 3) scene points.
         point_ids: (k,) ids of the points in the COLMAP model.
         cones: Cones of directions from which the points are visible.
-        distance: Median distance from the view to its own points, scene units.
+        distance: Median distance from the view to its own points, scene units; NaN if it has no points.
     """
 
     view: View
@@ -233,7 +233,7 @@ class ViewedPoints:
             points: (k,) indices of points; None for all points of the map.
         """
         in_camera = self.points3d[view.points] @ view.rotation.T + view.translation
-        distance = float(np.median(np.linalg.norm(in_camera, axis=-1)))
+        distance = float(np.median(np.linalg.norm(in_camera, axis=-1))) if len(in_camera) else np.nan
         whole = Region(view, self.points3d, self.point_ids, self.cones, distance)
         return whole if points is None else whole.part(points)
 
