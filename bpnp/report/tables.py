@@ -25,7 +25,10 @@ CAPTION = (
 PAPERS: dict[str, Paper] = {"MeshDataModule": "modelnet40", "ColmapDataModule": "megadepth"}  # by data module
 JOINT_LIMITS: dict[Paper, tuple[float, float]] = {"modelnet40": (15.0, 0.5), "megadepth": (10.0, 1.0)}
 # Options of the data that do not change the problems of a test.
-LOADING = {"batch_size", "eval_batch_size", "max_cells", "num_workers", "max_points", "fresh_subsets", "val_fraction"}
+LOADING = {
+    "batch_size", "cache_dir", "eval_batch_size", "fresh_subsets", "fresh_views", "max_cells", "max_points",
+    "num_workers", "train_outliers", "train_problems", "train_shapes", "val_fraction", "val_problems", "val_shapes",
+}  # fmt: skip
 
 
 def read_runs(paths: Sequence[Path | str]) -> dict[str, Results]:

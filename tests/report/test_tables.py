@@ -74,6 +74,9 @@ def test_the_best_of_a_column_is_that_of_runs_on_the_same_problems(tmp_path: Pat
 
     same = {"a": run("a", 1.0, data=data(batch_size=2)), "b": run("b", 2.0, data=data(batch_size=4))}
     assert bold(results_table(same))[0][:3] == ["1.00"] * 3
+    counts = {f"{part}_{what}": 9 for part in ("train", "val") for what in ("problems", "shapes")}
+    training = data(**counts, train_outliers={"ratio": 1}, fresh_views=True, cache_dir="cache")
+    assert bold(results_table(same | {"b": run("e", 2.0, data=training)}))[0][:3] == ["1.00"] * 3
     other = same | {"c": run("c", 0.1, data=data(seed=1)), "d": run("d", 0.2, data=data(num_points=3))}
     shown = bold(results_table(other))
     assert [texts[:3] for texts in shown[:2]] == [["1.00"] * 3, shown[1][:3]]
