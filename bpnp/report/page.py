@@ -60,7 +60,8 @@ COLUMNS = {  # columns of the table of problems: head and hover text
 }
 PROBLEMS = 500  # number of problems whose points are on the page
 PHOTO_BYTES = 4_000_000  # text of the photos on the page
-DIGITS = 5  # significant digits of errors; for points and poses, relative to their extent
+DIGITS = 5  # significant digits of errors; for points and translations, relative to their extent
+ROTATION_DIGITS = 12  # decimals of a quaternion, which is multiplied by points that may be far from the origin
 ERRORS = ("rotation_error_deg", "translation_error", "centre_error", "reprojection_error_deg", "seconds")
 COUNTS = ("inliers", "m", "n", "matches", "iterations")
 
@@ -340,4 +341,4 @@ def _pose(pose: tuple[Array, Array] | None, decimals: int) -> list[float] | None
     if pose is None or not np.isfinite(np.c_[pose]).all():
         return None
     quaternion = Rotation.from_matrix(pose[0]).as_quat()
-    return [*np.round(quaternion, DIGITS).tolist(), *np.round(np.asarray(pose[1], float), decimals).tolist()]
+    return [*np.round(quaternion, ROTATION_DIGITS).tolist(), *np.round(np.asarray(pose[1], float), decimals).tolist()]

@@ -50,6 +50,21 @@ def test_the_page_has_the_points_and_poses_of_every_problem() -> None:
         assert line["poses"]["a"]["pnp"] is None
 
 
+def test_poses_of_points_far_from_the_origin_project_them() -> None:
+    """Such as the coordinates of a national grid, in metres."""
+    original, shift = planted(1)[0], np.array([5e5, 5.2e6, 100.0])
+    rotation, translation = original.estimates["ransac"]
+    moved = replace(
+        original,
+        points3d=original.points3d + shift,
+        estimates={"ransac": (rotation, translation - rotation @ shift)},
+    )
+    _, (line,) = read(page_points({"a": results([moved])}, {"a": [moved]}))
+    *quaternion, x, y, z = line["poses"]["a"]["ransac"]
+    projected = seen(np.array(line["points3d"]), Rotation.from_quat(quaternion).as_matrix(), np.array([x, y, z]))
+    np.testing.assert_allclose(projected[line["match3d"]], line["points2d"], atol=1e-4)
+
+
 def test_the_page_keeps_the_problems_with_the_largest_errors() -> None:
     error = np.random.default_rng(0).random(PROBLEMS + 50)
     problems = [replace(own, error=float(error[own.index])) for own in planted(len(error))]
