@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
@@ -107,6 +108,7 @@ def view(
     """
     from bpnp.report.figures import plot_photo, plot_problem
     from bpnp.report.images import read_photo, save_figure
+    from bpnp.report.points import read_points
     from bpnp.report.tables import named_runs
 
     names = problems or []
@@ -123,11 +125,13 @@ def view(
     source = None
     if run.is_file():
         drawn, folder = [_solution(run)], run.absolute().parent
+        file_names = {0: run.stem}
     else:
         folders = named_runs([run])
         first = next(iter(folders.values()))
         folder = first if len(folders) == 1 else run
-        drawn = read_problems(first, names)
+        tested = read_points(first)
+        drawn, file_names = choose_problems(tested, names, first), picture_names(tested)
         if len(folders) > 1:
             drawn = merge_estimates(drawn, folders)
         if photos is not None:
@@ -136,7 +140,6 @@ def view(
 
             source = photo_finder(photos, side=VIEW_SIDE)(read_results(first), drawn)
     for problem in drawn:
-        name = run.stem if run.is_file() else re.sub(r"[^A-Za-z0-9._-]+", "_", problem.id) or str(problem.index)
         estimates = None if estimate is None else [estimate]
         if source is not None:
             found = source(problem)
@@ -148,7 +151,7 @@ def view(
         else:
             with_camera = replace(problem, camera=_camera_of(camera, photo))
             figure = plot_photo(with_camera, read_photo(photo), estimates=estimates)
-        say(f"wrote {save_figure(figure, output or folder / 'views' / f'{name}.png')}")
+        say(f"wrote {save_figure(figure, output or folder / 'views' / f'{file_names[problem.index]}.png')}")
 
 
 def merge_estimates(problems: "Sequence[ProblemPoints]", folders: Mapping[str, Path]) -> "list[ProblemPoints]":
@@ -196,31 +199,44 @@ def _solution(path: Path) -> "ProblemPoints":
         raise ValueError(f"{path}: {error}{there}") from error
 
 
-def read_problems(folder: Path, names: Sequence[str]) -> list["ProblemPoints"]:
-    """Read the problems with these names, or parts of names.
+def picture_names(problems: "Sequence[ProblemPoints]") -> dict[int, str]:
+    """Return a file name without suffix for each problem of a test, by its index.
+
+    It is the name of the problem with underscores for what a file name cannot hold, and with the index if several
+    problems would have the same file name.
 
     Args:
-        folder: Results folder.
+        problems: All problems of the test.
+    """
+    plain = {problem.index: re.sub(r"[^\w.-]+", "_", problem.id) for problem in problems}
+    counts = Counter(plain.values())
+    return {index: name if counts[name] == 1 and name else f"{name}-{index}" for index, name in plain.items()}
+
+
+def choose_problems(problems: "Sequence[ProblemPoints]", names: Sequence[str], folder: Path) -> "list[ProblemPoints]":
+    """Return the problems with these names, or parts of names.
+
+    Args:
+        problems: Problems of a test.
         names: Names. Empty: the worst problem.
+        folder: Results folder, for messages.
 
     Raises:
-        ValueError: A name is that of no problem, or part of several names.
+        ValueError: There are no problems, or a name is that of no problem, or part of several names.
     """
-    from bpnp.report.points import read_points
-
-    problems = {problem.id: problem for problem in read_points(folder)}
     if not problems:
         raise ValueError(f"{folder} has no points.npz; run `bpnp test` again, which writes it")
     if not names:
-        return [max(problems.values(), key=lambda problem: problem.error)]
+        return [max(problems, key=lambda problem: problem.error)]
+    by_name = {problem.id: problem for problem in problems}
     chosen = []
     for name in names:
-        alike = [id for id in problems if id == name] or [id for id in problems if name in id]
+        alike = [id for id in by_name if id == name] or [id for id in by_name if name in id]
         if len(alike) != 1:
-            some = ", ".join((alike or list(problems))[:20])
+            some = ", ".join((alike or list(by_name))[:20])
             count = f"{len(alike)} problems" if alike else "no problem"
             raise ValueError(f"{name!r} is in the names of {count} in {folder}; give one of {some}")
-        chosen.append(problems[alike[0]])
+        chosen.append(by_name[alike[0]])
     return chosen
 
 
@@ -273,7 +289,7 @@ def table(
         limit: number of problems, a fixed random choice; all by default.
         rho: ratios of outliers to matches, on both sides; a table and a plot over these.
         seeds: seeds of the data; the table has the mean over these and its standard deviation.
-        time_limit: seconds for each problem, for methods that have a limit.
+        time_limit: seconds for each problem, for methods that have a limit; inf for no limit.
         output: folder of the results.
         paper: published rows to add.
     """
@@ -290,10 +306,12 @@ def table(
         table_frame,
         table_of_rows,
     )  # fmt: skip
+    from bpnp.search.arguments import positive
     from bpnp.training.comparison import MethodTest, parse_methods, read_data
 
     at_least(1, limit=limit)
-    at_least(0, time_limit=time_limit, rho=min(rho, default=None) if rho else None)
+    at_least(0, rho=min(rho, default=None) if rho else None)
+    positive("time_limit", time_limit)
     chosen = parse_methods(methods, time_limit=time_limit)
     recipe = Path(packaged_config(data))
     tests: dict[tuple[float | None, str], list[MethodTest]] = {}  # by outlier ratio and method, one for each seed

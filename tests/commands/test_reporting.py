@@ -45,5 +45,11 @@ def test_every_problem_of_a_test_can_be_viewed_by_name(tmp_path: Path, fails: Ca
     main(["view", str(tmp_path), "scene/0004", "0007"])
     assert {path.name for path in (tmp_path / "test" / "views").iterdir()} == {"scene_0004.png", "scene_0007.png"}
     assert "give one of scene/000" in fails("view", str(tmp_path), "scene")
-    several = ["view", str(tmp_path), "scene/0004", "0007", "--output", "x.png"]
+    (tmp_path / "test" / "points.npz").unlink()
+    write_points(tmp_path / "test", [thin(drawn_problem(i, name)) for i, name in enumerate(("a/b", "a b", "größe"))])
+    for name in ("a/b", "a b", "größe"):
+        main(["view", str(tmp_path), name])
+    written = {path.name for path in (tmp_path / "test" / "views").iterdir()}
+    assert written >= {"a_b-0.png", "a_b-1.png", "größe.png"}
+    several = ["view", str(tmp_path), "a/b", "a b", "--output", "x.png"]
     assert "--output takes one problem, and 2 are given" in fails(*several)

@@ -158,6 +158,8 @@ def test_a_method_that_was_interrupted_starts_again(recipes: list[str], tmp_path
 def test_a_limit_of_time_reaches_the_methods(recipes: list[str], tmp_path: Path) -> None:
     main(["table", recipes[1], "--methods", "search", recipes[-1], "--limit=1", "--time_limit=1e-6"])
     assert not read_results(tmp_path / "out" / "search").rows[0].found
+    main(["table", recipes[1], *recipes[2:4], f"--output={tmp_path}/long", "--limit=1", "--time_limit", "inf"])
+    assert read_results(tmp_path / "long" / "blind").settings["method"]["time_limit"] == "inf"
 
 
 def test_an_outlier_sweep_adds_points_and_draws_its_curves(recipes: list[str], tmp_path: Path) -> None:
