@@ -1,5 +1,8 @@
 """Rank of views: planted locations with clumped points, and photos near one of them."""
 
+import warnings
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -39,6 +42,14 @@ def photo(scene: SceneMap, k: int, seed: int, turned_deg: float = 6.0) -> Array:
     seen = camera[:, :2] / camera[:, 2:]
     seen = seen[in_image(seen)]
     return np.concatenate([seen, rng.uniform(-0.6, 0.6, seen.shape)])
+
+
+def test_a_view_without_points_has_no_distance_and_gives_no_warning() -> None:
+    scene = city(0)
+    empty = replace(scene.views[0], points=scene.views[0].points[:0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert np.isnan(scene.region(empty).distance)
 
 
 def test_the_nearest_view_of_a_photo_is_among_the_first() -> None:
