@@ -140,7 +140,8 @@ def main() -> None:
     chosen = parser.parse_args()
     if not chosen.check:
         write(chosen.output, measure(chosen.seed, chosen.limit, chosen.trials))
-    fill_pages(PAGES, "completeness", {"data": table(json.loads(chosen.output.read_text()))}, check=chosen.check)
+    tables = {"data": table(json.loads(chosen.output.read_text()))}
+    fill_pages(PAGES, "completeness", tables, check=chosen.check, published=chosen.output.resolve() == FILE.resolve())
 
 
 if __name__ == "__main__":

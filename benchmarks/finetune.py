@@ -184,4 +184,5 @@ def main() -> None:
         torch.set_num_threads(1)
         if rows := measure(chosen, record):
             save_figure(recall_picture(rows), chosen.picture)
-    fill_pages(PAGES, "finetune", {"data": table(record)}, check=chosen.check)
+    published = chosen.output.resolve() == FILE.resolve()
+    fill_pages(PAGES, "finetune", {"data": table(record)}, check=chosen.check, published=published)

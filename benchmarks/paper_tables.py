@@ -14,6 +14,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -28,7 +29,7 @@ from lightning import LightningDataModule
 from record import DATA, ROOT, measured_today, write_json
 from torch import nn
 
-from bpnp.files import fingerprint, write_atomically
+from bpnp.files import fingerprint, write_atomically, write_text
 from bpnp.layers import RansacPnP, WeightedPnP
 from bpnp.models import BPnPNet, Search, TrainedNet
 from bpnp.models.evaluation import round_widths
@@ -216,8 +217,9 @@ def solve_problems(
 ) -> list[ProblemRow]:
     """Test a solver on the first `limit` problems of a fixed random order, each by itself, and return the rows.
 
-    Rows are appended to a file as they come. Those of the same `identity` and the same problems that are there already
-    are not measured again; a file of others is kept as *.previous.jsonl. Seconds are of one thread's CPU time. Without
+    Rows are appended to a file as they come, a line for each problem, below a line with commit, date and processor.
+    Those of the same `identity` and the same problems that are there already are not measured again; a file of others
+    is kept as *.previous.jsonl. Seconds are of one thread's CPU time. Without
     `solve`, nothing is measured or moved, and there are no rows unless the file has all of them.
     """
     data.setup("test")
@@ -225,19 +227,23 @@ def solve_problems(
     order = problem_order(len(problems))[:limit]
     drawn = fingerprint(problems.problem(order[0]).points2d.tolist()) if order else ""
     head = {"identity": dict(identity), "problems": drawn}
-    lines = file.read_text().splitlines() if file.is_file() else []
-    found = json.loads(lines[0]) if lines else {}
+    lines = read_lines(file)
+    found = lines[0] if lines else {}
     same = all(found.get(name) == value for name, value in head.items())
-    rows = [ProblemRow(**json.loads(line)) for line in lines[1:]] if same else []
+    rows = [ProblemRow(**row) for line in lines[1:] for row in rows_of_line(line)] if same else []
     missing = [i for i in order if i not in {row.index for row in rows}]
     if not order or (missing and not solve):
         return []
+    now = {"measured": measured_today()}
     if not same:
         if lines:
             previous = file.replace(file.with_suffix(".previous.jsonl"))
             print(f"{previous} has other weights, settings or problems; measured again", flush=True)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(json.dumps(head | {"measured": measured_today()}, sort_keys=True) + "\n")
+        lines = [head | now]
+    elif missing and measurements(lines)[-1:] != [now["measured"]]:
+        lines.append(now)
+    if missing or not same:  # without the incomplete end of a run that was stopped
+        write_text(file, "".join(f"{json.dumps(line, sort_keys=True)}\n" for line in lines))
     solver = build() if missing else nn.Identity()
     with file.open("a") as out:
         for i in missing:
@@ -248,19 +254,44 @@ def solve_problems(
             wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
             prediction.seconds.update({name: value * cpu / wall for name, value in prediction.seconds.items()})
             new = rows_from(prediction, batch, cpu)
-            out.write("".join(json.dumps(asdict(row)) + "\n" for row in new))
+            out.write(json.dumps([asdict(row) for row in new]) + "\n")
             out.flush()
             rows += new
     chosen = set(order)
     return sorted((row for row in rows if row.index in chosen), key=lambda row: row.index)
 
 
+def read_lines(file: Path) -> list[Any]:
+    """Return the complete lines of a file of `solve_problems`; none if there is no file.
+
+    The last line, or in a file with a line for each estimate the last problem, is left out if it is incomplete.
+    """
+    text = file.read_text() if file.is_file() else ""
+    lines = [json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")]
+    counts = Counter(row["index"] for line in lines for row in rows_of_line(line))
+    if lines and isinstance(lines[-1], dict) and (last := rows_of_line(lines[-1])):
+        index = last[0]["index"]
+        if counts[index] < max(counts.values()):
+            lines = [line for line in lines if index not in {row["index"] for row in rows_of_line(line)}]
+    return lines
+
+
+def rows_of_line(line: Any) -> list[dict[str, Any]]:
+    """Return the rows in a line of a file of `solve_problems`: those of a problem, or a single one in an older file."""
+    return line if isinstance(line, list) else [line] if "index" in line else []
+
+
+def measurements(lines: Iterable[Any]) -> list[dict[str, str]]:
+    """Return commit, date and processor of each part of a file of `solve_problems`."""
+    return [line["measured"] for line in lines if isinstance(line, dict) and "measured" in line]
+
+
 def provenance(file: Path) -> dict[str, str]:
-    """Return commit, date and processor of the rows that `solve_problems` wrote; the date alone for an older file."""
-    with file.open() as lines:
-        head = json.loads(lines.readline())
-    date = datetime.fromtimestamp(file.stat().st_mtime, UTC)
-    return head.get("measured", {"date": f"{date:%Y-%m-%d}"})
+    """Return commit, date and processor of the rows that `solve_problems` wrote, each several ones if they were
+    measured in several runs; the date alone for an older file."""
+    if parts := measurements(read_lines(file)):
+        return {key: ", ".join(dict.fromkeys(part[key] for part in parts)) for key in parts[0]}
+    return {"date": f"{datetime.fromtimestamp(file.stat().st_mtime, UTC):%Y-%m-%d}"}
 
 
 def branches(
@@ -381,7 +412,7 @@ def measure(
             if ("paper", label, estimate) in found
         }
         lowest = min((int(key.split("|")[1]) for key in record["rows"]), default=0)
-        if curves and name == table.sets[0] and options.seed == lowest and not options.quick:
+        if curves and name == table.sets[0] and options.seed == lowest and options.published:
             save_figure(recall_picture(curves, table), PICTURES / f"{table.name}.png")
     return record
 
@@ -543,7 +574,10 @@ def run(
     measured: Callable[[argparse.Namespace], dict[str, Any]],
     quick: Mapping[str, Any] = QUICK,
 ) -> None:
-    """Parse the options, measure, and fill the pages; a quick run, with the options `quick`, prints its tables."""
+    """Parse the options, measure, and fill the pages.
+
+    A quick run, with the options `quick`, and one with a record of its own print the tables instead, and draw nothing.
+    """
     chosen = parser.parse_args()
     if chosen.check:
         fill_pages(pages, table.name, markdown(table, read_record(chosen.output)), check=True)
@@ -555,11 +589,8 @@ def run(
         chosen.run = chosen.run.with_name(f"{chosen.run.name}-quick")
         chosen.output = chosen.run / "record.json"
         vars(chosen).update(quick)
-    found = markdown(table, measured(chosen))
-    if chosen.quick:
-        print("\n\n".join(f"{name}\n{text}" for name, text in found.items()))
-    else:
-        fill_pages(pages, table.name, found, check=False)
+    chosen.published = chosen.output.resolve() == parser.get_default("output").resolve()
+    fill_pages(pages, table.name, markdown(table, measured(chosen)), check=False, published=chosen.published)
 
 
 def figures(rows: Sequence[ProblemRow], recall: tuple[float, float]) -> dict[str, Any]:
@@ -644,7 +675,8 @@ def effect_text(label: str, found: Mapping[str, Any]) -> str:
     cells = [label, str(found["problems"])]
     for name in ERRORS:
         value, low, high = found[name]
-        cells.append(f"{value:+.2g} [{low:+.2g}, {high:+.2g}], better in {100 * found[f'{name} better']:.0f} %")
+        shown = "-" if np.isnan(value) else f"{value:+.2g}"  # of two infinite medians
+        cells.append(f"{shown} [{low:+.2g}, {high:+.2g}], better in {100 * found[f'{name} better']:.0f} %")
     value, low, high = (100 * x for x in found["recall"])
     cells.append(f"{value:+.0f} [{low:+.0f}, {high:+.0f}]")
     return f"| {' | '.join(cells)} |\n"
@@ -678,11 +710,17 @@ def fill_tables(text: str, marker: str, tables: Mapping[str, str]) -> str:
     )
 
 
-def fill_pages(pages: Iterable[Path], marker: str, tables: Mapping[str, str], *, check: bool) -> None:
+def fill_pages(
+    pages: Iterable[Path], marker: str, tables: Mapping[str, str], *, check: bool, published: bool = True
+) -> None:
     """Write the tables into the pages, or exit with status 1 if a page differs and `check` is set.
 
-    A table of a page that is not in `tables` is kept, and is an error with `check`.
+    A table of a page that is not in `tables` is kept, and is an error with `check`. Tables of a record that is not
+    published are printed instead.
     """
+    if not (published or check):
+        print("\n\n".join(f"{name}\n{text}" for name, text in tables.items()))
+        return
     stale = []
     for page in pages:
         text = page.read_text(encoding="utf-8")

@@ -118,4 +118,5 @@ def main() -> None:
         write_json(chosen.output, record)
         for name in DRAWN:
             shutil.copyfile(chosen.run / name, chosen.pictures / name)
-    fill_pages([PAGE], "tutorial", tables(record), check=chosen.check)
+    published = chosen.output.resolve() == FILE.resolve()
+    fill_pages([PAGE], "tutorial", tables(record), check=chosen.check, published=published)

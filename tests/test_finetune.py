@@ -24,6 +24,7 @@ def test_photos_and_shapes_are_tested_before_and_after_and_the_page_is_filled(
     page = tmp_path / "train.md"
     page.write_text("<!-- finetune: data -->\nold\n<!-- end of finetune -->\n")
     monkeypatch.setattr(finetune, "PAGES", (page,))
+    monkeypatch.setattr(finetune, "FILE", tmp_path / "record.json")
     monkeypatch.setattr(finetune, "TEST_SHAPES", 2)
     monkeypatch.setenv("BPNP_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(finetune, "STEPS", 2)

@@ -4,6 +4,7 @@ import json
 import shlex
 import shutil
 from argparse import Namespace
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -202,6 +203,53 @@ def test_a_test_that_was_stopped_measures_what_is_missing_and_another_solver_all
             assert file.with_suffix(".previous.jsonl").read_text() == before
 
 
+def test_a_file_that_was_cut_off_is_continued_and_names_every_commit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data, file = MeshDataModule(**SHAPES, cache_dir=str(tmp_path)), tmp_path / "known.jsonl"
+    monkeypatch.setattr("record.commit", lambda: "early")
+    with pytest.raises(KeyboardInterrupt):
+        solve_problems(file, lambda: Known(2), data, 5, {"steps": 1})
+    assert paper_tables.provenance(file)["commit"] == "early"
+    with file.open("a") as out:
+        out.write('[{"index": 3, "id": "sh')
+    monkeypatch.setattr("record.commit", lambda: "late")
+    rows = solve_problems(file, lambda: Known(3), data, 5, {"steps": 1})
+    assert len({r.index for r in rows}) == 5
+    measured = paper_tables.provenance(file)
+    assert measured["commit"] == "early, late"
+    assert "," not in measured["cpu"]
+    # A file of an older form has a line for each estimate; the second one of its third problem is missing.
+    head = json.loads(file.read_text().splitlines()[0])
+    found = [asdict(r) | {"estimate": name} for r in rows[:3] for name in ("pnp", "ransac")]
+    file.write_text("".join(json.dumps(line) + "\n" for line in [head, *found[:-1]]))
+    solver = Known(3)
+    assert len({r.index for r in solve_problems(file, lambda: solver, data, 5, {"steps": 1})}) == 5
+    assert solver.left == 0
+
+
+def test_a_record_of_its_own_leaves_the_pages_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page, text = tmp_path / "page.md", "<!-- table1: commands -->\nold\n<!-- end of table1 -->\n"
+    page.write_text(text)
+    published = []
+
+    def measured(options: Namespace) -> dict[str, Any]:
+        published.append(options.published)
+        return {"rows": {}, "effects": {}}
+
+    for name in ("other.json", "record.json"):
+        parser = paper_tables.options(
+            None, file=tmp_path / "record.json", run=tmp_path, sets=[], steps=1, pose_steps=1, epoch=1
+        )
+        monkeypatch.setattr("sys.argv", ["table1", "--output", str(tmp_path / name)])
+        paper_tables.run(table1.TABLE, parser, [page], measured)
+        assert (page.read_text() == text) == (name == "other.json")
+        assert ("commands\n" in capsys.readouterr().out) == (name == "other.json")
+    assert published == [False, True]
+
+
 def test_the_figures_are_those_of_the_rows() -> None:
     angles = [1.0, 2.0, 3.0, 40.0]
     rows = [
@@ -333,7 +381,7 @@ def test_a_row_keeps_its_provenance_and_is_compared_with_rows_that_are_there(
         return Known(10)
 
     def measure(*only: str, **other: int) -> dict[str, Any]:
-        options = {"seed": 0, "test_seed": 0, "only": only, "sets": ("toy",), "quick": True, "only_test": True}
+        options = {"seed": 0, "test_seed": 0, "only": only, "sets": ("toy",), "published": False, "only_test": True}
         chosen = Namespace(**(options | other), run=tmp_path, output=file)
         methods = [
             Method("paper", label, partial(known, label), 4, {"steps": 900}, {"seed": chosen.seed})

@@ -78,6 +78,7 @@ def ran(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     (tmp_path / "train.md").write_text(PAGE)
     (tmp_path / "pictures").mkdir()
     monkeypatch.setattr(tutorial, "PAGE", tmp_path / "train.md")
+    monkeypatch.setattr(tutorial, "FILE", tmp_path / "record.json")
     monkeypatch.setattr(tutorial.subprocess, "run", run)
     paths = {name: str(tmp_path / name) for name in ("run", "pictures")}
     monkeypatch.setattr(
