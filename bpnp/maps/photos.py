@@ -98,7 +98,7 @@ def focal_from_exif(photo: Path) -> float | None:
     if equivalent > 0:
         return float(equivalent * np.hypot(*size) / DIAGONAL_35MM)
     millimetres, resolution = _number_of(tags, FOCAL_LENGTH), _number_of(tags, RESOLUTION_X)
-    unit = MILLIMETRES.get(int(_number_of(tags, RESOLUTION_UNIT, 2)))
+    unit = MILLIMETRES.get(int(_number_of(tags, RESOLUTION_UNIT, 2.0)))
     if not (millimetres > 0 and resolution > 0 and unit and all(taken)):
         return None
     return millimetres * resolution / unit * max(size) / max(taken)

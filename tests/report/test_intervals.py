@@ -70,7 +70,7 @@ def test_what_is_interpolated_with_infinity_is_infinite() -> None:
     assert 0.9 < found.low <= 1
     assert bootstrap(np.r_[np.ones(9999), np.inf], fraction).value == np.inf
     assert paired_difference(np.full(4, 10.0), np.array([0.1, 0.1, np.inf, np.inf])).value == np.inf
-    assert paired_difference(np.full(2, 5.0), np.array([1.0, np.inf])) == Interval(np.inf, -4, np.inf)
+    assert paired_difference(np.full(2, 5.0), np.array([1.0, np.inf])) == Interval(np.inf, -4.0, np.inf)
 
 
 def test_a_difference_of_two_infinite_medians_is_unknown() -> None:
@@ -80,7 +80,7 @@ def test_a_difference_of_two_infinite_medians_is_unknown() -> None:
     assert (unknown.low, unknown.high) == (-np.inf, np.inf)
     # Both medians are finite, but infinite in more than 2.5 % of the draws.
     partly = paired_difference(np.r_[np.ones(6), np.full(5, np.inf)], np.r_[np.full(6, 3.0), np.full(5, np.inf)])
-    assert partly == Interval(2, -np.inf, np.inf)
+    assert partly == Interval(2.0, -np.inf, np.inf)
 
 
 def test_an_interval_of_nan_or_unequal_lists_is_refused() -> None:
