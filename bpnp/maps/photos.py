@@ -173,12 +173,13 @@ def detected_keypoints(photo: Path, *, most: int = MAPS.most_detected) -> Keypoi
     import cv2
 
     as_stored = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION  # as COLMAP reads photos
+    unreadable = f"OpenCV cannot read the photo {photo}; give a JPEG or PNG file"
     try:
         image = cv2.imread(str(photo), as_stored)
-    except cv2.error:  # over 2^30 pixels
-        image = None
+    except cv2.error as error:  # over 2^30 pixels
+        raise ValueError(unreadable) from error
     if image is None:
-        raise ValueError(f"OpenCV cannot read the photo {photo}; give a JPEG or PNG file")
+        raise ValueError(unreadable)
     points = cv2.SIFT.create(contrastThreshold=MAPS.contrast, enable_precise_upscale=True).detect(image)
     rows = np.array([(*point.pt, point.size) for point in points], np.float64).reshape(-1, 3)
     rows = rows[np.argsort(-rows[:, 2], kind="stable")[:most]]
