@@ -234,4 +234,4 @@ def test_a_difference_of_estimates_without_poses_is_a_dash() -> None:
         for row in rows_of({"pnp": 0.0, "ransac": 0.0})
     ]
     difference = texts({"run": results(lost)})["ransac", "pnp"]
-    assert difference[:2] == ["0\n0 to 0", "-\n-inf to inf"]
+    assert difference[:2] == ["0\n0 to 0", "-\n-inf to +inf"]
