@@ -3,6 +3,7 @@
 import ctypes
 import difflib
 import importlib.util
+import io
 import logging
 import os
 import re
@@ -49,6 +50,8 @@ def main(args: Sequence[str] | None = None) -> None:
     _quieten()
     if args is None:
         warnings.formatwarning = one_line_warning
+        if isinstance(sys.stdout, io.TextIOWrapper):
+            sys.stdout.reconfigure(errors="surrogateescape")  # prints file names that are not UTF-8 unchanged
     try:
         if args is None and arguments and arguments[0] in LIGHTNING:
             keep_freed_memory()

@@ -42,15 +42,16 @@ def write_atomically(path: Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
-def write_text(path: Path, text: str) -> Path:
+def write_text(path: Path, text: str, *, errors: str = "strict") -> Path:
     """Write a text file atomically, with its line ends unchanged, and return its path.
 
     Args:
         path: File.
         text: Content, written as UTF-8.
+        errors: Python's handler for what is not UTF-8: "surrogateescape" writes the bytes of file names unchanged.
     """
     with write_atomically(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="")
+        temporary.write_text(text, encoding="utf-8", errors=errors, newline="")
     return path
 
 

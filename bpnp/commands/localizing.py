@@ -94,7 +94,7 @@ def localize(
     positive("time_limit", time_limit)
     if focal_error is not None and not 0 < focal_error < 1:
         raise ValueError(f"`focal_error` is {focal_error}; it is a fraction of the focal length, above 0 and below 1")
-    files = photo_files(photos, besides=output)
+    files = photo_files(photos, besides=[output / "pictures", output / "solutions"])
     map_content = content_of_map(map)  # before it is read: if it changes afterwards, the next run finds another map
     scene = SceneMap.from_colmap(map)
     attempts, lens = _attempts(cluster), None if camera is None else _camera(camera, map, scene)
@@ -125,7 +125,7 @@ def localize(
         say(dumps({"map": folder.map_content, "photos": records}, indent=1))
     elif records:
         out.print(_table(records, out.width), Text(_caption(records), "dim italic"))
-    _report(files, records, folder, outcome, out, pictures=not no_pictures)
+    _report(files, records, folder, outcome, out)
     if outcome.errors:
         (name, reason), *others = outcome.errors.items()
         for other, why in others:
@@ -139,8 +139,6 @@ def _report(
     folder: "SolutionFolder",
     outcome: "Outcome",
     out: Console,
-    *,
-    pictures: bool,
 ) -> None:
     """Print the source of the cameras, and what was kept and written."""
     if records:
@@ -152,8 +150,11 @@ def _report(
         say(f"solved again, with {change}: {name}", to=out)
     if others := folder.of_other_maps():
         say(f"not in poses.txt: {len(others)} solutions in another map, such as {others[0]}", to=out)
-    written = ", solutions/, pictures/" if pictures else ", solutions/"
-    say(f"wrote poses.txt, results.json{written if records else ''} in {folder.path}", to=out)
+    for name, reason in outcome.not_drawn.items():
+        say(f"no picture of {name}: {reason}", to=out)
+    written = ["poses.txt", "results.json", *(["solutions/"] if records else [])]
+    written += ["pictures/"] if any(folder.picture(name).is_file() for name in records) else []
+    say(f"wrote {', '.join(written)} in {folder.path}", to=out)
 
 
 def _camera(text: str, map: Path, scene: "SceneMap") -> Any:

@@ -42,6 +42,7 @@ def localized_picture(
     """
     from matplotlib.figure import Figure
 
+    from bpnp.report.figures import shown_text
     from bpnp.report.solutions import solution_points
 
     figure = Figure(figsize=(sum(DRAWING.widths), 6.5), layout="constrained")
@@ -51,8 +52,8 @@ def localized_picture(
         figure.colorbar(marks, ax=image, location="bottom", shrink=0.5, aspect=40, label=f"residual, {solution.unit}")
     draw_from_above(above, scene, solution)
     near = "" if solution.view is None or solution.verdict == "failed" else f", found near view {solution.view}"
-    text = solution_points(solution, title=None if title is None else title + near).id.replace("$", r"\$")
-    figure.suptitle(text, fontsize=10, color=VERDICTS[solution.verdict])
+    text = solution_points(solution, title=None if title is None else title + near).id
+    figure.suptitle(shown_text(text), fontsize=10, color=VERDICTS[solution.verdict])
     return figure
 
 
@@ -91,13 +92,18 @@ def draw_matches(axes: "Axes", solution: Solution, *, photo: Array | None = None
 def plane_from_above(views: "Sequence[View]", forward: Array) -> Array:
     """Return the axes (2, 3) of a drawing of a map from above: right, and ahead along `forward` (3,).
 
-    Photos are assumed upright: down is the mean of their y axes.
+    Photos are assumed upright: down is the mean of their y axes. If these cancel each other, or if `forward` is
+    vertical, any direction is taken in its place.
     """
-    down = np.mean([view.rotation[1] for view in views], axis=0)
-    down /= np.linalg.norm(down)
-    ahead = forward - down * (forward @ down)
-    ahead /= np.linalg.norm(ahead)
+    down = _unit(np.mean([view.rotation[1] for view in views], axis=0), views[0].rotation[1])
+    ahead = _unit(forward - down * (forward @ down), np.cross(down, np.eye(3)[np.argmin(np.abs(down))]))
     return np.stack([np.cross(down, ahead), ahead])
+
+
+def _unit(vector: Array, otherwise: Array) -> Array:
+    """Return a vector (3,) of length 1 along another one, or along `otherwise` if that has no length."""
+    chosen = vector if np.linalg.norm(vector) > 1e-6 else otherwise
+    return np.asarray(chosen / np.linalg.norm(chosen))
 
 
 def draw_from_above(axes: "Axes", scene: "SceneMap", solution: Solution) -> None:

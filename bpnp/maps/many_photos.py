@@ -140,11 +140,13 @@ class Outcome:
         kept: Names of photos whose earlier solution is still valid.
         again: Reasons why photos were solved again, by name.
         errors: Error messages of photos that could not be tried, by name.
+        not_drawn: Error messages of pictures that could not be drawn, by the name of the photo.
     """
 
     kept: list[str] = field(default_factory=list)
     again: dict[str, str] = field(default_factory=dict)
     errors: dict[str, str] = field(default_factory=dict)
+    not_drawn: dict[str, str] = field(default_factory=dict)
 
 
 def localize_photos(
@@ -159,7 +161,8 @@ def localize_photos(
 ) -> Outcome:
     """Localise photos into a folder; solutions there with the same inputs and options are kept.
 
-    Each task is built just before it runs, since a photo may be replaced in the meantime.
+    A solution is written before its picture is drawn. A kept solution without a picture is drawn. Each task is built
+    just before it runs, since a photo may be replaced in the meantime.
 
     Args:
         scene: The map.
@@ -169,13 +172,29 @@ def localize_photos(
         pictures: Draw a picture of each photo. Default True.
         done: Callback with a short message for each photo.
         **options: As for `photo_task`.
+
+    Raises:
+        ValueError: A picture in the folder would replace a photo.
     """
     outcome = Outcome()
+    places = {folder.picture(name).resolve() for name in files}
+    if replaced := next((photo for photo in files.values() if photo.resolve() in places), None):
+        raise ValueError(f"{replaced} would be replaced by the picture of a result; use another folder for the results")
 
     def describe_failure(name: str, photo: Path, error: Exception) -> None:
         outcome.errors[name] = str(error)
+        outcome.again.pop(name, None)
         folder.forget_replaced(name, photo)
         done(f"{name}: could not be tried")
+
+    def draw(task: PhotoTask) -> None:
+        if not pictures or folder.picture(task.name).is_file():
+            return
+        try:
+            with delay_interrupts():  # matplotlib takes Ctrl-C for an invalid box
+                folder.draw(task, scene)
+        except (ValueError, OSError) as error:
+            outcome.not_drawn[task.name] = str(error)
 
     def tasks() -> Iterator[PhotoTask]:
         for name, photo in files.items():
@@ -187,6 +206,7 @@ def localize_photos(
             changes = folder.changes(task)
             if changes == []:
                 outcome.kept.append(name)
+                draw(task)
                 done(f"{name}: kept, {folder.records[name]['verdict']}")
                 continue
             if changes:
@@ -197,7 +217,8 @@ def localize_photos(
         for task, solution in attempts(scene, tasks()):
             try:
                 with delay_interrupts():
-                    folder.keep(task, solution, draw_in=scene if pictures else None)
+                    folder.keep(task, solution)
+                    draw(task)
                 done(f"{task.name}: {folder.records[task.name]['verdict']}")
             except (ValueError, OSError) as error:
                 describe_failure(task.name, task.photo, error)
@@ -270,13 +291,12 @@ class SolutionFolder:
         before = self.records[task.name][MADE_WITH]
         return [key for key, value in task.made_with.items() if before.get(key) != value]
 
-    def keep(self, task: PhotoTask, solution: Solution | str, *, draw_in: SceneMap | None = None) -> None:
-        """Write the solution of a photo, the fingerprints of its inputs and, with a map, its picture.
+    def keep(self, task: PhotoTask, solution: Solution | str) -> None:
+        """Write the solution of a photo and the fingerprints of its inputs, and delete the picture of an earlier one.
 
         Args:
             task: The photo.
             solution: Solution, or an error message.
-            draw_in: Map to draw the photo in; None for no picture.
 
         Raises:
             ValueError: There is no solution; with its error message.
@@ -284,12 +304,23 @@ class SolutionFolder:
         if isinstance(solution, str):
             raise ValueError(solution)
         self.picture(task.name).unlink(missing_ok=True)
-        if draw_in is not None:
-            photo = read_photo(task.photo)
-            save_figure(localized_picture(draw_in, solution, photo=photo, title=task.name), self.picture(task.name))
         text = f'{solution.to_json()[:-1]}, "{MADE_WITH}": {json.dumps(task.made_with)}}}'
         write_text(self._file("solutions", task.name, "json"), text + "\n")
         self._record(task.name, text)
+
+    def draw(self, task: PhotoTask, scene: SceneMap) -> None:
+        """Draw the picture of a photo from its solution.
+
+        Args:
+            task: The photo, which has a solution.
+            scene: Map to draw the photo in.
+
+        Raises:
+            ValueError: The photo cannot be read, or its solution is damaged.
+        """
+        solution = Solution.from_json(self._file("solutions", task.name, "json"))
+        figure = localized_picture(scene, solution, photo=read_photo(task.photo), title=task.name)
+        save_figure(figure, self.picture(task.name))
 
     def forget_replaced(self, name: str, photo: Path) -> None:
         """Delete the solution and the picture of a photo if they belong to another photo of that name."""
@@ -330,7 +361,7 @@ class SolutionFolder:
             if record["verdict"] == "confident" and name not in others:
                 x, y, z, w = Rotation.from_matrix(record["rotation"]).as_quat(canonical=True).tolist()
                 lines.append(f"{name} {' '.join(map(repr, (w, x, y, z, *record['translation'])))}\n")
-        write_text(self.path / "poses.txt", "".join(lines))
+        write_text(self.path / "poses.txt", "".join(lines), errors="surrogateescape")  # keeps names of photos
 
     def _record(self, name: str, text: str) -> None:
         content = json.loads(text)

@@ -3,7 +3,7 @@
 import importlib
 import math
 import sqlite3
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -49,28 +49,29 @@ class Keypoints(NamedTuple):
     size: Size | None
 
 
-def photo_files(paths: Iterable[Path], besides: Path | None = None) -> dict[str, Path]:
+def photo_files(paths: Iterable[Path], besides: Collection[Path] = ()) -> dict[str, Path]:
     """Return photo files by name: given files by file name, and files in given folders by their path in the folder.
 
     Args:
         paths: Files and folders; folders are searched recursively.
-        besides: Folder to skip, such as that of the results. None to skip nothing.
+        besides: Folders to skip in folders, such as that of the pictures of the results. Default: none.
 
     Raises:
         ValueError: A path does not exist, there is no photo, or two photos have one name.
     """
     files: dict[str, Path] = {}
-    left_out = None if besides is None else besides.resolve()
+    left_out = {folder.resolve() for folder in besides}
     for path in paths:
         if not path.exists():
             raise ValueError(f"{path} does not exist; give a photo or a folder of photos")
         inside = (file for file in sorted(path.rglob("*")) if file.suffix.lower() in SUFFIXES)
-        for file in (f for f in inside if left_out not in f.resolve().parents) if path.is_dir() else [path]:
+        for file in (f for f in inside if left_out.isdisjoint(f.resolve().parents)) if path.is_dir() else [path]:
             name = file.relative_to(path).as_posix() if path.is_dir() else file.name
             if files.setdefault(name, file) != file:
                 raise ValueError(f"{files[name]} and {file} have the same name; photos need different names")
     if not files:
-        raise ValueError("there are no photos; give one or more photos, or folders with photos")
+        outside = f" outside {' and '.join(map(str, besides))}" if besides else ""
+        raise ValueError(f"there are no photos{outside}; give one or more photos, or folders with photos")
     return files
 
 

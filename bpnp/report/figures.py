@@ -340,7 +340,7 @@ def plot_matches(
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
     height = float(np.clip(widths[0] * (bottom - top) / (right - left), 3, 8))
     figure.set_size_inches(sum(widths), height + CAPTIONS)
-    figure.suptitle(problem.id.replace("$", r"\$"), fontsize=10, color=colour)
+    figure.suptitle(shown_text(problem.id), fontsize=10, color=colour)
     entries = {label: handle for one in images for handle, label in zip(*one.get_legend_handles_labels(), strict=True)}
     figure.legend([*entries.values()], [*entries], loc="outside lower center", ncols=4, frameon=False, fontsize=8)
     return figure

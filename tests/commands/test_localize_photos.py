@@ -1,6 +1,7 @@
 """`bpnp localize`: photos that are taken out of their map are found again; bad ones do not stop others."""
 
 import json
+import os
 import shutil
 import signal
 from collections.abc import Callable
@@ -22,6 +23,7 @@ from bpnp import SceneMap, Solution
 from bpnp.cameras import camera_from
 from bpnp.cli import main
 from bpnp.examples import load
+from bpnp.maps import many_photos
 from bpnp.maps.photos import photo_files
 
 pytestmark = pytest.mark.slow
@@ -123,12 +125,79 @@ def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, 
 
 
 def test_photos_in_folders_within_are_named_by_their_path_and_results_are_no_photos(tmp_path: Path) -> None:
-    for name in ("day/0004.jpg", "night/0004.jpg", "found/pictures/0005.jpg"):
+    for name in ("day/0004.jpg", "night/0004.jpg", "pictures/0005.jpg", "solutions/views/0005.png"):
         (tmp_path / name).parent.mkdir(parents=True)
         (tmp_path / name).touch()
-    assert list(photo_files([tmp_path], besides=tmp_path / "found")) == ["day/0004.jpg", "night/0004.jpg"]
-    picture = tmp_path / "found/pictures/0005.jpg"  # by itself it is a photo, wherever it lies
-    assert photo_files([picture], besides=tmp_path / "found") == {"0005.jpg": picture}
+    results = [tmp_path / "pictures", tmp_path / "solutions"]
+    assert list(photo_files([tmp_path], besides=results)) == ["day/0004.jpg", "night/0004.jpg"]
+    picture = tmp_path / "pictures/0005.jpg"  # by itself it is a photo, wherever it lies
+    assert photo_files([picture], besides=results) == {"0005.jpg": picture}
+    with pytest.raises(ValueError, match=r"there are no photos outside .*pictures and .*solutions; give"):
+        photo_files([tmp_path / "pictures"], besides=results)
+
+
+@pytest.fixture(scope="module")
+def mesh_solution() -> bpnp.Solution:
+    example = load("mesh")
+    return bpnp.solve(example.points2d, example.points3d, example.camera)
+
+
+@pytest.fixture
+def command(tmp_path: Path, mesh_solution: bpnp.Solution, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """`bpnp localize` of a.png, with the same solution for every photo."""
+    plant_model(tmp_path / "map")
+    Image.new("RGB", (64, 48)).save(tmp_path / "a.png")
+    monkeypatch.setattr(SceneMap, "localize_photo", lambda *_, **__: mesh_solution)
+    monkeypatch.chdir(tmp_path)
+    return ["localize", "map", "a.png", "--camera", "SIMPLE_PINHOLE,80,32,24", "--output", "out"]
+
+
+def test_a_solution_without_a_picture_is_kept_and_drawn_by_the_next_run(
+    command: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    picture = Path("out/pictures/a.png")
+
+    def fail(*_: Any, **__: Any) -> None:
+        raise ValueError("no room")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(many_photos, "localized_picture", fail)
+        main(command)
+    shown = capsys.readouterr().out
+    assert "no picture of a.png: no room\nwrote poses.txt, results.json, solutions/ in out\n" in shown
+    assert "a.png" in Path("out/poses.txt").read_text()
+    main([*command, "--no_pictures"])
+    assert not picture.exists()
+    main(command)
+    shown = capsys.readouterr().out
+    assert "kept 1 of 1 photos" in shown
+    assert shown.endswith("wrote poses.txt, results.json, solutions/, pictures/ in out\n")
+    drawn = picture.read_bytes()
+    main([*command, "--seed", "3"])
+    assert "solved again, with other options: a.png" in capsys.readouterr().out
+    assert picture.read_bytes() == drawn
+    monkeypatch.setattr(SceneMap, "localize_photo", fail)
+    with pytest.raises(SystemExit):
+        main([*command, "--seed", "4"])
+    assert "solved again" not in capsys.readouterr().out
+
+
+def test_a_photo_is_not_replaced_by_its_picture(command: list[str], fails: Callable[..., str]) -> None:
+    Path("pictures").mkdir()
+    photo = Path("a.png").rename("pictures/a.png")
+    before = photo.read_bytes()
+    words = ["pictures/a.png" if word == "a.png" else "." if word == "out" else word for word in command]
+    assert "pictures/a.png would be replaced by the picture of a result; use another folder" in fails(*words)
+    assert photo.read_bytes() == before
+
+
+def test_a_file_name_that_is_not_utf8_is_kept_as_it_is(command: list[str]) -> None:
+    name = os.fsdecode(b"caf\xe9.png")
+    Path("photos").mkdir()
+    Path("a.png").rename(Path("photos", name))
+    main(["photos" if word == "a.png" else word for word in command] + ["--quiet"])
+    assert Path("out/pictures", name).is_file()
+    assert b"\ncaf\xe9.png " in Path("out/poses.txt").read_bytes()
 
 
 def test_ctrl_c_while_a_picture_is_drawn_ends_the_run_and_keeps_the_photo(

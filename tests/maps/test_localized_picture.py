@@ -8,7 +8,9 @@ import pytest
 from planted_model import PINHOLE, plant_model
 
 from bpnp import SceneMap, Solution
-from bpnp.maps.localized_picture import BOUND, draw_from_above, draw_matches, localized_picture
+from bpnp.cameras import camera_from
+from bpnp.maps.localized_picture import BOUND, draw_from_above, draw_matches, localized_picture, plane_from_above
+from bpnp.maps.views import View
 
 
 def test_matches_have_the_colour_of_their_residual_and_the_camera_stands_where_it_was_planted(tmp_path: Path) -> None:
@@ -58,6 +60,16 @@ def test_a_failed_photo_shows_its_keypoints_alone(tmp_path: Path) -> None:
     assert [line.get_label() for line in above.lines if not line.get_label().startswith("_")] == ["3 views"]
     shown = [figure.get_suptitle(), *(axes.get_title() for axes in figure.axes)]
     assert shown == ["a.jpg\nfailed: No pose fits.", f"{len(keypoints)} keypoints", "the map from above; no pose"]
+
+
+def test_a_map_without_a_direction_down_is_drawn() -> None:
+    """Two photos upside down to each other, and a camera that looks along the y axes."""
+    view = View("a.jpg", camera_from(np.eye(3)), np.eye(3), np.zeros(3), np.arange(3, dtype=np.int32))
+    turned = replace(view, rotation=np.diag([-1.0, -1, 1]))
+    for views, forward in (((view, turned), [0, 0, 1]), ((view, view), [0, 1, 0]), ((view, turned), [0, -1, 0])):
+        axes = plane_from_above(views, np.array(forward, float))
+        np.testing.assert_allclose(axes @ axes.T, np.eye(2), atol=1e-12)
+        np.testing.assert_allclose(axes[:, 1], 0, atol=1e-12)
 
 
 def test_an_ambiguous_photo_stands_at_both_places(tmp_path: Path) -> None:
