@@ -175,7 +175,7 @@ def as_tensor(name: str, values: ManyArrays | float) -> Tensor:
         return values.cpu()
     try:
         array = np.asarray(values)
-        return torch.as_tensor(np.array(array, array.dtype.newbyteorder("=")))
+        return torch.as_tensor(np.array(array, array.dtype.newbyteorder("=")), device="cpu")
     except (TypeError, ValueError) as error:
         raise ValueError(f"`{name}` is {short_repr(values)}; give an array of numbers, or a list of them") from error
 

@@ -157,7 +157,7 @@ def random_rotations(
     """
     if isinstance(generator, np.random.Generator):
         return quaternion_rotation(torch.from_numpy(generator.standard_normal((count, 4))))
-    return quaternion_rotation(torch.randn(count, 4, generator=generator, dtype=torch.float64))
+    return quaternion_rotation(torch.randn(count, 4, generator=generator, dtype=torch.float64, device="cpu"))
 
 
 def angle_between(a: Float[Tensor, "*#b 3"], b: Float[Tensor, "*#b 3"]) -> Float[Tensor, "*#b"]:

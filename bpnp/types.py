@@ -237,7 +237,7 @@ class Batch(Tensors):
         rotations = None if rotation is None else as_tensor_list("rotation", rotation, 2)
         translations = None if translation is None else as_tensor_list("translation", translation, 1)
         matches = None if match3d is None else as_tensor_list("match3d", match3d, 1)
-        focals = [torch.ones(())] if focal is None else as_tensor_list("focal", focal, 0)
+        focals = [torch.ones((), device="cpu")] if focal is None else as_tensor_list("focal", focal, 0)
         focals = focals * size if len(focals) == 1 else focals
         for name, values in (
             ("points3d", sets3d),
@@ -256,10 +256,10 @@ class Batch(Tensors):
         return cls(
             points2d=pad_sequence(sets2d, batch_first=True),
             points3d=pad_sequence(sets3d, batch_first=True),
-            mask2d=torch.stack([torch.arange(m) < len(x) for x in sets2d]),
-            mask3d=torch.stack([torch.arange(n) < len(x) for x in sets3d]),
+            mask2d=torch.stack([torch.arange(m, device="cpu") < len(x) for x in sets2d]),
+            mask3d=torch.stack([torch.arange(n, device="cpu") < len(x) for x in sets3d]),
             focal=stack_values("focal", focals, (), dtype),
-            index=torch.arange(size) if index is None else torch.as_tensor(index, dtype=torch.long),
+            index=torch.as_tensor(range(size) if index is None else index, dtype=torch.long, device="cpu"),
             ids=tuple(map(str, range(size))) if ids is None else tuple(ids),
             rotation=None if rotations is None else stack_values("rotation", rotations, (3, 3), dtype),
             translation=None if translations is None else stack_values("translation", translations, (3,), dtype),

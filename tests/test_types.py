@@ -166,3 +166,13 @@ def test_pixels_are_refused_as_bpnp_solve_refuses_them() -> None:
     assert str(solving.value).partition(";")[0] == str(batching.value).partition(";")[0]
     focal, centre = example.camera[0, 0], example.camera[:2, 2]
     assert len(Batch.from_arrays((example.points2d - centre) / focal, example.points3d)) == 1
+
+
+def test_a_batch_of_arrays_is_on_the_cpu_whatever_the_default_device() -> None:
+    arrays = lists(pair(3, 4), pair(5, 5))
+    with torch.device("meta"):
+        batch = Batch.from_arrays(**arrays)
+        unlabelled = Batch.from_arrays(arrays["points2d"], arrays["points3d"])
+    for one in (batch, unlabelled):
+        assert (one.count2d.tolist(), one.count3d.tolist(), one.index.tolist()) == ([3, 5], [4, 5], [0, 1])
+    assert unlabelled.focal.tolist() == [1, 1]

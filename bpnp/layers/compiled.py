@@ -51,7 +51,7 @@ def conjugate_gradients(
     """
     inputs = plan.kernel, plan.alpha, plan.beta, rows, cols, degree, rhs, tolerance
     x, mean = rhs.new_zeros(rhs.shape), rhs.new_zeros(rows.shape)
-    solved = torch.zeros(len(rhs), dtype=torch.bool)
+    solved = torch.zeros(len(rhs), dtype=torch.bool, device=rhs.device)
     arrays = [value.contiguous().numpy() for value in (*inputs, x, mean, solved)]
     (_, m, n), dtype = plan.kernel.shape, arrays[0].dtype
 

@@ -151,7 +151,7 @@ def _each(
         iterations[i] = 0 if count < MIN_POINTS else max_iterations
         x, p = (points[i][matches.real[i]].cpu().numpy() for points in matches[:2])
         if count >= MIN_POINTS and (found := estimate(x, p, threshold, max_iterations, seed)) is not None:
-            poses[i], iterations[i] = torch.as_tensor(found[0]), found[1]
+            poses[i], iterations[i] = torch.as_tensor(found[0], device="cpu"), found[1]
     return poses, iterations
 
 
@@ -193,8 +193,9 @@ def _opencv(x: Array, p: Array, threshold: float, max_iterations: int, seed: int
 
 def _count_inliers(pose: NDArray[Any], x: Array, p: Array, threshold: float) -> int:
     """Return the number of inliers of one pose [R | t]."""
-    matches = Matches(*(torch.as_tensor(values)[None] for values in (x, p, np.ones(len(x), bool))))
-    return int(residuals(torch.as_tensor(pose)[None, None], matches, threshold**2).inlier.sum())
+    arrays = pose[None], x, p, np.ones(len(x), bool)
+    poses, *matches = (torch.as_tensor(values, device="cpu")[None] for values in arrays)
+    return int(residuals(poses, Matches(*matches), threshold**2).inlier.sum())
 
 
 # Matches of `bpnp.robust.matches.normalised`, most probable first, threshold, most hypotheses, seed ->

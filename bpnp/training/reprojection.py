@@ -43,7 +43,8 @@ class ReprojectionLoss(nn.Module):
             missing = "assignment" if assignment is None else 'pose "pnp"'
             raise ValueError(f"the prediction has no {missing}; ReprojectionLoss trains networks such as BPnPNet")
         solved = pose.stats.converged
-        rotation = torch.where(solved[:, None, None], pose.rotation, torch.eye(3).to(pose.rotation))
+        eye = torch.eye(3, dtype=pose.rotation.dtype, device=pose.rotation.device)
+        rotation = torch.where(solved[:, None, None], pose.rotation, eye)
         translation = torch.where(solved[:, None], pose.translation, 0)
         camera = transform(rotation, translation, batch.points3d)
         angles = angle_between(bearings(batch.points2d).unsqueeze(2), camera.unsqueeze(1))

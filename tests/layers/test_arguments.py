@@ -1,5 +1,6 @@
 """Arguments that a layer cannot mean end in one clear error (`bpnp.checks` has the rules), whoever calls it and how."""
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -68,6 +69,24 @@ def test_half_precision_is_widened_and_ransac_has_no_gradient(dtype: torch.dtype
     assert not rotation.requires_grad
     assert stats.converged.all()
     assert rotation_angle(rotation.double(), PLANTED.rotation).max() < 1e-3
+
+
+@pytest.mark.parametrize("options", [{}, {"clip_columns": 1.0}, {"solver": "lbfgs"}, {"backend": "torch"}], ids=str)
+@pytest.mark.parametrize("layer", list(ARGUMENTS), ids=lambda layer: layer.__name__)
+def test_a_default_device_is_not_that_of_the_arguments(layer: Callable[..., Any], options: dict[str, Any]) -> None:
+    """As after `torch.set_default_device("cuda")`, with arguments on the CPU."""
+    if any(name not in inspect.signature(layer).parameters for name in options):
+        pytest.skip("no such option")
+    arguments = {name: value.clone() for name, value in ARGUMENTS[layer].items()}
+    if layer is not ransac_pnp:
+        next(iter(arguments.values())).requires_grad_()
+    expected = layer(**arguments, **options)
+    with torch.device("meta"):
+        found = layer(**arguments, **options)
+        if layer is not ransac_pnp:
+            found[0].sum().backward()
+    assert found[0].equal(expected[0])
+    assert found[-1].converged.equal(expected[-1].converged)
 
 
 @pytest.mark.parametrize("transform", ["vmap", "grad", "jacrev", "jvp"])
