@@ -26,7 +26,8 @@ def top_matches(
     """Select the most probable matches of each sample.
 
     A sample with m' and n' real points has floor(matches_factor * min(m', n')) matches, at most m' n'. The width k of
-    the result is the same of the padded sizes m and n, and at least 1.
+    the result is the same of the padded sizes m and n, and at least 1. Matches of equal probability are in the order of
+    their 2D points, then of their 3D points, so that the result does not depend on padding.
 
     Args:
         assignment: P (b, m, n).
@@ -42,11 +43,26 @@ def top_matches(
     real2d = assignment.new_ones(b, m, dtype=torch.bool) if mask2d is None else mask2d
     real3d = assignment.new_ones(b, n, dtype=torch.bool) if mask3d is None else mask3d
     count2d, count3d = real2d.sum(-1), real3d.sum(-1)
-    count = torch.minimum((matches_factor * torch.minimum(count2d, count3d)).long(), count2d * count3d)
+    count = torch.minimum((matches_factor * torch.minimum(count2d, count3d).double()).long(), count2d * count3d)
     scores = assignment.masked_fill(~(real2d.unsqueeze(-1) & real3d.unsqueeze(-2)), -1)
     k = min(max(1, int(matches_factor * min(m, n))), m * n)
-    flat = scores.flatten(1).topk(k, dim=-1).indices
+    flat = _stable_top(scores.flatten(1), k)
     return flat // n, flat % n, torch.arange(k, device=flat.device) < count.unsqueeze(-1)
+
+
+def _stable_top(scores: Float[Tensor, "b s"], k: int) -> Int[Tensor, "b k"]:
+    """Return the indices of the k largest scores, largest first, equal ones by index; NaN is larger than any number.
+
+    `torch.topk` orders equal scores by chance, and a stable sort of all scores takes much longer.
+    """
+    scores = scores.nan_to_num(torch.inf, posinf=torch.inf, neginf=-torch.inf)
+    least = scores.topk(k, dim=-1).values[:, -1:]
+    above, equal = scores > least, scores == least
+    room = k - above.sum(-1, keepdim=True)
+    chosen = above | (equal & (equal.cumsum(-1, dtype=torch.int32) <= room))
+    by_index = chosen.nonzero()[:, 1].view(-1, k)
+    order = scores.gather(1, by_index).sort(dim=-1, descending=True, stable=True).indices
+    return by_index.gather(1, order)
 
 
 @check_shapes
@@ -88,10 +104,10 @@ def ransac_pnp(
             other samples.
 
     Returns:
-        Rotation (b, 3, 3) and translation (b, 3) in the dtype of the assignment, and stats. `residual` (float64) is the
-            mean reprojection error of the inliers, normalised units. `iterations` is the number of hypotheses, or its
-            limit where the backend does not report it. A sample without a pose of 4 or more inliers has a pose of NaN,
-            an infinite `residual`, and `converged` is False.
+        Rotation (b, 3, 3) and translation (b, 3) in the dtype of the assignment, float32 for half precision, and stats.
+            `residual` (float64) is the mean reprojection error of the inliers, normalised units. `iterations` is the
+            number of hypotheses, or its limit where the backend does not report it. A sample without a pose of 4 or
+            more inliers has a pose of NaN, an infinite `residual`, and `converged` is False.
 
     Raises:
         ValueError: An argument has a wrong shape or dtype, the backend is unknown, or an option is not positive.

@@ -1,3 +1,6 @@
+import math
+
+import numpy as np
 import pytest
 import torch
 from planted import Planted, plant
@@ -5,6 +8,7 @@ from torch import Tensor
 
 from bpnp.geometry import project, rotation_angle, transform
 from bpnp.layers import ransac_pnp
+from bpnp.layers.ransac import top_matches
 
 THRESHOLD = 0.01
 
@@ -100,3 +104,57 @@ def test_a_seed_gives_the_same_pose_again_and_another_one_another(backend: str) 
     torch.testing.assert_close(poses(3), first, rtol=0, atol=0, equal_nan=True)
     if backend != "opencv":  # its generator starts afresh at each call
         assert (poses(4) - first).abs().max() > 0.1
+
+
+def padded_matches(assignment: Tensor, size: int, factor: float) -> list[tuple[int, int]]:
+    """Matches of one sample (m, n) that is padded to (size, size)."""
+    m, n = assignment.shape
+    wide = torch.nn.functional.pad(assignment, (0, size - n, 0, size - m))[None]
+    place = torch.arange(size)[None]
+    index2d, index3d, real = top_matches(wide, place < m, place < n, factor)
+    return list(zip(index2d[real].tolist(), index3d[real].tolist(), strict=True))
+
+
+@pytest.mark.parametrize("kind", ["one-hot", "underflowed", "constant", "distinct"])
+@pytest.mark.parametrize("size", [20, 23, 200])
+def test_matches_of_equal_probability_are_ordered_by_index_whatever_the_padding(kind: str, size: int) -> None:
+    m, n, factor = 18, 20, 1.5
+    assignment = torch.rand(m, n, generator=torch.Generator().manual_seed(0))
+    if kind == "one-hot":
+        assignment = torch.eye(m, n) / m
+    elif kind == "underflowed":
+        assignment = torch.where(assignment > 0.95, assignment, 0)
+    elif kind == "constant":
+        assignment = torch.full_like(assignment, 1 / (m * n))
+    order = np.argsort(-assignment.flatten().numpy(), kind="stable")[: int(factor * m)]
+    expected = list(zip((order // n).tolist(), (order % n).tolist(), strict=True))
+    assert padded_matches(assignment, size, factor) == expected
+
+
+def test_a_pose_of_one_to_one_matches_does_not_depend_on_padding() -> None:
+    """A one-to-one assignment has 20 equal entries, and RANSAC takes 30: ten are chosen among zeros."""
+    n = 20
+    planted = plant(1, n, noise=0.004, seed=2, dtype=torch.float32)
+    assignment, points2d, points3d = planted.permutation(), planted.points2d.clone(), planted.points3d
+    points2d[:, 14:] = points2d[:, 14:].roll(1, 1)
+    pad, poses = torch.nn.functional.pad, []
+    for more in (0, 3, 44):
+        mask = (torch.arange(n + more) < n)[None]
+        wide = pad(assignment, (0, more, 0, more)), pad(points2d, (0, 0, 0, more)), pad(points3d, (0, 0, 0, more))
+        rotation, _, stats = ransac_pnp(*wide, mask2d=mask, mask3d=mask, backend="poselib")
+        assert stats.converged.all()
+        poses.append(rotation)
+    assert max(float((pose - poses[0]).abs().max()) for pose in poses) < 1e-6
+
+
+@pytest.mark.parametrize("default", [torch.float32, torch.float64])
+def test_the_number_of_matches_is_exact(default: torch.dtype) -> None:
+    """1.4 * 45 is just below 63 in double precision, and 63 in single precision."""
+    before = torch.get_default_dtype()
+    assignment = torch.rand(45, 45, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    torch.set_default_dtype(default)
+    try:
+        counts = [len(padded_matches(assignment, size, 1.4)) for size in (45, 65)]
+    finally:
+        torch.set_default_dtype(before)
+    assert counts == [math.floor(1.4 * 45)] * 2 == [62, 62]
