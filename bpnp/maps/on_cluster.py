@@ -48,13 +48,16 @@ def attempts_on_cluster(scene: SceneMap, tasks: Iterable[PhotoTask], cluster: st
                 running[future.key] = task
                 yield future
 
-        waiting = submit()
-        done = as_completed(islice(waiting, MAPS.queued * max(sum(client.nthreads().values()), 1)))
-        for future in done:
-            task = running.pop(future.key)
-            yield task, str(future.exception()) if future.status == "error" else future.result()
-            done.update(islice(waiting, 1))
-        client.unregister_worker_plugin(plugin.name)
+        try:
+            waiting = submit()
+            done = as_completed(islice(waiting, MAPS.queued * max(sum(client.nthreads().values()), 1)))
+            for future in done:
+                task = running.pop(future.key)
+                yield task, str(future.exception()) if future.status == "error" else future.result()
+                done.update(islice(waiting, 1))
+        finally:  # a run that is stopped leaves no map on the workers
+            if client.status == "running":
+                client.unregister_worker_plugin(plugin.name)
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
-from distributed import Client, LocalCluster
+from distributed import Client, LocalCluster, Worker
 from PIL import Image
 from planted_model import HEIGHT, PINHOLE, WIDTH, plant_keypoints, plant_model
 
@@ -72,6 +72,22 @@ def test_a_lost_worker_loses_nothing(place: tuple[Path, Path, Path], cluster: Lo
         assert solution.verdict == "confident"
         np.testing.assert_array_equal(solution.rotation, alone[name].rotation)
         np.testing.assert_array_equal(solution.matches, alone[name].matches)
+
+
+def test_a_run_that_is_stopped_leaves_no_map_on_the_workers(
+    place: tuple[Path, Path, Path], cluster: LocalCluster
+) -> None:
+    scene = SceneMap.from_colmap(place[0])
+    found = attempts_on_cluster(scene, tasks(place, scene, views=VIEWS), cluster.scheduler_address)
+    with Client(cluster) as client:
+        next(found)
+        assert all(client.run(maps_of).values())
+        found.close()  # type: ignore[attr-defined]
+        assert not any(client.run(maps_of).values())
+
+
+def maps_of(dask_worker: Worker) -> list[str]:
+    return [name for name in dask_worker.plugins if name.startswith("bpnp-")]
 
 
 def test_processes_started_here_are_ended(place: tuple[Path, Path, Path]) -> None:
