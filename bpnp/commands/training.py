@@ -254,8 +254,10 @@ class BpnpCLI(LightningCLI):
     def before_validate(self) -> None:
         """Warn if the weights are untrained."""
         config = self.config[self.command]
-        trained = re.search("checkpoint|pretrained", str(config.get("model.solver")))
-        if not (config["ckpt_path"] or config.get("model.weights") or trained) and list(self.model.parameters()):
+        options = "model" if config.get("model.class_path") is None else "model.init_args"
+        trained = re.search("checkpoint|pretrained", str(config.get(f"{options}.solver")))
+        weights = config["ckpt_path"] or config.get(f"{options}.weights") or trained
+        if not weights and list(self.model.parameters()):
             sys.stderr.write("bpnp: no --ckpt_path: the weights of the solver are untrained\n")
 
     before_test = before_predict = before_validate

@@ -121,6 +121,14 @@ def test_solver_and_metric_of_the_contributing_guide(
     assert float(value) == pytest.approx(float((4 / away - 1).abs().median()), rel=1e-4)
 
 
+def test_weights_of_a_task_by_class_path_are_trained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    task = "--model=bpnp.training.task.BlindPnPTask"
+    main(["test", task, "--model.init_args.weights=procedural-so3", *MESHES, *folders(tmp_path / "trained")])
+    assert "untrained" not in capsys.readouterr().err
+    main(["test", task, *SMALL_NET, *MESHES, *folders(tmp_path / "untrained")])
+    assert "untrained" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(("name", "kind"), [("procedural-so3", BPnPNet), ("matcher-sfm", Matcher)])
 def test_packaged_weights_are_found_by_name_wherever_a_checkpoint_is_taken(name: str, kind: type) -> None:
     for net in (source_from(name), checked_prior(name), TrainedNet.from_checkpoint(name)):
