@@ -187,7 +187,7 @@ class Loop:
     The machine code is kept in ``loops`` in `cache_folder`, or in NUMBA_CACHE_DIR. Each version of the source has its
     own folder there. The source includes the files of the parts that the function calls and of the named tuples that it
     takes; numba itself only checks the function's file. One process compiles; others that need the same loop wait for
-    it. If the folder is not writable, each process compiles.
+    it. If the folder is not writable, or the disk is full, each process compiles.
     """
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
@@ -215,7 +215,12 @@ class Loop:
             if not any(folder.glob("*/*.nbc")):
                 _announce(folder.parent)
                 stack.enter_context(_collection_paused())
-            compiled.compile(tuple(map(numba.typeof, arguments)))
+            types = tuple(map(numba.typeof, arguments))
+            try:
+                compiled.compile(types)
+            except OSError:  # a full disk or a quota: the machine code could not be written
+                compiled = numba.njit(self.function, **self.options)
+                compiled.compile(types)
             self.compiled = compiled
 
 

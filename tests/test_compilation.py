@@ -59,18 +59,18 @@ def package(tmp_path: Path) -> Path:
     return folder.parent
 
 
-def start(package: Path, cache: Path) -> subprocess.Popen[str]:
+def start(package: Path, cache: Path, code: str = CALL) -> subprocess.Popen[str]:
     """Start a process that calls the loop, with a home in which it may write to `cache`."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith(("NUMBA", "BPNP"))}
     environment |= {"PYTHONPATH": str(package), "XDG_CACHE_HOME": str(cache), "HOME": str(cache)}
-    call = [sys.executable, "-c", CALL]
+    call = [sys.executable, "-c", code]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     return subprocess.Popen(call, env=environment, cwd=package, text=True, **pipes)
 
 
-def called(package: Path, cache: Path) -> tuple[str, str]:
+def called(package: Path, cache: Path, code: str = CALL) -> tuple[str, str]:
     """Return what a new process that calls the loop prints, and what it logs."""
-    process = start(package, cache)
+    process = start(package, cache, code)
     out, log = process.communicate()
     assert process.returncode == 0, log
     return out, log
@@ -113,6 +113,23 @@ def test_a_loop_runs_where_nothing_can_be_written(package: Path, tmp_path: Path)
     out, log = called(package, cache)
     assert out == "8 10 True \n"
     assert "compiling" in log
+
+
+FULL = """
+import resource
+resource.setrlimit(resource.RLIMIT_FSIZE, (2000, resource.RLIM_INFINITY))
+"""
+
+
+def test_a_loop_runs_where_its_code_does_not_fit_on_the_disk(package: Path, tmp_path: Path) -> None:
+    """The folder can be written to, but no file may have more than 2000 bytes; without the limit the loop is kept."""
+    cache = tmp_path / "cache"
+    out, log = called(package, cache, FULL + CALL)
+    assert out == "8 10 True \n"
+    assert "compiling" in log
+    assert not list(cache.rglob("*.nbc"))
+    assert called(package, cache)[0] == "8 10 True \n"
+    assert list(cache.rglob("*.nbc"))
 
 
 SIGNATURES = """
