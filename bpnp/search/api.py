@@ -314,7 +314,15 @@ def solve_many(
     def problem(i: int, lens: Camera | None, focal: UnknownFocal | None = None) -> Problem:
         arrays = {name: values[i] for name, values in point_options.items()}
         with about(f"problem {i}" if count > 1 else None):
-            return problem_from(pixels[i], scenes[i], lens, prior=priors[i], focal=focal, **arrays)
+            return problem_from(
+                pixels[i],
+                scenes[i],
+                lens,
+                prior=priors[i],
+                focal=focal,
+                inlier_threshold=options.inlier_threshold,
+                **arrays,
+            )
 
     if distortion or image_size is not None or focal_error is not None:
         unknown = [unknown_camera(one, image_size, focal_error, distortion) for one in cameras]

@@ -38,11 +38,13 @@ def problem_from(
     cosines3d: Array | None = None,
     prior: Prior | None = None,
     focal: UnknownFocal | None = None,
+    inlier_threshold: float | None = None,
 ) -> Problem:
     """Check the arrays of one problem, undistort its pixels, and build it.
 
     The arrays are as for `bpnp.solve`; camera and prior are already checked. `cosines3d` and `focal` are fields of
-    `Problem` and not checked. Pixels that cannot be undistorted are dropped.
+    `Problem` and not checked. Pixels that cannot be undistorted are dropped. The `inlier_threshold`, in the unit of the
+    image points, becomes the largest residual of a match in an enumeration.
 
     Raises:
         ValueError: The arrays have a wrong or swapped shape, too few points (3 with a known gravity, else 4) or NaN;
@@ -63,6 +65,7 @@ def problem_from(
     usable = np.flatnonzero(np.isfinite(bearings).all(-1))
     check_seen(usable, image, fewest)
     in_pixels = camera if camera is not None and camera.focal >= INPUTS.least_focal else None
+    per_radian = units_per_radian(plane[usable], unit, camera)
     pose_prior = prior if isinstance(prior, (PosePrior, GravityPrior)) else None
     problem = Problem.of(
         bearings,
@@ -73,7 +76,8 @@ def problem_from(
         cosines3d=cosines3d,
         scores2d=checked_scores("scores2d", scores2d, len(image)),
         scores3d=checked_scores("scores3d", scores3d, len(scene)),
-        floor=None if in_pixels is None else INPUTS.floor_pixels / units_per_radian(plane[usable], unit, in_pixels),
+        floor=None if in_pixels is None else INPUTS.floor_pixels / per_radian,
+        radius=None if inlier_threshold is None else inlier_threshold / per_radian,
         focal=focal,
         points2d=None if unit == "rad" else image,
         camera=camera,

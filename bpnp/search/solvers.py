@@ -100,9 +100,8 @@ def solve_problems(problems: Mapping[int, Problem], options: Options) -> dict[in
 
 def _by_search(i: int, problem: Problem, options: Options) -> Solution:
     start, deadline = time.perf_counter(), options.deadline(problem)
-    radius = None if options.inlier_threshold is None else options.inlier_threshold / problem.per_radian
     result = search_poses(
-        replace(problem, radius=radius),
+        problem,
         around=None if problem.network is None else _pose_of_network(problem.network, problem, deadline),
         clutter=options.clutter,
         proposals=_proposals_of_matcher(problem, options.seed) if options.asks else None,

@@ -13,6 +13,8 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 import bpnp
+from bpnp.cameras import camera_from
+from bpnp.search.rig.solve import RigPoints
 
 CAMERA = ("SIMPLE_PINHOLE", [500.0, 320.0, 240.0])
 
@@ -215,3 +217,22 @@ def test_a_solution_of_a_rig_is_neither_drawn_nor_exported_as_one_image(tmp_path
         assert degrees_between(alone.rotation, pose[0]) < 2
         alone.to_colmap(tmp_path / f"{len(image)}")
     assert {folder.name for folder in tmp_path.iterdir()} == {"9", "8"}
+
+
+def test_the_threshold_is_the_search_radius_of_each_camera() -> None:
+    """Near the axis an error of 20 pixels is an angle of 20 / f."""
+    rng = np.random.default_rng(0)
+    images = [rng.uniform(300, 340, (6, 2)) - [0, 80] for _ in range(2)]
+    lenses = [camera_from(("SIMPLE_PINHOLE", [focal, 320.0, 240.0])) for focal in (500.0, 1000.0)]
+    for threshold, radii in ((20.0, [0.04, 0.02]), (None, [3 / 500, 3 / 1000])):
+        points = RigPoints(
+            images,
+            rng.uniform(-1, 1, (9, 3)),
+            [(np.eye(3), np.zeros(3))] * 2,
+            {"labels2d": [None] * 2, "scores2d": [None] * 2},
+            inlier_threshold=threshold,
+            clutter=None,
+            prior=None,
+            is_metric=True,
+        )
+        assert [problem.match_radius for problem in points.rig(lenses).problems] == pytest.approx(radii, rel=0.02)

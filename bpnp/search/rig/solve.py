@@ -60,7 +60,14 @@ def prepare_rig(
             "the distance of the scene from a camera; use PosePrior(rotation, None, rotation_sigma_deg)"
         )
     points = RigPoints(
-        list(points2d), points3d, list(mounts), dict(point_options), options.clutter, prior, is_metric=not scale
+        list(points2d),
+        points3d,
+        list(mounts),
+        dict(point_options),
+        options.inlier_threshold,
+        options.clutter,
+        prior,
+        is_metric=not scale,
     )
     lenses = [None if camera is None else camera_from(camera) for camera in cameras]
     if unknown is None:
@@ -80,6 +87,7 @@ class RigPoints:
     points3d: Any
     mounts: list[Pose]
     point_options: dict[str, Any]
+    inlier_threshold: float | None
     clutter: float | None
     prior: Prior | None
     is_metric: bool
@@ -91,7 +99,9 @@ class RigPoints:
             arrays = {name: values[k] if name.endswith("2d") else values for name, values in self.point_options.items()}
             vertical = self.prior if isinstance(self.prior, GravityPrior) else None  # with it, three points fix a pose
             with about(f"camera {k}"):
-                problem = problem_from(image, self.points3d, lens, prior=vertical, **arrays)
+                problem = problem_from(
+                    image, self.points3d, lens, prior=vertical, inlier_threshold=self.inlier_threshold, **arrays
+                )
             problems.append(replace(problem, clutter=self.clutter))
         prior = self.prior if self.prior is None else problems[0].prior_from_user(self.prior)
         rig = Rig(problems, self.mounts, is_metric=self.is_metric, prior=prior, lens=focal)
