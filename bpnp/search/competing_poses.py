@@ -44,7 +44,8 @@ def judge_with_competitors(
 ) -> SearchResult:
     """Judge a confident pose again with its competing poses among the candidates.
 
-    A better pose of a repeated structure becomes the best one, and its competing poses are proposed in turn. The given
+    A better pose of a repeated structure becomes the best one, and its competing poses are proposed in turn. If the
+    deadline of the scene passes before all of them are refined, the verdict is "ambiguous" at best. The given
     camera is accepted unless another lens, whose parameters count as unknowns, has fewer false alarms by the factor
     `settings.focal_chance`.
 
@@ -60,10 +61,12 @@ def judge_with_competitors(
     Returns:
         The verdict, with the competing poses among its candidates.
     """
+    untested = False
     while result.verdict == "confident":
         competitors = repeated_competitors(result, problem, scene_of, settings, enumerated=enumerated)
         if not len(competitors):
             break
+        untested = not enumerated and scene_of().deadline.passed()  # then not all of them were refined
         candidates, leader = Hypotheses.concatenate([result.candidates, competitors]), result.best[1]
         result = judge(
             candidates,
@@ -75,6 +78,8 @@ def judge_with_competitors(
         )
         if np.array_equal(result.best[1], leader):
             break
+    if untested and result.verdict == "confident":
+        return result.add_objection(objection("untested"))
     other = other_lens(result, problem, scene_of, settings) if result.verdict == "confident" else None
     return result if other is None else result.add_objection(other)
 

@@ -20,7 +20,7 @@ from bpnp.search.matching import failed_solution, finished
 from bpnp.search.problem import Problem
 from bpnp.search.solution import Solution
 from bpnp.search.verdict.decide import match_count
-from bpnp.search.verdict.reasons import objection
+from bpnp.search.verdict.reasons import objection, undecided
 from bpnp.search.verdict.uncertainty import linearised, pose_covariance
 
 
@@ -150,8 +150,9 @@ def verify_problem(
     claim = problem.from_user(rotation, translation)
     result, optimum = judge_given_pose(problem, *claim, refine=refine, seed=seed, deadline=deadline)
     if result.verdict == "confident" and deadline.passed():
-        one = objection("untested", seconds=time_limit)
-        result = replace(result, verdict="ambiguous", reason=one.clause, code=one.code)
+        result = result.add_objection(objection("untested"))
+    if result.code == "untested":
+        result = replace(result, reason=undecided(result.reason, time_limit))
     solution = finished(problem, result, time.perf_counter() - begun, inlier_threshold)
     if not refine and solution.found:  # to the last digit
         first = replace(solution.candidates[0], translation=translation)

@@ -3,20 +3,22 @@
 import math
 import re
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from planted import directions
+from planted import degrees_between, directions
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.special import stdtrit
 
 from bpnp.runtime import NEVER, Deadline
-from bpnp.search.competing_poses import AtZoom, likeliest_zoom, other_lens
+from bpnp.search.competing_poses import AtZoom, judge_with_competitors, likeliest_zoom, other_lens
 from bpnp.search.config import DEFAULT
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, UnknownFocal
+from bpnp.search.propose.known_matches import poses_of_matches
 from bpnp.search.search_frame import Scene
 from bpnp.search.verdict.decide import SearchResult, judge
 
@@ -173,3 +175,26 @@ def test_a_focal_length_sweep_reaches_the_true_focal_length(factor: float) -> No
     else:
         zoom = float(re.search(r"with (\S+) times the focal length", other.clause)[1])
         assert zoom == pytest.approx(1 / factor, rel=0.03)
+
+
+def test_a_pose_is_not_confident_if_there_was_no_time_to_refine_its_competing_pose() -> None:
+    """Half of the scene is nearly a copy of the other half, turned by 180 degrees. The planted pose fits best."""
+    rng = np.random.default_rng(0)
+    half = rng.uniform(-1, 1, (40, 3))
+    points = np.concatenate([half, half * [-1, -1, 1] + 0.01 * rng.standard_normal((40, 3))])
+    rays = points + [0, 0, 6] + 0.006 * rng.standard_normal(points.shape)
+    problem = Problem.of(rays / np.linalg.norm(rays, axis=1, keepdims=True), points)
+    found = poses_of_matches(problem, np.arange(80), np.arange(80), 0)
+    alone = judge(found, problem, batches=0, exhaustive=True)
+    assert (alone.verdict, len(alone.candidates)) == ("confident", 1)
+    in_time, late = (
+        judge_with_competitors(
+            alone, problem, partial(Scene, problem, 0, DEFAULT, end), DEFAULT.evidence, exhaustive=True
+        )
+        for end in (NEVER, Deadline(0.0))
+    )
+    assert degrees_between(in_time.best[0], np.eye(3)) < 1
+    assert degrees_between(in_time.candidates.rotation[1], np.diag([-1.0, -1.0, 1.0])) < 2
+    assert (in_time.verdict, in_time.code) == ("confident", "confident")
+    assert (late.verdict, late.code) == ("ambiguous", "untested")
+    assert late.reason.startswith("There was no time to test its competing poses")

@@ -24,7 +24,7 @@ CLAUSES = {
     "better_nearby": "the nearest optimum, {degrees:.2g} deg away, fits better (by {margin:.1f} decades)",
     "other_points": "a pose {degrees:.0f} deg away explains other points, and the difference may be chance",
     "rough_residuals": "the points fit better with residuals far larger than those of the matches",
-    "untested": "not decided in {seconds:.3g} s: its competing poses were not tested",
+    "untested": "there was no time to test its competing poses",
     "incomplete": "a better {what} may exist (miss probability up to {probability})",
     # Another camera, or another scene, may be the right one.
     "other_camera": "with {camera} the points fit significantly better, by a pose {degrees:.0f} deg and "
