@@ -288,7 +288,7 @@ def weighted_pnp(
         r = torch.where(found[:, None, None], rotation.double(), torch.eye(3, dtype=q.dtype, device=q.device))
         r = roma.special_procrustes(r)
         t = (torch.where(found[:, None], translation.double(), 1) + _rotate(r, centre)) / scale
-        r, t, iterations = SOLVERS[solver](q, points, r, t, tolerance=tolerance, max_iterations=max_iterations)
+        r, t, iterations = SOLVERS[solver](q, points.detach(), r, t, tolerance=tolerance, max_iterations=max_iterations)
         residual, well_posed, factor = _judge(derivatives(q, points, r, t))
         converged = found & (residual <= tolerance) & well_posed & (t.norm(dim=-1) < FARTHEST)
         grams = None
