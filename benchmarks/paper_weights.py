@@ -1,6 +1,6 @@
 """The packaged weights `paper-lc` and `paper-lclp`: the paper's losses on drawn shapes, which have no data licence.
 
-    python -m benchmarks paper_weights                     # 3.5 hours; a run that was stopped goes on
+    python -m benchmarks paper_weights                     # 4.5 hours; a run that was stopped goes on
     python -m benchmarks paper_weights --output elsewhere  # keeps the weights of the package
 
 The settings are those of configs/paper/modelnet40.yaml but for `SETTINGS` and for what each of `STAGES` has.
@@ -43,6 +43,7 @@ class Stage:
     points: of each problem, out of the 1,000 fixed points of its shape.
     kind: of the drawn shapes (`MeshDataModule`).
     learning_rate: of the optimizer; constant, or with `decay` falling by a half cosine within the stage.
+    pose_weight: gamma_p of Eq. 15 in a stage with the pose loss; the paper has 1.
     muon: whether Muon is the optimizer, or Adam, as in the paper. Adam starts at step 0, with a warm-up.
     packaged: whether its end is one of the packaged weights.
     """
@@ -54,6 +55,7 @@ class Stage:
     loss: MatchingLoss = "likelihood"
     kind: ProceduralKind = "aligned"
     pose_loss: bool = False
+    pose_weight: float = 1.0
     decay: bool = True
     muon: bool = True
     packaged: bool = False
@@ -68,7 +70,8 @@ STAGES = (
     Stage("likelihood-lp", 256, 1750, 3e-3, pose_loss=True),
     Stage("both", 1000, 1200, 3e-3, "correspondence", pose_loss=True),
     Stage("both-adam", 1000, 400, 2e-4, "correspondence", pose_loss=True, muon=False),
-    Stage("paper-lclp", 1000, 700, 4e-4, "correspondence", pose_loss=True, muon=False, packaged=True),
+    Stage("both-adam-2", 1000, 700, 4e-4, "correspondence", pose_loss=True, muon=False),
+    Stage("paper-lclp", 1000, 2700, 6e-4, "correspondence", pose_loss=True, pose_weight=4, muon=False, packaged=True),
 )
 
 
@@ -92,6 +95,7 @@ def trainings(folder: Path) -> Iterator[tuple[Stage, Training, int]]:
             *SETTINGS, f"--data.num_points={stage.points}", "--data.batch_size=8",
             f"--data.procedural_kind={stage.kind}", *optimizer, *decay,
             f"--model.matching_loss={stage.loss}", f"--pose_loss.start_epoch={first}",
+            f"--pose_loss.weight={stage.pose_weight:g}",
         )  # fmt: skip
         training = Training(folder / stage.name, arguments, end, EPOCH, initial)
         yield stage, training, total
