@@ -31,7 +31,7 @@ def test_points_behind_the_camera_are_no_inliers(backend: str) -> None:
 
 
 def hashed(counter: int, seed: int) -> float:
-    """The same hash with integers of Python, and division in double precision."""
+    """Compute the hash with integers of Python, and divide in double precision."""
     state = counter
     for salt in (0, (seed * 0x9E3779B1 + 1) & 0xFFFFFFFF):
         state = (state + salt) & 0xFFFFFFFF

@@ -56,7 +56,7 @@ def test_a_rig_is_confident_where_no_single_camera_is() -> None:
 def test_cameras_that_see_the_same_unrelated_objects_are_no_evidence_for_each_other(
     cameras: int, baseline: float, count: int
 ) -> None:
-    """All cameras see ten objects, of which the scene has none; by chance, one NFA in a hundred is below 0.01."""
+    """All cameras see ten objects that are not in the scene; by chance, one NFA in a hundred is below 0.01."""
     for seed in range(4):
         rng = np.random.default_rng([41, seed])
         objects, scene = rng.uniform(-1, 1, (10, 3)) + [0, 0, 6], rng.uniform(-1, 1, (count, 3))

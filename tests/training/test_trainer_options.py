@@ -245,7 +245,7 @@ def test_a_test_is_logged_into_the_wandb_run_of_its_training(
 def test_a_training_that_goes_on_stays_in_its_wandb_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """As often as it is continued; from a checkpoint of another folder it has a run of its own."""
+    """Two continuations have the same id; a training from a checkpoint of another folder has its own."""
     monkeypatch.setenv("WANDB_MODE", "offline")
     options = ["--trainer.logger=WandbLogger", "--trainer.logger.mode=offline", "--trainer.limit_train_batches=1"]
     options += ["--trainer.log_every_n_steps=1", "--pose_loss.start_epoch=0"]
