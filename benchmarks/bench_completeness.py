@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import symmetric
-from paper_tables import fill_pages
+from paper_tables import fill_pages, is_published
 from record import ROOT, Problem, write
 from scipy.spatial.transform import Rotation
 
@@ -141,7 +141,7 @@ def main() -> None:
     if not chosen.check:
         write(chosen.output, measure(chosen.seed, chosen.limit, chosen.trials))
     tables = {"data": table(json.loads(chosen.output.read_text()))}
-    fill_pages(PAGES, "completeness", tables, check=chosen.check, published=chosen.output.resolve() == FILE.resolve())
+    fill_pages(PAGES, "completeness", tables, check=chosen.check, published=is_published(parser, chosen))
 
 
 if __name__ == "__main__":

@@ -30,6 +30,7 @@ from paper_tables import (
     fill_pages,
     finish_recall,
     head,
+    is_published,
     network,
     provenance,
     row_text,
@@ -184,5 +185,5 @@ def main() -> None:
         torch.set_num_threads(1)
         if rows := measure(chosen, record):
             save_figure(recall_picture(rows), chosen.picture)
-    published = chosen.output.resolve() == FILE.resolve()
+    published = is_published(parser, chosen)
     fill_pages(PAGES, "finetune", {"data": table(record)}, check=chosen.check, published=published)

@@ -589,7 +589,7 @@ def run(
         chosen.run = chosen.run.with_name(f"{chosen.run.name}-quick")
         chosen.output = chosen.run / "record.json"
         vars(chosen).update(quick)
-    chosen.published = chosen.output.resolve() == parser.get_default("output").resolve()
+    chosen.published = is_published(parser, chosen)
     fill_pages(pages, table.name, markdown(table, measured(chosen)), check=False, published=chosen.published)
 
 
@@ -708,6 +708,11 @@ def fill_tables(text: str, marker: str, tables: Mapping[str, str]) -> str:
     return re.sub(
         rf"<!-- {marker}: ([a-z0-9-]+) -->\n(.*?)<!-- end of {marker} -->", replace_table, text, flags=re.DOTALL
     )
+
+
+def is_published(parser: argparse.ArgumentParser, chosen: argparse.Namespace) -> bool:
+    """Return whether `--output` is its default, the record of the pages, and not a record of its own."""
+    return bool(chosen.output.resolve() == parser.get_default("output").resolve())
 
 
 def fill_pages(

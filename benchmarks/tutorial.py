@@ -19,7 +19,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from paper_tables import PICTURES, effect, effect_head, effect_text, figures, fill_pages, head, row_text
+from paper_tables import PICTURES, effect, effect_head, effect_text, figures, fill_pages, head, is_published, row_text
 from record import ROOT, measured_today, write_json
 
 from bpnp.report.results import ProblemRow, read_results
@@ -118,5 +118,4 @@ def main() -> None:
         write_json(chosen.output, record)
         for name in DRAWN:
             shutil.copyfile(chosen.run / name, chosen.pictures / name)
-    published = chosen.output.resolve() == FILE.resolve()
-    fill_pages([PAGE], "tutorial", tables(record), check=chosen.check, published=published)
+    fill_pages([PAGE], "tutorial", tables(record), check=chosen.check, published=is_published(parser, chosen))

@@ -154,10 +154,10 @@ class BpnpCLI(LightningCLI):
         self.config = parser.parse_args(args)
         config = self.config[self.command]
         config["ckpt_path"] = path
+        joined = self.command == "test" or (self.command == "fit" and _is_in(path, folder))
         for logger in _as_list(config.get("trainer.logger")):
             _log_in(logger, config["trainer.default_root_dir"])
-            continued = self.command == "fit" and path is not None and _is_in(path, folder)
-            if (continued or self.command == "test") and path is not None and Path(path).is_file():
+            if joined and path is not None and Path(path).is_file():
                 join_training(logger, path, self.command)
 
     def before_instantiate_classes(self) -> None:
@@ -239,7 +239,7 @@ class BpnpCLI(LightningCLI):
             return
         self.held.enter_context(lock_folder(root))
         folder, path = Path(_checkpoint_folder(str(root))), self.config[self.command]["ckpt_path"]
-        if not (path is not None and _is_in(path, folder)) and any(folder.glob("*.ckpt")):
+        if not _is_in(path, folder) and any(folder.glob("*.ckpt")):
             raise ValueError(
                 f"{root} holds a training. Continue it with --ckpt_path last, or set --trainer.default_root_dir to "
                 "another folder."
@@ -350,8 +350,8 @@ def _checkpoint_folder(root: str) -> str:
     return str(Path(root) / "checkpoints")
 
 
-def _is_in(path: str, folder: Path) -> bool:
-    return Path(path).resolve().parent == folder.resolve()
+def _is_in(path: str | None, folder: Path) -> bool:
+    return path is not None and Path(path).resolve().parent == folder.resolve()
 
 
 def run_training(arguments: Sequence[str]) -> None:

@@ -16,6 +16,7 @@ another camera than the three.
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from itertools import combinations, permutations
 
 import numpy as np
@@ -74,6 +75,10 @@ class Rig:
         least = RIG.same_centre * np.abs(centres).max()
         pairs = combinations(range(len(mounts)), 2)
         self.apart = [(k, other) for k, other in pairs if np.linalg.norm(centres[k] - centres[other]) > least]
+
+    @cached_property
+    def _images(self) -> list[KDTree]:
+        return [KDTree(problem.bearings) for problem in self.problems]
 
     def pose_of(self, k: int, rotation: Array, translation: Array) -> Pose:
         """Return the poses of camera k for poses (..., 3, 3), (..., 4) of the rig."""
@@ -168,25 +173,28 @@ class Rig:
 
         With logs L in g cameras, each counts (L + min(L, e)) / g; e is that of the parallax, a position on a line.
         """
-        images = [KDTree(problem.bearings) for problem in self.problems]
+        if len(self.problems) == 1:
+            return list(terms)
         result: list[Terms | None] = []
         for k, (problem, own, of) in enumerate(zip(self.problems, directions, terms, strict=True)):
-            seen = np.flatnonzero(np.isfinite(own[:, 0]))
-            if of is None or len(self.problems) == 1:
-                result.append(of)
+            if of is None:
+                result.append(None)
                 continue
+            seen = np.flatnonzero(np.isfinite(own[:, 0]))
             scales = problem.image.scales[-of.logs.shape[1] :]
             _, nearest = KDTree(own[seen]).query(problem.bearings[problem.image.chosen])
-            distances = [_distances(image, each[seen[nearest]]) for image, each in zip(images, directions, strict=True)]
+            nearest = seen[nearest]
+            distances = [_distances(*each) for each in zip(self._images, (d[nearest] for d in directions), strict=True)]
             near = np.array(distances)[:, :, None] <= ALARMS.farthest * scales
             near[k] = True
+            cameras = near.sum(0)  # (points, scales), as `widest`
             parallax = self._parallax(k, seen, directions, rotation, translation)
-            widest = (near * parallax[:, None, None]).max(0)  # (points, scales)
+            widest = (near * parallax[:, None, None]).max(0)
             ratio = (widest / (math.sqrt(2 * math.pi) * scales))[:, :, None]
             along = np.log1p(match_shares(problem) * np.maximum(ratio - 1, 0))
-            logs = (of.logs + np.minimum(of.logs, along)) / near.sum(0)[:, :, None]
-            logs = np.where((of.logs > 0) & (near.sum(0) > 1)[:, :, None], logs, of.logs)
-            result.append(of._replace(logs=logs, together=of.together * near.sum(0)))
+            logs = (of.logs + np.minimum(of.logs, along)) / cameras[:, :, None]
+            logs = np.where((of.logs > 0) & (cameras > 1)[:, :, None], logs, of.logs)
+            result.append(of._replace(logs=logs, together=of.together * cameras))
         return result
 
     def distinct_fraction(self, rotation: Array, translation: Array, scale: float) -> float:
