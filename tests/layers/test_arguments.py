@@ -78,7 +78,7 @@ def test_half_precision_is_widened_and_ransac_has_no_gradient(dtype: torch.dtype
         (weighted_pnp, {"solver": "lbfgs"}),
         (ransac_pnp, {"backend": "torch"}),
     ],
-    ids=str,
+    ids=lambda value: getattr(value, "__name__", str(value)),
 )
 def test_a_default_device_is_not_that_of_the_arguments(layer: Callable[..., Any], options: dict[str, Any]) -> None:
     """As after `torch.set_default_device("cuda")`, with arguments on the CPU."""
