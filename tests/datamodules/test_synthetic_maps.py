@@ -4,11 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from jsonargparse import ArgumentParser
 from scipy.spatial.transform import Rotation
 
 from bpnp.datamodules import Outliers, Problem, SyntheticMapDataModule
-from bpnp.datamodules.synthetic_maps.maps import KINDS, MOST_ERROR_PX, MapOptions, draw_map_problem
+from bpnp.datamodules.synthetic_maps.maps import KINDS, MOST_ERROR_PX, Frame, MapOptions, draw_map_problem
 
 pytestmark = pytest.mark.slow
 
@@ -60,7 +61,7 @@ def test_points_lie_in_the_image_and_the_frame_is_arbitrary() -> None:
         assert 24 <= 2 * np.degrees(np.arctan(half)) <= 115
         assert np.abs(problem.points2d).max() <= half * (1 + 1e-6)
         assert np.abs(problem.points2d).max(0).min() <= half * 0.75 * (1 + 1e-6)
-    for frame in ("any", "upright", "view"):
+    for frame in ("any", "upright", "y_down", "view"):
         kinds = {"facades": 1.0}
         data = SyntheticMapDataModule(num_points=40, test_problems=60, eval_batch_size=60, frame=frame, kinds=kinds)
         data.setup("test")
@@ -74,19 +75,22 @@ def test_points_lie_in_the_image_and_the_frame_is_arbitrary() -> None:
             assert (real[:, 2] > 0).float().mean() > 0.95
             assert (real[:, :2].norm(dim=1) < 1.6 * real[:, 2]).float().mean() > 0.9
         else:
-            assert batch.rotation[:, 1, 2].quantile(0.75) < -0.8  # the third axis is upwards in the image
-            assert batch.rotation[:, 2, :2].mean(0).norm() < 0.35  # and any horizontal direction is ahead
+            vertical, upwards, horizontal = (2, 1, [0, 1]) if frame == "upright" else (1, -1, [0, 2])
+            assert (upwards * batch.rotation[:, 1, vertical]).quantile(0.75) < -0.8  # that axis is upwards in the image
+            assert batch.rotation[:, 2, horizontal].mean(0).norm() < 0.35  # and any horizontal direction is ahead
+            assert torch.linalg.det(batch.rotation).min() > 0.999
     extents = [np.median(np.ptp(problem.points3d, axis=0)) for problem in plenty]
     assert max(extents) / min(extents) > 20
 
 
-def test_an_upright_frame_is_tilted_by_so_many_degrees() -> None:
-    kinds = {"facades": 1.0}
-    level, tilted = (problems(60, num_points=60, noise_px=0.0, kinds=kinds, tilt_deg=tilt) for tilt in (0.0, 10.0))
+@pytest.mark.parametrize(("frame", "vertical"), [("upright", 2), ("y_down", 1)])
+def test_an_upright_frame_is_tilted_by_so_many_degrees(frame: Frame, vertical: int) -> None:
+    options = {"num_points": 60, "noise_px": 0.0, "kinds": {"facades": 1.0}, "frame": frame}
+    level, tilted = (problems(60, **options, tilt_deg=tilt) for tilt in (0.0, 10.0))
     angles = []
     for straight, turned in zip(level, tilted, strict=True):
         turn = turned.rotation.T @ straight.rotation
-        angles.append(np.degrees(np.arccos(turn[2, 2])))
+        angles.append(np.degrees(np.arccos(turn[vertical, vertical])))
         assert np.abs(errors_px(turned)).max() < 0.1
     assert np.sqrt(np.mean(np.square(angles))) == pytest.approx(10 * 2**0.5, rel=0.2)
 

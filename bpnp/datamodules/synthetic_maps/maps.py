@@ -30,7 +30,8 @@ from bpnp.datamodules.synthetic_maps.scene import (
 from bpnp.poses import MIN_POINTS
 from bpnp.types import Batch
 
-Frame = Literal["upright", "view"]
+Frame = Literal["upright", "y_down", "view"]
+Y_DOWN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # turns the third axis upwards to -y
 LONG_SIDE = 1200.0  # longer side of an image, pixels
 LEAST_POINTS = 1500  # least number of feature points of a scene
 MOST_ERROR_PX = 5.0  # largest error of a match, pixels; a reconstruction drops keypoints beyond it
@@ -49,10 +50,11 @@ class MapOptions:
     """Options of `draw_map_problem`; see `SyntheticMapDataModule` for those not listed.
 
     Args:
-        frame: Frame of the map: "upright" for the third axis upwards and any heading, "view" for the coordinates of the
-            first of the cameras whose map points are taken.
-        tilt_deg: Standard deviation of the upright frame's rotation about each of its horizontal axes, degrees, as
-            where the vertical is known roughly.
+        frame: Frame of the map: "upright" for the third axis upwards and any heading, "y_down" for the second axis
+            downwards and any heading, "view" for the coordinates of the first of the cameras whose map points are
+            taken.
+        tilt_deg: Standard deviation of the rotation about each horizontal axis of a frame with a known vertical, degrees,
+            as where the vertical is known roughly.
     """
 
     num_points: int = 256
@@ -140,7 +142,9 @@ def _draw(name: str, kind: str, half: float, options: MapOptions, rng: np.random
     tilt = Rotation.from_rotvec([*(math.radians(options.tilt_deg) * rng.standard_normal(2)), 0.0]).as_matrix()
     scale = _log_uniform(options.scale_range, rng)
     map_rotation, origin = tilt @ heading, 20 * scale * rng.standard_normal(3)
-    if options.frame == "view":
+    if options.frame == "y_down":
+        map_rotation = Y_DOWN @ map_rotation
+    elif options.frame == "view":
         map_rotation, origin = cameras[0].rotation, scale * cameras[0].translation
     pick = rng.permutation(len(matched2d))[:matches]
     chosen2d = np.concatenate([matched2d[pick], rng.permutation(others2d)[:extra2d]])
@@ -281,8 +285,10 @@ class SyntheticMapDataModule(ProblemDataModule):
         views: Smallest and largest number of photos whose map points are taken.
         kinds: Weight of each kind of scene; None for half facades, and a quarter each street and statue.
         frame: Frame of the map: "any", the default, rotated at random; "upright", the third axis upwards and any
-            heading; "view", the coordinates of the first of the cameras whose map points are taken.
-        tilt_deg: Standard deviation of an upright frame's rotation about each of its horizontal axes, degrees.
+            heading; "y_down", the second axis downwards and any heading, as in many maps of COLMAP; "view", the
+            coordinates of the first of the cameras whose map points are taken.
+        tilt_deg: Standard deviation of the rotation about each horizontal axis of a frame "upright" or "y_down",
+            degrees.
         scale_range: Smallest and largest number of scene units in a metre, drawn for each scene, uniform in its
             logarithm.
         field_of_view: Field of view of the longer side of an image, degrees; a number or [low, high], uniform in the
@@ -305,7 +311,7 @@ class SyntheticMapDataModule(ProblemDataModule):
         outliers: NumberOrRange = (0.25, 1.0),
         views: tuple[int, int] = (1, 3),
         kinds: Mapping[str, float] | None = None,
-        frame: Literal["any", "upright", "view"] = "any",
+        frame: Literal["any", "upright", "y_down", "view"] = "any",
         tilt_deg: float = 0.0,
         scale_range: tuple[float, float] = (0.1, 10.0),
         field_of_view: NumberOrRange = (24.0, 115.0),
