@@ -53,8 +53,8 @@ class MapOptions:
         frame: Frame of the map: "upright" for the third axis upwards and any heading, "y_down" for the second axis
             downwards and any heading, "view" for the coordinates of the first of the cameras whose map points are
             taken.
-        tilt_deg: Standard deviation of the rotation about each horizontal axis of a frame with a known vertical, degrees,
-            as where the vertical is known roughly.
+        tilt_deg: Standard deviation of the rotation about each horizontal axis of a frame "upright" or "y_down",
+            degrees, as where the vertical is known roughly.
     """
 
     num_points: int = 256
