@@ -191,6 +191,23 @@ def is_finite(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 
     return rotation.isfinite().all((-2, -1)) & translation.isfinite().all(-1)
 
 
+def masked_median(values: Float[Tensor, "*b k"], mask: Bool[Tensor, "*#b k"]) -> Float[Tensor, "*b"]:
+    """Return the lower median of the masked values, as `torch.nanmedian`, which is not deterministic on a GPU.
+
+    Args:
+        values: Values (..., k).
+        mask: True at the values that count (..., k), broadcast.
+
+    Returns:
+        Median (...); NaN where no value counts.
+    """
+    mask = mask.expand_as(values)
+    ordered = values.masked_fill(~mask, torch.inf).sort(-1).values
+    count = mask.sum(-1, keepdim=True)
+    middle = ordered.gather(-1, (count - 1).clamp(min=0) // 2)
+    return middle.masked_fill(count == 0, torch.nan).squeeze(-1)
+
+
 def chords(
     bearings: Float[Tensor, "b m 3"],
     points3d: Float[Tensor, "b n 3"],

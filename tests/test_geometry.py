@@ -11,6 +11,7 @@ from bpnp.geometry import (
     angle_between,
     bearings,
     hat,
+    masked_median,
     project,
     quaternion_rotation,
     random_rotations,
@@ -96,3 +97,17 @@ def test_random_rotations_are_uniform_and_repeatable(kind: str) -> None:
     angle = rotation_angle(rotation[::2], rotation[1::2])
     below = (angle < 2.0).double().mean()
     assert abs(float(below) - (2.0 - math.sin(2.0)) / math.pi) < 0.04
+
+
+@pytest.mark.parametrize("count", [1, 6, 7])
+def test_a_median_of_the_masked_values_is_numpys(count: int) -> None:
+    rng = np.random.default_rng(count)
+    values, mask = rng.normal(size=(4, 3, count)), rng.random((4, 1, count)) < 0.6
+    mask[0] = False
+    values[1, 0, 0] = values[1, 0, -1]  # a tie
+    found = masked_median(torch.tensor(values), torch.tensor(mask))
+    hidden = np.where(mask, values, np.nan)
+    assert found[0].isnan().all()
+    for row, some in zip(hidden.reshape(-1, count), found.ravel().tolist(), strict=True):
+        if not np.isnan(row).all():
+            assert some == np.nanpercentile(row, 50, method="lower")

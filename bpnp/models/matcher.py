@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from bpnp.geometry import masked_median
 from bpnp.layers.assignment import check_mu, dustbin_marginals, sinkhorn, uniform_marginal
 from bpnp.layers.implicit import BackwardStats
 from bpnp.layers.pnp import WeightedPnP
@@ -204,9 +205,8 @@ def robust_frame(
     Returns:
         Centre (b, 1, d) and radius (b, 1, 1); the radius of coinciding points is one.
     """
-    hidden = points.masked_fill(~mask.unsqueeze(-1), torch.nan)
-    centre = hidden.nanmedian(1, keepdim=True).values
-    radius = torch.linalg.vector_norm(hidden - centre, dim=-1).nanmedian(1).values[:, None, None]
+    centre = masked_median(points.mT, mask.unsqueeze(1)).unsqueeze(1)
+    radius = masked_median(torch.linalg.vector_norm(points - centre, dim=-1), mask)[:, None, None]
     return centre, torch.where(radius > 0, radius, 1)
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bpnp.geometry import bearings, retract
+from bpnp.geometry import bearings, masked_median, retract
 from bpnp.poses import MIN_POINTS
 from bpnp.robust.matches import Matches, distinct_triples, residuals, truncated_scores
 from bpnp.robust.minimal_solvers import poses_of_triples, take
@@ -66,7 +66,7 @@ def consensus(
     pose = _best(poses, truncated_scores(poses, matches, threshold2), 1)
     pose = refine_locally(pose, matches, threshold2, RANSAC.final_steps)
     squared, inlier, *_ = residuals(pose, matches, threshold2)
-    median = torch.where(inlier, squared, torch.nan).nanmedian(-1).values.nan_to_num(threshold2)
+    median = masked_median(squared, inlier).nan_to_num(threshold2)
     pose = refine_locally(pose, matches, threshold2, RANSAC.final_steps, cauchy=4 * median)
     return pose.squeeze(1), matches.real.sum(-1).fill_(hypotheses)
 
