@@ -367,6 +367,10 @@ def measure(
     known = {row["settings"]["test_seed"] for row in record["rows"].values()}
     if known - {options.test_seed}:
         sys.exit(f"{options.output} has rows of the test seed {min(known)}; give another --output for another")
+    parts = [one for one in trained.values() if one.steps % one.epoch]
+    if parts and not options.only_test:
+        names = ", ".join(f"{one.folder.name} has {one.steps} and {one.epoch}" for one in parts)
+        sys.exit(f"the steps of each training must be a multiple of those between checkpoints: {names}")
     for one in trained.values():
         if not options.only_test:
             one.run()
@@ -582,8 +586,6 @@ def run(
     if chosen.check:
         fill_pages(pages, table.name, markdown(table, read_record(chosen.output)), check=True)
         return
-    if not chosen.only_test and (chosen.steps % chosen.epoch or chosen.pose_steps % chosen.epoch):
-        parser.error(f"--steps and --pose_steps must be multiples of --epoch, {chosen.epoch}")
     torch.set_num_threads(1)
     if chosen.quick:
         chosen.run = chosen.run.with_name(f"{chosen.run.name}-quick")

@@ -6,8 +6,9 @@
 
 DATA is a folder with a folder `colmap` of COLMAP models, those of `TRAINED` and `TESTED` (docs/data.md). The training
 is configs/paper/megadepth.yaml but for data, steps, learning rate and normalised scene points (the scenes have
-different units): first on drawn maps, `--drawn_steps`, then on the photos of `TRAINED`. The landmarks that are tested
-are apart from those that are trained on. Photos have up to 1,000 of the points that they see.
+different units): first on drawn maps of up to 128 points, `--few_steps`, and of up to 1,000, `--drawn_steps`, both at
+`DRAWN_RATE`, then on the photos of `TRAINED`. The landmarks that are tested are apart from those that are trained on.
+Photos have up to 1,000 of the points that they see.
 """
 
 import argparse
@@ -31,13 +32,16 @@ TABLE = Table("table2", "megadepth", (10.0, 1.0), ("photos",))
 FILE, PAGES = ROOT / "benchmarks" / "table2.json", (ROOT / "docs" / "table2.md",)
 POINTS = 1000
 EPOCH = 18  # batches of the training photos of `TRAINED`; an epoch has no more
-SHORT = {"drawn_steps": 90, "steps": 144, "pose_steps": 54, "epoch": EPOCH}  # of a quick run
+DRAWN_EPOCH = 90  # steps on drawn maps between checkpoints
+SHORT = {"few_steps": 90, "drawn_steps": 90, "steps": 144, "pose_steps": 54, "epoch": EPOCH}  # of a quick run
 BASELINES: dict[str, Callable[[], nn.Module]] = {
     "SoftPOSIT near the truth": partial(SoftPOSIT, start="near_truth"),
     "RANSAC": RandomRansac,
     "GOSMA": GOSMA,
 }
-DRAWN = ("num_points=128", "outliers=0.0", "frame=upright", "train_problems=1600", "val_problems=16", "batch_size=16")
+FEW_POINTS = 128
+DRAWN_RATE = 5e-4
+DRAWN = ("outliers=0.0", "frame=y_down", "tilt_deg=8", "val_problems=48", "batch_size=16")
 
 
 def data_module(root: Path, seed: int, _: str) -> ColmapDataModule:
@@ -49,22 +53,28 @@ def data_module(root: Path, seed: int, _: str) -> ColmapDataModule:
 def trainings(options: argparse.Namespace) -> dict[str, Training]:
     """On drawn maps, then on photos, and the two branches."""
     shared = (
-        "--config=paper/megadepth", "--model.solver.features3d.normalise=true",
-        f"--model.learning_rate={options.learning_rate}", f"--seed_everything={options.seed}",
+        "--config=paper/megadepth", "--model.solver.features3d.normalise=true", f"--seed_everything={options.seed}",
     )  # fmt: skip
     folder = options.run / f"seed{options.seed}"
-    drawn = ("--data=bpnp.datamodules.SyntheticMapDataModule", *(f"--data.{option}" for option in DRAWN))
-    start = Training(folder / "drawn", (*shared, *drawn), options.drawn_steps, options.epoch)
+    maps = (
+        "--data=bpnp.datamodules.SyntheticMapDataModule", *(f"--data.{option}" for option in DRAWN),
+        f"--data.seed={options.seed}", f"--model.learning_rate={DRAWN_RATE}",
+    )  # fmt: skip
+    few_points = (*shared, *maps, f"--data.num_points={FEW_POINTS}")
+    few = Training(folder / "few", few_points, options.few_steps, DRAWN_EPOCH)
+    more_points = (*shared, *maps, f"--data.num_points={POINTS}", f"--model.weights={few.checkpoint}")
+    drawn = Training(folder / "drawn", more_points, options.drawn_steps, DRAWN_EPOCH)
     roots = json.dumps([str(options.data / "colmap" / scene) for scene in TRAINED])
     photos = (f"--data.root={roots}", "--data.test_fraction=0", "--data.val_fraction=0.15")
-    arguments = (*shared, *photos, f"--data.seed={options.seed}", f"--model.weights={start.checkpoint}")
+    rate = f"--model.learning_rate={options.learning_rate}"
+    arguments = (*shared, *photos, rate, f"--data.seed={options.seed}", f"--model.weights={drawn.checkpoint}")
     schedule = {"steps": options.steps, "pose_steps": options.pose_steps}
-    return {"drawn": start} | paper_tables.branches(folder, arguments, epoch=options.epoch, **schedule)
+    return {"few": few, "drawn": drawn} | paper_tables.branches(folder, arguments, epoch=options.epoch, **schedule)
 
 
 def methods(options: argparse.Namespace, trained: dict[str, Training]) -> Iterator[Method]:
     """Networks with the paper's inference and with ours, then other methods."""
-    drawn = {"drawn_steps": options.drawn_steps}
+    drawn = {"few_steps": options.few_steps, "drawn_steps": options.drawn_steps}
     branches = paper_tables.branch_weights(trained, options)
     weights = [Weights(one.group, one.label, one.checkpoint, one.settings | drawn) for one in branches]
     yield from paper_tables.network_methods(weights, options)
@@ -80,5 +90,8 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
 def main() -> None:
     run = ROOT / "runs" / "table2"
     parser = paper_tables.options(__doc__, file=FILE, run=run, sets=TABLE.sets, steps=1980, pose_steps=396, epoch=EPOCH)
-    parser.add_argument("--drawn_steps", type=int, default=1980, help="on drawn maps (default: %(default)s)")
+    for stage, points in (("few", FEW_POINTS), ("drawn", POINTS)):
+        parser.add_argument(
+            f"--{stage}_steps", type=int, default=1800, help=f"on drawn maps of up to {points} points (default: 1800)"
+        )
     paper_tables.run(TABLE, parser, PAGES, measure, QUICK | SHORT)

@@ -121,8 +121,17 @@ def test_branches_of_unequal_lengths_are_refused_or_named(tmp_path: Path, monkey
     with pytest.raises(SystemExit, match=r"the branches differ in their steps \(Lc 900, Lc Lp 800\)"):
         table1.main()
     monkeypatch.setattr("sys.argv", [*command, "--pose_steps", "150"])
-    with pytest.raises(SystemExit, match="2"):
+    parts = "lc-from700 has 850 and 100, lclp-from700 has 850 and 100"
+    with pytest.raises(SystemExit, match=f"a multiple of those between checkpoints: {parts}"):
         table1.main()
+
+
+def test_steps_on_drawn_maps_are_whole_epochs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(paper_tables.subprocess, "run", lambda *_, **__: pytest.fail("trained"))
+    command = ["table2", "--run", str(tmp_path), "--output", str(tmp_path / "record.json"), "--drawn_steps", "600"]
+    monkeypatch.setattr("sys.argv", [*command, "--steps", "144", "--pose_steps", "54"])
+    with pytest.raises(SystemExit, match="a multiple of those between checkpoints: drawn has 600 and 90"):
+        table2.main()
 
 
 def test_the_weights_with_the_pose_loss_go_on_from_those_without_and_switch_once(tmp_path: Path) -> None:
