@@ -121,17 +121,19 @@ def each_camera(value: Any, count: int) -> list[Any]:
 def each_prior(value: Any, count: int) -> list[Any]:
     """Return the priors of `count` problems, unchanged, from one prior or a list of priors.
 
-    A list of rows of four numbers is one matrix [R | t].
+    A list of rows of four numbers is one matrix [R | t], and a list of a rotation and a translation is one pose.
     """
-    if isinstance(value, list) and len(value) in (3, 4) and all(map(_is_row, value)):
+    if isinstance(value, list) and len(value) in (3, 4) and all(_are_numbers(row, 4) for row in value):
+        return [value] * count
+    if isinstance(value, list) and len(value) == 2 and _are_numbers(value[1], 3):
         return [value] * count
     return each_of("prior", value, count)
 
 
-def _is_row(values: Any) -> bool:
-    """Return True for a row of a matrix [R | t]; a PosePrior is also a tuple of four, but not of four numbers."""
+def _are_numbers(values: Any, count: int) -> bool:
+    """Return True for a sequence of so many numbers; a PosePrior is also a tuple of four, but not of four numbers."""
     is_sequence = isinstance(values, (list, tuple)) or getattr(values, "ndim", 0) == 1
-    return is_sequence and len(values) == 4 and all(np.ndim(value) == 0 for value in values)
+    return is_sequence and len(values) == count and all(np.ndim(value) == 0 for value in values)
 
 
 def positive(name: str, value: Any, *, finite: bool = False) -> float | None:

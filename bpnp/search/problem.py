@@ -228,7 +228,7 @@ class Problem:
         """Reason why these points fix no pose; None if they may."""
         fewest = MIN_POINTS - isinstance(self.prior, GravityPrior)
         reason = why_degenerate(self.bearings, self.points3d, fewest)
-        return f"of the lights that no other problem has, {reason}" if reason and self.taken2d else reason
+        return f"of the 2D points that no other problem has, {reason}" if reason and self.taken2d else reason
 
     def project(self, in_camera: Array) -> Array:
         """Project points (p, 3) in the camera's frame to `image_points`; NaN for points without an image."""
@@ -472,7 +472,7 @@ def why_degenerate(bearings: Array, points3d: Array, fewest: int = MIN_POINTS) -
         while len(others) and count < fewest:
             count, others = count + 1, others[(others != others[0]).any(-1)]
         if count < fewest:
-            return f"only {count} different {name} point{'s' if count > 1 else ''}: {fewest} or more fix a pose"
+            return f"only {count} different {name} point{'' if count == 1 else 's'}: {fewest} or more fix a pose"
     extents = np.linalg.svd(points3d - points3d.mean(0), compute_uv=False)
     if extents[1] <= PROBLEM.line * extents[0]:
         return "the 3D points lie on one line: the camera can turn about it"
