@@ -247,7 +247,7 @@ def solve_many(
         scores2d: Sequence of k arrays (m_i,), or one array for all problems.
         scores3d: Sequence of k arrays (n_i,), or one array for all problems.
         solver: As for `solve`. On a GPU a module solves problems of similar size in one batch.
-        prior: One prior for all problems, or a list of k priors. A list of the rows of [R | t], or [R, t], is one prior.
+        prior: One prior for all problems, or a list of k priors. A list [R, t], or of the rows of [R | t], is one.
         inlier_threshold: Largest reprojection error of a match, for all problems; as for `solve`.
         clutter: Expected fraction of the image points without a correspondence, for all problems; as for `solve`.
         at_infinity: `points3d` are unit directions; as for `solve`. The problems are then independent.

@@ -263,7 +263,8 @@ def test_priors_of_many_problems_are_one_or_a_list_of_them() -> None:
     matrix, pose = np.eye(4)[:3].tolist(), PosePrior(np.eye(3), None, 5.0)
     assert each_prior(matrix, 3) == [matrix] * 3
     parts = [np.eye(3), np.ones(3)]
-    assert each_prior(parts, 2) == [parts] * 2 and each_prior([parts] * 2, 2) == [parts] * 2
+    assert each_prior(parts, 2) == [parts] * 2
+    assert each_prior([parts] * 2, 2) == [parts] * 2
     assert each_prior([np.eye(4)] * 4, 4)[3].shape == (4, 4)
     assert each_prior([pose] * 4, 4) == [pose] * 4
     assert each_prior([matrix, None, matrix], 3) == [matrix, None, matrix]
