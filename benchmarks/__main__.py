@@ -31,6 +31,7 @@ def main() -> None:
         return
     sys.path.insert(0, str(FOLDER))
     sys.argv = [f"python -m benchmarks {name}", *sys.argv[2:]]
+    importlib.import_module("record").commit()
     importlib.import_module(commands[name][0]).main()
 
 

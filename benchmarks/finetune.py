@@ -24,6 +24,7 @@ import torch
 from lightning import LightningDataModule
 from paper_tables import (
     PICTURES,
+    check_beginning,
     digest,
     draw_recall,
     figures,
@@ -111,6 +112,7 @@ def targets(options: argparse.Namespace) -> Iterator[Target]:
 def fine_tune(target: Target, folder: Path) -> Path:
     """Fine-tune the weights to the data, as far as that was not done, and return the checkpoint."""
     checkpoint = folder / "checkpoints" / "last.ckpt"
+    check_beginning(folder, target.arguments, [checkpoint_path(WEIGHTS)])
     if (done := trained_steps(checkpoint)) < STEPS:
         resumed = ["--ckpt_path", "last"] if done else []
         command = [
@@ -181,9 +183,11 @@ def main() -> None:
     chosen = parser.parse_args()
     record: dict[str, Any] = json.loads(chosen.output.read_text()) if chosen.output.is_file() else {}
     record = {"rows": record.get("rows", {})}
+    published = is_published(parser, chosen)
     if not chosen.check:
         torch.set_num_threads(1)
-        if rows := measure(chosen, record):
+        rows = measure(chosen, record)
+        own = chosen.picture != parser.get_default("picture")
+        if own or (published and rows.keys() == record["rows"].keys()):  # the picture of the page has all data
             save_figure(recall_picture(rows), chosen.picture)
-    published = is_published(parser, chosen)
     fill_pages(PAGES, "finetune", {"data": table(record)}, check=chosen.check, published=published)

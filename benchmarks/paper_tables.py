@@ -55,6 +55,8 @@ QUARTERS = (0.25, 0.5, 0.75)
 # Of 2,500 steps an epoch: 120 epochs, then 20 to 80 with the pose loss (section 3.5).
 PRINTED_STEPS = {"Lc": "300,000", "Lc Lp": "350,000 to 500,000"}
 PICTURES = ROOT / "docs" / "images"
+NEVER = 10**6  # an epoch that no training reaches
+WEIGHTS_OPTION = "--model.weights="
 
 
 SEARCH_SECONDS = 10.0
@@ -131,6 +133,9 @@ class Weights:
 class Training:
     """A `bpnp fit` of a number of steps, in epochs of `epoch` steps with a checkpoint each.
 
+    Its arguments, and the content of the weights that it starts from, are kept in `training.json` of the folder: a
+    training that was begun with others is not taken for this one.
+
     start: checkpoint to go on from where the folder has none of its own.
     forks: whether branches start from here; a copy of the checkpoint at exactly `steps` is kept for them.
     """
@@ -153,6 +158,9 @@ class Training:
 
     def run(self) -> Path:
         """Train what is missing and return the checkpoint."""
+        weights = [word.removeprefix(WEIGHTS_OPTION) for word in self.arguments if word.startswith(WEIGHTS_OPTION)]
+        starts = [path for path in (self.start, *map(Path, weights)) if path]
+        check_beginning(self.folder, self.arguments, starts, epoch=self.epoch)
         if (done := trained_steps(self.checkpoint)) < self.steps:
             self._train(done)
             if (done := trained_steps(self.checkpoint)) != self.steps:
@@ -179,6 +187,26 @@ class Training:
         ]  # fmt: skip
         print(f"{self.folder}: {done} of {self.steps} steps\n  {' '.join(command[1:])}", flush=True)
         subprocess.run(command, check=True)
+
+
+def check_beginning(folder: Path, arguments: Iterable[str], starts: Iterable[Path], **settings: Any) -> None:
+    """Exit if the training in a folder was begun with others; write how this one begins to its `training.json`.
+
+    starts: weights that it starts from, compared by content if all of them still exist.
+    """
+    content = [digest(path) if path.is_file() else None for path in starts]
+    now = {"arguments": list(arguments), "starts": content} | settings
+    file = folder / "training.json"
+    if not (trained_steps(folder / "checkpoints" / "last.ckpt") and file.is_file()):
+        write_json(file, now)
+        return
+    before = json.loads(file.read_text(encoding="utf-8"))
+    changed = [name for name in now if now[name] != before.get(name) and (name != "starts" or None not in content)]
+    if changed:
+        sys.exit(
+            f"the training in {folder} was begun with other {', '.join(changed)} ({file.name}); give another --run, "
+            "or delete the folder"
+        )
 
 
 def trained_steps(checkpoint: str | Path) -> int:
@@ -298,11 +326,11 @@ def branches(
     folder: Path, arguments: tuple[str, ...], *, steps: int, pose_steps: int, epoch: int
 ) -> dict[str, Training]:
     """A training with L_c, and two that go on from it at the switch for as many steps: with L_c, and with L_c + L_p."""
-    first, end = Training(folder / "lc", arguments, steps, epoch, forks=True), steps + pose_steps
-    posed = (*arguments, f"--pose_loss.start_epoch={steps // epoch}")
+    without, posed = ((*arguments, f"--pose_loss.start_epoch={at}") for at in (NEVER, steps // epoch))
+    first, end = Training(folder / "lc", without, steps, epoch, forks=True), steps + pose_steps
     return {
         "first": first,
-        "Lc": Training(folder / f"lc-from{steps}", arguments, end, epoch, first.switch),
+        "Lc": Training(folder / f"lc-from{steps}", without, end, epoch, first.switch),
         "Lc Lp": Training(folder / f"lclp-from{steps}", posed, end, epoch, first.switch),
     }
 
@@ -491,17 +519,20 @@ def markdown(table: Table, record: Mapping[str, Any]) -> dict[str, str]:
         result[title] = effect_head(table.recall) + "".join(texts)
     result["commands"] = "```\n" + "".join(f"{line}\n" for line in commands(table, record)) + "```\n"
     names = ("training", "steps until the switch", "steps of Lc", "steps of Lc Lp", "learning rate")
-    trained: dict[tuple[str, int, float], dict[str, int]] = {}
+    trained: dict[tuple[str, int, float, str], dict[str, int]] = {}
     for key, found in record["rows"].items():
         _, seed, group, label, _ = split[key]
         if group == "paper":
             settings = found["settings"]
-            trained.setdefault((seed, settings["steps"], settings["learning_rate"]), {})[label] = found["steps"]
+            drawn = " + ".join(f"{steps:,}" for steps in settings.get("drawn_steps", ()))
+            name = (seed, settings["steps"], settings["learning_rate"], drawn)
+            trained.setdefault(name, {})[label] = found["steps"]
     if trained:
         cells = [
-            (f"seed {seed}", switch, *(steps.get(label, "") for label in BRANCHES), f"{rate:g}")
-            for (seed, switch, rate), steps in trained.items()
-        ]
+            (f"seed {seed}{f', after {drawn} steps on drawn maps' if drawn else ''}", switch,
+             *(steps.get(label, "") for label in BRANCHES), f"{rate:g}")
+            for (seed, switch, rate, drawn), steps in trained.items()
+        ]  # fmt: skip
         lines_of_trainings = (names, ["---"] * len(names), *cells)
         result["training"] = "".join(f"| {' | '.join(map(str, cells))} |\n" for cells in lines_of_trainings)
     return result
@@ -537,7 +568,7 @@ def commands(table: Table, record: Mapping[str, Any]) -> list[str]:
             word
             for name, value in (one | limits).items()
             if name not in DEFAULTS or DEFAULTS[name] != value
-            for word in (f"--{name}", *([] if value is None else [str(value)]))
+            for word in (f"--{name}", *([] if value is None else map(str, np.atleast_1d(value))))
         ]
         if weights:
             words += ["--weights", *(f"{name}=CHECKPOINT" for name in weights)]

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -54,14 +55,18 @@ class Similarity:
         return turned, self.scale * translation - turned @ self.shift
 
 
-def parser(doc: str | None) -> argparse.ArgumentParser:
-    """Return a parser with the options of all benchmarks: data, seed, number of problems, rows, and the record file."""
+def parser(doc: str | None, *, own_record: bool = True) -> argparse.ArgumentParser:
+    """Return a parser with the options of all benchmarks: data, seed and rows.
+
+    own_record: with the number of problems and the record file as well.
+    """
     result = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     result.add_argument("--data", type=Path, default=DATA, help="folder with colmap, photos and psb")
     result.add_argument("--seed", type=int, default=9, help="of the problems and of the search (default: %(default)s)")
-    result.add_argument("--limit", type=int, default=12, help="problems a row (default: %(default)s)")
     result.add_argument("--only", nargs="*", default=[""], help="parts of names: only rows with one of them")
-    result.add_argument("--output", type=Path, help="JSON file for machine, commit, command and rows")
+    if own_record:
+        result.add_argument("--limit", type=int, default=12, help="problems a row (default: %(default)s)")
+        result.add_argument("--output", type=Path, help="JSON file for machine, commit, command and rows")
     return result
 
 
@@ -250,8 +255,12 @@ def write_json(path: Path, record: dict[str, Any]) -> None:
         temporary.write_text(json.dumps(record, indent=1) + "\n")
 
 
+@cache
 def commit() -> str:
-    """Return the commit of this checkout; it ends in "-dirty" if files differ from it."""
+    """Return the commit of this checkout at the first call; it ends in "-dirty" if files differ from it.
+
+    `python -m benchmarks` calls it at the start: a record that is written, or a later commit, does not change it.
+    """
     described = subprocess.run(
         ["git", "-C", ROOT, "describe", "--always", "--dirty"], capture_output=True, text=True, check=False
     )

@@ -356,11 +356,11 @@ def fill_tables(text: str, results: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    options = parser(__doc__)
+    options = parser(__doc__, own_record=False)
     options.set_defaults(seed=None)
     options.add_argument("--quick", action="store_true", help="few problems a row")
     options.add_argument("--check", action="store_true", help="compare, write nothing")
-    options.add_argument("--file", type=Path, default=FILE, help="(default: benchmarks/results.json)")
+    options.add_argument("--file", type=Path, default=FILE, help="another fills no page (default: %(default)s)")
     chosen = options.parse_args()
     kept = json.loads(chosen.file.read_text()) if chosen.file.is_file() else {}
     part = "quick" if chosen.quick else "full"
@@ -376,7 +376,7 @@ def main() -> None:
             continue
         results[row.name] = result
         write(chosen.file, {name: kept.get(name, {}) for name in ("quick", "full")} | {part: results})
-    for document in DOCUMENTS:
+    for document in DOCUMENTS if chosen.file.resolve() == FILE.resolve() or chosen.check else ():
         text = document.read_text(encoding="utf-8")
         if (new := fill_tables(text, results if part == "full" else kept.get("full", {}))) == text:
             continue

@@ -6,9 +6,9 @@
 
 DATA is a folder with a folder `colmap` of COLMAP models, those of `TRAINED` and `TESTED` (docs/data.md). The training
 is configs/paper/megadepth.yaml but for data, steps, learning rate and normalised scene points (the scenes have
-different units): first on drawn maps of up to 128 points, `--few_steps`, and of up to 1,000, `--drawn_steps`, both at
-`DRAWN_RATE`, then on the photos of `TRAINED`. The landmarks that are tested are apart from those that are trained on.
-Photos have up to 1,000 of the points that they see.
+different units): first on drawn maps of up to 128, 256 and 1,000 points, `--drawn_steps`, at `DRAWN_RATE`, then on the
+photos of `TRAINED`. The landmarks that are tested are apart from those that are trained on. Photos have up to 1,000 of
+the points that they see.
 """
 
 import argparse
@@ -33,13 +33,13 @@ FILE, PAGES = ROOT / "benchmarks" / "table2.json", (ROOT / "docs" / "table2.md",
 POINTS = 1000
 EPOCH = 18  # batches of the training photos of `TRAINED`; an epoch has no more
 DRAWN_EPOCH = 90  # steps on drawn maps between checkpoints
-SHORT = {"few_steps": 90, "drawn_steps": 90, "steps": 144, "pose_steps": 54, "epoch": EPOCH}  # of a quick run
+SHORT = {"drawn_steps": [90, 90, 90], "steps": 90, "pose_steps": 36, "epoch": EPOCH}  # of a quick run
 BASELINES: dict[str, Callable[[], nn.Module]] = {
     "SoftPOSIT near the truth": partial(SoftPOSIT, start="near_truth"),
     "RANSAC": RandomRansac,
     "GOSMA": GOSMA,
 }
-FEW_POINTS = 128
+DRAWN_POINTS = (128, 256, POINTS)
 DRAWN_RATE = 5e-4
 DRAWN = ("outliers=0.0", "frame=y_down", "tilt_deg=8", "val_problems=48", "batch_size=16")
 
@@ -59,22 +59,25 @@ def trainings(options: argparse.Namespace) -> dict[str, Training]:
     maps = (
         "--data=bpnp.datamodules.SyntheticMapDataModule", *(f"--data.{option}" for option in DRAWN),
         f"--data.seed={options.seed}", f"--model.learning_rate={DRAWN_RATE}",
+        f"--pose_loss.start_epoch={paper_tables.NEVER}",
     )  # fmt: skip
-    few_points = (*shared, *maps, f"--data.num_points={FEW_POINTS}")
-    few = Training(folder / "few", few_points, options.few_steps, DRAWN_EPOCH)
-    more_points = (*shared, *maps, f"--data.num_points={POINTS}", f"--model.weights={few.checkpoint}")
-    drawn = Training(folder / "drawn", more_points, options.drawn_steps, DRAWN_EPOCH)
+    stages: dict[str, Training] = {}
+    weights: tuple[str, ...] = ()
+    for points, steps in zip(DRAWN_POINTS, options.drawn_steps, strict=True):
+        arguments = (*shared, *maps, f"--data.num_points={points}", *weights)
+        stages[f"drawn{points}"] = Training(folder / f"drawn{points}", arguments, steps, DRAWN_EPOCH)
+        weights = (f"--model.weights={stages[f'drawn{points}'].checkpoint}",)
     roots = json.dumps([str(options.data / "colmap" / scene) for scene in TRAINED])
     photos = (f"--data.root={roots}", "--data.test_fraction=0", "--data.val_fraction=0.15")
     rate = f"--model.learning_rate={options.learning_rate}"
-    arguments = (*shared, *photos, rate, f"--data.seed={options.seed}", f"--model.weights={drawn.checkpoint}")
+    arguments = (*shared, *photos, rate, f"--data.seed={options.seed}", *weights)
     schedule = {"steps": options.steps, "pose_steps": options.pose_steps}
-    return {"few": few, "drawn": drawn} | paper_tables.branches(folder, arguments, epoch=options.epoch, **schedule)
+    return stages | paper_tables.branches(folder, arguments, epoch=options.epoch, **schedule)
 
 
 def methods(options: argparse.Namespace, trained: dict[str, Training]) -> Iterator[Method]:
     """Networks with the paper's inference and with ours, then other methods."""
-    drawn = {"few_steps": options.few_steps, "drawn_steps": options.drawn_steps}
+    drawn = {"drawn_steps": list(options.drawn_steps)}
     branches = paper_tables.branch_weights(trained, options)
     weights = [Weights(one.group, one.label, one.checkpoint, one.settings | drawn) for one in branches]
     yield from paper_tables.network_methods(weights, options)
@@ -90,8 +93,8 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
 def main() -> None:
     run = ROOT / "runs" / "table2"
     parser = paper_tables.options(__doc__, file=FILE, run=run, sets=TABLE.sets, steps=1980, pose_steps=396, epoch=EPOCH)
-    for stage, points in (("few", FEW_POINTS), ("drawn", POINTS)):
-        parser.add_argument(
-            f"--{stage}_steps", type=int, default=1800, help=f"on drawn maps of up to {points} points (default: 1800)"
-        )
+    default = (1800, 1800, 270)
+    parser.add_argument(
+        "--drawn_steps", type=int, nargs=3, default=default, help="of each stage on drawn maps (default: %(default)s)"
+    )
     paper_tables.run(TABLE, parser, PAGES, measure, QUICK | SHORT)

@@ -111,11 +111,12 @@ def main() -> None:
     parser.add_argument("--pictures", type=Path, default=PICTURES, help="folder of the pictures (default: %(default)s)")
     parser.add_argument("--check", action="store_true", help="compare the page with the record, measure nothing")
     chosen = parser.parse_args()
+    published = is_published(parser, chosen)
     if chosen.check:
         record: dict[str, Any] = json.loads(chosen.output.read_text()) if chosen.output.is_file() else {}
     else:
         record = measure(chosen.run)
         write_json(chosen.output, record)
-        for name in DRAWN:
+        for name in DRAWN if published or chosen.pictures != parser.get_default("pictures") else ():
             shutil.copyfile(chosen.run / name, chosen.pictures / name)
-    fill_pages([PAGE], "tutorial", tables(record), check=chosen.check, published=is_published(parser, chosen))
+    fill_pages([PAGE], "tutorial", tables(record), check=chosen.check, published=published)

@@ -195,10 +195,11 @@ def test_tables_are_filled_and_checked(tmp_path: Path, monkeypatch: pytest.Monke
     made.outcome = record.Outcome("", 0.25, 0.0, "confident", 0.5)
     monkeypatch.setattr(here, "ROWS", rows)
     monkeypatch.setattr(here, "DOCUMENTS", (guide,))
+    monkeypatch.setattr(here, "FILE", file)
     monkeypatch.setattr(record, "warm_up", lambda: None)
 
     def run(*arguments: str) -> None:
-        monkeypatch.setattr("sys.argv", ["results", "--file", str(file), *arguments])
+        monkeypatch.setattr("sys.argv", ["results", *arguments])
         here.main()
 
     guide.write_text("before\n<!-- results: leds -->\nold\n<!-- end of results -->\nafter\n")
@@ -231,6 +232,12 @@ def test_tables_are_filled_and_checked(tmp_path: Path, monkeypatch: pytest.Monke
     assert made.seeds[-1] == 9
     rows[0] = replace(rows[0], problems=(2, 0))
     run("--quick", "--check")  # a row without quick problems is not measured
+    other = tmp_path / "other.json"
+    run("--file", str(other))
+    assert json.loads(other.read_text())["full"]["leds: two rings"]["confident_and_wrong"] == 2
+    assert guide.read_text() == text, "a record of its own fills no page"
+    with pytest.raises(SystemExit, match="2"):
+        run("--limit", "2")  # an option of the other benchmarks
 
 
 def test_lines_of_reliability_and_deviations_sum_up_their_rows() -> None:

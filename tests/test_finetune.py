@@ -52,6 +52,15 @@ def test_photos_and_shapes_are_tested_before_and_after_and_the_page_is_filled(
     assert (tmp_path / "recall.png").stat().st_size > 0
     monkeypatch.setattr("sys.argv", ["finetune", *paths, "--check"])
     finetune.main()
+    picture = tmp_path / "picture.png"
+    monkeypatch.setattr(finetune, "PICTURE", picture)
+    options = paths[: paths.index("--picture")]
+    monkeypatch.setattr("sys.argv", ["finetune", *options, "--scenes", "scene", "--shapes"])
+    finetune.main()
+    assert not picture.is_file(), "the picture of the page has all data of the record"
+    monkeypatch.setattr("sys.argv", ["finetune", *options, "--scenes", "scene", "--shapes", "shapes"])
+    finetune.main()
+    assert picture.stat().st_size > 0
 
 
 def test_the_picture_has_the_problems_that_were_not_tuned_on() -> None:

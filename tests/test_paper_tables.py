@@ -83,13 +83,14 @@ def plant_steps(checkpoint: Path, steps: int) -> None:
 def test_both_branches_start_at_the_switch_and_have_equal_lengths(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    starts = {}
+    starts, joins = {}, {}
 
     def train(command: list[str], check: bool) -> None:
         options = dict(word.split("=", 1) for word in command if word.startswith("--") and "=" in word)
         folder, start = Path(options["--trainer.default_root_dir"]), command[-1]
         if not (folder / "checkpoints" / "last.ckpt").is_file() and "from" in folder.name:
             starts[folder.name] = paper_tables.trained_steps(start)
+        joins[folder.name] = int(options["--pose_loss.start_epoch"])
         steps = int(options["--trainer.limit_train_batches"]) * int(options["--trainer.max_epochs"])
         plant_steps(folder / "checkpoints" / "last.ckpt", steps)
 
@@ -102,6 +103,8 @@ def test_both_branches_start_at_the_switch_and_have_equal_lengths(
     assert run(steps=20, pose_steps=10) == {"first": 20, "Lc": 30, "Lc Lp": 30}
     assert run(steps=50, pose_steps=20) == {"first": 50, "Lc": 70, "Lc Lp": 70}
     assert starts == {"lc-from20": 20, "lclp-from20": 20, "lc-from50": 50, "lclp-from50": 50}
+    assert (joins.pop("lclp-from20"), joins.pop("lclp-from50")) == (2, 5)
+    assert min(joins.values()) > 1e5  # not the 120 of the recipe, which a longer training reaches
     assert run(steps=20, pose_steps=30) == {"first": 50, "Lc": 50, "Lc Lp": 50}  # goes on with its own checkpoints
     shutil.rmtree(tmp_path / "lclp-from20")
     run(steps=20, pose_steps=30)  # from the checkpoint that was kept
@@ -111,6 +114,27 @@ def test_both_branches_start_at_the_switch_and_have_equal_lengths(
     monkeypatch.setattr(paper_tables.subprocess, "run", lambda *_, **__: None)
     with pytest.raises(SystemExit, match="lc-from50 has 70 steps instead of 90; was it begun with another --epoch"):
         run(steps=50, pose_steps=40)
+
+
+def test_a_training_that_was_begun_otherwise_is_not_taken_for_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    weights, folder = tmp_path / "weights.ckpt", tmp_path / "run"
+    plant_steps(weights, 5)
+    given = f"--model.weights={weights}"
+    monkeypatch.setattr(
+        paper_tables.subprocess, "run", lambda *_, **__: plant_steps(folder / "checkpoints" / "last.ckpt", 20)
+    )
+    Training(folder, ("--model.learning_rate=1e-4", given), 20, 10).run()
+    monkeypatch.setattr(paper_tables.subprocess, "run", lambda *_, **__: pytest.fail("trained again"))
+    Training(folder, ("--model.learning_rate=1e-4", given), 10, 10).run()  # a shorter one of the same kind is there
+    with pytest.raises(SystemExit, match="was begun with other arguments"):
+        Training(folder, ("--model.learning_rate=1e-5", given), 20, 10).run()
+    with pytest.raises(SystemExit, match="was begun with other epoch"):
+        Training(folder, ("--model.learning_rate=1e-4", given), 20, 20).run()
+    plant_steps(weights, 6)
+    with pytest.raises(SystemExit, match="was begun with other starts"):
+        Training(folder, ("--model.learning_rate=1e-4", given), 20, 10).run()
 
 
 def test_branches_of_unequal_lengths_are_refused_or_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,9 +152,19 @@ def test_branches_of_unequal_lengths_are_refused_or_named(tmp_path: Path, monkey
 
 def test_steps_on_drawn_maps_are_whole_epochs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(paper_tables.subprocess, "run", lambda *_, **__: pytest.fail("trained"))
-    command = ["table2", "--run", str(tmp_path), "--output", str(tmp_path / "record.json"), "--drawn_steps", "600"]
+    command = [
+        "table2",
+        "--run",
+        str(tmp_path),
+        "--output",
+        str(tmp_path / "record.json"),
+        "--drawn_steps",
+        "90",
+        "90",
+        "600",
+    ]
     monkeypatch.setattr("sys.argv", [*command, "--steps", "144", "--pose_steps", "54"])
-    with pytest.raises(SystemExit, match="a multiple of those between checkpoints: drawn has 600 and 90"):
+    with pytest.raises(SystemExit, match="a multiple of those between checkpoints: drawn1000 has 600 and 90"):
         table2.main()
 
 
