@@ -29,7 +29,7 @@ SIZE = 2000  # pixels of a side
 FALSE, MISSING, NOISE_PX, LEAST = 0.3, 0.2, 0.3, 8
 CATALOGUES, FIELDS = (2000, 5000, 10_000), (5.0, 20.0, 60.0, 180.0)
 WIDE = 100.0  # degrees from which the camera is a fisheye
-NARROW, IN_VIEW = 5.0, 15.0  # up to these degrees a catalogue is a belt of the sky, in which a field has so many stars
+NARROW, IN_VIEW = 5.0, 15.0  # degrees of a field up to which a catalogue is a belt of the sky; its stars in a field
 
 
 class Frame(NamedTuple):

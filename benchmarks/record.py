@@ -26,7 +26,7 @@ from bpnp.search.verdict.covariance import student_factor
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("BPNP_SHARED_DATA", ROOT.parent / "shared" / "data"))
-TIME_LIMIT = 60.0  # seconds: so many that a search ends by its own rules, also on a busy machine
+TIME_LIMIT = 60.0  # seconds, enough for a search to end by its own rules, also on a busy machine
 NO_POSE_DEG = 180.0
 NEAR_FOCAL = 0.03  # of a focal length that counts as right, and of the depth, of a camera's centre
 MOST_SIGMAS = 3.0  # standard deviations that the error of a focal length may have

@@ -151,7 +151,7 @@ RELIABILITY = (
     *(Line(f"LEDs that a half turn nearly maps onto each other, {normals} normals", [f"devices, {normals} normals"],
            (600, 20)) for normals in ("with", "without")),
 )  # fmt: skip
-# Rows of which the table of errors in standard deviations takes the mean, over all correct poses.
+# Rows whose mean the table of errors in standard deviations shows, over all correct poses.
 SIGMAS = {
     "LEDs": ("leds: ",),
     "photos against one view": ("maps: points of one view",),
