@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, SupportsFloat, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, SupportsFloat, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -64,6 +64,22 @@ class Pinhole:
         return in_front(points) @ self.matrix[:2].T
 
 
+class _Fisheye(NamedTuple):
+    """A fisheye, which sees the angle t from its axis at the radius t (1 + k1 t^2 + ...), in focal lengths.
+
+    Attributes:
+        focals: (1,) or (2,) focal lengths, pixels.
+        centre: (2,) principal point, pixels.
+        distance: Radius as a polynomial of the angle.
+        widest: Angle up to which the radius rises, the first root of its derivative; at most 180 degrees. Radians.
+    """
+
+    focals: Array
+    centre: Array
+    distance: np.polynomial.Polynomial
+    widest: float
+
+
 @dataclass(frozen=True, eq=False)
 class Lens:
     """Camera of any COLMAP model, with its distortion.
@@ -111,20 +127,12 @@ class Lens:
 
         Rays of a fisheye reach up to 180 degrees off its axis.
         """
-        name, params = self.camera.model.name, np.asarray(self.camera.params, np.float64)
-        if name not in FISHEYE:
+        if (fisheye := self._fisheye) is None:
             return _of_length_one(np.column_stack([self.normalise(pixels), np.ones(len(pixels))]))
-        focals, count = FISHEYE[name]
-        distorted = (pixels - params[focals : focals + 2]) / params[:focals]
-        radius = np.linalg.norm(distorted, axis=-1)
-        # t (1 + k1 t^2 + ...) rises up to the first root of its derivative, at most to 180 degrees.
-        radial = np.zeros(2 * count + 2)
-        radial[1::2] = np.r_[1.0, params[focals + 2 : focals + 2 + count]]
-        distance = np.polynomial.Polynomial(radial).trim()
+        distance, widest = fisheye.distance, fisheye.widest
         slope = distance.deriv()
-        roots = slope.roots()
-        maxima = roots.real[(abs(roots.imag) < 1e-9) & (roots.real > 0)]
-        widest = min([np.pi, *maxima.tolist()])
+        distorted = (pixels - fisheye.centre) / fisheye.focals
+        radius = np.linalg.norm(distorted, axis=-1)
         edges = np.linspace(0, widest, EDGES)
         rising = distance(edges)
         k = np.clip(np.searchsorted(rising, radius) - 1, 0, EDGES - 2)
@@ -137,8 +145,31 @@ class Lens:
         return np.column_stack([transverse, np.cos(angle)])
 
     def project(self, points: Array) -> Array:
-        """Project points (k, 3) in camera coordinates to pixels (k, 2); NaN unless z > 0."""
-        return np.asarray(self.camera.img_from_cam(np.ascontiguousarray(in_front(points))), dtype=np.float64)
+        """Project points (k, 3) in camera coordinates to pixels (k, 2); NaN unless z > 0.
+
+        A fisheye also projects points with z <= 0, up to the angle at which its radius stops rising.
+        """
+        if (fisheye := self._fisheye) is None:
+            return np.asarray(self.camera.img_from_cam(np.ascontiguousarray(in_front(points))), dtype=np.float64)
+        across = np.linalg.norm(points[:, :2], axis=-1)
+        angle = np.arctan2(across, points[:, 2])
+        radius = np.where((angle < fisheye.widest) & (points != 0).any(-1), fisheye.distance(angle), np.nan)
+        outwards = points[:, :2] / np.maximum(across, np.finfo(float).tiny)[:, None]
+        return np.asarray(fisheye.centre + fisheye.focals * radius[:, None] * outwards)
+
+    @property
+    def _fisheye(self) -> _Fisheye | None:
+        """Parameters of a fisheye; None for another model."""
+        name, params = self.camera.model.name, np.asarray(self.camera.params, np.float64)
+        if name not in FISHEYE:
+            return None
+        focals, count = FISHEYE[name]
+        radial = np.zeros(2 * count + 2)
+        radial[1::2] = np.r_[1.0, params[focals + 2 : focals + 2 + count]]
+        distance = np.polynomial.Polynomial(radial).trim()
+        roots = distance.deriv().roots()
+        maxima = roots.real[(abs(roots.imag) < 1e-9) & (roots.real > 0)]
+        return _Fisheye(params[:focals], params[focals : focals + 2], distance, min([np.pi, *maxima.tolist()]))
 
 
 Camera = Pinhole | Lens

@@ -79,7 +79,7 @@ def test_a_wrong_focal_length_is_no_confident_wrong_rotation(factor: float, fiel
     assert solution.verdict != "confident" or degrees_between(solution.rotation, rotation) < 0.1
 
 
-@pytest.mark.parametrize(("field", "count", "factor"), [(40.0, 600, 0.85), (180.0, 300, 1.1)])
+@pytest.mark.parametrize(("field", "count", "factor"), [(40.0, 600, 0.85), (180.0, 300, 1.1), (220.0, 200, 1.02)])
 def test_an_unknown_focal_length_is_found_with_the_rotation(field: float, count: int, factor: float) -> None:
     image, directions, rotation, _ = sky(4, field=field, count=count)
     focal = lens(field).focal
@@ -90,6 +90,20 @@ def test_an_unknown_focal_length_is_found_with_the_rotation(field: float, count:
     assert solution.parameters == ("rotation_x", "rotation_y", "rotation_z", "focal_length")
     assert abs(solution.focal_length - focal) < 4 * solution.focal_length_std < 0.002 * focal
     assert math.isnan(solution.centre_std)
+
+
+def test_an_unknown_focal_length_is_found_with_a_threshold_of_the_noise() -> None:
+    """The coarse search has a wrong focal length, whose residuals are many times the threshold."""
+    image, directions, rotation, star = sky(4)
+    model = lens(40.0, 1.03).model
+    solution = look(image, directions, model, focal_error=0.05, inlier_threshold=1.0)
+    assert solution.verdict == "confident", solution.reason
+    assert degrees_between(solution.rotation, rotation) < 0.05
+    assert solution.focal_length == pytest.approx(lens(40.0).focal, rel=1e-3)
+    assert solution.inlier_threshold == 1.0
+    assert solution.inlier_count > 0.9 * (star >= 0).sum()  # 99.6 % of the normal errors of 0.3 pixels
+    narrow = look(image, directions, model, focal_error=0.05, inlier_threshold=1e-3)
+    assert narrow.verdict != "confident" or degrees_between(narrow.rotation, rotation) < 0.05
 
 
 @pytest.mark.parametrize("error", [0.003, 0.01, 0.1])

@@ -176,6 +176,8 @@ class _SkySweep(FocalSweep):
         zoom, radial = self.unknown.parts(camera)
         sky = self.sky.at(zoom, radial)
         model = _model(sky)
+        if len(solution.matches) < model.fixing:
+            return camera
         matches = _in_image(sky, solution.matches)
         linearise = image_equations(model, matches, lost=INFINITY.lost, robust=INFINITY.robust)
         start = model.state(solution.rotation)
@@ -221,11 +223,15 @@ def _is_settled(last: Iteration) -> bool:
 
 
 def _with_focal_length(sky: Sky, rotation: Array, matches: Labels) -> Array:
-    """Return the covariance (4, 4) of rotation and focal length, pixels, from matches (k, 2)."""
+    """Return the covariance (4, 4) of rotation and focal length, pixels, from matches (k, 2); NaN without matches."""
+    if not len(matches):
+        return np.full((4, 4), math.nan)
     model = _model(sky)
     state = model.state(rotation)
     rows = [image_rows(model, each, state) for each in _in_image(sky, matches)]
     residual, jacobian = map(np.concatenate, zip(*rows, strict=True))
+    in_view = np.isfinite(residual).all(-1) & np.isfinite(jacobian).all((-1, -2))
+    residual, jacobian = residual[in_view], jacobian[in_view]
     assert sky.lenses[0] is not None
     unit = np.array([1, 1, 1, sky.lenses[0].focal])
     covariance = uncertainty_of(residual, jacobian, model.information(state)).covariance[:4, :4]
@@ -235,7 +241,8 @@ def _with_focal_length(sky: Sky, rotation: Array, matches: Labels) -> Array:
 def _solve(sky: Sky, options: Options, settings: InfinitySettings = INFINITY) -> Solution:
     """Return the solution for given cameras, which are some of the sweep if the focal length is unknown."""
     begun, deadline = Clock.now(), Deadline.after(options.time_limit)
-    inlier_threshold, scene, lens = options.inlier_threshold, sky.problem.points3d, sky.lenses[0]
+    inlier_threshold = None if settings is COARSE else options.inlier_threshold
+    scene, lens = sky.problem.points3d, sky.lenses[0]
     parts = [_bearings(image, own) for image, own in zip(sky.images, sky.lenses, strict=True)]
     planes = [plane for _, plane, _ in parts]
     every = np.concatenate([_to_rig(sky, k, rays) for k, (rays, _, _) in enumerate(parts)])
@@ -259,7 +266,7 @@ def _solve(sky: Sky, options: Options, settings: InfinitySettings = INFINITY) ->
         result = search_rotation(
             replace(problem, bearings=every),
             pixel,
-            noise=None if settings is COARSE else noise,
+            noise=noise,
             seed=options.seed,
             deadline=deadline,
             settings=settings,
