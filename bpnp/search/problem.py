@@ -186,7 +186,7 @@ class Problem:
     def without(self, taken: Labels) -> "Problem":
         """Return the problem without the image points that have these indices among the user's."""
         stay = np.flatnonzero(~np.isin(self.usable, taken))
-        return replace(self.choose(stay), taken2d=len(self.bearings) - len(stay))
+        return replace(self.choose(stay), taken2d=self.taken2d + len(self.bearings) - len(stay))
 
     @property
     def usable(self) -> Labels:

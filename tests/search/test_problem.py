@@ -106,6 +106,8 @@ def test_some_points_keep_their_annotations_and_indices() -> None:
     left = problem.without(np.array([0, 1, 2]))
     assert (len(left.bearings), left.taken2d, left.dropped2d) == (37, 3, 0)
     np.testing.assert_array_equal(left.usable, np.arange(3, 40))
+    fewer = left.without(np.array([5, 7]))
+    assert (len(fewer.bearings), fewer.taken2d, fewer.dropped2d) == (35, 5, 0)
 
 
 def test_the_record_is_frozen() -> None:
