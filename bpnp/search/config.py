@@ -212,6 +212,8 @@ class Rules(NamedTuple):
         ladder: Number of radii 1, 1/2, 1/4 ... at which matches are counted. [radii; calibration]
         missed: Nats subtracted for each expected but missing point; one in five is missed. [nats; calibration]
         lacking: Matches subtracted from a hypothesis for each expected but missing point. [matches; calibration]
+        visited: Pairs of an image set and a scene set that a sweep may visit per hypothesis of its budget. Those whose
+            labels differ are no hypothesis; this many take about as long as one. [pairs; cost]
         behind: Matches that a hypothesis may lack against the best one of its stage and still be refined. [matches;
             calibration]
         skipped: Matches of the best pose from which its own triples are not solved again. [matches; calibration]
@@ -228,6 +230,7 @@ class Rules(NamedTuple):
     ladder: int = 5
     missed: float = 1.5
     lacking: float = 0.25
+    visited: int = 256
     behind: float = 1.0
     skipped: int = 5
     counted: int = 12
@@ -266,6 +269,7 @@ class EnumerationSettings:
         prior_weight: Match radii that weigh as much as one standard deviation of a prior. Noise is a tenth to a third
             of a radius. [match radii; calibration]
         smallest_scale: Smallest scale of the residuals if the pixel size is unknown. [radians; numerics]
+        all_around: Cosine from the mean bearing; a camera with a bearing below it sees all around. [1; not tuned]
         ranked: Number of points up to which all neighbours are ranked; beyond, only this many of each. [points; cost]
         scenes: Number of scenes whose tables stay in the cache. [scenes; cost]
         opposite: Cosine of two normals below which no camera faces both. [1; not tuned]
@@ -299,6 +303,7 @@ class EnumerationSettings:
     sigmas: float = 4.0
     prior_weight: float = 0.1
     smallest_scale: float = 1e-5
+    all_around: float = -0.5
     ranked: int = 64
     scenes: int = 8
     opposite: float = -0.8
@@ -325,6 +330,7 @@ class TimeSettings:
             [seconds; cost]
         ending_a_point: Time that each 2D or 3D point adds to `ending`. [seconds per point; cost]
         hypothesis: Time of a hypothesis of the enumeration before it is measured. [seconds; cost]
+        least_pace: Least measured time of a hypothesis; a coarse clock may measure 0. [seconds; numerics]
         built: Time of a set of points when a stage of the enumeration begins. [seconds; cost]
         built_facing: The same for a set of points with normals. [seconds; cost]
         shortest: Time before the deadline in which no hypothesis is begun. [seconds; cost]
@@ -337,6 +343,7 @@ class TimeSettings:
     ending: float = 4e-3
     ending_a_point: float = 8e-6
     hypothesis: float = 2e-6
+    least_pace: float = 1e-9
     built: float = 5e-7
     built_facing: float = 5e-6
     shortest: float = 5e-5

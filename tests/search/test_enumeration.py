@@ -1,5 +1,7 @@
 import itertools
 import math
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.robust.minimal_solvers import p3p
 from bpnp.runtime import Clock
+from bpnp.search.config import ENUMERATION, RULES, Stage
+from bpnp.search.enumeration import search
+from bpnp.search.enumeration.points import ImageSide
 from bpnp.search.enumeration.search import Enumerated, Enumeration, enumerate_poses
 from bpnp.search.problem import Problem
 
@@ -76,6 +81,82 @@ def test_small_problems_are_exhausted(seed: int) -> None:
     assert matches.max() == brute_force(rays, points, 1e-6) == 5
     assert degrees_between(poses.rotation[matches.argmax()], rotation) < 1e-3
     assert enumerate_poses(Problem.of(rays, points), radius=RADIUS, deadline=Clock.now()).ended == "interrupted"
+
+
+def test_an_image_point_opposite_to_the_mean_bearing_is_matched() -> None:
+    """The stereographic coordinates about the mean bearing have no place for the opposite direction."""
+    rng = np.random.default_rng(0)
+    rays = directions(rng.standard_normal((7, 3)) + [0, 0, 1])
+    rays = np.concatenate([rays, directions(-rays.sum(0, keepdims=True))])
+    poses = solved(rays, rays * rng.uniform(2, 3, (8, 1))).poses
+    assert degrees_between(poses.rotation[0], np.eye(3)) < 1e-3
+    assert poses.matches[0].tolist() == list(range(8))
+    assert poses.evidence[0] > 0
+
+
+@pytest.mark.parametrize(("count", "most"), [(12, 4), (100, 2)])
+def test_a_camera_that_sees_all_around_has_chance_matches_in_the_whole_sphere(count: int, most: int) -> None:
+    """A cap of the radius r is the fraction (1 - cos r) / 2 of the sphere; few points do not reach all its sides."""
+    images = (directions(np.random.default_rng([k, count]).standard_normal((count, 3))) for k in range(40))
+    densities = np.array([ImageSide(image, RADIUS, None, 2.0).density for image in images])
+    ratio = densities / ((1 - math.cos(RADIUS)) / 2)
+    assert 0.5 < np.median(ratio) < most
+    assert ratio.max() < 2 * most
+
+
+class Sweeps:
+    """Calls of the compiled loop: its arguments and what it returns."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.calls: list[tuple[Any, Any]] = []
+        self.explore = search.explore
+        monkeypatch.setattr(search, "explore", self)
+
+    def __call__(self, *arguments: Any) -> Any:
+        self.calls.append((arguments, self.explore(*arguments)))
+        return self.calls[-1][1]
+
+
+def labelled(count: int, first: int) -> Enumeration:
+    """Unrelated points, the image points with labels from 0 and the scene points from `first`, each label once."""
+    rng = np.random.default_rng(0)
+    rays = directions(rng.standard_normal((count, 3)) * [0.3, 0.3, 0] + [0, 0, 1])
+    labels = first + rng.permutation(count)
+    problem = Problem.of(rays, rng.uniform(-1, 1, (count, 3)), labels2d=np.arange(count), labels3d=labels)
+    stage = Stage(3, count - 1, count - 1, 0.5)
+    return Enumeration(problem, RADIUS, replace(ENUMERATION, stages=(stage,), chunk=10, look=10))
+
+
+def test_pairs_whose_labels_differ_end_a_sweep_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One hypothesis fits each of the C(14, 3) sets of image points, of 6 C(14, 3) pairs with sets of the scene."""
+    run, sweeps, sets = labelled(14, 0), Sweeps(monkeypatch), math.comb(14, 3)
+    while run.advance(math.inf):
+        pass
+    assert run.ended == "exhausted"
+    calls = [(arguments, end) for arguments, end in sweeps.calls if arguments[2] > 0]
+    passed = [sets * (end[0] - row) + end[1] - t for (row, t, *_), end in calls]
+    assert sum(passed) == 6 * sets**2
+    assert max(passed) <= 10 * RULES.visited
+    assert sum(end[2] for _, end in calls) == run.solved == sets
+
+
+def test_image_points_without_a_fitting_label_take_part_in_no_hypothesis(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three image points have labels of the scene: one set, in 6 orders, with every set of the scene."""
+    for fitting, rows in ((0, 0), (3, 6)):
+        run, sweeps = labelled(14, 14 - fitting), Sweeps(monkeypatch)
+        while run.advance(math.inf):
+            pass
+        assert run.ended == "exhausted"
+        assert sum(end[3] for arguments, end in sweeps.calls if arguments[2] > 0) == rows * math.comb(14, 3)
+
+
+def test_a_clock_that_stands_still_ends_no_enumeration(monkeypatch: pytest.MonkeyPatch) -> None:
+    rays, points, rotation, _, _ = planted(np.random.default_rng(0), 8, noise=0.0)
+    monkeypatch.setattr(Clock, "now", classmethod(lambda cls: 0.0))
+    run = Enumeration(Problem.of(rays, points), RADIUS, replace(ENUMERATION, chunk=10, look=10))
+    while run.advance(1e3):
+        pass
+    assert degrees_between(run.poses().rotation[0], rotation) < 0.1
 
 
 @pytest.mark.parametrize("basin_count", [1, 3])

@@ -50,14 +50,15 @@ def explore(
         return sweep(row, first, budget, stop, block, problem, kept, work)
     kept.at[0] = -1
     settle(work.poses[0], reach, problem, kept, work)
-    return row, first, 0
+    return row, first, 0, 0
 
 
 @part
 def sweep(row: int, first: int, budget: int, stop: float, block: Any, problem: Any, kept: Any, work: Any) -> Any:
     """Solve up to `budget` hypotheses, and keep the refined poses.
 
-    A row is an image set in one order. The sweep also ends after an image set once the best evidence reaches `stop`.
+    A row is an image set in one order. The sweep also ends after an image set once the best evidence reaches `stop`,
+    and after `RULES.visited` pairs of a row and a triangle per hypothesis: labels may exclude most pairs.
 
     Args:
         row: First row.
@@ -70,11 +71,11 @@ def sweep(row: int, first: int, budget: int, stop: float, block: Any, problem: A
         work: A `Work`, overwritten.
 
     Returns:
-        The next row, its next triangle, and the number of hypotheses solved.
+        The next row, its next triangle, the number of hypotheses solved, and the number of pairs visited.
     """
     triangles, orders, rays, best, poses = block.triangles, block.orders, problem.image.rays, kept.best, work.poses
     labels2d, labels3d, normals = problem.image.grid.labels, problem.scene.labels, problem.scene.normals
-    solved, t = 0, first
+    solved, visited, t = 0, 0, first
     while row < len(orders) * len(block.sets) and not (
         t == 0 and row % len(orders) == 0 and kept.evidence[best[0]] >= stop
     ):
@@ -88,10 +89,10 @@ def sweep(row: int, first: int, budget: int, stop: float, block: Any, problem: A
         if block.size == 3:
             hand = 1 if _determinant(rays[i], rays[j], rays[k]) > 0 else 2
         while t < len(triangles.triples):
-            if solved >= budget:
-                return row, t, solved
+            if solved >= budget or visited >= RULES.visited * budget:
+                return row, t, solved, visited
             a, b, c = triangles.triples[t, 0], triangles.triples[t, 1], triangles.triples[t, 2]
-            t += 1
+            t, visited = t + 1, visited + 1
             if not triangles.orientation[t - 1] & hand:
                 continue
             if not (
@@ -118,7 +119,7 @@ def sweep(row: int, first: int, budget: int, stop: float, block: Any, problem: A
                 if allowed(pose, problem.prior) and witnessed(pose, (a, b, c), (i, j, k), block, problem):
                     consider(pose, block.reach, problem, kept, work)
         row, t = row + 1, 0
-    return row, t, solved
+    return row, t, solved, visited
 
 
 @part
@@ -274,7 +275,7 @@ def tightened(pose: Any, reach: float, last: float, problem: Any, matches: Any, 
 @part
 def allowed(pose: Any, prior: Any) -> bool:
     """Return whether a pose agrees with the prior translation and directions."""
-    in_scene, in_camera, shift2 = prior.in_scene, prior.in_camera, 0.0
+    in_scene, in_camera, shift2, off2 = prior.in_scene, prior.in_camera, 0.0, 0.0
     for k in range(3):
         shift2 += (pose[3, k] - prior.translation[k]) ** 2
     if shift2 > prior.farthest_shift2:

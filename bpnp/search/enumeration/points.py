@@ -56,7 +56,7 @@ class Grid(NamedTuple):
 
 
 class ImageArrays(NamedTuple):
-    """Bearings in a frame whose z axis is their mean, and in stereographic coordinates (x, y) / (|p| + z) about it.
+    """Bearings in a frame about `axis_of` them, and in stereographic coordinates (x, y) / (|p| + z) about its z axis.
 
     A difference s of coordinates is an angle of s (1 + cos theta), theta from the axis. `Grid.gain` converts
     differences near an image point to match radii.
@@ -154,7 +154,7 @@ class ImageSide:
     """
 
     def __init__(self, bearings: Array, radius: float, labels2d: Places | None, reach: float) -> None:
-        self.turn = turned_to(bearings.mean(0))
+        self.turn = turned_to(axis_of(bearings))
         rays = bearings @ self.turn.T
         per_radian = 1 / float(radius)
         flat, gain = rays[:, :2] / np.maximum(1 + rays[:, 2:], 1e-9), (1 + rays[:, 2]) * per_radian
@@ -166,6 +166,22 @@ class ImageSide:
     def nearest(self) -> Places:
         """Nearest points (m, k) of each image point."""
         return nearest_of(self.arrays.rays, np.empty((0, 3)))
+
+
+def axis_of(bearings: Array) -> Array:
+    """Return a direction (3,) about which bearings (m, 3) have stereographic coordinates.
+
+    It is the mean bearing. The opposite direction has no coordinates; for a camera that sees all around, the axis is
+    therefore the direction whose opposite is farthest from every bearing.
+
+    >>> axis_of(np.array([[0.0, 0, 1], [0, 0.6, 0.8]])).tolist()
+    [0.0, 0.3, 0.9]
+    """
+    mean = bearings.mean(0)
+    length = float(np.linalg.norm(mean))
+    if float((bearings @ mean).min()) > ENUMERATION.all_around * length:
+        return np.asarray(mean)
+    return np.asarray(DIRECTIONS[(bearings @ DIRECTIONS.T).min(0).argmax()])
 
 
 def scene_side(points3d: Array, normals3d: Array | None, labels3d: Places | None) -> SceneSide:

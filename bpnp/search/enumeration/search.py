@@ -95,6 +95,8 @@ class Enumeration:
             np.full(kept, -1),
             np.zeros(1, np.int64),
         )
+        every, known = image.arrays.grid.labels, scene.arrays.labels
+        self._may_match = (every < 0) | np.isin(every, known) | (known < 0).any()  # image points with a fitting label
         matches = Matches(np.empty(m, np.int64), np.empty(m))
         self.work = Work(np.empty((4, 4, 3)), matches, np.empty((8, 6)))
         seen = settings.seen_witnesses * n / max(m - fixing, 1)
@@ -140,6 +142,7 @@ class Enumeration:
         """Continue with the hypotheses of a stage, without those solved before."""
         m, n = len(self.image.arrays.rays), len(self.scene.arrays.points)
         sets = sets_within(self.image.nearest, stage.near2d, stage.matches)
+        sets = sets[self._may_match[sets].all(-1)]
         triangles = self.scene.triangles(stage.matches, stage.near3d)
         before = self._done.get((stage.matches, stage.reach), (0, 0))
         self._done[stage.matches, stage.reach] = len(sets), len(triangles.triples)
@@ -206,16 +209,16 @@ class Enumeration:
         """Solve hypotheses of the stage.
 
         Args:
-            most: Number of hypotheses. Fewer are solved if a better significant pose is found, or half of the time is
-                over.
+            most: Number of hypotheses. Fewer are solved if a better significant pose is found, half of the time is
+                over, or labels exclude almost all.
             deadline: When to stop (`Clock.now`).
         """
         start, stop = Clock.now(), max(self.best + 1e-9, self.tests)
         most = int(min(most, max(0.5 * (deadline - start) / self._pace, 1)))
-        self._row, self._triangle, solved = self._explored(self._row, self._triangle, most, stop, 1.0)
+        self._row, self._triangle, solved, visited = self._explored(self._row, self._triangle, most, stop, 1.0)
         self.solved += solved
-        if solved >= most:
-            self._pace = (Clock.now() - start) / solved
+        if (done := max(solved, visited // RULES.visited)) >= most:
+            self._pace = max((Clock.now() - start) / done, TIME.least_pace)
 
     def propose(self, rotation: Array, translation: Array, reach: float) -> None:
         """Refine a pose (3, 3), (3,) from matches within `reach` radii, and keep it."""
@@ -251,8 +254,8 @@ class Enumeration:
             residual=np.where(matched, angle, math.inf),
         )
 
-    def _explored(self, *where: int | float) -> tuple[int, int, int]:
-        """Call the compiled loops; return the next row, the next triangle and the number of hypotheses solved."""
+    def _explored(self, *where: int | float) -> tuple[int, int, int, int]:
+        """Call the compiled loops; return the next row and triangle, and the numbers of hypotheses and of pairs."""
         return explore(*where, self._block, self.tables, self.kept, self.work)
 
 
