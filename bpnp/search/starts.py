@@ -15,11 +15,17 @@ Array = NDArray[np.float32]
 class PosePrior(NamedTuple):
     """Rough pose, camera = R p + t, with one standard deviation of its errors.
 
+    The errors are those of the rotation about the centroid o of the scene points, and of the position R o + t of this
+    centroid in the camera's frame. They are independent, and do not depend on the origin of the scene. If instead the
+    position of the camera is known to s, as from a tracker in a map, a wrong rotation also moves a centroid at the
+    distance d: give math.hypot(s, math.radians(rotation_sigma_deg) * d) as `translation_sigma`.
+
     Attributes:
         rotation: (3, 3).
         translation: (3,) in scene units; None if only the rotation is given.
         rotation_sigma_deg: Standard deviation about each axis, degrees.
-        translation_sigma: Standard deviation along each axis, scene units; infinite by default.
+        translation_sigma: Standard deviation of the centroid's position along each axis, scene units; infinite by
+            default.
 
     >>> import numpy as np
     >>> from bpnp import PosePrior

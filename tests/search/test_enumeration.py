@@ -17,6 +17,7 @@ from bpnp.search.enumeration import search
 from bpnp.search.enumeration.points import ImageSide
 from bpnp.search.enumeration.search import Enumerated, Enumeration, enumerate_poses
 from bpnp.search.problem import Problem
+from bpnp.search.starts import PosePrior
 
 Array = NDArray[np.float64]
 RADIUS = 2e-3
@@ -148,6 +149,15 @@ def test_image_points_without_a_fitting_label_take_part_in_no_hypothesis(monkeyp
             pass
         assert run.ended == "exhausted"
         assert sum(end[3] for arguments, end in sweeps.calls if arguments[2] > 0) == rows * math.comb(14, 3)
+
+
+@pytest.mark.parametrize(("sigmas", "is_found"), [(3.8, True), (4.2, False)])
+def test_no_pose_beyond_four_standard_deviations_of_a_prior_rotation_is_tried(sigmas: float, is_found: bool) -> None:
+    rays, points, rotation, _, _ = planted(np.random.default_rng(0), 8, noise=0.0)
+    turned = Rotation.from_rotvec(math.radians(2 * sigmas) * np.array([0.6, 0, 0.8])).as_matrix() @ rotation
+    problem = Problem.of(rays, points, prior=PosePrior(turned, None, 2.0))
+    poses = enumerate_poses(problem, radius=RADIUS).poses
+    assert any(degrees_between(each, rotation) < 0.2 for each in poses.rotation) == is_found
 
 
 def test_a_clock_that_stands_still_ends_no_enumeration(monkeypatch: pytest.MonkeyPatch) -> None:

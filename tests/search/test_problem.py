@@ -64,6 +64,17 @@ def test_a_prior_is_divided_by_the_size_of_the_scene() -> None:
     assert Problem.of(rays, points, prior=gravity).prior == gravity
 
 
+def test_a_prior_does_not_depend_on_the_origin_of_the_scene() -> None:
+    rays, points, rotation, translation = scene()
+    shift, priors = np.array([300.0, -1000.0, 50.0]), []
+    for moved in (np.zeros(3), shift):
+        prior = PosePrior(rotation, translation - rotation @ moved, 5.0, 0.3)
+        known = Problem.of(rays, points + moved, prior=prior).prior
+        assert isinstance(known, PosePrior)
+        priors.append(np.r_[known.translation, known.translation_sigma, known.rotation_sigma_deg])
+    np.testing.assert_allclose(priors[0], priors[1], rtol=1e-9)
+
+
 @pytest.mark.parametrize("count", [12, 120], ids=["few", "many"])
 def test_a_search_gives_the_same_digits_in_any_unit(count: int) -> None:
     rays, points, rotation, translation = scene(count)

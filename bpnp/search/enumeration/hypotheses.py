@@ -283,9 +283,8 @@ def allowed(pose: Any, prior: Any) -> bool:
     for k in range(len(in_scene)):
         x, y, z = rotated(pose, in_scene[k, 0], in_scene[k, 1], in_scene[k, 2])
         dx, dy, dz = x - in_camera[k, 0], y - in_camera[k, 1], z - in_camera[k, 2]
-        if dx * dx + dy * dy + dz * dz > prior.farthest2:
-            return False
-    return True
+        off2 += dx * dx + dy * dy + dz * dz
+    return off2 <= prior.farthest2
 
 
 @part

@@ -79,7 +79,7 @@ class PriorArrays(NamedTuple):
         in_scene: (k, 3) directions a.
         in_camera: (k, 3) directions b = R a.
         weight: Weight of R a - b, in match radii.
-        farthest2: Largest square of R a - b.
+        farthest2: Largest sum of the squares of R a - b.
         translation: (3,).
         farthest_shift2: Largest squared distance from it; infinite without a prior translation.
     """
@@ -333,13 +333,14 @@ def prior_arrays(
         return arrays, Heading(none, none, np.zeros((3, 3, 3)), sine2), log_share
     if isinstance(prior, GravityPrior):
         camera, up = prior.directions()
-        in_scene, in_camera, off = up[None], (image.turn @ camera)[None], math.radians(prior.sigma_deg)
+        sigma, moved = math.radians(prior.sigma_deg), 1
+        in_scene, in_camera = up[None], (image.turn @ camera)[None]
         from_camera, from_scene = turned_to(in_camera[0]), turned_to(up)
     else:
-        prior_rotation, sigma = np.asarray(prior.rotation, np.float64), math.radians(prior.rotation_sigma_deg)
+        prior_rotation, sigma, moved = np.asarray(prior.rotation, np.float64), math.radians(prior.rotation_sigma_deg), 2
         rotation = image.turn @ prior_rotation
         from_camera, from_scene = np.eye(3), rotation
-        in_scene, in_camera, off = np.eye(3), np.ascontiguousarray(rotation.T), math.sqrt(2) * sigma
+        in_scene, in_camera = np.eye(3), np.ascontiguousarray(rotation.T)
         if (predicted := predicted_pose(prior)) is not None:
             translation = image.turn @ predicted[1]
             farthest_shift2 = (settings.sigmas * prior.translation_sigma) ** 2
@@ -349,6 +350,8 @@ def prior_arrays(
     rays = np.ascontiguousarray(image.arrays.rays @ from_camera.T)
     points = np.ascontiguousarray(scene.arrays.points @ from_scene.T)
     heading = Heading(rays, points, from_camera.T @ about @ from_scene, sine2)
-    weight, farthest2 = settings.prior_weight / off, (2 * math.sin(min(settings.sigmas * off, math.pi) / 2)) ** 2
+    # A rotation by v about an axis across `moved` directions moves each of them by 2 sin(v / 2).
+    weight = settings.prior_weight / (math.sqrt(moved) * sigma)
+    farthest2 = moved * (2 * math.sin(min(settings.sigmas * sigma, math.pi) / 2)) ** 2
     arrays = PriorArrays(in_scene, in_camera, float(weight), float(farthest2), translation, float(farthest_shift2))
     return arrays, heading, log_share
