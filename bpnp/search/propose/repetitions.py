@@ -47,8 +47,9 @@ def registered(problem: Problem, rotation: Array, translation: Array, scale: flo
     labels, normals = problem.labels3d, problem.normals3d if problem.cosines3d is None else None
     if len(points) <= limits.whole:
         tolerance = matching_tolerance(points, np.arange(len(points)), noise)
-        motions = _of_scene(*(_frozen(x) for x in (points, labels, normals)), tolerance)
-        return motions.of(points, matched, tolerance, limits.share)
+        arrays = (_frozen(x) for x in (points, labels, normals))
+        motions = _of_scene(*arrays, tolerance, limits.share_of_scene, limits.bases_of_scene)
+        return motions.of(points, matched, tolerance, limits.share, labels3d=labels, normals3d=normals)
     centre = np.median(points[matched], 0)
     near = np.sort(np.argsort(np.linalg.norm(points - centre, axis=-1), kind="stable")[: limits.around])
     sources = np.flatnonzero(np.isin(near, matched))
@@ -75,18 +76,11 @@ def _frozen(array: NDArray[Any] | None) -> Frozen:
 
 
 @lru_cache(maxsize=64)
-def _of_scene(points: Frozen, labels: Frozen, normals: Frozen, tolerance: float) -> Motions:
+def _of_scene(points: Frozen, labels: Frozen, normals: Frozen, tolerance: float, least: float, bases: int) -> Motions:
     """Return the motions of a whole scene, cached for all problems of it."""
     arrays = [None if x is None else np.frombuffer(x[0], x[1]).reshape(x[2]).copy() for x in (points, labels, normals)]
     assert arrays[0] is not None
-    return self_motions(
-        arrays[0],
-        tolerance,
-        labels3d=arrays[1],
-        normals3d=arrays[2],
-        least=DEFAULT.share_of_scene,
-        bases=DEFAULT.bases_of_scene,
-    )
+    return self_motions(arrays[0], tolerance, labels3d=arrays[1], normals3d=arrays[2], least=least, bases=bases)
 
 
 def competing_poses(

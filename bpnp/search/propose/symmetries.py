@@ -59,11 +59,28 @@ class Motions(NamedTuple):
         kept = self.fraction >= least
         return Motions(self.rotation[kept], self.shift[kept], self.fraction[kept], self.complete)
 
-    def of(self, points3d: Array, sources: Indices, tolerance: float, least: float) -> "Motions":
-        """Return those motions of a scene that map at least a fraction `least` of some of its points (k,)."""
-        tree = cKDTree(points3d)
+    def of(
+        self,
+        points3d: Array,
+        sources: Indices,
+        tolerance: float,
+        least: float,
+        *,
+        labels3d: Indices | None = None,
+        normals3d: Array | None = None,
+    ) -> "Motions":
+        """Return those motions of a scene that map at least a fraction `least` of some of its points.
+
+        Args:
+            points3d: (n, 3) scene points.
+            sources: (s,) indices of the points that are moved.
+            tolerance: As for `self_motions`.
+            least: Smallest fraction of the sources that a motion maps.
+            labels3d: As for `self_motions`.
+            normals3d: As for `self_motions`.
+        """
         moved = np.einsum("kij,sj->ksi", self.rotation, points3d[sources]) + self.shift[:, None]
-        near = np.isfinite(tree.query(moved, distance_upper_bound=tolerance)[0])
+        near, _ = _mapped(cKDTree(points3d), moved, self.rotation, sources, tolerance, labels3d, normals3d)
         fraction = near.mean(-1) if len(sources) else np.zeros(len(near))
         order = np.argsort(-fraction, kind="stable")
         order = order[fraction[order] >= max(least, SYMMETRIES.fewest / max(len(sources), 1))]
@@ -152,7 +169,7 @@ def self_motions(
     unique = distinct(
         rotation, offsets / size, score, SYMMETRIES.refined, SYMMETRIES.same_deg, max(4 * tolerance / size, 1e-6)
     )
-    refined = [_refine(points, tree, moved, rotation[k], shift[k], tolerance, labels, normals) for k in unique]
+    refined = [_refine(points, tree, moved, rotation[k], shift[k], tolerance, labels3d, normals3d) for k in unique]
     motions = [one for one in refined if one[2] >= least and _moves(one, points[moved], 3 * tolerance)]
     if not motions:
         return Motions.none()
@@ -263,18 +280,13 @@ def _refine(
     rotation: Array,
     shift: Array,
     tolerance: float,
-    labels: Indices,
-    normals: Array,
+    labels3d: Indices | None,
+    normals3d: Array | None,
 ) -> tuple[Array, Array, float]:
     """Return a motion fitted to the nearest scene points of the moved ones, and the fraction that it maps."""
     own, near, reach = points[moved], np.zeros(len(moved), bool), 2 * tolerance
     for step in range(SYMMETRIES.rounds + 1):
-        distance, target = tree.query(own @ rotation.T + shift, distance_upper_bound=reach)
-        near = np.isfinite(distance)
-        target = np.where(near, target, 0)
-        near &= (labels[moved] == labels[target]) | (labels[moved] < 0) | (labels[target] < 0)
-        if len(normals):
-            near &= ((normals[moved] @ rotation.T) * normals[target]).sum(-1) > 0.5
+        near, target = _mapped(tree, own @ rotation.T + shift, rotation, moved, reach, labels3d, normals3d)
         if step == SYMMETRIES.rounds or near.sum() < 3:
             break
         one, other = own[near], points[target[near]]
@@ -285,6 +297,41 @@ def _refine(
         shift = onto - rotation @ centre
         reach = tolerance if step else 1.5 * tolerance
     return rotation, shift, float(near.mean())
+
+
+def _mapped(
+    tree: Any,
+    moved: Array,
+    rotation: Array,
+    sources: Indices,
+    reach: float,
+    labels3d: Indices | None,
+    normals3d: Array | None,
+) -> tuple[NDArray[np.bool_], Indices]:
+    """Return which moved points lie on a scene point with a fitting label and normal.
+
+    Args:
+        tree: cKDTree of the scene points.
+        moved: (..., s, 3) moved points.
+        rotation: (..., 3, 3) of the motions.
+        sources: (s,) indices of the moved points.
+        reach: Largest distance from the nearest scene point.
+        labels3d: As for `self_motions`.
+        normals3d: As for `self_motions`.
+
+    Returns:
+        The mask (..., s), and the indices (..., s) of the nearest scene points; 0 if none is within reach.
+    """
+    distance, target = tree.query(moved, distance_upper_bound=reach)
+    near = np.isfinite(distance)
+    target = np.where(near, target, 0)
+    if labels3d is not None:
+        own, other = labels3d[sources], labels3d[target]
+        near &= (own == other) | (own < 0) | (other < 0)
+    if normals3d is not None:
+        turned = normals3d[sources] @ np.swapaxes(rotation, -1, -2)
+        near &= (turned * normals3d[target]).sum(-1) > 0.5
+    return near, target
 
 
 def _moves(motion: tuple[Array, Array, float], own: Array, least: float) -> bool:

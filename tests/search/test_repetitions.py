@@ -1,0 +1,67 @@
+"""Motions of the matched points of a pose, against fractions counted point by point."""
+
+import numpy as np
+from numpy.typing import NDArray
+from planted import directions
+
+from bpnp.search.config import Evidence, Repetitions
+from bpnp.search.problem import Problem
+from bpnp.search.propose.repetitions import registered
+from bpnp.search.propose.symmetries import Motions, matching_tolerance
+
+Array = NDArray[np.float64]
+TRANSLATION = np.array([0.0, 0.0, 9.0])
+GRID = np.stack(np.meshgrid(np.arange(10.0), np.arange(5.0), [0.0], indexing="ij"), -1).reshape(-1, 3) - [4.5, 2, 0]
+LEFT = GRID[:, 0] < -1
+
+
+def motions_of(problem: Problem, limits: Repetitions | None = None) -> Motions:
+    settings = Evidence() if limits is None else Evidence(repetitions=limits)
+    return registered(problem, np.eye(3), TRANSLATION, 1e-4, settings)
+
+
+def counted(motions: Motions, fits: NDArray[np.bool_], normals: Array | None = None) -> list[float]:
+    """Return the fraction of the grid that each motion maps onto points that fit (n, n)."""
+    fractions = []
+    for rotation, shift in zip(motions.rotation, motions.shift, strict=True):
+        away = np.linalg.norm((GRID @ rotation.T + shift)[:, None] - GRID, axis=-1)
+        mapped = fits & (away < matching_tolerance(GRID, np.arange(len(GRID)), 1e-3))
+        if normals is not None:
+            mapped &= normals @ rotation.T @ normals.T > 0.5
+        fractions.append(mapped.any(1).mean())
+    return fractions
+
+
+def test_points_of_other_labels_are_not_mapped() -> None:
+    """The left 20 of 50 points have one label, the others one each: no motion maps more than the 20, and the 6 others
+    that lie on its axis."""
+    labels = np.where(LEFT, 0, 1 + np.arange(len(GRID)))
+    motions = motions_of(Problem(directions(GRID + TRANSLATION), GRID, labels2d=labels, labels3d=labels))
+    assert len(motions.fraction)
+    assert motions.fraction.max() <= 26 / 50
+    np.testing.assert_allclose(motions.fraction, counted(motions, labels[:, None] == labels))
+
+
+def test_points_with_other_normals_are_not_mapped() -> None:
+    """The left 20 points face the other way than the rest."""
+    normals = np.where(LEFT, 1.0, -1.0)[:, None] * [0.0, 0.0, 1.0]
+    motions = motions_of(Problem(directions(GRID + TRANSLATION), GRID, normals3d=normals))
+    everything = np.ones((len(GRID), len(GRID)), bool)
+    np.testing.assert_allclose(motions.fraction, counted(motions, everything, normals))
+    assert np.abs(motions.fraction - counted(motions, everything)).max() > 0.05
+
+
+def test_the_registration_of_a_scene_follows_its_settings() -> None:
+    """Two copies of 16 points and 18 others: a motion maps 16 of 50, and only a base within a copy shows it."""
+    few = many = none = 0
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        part = rng.uniform(-1, 1, (16, 3))
+        points = np.concatenate([part, part + [3, 0, 0], rng.uniform(-1, 4, (18, 3)) * [1, 0.5, 0.5]])
+        problem = Problem(directions(points + TRANSLATION), points)
+        many += len(motions_of(problem, Repetitions(share=0.2)).fraction) > 0
+        few += len(motions_of(problem, Repetitions(share=0.2, bases_of_scene=1)).fraction) > 0
+        none += len(motions_of(problem, Repetitions(share=0.2, share_of_scene=0.5)).fraction) > 0
+    assert many >= 9
+    assert few <= 7
+    assert none == 0
