@@ -6,7 +6,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import bpnp
-from bpnp.search.propose.symmetries import Motions, mirror_pose, self_motions
+from bpnp.search.propose import symmetries
+from bpnp.search.propose.symmetries import Motions, matching_tolerance, mirror_pose, self_motions
 
 Array = NDArray[np.float64]
 
@@ -135,3 +136,34 @@ def test_an_exactly_symmetric_object_is_ambiguous(fold: int, each: int) -> None:
     assert found.verdict == "ambiguous"
     assert abs(error - 360 / fold * round(error * fold / 360)) < 3
     assert f"{360 // fold} deg" in found.reason or f"{720 // fold} deg" in found.reason
+
+
+def test_of_a_small_lattice_some_motions_may_be_missing() -> None:
+    """24 rotations, each with dozens of shifts that map over a fifth of the 64 points."""
+    points = np.stack(np.meshgrid(*[np.arange(4.0)] * 3), -1).reshape(-1, 3)
+    tolerance = matching_tolerance(points, np.arange(64), 0.0)
+    assert not self_motions(points, tolerance, least=0.2, bases=128).complete
+
+
+@pytest.mark.parametrize("repeats", [(16, 1), (4, 4)])
+def test_a_complete_registration_has_every_shift_of_a_repetition(repeats: tuple[int, int]) -> None:
+    motif = np.random.default_rng(0).uniform(0, 0.8, (4, 3))
+    cells = np.stack([*np.meshgrid(*[np.arange(float(n)) for n in repeats], indexing="ij"), np.zeros(repeats)], -1)
+    cells = cells.reshape(-1, 3)
+    points = (cells[:, None] + motif).reshape(-1, 3)
+    tolerance = matching_tolerance(points, np.arange(len(points)), 0.0)
+    motions = self_motions(points, tolerance, least=0.2, bases=128)
+    shifts = np.concatenate([cells, -cells, cells * [1, -1, 1], cells * [-1, 1, 1]])
+    fraction = np.prod([np.maximum(n - np.abs(shifts[:, k]), 0) / n for k, n in enumerate(repeats)], 0)
+    upright = motions.rotation.trace(axis1=1, axis2=2) > 1 + 2 * np.cos(0.05)
+    found = motions.shift[upright]
+    planted = shifts[(fraction > 0.22) & shifts.any(1)]
+    lacking = (np.linalg.norm(planted[:, None] - found, axis=-1) > 4 * tolerance).all(1)
+    assert not (motions.complete and lacking.any())
+
+
+def test_motions_may_be_missing_if_the_registration_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = parts(2, 25, 0, 4)
+    assert self_motions(points, 0.02).complete
+    monkeypatch.setattr(symmetries, "SYMMETRIES", symmetries.SYMMETRIES._replace(most_work=32))
+    assert not self_motions(points, 0.02).complete

@@ -36,7 +36,8 @@ class Motions(NamedTuple):
         rotation: (k, 3, 3).
         shift: (k, 3), in the unit of the scene.
         fraction: (k,) of the source points that come to lie within the tolerance of a scene point.
-        complete: False where the scene has more motions than are kept, as a lattice has.
+        complete: False if motions may be missing, because the scene has more than are ranked, as a lattice has, or
+            their registration was cut off (`SymmetrySettings.most_work`).
     """
 
     rotation: Array
@@ -45,9 +46,9 @@ class Motions(NamedTuple):
     complete: bool
 
     @classmethod
-    def none(cls) -> "Motions":
+    def none(cls, *, complete: bool = True) -> "Motions":
         """Return an empty record."""
-        return cls(np.empty((0, 3, 3)), np.empty((0, 3)), np.empty(0), True)
+        return cls(np.empty((0, 3, 3)), np.empty((0, 3)), np.empty(0), complete)
 
     def competitors(self, rotation: Array, translation: Array) -> tuple[Array, Array]:
         """Return the poses (k, 3, 3), (k, 3) that these motions confuse with the pose (3, 3), (3,)."""
@@ -158,7 +159,7 @@ def self_motions(
     room = SYMMETRIES.most_found
     found = Found(np.zeros((room, 3, 3)), np.zeros((room, 3)), np.zeros(room))
     most = SYMMETRIES.most_work // max(len(chosen), 1)
-    total = _register(
+    total, complete = _register(
         scene, chosen, sample, tolerance, math.ceil(0.7 * least * len(sample)), most, found, np.empty((4, 3, 3))
     )
     kept = min(total, room)
@@ -169,17 +170,18 @@ def self_motions(
     unique = distinct(
         rotation, offsets / size, score, SYMMETRIES.refined, SYMMETRIES.same_deg, max(4 * tolerance / size, 1e-6)
     )
+    complete = bool(complete) and total <= room and len(unique) < SYMMETRIES.refined
     refined = [_refine(points, tree, moved, rotation[k], shift[k], tolerance, labels3d, normals3d) for k in unique]
     motions = [one for one in refined if one[2] >= least and _moves(one, points[moved], 3 * tolerance)]
     if not motions:
-        return Motions.none()
+        return Motions.none(complete=complete)
     motions.sort(key=lambda one: -one[2])
     rotation, shift, fraction = (np.array(part) for part in zip(*motions, strict=True))
     offsets = rotation @ median_point + shift
     unique = distinct(
         rotation, offsets / size, fraction, SYMMETRIES.refined, SYMMETRIES.same_deg, max(4 * tolerance / size, 1e-6)
     )
-    return Motions(rotation[unique], shift[unique], fraction[unique], len(unique) < SYMMETRIES.refined)
+    return Motions(rotation[unique], shift[unique], fraction[unique], complete)
 
 
 def extent(points: Array) -> float:
@@ -357,9 +359,10 @@ def _register(
         work: (4, 3, 3), overwritten.
 
     Returns:
-        The number of motions, which may exceed the slots of `found`.
+        The number of motions, which may exceed the slots of `found`; and False if a base took more than the largest
+        work, so that the rest of the scene was left out for it.
     """
-    points, count = scene.points, 0
+    points, count, complete = scene.points, 0, True
     frame, target, rotation, shift = work[0], work[1], work[2], work[3, 0]
     for base in range(len(bases)):
         a, b, c = bases[base, 0], bases[base, 1], bases[base, 2]
@@ -369,6 +372,7 @@ def _register(
         work_done = 0
         for i in range(len(points)):
             if work_done > most:
+                complete = False
                 break
             if not _fits(scene, a, i):
                 continue
@@ -423,7 +427,7 @@ def _register(
                                 found.shift[place, p] = shift[p]
                                 for q in range(3):
                                     found.rotation[place, p, q] = rotation[p, q]
-    return count
+    return count, complete
 
 
 @part
