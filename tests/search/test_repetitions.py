@@ -3,10 +3,11 @@
 import numpy as np
 from numpy.typing import NDArray
 from planted import directions
+from scipy.optimize import nnls
 
 from bpnp.search.config import Evidence, Repetitions
 from bpnp.search.problem import Problem
-from bpnp.search.propose.repetitions import registered
+from bpnp.search.propose.repetitions import _among, registered
 from bpnp.search.propose.symmetries import Motions, matching_tolerance
 
 Array = NDArray[np.float64]
@@ -65,3 +66,15 @@ def test_the_registration_of_a_scene_follows_its_settings() -> None:
     assert many >= 9
     assert few <= 7
     assert none == 0
+
+
+def test_image_points_among_the_projected_points_are_in_the_cone_of_their_directions() -> None:
+    rng = np.random.default_rng(0)
+    bearings = rng.normal(size=(60, 3))
+    bearings[:45, 2] = np.abs(bearings[:45, 2])
+    bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
+    problem = Problem(bearings, 5 * bearings)
+    seen = bearings[bearings @ problem.image.centre > 0.1] + rng.normal(0, 0.01, 3)
+    inside = [nnls(seen.T, one)[1] < 1e-9 for one in bearings[problem.image.chosen]]
+    assert 5 < sum(inside) < 55
+    np.testing.assert_array_equal(_among(problem, seen), inside)

@@ -210,4 +210,5 @@ def _among(problem: Problem, seen: Array) -> NDArray[np.bool_]:
         sides = ConvexHull(plane).equations
     except (QhullError, ValueError):  # collinear or too few points
         return np.zeros(len(points), bool)
-    return np.asarray((points @ sides[:, :2].T + sides[:, 2] <= 0).all(-1))
+    in_front = problem.bearings[image.chosen] @ image.centre > 0  # those behind project to the opposite side
+    return np.asarray((points @ sides[:, :2].T + sides[:, 2] <= 0).all(-1) & in_front)
