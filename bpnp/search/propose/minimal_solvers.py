@@ -188,8 +188,8 @@ def p3p_depths(chords: Any, a: float, b: float, poses: Any) -> int:
         first, second = cubic_root(constant, linear, quadratic, leading), 1.0
     elif leading != 0:
         first, second = 1.0, cubic_root(leading, quadratic, linear, constant)
-    else:
-        return 0
+    else:  # the first conic is a pair of lines, as for an equilateral triangle seen along its axis
+        first, second = 1.0, 0.0
     xx, xy, xw = first + second, first * xy1, second * xw2
     yy, yw, ww = first * yy1 + second * yy2, first * yw1 + second * yw2, first * ww1 + second * ww2
     # The point p where the lines meet, from the adjugate, and D + [p]x, which has rank one.
