@@ -7,6 +7,7 @@ from planted import degrees_between, directions, seen
 from scipy.spatial.transform import Rotation
 
 from bpnp.search.config import DEFAULT
+from bpnp.search.kernels.sides import kernel_sides, side_of
 from bpnp.search.problem import Problem, faces
 from bpnp.search.search import search_poses
 
@@ -69,3 +70,21 @@ def test_annotations_of_the_points_find_a_pose_that_the_points_alone_do_not(know
     blind = search_poses(Problem.of(problem.bearings, problem.points3d), settings=DEFAULT.limited(9))
     assert degrees_between(blind.best[0], rotation) > 5
     assert blind.verdict == "failed"
+
+
+@pytest.mark.parametrize("likely", [0, 12, 300])
+def test_clusters_keep_the_weight_of_few_likely_points_among_many_impossible_ones(likely: int) -> None:
+    """A score below the smallest float32 number is a weight of 0."""
+    rng = np.random.default_rng(likely)
+    count, points = 20_000, rng.uniform(-1, 1, (20_000, 3)).astype(np.float32)
+    scores = np.where(np.arange(count) < likely, 1.0, 1e-50)
+    side = side_of(points, scores, np.zeros(count, np.int64), None, np.arange(count))
+    clusters = side.clustered(64, DEFAULT, rng)
+    assert clusters.weights.sum() == likely
+    if likely:
+        mean = clusters.weights @ clusters.points / likely
+        np.testing.assert_allclose(mean, points[:likely].mean(0), atol=0.01)
+    bearings = side.at(slice(0, 40))._replace(weights=np.ones(40, np.float32))
+    seen, scene = kernel_sides(bearings, clusters, DEFAULT.facing)
+    assert scene.b.sum() == likely
+    assert np.isfinite(seen.odds).all()

@@ -141,6 +141,7 @@ def with_partners(side: Side, other: Side) -> Side:
 
 def _clusters(side: Side, count: int, settings: SearchSettings, rng: np.random.Generator) -> Side:
     """Return at most `count` clusters of points of one label."""
+    side = side.at(np.flatnonzero(side.weights > 0))  # a sample of the others may contain none of these
     k = len(side.points)
     if k <= count:
         return side
@@ -214,8 +215,8 @@ def blocks_of(labels2d: NDArray[np.int32], labels3d: NDArray[np.int32]) -> NDArr
 
 
 def _fitting(side: Side, other: Side) -> Array:
-    """Return the fraction of the other side, by weight, with a fitting label; at least 1e-6."""
-    if (side.labels < 0).all():
+    """Return the fraction of the other side, by weight, with a fitting label; at least 1e-6, and 1 if it is empty."""
+    if (side.labels < 0).all() or not len(other.labels):
         return np.ones(len(side.labels), np.float32)
     values, place = np.unique(other.labels, return_inverse=True)
     weights, free = np.bincount(place, other.weights), other.weights[other.labels < 0].sum()
