@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,9 +11,12 @@ from planted import degrees_between, directions
 from scipy.spatial.transform import Rotation
 
 from bpnp.cameras import camera_from
+from bpnp.search.config import OtherFocal
 from bpnp.search.pose_model import lens_columns, lens_error_columns, log10_lenses
 from bpnp.search.problem import Problem, UnknownFocal
+from bpnp.search.propose import lens
 from bpnp.search.propose.lens import fit_lens, lens_model
+from bpnp.search.refine.gauss_newton import soft_equations
 from bpnp.search.verdict.uncertainty import linearised, local_covariance
 
 Array = NDArray[np.float64]
@@ -53,6 +57,24 @@ def test_without_a_radial_coefficient_only_the_focal_length_is_fitted() -> None:
     assert fit.radial is None
     assert fit.zoom == pytest.approx(0.95, rel=1e-5)
     assert lens_model(problem, bends=False).size == 7
+
+
+@pytest.mark.parametrize("count", [300, 401, 799, 801])
+def test_first_steps_use_at_most_the_stated_number_of_bearings(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    used: list[int] = []
+
+    def counted(*args: Any, chosen: Any = None, **options: Any) -> Any:
+        used.extend([] if chosen is None else [len(chosen)])
+        return soft_equations(*args, chosen=chosen, **options)
+
+    monkeypatch.setattr(lens, "soft_equations", counted)
+    points, pixels = planted(0.0, seed=3, count=count, zoom=0.97)
+    problem = Problem(directions(np.c_[pixels / FOCAL, np.ones(count)]), points)
+    fit = fit_lens(problem, np.eye(3), problem.centre3d, 2e-3)
+    assert fit is not None
+    assert fit.zoom == pytest.approx(0.97, rel=1e-3)
+    assert len(used) == 1
+    assert OtherFocal.bearings / 2 <= used[0] <= OtherFocal.bearings
 
 
 @pytest.mark.parametrize("radial", [-0.2, 0.0, 0.3])

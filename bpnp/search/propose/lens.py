@@ -79,7 +79,7 @@ def fit_lens(
         outermost = float(((problem.bearings[:, :2] / problem.bearings[:, 2:]) ** 2).sum(-1).max())
         largest[model.columns["radial"]] = LENS.most_bend / outermost
     chosen = problem.image.chosen
-    some = chosen[:: max(len(chosen) // OtherFocal.bearings, 1)]
+    some = chosen[:: max(math.ceil(len(chosen) / OtherFocal.bearings), 1)]
     linearise = soft_equations(model, [problem], chosen=some, most=LENS.correspondences)
     state = PoseState(rotation, centre3d, radial=radial or 0.0)
     for widths in (LENS.first + LENS.widths, *[LENS.widths] * (LENS.most_rounds - 1)):
