@@ -144,7 +144,7 @@ def truncated_scores(
     # x' - x = (row_0 - x row_2) [p; 1] / depth: one product for the numerator, and the depth is only squared.
     along_x, along_y = torch.cat([scene, -x * scene], 1), torch.cat([scene, -y * scene], 1)
     scores = []
-    for part in poses.float().split(max(1, RANSAC.chunk // (x.shape[0] * x.shape[2])), dim=1):
+    for part in poses.float().split(max(1, RANSAC.chunk // max(1, x.shape[0] * x.shape[2])), dim=1):
         row0, row1, row2 = part.unbind(2)
         squared = (torch.cat([row0, row2], -1) @ along_x).square_()
         squared += (torch.cat([row1, row2], -1) @ along_y).square_()

@@ -37,3 +37,8 @@ def test_poses_and_scores_are_poselibs(inliers: float, lead: float) -> None:
     assert (scores[:, 0] < 1.005 * scores[:, 1]).all()
     assert torch.rad2deg(rotation_angle(ours[0], theirs[0])).max() < 0.2
     assert torch.rad2deg(rotation_angle(ours[0], planted.rotation)).max() < 1
+
+
+def test_an_empty_batch_has_no_scores() -> None:
+    matches = Matches(torch.zeros(0, 5, 2), torch.zeros(0, 5, 3), torch.zeros(0, 5, dtype=torch.bool))
+    assert truncated_scores(torch.zeros(0, 7, 3, 4), matches, THRESHOLD**2).shape == (0, 7)
