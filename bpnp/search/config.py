@@ -245,7 +245,7 @@ class EnumerationSettings:
     """Constants of the enumeration.
 
     Attributes:
-        most_products: Largest number of image points times scene points that are enumerated: 60 x 60. [products; cost]
+        most_products: Largest number of image points times scene points that are enumerated: 63 x 63. [products; cost]
         most_products_known: The limit where a prior lets two matches fix a pose. [products; cost]
         stages: Blocks of hypotheses, in their order; those of two matches need a prior that lets two fix a pose.
             [`Stage`; calibration]
@@ -643,7 +643,7 @@ class SymmetrySettings(NamedTuple):
         widest: Number of triangles drawn for a base; the largest is taken. [triangles; not tuned]
         fewest: Smallest number of moved points that lie on others. Three fix a motion and are no evidence of it.
             [points; derived]
-        first: Number of sampled points; at least one must confirm a motion. One of 12 motions of a third of the
+        first: Number of sampled points; at least one must confirm a motion. One of 17 motions of a third of the
             points fails. [points; derived]
         checked: Number of sampled points that confirm a motion before all points do. [points; cost]
         most_work: Largest number of pairs of points that are compared for all bases together, some 0.1 s; the rest is

@@ -112,5 +112,6 @@ def test_derived_constants_follow_from_their_laws() -> None:
     assert chi2.cdf(INFINITY.reach**2, 2) == pytest.approx(0.994, abs=5e-4)
     assert (1 - 0.2**3) ** MATCHES.triples == pytest.approx(3e-4, rel=0.1)
     assert (1 - 0.5**3) ** SYMMETRIES.bases == pytest.approx(0.014, rel=0.05)
+    assert (1 - 1 / 3) ** SYMMETRIES.first == pytest.approx(1 / 17, rel=0.05)
     assert (1 - 1 / 27) ** Repetitions.bases_of_scene == pytest.approx(0.008, rel=0.05)
     assert REFINER.difference == pytest.approx(np.cbrt(np.finfo(float).eps), rel=0.02)
