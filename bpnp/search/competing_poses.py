@@ -120,7 +120,8 @@ def repeated_competitors(
         refined = add_false_alarms(anneal_to_end(scene_of(), *poses, scale), problem)
     others, fraction = (refined.rotation, refined.translation), float(motions.fraction.min(initial=1.0))
     behind = repetition_margins(problem, best, poses, others, scale, limits, fraction=fraction)
-    behind = np.maximum(behind, 0) if motions.complete else np.zeros(len(refined))
+    # A motion that was left out, as of a lattice, could explain a better pose that is not among these.
+    behind = np.maximum(behind, 0) if motions.left_out < limits.symmetric else np.zeros(len(refined))
     if enumerated and (behind >= settings.margin).all():
         return Hypotheses.empty()
     alarms = np.minimum(refined.log10_false_alarms, result.log10_false_alarms + behind)

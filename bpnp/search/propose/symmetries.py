@@ -36,19 +36,24 @@ class Motions(NamedTuple):
         rotation: (k, 3, 3).
         shift: (k, 3), in the unit of the scene.
         fraction: (k,) of the source points that come to lie within the tolerance of a scene point.
-        complete: False if motions may be missing, because the scene has more than are ranked, as a lattice has, or
-            their registration was cut off (`SymmetrySettings.most_work`).
+        left_out: Largest fraction that a motion which is not among these may map. It is 0 unless a scene has more than
+            are refined, as a lattice has, and 1 if the registration was cut off (`SymmetrySettings.most_work`).
     """
 
     rotation: Array
     shift: Array
     fraction: Array
-    complete: bool
+    left_out: float
+
+    @property
+    def complete(self) -> bool:
+        """True if no motion was left out."""
+        return self.left_out == 0
 
     @classmethod
-    def none(cls, *, complete: bool = True) -> "Motions":
+    def none(cls, *, left_out: float = 0.0) -> "Motions":
         """Return an empty record."""
-        return cls(np.empty((0, 3, 3)), np.empty((0, 3)), np.empty(0), complete)
+        return cls(np.empty((0, 3, 3)), np.empty((0, 3)), np.empty(0), left_out)
 
     def competitors(self, rotation: Array, translation: Array) -> tuple[Array, Array]:
         """Return the poses (k, 3, 3), (k, 3) that these motions confuse with the pose (3, 3), (3,)."""
@@ -58,7 +63,7 @@ class Motions(NamedTuple):
     def mapping(self, least: float) -> "Motions":
         """Return the motions that map at least this fraction."""
         kept = self.fraction >= least
-        return Motions(self.rotation[kept], self.shift[kept], self.fraction[kept], self.complete)
+        return Motions(self.rotation[kept], self.shift[kept], self.fraction[kept], self.left_out)
 
     def of(
         self,
@@ -85,7 +90,10 @@ class Motions(NamedTuple):
         fraction = near.mean(-1) if len(sources) else np.zeros(len(near))
         order = np.argsort(-fraction, kind="stable")
         order = order[fraction[order] >= max(least, SYMMETRIES.fewest / max(len(sources), 1))]
-        return Motions(self.rotation[order], self.shift[order], fraction[order], self.complete)
+        left_out = min(
+            self.left_out * len(points3d) / max(len(sources), 1), 1.0
+        )  # as if all that they map were sources
+        return Motions(self.rotation[order], self.shift[order], fraction[order], left_out)
 
 
 def mirror_pose(points3d: Array, rotation: Array, translation: Array) -> tuple[Array, Array] | None:
@@ -170,18 +178,20 @@ def self_motions(
     unique = distinct(
         rotation, offsets / size, score, SYMMETRIES.refined, SYMMETRIES.same_deg, max(4 * tolerance / size, 1e-6)
     )
-    complete = bool(complete) and total <= room and len(unique) < SYMMETRIES.refined
     refined = [_refine(points, tree, moved, rotation[k], shift[k], tolerance, labels3d, normals3d) for k in unique]
-    motions = [one for one in refined if one[2] >= least and _moves(one, points[moved], 3 * tolerance)]
-    if not motions:
-        return Motions.none(complete=complete)
-    motions.sort(key=lambda one: -one[2])
-    rotation, shift, fraction = (np.array(part) for part in zip(*motions, strict=True))
+    ranked = [k for k, one in enumerate(refined) if one[2] >= least and _moves(one, points[moved], 3 * tolerance)]
+    if not ranked:
+        return Motions.none(left_out=0.0 if complete else 1.0)
+    ranked.sort(key=lambda k: -refined[k][2])
+    rotation, shift, fraction = (np.array(part) for part in zip(*(refined[k] for k in ranked), strict=True))
     offsets = rotation @ median_point + shift
     unique = distinct(
         rotation, offsets / size, fraction, SYMMETRIES.refined, SYMMETRIES.same_deg, max(4 * tolerance / size, 1e-6)
     )
-    return Motions(rotation[unique], shift[unique], fraction[unique], complete)
+    # Candidates that were not refined had lower scores: they map no more than those of the lower half.
+    is_cut = total > room or len(refined) == SYMMETRIES.refined
+    lower = [float(fraction[k]) for k in unique if is_cut and ranked[k] >= len(refined) // 2]
+    return Motions(rotation[unique], shift[unique], fraction[unique], max(lower, default=0.0) if complete else 1.0)
 
 
 def extent(points: Array) -> float:
