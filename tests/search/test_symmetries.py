@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from planted import degrees_between
 from scipy.spatial.transform import Rotation
 
 import bpnp
@@ -184,3 +185,27 @@ def test_motions_may_be_missing_if_the_registration_is_cut_off(monkeypatch: pyte
     assert self_motions(points, 0.02).left_out == 0
     monkeypatch.setattr(symmetries, "SYMMETRIES", symmetries.SYMMETRIES._replace(most_work=32))
     assert self_motions(points, 0.02).left_out == 1
+
+
+def test_a_shift_that_was_left_out_makes_a_row_of_equal_things_ambiguous() -> None:
+    """A row of 15 motifs and four unique points, of which the image shows the left half. A shift by nine motifs maps
+    over half of the points in view, but is not among the motions that are compared."""
+    rng = np.random.default_rng(0)
+    motif = rng.uniform(0, 0.8, (4, 3))
+    row = np.concatenate([motif + [k, 0, 0] for k in range(15)])
+    points = np.concatenate([row, rng.uniform(row.min(0), row.max(0), (4, 3))])
+    in_view = points[points[:, 0] < 7.9]
+    tolerance, shift = matching_tolerance(points, np.arange(64), 0.0), np.array([9.0, 0, 0])
+    nearest = np.linalg.norm((in_view + shift)[:, None] - points, axis=-1).min(1)
+    assert (nearest < tolerance).mean() > 0.6
+    motions = self_motions(points, tolerance, least=0.2, bases=128)
+    moved = in_view @ motions.rotation.transpose(0, 2, 1) + motions.shift[:, None]
+    assert np.linalg.norm(moved - in_view - shift, axis=-1).max(1).min() > 0.5
+
+    rotation = Rotation.random(rng=np.random.default_rng(5)).as_matrix()
+    camera = (in_view - in_view.mean(0)) @ rotation.T + [0, 0, 16]
+    image = camera[:, :2] / camera[:, 2:] + 1e-3 * rng.normal(size=(len(in_view), 2))
+    solution = bpnp.solve(rng.permutation(image), points, seed=0)
+    assert degrees_between(solution.rotation, rotation) < 3
+    assert solution.verdict == "ambiguous"
+    assert solution.reason_code == "competing_pose"
