@@ -94,7 +94,7 @@ def propose_elsewhere(
         regions: Regions of the map, ranked for the explained image points; the first ones of other points are searched.
     """
     scale = _scale_of(problem, solution)
-    repeated, _ = repeated_poses(problem, *_pose_of(problem, solution), scale, DEFAULT.evidence)
+    repeated = repeated_poses(problem, *_pose_of(problem, solution), scale, DEFAULT.evidence).poses
     return [
         *(_pose_of(problem, one) for one in earlier),
         *zip(repeated.rotation, repeated.translation, strict=True),

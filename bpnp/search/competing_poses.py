@@ -110,16 +110,17 @@ def repeated_competitors(
     scale = result.residual if enumerated else min(result.residual, likeliest_scale(problem, *best))
     scale = max(scale, problem.image.scales[0])
     least = settings.repetitions.symmetric if enumerated else 0.0
-    repeated, motions = repeated_poses(problem, *best, scale, settings, least=least)
+    repeated, sizes, motions = repeated_poses(problem, *best, scale, settings, least=least)
     if not len(repeated):
         return repeated
-    poses, limits = (repeated.rotation, repeated.translation), settings.repetitions
+    poses, limits, rigid = (repeated.rotation, repeated.translation), settings.repetitions, sizes == 1
     if enumerated:
         refined, limits = repeated, replace(limits, most_missing=1e-12)
     else:
         refined = add_false_alarms(anneal_to_end(scene_of(), *poses, scale), problem)
     others, fraction = (refined.rotation, refined.translation), float(motions.fraction.min(initial=1.0))
-    behind = repetition_margins(problem, best, poses, others, scale, limits, fraction=fraction)
+    shifted = poses[0][rigid], poses[1][rigid]
+    behind = repetition_margins(problem, best, shifted, others, scale, limits, fraction=fraction)
     # A motion that was left out, as of a lattice, could explain a better pose that is not among these.
     behind = np.maximum(behind, 0) if motions.left_out < limits.symmetric else np.zeros(len(refined))
     if enumerated and (behind >= settings.margin).all():

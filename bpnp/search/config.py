@@ -91,6 +91,8 @@ class Repetitions:
         bases: Number of bases with few points. [bases; cost]
         fewer_bases: Number of bases with many points. A motion of nine tenths of the matches is missed by (1 - 0.9^3)^8
             = 3e-5 of the registrations. [bases; derived]
+        factor: Largest ratio of the sizes of a part and its copy, in a registration of at most `many` points. [factor;
+            not tuned]
         kept: Largest number of competing poses; those with the fewest false alarms are kept. [poses; cost]
         most_missing: Largest fraction of its points that a map may lack. [fraction; not tuned]
     """
@@ -105,6 +107,7 @@ class Repetitions:
     many: int = 500
     bases: int = 16
     fewer_bases: int = 8
+    factor: float = 4.0
     kept: int = 6
     most_missing: float = 1 / 3
 
@@ -643,14 +646,18 @@ class SymmetrySettings(NamedTuple):
         widest: Number of triangles drawn for a base; the largest is taken. [triangles; not tuned]
         fewest: Smallest number of moved points that lie on others. Three fix a motion and are no evidence of it.
             [points; derived]
+        fewest_scaled: The same for motions of another scale. [points; calibration]
         first: Number of sampled points; at least one must confirm a motion. One of 17 motions of a third of the
             points fails. [points; derived]
+        bases_scaled: Largest number of bases that are matched at other scales, at most a third of all. [bases; cost]
+        most_scaled: Largest number of these bases times points. [bases * points; cost]
         checked: Number of sampled points that confirm a motion before all points do. [points; cost]
         most_work: Largest number of pairs of points that are compared for all bases together, some 0.1 s; the rest is
             left out. [pairs; cost]
         confirming: Number of pairs that take as long as a sampled point. [pairs; cost]
         most_found: Number of motions of all bases together that are ranked. [motions; cost]
         refined: Number of motions, those of the largest fraction first, that are refined. [motions; cost]
+        refined_scaled: The same for motions of another scale. [motions; cost]
         near_symmetry: Largest error of a point under a near symmetry, as a fraction of the extent. [fraction;
             convention]
         spacing: Largest error in spacings of the points: at a quarter of the spacing 1 to 6 % of the points lie on
@@ -668,12 +675,16 @@ class SymmetrySettings(NamedTuple):
     compact: int = 4
     widest: int = 4
     fewest: int = 5
+    fewest_scaled: int = 8
     first: int = 7
+    bases_scaled: int = 16
+    most_scaled: int = 2000
     checked: int = 32
     most_work: int = 30_000_000
     confirming: int = 8
     most_found: int = 4096
     refined: int = 48
+    refined_scaled: int = 8
     near_symmetry: float = 0.02
     spacing: float = 0.25
     flat: float = 0.1

@@ -71,7 +71,7 @@ def judge_given_pose(
     others = _proposed(problem, claim, scene)
     if few:  # as in an enumeration, whose candidates are refined
         motions = registered(one, rotation, translation, float(claim.scale[0]), settings)
-        copies = competing_poses(one, rotation, translation, motions, settings)
+        copies = competing_poses(one, rotation, translation, motions, settings)[:2]
         if len(copies[0]):
             others = Hypotheses.concatenate([others, anneal_to_end(scene, *copies, float(claim.scale[0]))])
     others = _with_new_false_alarms(others, one)

@@ -90,6 +90,7 @@ class Problem:
         given3d: The scene points in the user's coordinates; None if they are these.
         taken2d: Number of image points that were left to another problem.
         network: Trained network whose pose is tried first.
+        baseline: True if other cameras at known distances see the scene too: a copy of another size looks different.
 
     Examples:
         >>> rng = np.random.default_rng(0)
@@ -129,6 +130,7 @@ class Problem:
     given3d: Array | None = None
     taken2d: int = 0
     network: Any = None
+    baseline: bool = False
 
     @classmethod
     def of(cls, bearings: Array, points3d: Array, *, prior: Prior | None = None, **attributes: Any) -> "Problem":

@@ -14,6 +14,9 @@ from scipy.spatial.transform import Rotation
 
 import bpnp
 from bpnp.cameras import camera_from
+from bpnp.search.problem import Problem
+from bpnp.search.propose.symmetries import Motions
+from bpnp.search.rig.cameras import Rig
 from bpnp.search.rig.solve import RigPoints
 
 CAMERA = ("SIMPLE_PINHOLE", [500.0, 320.0, 240.0])
@@ -236,3 +239,34 @@ def test_the_threshold_is_the_search_radius_of_each_camera() -> None:
             is_metric=True,
         )
         assert [problem.match_radius for problem in points.rig(lenses).problems] == pytest.approx(radii, rel=0.02)
+
+
+@pytest.mark.parametrize(("seed", "is_metric"), [(0, True), (2, True), (2, False), (3, False)])
+def test_a_rig_of_known_size_decides_between_a_part_and_its_copy_of_half_the_size(seed: int, is_metric: bool) -> None:
+    rng = np.random.default_rng([9, seed])
+    part = rng.uniform(-0.5, 0.5, (12, 3))
+    copy = 0.5 * part @ Rotation.random(rng=rng).as_matrix().T + [1.5, 0.5, 0]
+    rotation, mounts, images = Rotation.random(rng=rng).as_matrix(), [], []
+    for _ in range(2):
+        turn = Rotation.from_rotvec(0.15 * rng.standard_normal(3)).as_matrix()
+        mounts.append((turn, rng.uniform(-0.4, 0.4, 3)))
+        camera = (part @ rotation.T + [0.1, -0.1, 3]) @ turn.T + mounts[-1][1]
+        images.append(500 * camera[:, :2] / camera[:, 2:] + [320, 240] + 0.2 * rng.standard_normal((12, 2)))
+    scene = np.concatenate([part, copy])
+    solution = bpnp.solve(images, scene, [CAMERA] * 2, rig=mounts, scale=not is_metric, time_limit=60)
+    assert solution.verdict == ("confident" if is_metric else "ambiguous")
+    assert not is_metric or degrees_between(solution.rotation, rotation) < 1
+
+
+def test_a_larger_rig_sees_a_copy_of_another_size_as_a_smaller_one_sees_the_part() -> None:
+    _, part, mounts, (rotation, translation), _ = planted_rig(0, (10, 10))
+    turn, shift = Rotation.from_rotvec([0.4, 0.9, -0.3]).as_matrix(), np.array([2.0, 0.5, -1])
+    motions = Motions(turn[None], shift[None], np.array([0.6]), np.ones(1), 0.0)
+    cameras = [(part @ rotation.T + translation) @ mount.T + offset for mount, offset in mounts]
+    bearings = [camera / np.linalg.norm(camera, axis=1, keepdims=True) for camera in cameras]
+    rig = Rig([Problem(each, part) for each in bearings], mounts, is_metric=False)
+    first = rig.pose_of(0, rotation, np.append(translation, 1))
+    others = rig.rig_of(0, *motions.competitors(*first), motions.scale[:, None])
+    for k, camera in enumerate(cameras):
+        other, moved = rig.pose_of(k, *others)
+        np.testing.assert_allclose(motions.apply(part)[0] @ other[0].T + moved[0], 0.6 * camera)

@@ -102,6 +102,74 @@ def test_a_lattice_has_more_motions_than_are_ranked() -> None:
     assert not self_motions(lattice, 0.05).complete
 
 
+def part_and_copy(scale: float, each: int, unique: int, seed: int) -> tuple[Array, Array, Array]:
+    """Return random points, their copy of another size and unique points, in that order; the rotation and the shift."""
+    rng = np.random.default_rng(seed)
+    base, turn, shift = rng.uniform(-1, 1, (each, 3)), Rotation.random(rng=rng).as_matrix(), np.array([3.0, -2, 1])
+    copy = scale * base @ turn.T + shift
+    return np.concatenate([base, copy, rng.uniform(-1, 4, (unique, 3))]), turn, shift
+
+
+@pytest.mark.parametrize("scale", [0.3, 0.5, 0.7, 1.5, 3.0])
+@pytest.mark.parametrize("unique", [0, 12])
+def test_a_copy_of_another_size_is_found(scale: float, unique: int) -> None:
+    points, turn, shift = part_and_copy(scale, 20, unique, 1)
+    motions = self_motions(points, 0.02, least=0.2, bases=128, factor=4)
+    there, back = (int(np.argmin(abs(motions.scale - size))) for size in (scale, 1 / scale))
+    np.testing.assert_allclose(motions.scale[[there, back]], [scale, 1 / scale])
+    np.testing.assert_allclose(motions.rotation[[there, back]], [turn, turn.T], atol=1e-9)
+    np.testing.assert_allclose(motions.shift[[there, back]], [shift, -turn.T @ shift / scale], atol=1e-9)
+    np.testing.assert_allclose(motions.fraction[[there, back]], 20 / len(points), atol=0.06)
+    assert (self_motions(points, 0.02, least=0.2, bases=128).scale == 1).all()
+
+
+def test_the_competitor_of_a_copy_of_another_size_projects_the_same_image() -> None:
+    points, turn, shift = part_and_copy(0.4, 20, 0, 2)
+    planted = Motions(turn[None], shift[None], np.array([0.4]), np.ones(1), 0.0)
+    rotation, translation = Rotation.from_euler("xyz", [0.5, 0.2, 0.1]).as_matrix(), np.array([0.3, 0.1, 9.0])
+    (other,), (moved,) = planted.competitors(rotation, translation)
+    one, copy = points[:20] @ rotation.T + translation, points[20:] @ other.T + moved
+    np.testing.assert_allclose(copy[:, :2] / copy[:, 2:], one[:, :2] / one[:, 2:])
+    np.testing.assert_allclose(copy[:, 2], 0.4 * one[:, 2])
+    np.testing.assert_allclose(planted.apply(points[:20])[0], points[20:])
+    np.testing.assert_allclose(planted.inverse().apply(points[20:])[0], points[:20])
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e7])
+def test_a_copy_of_another_size_is_found_in_any_unit(unit: float) -> None:
+    points, _, _ = part_and_copy(0.5, 25, 5, 3)
+    one, other = (self_motions(size * points, 0.02 * size, factor=4) for size in (1.0, unit))
+    np.testing.assert_allclose(np.sort(one.scale), [0.5, 2])
+    np.testing.assert_allclose(other.scale, one.scale)
+    np.testing.assert_allclose(other.shift / unit, one.shift, atol=1e-6)
+
+
+def test_labels_and_normals_distinguish_a_copy_of_another_size() -> None:
+    points, turn, _ = part_and_copy(0.5, 25, 0, 4)
+    normals = np.random.default_rng(1).normal(size=(25, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    for labels, normals3d, count in [
+        (np.tile(np.arange(25), 2), np.concatenate([normals, normals @ turn.T]), 2),
+        (np.repeat([0, 1], 25), None, 0),
+        (None, np.concatenate([normals, -normals @ turn.T]), 0),
+    ]:
+        assert len(self_motions(points, 0.02, labels3d=labels, normals3d=normals3d, factor=4).scale) == count
+
+
+def test_the_tolerance_of_a_smaller_copy_is_smaller() -> None:
+    points, turn, shift = part_and_copy(0.25, 30, 0, 5)
+    points[30:] += 0.012 * np.random.default_rng(5).choice([-1, 1], (30, 3))  # 0.02 in all
+    planted = Motions(turn[None], shift[None], np.array([0.25]), np.ones(1), 0.0)
+    assert len(planted.of(points, np.arange(30), 0.1, 0.9).scale) == 1  # 0.025 at the size of the copy
+    assert not len(planted.of(points, np.arange(30), 0.05, 0.9).scale)
+
+
+@pytest.mark.parametrize("count", [10, 20, 40, 120, 400])
+def test_random_points_have_no_copy_of_another_size(count: int) -> None:
+    points = np.random.default_rng(count).uniform(-1, 1, (count, 3))
+    assert (self_motions(points, 0.1 * count ** (-1 / 3), factor=4).scale == 1).all()
+
+
 def test_the_mirror_image_of_a_plane_projects_to_the_same_points_from_afar() -> None:
     rng = np.random.default_rng(0)
     board = np.c_[rng.uniform(-1, 1, (20, 2)), np.zeros(20)]
@@ -209,3 +277,34 @@ def test_a_shift_that_was_left_out_makes_a_row_of_equal_things_ambiguous() -> No
     assert degrees_between(solution.rotation, rotation) < 3
     assert solution.verdict == "ambiguous"
     assert solution.reason_code == "competing_pose"
+
+
+def image_of(points: Array, seed: int) -> tuple[Array, Array, Array]:
+    """Return the noisy image (k, 2) of points seen from a random side, 1 pixel at 1,000 pixels, and the pose."""
+    rng = np.random.default_rng([seed, 8])
+    rotation = Rotation.random(rng=rng).as_matrix()
+    size = np.abs(points - points.mean(0)).max()
+    translation = size * np.array([0.1, 0, 5]) - rotation @ points.mean(0)
+    camera = points @ rotation.T + translation
+    image = camera[:, :2] / camera[:, 2:] + 1e-3 * rng.normal(size=(len(points), 2))
+    return rng.permutation(image), rotation, translation
+
+
+@pytest.mark.parametrize(("scale", "unique"), [(0.5, 0), (0.5, 15), (1.5, 15), (0.33, 15)])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_copy_of_another_size_makes_a_pose_ambiguous(scale: float, unique: int, seed: int) -> None:
+    points, _, _ = part_and_copy(scale, 30, unique, seed)
+    image, rotation, translation = image_of(points[30 * (seed % 2) :][:30], seed)
+    found = bpnp.solve(image, np.random.default_rng(seed).permutation(points), seed=seed, time_limit=30)
+    assert found.verdict == "ambiguous"
+    given = bpnp.verify(image, points, rotation, translation)
+    assert given.verdict == "ambiguous"
+
+
+@pytest.mark.parametrize(("scale", "unique"), [(0.5, 4), (0.7, 15)])
+def test_a_copy_of_another_size_that_the_image_shows_too_decides(scale: float, unique: int) -> None:
+    points, _, _ = part_and_copy(scale, 25, unique, 6)
+    image, rotation, _ = image_of(points, 6)
+    found = bpnp.solve(image, np.random.default_rng(6).permutation(points), time_limit=30)
+    assert found.verdict == "confident"
+    assert np.degrees(Rotation.from_matrix(rotation @ found.rotation.T).magnitude()) < 1

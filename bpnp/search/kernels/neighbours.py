@@ -127,13 +127,13 @@ def _enter(table: Any) -> None:
 
 
 @part
-def lies_on(table: Any, x: Any, y: Any, z: Any) -> Any:
-    """Return whether (x, y, z) is within the tolerance of a point of the table."""
+def lies_on(table: Any, x: Any, y: Any, z: Any, reach: Any) -> Any:
+    """Return whether (x, y, z) is within `reach`, at most the tolerance, of a point of the table."""
     points, tolerance, heads, links = table
     e = heads[entry(heads, x, y, z, 2 * tolerance)]
     while e >= 0:
         dx, dy, dz = points[e >> 3, 0] - x, points[e >> 3, 1] - y, points[e >> 3, 2] - z
-        if dx * dx + dy * dy + dz * dz < tolerance * tolerance:
+        if dx * dx + dy * dy + dz * dz < reach * reach:
             return True
         e = links[e]
     return False

@@ -2,7 +2,7 @@
 
 import math
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +19,22 @@ Pose = tuple[Array, Array]
 DEFAULT = Repetitions()
 
 
+class Repeated(NamedTuple):
+    """Competing poses due to the motions of a scene, and to the mirror image of a flat one.
+
+    Attributes:
+        poses: (c,) unrefined poses.
+        scale: (c,) scale of the motion of each pose, 1 for rigid ones.
+        motions: All motions, from which the poses were chosen.
+    """
+
+    poses: Hypotheses
+    scale: Array
+    motions: Motions
+
+
 def registered(problem: Problem, rotation: Array, translation: Array, scale: float, settings: Evidence) -> Motions:
-    """Return the rigid motions that map the matched points of a pose onto other scene points.
+    """Return the motions that map the matched points of a pose onto other scene points.
 
     If a pose is wrong because of a symmetry or a repetition, one of these motions maps nearly all of its matched points
     onto those of the correct pose. They may be any fraction of the scene.
@@ -48,7 +62,7 @@ def registered(problem: Problem, rotation: Array, translation: Array, scale: flo
     if len(points) <= limits.whole:
         tolerance = matching_tolerance(points, np.arange(len(points)), noise)
         arrays = (_frozen(x) for x in (points, labels, normals))
-        motions = _of_scene(*arrays, tolerance, limits.share_of_scene, limits.bases_of_scene)
+        motions = _of_scene(*arrays, tolerance, limits.share_of_scene, limits.bases_of_scene, limits.factor)
         return motions.of(points, matched, tolerance, limits.share, labels3d=labels, normals3d=normals)
     centre = np.median(points[matched], 0)
     near = np.sort(np.argsort(np.linalg.norm(points - centre, axis=-1), kind="stable")[: limits.around])
@@ -64,6 +78,7 @@ def registered(problem: Problem, rotation: Array, translation: Array, scale: flo
         normals3d=None if normals is None else normals[near],
         least=limits.share,
         bases=limits.bases if len(part) <= limits.many else limits.fewer_bases,
+        factor=limits.factor if len(part) <= limits.many else 1.0,
     )
 
 
@@ -76,16 +91,19 @@ def _frozen(array: NDArray[Any] | None) -> Frozen:
 
 
 @lru_cache(maxsize=64)
-def _of_scene(points: Frozen, labels: Frozen, normals: Frozen, tolerance: float, least: float, bases: int) -> Motions:
+def _of_scene(
+    points: Frozen, labels: Frozen, normals: Frozen, tolerance: float, least: float, bases: int, factor: float
+) -> Motions:
     """Return the motions of a whole scene, cached for all problems of it."""
     arrays = [None if x is None else np.frombuffer(x[0], x[1]).reshape(x[2]).copy() for x in (points, labels, normals)]
     assert arrays[0] is not None
-    return self_motions(arrays[0], tolerance, labels3d=arrays[1], normals3d=arrays[2], least=least, bases=bases)
+    options: dict[str, Any] = {"labels3d": arrays[1], "normals3d": arrays[2]}
+    return self_motions(arrays[0], tolerance, least=least, bases=bases, factor=factor, **options)
 
 
 def competing_poses(
     problem: Problem, rotation: Array, translation: Array, motions: Motions, settings: Evidence
-) -> Pose:
+) -> tuple[Array, Array, Array]:
     """Return the competing poses of a pose due to motions and to the mirror image of a flat scene.
 
     Args:
@@ -96,21 +114,22 @@ def competing_poses(
         settings: Constants of the verdict.
 
     Returns:
-        Rotations (c, 3, 3) and translations (c, 3) of poses that differ from the given one by over `settings.same`.
+        Rotations (c, 3, 3) and translations (c, 3) of poses that differ from the given one by over `settings.same`, and
+        the scales (c,) of their motions.
     """
     poses = motions.competitors(rotation, translation)
-    every = [rotation[None], poses[0]], [translation[None], poses[1]]
+    every = [rotation[None], poses[0]], [translation[None], poses[1]], [np.ones(1), motions.scale]
     if (mirrored := mirror_pose(problem.points3d, rotation, translation)) is not None:
-        for parts, one in zip(every, mirrored, strict=True):
+        for parts, one in zip(every, (*mirrored, np.ones(())), strict=True):
             parts.append(one[None])
-    rotations, translations = (np.concatenate(parts) for parts in every)
+    rotations, translations, scales = (np.concatenate(parts) for parts in every)
     other = np.flatnonzero(~problem.same_pose(rotations, translations, settings.same))
-    return rotations[other], translations[other]
+    return rotations[other], translations[other], scales[other]
 
 
 def repeated_poses(
     problem: Problem, rotation: Array, translation: Array, scale: float, settings: Evidence, *, least: float = 0.0
-) -> tuple[Hypotheses, Motions]:
+) -> Repeated:
     """Return the competing poses of a pose due to the motions of the scene, and these motions.
 
     Args:
@@ -131,18 +150,19 @@ def repeated_poses(
         >>> scene = np.concatenate([motif + [2 * k, 0, 6] for k in range(3)])
         >>> image = motif + [0, 0, 6]  # the first of three equal things
         >>> problem = Problem(image / np.linalg.norm(image, axis=1, keepdims=True), scene)
-        >>> repeated, _ = repeated_poses(problem, np.eye(3), np.zeros(3), 1e-3, Evidence())
-        >>> sorted(repeated.translation[:2, 0].round(6).tolist())
+        >>> repeated = repeated_poses(problem, np.eye(3), np.zeros(3), 1e-3, Evidence())
+        >>> sorted(repeated.poses.translation[:2, 0].round(6).tolist())
         [-4.0, -2.0]
     """
     motions = registered(problem, rotation, translation, scale, settings).mapping(least)
-    rotations, translations = competing_poses(problem, rotation, translation, motions, settings)
+    rotations, translations, sizes = competing_poses(problem, rotation, translation, motions, settings)
     scales = np.full(len(rotations), scale)
     alarms = alarms_of(problem, rotations, translations, scales).own
     poses = Hypotheses.from_poses(
         rotations, translations, scale=scales, log10_false_alarms=alarms, log10_rough=alarms.copy()
     )
-    return poses[np.argsort(alarms, kind="stable")[: settings.repetitions.kept]], motions
+    kept = np.argsort(alarms, kind="stable")[: settings.repetitions.kept]
+    return Repeated(poses[kept], sizes[kept], motions)
 
 
 def repetition_margins(
@@ -166,7 +186,8 @@ def repetition_margins(
     Args:
         problem: Points of the problem.
         best: Rotation (3, 3) and translation (3,) of the best pose.
-        repeated: Rotations and translations of the unrefined poses that the motions give.
+        repeated: Rotations and translations of the unrefined poses that the rigid motions give. A map does not go on
+            with ever smaller copies.
         competitors: Rotations (c, 3, 3) and translations (c, 3) of the competing poses.
         scale: Scale of the residuals, radians.
         limits: Constants.
@@ -198,7 +219,8 @@ def _is_repeated(problem: Problem, best: Pose, repeated: Pose, reach: float) -> 
         for r, t in zip(*repeated, strict=True)
         for target in ((own @ rotation.T + translation - t) @ r, (own @ r.T + t - translation) @ rotation)
     ]
-    return np.asarray(np.isfinite(cKDTree(points).query(moved, distance_upper_bound=reach)[0]).any(0))
+    each = np.reshape(moved, (-1, len(own), 3))
+    return np.asarray(np.isfinite(cKDTree(points).query(each, distance_upper_bound=reach)[0]).any(0))
 
 
 def _among(problem: Problem, seen: Array) -> NDArray[np.bool_]:

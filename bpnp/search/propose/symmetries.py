@@ -1,19 +1,21 @@
-"""Rigid motions that map a part of a scene onto the scene: the poses that a symmetry or a repetition confuses.
+"""Motions that map a part of a scene onto the scene: the poses that a symmetry or a repetition confuses.
 
-If p -> S p + d maps scene points onto other scene points, the pose (R S^T, t - R S^T d) projects the images of these
-points to where (R, t) projects the points themselves. Every such pose is a competitor of (R, t).
+A motion is a similarity p -> s S p + d, with the scale s = 1 if it is rigid. If it maps scene points onto other scene
+points, the pose (R S^T, s t - R S^T d) projects the images of these points to where (R, t) projects the points
+themselves: R S^T (s S p + d) + s t - R S^T d = s (R p + t). Every such pose is a competitor of (R, t).
 
 The motions are found by registering the scene with itself. A base of three points is matched with every congruent
-triangle of the scene. Its edges determine the motion, and a sample of the points confirms it. Bases lie in a
-neighbourhood of some points, so that the cost of a base grows linearly with the scene. A motion that maps a fraction x
-of the points is missed by B bases with a probability of (1 - x^3)^B. The probability is lower if the part is connected
-in space.
+triangle of the scene, and for motions of another scale with every similar one. Its edges determine the motion, and a
+sample of the points confirms it. Bases lie in a neighbourhood of some points, so that the cost of a base grows linearly
+with the scene. A motion that maps a fraction x of the points is missed by B bases with a probability of (1 - x^3)^B.
+The probability is lower if the part is connected in space.
 
 Source: D. Aiger, N. J. Mitra, D. Cohen-Or, 4-points congruent sets for robust pairwise surface registration, ACM TOG
 2008, with triangles in place of coplanar bases.
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,40 +32,65 @@ Indices = NDArray[np.int64]
 
 
 class Motions(NamedTuple):
-    """Rigid motions p -> rotation p + shift of a scene, those that map the largest fraction first.
+    """Motions p -> scale rotation p + shift of a scene, those that map the largest fraction first.
 
     Attributes:
         rotation: (k, 3, 3).
         shift: (k, 3), in the unit of the scene.
-        fraction: (k,) of the source points that come to lie within the tolerance of a scene point.
-        left_out: Largest fraction that a motion which is not among these may map. It is 0 unless a scene has more than
-            are refined, as a lattice has, and 1 if the registration was cut off (`SymmetrySettings.most_work`).
+        scale: (k,) size of the copy over that of the part; exactly 1 for rigid motions.
+        fraction: (k,) of the source points that come to lie within the tolerance of a scene point. The tolerance of a
+            smaller copy is smaller by its scale.
+        left_out: Largest fraction that a rigid motion which is not among these may map. It is 0 unless a scene has more
+            than are refined, as a lattice has, and 1 if the registration was cut off (`SymmetrySettings.most_work`).
     """
 
     rotation: Array
     shift: Array
+    scale: Array
     fraction: Array
     left_out: float
 
     @property
     def complete(self) -> bool:
-        """True if no motion was left out."""
+        """True if no rigid motion was left out."""
         return self.left_out == 0
 
     @classmethod
-    def none(cls, *, left_out: float = 0.0) -> "Motions":
+    def none(cls) -> "Motions":
         """Return an empty record."""
-        return cls(np.empty((0, 3, 3)), np.empty((0, 3)), np.empty(0), left_out)
+        return cls(np.empty((0, 3, 3)), np.empty((0, 3)), np.empty(0), np.empty(0), 0.0)
+
+    @classmethod
+    def concatenate(cls, parts: Sequence["Motions"]) -> "Motions":
+        """Return the motions of several records."""
+        rotation, shift, scale, fraction = (
+            np.concatenate(each) for each in zip(*(part[:4] for part in [cls.none(), *parts]), strict=True)
+        )
+        return cls(rotation, shift, scale, fraction, max((part.left_out for part in parts), default=0.0))
+
+    def select(self, kept: Indices | NDArray[np.bool_]) -> "Motions":
+        """Return the motions at some indices, or those of a mask."""
+        return Motions(self.rotation[kept], self.shift[kept], self.scale[kept], self.fraction[kept], self.left_out)
 
     def competitors(self, rotation: Array, translation: Array) -> tuple[Array, Array]:
         """Return the poses (k, 3, 3), (k, 3) that these motions confuse with the pose (3, 3), (3,)."""
         rotations = rotation @ self.rotation.transpose(0, 2, 1)
-        return rotations, translation - np.einsum("kij,kj->ki", rotations, self.shift)
+        return rotations, self.scale[:, None] * translation - np.einsum("kij,kj->ki", rotations, self.shift)
+
+    def apply(self, points3d: Array) -> Array:
+        """Return the points (n, 3) moved by each motion, (k, n, 3)."""
+        linear = self.scale[:, None, None] * self.rotation
+        return np.einsum("kij,sj->ksi", linear, points3d) + self.shift[:, None]
+
+    def inverse(self) -> "Motions":
+        """Return the inverse motions, with the same fractions."""
+        back = self.rotation.transpose(0, 2, 1)
+        shift = -np.einsum("kij,kj->ki", back, self.shift) / self.scale[:, None]
+        return self._replace(rotation=back, shift=shift, scale=1 / self.scale)
 
     def mapping(self, least: float) -> "Motions":
         """Return the motions that map at least this fraction."""
-        kept = self.fraction >= least
-        return Motions(self.rotation[kept], self.shift[kept], self.fraction[kept], self.left_out)
+        return self.select(self.fraction >= least)
 
     def of(
         self,
@@ -85,15 +112,15 @@ class Motions(NamedTuple):
             labels3d: As for `self_motions`.
             normals3d: As for `self_motions`.
         """
-        moved = np.einsum("kij,sj->ksi", self.rotation, points3d[sources]) + self.shift[:, None]
-        near, _ = _mapped(cKDTree(points3d), moved, self.rotation, sources, tolerance, labels3d, normals3d)
+        moved, reach = self.apply(points3d[sources]), tolerance * np.minimum(self.scale, 1)[:, None]
+        near, _ = _mapped(cKDTree(points3d), moved, self.rotation, sources, reach, labels3d, normals3d)
         fraction = near.mean(-1) if len(sources) else np.zeros(len(near))
+        fewest = np.where(self.scale == 1, SYMMETRIES.fewest, SYMMETRIES.fewest_scaled)
         order = np.argsort(-fraction, kind="stable")
-        order = order[fraction[order] >= max(least, SYMMETRIES.fewest / max(len(sources), 1))]
-        left_out = min(
-            self.left_out * len(points3d) / max(len(sources), 1), 1.0
-        )  # as if all that they map were sources
-        return Motions(self.rotation[order], self.shift[order], fraction[order], left_out)
+        order = order[(fraction >= np.maximum(least, fewest / max(len(sources), 1)))[order]]
+        # As if all points that they map were sources.
+        left_out = min(self.left_out * len(points3d) / max(len(sources), 1), 1.0)
+        return self._replace(fraction=fraction, left_out=left_out).select(order)
 
 
 def mirror_pose(points3d: Array, rotation: Array, translation: Array) -> tuple[Array, Array] | None:
@@ -128,8 +155,9 @@ def self_motions(
     normals3d: Array | None = None,
     least: float = 0.3,
     bases: int = SYMMETRIES.bases,
+    factor: float | int = 1,
 ) -> Motions:
-    """Find rigid motions that map a fraction of a scene's points onto its points.
+    """Find motions that map a fraction of a scene's points onto its points.
 
     Args:
         points3d: (n, 3) scene points.
@@ -139,6 +167,7 @@ def self_motions(
         normals3d: (n, 3) unit normals; a point only maps onto points with a normal within 60 degrees of its moved one.
         least: smallest fraction of the sources that a motion maps.
         bases: number of bases that are matched.
+        factor: largest ratio of the sizes of a part and its copy; 1 for rigid motions only.
 
     Returns:
         Distinct motions without the identity, the largest fraction first.
@@ -151,6 +180,8 @@ def self_motions(
         >>> cosines = (np.trace(motions.rotation, axis1=1, axis2=2) - 1) / 2
         >>> np.degrees(np.arccos(cosines)).round(), motions.fraction
         (array([120., 120.]), array([1., 1.]))
+        >>> np.sort(self_motions(np.concatenate([part, part / 2 + [3, 0, 0]]), 0.02, factor=4).scale).round(6)
+        array([0.5, 2. ])
     """
     points = np.ascontiguousarray(points3d, np.float64)
     moved = np.arange(len(points)) if sources is None else np.asarray(sources, np.int64)
@@ -162,36 +193,66 @@ def self_motions(
     labels = np.full(len(points), -1) if labels3d is None else np.asarray(labels3d, np.int64)
     normals = np.empty((0, 3)) if normals3d is None else np.ascontiguousarray(normals3d, np.float64)
     scene = SceneIndex(points, hashed(points, 2 * tolerance), distance, index.astype(np.int64), labels, normals)
-    least = max(least, SYMMETRIES.fewest / len(moved))
-    chosen, sample = _bases(points, moved, bases), _sample(moved)
-    room = SYMMETRIES.most_found
+    chosen = _bases(points, moved, bases)
+    features = labels3d, normals3d
+    rigid = _motions(scene, tree, moved, chosen, tolerance, least, 1.0, features)
+    if factor == 1:
+        return rigid
+    several = min(bases // 3, SYMMETRIES.bases_scaled, SYMMETRIES.most_scaled // len(points))
+    chosen = _longer_first(points, chosen[:several])
+    scaled = _motions(scene, tree, moved, chosen, tolerance, least, float(factor), features)
+    both = Motions.concatenate([rigid, scaled])
+    return both.select(_distinct(both, points[moved], tolerance, len(both.scale)))
+
+
+def _motions(
+    scene: "SceneIndex",
+    tree: Any,
+    moved: Indices,
+    bases: Indices,
+    tolerance: float,
+    least: float,
+    factor: float,
+    features: tuple[Indices | None, Array | None],
+) -> Motions:
+    """Return the distinct motions that map bases, refined: rigid ones, or scaled ones if the factor is above 1."""
+    rigid, own = factor == 1, scene.points[moved]
+    fewest, count = SYMMETRIES.fewest, SYMMETRIES.refined
+    if not rigid:
+        fewest, count = SYMMETRIES.fewest_scaled, SYMMETRIES.refined_scaled
+    least = max(least, fewest / len(moved))
+    sample, room = _sample(moved), SYMMETRIES.most_found
     found = Found(np.zeros((room, 3, 3)), np.zeros((room, 3)), np.zeros(room))
-    most = SYMMETRIES.most_work // max(len(chosen), 1)
-    total, complete = _register(
-        scene, chosen, sample, tolerance, math.ceil(0.7 * least * len(sample)), most, found, np.empty((4, 3, 3))
-    )
-    kept = min(total, room)
-    rotation, shift, score = found.rotation[:kept], found.shift[:kept], found.score[:kept]
-    median_point = np.median(points[moved], 0)
-    size = extent(points[moved])
-    offsets = rotation @ median_point + shift
-    unique = distinct(
-        rotation, offsets / size, score, SYMMETRIES.refined, SYMMETRIES.same_deg, max(4 * tolerance / size, 1e-6)
-    )
-    refined = [_refine(points, tree, moved, rotation[k], shift[k], tolerance, labels3d, normals3d) for k in unique]
-    ranked = [k for k, one in enumerate(refined) if one[2] >= least and _moves(one, points[moved], 3 * tolerance)]
-    if not ranked:
-        return Motions.none(left_out=0.0 if complete else 1.0)
-    ranked.sort(key=lambda k: -refined[k][2])
-    rotation, shift, fraction = (np.array(part) for part in zip(*(refined[k] for k in ranked), strict=True))
-    offsets = rotation @ median_point + shift
-    unique = distinct(
-        rotation, offsets / size, fraction, SYMMETRIES.refined, SYMMETRIES.same_deg, max(4 * tolerance / size, 1e-6)
-    )
+    confirming, most = math.ceil(0.7 * least * len(sample)), SYMMETRIES.most_work // max(len(bases), 1)
+    total, complete = _register(scene, bases, sample, tolerance, confirming, factor, most, found, np.empty((4, 3, 3)))
+    linear, shift, score = (part[: min(total, room)] for part in found)
+    scale = np.ones(len(linear)) if rigid else np.cbrt(np.linalg.det(linear))
+    motions = Motions(linear / scale[:, None, None], shift, scale, score, 0.0)
+    motions = motions.select(_distinct(motions, own, tolerance, count))
+    if not rigid and len(moved) == len(scene.points):
+        motions = Motions.concatenate([motions, motions.inverse()])
+    each = [motions.select(np.array([k])) for k in range(len(motions.scale))]
+    refined = [_refine(scene.points, tree, moved, one, tolerance, *features) for one in each]
+    ranked = [k for k, one in enumerate(refined) if one.fraction[0] >= least and _moves(one, own, 3 * tolerance)]
+    motions = Motions.concatenate([refined[k] for k in ranked])
+    unique = _distinct(motions, own, tolerance, count)
+    if not rigid:
+        return motions.select(unique)
     # Candidates that were not refined had lower scores: they map no more than those of the lower half.
-    is_cut = total > room or len(refined) == SYMMETRIES.refined
-    lower = [float(fraction[k]) for k in unique if is_cut and ranked[k] >= len(refined) // 2]
-    return Motions(rotation[unique], shift[unique], fraction[unique], max(lower, default=0.0) if complete else 1.0)
+    is_cut = total > room or len(refined) == count
+    lower = [float(motions.fraction[k]) for k in unique if is_cut and ranked[k] >= len(refined) // 2]
+    return motions.select(unique)._replace(left_out=max(lower, default=0.0) if complete else 1.0)
+
+
+def _distinct(motions: Motions, own: Array, tolerance: float, count: int) -> Indices:
+    """Return the indices of at most `count` different motions of points (k, 3), best first."""
+    if not len(motions.scale):
+        return np.empty(0, np.int64)
+    size = extent(own)
+    offsets = motions.apply(np.median(own, 0)[None])[:, 0] / size
+    places = np.column_stack([offsets, motions.scale])
+    limits = SYMMETRIES.same_deg, max(4 * tolerance / size, 1e-6)
+    return distinct(motions.rotation, places, motions.fraction, count, *limits)
 
 
 def extent(points: Array) -> float:
@@ -245,12 +306,12 @@ class Found(NamedTuple):
     """Motions that the compiled loops write.
 
     Attributes:
-        rotation: (c, 3, 3).
+        linear: (c, 3, 3) rotations times scales.
         shift: (c, 3).
         score: (c,) numbers of confirming points.
     """
 
-    rotation: Array
+    linear: Array
     shift: Array
     score: Array
 
@@ -274,6 +335,12 @@ def _bases(points: Array, moved: Indices, count: int) -> Indices:
     return np.ascontiguousarray(np.column_stack([first, widest]))
 
 
+def _longer_first(points: Array, bases: Indices) -> Indices:
+    """Return bases (b, 3) with the second point farther from the first than the third is."""
+    lengths = np.linalg.norm(points[bases[:, 1:]] - points[bases[:, :1]], axis=-1)
+    return np.ascontiguousarray(np.where((lengths[:, 1] > lengths[:, 0])[:, None], bases[:, [0, 2, 1]], bases))
+
+
 def _neighbours(points: Array) -> int:
     """Return the number of neighbours of a point that bases and matches come from."""
     return SYMMETRIES.neighbours if len(points) <= SYMMETRIES.many else SYMMETRIES.many_neighbours
@@ -289,26 +356,31 @@ def _refine(
     points: Array,
     tree: Any,
     moved: Indices,
-    rotation: Array,
-    shift: Array,
+    motion: Motions,
     tolerance: float,
     labels3d: Indices | None,
     normals3d: Array | None,
-) -> tuple[Array, Array, float]:
-    """Return a motion fitted to the nearest scene points of the moved ones, and the fraction that it maps."""
-    own, near, reach = points[moved], np.zeros(len(moved), bool), 2 * tolerance
+) -> Motions:
+    """Return a motion (1,) fitted to the nearest scene points of the moved ones, with the fraction that it maps.
+
+    Source: S. Umeyama, Least-squares estimation of transformation parameters between two point patterns, PAMI 1991.
+    """
+    own, near, reach, rigid = points[moved], np.zeros(len(moved), bool), 2 * tolerance, motion.scale[0] == 1
     for step in range(SYMMETRIES.rounds + 1):
-        near, target = _mapped(tree, own @ rotation.T + shift, rotation, moved, reach, labels3d, normals3d)
+        bound = reach * min(float(motion.scale[0]), 1.0)
+        near, target = _mapped(tree, motion.apply(own)[0], motion.rotation[0], moved, bound, labels3d, normals3d)
         if step == SYMMETRIES.rounds or near.sum() < 3:
             break
         one, other = own[near], points[target[near]]
         centre, onto = one.mean(0), other.mean(0)
-        left, _, right = np.linalg.svd((other - onto).T @ (one - centre))
-        sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-        rotation = left @ sign @ right
-        shift = onto - rotation @ centre
+        left, stretch, right = np.linalg.svd((other - onto).T @ (one - centre))
+        sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+        rotation = (left * sign) @ right
+        scale = 1.0 if rigid else float((stretch * sign).sum() / max(((one - centre) ** 2).sum(), 1e-300))
+        shift = onto - scale * rotation @ centre
+        motion = motion._replace(rotation=rotation[None], shift=shift[None], scale=np.array([scale]))
         reach = tolerance if step else 1.5 * tolerance
-    return rotation, shift, float(near.mean())
+    return motion._replace(fraction=np.array([near.mean()]))
 
 
 def _mapped(
@@ -316,7 +388,7 @@ def _mapped(
     moved: Array,
     rotation: Array,
     sources: Indices,
-    reach: float,
+    reach: float | Array,
     labels3d: Indices | None,
     normals3d: Array | None,
 ) -> tuple[NDArray[np.bool_], Indices]:
@@ -327,15 +399,15 @@ def _mapped(
         moved: (..., s, 3) moved points.
         rotation: (..., 3, 3) of the motions.
         sources: (s,) indices of the moved points.
-        reach: Largest distance from the nearest scene point.
+        reach: Largest distance from the nearest scene point, one or (..., 1) of the motions.
         labels3d: As for `self_motions`.
         normals3d: As for `self_motions`.
 
     Returns:
         The mask (..., s), and the indices (..., s) of the nearest scene points; 0 if none is within reach.
     """
-    distance, target = tree.query(moved, distance_upper_bound=reach)
-    near = np.isfinite(distance)
+    distance, target = tree.query(moved, distance_upper_bound=np.max(reach, initial=0.0))
+    near = distance < reach
     target = np.where(near, target, 0)
     if labels3d is not None:
         own, other = labels3d[sources], labels3d[target]
@@ -346,17 +418,24 @@ def _mapped(
     return near, target
 
 
-def _moves(motion: tuple[Array, Array, float], own: Array, least: float) -> bool:
+def _moves(motion: Motions, own: Array, least: float) -> bool:
     """Return whether a motion is not the identity: its root mean square shift of points (k, 3) exceeds `least`."""
-    rotation, shift, _ = motion
-    return float(np.sqrt(((own @ rotation.T + shift - own) ** 2).sum(-1).mean())) > least
+    return float(np.sqrt(((motion.apply(own)[0] - own) ** 2).sum(-1).mean())) > least
 
 
 @compiled
 def _register(
-    scene: Any, bases: Any, sample: Any, tolerance: float, least: int, most: int, found: Any, work: Any
+    scene: Any,
+    bases: Any,
+    sample: Any,
+    tolerance: float,
+    least: int,
+    factor: float,
+    most: int,
+    found: Any,
+    work: Any,
 ) -> Any:
-    """Find the motions that map a base onto a congruent one and that enough sampled points confirm.
+    """Find the motions that map a base onto a congruent or similar one and that enough sampled points confirm.
 
     Args:
         scene: A `SceneIndex`.
@@ -364,6 +443,8 @@ def _register(
         sample: Indices of sampled points.
         tolerance: Largest distance of a moved point from a scene point.
         least: Sampled points that must confirm a motion.
+        factor: Largest ratio of the sizes of two similar bases, which differ by more than the tolerance; 1 for
+            congruent bases.
         most: Largest work for a base.
         found: A `Found`, written; the motions with the most confirming points are kept.
         work: (4, 3, 3), overwritten.
@@ -373,7 +454,7 @@ def _register(
         work, so that the rest of the scene was left out for it.
     """
     points, count, complete = scene.points, 0, True
-    frame, target, rotation, shift = work[0], work[1], work[2], work[3, 0]
+    frame, target, linear, shift = work[0], work[1], work[2], work[3, 0]
     for base in range(len(bases)):
         a, b, c = bases[base, 0], bases[base, 1], bases[base, 2]
         ab, ac, bc = _between(points, a, b), _between(points, a, c), _between(points, b, c)
@@ -387,24 +468,39 @@ def _register(
             if not _fits(scene, a, i):
                 continue
             row = scene.distance[i]
-            first_j, last_j = _first_above(row, ab - tolerance), _first_above(row, ab + tolerance)
-            first_l, last_l = _first_above(row, ac - tolerance), _first_above(row, ac + tolerance)
+            first_j, last_j = _first_above(row, ab / factor - tolerance), _first_above(row, ab * factor + tolerance)
+            first_l, last_l = 0, 0
+            if factor == 1:
+                first_l, last_l = _first_above(row, ac - tolerance), _first_above(row, ac + tolerance)
+            scale, near = 1.0, tolerance
             for at_j in range(first_j, last_j):
                 j = scene.neighbours[i, at_j]
                 if j == i or not _fits(scene, b, j):
                     continue
+                if factor > 1:
+                    if abs(row[at_j] - ab) <= tolerance:
+                        continue
+                    scale = row[at_j] / ab
+                    near = tolerance * min(scale, 1.0)
+                    # Both limits grow with the scale, which grows with j.
+                    while first_l < len(row) and row[first_l] < scale * ac - near:
+                        first_l += 1
+                    while last_l < len(row) and row[last_l] < scale * ac + near:
+                        last_l += 1
                 for at_l in range(first_l, last_l):
                     l = scene.neighbours[i, at_l]  # noqa: E741
                     work_done += 1
                     if l in (i, j) or not _fits(scene, c, l) or (i == a and j == b and l == c):
                         continue
-                    if abs(_between(points, j, l) - bc) > tolerance:
+                    jl = _between(points, j, l)
+                    if abs(jl - scale * bc) > near:
                         continue
                     if not _frame(points, i, j, l, target):
                         continue
+                    size = (row[at_j] + row[at_l] + jl) / (ab + ac + bc) if factor > 1 else 1.0
                     for p in range(3):
                         for q in range(3):
-                            rotation[p, q] = (
+                            linear[p, q] = size * (
                                 target[0, p] * frame[0, q] + target[1, p] * frame[1, q] + target[2, p] * frame[2, q]
                             )
                     for p in range(3):
@@ -412,7 +508,7 @@ def _register(
                         y = (points[a, 1] + points[b, 1] + points[c, 1]) / 3
                         z = (points[a, 2] + points[b, 2] + points[c, 2]) / 3
                         shift[p] = (points[i, p] + points[j, p] + points[l, p]) / 3 - (
-                            rotation[p, 0] * x + rotation[p, 1] * y + rotation[p, 2] * z
+                            linear[p, 0] * x + linear[p, 1] * y + linear[p, 2] * z
                         )
                     score, left = 0, len(sample)
                     for s in range(len(sample)):
@@ -420,7 +516,7 @@ def _register(
                             break
                         left -= 1
                         work_done += SYMMETRIES.confirming
-                        score += _on(scene, rotation, shift, sample[s])
+                        score += _on(scene, linear, shift, sample[s], 2 * near)
                     if score >= least:
                         place = count if count < len(found.score) else -1
                         if place < 0:
@@ -436,7 +532,7 @@ def _register(
                             for p in range(3):
                                 found.shift[place, p] = shift[p]
                                 for q in range(3):
-                                    found.rotation[place, p, q] = rotation[p, q]
+                                    found.linear[place, p, q] = linear[p, q]
     return count, complete
 
 
@@ -484,13 +580,14 @@ def _frame(points: Any, a: int, b: int, c: int, frame: Any) -> Any:
 
 
 @part
-def _on(scene: Any, rotation: Any, shift: Any, k: int) -> Any:
+def _on(scene: Any, linear: Any, shift: Any, k: int, reach: Any) -> Any:
     """Return whether a moved point lies near a scene point."""
     points = scene.points
     x, y, z = points[k, 0], points[k, 1], points[k, 2]
     return lies_on(
         scene.table,
-        rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + shift[0],
-        rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + shift[1],
-        rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + shift[2],
+        linear[0, 0] * x + linear[0, 1] * y + linear[0, 2] * z + shift[0],
+        linear[1, 0] * x + linear[1, 1] * y + linear[1, 2] * z + shift[1],
+        linear[2, 0] * x + linear[2, 1] * y + linear[2, 2] * z + shift[2],
+        reach,
     )

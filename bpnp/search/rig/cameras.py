@@ -64,17 +64,19 @@ class Rig:
     ) -> None:
         if isinstance(prior, PosePrior) and not is_metric:
             prior = prior._replace(translation=None)
-        self.mounts = [(turn, shift / problem.size) for problem, (turn, shift) in zip(problems, mounts, strict=True)]
-        self.problems = [
-            replace(each, prior=_prior_of(mount, prior)) for each, mount in zip(problems, self.mounts, strict=True)
-        ]
-        self.floor = max(each.floor or float(each.image.scales[0]) for each in self.problems)
-        self.model = PoseModel(problems[0].centre3d, lens, mounts=self.mounts, scale=not is_metric, prior=prior)
-        self.unknowns = self.model.size
         centres = np.array([-turn.T @ shift for turn, shift in mounts])
         least = RIG.same_centre * np.abs(centres).max()
         pairs = combinations(range(len(mounts)), 2)
         self.apart = [(k, other) for k, other in pairs if np.linalg.norm(centres[k] - centres[other]) > least]
+        self.mounts = [(turn, shift / problem.size) for problem, (turn, shift) in zip(problems, mounts, strict=True)]
+        baseline = is_metric and bool(self.apart)
+        self.problems = [
+            replace(each, prior=_prior_of(mount, prior), baseline=baseline)
+            for each, mount in zip(problems, self.mounts, strict=True)
+        ]
+        self.floor = max(each.floor or float(each.image.scales[0]) for each in self.problems)
+        self.model = PoseModel(problems[0].centre3d, lens, mounts=self.mounts, scale=not is_metric, prior=prior)
+        self.unknowns = self.model.size
 
     @cached_property
     def _images(self) -> list[KDTree]:

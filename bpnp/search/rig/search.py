@@ -249,8 +249,10 @@ class RigPoses:
         if result.verdict == "confident":
             strongest, seen = self._strongest()
             pose_and_scale = seen.rotation[0], seen.translation[0], float(seen.scale[0])
-            repeated, _ = repeated_poses(self.rig.problems[strongest], *pose_and_scale, self.verdict_settings)
+            repeated, sizes, _ = repeated_poses(self.rig.problems[strongest], *pose_and_scale, self.verdict_settings)
             unit = self.best.translation[0, 3]
+            if self.rig.model.scale:  # a copy of another size looks the same if the rig is larger as well
+                unit = unit * sizes[:, None]
             copies = self.rig.rig_of(strongest, repeated.rotation, repeated.translation, unit)
             self.add_refined(self.rig.candidates(*copies))
             result = self._judge()

@@ -192,9 +192,12 @@ def motions_of(candidates: Hypotheses, problem: Problem, settings: Evidence) -> 
 def is_symmetric(candidates: Hypotheses, problem: Problem, settings: Evidence) -> bool:
     """Return True if a motion maps a large part of the matched points onto other scene points.
 
-    The motion could by itself explain a better pose. The fraction is compared with `Evidence.repetitions`.
+    The motion could by itself explain a better pose. The fraction is compared with `Evidence.repetitions`. Motions of
+    another scale could not if there is a baseline.
     """
-    return float(motions_of(candidates, problem, settings).fraction.max(initial=0)) >= settings.repetitions.symmetric
+    motions = motions_of(candidates, problem, settings)
+    fraction = motions.fraction[motions.scale == 1] if problem.baseline else motions.fraction
+    return float(fraction.max(initial=0)) >= settings.repetitions.symmetric
 
 
 def count_starts(candidates: Hypotheses, problem: Problem, settings: Evidence, *, symmetric: bool = False) -> int:
