@@ -121,8 +121,8 @@ def repeated_competitors(
     others, fraction = (refined.rotation, refined.translation), float(motions.fraction.min(initial=1.0))
     shifted = poses[0][rigid], poses[1][rigid]
     behind = repetition_margins(problem, best, shifted, others, scale, limits, fraction=fraction)
-    # A motion that was left out, as of a lattice, could explain a better pose that is not among these.
-    behind = np.maximum(behind, 0) if motions.left_out < limits.symmetric else np.zeros(len(refined))
+    # If the pose is wrong, a motion maps nearly all of its matches; of a lattice it may not be among these.
+    behind = np.maximum(behind, 0) if motions.left_out < limits.hiding else np.zeros(len(refined))
     if enumerated and (behind >= settings.margin).all():
         return Hypotheses.empty()
     alarms = np.minimum(refined.log10_false_alarms, result.log10_false_alarms + behind)

@@ -80,6 +80,9 @@ class Repetitions:
         share_of_scene: Smallest fraction of all points that a motion of a whole scene maps. [fraction; calibration]
         symmetric: Fraction of the matched points from which a motion could by itself explain a better pose. [fraction;
             calibration]
+        hiding: Fraction of the matched points that a motion which was not compared has to map to hide a better pose. A
+            motion maps at least 0.9 of the matches of a wrong pose onto those of the correct one. [fraction;
+            calibration]
         whole: Largest number of points of a scene that is registered as a whole, once for all problems of it. [points;
             cost]
         bases_of_scene: Number of bases of that registration. A motion of a third of the points is missed by at most (1
@@ -101,6 +104,7 @@ class Repetitions:
     share: float = 0.3
     share_of_scene: float = 0.2
     symmetric: float = 0.5
+    hiding: float = 0.8
     whole: int = 64
     bases_of_scene: int = 128
     around: int = 4096

@@ -24,9 +24,9 @@ def motions_of(problem: Problem, limits: Repetitions | None = None) -> Motions:
 def counted(motions: Motions, fits: NDArray[np.bool_], normals: Array | None = None) -> list[float]:
     """Return the fraction of the grid that each motion maps onto points that fit (n, n)."""
     fractions = []
-    for rotation, shift in zip(motions.rotation, motions.shift, strict=True):
-        away = np.linalg.norm((GRID @ rotation.T + shift)[:, None] - GRID, axis=-1)
-        mapped = fits & (away < matching_tolerance(GRID, np.arange(len(GRID)), 1e-3))
+    for rotation, shift, scale in zip(motions.rotation, motions.shift, motions.scale, strict=True):
+        away = np.linalg.norm((scale * GRID @ rotation.T + shift)[:, None] - GRID, axis=-1)
+        mapped = fits & (away < min(scale, 1) * matching_tolerance(GRID, np.arange(len(GRID)), 1e-3))
         if normals is not None:
             mapped &= normals @ rotation.T @ normals.T > 0.5
         fractions.append(mapped.any(1).mean())
