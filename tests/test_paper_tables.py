@@ -75,7 +75,7 @@ def test_a_training_goes_on_from_its_own_checkpoint_and_a_branch_from_anothers(
 
 
 def plant_steps(checkpoint: Path, steps: int) -> None:
-    """Write a checkpoint of so many steps."""
+    """Write a checkpoint with a number of steps."""
     checkpoint.parent.mkdir(parents=True, exist_ok=True)
     torch.save({"global_step": steps, "state_dict": {}}, checkpoint)
 

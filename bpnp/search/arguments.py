@@ -131,7 +131,7 @@ def each_prior(value: Any, count: int) -> list[Any]:
 
 
 def _are_numbers(values: Any, count: int) -> bool:
-    """Return True for a sequence of so many numbers; a PosePrior is also a tuple of four, but not of four numbers."""
+    """Return True for a sequence of `count` numbers; a PosePrior is also a tuple of four, but not of four numbers."""
     is_sequence = isinstance(values, (list, tuple)) or getattr(values, "ndim", 0) == 1
     return is_sequence and len(values) == count and all(np.ndim(value) == 0 for value in values)
 

@@ -8,7 +8,7 @@ from bpnp.search.propose.minimal_solvers import p3p_poses
 
 @pytest.mark.parametrize("along", [1.2, 1.5, 2.0, 3.0, 6.0])
 def test_an_equilateral_triangle_seen_along_its_axis_has_all_its_poses(along: float) -> None:
-    """Of rays at equal angles, with |f_i - f_j|^2 = c, the depths for unit sides are d = 1/sqrt(c), and those where
+    """Rays at equal angles, with |f_i - f_j|^2 = c, the depths for unit sides are d = 1/sqrt(c), and those where
     one of them is (1 - c) d if that is positive."""
     rays = np.full((3, 3), 1.0) + (along - 1) * np.eye(3)
     unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)

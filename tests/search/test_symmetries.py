@@ -256,7 +256,7 @@ def test_motions_may_be_missing_if_the_registration_is_cut_off(monkeypatch: pyte
 
 
 def test_a_shift_that_was_left_out_makes_a_row_of_equal_things_ambiguous() -> None:
-    """A row of 15 motifs and four unique points, of which the image shows the left half. A shift by nine motifs maps
+    """A row of 15 motifs and four unique points; the image shows the left half. A shift by nine motifs maps
     over half of the points in view, but is not among the motions that are compared. The bound on what it maps is
     higher: as if it mapped nothing but points in view."""
     rng = np.random.default_rng(0)
