@@ -187,7 +187,7 @@ def main() -> None:
     if not chosen.check:
         torch.set_num_threads(1)
         rows = measure(chosen, record)
-        own = chosen.picture != parser.get_default("picture")
+        own = not is_published(parser, chosen, "picture")
         if own or (published and rows.keys() == record["rows"].keys()):  # the picture of the page has all data
             save_figure(recall_picture(rows), chosen.picture)
     fill_pages(PAGES, "finetune", {"data": table(record)}, check=chosen.check, published=published)

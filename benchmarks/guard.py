@@ -4,11 +4,11 @@
     python -m benchmarks guard --seed 71 --output after.json --against before.json
 
 Kinds: shapes and meshes, photos against one view and in their maps, LEDs, near-symmetric devices, symmetric objects,
-unknown focal lengths, unrelated points, and `verify`. The file has verdict, error, false alarms, CPU
-seconds and pose of every problem. With --against, the differences are paired: CPU as the geometric mean of the ratios,
-verdicts as those gained and lost, and answers as the number of poses that differ by more than their own bound would
-allow. The exit status is 1 where a kind has fewer successes, a confident and wrong pose more, or 1.15 times the CPU
-seconds. --limit: problems a kind.
+unknown focal lengths, unrelated points, and `verify`. The file has verdict, error, false alarms, CPU seconds and pose
+of every problem. With --against, the differences are paired: CPU as the geometric mean of the ratios, verdicts as those
+gained and lost, and answers as the number of poses that differ by more than their own bound would allow. The exit
+status is 1 where a kind has fewer successes, a confident and wrong pose more, or 1.15 times the CPU seconds. --limit:
+problems a kind.
 """
 
 import argparse

@@ -197,7 +197,7 @@ def check_beginning(folder: Path, arguments: Iterable[str], starts: Iterable[Pat
     content = [digest(path) if path.is_file() else None for path in starts]
     now = {"arguments": list(arguments), "starts": content} | settings
     file = folder / "training.json"
-    if not (trained_steps(folder / "checkpoints" / "last.ckpt") and file.is_file()):
+    if not ((folder / "checkpoints" / "last.ckpt").is_file() and file.is_file()):
         write_json(file, now)
         return
     before = json.loads(file.read_text(encoding="utf-8"))
@@ -247,8 +247,8 @@ def solve_problems(
 
     Rows are appended to a file as they come, a line for each problem, below a line with commit, date and processor.
     Those of the same `identity` and the same problems that are there already are not measured again; a file of others
-    is kept as *.previous.jsonl. Seconds are of one thread's CPU time. Without
-    `solve`, nothing is measured or moved, and there are no rows unless the file has all of them.
+    is kept as *.previous.jsonl. Seconds are of one thread's CPU time. Without `solve`, nothing is measured or moved,
+    and there are no rows unless the file has all of them.
     """
     data.setup("test")
     problems = data.datasets["test"]  # type: ignore[attr-defined]
@@ -743,9 +743,9 @@ def fill_tables(text: str, marker: str, tables: Mapping[str, str]) -> str:
     )
 
 
-def is_published(parser: argparse.ArgumentParser, chosen: argparse.Namespace) -> bool:
-    """Return whether `--output` is its default, the record of the pages, and not a record of its own."""
-    return bool(chosen.output.resolve() == parser.get_default("output").resolve())
+def is_published(parser: argparse.ArgumentParser, chosen: argparse.Namespace, option: str = "output") -> bool:
+    """Return whether a path is its default: that of the record of the pages, or of their pictures."""
+    return bool(getattr(chosen, option).resolve() == parser.get_default(option).resolve())
 
 
 def fill_pages(

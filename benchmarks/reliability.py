@@ -17,8 +17,8 @@ Rows:
 - devices: LEDs that a half turn nearly maps onto each other
 - pitch: crossings of lines of a playing field, gravity known to 2 degrees
 
---limit: problems of each row. No constant was chosen on the scenes of the photos (`--scenes`)
-but for two scales of the search near a view, on south_building.
+--limit: problems of each row. No constant was chosen on the scenes of the photos (`--scenes`) but for two scales of the
+search near a view, on south_building.
 
 Success: rotation within 3 degrees, and the centroid of the scene moved by less than a tenth of its distance; with a
 wrong focal length, the camera centre within a twentieth. Wrong: no success, and outside the 99.9 % bound of the

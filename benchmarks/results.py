@@ -31,7 +31,7 @@ import shapes
 import symmetric
 import torch
 from hard_scenes import SCENES
-from paper_tables import network
+from paper_tables import is_published, network
 from record import ROOT, TIME_LIMIT, Outcome, Problem, commit, measure_rows, parser, write
 from torch import nn
 from view_problems import REPORTED, photos
@@ -376,7 +376,7 @@ def main() -> None:
             continue
         results[row.name] = result
         write(chosen.file, {name: kept.get(name, {}) for name in ("quick", "full")} | {part: results})
-    for document in DOCUMENTS if chosen.file.resolve() == FILE.resolve() or chosen.check else ():
+    for document in DOCUMENTS if chosen.check or is_published(options, chosen, "file") else ():
         text = document.read_text(encoding="utf-8")
         if (new := fill_tables(text, results if part == "full" else kept.get("full", {}))) == text:
             continue

@@ -117,6 +117,6 @@ def main() -> None:
     else:
         record = measure(chosen.run)
         write_json(chosen.output, record)
-        for name in DRAWN if published or chosen.pictures != parser.get_default("pictures") else ():
+        for name in DRAWN if published or not is_published(parser, chosen, "pictures") else ():
             shutil.copyfile(chosen.run / name, chosen.pictures / name)
     fill_pages([PAGE], "tutorial", tables(record), check=chosen.check, published=published)

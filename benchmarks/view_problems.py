@@ -19,14 +19,8 @@ from bpnp.datamodules.colmap.reconstruction import ImagePoints, Reconstruction, 
 from bpnp.maps.scene_map import SceneMap
 from bpnp.maps.views import View
 
-REPORTED = (
-    "fountain-P11",
-    "south_building",
-    "tabletop",
-    "walk_4",
-    "walkthrough",
-)  # no constant was chosen on them but for two
-# scales of the search near a view, on south_building
+# No constant was chosen on these but for two scales of the search near a view, on south_building.
+REPORTED = ("fountain-P11", "south_building", "tabletop", "walk_4", "walkthrough")
 LEAST_OVERLAP = 0.35
 MOST_POINTS = 1024
 LEAST_MATCHES = 10  # fewer matches count as a failure
@@ -157,8 +151,8 @@ def photos(
 ) -> Iterator[Problem]:
     """Yield at most `limit` photos of the reported scenes in their maps, without a prior.
 
-    They are given a view if there is one, or only the points. With `apart`, each photo is put into the map of
-    another problem, half a list away. The error of a centre is in median distances of the points.
+    They are given a view if there is one, or only the points. With `apart`, each photo is put into the map of another
+    problem, half a list away. The error of a centre is in median distances of the points.
     """
     each = -(-limit // len(REPORTED))
     drawn = list(scene_problems(data, REPORTED, each, against=against, outliers=outliers, seed=seed))

@@ -123,11 +123,10 @@ def each_prior(value: Any, count: int) -> list[Any]:
 
     A list of rows of four numbers is one matrix [R | t], and a list of a rotation and a translation is one pose.
     """
-    if isinstance(value, list) and len(value) in (3, 4) and all(_are_numbers(row, 4) for row in value):
-        return [value] * count
-    if isinstance(value, list) and len(value) == 2 and _are_numbers(value[1], 3):
-        return [value] * count
-    return each_of("prior", value, count)
+    size = len(value) if isinstance(value, list) else 0
+    is_matrix = size in (3, 4) and all(_are_numbers(row, 4) for row in value)
+    is_pose = size == 2 and _are_numbers(value[1], 3)
+    return [value] * count if is_matrix or is_pose else each_of("prior", value, count)
 
 
 def _are_numbers(values: Any, count: int) -> bool:

@@ -25,6 +25,7 @@ from bpnp.search.enumeration.points import (
     sets_within,
 )
 from bpnp.search.hypotheses import Hypotheses
+from bpnp.search.kernels.sides import fit_any
 from bpnp.search.problem import Problem
 from bpnp.search.starts import PosePrior
 
@@ -95,8 +96,7 @@ class Enumeration:
             np.full(kept, -1),
             np.zeros(1, np.int64),
         )
-        every, known = image.arrays.grid.labels, scene.arrays.labels
-        self._may_match = (every < 0) | np.isin(every, known) | (known < 0).any()  # image points with a fitting label
+        self._may_match = fit_any(image.arrays.grid.labels, scene.arrays.labels)
         matches = Matches(np.empty(m, np.int64), np.empty(m))
         self.work = Work(np.empty((4, 4, 3)), matches, np.empty((8, 6)))
         seen = settings.seen_witnesses * n / max(m - fixing, 1)

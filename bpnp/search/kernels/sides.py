@@ -134,9 +134,16 @@ def side_of(points: Array, scores: Any, labels: Any, cones: Any, order: NDArray[
 
 def with_partners(side: Side, other: Side) -> Side:
     """Return the side with weight 0 for each point whose label fits no point of the other side."""
-    fitting = np.unique(other.labels)
-    possible = np.isin(side.labels, fitting) | (side.labels < 0) | (-1 in fitting)
-    return side._replace(weights=np.where(possible, side.weights, np.float32(0)))
+    return side._replace(weights=np.where(fit_any(side.labels, other.labels), side.weights, np.float32(0)))
+
+
+def fit_any(labels: NDArray[Any], others: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return which labels (k,) fit one of the others; -1 fits any.
+
+    >>> fit_any(np.array([0, 1, -1]), np.array([1, 2])).tolist()
+    [False, True, True]
+    """
+    return np.asarray((labels < 0) | np.isin(labels, others) | (others < 0).any())
 
 
 def _clusters(side: Side, count: int, settings: SearchSettings, rng: np.random.Generator) -> Side:

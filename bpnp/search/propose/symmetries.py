@@ -50,11 +50,6 @@ class Motions(NamedTuple):
     fraction: Array
     left_out: float
 
-    @property
-    def complete(self) -> bool:
-        """True if no rigid motion was left out."""
-        return self.left_out == 0
-
     @classmethod
     def none(cls) -> "Motions":
         """Return an empty record."""
