@@ -63,16 +63,19 @@ def report(
         say(f"wrote {save_figure(training_curves(folder), curves)}")
     named = named_runs(runs)
     paths = list(named.values())
+    results = read_runs(paths)
+    intervals = interval_table(results)
+    grouped = group_table(results) if groups else None
     if html is not None:
         from bpnp.commands.photo_files import photo_finder
 
-        say(f"wrote {write_page(paths, html, paper=paper, photos=photo_finder(photos))}")
+        page = write_page(paths, html, paper=paper, photos=photo_finder(photos), intervals=intervals, groups=grouped)
+        say(f"wrote {page}")
     if recall is not None:
         say(f"wrote {save_figure(recall_curve(paths, paper=paper), recall)}")
-    results = read_runs(paths)
     console().print(results_table(results, paper=paper))
-    console().print(interval_table(results).split_table())
-    if groups and (grouped := group_table(results)) is not None:
+    console().print(intervals.split_table())
+    if grouped is not None:
         console().print(grouped.split_table())
     elif groups:
         say("--groups: all problems are of one group, or their names have no group before a slash")

@@ -25,7 +25,7 @@ from bpnp.files import write_text
 from bpnp.report.charts import CONFIG, RECALLS, chart_text, figures, look, recall_chart
 from bpnp.report.groups import differences, group_table, training_configs
 from bpnp.report.intervals import CAPTION as INTERVAL_CAPTION
-from bpnp.report.intervals import interval_table
+from bpnp.report.intervals import IntervalTable, interval_table
 from bpnp.report.photos import PhotoFinder, PhotoSource
 from bpnp.report.points import Array, ProblemPoints, read_points, utf8
 from bpnp.report.results import (
@@ -86,6 +86,8 @@ def write_page(
     *,
     paper: Paper | None = None,
     photos: PhotoFinder | None = None,
+    intervals: IntervalTable | None = None,
+    groups: IntervalTable | None = None,
 ) -> Path:
     """Write the page of one or several results folders atomically.
 
@@ -94,6 +96,8 @@ def write_page(
         output: HTML file; an existing one is replaced.
         paper: Data set whose published rows are added, "modelnet40" or "megadepth". Default: None, no rows.
         photos: Function that finds the photos of each test. Default: None, no photos.
+        intervals: Result of `interval_table` for these folders. Default: None, which computes it.
+        groups: Result of `group_table` for these folders. Default: None, which computes it.
 
     Returns:
         Path of the file.
@@ -101,10 +105,17 @@ def write_page(
     Raises:
         ValueError: A folder or its points cannot be read.
     """
-    return write_text(Path(output), page_html(paths, paper=paper, photos=photos))
+    return write_text(Path(output), page_html(paths, paper=paper, photos=photos, intervals=intervals, groups=groups))
 
 
-def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None, photos: PhotoFinder | None = None) -> str:
+def page_html(
+    paths: Sequence[Path | str],
+    *,
+    paper: Paper | None = None,
+    photos: PhotoFinder | None = None,
+    intervals: IntervalTable | None = None,
+    groups: IntervalTable | None = None,
+) -> str:
     """Return the page as text; arguments and errors are those of `write_page`."""
     folders = named_runs(paths)
     runs = {name: read_results(path) for name, path in folders.items()}
@@ -142,10 +153,10 @@ def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None, photos
         heads=[column.header for column in RESULT_COLUMNS],
         rows=quartile_rows(runs, paper),
         caption=CAPTION,
-        intervals=interval_table(runs),
+        intervals=intervals or interval_table(runs),
         interval_caption=INTERVAL_CAPTION,
         trainings=training_pictures(folders, runs),
-        groups=group_table(runs),
+        groups=groups or group_table(runs),
         differences=differences(runs, training_configs(folders, runs)),
         charts=list(map(chart_text, charts)),
         causes=CAUSES,

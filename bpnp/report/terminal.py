@@ -36,6 +36,14 @@ Paper = Literal["modelnet40", "megadepth"]  # data sets of the paper, whose publ
 WIDTH = 80  # columns; narrower terminals wrap
 
 
+class Terminal(Console):
+    """Console of rich that raises BrokenPipeError if its reader is gone, instead of exiting with status 1."""
+
+    def on_broken_pipe(self) -> None:
+        """Raise the error again; rich calls this while it handles it."""
+        raise  # noqa: PLE0704
+
+
 def say(line: object, *, to: Console | None = None) -> None:
     """Print a line without wrapping or colours.
 
@@ -43,7 +51,7 @@ def say(line: object, *, to: Console | None = None) -> None:
         line: Text.
         to: Console. Default: standard output.
     """
-    (to or Console()).print(str(line), markup=False, highlight=False, soft_wrap=True)
+    (to or Terminal()).print(str(line), markup=False, highlight=False, soft_wrap=True)
 
 
 def progress(*, items: bool = True, quiet: bool = False) -> Progress:
@@ -53,7 +61,7 @@ def progress(*, items: bool = True, quiet: bool = False) -> Progress:
         items: Show how many items are done.
     """
     columns = (BarColumn(), MofNCompleteColumn()) if items else ()
-    console = Console(stderr=True, quiet=quiet, force_jupyter=False)  # a notebook's needs ipywidgets
+    console = Terminal(stderr=True, quiet=quiet, force_jupyter=False)  # a notebook's needs ipywidgets
     return Progress(
         SpinnerColumn(),
         TextColumn("{task.description}", markup=False),
@@ -90,7 +98,7 @@ def count_items(what: str, total: int, *, quiet: bool = False) -> Iterator[Calla
 
 def console(*, json: bool = False, quiet: bool = False) -> Console:
     """Return a console on standard output, at least `WIDTH` columns wide."""
-    terminal = Console(stderr=json, quiet=quiet)
+    terminal = Terminal(stderr=json, quiet=quiet)
     terminal.width = max(terminal.width, WIDTH)
     return terminal
 

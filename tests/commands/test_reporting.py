@@ -1,13 +1,20 @@
 """`bpnp report`, `view` and `wandb` on planted results."""
 
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from matplotlib.image import imread
+from numpy.typing import NDArray
 from report_data import drawn_problem, rows, write_run
 
 from bpnp.cli import main
+from bpnp.report import intervals
+from bpnp.report.intervals import _draw
 from bpnp.report.points import thin, write_points
 
 
@@ -36,6 +43,40 @@ def test_report_and_view_write_the_files_that_they_print(
     assert "'nothing' is in the names of no problem in" in fails("view", str(tmp_path / "run"), "nothing")
     (tmp_path / "run" / "test" / "points.npz").unlink()
     assert "has no points.npz; run `bpnp test` again" in fails("view", str(tmp_path / "run"))
+
+
+def test_a_reader_that_closes_the_pipe_is_no_error(tmp_path: Path) -> None:
+    """The pipe is closed before the table is printed, as in `bpnp report RUN | true`."""
+    write_run(tmp_path, 9, 0)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "bpnp", "report", str(tmp_path)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    process.stdout.close()
+    _, error = process.communicate(timeout=120)
+    assert error == ""
+    assert process.returncode == 0
+
+
+def test_a_page_and_the_tables_of_the_terminal_share_their_intervals(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_run(tmp_path / "run", 12, 0)
+    drawn: list[int] = []
+
+    def count(values: NDArray[np.float64], *rest: Any) -> tuple[float, NDArray[np.float64]]:
+        drawn.append(len(values))
+        return _draw(values, *rest)
+
+    monkeypatch.setattr(intervals, "_draw", count)
+    main(["report", str(tmp_path / "run"), "--groups"])
+    alone = list(drawn)
+    drawn.clear()
+    main(["report", str(tmp_path / "run"), "--groups", "--html", str(tmp_path / "report.html")])
+    assert drawn == alone
 
 
 def test_every_problem_of_a_test_can_be_viewed_by_name(tmp_path: Path, fails: Callable[..., str]) -> None:

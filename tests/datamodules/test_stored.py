@@ -11,8 +11,8 @@ from lightning import LightningDataModule
 
 import bpnp.datamodules
 from bpnp.datamodules import Problem, ProblemSource, StoredDataModule, write_problems
-from bpnp.datamodules.store import Store, StoreError, open_store
-from bpnp.datamodules.stored import PROBLEMS, StoredProblems, scene_rows, stored_problem
+from bpnp.datamodules.store import Store, StoreError, new_store, open_store
+from bpnp.datamodules.stored import PROBLEMS, WIDTHS, StoredProblems, scene_rows, stored_problem
 
 
 def sets(i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -43,6 +43,13 @@ def test_a_store_without_problems_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=r"there are no problems to write into .*empty; give at least one"):
         write_problems(tmp_path / "empty", iter(()))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_store_without_problems_of_an_earlier_version_is_refused(tmp_path: Path) -> None:
+    with new_store(tmp_path / "empty", PROBLEMS, WIDTHS):
+        pass
+    with pytest.raises(StoreError, match=r"empty holds no problems; remove it"):
+        StoredDataModule(str(tmp_path / "empty")).setup()
 
 
 @pytest.fixture
