@@ -457,13 +457,16 @@ def _integers(name: str, values: Any, count: int) -> Labels:
 
 
 def checked_scores(name: str, values: Any, count: int) -> Array | None:
-    """Return the probabilities (count,) that a point has a correspondence, in (0, 1]; None stays None."""
+    """Return the probabilities (count,) that a point has a correspondence, over the largest; None stays None.
+
+    Only their ratios matter, and float32 has no numbers below 1e-45.
+    """
     if values is None:
         return None
     scores = _one_each(name, numbers(name, values), (count,))
     good = (scores > 0) & (scores <= 1)
     _check_rows(name, scores, good, "scores are above 0 and at most 1: divide by the largest")
-    return scores
+    return scores / scores.max(initial=0)
 
 
 def _one_each(name: str, values: npt.NDArray[Any], shape: tuple[int, ...]) -> npt.NDArray[Any]:

@@ -62,6 +62,16 @@ def test_scores_of_scene_points_weigh_the_likelihood() -> None:
     assert weighted - plain == pytest.approx(math.log(160 / 84), abs=0.1)
 
 
+@pytest.mark.parametrize("largest", [1e-20, 1e-300, 5e-324])
+def test_only_ratios_of_scores_matter(largest: float) -> None:
+    """Scores below the smallest float32 number left no points to search."""
+    scores = np.full(80, largest)
+    solution = solve(seen(OBJECT, *POSES[0]), OBJECT, scores2d=scores, scores3d=scores, time_limit=600)
+    assert solution.verdict == "confident"
+    assert degrees_between(solution.rotation, POSES[0][0]) < 0.1
+    np.testing.assert_array_equal(solution.matches[:, 0], solution.matches[:, 1])
+
+
 def test_equal_objects_are_ambiguous_and_a_prior_decides() -> None:
     """Points that a half turn about z maps onto themselves: both poses are candidates."""
     half = RNG.uniform(-1, 1, (6, 3))
