@@ -129,26 +129,52 @@ def labelled(count: int, first: int) -> Enumeration:
 
 
 def test_pairs_whose_labels_differ_end_a_sweep_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One hypothesis fits each of the C(14, 3) sets of image points, of 6 C(14, 3) pairs with sets of the scene."""
+    """One hypothesis fits each of the C(14, 3) sets of image points.
+
+    A fourteenth of the 6 C(14, 3) pairs with sets of the scene have the same label at their first points.
+    """
     run, sweeps, sets = labelled(14, 0), Sweeps(monkeypatch), math.comb(14, 3)
     while run.advance(math.inf):
         pass
     assert run.ended == "exhausted"
-    calls = [(arguments, end) for arguments, end in sweeps.calls if arguments[2] > 0]
-    passed = [sets * (end[0] - row) + end[1] - t for (row, t, *_), end in calls]
-    assert sum(passed) == 6 * sets**2
-    assert max(passed) <= 10 * RULES.visited
-    assert sum(end[2] for _, end in calls) == run.solved == sets
+    ends = [end for arguments, end in sweeps.calls if arguments[2] > 0]
+    assert sum(visited for *_, visited in ends) == 6 * sets**2 // 14
+    assert max(visited for *_, visited in ends) <= 10 * RULES.visited
+    assert sum(solved for _, _, solved, _ in ends) == run.solved == sets
+
+
+@pytest.mark.parametrize(("any2d", "any3d"), [(0, 0), (2, 0), (0, 2), (2, 2)])
+def test_every_hypothesis_whose_labels_fit_is_solved_once(any2d: int, any3d: int) -> None:
+    """Two labels on each side, and points that fit any; two stages, of which the second adds the sets of the rest."""
+    count, rng = 9, np.random.default_rng(3)
+    rays = directions(rng.standard_normal((count, 3)) * [0.3, 0.3, 0] + [0, 0, 1])
+    labels2d, labels3d = np.arange(count) % 2, rng.permutation(count) % 2
+    labels2d[:any2d], labels3d[:any3d] = -1, -1
+    problem = Problem.of(rays, rng.uniform(-1, 1, (count, 3)), labels2d=labels2d, labels3d=labels3d)
+    stages = Stage(3, 4, 4, 0.5), Stage(3, count - 1, count - 1, 0.5)
+    run = Enumeration(problem, RADIUS, replace(ENUMERATION, stages=stages, chunk=10, look=10))
+    while run.advance(math.inf):
+        pass
+    fitting = (labels2d[:, None] == labels3d) | (labels2d[:, None] < 0) | (labels3d < 0)
+    expected = sum(
+        bool(fitting[seen, chosen].all())
+        for seen in itertools.combinations(range(count), 3)
+        for chosen in itertools.permutations(range(count), 3)
+    )
+    assert run.ended == "exhausted"
+    assert run.solved == expected
 
 
 def test_image_points_without_a_fitting_label_take_part_in_no_hypothesis(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three image points have labels of the scene: one set, in 6 orders, with every set of the scene."""
-    for fitting, rows in ((0, 0), (3, 6)):
+    """Three image points have labels of the scene: one set, in 6 orders, each of them first in two."""
+    for fitting in (0, 3):
         run, sweeps = labelled(14, 14 - fitting), Sweeps(monkeypatch)
         while run.advance(math.inf):
             pass
         assert run.ended == "exhausted"
-        assert sum(end[3] for arguments, end in sweeps.calls if arguments[2] > 0) == rows * math.comb(14, 3)
+        firsts = run.scene.arrays.labels[run.scene.triangles(3, 13).triples[:, 0]]
+        visited = sum(end[3] for arguments, end in sweeps.calls if arguments[2] > 0)
+        assert visited == 2 * (firsts < 14).sum()
 
 
 @pytest.mark.parametrize(("sigmas", "is_found"), [(3.8, True), (4.2, False)])

@@ -20,6 +20,11 @@ class Block(NamedTuple):
         sets: (t, 3) image points; with size 2 the last index repeats the second.
         orders: (6, 3) or (2, 3) orders of a set.
         triangles: Triangles of the scene; with size 2 the last point repeats the second.
+        by_label: (t,) indices of the triangles in the order of the label of their first point, -1 first.
+        low: (m,) index in `by_label` of the first triangle whose first point has the label of an image point, or has a
+            label if that is -1.
+        high: (m,) index behind the last one.
+        free: Number of triangles whose first point has the label -1.
         old_image: Number of sets of an earlier block.
         old_scene: Number of triangles of an earlier block.
         witnesses: (n, w) preverification points near each scene point.
@@ -31,6 +36,10 @@ class Block(NamedTuple):
     sets: Places
     orders: Places
     triangles: Triangles
+    by_label: Places
+    low: Places
+    high: Places
+    free: int
     old_image: int
     old_scene: int
     witnesses: Places
@@ -57,12 +66,13 @@ def explore(
 def sweep(row: int, first: int, budget: int, stop: float, block: Any, problem: Any, kept: Any, work: Any) -> Any:
     """Solve up to `budget` hypotheses, and keep the refined poses.
 
-    A row is an image set in one order. The sweep also ends after an image set once the best evidence reaches `stop`,
-    and after `RULES.visited` pairs of a row and a triangle per hypothesis: labels may exclude most pairs.
+    A row is an image set in one order, paired with the triangles whose first point fits the label of its first point.
+    The sweep also ends after an image set once the best evidence reaches `stop`, and after `RULES.visited` pairs of a
+    row and a triangle per hypothesis: labels may exclude most pairs.
 
     Args:
         row: First row.
-        first: First triangle of this row.
+        first: First triangle of this row, counted among its own.
         budget: Largest number of hypotheses.
         stop: Evidence that ends the sweep, nats.
         block: A `Block`.
@@ -75,26 +85,29 @@ def sweep(row: int, first: int, budget: int, stop: float, block: Any, problem: A
     """
     triangles, orders, rays, best, poses = block.triangles, block.orders, problem.image.rays, kept.best, work.poses
     labels2d, labels3d, normals = problem.image.grid.labels, problem.scene.labels, problem.scene.normals
-    solved, visited, t = 0, 0, first
+    old_image, old_scene, by_label, free = block.old_image, block.old_scene, block.by_label, block.free
+    solved, visited, at = 0, 0, first
     while row < len(orders) * len(block.sets) and not (
-        t == 0 and row % len(orders) == 0 and kept.evidence[best[0]] >= stop
+        at == 0 and row % len(orders) == 0 and kept.evidence[best[0]] >= stop
     ):
         place, order = row // len(orders), row % len(orders)
         image_set, turn = block.sets[place], orders[order]
         i, j, k = image_set[turn[0]], image_set[turn[1]], image_set[turn[2]]
-        if place < block.old_image and t < block.old_scene:
-            t = block.old_scene
+        offset, last = block.low[i] - free, free + block.high[i] - block.low[i]
+        if place < old_image and at < old_scene and free == len(by_label):
+            at = old_scene
         chords, hand = chords_between(rays, i, j, k), 3
         kept.at[0] = place
         if block.size == 3:
             hand = 1 if _determinant(rays[i], rays[j], rays[k]) > 0 else 2
-        while t < len(triangles.triples):
+        while at < last:
             if solved >= budget or visited >= RULES.visited * budget:
-                return row, t, solved, visited
-            a, b, c = triangles.triples[t, 0], triangles.triples[t, 1], triangles.triples[t, 2]
-            t, visited = t + 1, visited + 1
-            if not triangles.orientation[t - 1] & hand:
+                return row, at, solved, visited
+            t = by_label[at if at < free else offset + at]
+            at, visited = at + 1, visited + 1
+            if (place < old_image and t < old_scene) or not triangles.orientation[t] & hand:
                 continue
+            a, b, c = triangles.triples[t, 0], triangles.triples[t, 1], triangles.triples[t, 2]
             if not (
                 fits(labels2d[i], labels3d[a]) and fits(labels2d[j], labels3d[b]) and fits(labels2d[k], labels3d[c])
             ):
@@ -107,7 +120,7 @@ def sweep(row: int, first: int, budget: int, stop: float, block: Any, problem: A
             if block.size == 2:
                 count = solve_p2p(i, j, a, b, problem.heading, rays, problem.scene.points, poses)
             else:
-                count = solve_p3p(rays, (i, j, k), chords, triangles, t - 1, poses)
+                count = solve_p3p(rays, (i, j, k), chords, triangles, t, poses)
             for s in range(count):
                 pose = poses[s]
                 if not (
@@ -118,8 +131,8 @@ def sweep(row: int, first: int, budget: int, stop: float, block: Any, problem: A
                     continue
                 if allowed(pose, problem.prior) and witnessed(pose, (a, b, c), (i, j, k), block, problem):
                     consider(pose, block.reach, problem, kept, work)
-        row, t = row + 1, 0
-    return row, t, solved, visited
+        row, at = row + 1, 0
+    return row, at, solved, visited
 
 
 @part

@@ -116,6 +116,7 @@ class SceneSide:
         arrays: Points, normals and labels.
         nearest: (n, k) nearest points of each point.
         tables: Triangles by (size, near) that were built so far.
+        orders: Their orders by label.
     """
 
     def __init__(self, points3d: Array, normals3d: Array | None, labels3d: Places | None) -> None:
@@ -124,6 +125,7 @@ class SceneSide:
         self.arrays = SceneArrays(np.array(points3d, np.float64, order="C"), normals, labels)
         self.nearest = nearest_of(self.arrays.points, normals)
         self.tables: dict[tuple[int, int], Triangles] = {}
+        self.orders: dict[tuple[int, int], tuple[Places, Places]] = {}
 
     def triangles(self, size: int, near: int) -> Triangles:
         """Return the triangles of a point and two of its `near` nearest, or the `pairs` with one of them.
@@ -141,6 +143,20 @@ class SceneSide:
                 visible_triangles(self.arrays.points, self.arrays.normals, sets) if size == 3 else pairs(sets)
             )
         return self.tables[size, near]
+
+    def by_label(self, size: int, near: int) -> tuple[Places, Places]:
+        """Return the order of the `triangles` by the label of their first point, stable, and the labels in this order.
+
+        Args:
+            size: Points of a set, 3 or 2.
+            near: Number of neighbours.
+        """
+        near = min(near, self.nearest.shape[1])
+        if (size, near) not in self.orders:
+            labels = self.arrays.labels[self.triangles(size, near).triples[:, 0]]
+            order = np.argsort(labels, kind="stable")
+            self.orders[size, near] = order, labels[order]
+        return self.orders[size, near]
 
 
 class ImageSide:

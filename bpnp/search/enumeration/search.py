@@ -106,7 +106,10 @@ class Enumeration:
         self.tests = math.log(RULES.ladder) + max(problems, 0.0)
         self._done: dict[tuple[int, float], tuple[int, int]] = {}
         none = np.empty((0, fixing), np.int64)
-        self._block = Block(fixing, none, ORDERS[fixing], pairs(none), 0, 0, self._witnesses, 0, 1.0)
+        empty = np.zeros(m, np.int64)
+        self._block = Block(
+            fixing, none, ORDERS[fixing], pairs(none), empty[:0], empty, empty, 0, 0, 0, self._witnesses, 0, 1.0
+        )
 
     @property
     def is_significant(self) -> bool:
@@ -152,7 +155,14 @@ class Enumeration:
         need = (1 if chance < one else 2 if chance < two else 3) + (stage.matches == 2)
         need = min(need, m - stage.matches, n - stage.matches)
         size, orders = stage.matches, ORDERS[stage.matches]
-        self._block = Block(size, sets, orders, triangles, *before, self._witnesses, need, stage.reach)
+        by_label, sorted_labels = self.scene.by_label(size, stage.near3d)
+        labels, free = self.image.arrays.grid.labels, int(np.searchsorted(sorted_labels, 0))
+        low, high = (np.searchsorted(sorted_labels, labels, side) for side in ("left", "right"))
+        low, high = np.where(labels < 0, free, low), np.where(labels < 0, len(by_label), high)
+        self._block = Block(
+            *(size, sets, orders, triangles, by_label, low, high, free, *before),
+            *(self._witnesses, need, stage.reach),
+        )
         self._row, self._triangle = 0, 0
         self.kept.most[0] = 0.0
 
