@@ -9,11 +9,11 @@ their distance from the views, a third of them are dropped, and some copies are 
 --photos are removed from the map, with all points that fewer than two of the remaining views see.
 
 Success: rotation within 5 degrees, and the camera centre within a tenth of the distance. With --twice every place
-exists twice, where the second copy lacks this fraction of its points; then no pose is correct.
+exists twice, and the second copy lacks this fraction of its points; only the pose in the complete copy is correct.
 
 A row begins with the cost of opening the map before the first photo, in CPU seconds and peak memory of a new process:
 as a COLMAP model, and with the index of a large map. Then follows the ranking of the views (`bpnp.maps.views`): the
-number of photos for which one of the first 1, 10 and 50 views is rotated by less than 30 degrees and lies within half
+fraction of photos for which one of the first 1, 10 and 50 views is rotated by less than 30 degrees and lies within half
 the distance.
 """
 
@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from record import TIME_LIMIT, Array, Pose, Problem, Row, Similarity, degrees, parser, run, spread
+from record import Array, Pose, Problem, Row, Similarity, degrees, parser, run, spread
 from scipy.spatial.transform import Rotation
 from view_problems import REPORTED, map_of, median_distance, model_of, part_of
 
@@ -43,7 +43,7 @@ NEAR_DEG, NEAR_SHIFT = 30.0, 0.5  # of a view that shows about what a photo show
 FIRST = (1, 10, 50)
 VIEWS = (477, 1000, 3000, 10_000)
 MOVED, WAVES = 0.1, 6  # root mean square of the field, in distances of the view; sine waves in it
-DROPPED = 0.3  # share of a copy's points
+DROPPED = 0.3  # fraction of a copy's points
 APART = 40.0  # side of the cube in which places lie, in distances of a view, for 10 of them
 CAMERA = camera_from(np.eye(3))  # views are looked near by pose alone
 
@@ -211,7 +211,7 @@ def is_near(view: View, photo: CityPhoto) -> bool:
     )
 
 
-def problems(scene: SceneMap, photos: Sequence[CityPhoto], seed: int) -> Iterator[Problem]:
+def problems(scene: SceneMap, photos: Sequence[CityPhoto], seed: int, time_limit: float) -> Iterator[Problem]:
     with tempfile.TemporaryDirectory() as folder, multiprocessing.get_context("spawn").Pool(1, None, (), 1) as pool:
         write_map(scene, Path(folder))
         first, again = pool.map(open_map, [Path(folder)] * 2, chunksize=1)
@@ -219,25 +219,36 @@ def problems(scene: SceneMap, photos: Sequence[CityPhoto], seed: int) -> Iterato
     print(f"opened in {first}, again {again}, {rank_views(scene, photos)}", end="; ", flush=True)
     for photo in photos:
         pixels, camera = photo.focal * photo.points2d, np.diag([photo.focal, photo.focal, 1.0])
-        search = partial(scene.localize, pixels, camera, seed=seed, time_limit=TIME_LIMIT)
+        search = partial(scene.localize, pixels, camera, seed=seed, time_limit=time_limit)
         yield Problem(photo.name, search, photo.poses[:1], distance=photo.distance)
 
 
 def rows(options: argparse.Namespace) -> Iterator[Row]:
     names = options.scenes or sorted(path.name for path in (options.data / "colmap").iterdir())
+    if missing := set(options.photos) - set(names):
+        raise SystemExit(f"photos of {', '.join(sorted(missing))}: not a model of this city; name others with --photos")
     scenes = [model_of(options.data, name) for name in names]
     wanted = dict.fromkeys(options.photos, -(-options.limit // len(options.photos)))
     for views in options.views if options.twice is None else [0]:
         scene, photos = city(scenes, wanted, views, options.seed, twice=options.twice)
         name = f"{len(scene.views):,} views, {len(scene.points3d):,} points"
-        drawn = partial(problems, scene, photos[: options.limit], options.seed)
+        drawn = partial(problems, scene, photos[: options.limit], options.seed, options.time_limit)
         yield Row(name, drawn, RIGHT_DEG, RIGHT_SHIFT)
 
 
 def main() -> None:
     options = parser(__doc__)
-    options.add_argument("scenes", nargs="*", metavar="SCENE", help="models of the city (default: all of the data)")
-    options.add_argument("--photos", nargs="+", default=REPORTED, metavar="SCENE", help="scenes of the photos")
-    options.add_argument("--views", type=int, nargs="+", default=VIEWS, help="of the cities")
-    options.add_argument("--twice", type=float, help="every place twice, this share of the points of one gone")
-    run(rows, options)
+    options.add_argument("scenes", nargs="*", metavar="SCENE", help="models of the city (default: all of --data)")
+    options.add_argument(
+        "--photos",
+        nargs="+",
+        default=REPORTED,
+        metavar="SCENE",
+        help="models whose photos are localised (default: %(default)s)",
+    )
+    options.add_argument(
+        "--views", type=int, nargs="+", default=VIEWS, help="numbers of views of the cities; not with --twice"
+    )
+    options.add_argument("--twice", type=float, help="fraction of the points that the second copy of each place lacks")
+    chosen = options.parse_args()
+    run(rows(chosen), chosen)

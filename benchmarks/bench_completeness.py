@@ -1,7 +1,7 @@
 """Calibration of the miss probability 2^-k on symmetric objects, without the comparison of poses under their motions.
 
     python -m benchmarks completeness          # 3 CPU minutes; writes benchmarks/completeness.json and docs/verdict.md
-    python -m benchmarks completeness --check  # whether docs/verdict.md is what the record says
+    python -m benchmarks completeness --check  # compare docs/verdict.md with the record
 
 Every search runs `TURNS` rounds. After each round the best pose has the basin count k. For each k the table lists how
 many best poses reached it, how many of them were wrong at that moment, and the bound 2^-k. Objects have eight or more
@@ -35,7 +35,7 @@ from bpnp.search.verdict.decide import count_starts, no_pose
 FILE, PAGES = ROOT / "benchmarks" / "completeness.json", (ROOT / "docs" / "verdict.md",)
 TURNS = 8
 BASIN_COUNTS = (1, 2, 3, 4, 6, 8, 10)
-UNIQUE = 8  # points at least that no symmetry maps onto others
+UNIQUE = 8  # smallest number of points that no symmetry maps onto others
 RIGHT_DEG = 3.0
 # No motion maps more than all of the points: no competitor is proposed, and no scene counts as symmetric.
 BLIND = replace(

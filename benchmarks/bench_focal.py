@@ -6,9 +6,10 @@ Rows: maps (photos removed from their map, no view given), lenses (the same with
 for sceaux_castle_txt and statue_of_liberty that of their own camera), leds (10 or more are visible).
 
 Success: rotation within 1.5 degrees, for LEDs within 3. A line has the fraction with a focal length within 3 %, the
-number of confident poses that are more than 3 degrees off, and the number of confident poses that are off in another
-way: the focal length by more than three standard deviations, or the centre by more than 3 % of the depth. --limit:
-problems per scene, or per setting of LEDs.
+number of confident poses that are more than 3 degrees off, and the number of confident poses whose focal length is off
+by more than three standard deviations or whose centre is off by more than 3 % of the depth.
+
+--limit: problems per scene, or per setting of LEDs.
 """
 
 import argparse
@@ -18,7 +19,7 @@ from typing import Any
 
 import numpy as np
 from leds import Setting, frames
-from record import TIME_LIMIT, Array, Problem, Row, parser, run
+from record import Array, Problem, Row, parser, run
 from view_problems import (
     REPORTED,
     ViewProblem,
@@ -33,7 +34,7 @@ from bpnp.cameras import camera_from, image_size
 
 RIGHT_DEG = {"maps": 1.5, "lenses": 1.5, "leds": 3.0}
 RADIAL = (-0.3, -0.15, -0.05, 0.0, 0.07, 0.15, 0.3)
-DISTORTED = ("sceaux_castle_txt", "statue_of_liberty")  # whose own cameras are
+DISTORTED = ("sceaux_castle_txt", "statue_of_liberty")  # models whose own cameras have radial distortion
 SCENES = (*REPORTED, "statue_of_liberty")
 LEDS = [Setting(f"{kind}, {n} lights, 10 seen", kind, n, least=10) for kind in ("ring", "headset") for n in (0, 3)]
 
@@ -42,7 +43,9 @@ def of_photos(options: argparse.Namespace) -> Iterator[Problem]:
     settings: dict[str, Any] = {"against": "map", "outliers": 1.0, "seed": options.seed}
     for photo in scene_problems(options.data, options.scenes, options.limit, **settings):
         (pixels, size), distance = image_of(photo), median_distance(photo.points3d[photo.matched], photo.pose)
-        search = partial(photo.scene.localize, pixels, image_size=size, seed=options.seed, time_limit=TIME_LIMIT)
+        search = partial(
+            photo.scene.localize, pixels, image_size=size, seed=options.seed, time_limit=options.time_limit
+        )
         yield Problem(photo.name, search, [photo.pose], distance=distance, focal=photo.focal)
 
 
@@ -55,21 +58,26 @@ def distorted_photos(options: argparse.Namespace) -> Iterator[Problem]:
             photo, size = view_problem(scene, query, **settings), image_size(query.camera)
             assert size is not None
             centre, radial = (size[0] / 2, size[1] / 2), RADIAL[(k + options.seed) % len(RADIAL)]
-            bent = camera_from(("SIMPLE_RADIAL", (photo.focal, *centre, radial)))
-            lens = query.camera if name in DISTORTED else bent
+            lens, kind = camera_from(("SIMPLE_RADIAL", (photo.focal, *centre, radial))), f"{radial}"
+            if name in DISTORTED:
+                lens, kind = query.camera, "own lens"
             pixels = lens.project(np.column_stack([photo.points2d, np.ones(len(photo.points2d))]))
             inside = ((pixels >= 0) & (pixels <= size)).all(-1) & np.isfinite(
                 lens.normalise(np.nan_to_num(pixels))
             ).all(-1)
-            search_options: dict[str, Any] = {"image_size": size, "seed": options.seed, "time_limit": TIME_LIMIT}
+            search_options: dict[str, Any] = {
+                "image_size": size,
+                "seed": options.seed,
+                "time_limit": options.time_limit,
+            }
             search = partial(photo.scene.localize, pixels[inside], **search_options)
             distance = median_distance(photo.points3d[photo.matched], photo.pose)
-            yield Problem(f"{photo.name}, {radial}", search, [photo.pose], distance=distance, focal=lens.focal)
+            yield Problem(f"{photo.name}, {kind}", search, [photo.pose], distance=distance, focal=lens.focal)
 
 
 def image_of(photo: ViewProblem) -> tuple[Array, tuple[int, int]]:
-    """Return keypoints (m, 2), pixels, and the size of an image centred on the principal point that contains them; the
-    size is that of the map's images if they lie within it.
+    """Return keypoints (m, 2), pixels, and the size of an image that is centred on the principal point and contains
+    them: that of the map's images if it is large enough.
     """
     pixels = photo.focal * photo.points2d
     sizes = [size for view in photo.scene.views if (size := image_size(view.camera))]
@@ -85,13 +93,15 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
         yield Row("whole map, distorted", partial(distorted_photos, options), RIGHT_DEG["lenses"])
         return
     for k, setting in enumerate(LEDS):
-        arguments = {"image_size": (setting.camera.size, setting.camera.size), "seed": options.seed}
+        size = setting.camera.size, setting.camera.size
+        arguments: dict[str, Any] = {"image_size": size, "seed": options.seed, "time_limit": options.time_limit}
         drawn = partial(frames, setting, k, options.limit, options.seed, **arguments)
         yield Row(setting.name, drawn, RIGHT_DEG["leds"])
 
 
 def main() -> None:
     options = parser(__doc__)
-    options.add_argument("what", choices=RIGHT_DEG)
-    options.add_argument("--scenes", nargs="+", default=SCENES, metavar="SCENE")
-    run(rows, options)
+    options.add_argument("what", choices=RIGHT_DEG, help="kind of problems")
+    options.add_argument("--scenes", nargs="+", default=SCENES, metavar="SCENE", help="models of the photos")
+    chosen = options.parse_args()
+    run(rows(chosen), chosen)

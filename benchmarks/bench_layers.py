@@ -22,7 +22,7 @@ import numpy as np
 import roma
 import torch
 from paper_layers import SINKHORN_TOLERANCE, PaperPnP, PaperSinkhorn
-from record import parser, write
+from record import parser, positive, select, write
 from torch import Tensor, nn
 
 from bpnp.cli import keep_freed_memory
@@ -78,8 +78,8 @@ Row = tuple[str, str, Callable[[], object], Callable[[], object]]  # what, on wh
 
 
 def race(ours: Callable[[], object], papers: Callable[[], object], rounds: int) -> tuple[float, float, float]:
-    """Return the CPU milliseconds of two functions that run alternately, and the ratio of the second to the first. Each
-    is called once to warm up and once to choose the number of calls.
+    """Return the median CPU milliseconds of two functions that run alternately, and the median ratio of the second to
+    the first. Each is called once to warm up and once to choose the number of calls.
     """
     timers = [Timer(candidate, timer=time.process_time) for candidate in (ours, papers)]
     repeats = [max(1, round(SHORTEST / max(timer.repeat(2, 1)[1], 1e-6))) for timer in timers]
@@ -126,18 +126,18 @@ def gradient_of(outputs: Any, inputs: Tensor, incoming: Any) -> Callable[[], obj
 
 
 def main() -> None:
-    options = parser(__doc__)
-    options.add_argument("--points", type=int, default=1000, help="on each side (default: 1000)")
-    options.add_argument("--rounds", type=int, default=7, help="timings of each side in a row (default: 7)")
-    options.add_argument("--batch", type=int, default=4, help="problems in a batch (default: 4)")
+    options = parser(__doc__, without=["data", "seed", "limit", "time-limit"])
+    options.add_argument("--points", type=positive, default=1000, help="on each side (default: 1000)")
+    options.add_argument("--rounds", type=positive, default=7, help="timings of each side in a row (default: 7)")
+    options.add_argument("--batch", type=positive, default=4, help="problems in a batch (default: 4)")
     chosen = options.parse_args()
     keep_freed_memory()
     torch.set_num_threads(1)
     found = []
-    for what, inputs, ours, papers in rows(chosen.points, chosen.batch):
-        if any(part in f"{what}; {inputs}" for part in chosen.only):
-            *ms, ratio = race(ours, papers, chosen.rounds)
-            print(f"{what}; {inputs}: ours {ms[0]:.3g} CPU ms, the paper's {ms[1]:.3g}, ratio {ratio:.3g}", flush=True)
-            found.append({"what": what, "inputs": inputs, "ms": ms, "ratio": ratio})
+    drawn = select(rows(chosen.points, chosen.batch), chosen.only, lambda row: f"{row[0]}; {row[1]}")
+    for what, inputs, ours, papers in drawn:
+        *ms, ratio = race(ours, papers, chosen.rounds)
+        print(f"{what}; {inputs}: ours {ms[0]:.3g} CPU ms, the paper's {ms[1]:.3g}, ratio {ratio:.3g}", flush=True)
+        found.append({"what": what, "inputs": inputs, "ms": ms, "ratio": ratio})
     if chosen.output:
         write(chosen.output, {"points": chosen.points, "batch": chosen.batch, "rows": found})

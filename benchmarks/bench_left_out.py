@@ -20,7 +20,7 @@ import poselib
 import pycolmap
 from numpy.typing import NDArray
 from rebuilt_maps import PhotoScene, align
-from record import TIME_LIMIT, Array, Problem, Row, parser, run, spread
+from record import Array, Problem, Row, parser, run, spread
 from scipy.cluster.vq import kmeans2, vq
 from view_problems import median_distance
 
@@ -79,8 +79,8 @@ class DescribedMap:
         pose, stats = poselib.estimate_absolute_pose(pixels[keypoints], self.points3d[points], lens, accepted, {})
         verdict = "confident" if stats["num_inliers"] >= LEAST_INLIERS else "ambiguous"
         return SimpleNamespace(
-            rotation=np.asarray(pose.R), translation=np.asarray(pose.t), verdict=verdict, focal_length=np.nan,
-            focal_length_std=np.nan,
+            rotation=np.asarray(pose.R), translation=np.asarray(pose.t), verdict=verdict, reason="",
+            focal_length=np.nan, focal_length_std=np.nan,
             covariance=np.full((6, 6), np.nan), matches=np.column_stack([keypoints, points]),
         )  # fmt: skip
 
@@ -117,10 +117,11 @@ def descriptor_matches(
     return kept, points[np.concatenate(nearest)[kept]]
 
 
-def problems_of(scene: PhotoScene, photo: str, full: SceneMap, seed: int) -> dict[str, Problem]:
+def problems_of(scene: PhotoScene, photo: str, full: SceneMap, seed: int, time_limit: float) -> dict[str, Problem]:
     """Return the problems of one photo that is removed from its map, by method."""
     model = scene.model(left_out=photo)
     place, found = SceneMap.from_colmap(model), detected_keypoints(scene.photos / photo)
+    _ = place.cones, place.pictures  # once a map, like the descriptors of the other methods
     (true,) = full.named([photo])
     shared = np.array([np.isin(view.points, true.points).sum() for view in full.views])
     likely = [full.views[i].name for i in np.argsort(-shared, kind="stable")]
@@ -128,7 +129,7 @@ def problems_of(scene: PhotoScene, photo: str, full: SceneMap, seed: int) -> dic
     far = median_distance(full.points3d[true.points], (true.rotation, true.translation))
     alignment = align(full, place)
     described = DescribedMap(model, scene.database)
-    arguments: dict[str, Any] = {"scores": found.scores, "seed": seed, "time_limit": TIME_LIMIT}
+    arguments: dict[str, Any] = {"scores": found.scores, "seed": seed, "time_limit": time_limit}
     searches: dict[str, Callable[[], Solution]] = {}
     for method, named in (("views", views), ("map", None)):
         searches[method] = partial(place.localize, found.pixels, ("PINHOLE", CAMERA), views=named, **arguments)
@@ -146,7 +147,7 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
         scene = PhotoScene(options.data / "photos" / name, kept, CAMERA, FEATURES)
         full = SceneMap.from_colmap(scene.model())
         chosen = spread([photo for photo in scene.names() if photo in full.view_numbers], options.limit)
-        drawn = [problems_of(scene, photo, full, options.seed) for photo in chosen]
+        drawn = [problems_of(scene, photo, full, options.seed, options.time_limit) for photo in chosen]
         for method in drawn[0]:
             yield Row(f"{name}, {method}", partial(list, [one[method] for one in drawn]), RIGHT_DEG)
 
@@ -155,4 +156,5 @@ def main() -> None:
     options = parser(__doc__)
     options.add_argument("scenes", nargs="+", metavar="SCENE")
     options.add_argument("--maps", type=Path, default=Path("runs/left-out"), help="folder of the maps that are built")
-    run(rows, options)
+    chosen = options.parse_args()
+    run(rows(chosen), chosen)

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from leds import Camera, device
-from record import TIME_LIMIT, Array, Problem, Row, parser, run
+from record import Array, Problem, Row, parser, run
 from scipy.spatial.transform import Rotation
 from view_problems import LEAST_MATCHES, MOST_POINTS, REPORTED, images_of, model_of, overlapping, view_problem
 
@@ -31,14 +31,14 @@ def pose_matrix(rotation: Array, translation: Array) -> Array:
     return np.block([[rotation, np.reshape(translation, (3, 1))], [np.zeros((1, 3)), 1.0]])
 
 
-def problems(cameras: int, used: int, limit: int, seed: int, scale: bool) -> Iterator[Problem]:
+def problems(cameras: int, used: int, scale: bool, options: argparse.Namespace) -> Iterator[Problem]:
     """Yield problems with cameras at random positions that look at a device; the search uses only the first ones.
 
     Every fifth frame has a new device. The pose is rig_from_world, that of the first camera.
     """
-    rng, number = np.random.default_rng([seed, cameras]), 0
-    while number < limit:
-        shown = device("headset", 1000 * seed + number // 5)
+    rng, number = np.random.default_rng([options.seed, cameras]), 0
+    while number < options.limit:
+        shown = device("headset", 1000 * options.seed + number // 5)
         poses, pixels = [], []
         for _ in range(cameras):
             turn = Rotation.random(random_state=rng.integers(2**31)).as_matrix()
@@ -53,7 +53,7 @@ def problems(cameras: int, used: int, limit: int, seed: int, scale: bool) -> Ite
         if min(map(len, pixels)) <= LEAST:
             continue
         points3d = shown.points3d / (0.2 * 25 ** rng.random()) if scale else shown.points3d
-        search = rig_search(pixels[:used], points3d, [PINHOLE.model] * used, poses, seed=seed, scale=scale)
+        search = rig_search(pixels[:used], points3d, [PINHOLE.model] * used, poses, options, scale=scale)
         yield Problem(f"{number}", search, [(poses[0][:3, :3], poses[0][:3, 3])], shown.points3d)
         number += 1
 
@@ -74,16 +74,21 @@ def of_photos(used: slice, options: argparse.Namespace) -> Iterator[Problem]:
             rig = [query, *local][used]
             poses = [pose_matrix(each.rotation, each.translation) for each in rig]
             matrices = [np.diag([each.camera.focal] * 2 + [1.0]) for each in rig]
-            search = rig_search(pixels[used], shown.points3d, matrices, poses, seed=options.seed)
+            search = rig_search(pixels[used], shown.points3d, matrices, poses, options)
             pose = rig[0].rotation, rig[0].translation
             yield Problem(shown.name, search, [pose], shown.points3d, shown.distance)
 
 
 def rig_search(
-    pixels: Sequence[Array], points3d: Array, cameras: Sequence[Any], poses: Sequence[Array], **arguments: Any
+    pixels: Sequence[Array],
+    points3d: Array,
+    cameras: Sequence[Any],
+    poses: Sequence[Array],
+    options: argparse.Namespace,
+    **arguments: Any,
 ) -> partial[bpnp.Solution]:
     """Return the search for cameras with the poses camera_from_world, in the frame of the first."""
-    arguments["time_limit"] = TIME_LIMIT
+    arguments |= {"seed": options.seed, "time_limit": options.time_limit}
     if len(pixels) == 1:
         return partial(bpnp.solve, pixels[0], points3d, cameras[0], **arguments)
     rig = [one @ np.linalg.inv(poses[0]) for one in poses[: len(pixels)]]
@@ -95,12 +100,13 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
         ("2 cameras", 2, 2, False), ("4 cameras", 4, 4, False), ("one camera", 2, 1, False),
         ("2 cameras, scale unknown", 2, 2, True), ("4 cameras, scale unknown", 4, 4, True),
     ):  # fmt: skip
-        yield Row(f"LEDs, {name}", partial(problems, cameras, used, options.limit, options.seed, scale), RIGHT_DEG)
+        yield Row(f"LEDs, {name}", partial(problems, cameras, used, scale, options), RIGHT_DEG)
     for name, photos in (("camera 1", (0, 1)), ("camera 2", (1, 2)), ("camera 3", (2, 3)), ("3 cameras", (0, 3))):
         yield Row(f"photos, {name}", partial(of_photos, slice(*photos), options), RIGHT_DEG)
 
 
 def main() -> None:
     options = parser(__doc__)
-    options.add_argument("--scenes", nargs="*", default=REPORTED, help="COLMAP models of the photos")
-    run(rows, options)
+    options.add_argument("--scenes", nargs="+", default=REPORTED, help="COLMAP models of the photos")
+    chosen = options.parse_args()
+    run(rows(chosen), chosen)

@@ -4,19 +4,18 @@
     python -m benchmarks guard --seed 71 --output after.json --against before.json
 
 Kinds: shapes and meshes, photos against one view and in their maps, LEDs, near-symmetric devices, symmetric objects,
-unknown focal lengths, unrelated points, and `verify`. The file has verdict, error, false alarms, CPU seconds and pose
-of every problem. With --against, the differences are paired: CPU as the geometric mean of the ratios, verdicts as those
-gained and lost, and answers as the number of poses that differ by more than their own bound would allow. The exit
-status is 1 where a kind has fewer successes, a confident and wrong pose more, or 1.15 times the CPU seconds. --limit:
-problems a kind.
+unknown focal lengths, unrelated points, and `verify`. The file has verdict, errors, CPU seconds and pose of every
+problem. With --against, a line for each kind has the paired differences: the geometric mean of the ratios of the CPU
+seconds, the confident verdicts that were gained and lost, and the number of poses that differ by more than 2 degrees or
+a twentieth of the translation. The exit status is 1 if a kind has fewer successes, more poses that are confident and
+wrong, or more than 1.15 times the CPU seconds. --limit: problems of each kind.
 """
 
 import argparse
 import json
-import sys
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +24,16 @@ import leds
 import numpy as np
 import shapes
 import symmetric
-from record import Problem, command, machine, nearest, parser, solve_problem
+from record import Outcome, Problem, Row, degrees, parser, run
+from reliability import RIGHT_DEG, RIGHT_MOVED
 from scipy.spatial.transform import Rotation
 from view_problems import photos
 
 import bpnp
 
 MOST_CPU = 1.15
-RIGHT_DEG = 3.0
+OTHER_DEG, OTHER_SHIFT = 2.0, 0.05  # of different poses; the shift relative to the translation
+ANSWER = ("rotation", "translation")
 Draw = Callable[[argparse.Namespace], Iterable[Problem]]
 
 
@@ -41,7 +42,7 @@ def of_shapes(chosen: str, ratio: float, options: argparse.Namespace) -> Iterato
 
 
 def of_verify(turned: float, options: argparse.Namespace) -> Iterator[Problem]:
-    """Yield true poses of cluttered shapes to be verified, or poses turned by some degrees."""
+    """Yield true poses of cluttered shapes to be verified, or poses rotated by some degrees."""
     for name, points2d, points3d, rotation, translation in shapes.shapes(0.25, options.limit, options.seed):
         turn = Rotation.from_rotvec([0, np.radians(turned), 0]).as_matrix()
         search = partial(bpnp.verify, points2d, points3d, turn @ rotation, translation)
@@ -49,7 +50,7 @@ def of_verify(turned: float, options: argparse.Namespace) -> Iterator[Problem]:
 
 
 def of_noise(options: argparse.Namespace) -> Iterator[Problem]:
-    """Yield points that have nothing to do with each other."""
+    """Yield image points and scene points that are unrelated."""
     for k in range(options.limit):
         rng = np.random.default_rng([options.seed, 99, k])
         count = int(rng.choice([12, 30, 100]))
@@ -59,21 +60,21 @@ def of_noise(options: argparse.Namespace) -> Iterator[Problem]:
 
 def of_symmetric(unique: Callable[[int], bool], options: argparse.Namespace) -> Iterator[Problem]:
     kinds = [kind for kind in symmetric.KINDS if unique(kind.unique)]
-    for k in range(options.limit):
-        kind = kinds[k % len(kinds)]
-        yield from symmetric.problems(kind, 1, options.seed + k, options.time_limit)
+    drawn = [symmetric.problems(kind, options.limit, options.seed, options.time_limit) for kind in kinds]
+    yield from islice(chain.from_iterable(zip(*drawn, strict=True)), options.limit)
 
 
 def of_leds(name: str, options: argparse.Namespace) -> Iterator[Problem]:
-    return leds.problems(name, options.limit, options.seed)
+    return leds.problems(name, options.limit, options.seed, options.time_limit)
 
 
 def of_devices(normals: bool, options: argparse.Namespace) -> Iterator[Problem]:
-    return symmetric.device_problems(options.limit, options.seed, normals=normals, frames=3)
+    return symmetric.device_problems(options.limit, options.seed, options.time_limit, normals=normals, frames=3)
 
 
 def of_photos(against: Any, outliers: float, in_map: bool, apart: bool, options: argparse.Namespace) -> Any:
-    return photos(against, outliers, options.limit, options.seed, options.data, in_map=in_map, apart=apart)
+    count = options.limit, options.seed, options.data
+    return photos(against, outliers, *count, in_map=in_map, apart=apart, time_limit=options.time_limit)
 
 
 def of_focal(what: str, options: argparse.Namespace) -> Iterator[Problem]:
@@ -115,82 +116,56 @@ KINDS: dict[str, Draw] = {
 }
 
 
-def measure(problem: Problem) -> dict[str, Any]:
-    """Solve a problem and return its outcome with the answer, as plain numbers."""
-    kept: list[Any] = []
-
-    def search() -> Any:
-        kept.append(problem.solve())
-        return kept[0]
-
-    outcome = solve_problem(
-        Problem(problem.name, search, problem.poses, problem.points3d, problem.distance, problem.focal)
-    )
-    found = kept[0]
-    row = {key: value for key, value in asdict(outcome).items() if key != "sigmas"}
-    right = bool(problem.poses) and outcome.rotation_deg < RIGHT_DEG and outcome.moved < 0.1
-    return row | {
-        "right": right,
-        "wrong": outcome.verdict == "confident" and not right and outcome.outside,
-        "log10_false_alarms": float(found.log10_false_alarms),
-        "reason": found.reason,
-        "rotation": np.asarray(found.rotation).tolist(),
-        "translation": np.asarray(found.translation).tolist(),
-    }
-
-
-def line(kind: str, rows: list[dict[str, Any]]) -> str:
-    """Return the summary of a kind."""
-    count, seconds = max(len(rows), 1), np.array([row["cpu_seconds"] for row in rows] or [0.0])
-    shares = (sum(row["right"] for row in rows), sum(row["verdict"] == "confident" for row in rows))
-    cpu = f"CPU s {np.median(seconds):.3g}, mean {seconds.mean():.3g}"
-    right, confident = (f"{100 * value / count:.0f} %" for value in shares)
-    return f"{kind}: {count}, right {right}, confident {confident}, wrong {sum(r['wrong'] for r in rows)}, {cpu}"
-
-
-def compare(kind: str, rows: list[dict[str, Any]], before: list[dict[str, Any]]) -> tuple[str, bool]:
-    """Return the paired comparison of a kind, and whether it is held."""
-    earlier = {row["problem"]: row for row in before}
-    pairs = [(row, earlier[row["problem"]]) for row in rows if row["problem"] in earlier]
+def compare(row: Row, found: Sequence[Outcome], before: Sequence[Outcome]) -> tuple[str, bool]:
+    """Return the paired comparison of a kind with an earlier run, and whether the kind is held."""
+    earlier = {outcome.problem: outcome for outcome in before}
+    pairs = [(outcome, earlier[outcome.problem]) for outcome in found if outcome.problem in earlier]
     if not pairs:
         return "no problem in common", False
-    ratio = float(np.exp(np.mean([np.log(a["cpu_seconds"] / max(b["cpu_seconds"], 1e-9)) for a, b in pairs])))
-    gained = sum(a["verdict"] == "confident" != b["verdict"] for a, b in pairs)
-    lost = sum(b["verdict"] == "confident" != a["verdict"] for a, b in pairs)
-    right = sum(a["right"] for a, _ in pairs) - sum(b["right"] for _, b in pairs)
-    wrong = sum(a["wrong"] for a, _ in pairs) - sum(b["wrong"] for _, b in pairs)
+    ratio = float(np.exp(np.mean([np.log(a.cpu_seconds / max(b.cpu_seconds, 1e-9)) for a, b in pairs])))
+    new, old = ([pair[k] for pair in pairs] for k in (0, 1))
+    sure = [[outcome.verdict == "confident" for outcome in outcomes] for outcomes in (new, old)]
+    gained = sum(a and not b for a, b in zip(*sure, strict=True))
+    lost = sum(b and not a for a, b in zip(*sure, strict=True))
+    right = sum(map(row.is_right, new)) - sum(map(row.is_right, old))
+    wrong = sum(map(row.is_confident_and_wrong, new)) - sum(map(row.is_confident_and_wrong, old))
     other = sum(differs(a, b) for a, b in pairs)
     text = f"CPU {ratio:.2f}, right {right:+d}, wrong {wrong:+d}, confident +{gained} -{lost}, {other} other poses"
     return text, right >= 0 and wrong <= 0 and ratio <= MOST_CPU
 
 
-def differs(one: dict[str, Any], other: dict[str, Any]) -> bool:
-    """Return whether two answers are different poses."""
-    poses = [(np.array(row["rotation"], float), np.array(row["translation"], float)) for row in (one, other)]
-    turn, _, moved, _ = nearest(Problem("", lambda: bpnp.solve([], []), [poses[0]]), *poses[1])
-    return turn > 2 or moved > 0.05
+def differs(one: Outcome, other: Outcome) -> bool:
+    """Return True if two answers are different poses, or only one of them is a pose."""
+    rotations, translations = (np.array([getattr(each, name) for each in (one, other)]) for name in ANSWER)
+    if not (np.isfinite(rotations).any() and np.isfinite(translations).any()):
+        return False
+    moved = np.linalg.norm(translations[0] - translations[1]) / np.linalg.norm(translations[1])
+    return degrees(*rotations) > OTHER_DEG or bool(moved > OTHER_SHIFT)
+
+
+def read_outcomes(file: Path) -> dict[str, list[Outcome]]:
+    """Return the outcomes of each kind in a file of `--output`."""
+    rows = json.loads(file.read_text(encoding="utf-8"))["rows"]
+    return {kind: [Outcome(**outcome) for outcome in row["outcomes"]] for kind, row in rows.items()}
+
+
+def rows(options: argparse.Namespace) -> Iterator[Row]:
+    for kind, draw in KINDS.items():
+        yield Row(kind, partial(draw, options), RIGHT_DEG, right_moved=RIGHT_MOVED)
 
 
 def main() -> None:
     options = parser(__doc__)
+    options.set_defaults(time_limit=10.0)
     options.add_argument("--against", type=Path, help="file of an earlier run")
-    options.add_argument("--time-limit", type=float, default=10.0, help="seconds a problem (default: %(default)s)")
-    args = options.parse_args()
-    bpnp.warm_up()
-    record: dict[str, Any] = {"machine": machine(), "command": command(sys.argv), "kinds": {}}
-    before = json.loads(args.against.read_text())["kinds"] if args.against else {}
+    chosen = options.parse_args()
+    if chosen.against and not chosen.against.is_file():
+        options.error(f"--against: there is no file {chosen.against}")
+    before = read_outcomes(chosen.against) if chosen.against else {}
     held = True
-    for kind, draw in KINDS.items():
-        if not any(part in kind for part in args.only):
-            continue
-        rows = record["kinds"][kind] = [measure(problem) for problem in draw(args)]
-        text, good = compare(kind, rows, before[kind]) if kind in before else ("", True)
-        held &= good
-        print(line(kind, rows) + (f" | {text}" if text else "") + ("" if good else " NOT HELD"), flush=True)
-        if args.output:
-            args.output.write_text(json.dumps(record, indent=1, default=str))
+    for row, found in run(rows(chosen), chosen):
+        if chosen.against:
+            text, good = compare(row, found, before.get(row.name, []))
+            print(f"{row.name}: {text}{'' if good else ' NOT HELD'}")
+            held &= good
     raise SystemExit(not held)
-
-
-if __name__ == "__main__":
-    main()

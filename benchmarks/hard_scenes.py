@@ -19,26 +19,26 @@ WINDOW = np.array([[0, 0, 0], [0.5, 0, 0], [0.5, 0.8, 0], [0, 0.8, 0], [0.25, 0.
 
 
 def board(rng: np.random.Generator) -> Drawn:
-    """Part of a lattice of 14 x 10 points."""
+    """Draw part of a lattice of 14 x 10 points."""
     points = 0.3 * np.array([[i, j, 0.0] for i in range(14) for j in range(10)])
     return _in_frame(points, points, _facing(rng, 40, (1.5, 2.5), aside=0.8), rng)
 
 
 def wallpaper(rng: np.random.Generator) -> Drawn:
-    """Part of a motif of five points in relief, repeated 8 x 5 times."""
+    """Draw part of a motif of five points in relief, repeated 8 x 5 times."""
     motif = rng.uniform(0, 0.5, (5, 3)) * (1, 1, 0.3)
     points = np.concatenate([motif + (0.5 * i, 0.5 * j, 0) for i in range(8) for j in range(5)])
     return _in_frame(points, points, _facing(rng, 40, (1.5, 2.5), aside=0.8), rng)
 
 
 def stairs(rng: np.random.Generator) -> Drawn:
-    """Part of twelve steps with the same eight points across."""
+    """Draw part of twelve steps with the same eight points across."""
     points = np.array([[x, 0.2 * k, 0.25 * k] for x in rng.uniform(-1, 1, 8) for k in range(12)])
     return _in_frame(points, points, _facing(rng, 40, (2, 3), aside=0.6), rng)
 
 
 def row_of_windows(rng: np.random.Generator) -> Drawn:
-    """Part of two rows of six windows and a door."""
+    """Draw part of two rows of six windows and a door."""
     door = np.array([[6.2, 0, 0], [6.9, 0, 0], [6.9, 1.9, 0], [6.2, 1.9, 0]])
     points = np.concatenate([*(WINDOW[:4] + (i, 1.5 * j, 0) for i in range(6) for j in range(2)), door])
     points += 0.002 * rng.standard_normal(points.shape)
@@ -46,7 +46,7 @@ def row_of_windows(rng: np.random.Generator) -> Drawn:
 
 
 def ending_facade(rng: np.random.Generator) -> Drawn:
-    """Columns 4 to 9 of a facade against a map of columns 1 to 6."""
+    """Draw columns 4 to 9 of a facade against a map of columns 1 to 6."""
     column = np.repeat(np.arange(9), 10)
     points = np.concatenate([WINDOW + (i, 1.5 * j, 0) for i in range(9) for j in range(2)])
     points += 0.002 * rng.standard_normal(points.shape)
@@ -54,7 +54,7 @@ def ending_facade(rng: np.random.Generator) -> Drawn:
 
 
 def colonnade(rng: np.random.Generator) -> Drawn:
-    """Columns 3 to 6 of a colonnade against a map of columns 4 to 8."""
+    """Draw columns 3 to 6 of a colonnade against a map of columns 4 to 8."""
     column = np.repeat(np.arange(8), 12)
     points = np.tile(rng.uniform(-1, 1, (12, 3)) * (0.15, 1, 0.15), (8, 1)) + np.outer(column, (0.8, 0, 0))
     points += 0.003 * rng.standard_normal(points.shape)
@@ -63,7 +63,7 @@ def colonnade(rng: np.random.Generator) -> Drawn:
 
 
 def gappy_facade(rng: np.random.Generator) -> Drawn:
-    """Part of two rows of nine windows; a fifth of the points is missing in the map, another fifth in the image."""
+    """Draw part of two rows of nine windows; a fifth of the points is missing in the map, another in the image."""
     points = np.concatenate([WINDOW + (i, 1.5 * j, 0) for i in range(9) for j in range(2)])
     points += 0.002 * rng.standard_normal(points.shape)
     seen, mapped = rng.random((2, len(points))) < 0.8
@@ -78,13 +78,13 @@ def facade_with_door(rng: np.random.Generator) -> Drawn:
 
 
 def lines(rng: np.random.Generator) -> Drawn:
-    """Five lines of 15 points, evenly spaced, in the image, and five others in the scene."""
+    """Draw five lines of 15 points, evenly spaced, in the image, and five others in the scene."""
     image, scene = (np.concatenate([_line(rng, axes) for _ in range(5)]) for axes in (2, 3))
     return image * 200 + (320, 240), scene, []
 
 
 def clumps(rng: np.random.Generator) -> Drawn:
-    """Five to eight clumps of eight keypoints, and as many of scene points, at other places."""
+    """Draw five to eight clumps of eight keypoints, and as many of scene points, at other places."""
     count, width = int(rng.choice([5, 6, 8])), rng.choice([1.0, 3.0, 6.0])
     image = np.repeat(rng.uniform((0, 0), (WIDTH, HEIGHT), (count, 2)), 8, 0)
     scene = np.repeat(rng.standard_normal((count, 3)), 8, 0)

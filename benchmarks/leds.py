@@ -190,10 +190,11 @@ SETTINGS = {
 }
 
 
-def problems(name: str, limit: int, seed: int) -> Iterator[Problem]:
-    """Yield frames of one of SETTINGS, with the camera given."""
+def problems(name: str, limit: int, seed: int, time_limit: float | None = None) -> Iterator[Problem]:
+    """Yield frames of one of SETTINGS, with the camera given; `time_limit` as for `solve`."""
     setting = SETTINGS[name]
-    return frames(setting, list(SETTINGS).index(name), limit, seed, camera=setting.camera.model)
+    number = list(SETTINGS).index(name)
+    return frames(setting, number, limit, seed, camera=setting.camera.model, time_limit=time_limit)
 
 
 def frames(setting: Setting, number: int, limit: int, seed: int, /, **options: Any) -> Iterator[Problem]:

@@ -31,7 +31,7 @@ class PhotoScene:
 
     @property
     def database(self) -> Path:
-        """Compute features and verified matches of all photos."""
+        """Path of the features and verified matches of all photos, which are computed at the first use."""
         path = self.kept / "features.db"
         if not path.is_file():
             self.kept.mkdir(parents=True, exist_ok=True)
@@ -51,7 +51,7 @@ class PhotoScene:
         return path
 
     def names(self) -> list[str]:
-        """Names of the photos."""
+        """Return the names of the photos, sorted."""
         return sorted(path.name for path in self.photos.iterdir() if path.suffix.lower() in {".jpg", ".png"})
 
     def model(self, left_out: str | None = None) -> Path:

@@ -7,7 +7,7 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from functools import cache
@@ -28,10 +28,10 @@ ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("BPNP_SHARED_DATA", ROOT.parent / "shared" / "data"))
 TIME_LIMIT = 60.0  # seconds, enough for a search to end by its own rules, also on a busy machine
 NO_POSE_DEG = 180.0
-NEAR_FOCAL = 0.03  # of a focal length that counts as right, and of the depth, of a camera's centre
+NEAR_FOCAL = 0.03  # largest relative error of a correct focal length; of a camera centre, in depths
 MOST_SIGMAS = 3.0  # standard deviations that the error of a focal length may have
 FAR_DEG = 3.0  # from which a confident pose with an unknown focal length is counted, whatever its bound
-BOUND = 0.999  # share of the confident poses that are within their bound
+BOUND = 0.999  # probability of the region around a pose that `beyond_bound` tests
 
 T = TypeVar("T")
 Array = NDArray[np.float64]
@@ -55,29 +55,55 @@ class Similarity:
         return turned, self.scale * translation - turned @ self.shift
 
 
-def parser(doc: str | None, *, own_record: bool = True) -> argparse.ArgumentParser:
-    """Return a parser with the options of all benchmarks: data, seed and rows.
+def parser(doc: str | None, *, without: Collection[str] = ()) -> argparse.ArgumentParser:
+    """Return a parser with the options that most benchmarks have.
 
-    own_record: with the number of problems and the record file as well.
+    Args:
+        doc: docstring of the benchmark, which is its help.
+        without: names of the options that this benchmark does not have.
     """
     result = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
-    result.add_argument("--data", type=Path, default=DATA, help="folder with colmap, photos and psb")
-    result.add_argument("--seed", type=int, default=9, help="of the problems and of the search (default: %(default)s)")
-    result.add_argument("--only", nargs="*", default=[""], help="parts of names: only rows with one of them")
-    if own_record:
-        result.add_argument("--limit", type=int, default=12, help="problems a row (default: %(default)s)")
-        result.add_argument("--output", type=Path, help="JSON file for machine, commit, command and rows")
+    options: dict[str, dict[str, Any]] = {
+        "data": {"type": Path, "default": DATA, "help": "folder with colmap, photos and psb"},
+        "seed": {"type": int, "default": 9, "help": "of the problems and of the search (default: %(default)s)"},
+        "only": {"nargs": "+", "default": [""], "help": "parts of names: only rows with one of them"},
+        "limit": {"type": positive, "default": 12, "help": "problems a row (default: %(default)s)"},
+        "time-limit": {"type": float, "default": TIME_LIMIT, "help": "seconds a problem (default: %(default)s)"},
+        "output": {"type": Path, "help": "JSON file for machine, commit, command and rows"},
+    }
+    for name, settings in options.items():
+        if name not in without:
+            result.add_argument(f"--{name}", **settings)
     return result
+
+
+def positive(text: str) -> int:
+    """Return a positive integer of a command line."""
+    if not text.isdecimal() or int(text) == 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive integer")
+    return int(text)
+
+
+def select(items: Iterable[T], only: Sequence[str], name: Callable[[T], str]) -> Iterator[T]:
+    """Yield the items with one of these parts in their name, and exit with an error if there is none."""
+    found = False
+    for item in items:
+        if any(part in name(item) for part in only):
+            found = True
+            yield item
+    if not found:
+        sys.exit(f"no row has {' or '.join(map(repr, only))} in its name")
 
 
 def spread(items: Sequence[T], limit: int, first: float = 0.0) -> list[T]:
     """Return at most `limit` items, evenly spread; the first one after this fraction of a step."""
-    return [items[k] for k in sorted({int((k + first) * len(items) / limit) for k in range(limit)})]
+    count = min(limit, len(items))
+    return [items[int((k + first) * len(items) / count)] for k in range(count)]
 
 
 @dataclass(frozen=True)
 class Problem:
-    """A problem and its true poses: each of them is correct; no poses for points without a common pose."""
+    """A problem and its true poses: each of them is correct. There is none if the points have no pose in common."""
 
     name: str
     solve: Callable[[], Solution]
@@ -101,6 +127,9 @@ class Outcome:
     moved: float = 0.0  # of the scene's centroid in the camera frame, over its distance
     focal_sigmas: float = np.nan  # error of the estimated focal length in standard deviations
     sigmas: Sequence[float] = ()  # errors of a nearly correct pose in standard deviations (`sigmas`)
+    reason: str = ""  # of the verdict
+    rotation: Sequence[Sequence[float]] = ()  # of the estimated pose (3, 3); empty if only its errors are known
+    translation: Sequence[float] = ()
 
 
 @dataclass(frozen=True)
@@ -112,11 +141,18 @@ class Row:
     right_deg: float
     right_shift: float = np.inf
     right_moved: float = np.inf
-    excused: bool = True  # a confident pose that is not right and within its own bound is no broken promise
+    excused: bool = True  # False: a confident pose that is not right is wrong even within its own bound
 
     def is_right(self, one: Outcome) -> bool:
         limits = (one.rotation_deg, self.right_deg), (one.shift, self.right_shift), (one.moved, self.right_moved)
         return all(error < limit or np.isinf(limit) for error, limit in limits)
+
+    def is_wrong(self, one: Outcome) -> bool:
+        """Return True if a pose is not correct, and a confident one would break its promise."""
+        return not self.is_right(one) and (one.outside or not self.excused)
+
+    def is_confident_and_wrong(self, one: Outcome) -> bool:
+        return one.verdict == "confident" and self.is_wrong(one)
 
 
 def solve_problem(problem: Problem) -> Outcome:
@@ -128,7 +164,8 @@ def solve_problem(problem: Problem) -> Outcome:
     off = sigmas(found, pose, np.median(problem.points3d, 0)) if turn < FAR_DEG else []
     focal = float(found.focal_length / problem.focal)
     error = abs(found.focal_length - problem.focal) / max(found.focal_length_std, np.finfo(float).tiny)
-    return Outcome(problem.name, turn, shift, found.verdict, seconds, outside, focal, moved, error, off)
+    answer = found.reason, found.rotation.tolist(), found.translation.tolist()
+    return Outcome(problem.name, turn, shift, found.verdict, seconds, outside, focal, moved, error, off, *answer)
 
 
 def nearest(problem: Problem, rotation: Array, translation: Array) -> tuple[float, float, float, Any]:
@@ -185,21 +222,23 @@ def degrees(one: Any, other: Any) -> float:
 def summary(found: Sequence[Outcome], row: Row) -> dict[str, Any]:
     """Return the figures of a row.
 
-    They are the quartiles of the rotation error; the fractions of correct and of confident poses; the number of poses
-    that are confident, wrong and outside their own bound; CPU seconds; and the fraction of the errors of correct poses
-    within 1, 2 and 3 of their standard deviations. With unknown focal lengths: the fraction that is near the true one,
-    and the number of confident poses that are far off.
+    They are the quartiles of the rotation error; the fractions of correct, of wrong (`Row.is_wrong`) and of confident
+    poses; the number of poses that are confident and wrong; mean and median CPU seconds; and the fraction of the errors
+    of correct poses within 1, 2 and 3 of their standard deviations. With unknown focal lengths also: the fraction that
+    is near the true one; the number of confident poses that are more than `FAR_DEG` off; the number of confident poses
+    whose focal length is off by more than `MOST_SIGMAS` standard deviations or whose centre is off by more than
+    `NEAR_FOCAL`; and the fraction of poses that are correct, confident, and not off in this way.
     """
     turn, focal, seconds = np.array([(o.rotation_deg, o.focal, o.cpu_seconds) for o in found]).T
     right, sure = np.array([row.is_right(o) for o in found]), np.array([o.verdict == "confident" for o in found])
-    wrong = ~right & np.array([o.outside or not row.excused for o in found])
+    wrong = np.array([row.is_wrong(o) for o in found])
     result: dict[str, Any] = {
         "problems": len(found),
         "rotation_q_deg": [round(float(q), 4) for q in np.percentile(turn, (25, 50, 75))],
         "right": round(float(right.mean()), 4),
         "wrong": round(float(wrong.mean()), 4),
         "confident": round(float(sure.mean()), 4) if any(o.verdict for o in found) else None,
-        "confident_and_wrong": int((sure & wrong).sum()),
+        "confident_and_wrong": sum(map(row.is_confident_and_wrong, found)),
         "cpu_seconds": round(float(seconds.mean()), 4),
         "median_cpu_seconds": round(float(np.median(seconds)), 4),
     }
@@ -214,17 +253,13 @@ def summary(found: Sequence[Outcome], row: Row) -> dict[str, Any]:
     return result
 
 
-def measure_rows(
-    rows: Iterable[Row], only: Sequence[str] = ("",)
-) -> Iterator[tuple[Row, dict[str, Any], list[Outcome]]]:
-    """Yield the rows that have one of these parts in their name, with summary and outcomes, and print a line for each.
+def measure_rows(rows: Iterable[Row]) -> Iterator[tuple[Row, dict[str, Any], list[Outcome]]]:
+    """Yield the rows with summary and outcomes, and print a line for each.
 
     The problems of a row are drawn before the first of them is solved.
     """
     warm_up()
     for row in rows:
-        if not any(part in row.name for part in only):
-            continue
         found = [one if isinstance(one, Outcome) else solve_problem(one) for one in list(row.draw())]
         if not found:
             print(f"{row.name}: no problems", flush=True)
@@ -235,13 +270,19 @@ def measure_rows(
         yield row, result, found
 
 
-def run(rows: Callable[[argparse.Namespace], Iterable[Row]], options: argparse.ArgumentParser) -> None:
-    """Measure the rows of a benchmark, and write each with its outcomes to `--output` at once."""
-    chosen, results = options.parse_args(), {}
-    for row, result, found in measure_rows(rows(chosen), chosen.only):
+def run(rows: Iterable[Row], options: argparse.Namespace) -> list[tuple[Row, list[Outcome]]]:
+    """Measure the rows that `--only` selects, and write each with its outcomes to `--output` at once.
+
+    Returns:
+        The rows that were measured, with their outcomes.
+    """
+    measured, results = [], {}
+    for row, result, found in measure_rows(select(rows, options.only, lambda row: row.name)):
+        measured.append((row, found))
         results[row.name] = result | {"outcomes": [asdict(outcome) for outcome in found]}
-        if chosen.output:
-            write(chosen.output, {"rows": results})
+        if options.output:
+            write(options.output, {"rows": results})
+    return measured
 
 
 def write(path: Path, record: dict[str, Any]) -> None:
@@ -273,7 +314,7 @@ def measured_today() -> dict[str, str]:
 
 
 def command(words: Sequence[str]) -> str:
-    """Return a command line in which paths below the root are shortened to their last part.
+    """Return a command line in which absolute paths are shortened to their last part.
 
     >>> command(["python -m benchmarks table1", "--run", "/tmp/runs/table1", "--steps", "3"])
     'python -m benchmarks table1 --run table1 --steps 3'

@@ -17,12 +17,12 @@ Rows:
 - devices: LEDs that a half turn nearly maps onto each other
 - pitch: crossings of lines of a playing field, gravity known to 2 degrees
 
---limit: problems of each row. No constant was chosen on the scenes of the photos (`--scenes`) but for two scales of the
-search near a view, on south_building.
+--limit: problems of each row; photos of each scene, as many as the scene with the fewest has. No constant was chosen on
+the scenes of the photos (`--scenes`), except for two scales of the search near a view, on south_building.
 
-Success: rotation within 3 degrees, and the centroid of the scene moved by less than a tenth of its distance; with a
-wrong focal length, the camera centre within a twentieth. Wrong: no success, and outside the 99.9 % bound of the
-solution.
+Success: rotation within 3 degrees, and the centroid of the scene moved by less than a tenth of its distance. Wrong: no
+success, and outside the 99.9 % bound of the solution. Rows "wrong focal": success is a camera centre within a twentieth
+of the distance, and every other pose is wrong.
 """
 
 import argparse
@@ -36,7 +36,7 @@ import numpy as np
 import shapes
 import symmetric
 from hard_scenes import CAMERA, SCENES, Drawn, wrong_focal_plane
-from record import TIME_LIMIT, Array, Pose, Problem, Row, parser, run
+from record import Array, Pose, Problem, Row, parser, run
 from scipy.special import softmax
 from view_problems import LEAST_MATCHES, REPORTED, Against, ViewProblem, scene_problems
 
@@ -55,7 +55,7 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
     near = partial(Row, right_deg=np.inf, right_shift=RIGHT_CENTRE, excused=False)
     count, photos = (options.limit, options.seed), partial(of_photos, cache(partial(in_turns, options)), options)
     for name in leds.SETTINGS:
-        yield right(f"leds, {name}", partial(leds.problems, name, *count))
+        yield right(f"leds, {name}", partial(leds.problems, name, *count, options.time_limit))
     for ratio in (0.0, 0.25, 0.5):
         drawn = partial(shapes.problems, "shapes", ratio, *count, options.data, options.time_limit)
         yield right(f"shapes, {ratio:g} outliers a match", drawn)
@@ -73,10 +73,13 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
         drawn = partial(symmetric.problems, parts, *count, options.time_limit)
         yield right(f"symmetric, {parts.label}", drawn)
     for normals in (True, False):
-        drawn = partial(symmetric.device_problems, *count, normals=normals)
+        drawn = partial(symmetric.device_problems, *count, options.time_limit, normals=normals)
         yield right(f"devices, {'with' if normals else 'without'} normals", drawn)
     for tilt in (0.0, 30.0, 60.0):
-        yield right(f"pitch with gravity, tilt {tilt:g} deg", partial(symmetric.pitch_problems, tilt, *count))
+        yield right(
+            f"pitch with gravity, tilt {tilt:g} deg",
+            partial(symmetric.pitch_problems, tilt, *count, options.time_limit),
+        )
     for kind in ("none", "likeliest", "probabilities"):
         yield right(f"labels, {kind}", partial(of_classes, kind, options))
 
@@ -85,7 +88,7 @@ def of_photos(
     drawn: Callable[[float, Against], Sequence[ViewProblem]], options: argparse.Namespace, outliers: float,
     against: Against, factors: Sequence[Sequence[float]],
 ) -> Iterator[Problem]:  # fmt: skip
-    """Yield photos whose cameras have these factors of the focal length in turn; NaN for an unknown focal length."""
+    """Yield photos whose cameras have these factors of the focal length in turn; a factor that is NaN is left out."""
     solve_one, arguments = in_map if against == "map" else with_cones, limits(options)
     for photo, chosen in zip(drawn(outliers, against), cycle(factors)):
         for factor in chosen:
@@ -158,7 +161,7 @@ def problem(name: str, run: Callable[[], Solution], poses: Sequence[Pose], point
 
 def main() -> None:
     options = parser(__doc__)
-    options.add_argument("--scenes", nargs="*", default=REPORTED)
+    options.add_argument("--scenes", nargs="+", default=REPORTED, help="models of the photos")
     options.add_argument("--factors", type=float, nargs="+", default=FACTORS, help="of wrong focal lengths")
-    options.add_argument("--time-limit", type=float, default=TIME_LIMIT, help="seconds (default: %(default)s)")
-    run(rows, options)
+    chosen = options.parse_args()
+    run(rows(chosen), chosen)

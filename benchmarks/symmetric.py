@@ -63,7 +63,7 @@ def points_of(kind: Kind, rng: np.random.Generator) -> Array:
 def problems(kind: Kind, limit: int, seed: int, time_limit: float | None = None) -> Iterator[Problem]:
     """Yield problems of a kind: any rotation, four to six units away, with noise of a pixel at a focal length of 1000.
 
-    With outliers a fifth of the object's points are hidden too.
+    With outliers a fifth of the object's points are hidden too. `time_limit` as for `solve`, here and below.
     """
     for k in range(limit):
         rng = np.random.default_rng([seed, KINDS.index(kind), k])
@@ -79,13 +79,14 @@ def problems(kind: Kind, limit: int, seed: int, time_limit: float | None = None)
             image = np.concatenate([shown, rng.uniform(shown.min(0), shown.max(0), (count, 2))])
         options: dict[str, Any] = {"seed": k, "time_limit": time_limit}
         search = partial(bpnp.solve, rng.permutation(image), rng.permutation(points), **options)
-        # Of an exactly symmetric object no pose is right: its copies fit as well.
+        # An exactly symmetric object has no correct pose: the rotated copies of a pose fit as well.
         yield Problem(f"{kind.label} #{k}", search, [(rotation, translation)] if kind.unique else [], points)
 
 
 def near_symmetric_device(rng: np.random.Generator, pairs: int = 14, unique: int = 4) -> tuple[Array, Array]:
-    """Return LEDs (n, 3), metres, and normals (n, 3) of a shell that a half turn maps onto itself, but for jitter and
-    some unique LEDs."""
+    """Return LEDs (n, 3), metres, and normals (n, 3) of a shell that a half turn maps onto itself, except for jitter
+    and some unique LEDs.
+    """
     outward = rng.normal(size=(pairs + unique, 3)) * (1, 1, 0.4)
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
     points = outward / np.linalg.norm(outward / (0.09, 0.05, 0.04), axis=1, keepdims=True)
@@ -95,9 +96,14 @@ def near_symmetric_device(rng: np.random.Generator, pairs: int = 14, unique: int
     return points + JITTER * 0.09 * rng.normal(size=points.shape), normals
 
 
-def device_problems(limit: int, seed: int, *, normals: bool = True, frames: int = 20) -> Iterator[Problem]:
-    """Yield pictures of near-symmetric devices, `frames` of each: 0.3 px at a focal length of 500, LEDs that face the
-    camera, none to three other lights."""
+def device_problems(
+    limit: int, seed: int, time_limit: float | None = None, *, normals: bool = True, frames: int = 20
+) -> Iterator[Problem]:
+    """Yield pictures of near-symmetric devices, `frames` of each.
+
+    They show LEDs that face the camera, with noise of 0.3 pixels at a focal length of 500, and none to three other
+    lights.
+    """
     camera = np.array([[500.0, 0, 400], [0, 500, 400], [0, 0, 1]])
     for k in range(limit):
         points, outward = near_symmetric_device(np.random.default_rng([seed, 1, k // frames]))
@@ -111,17 +117,17 @@ def device_problems(limit: int, seed: int, *, normals: bool = True, frames: int 
             seen = (at[:, :2] / at[:, 2:] * 500 + 400)[facing]
         others = rng.uniform(seen.min(0) - 30, seen.max(0) + 30, (rng.integers(0, 4), 2))
         pixels = rng.permutation(np.concatenate([seen + 0.3 * rng.normal(size=seen.shape), others]))
-        options: dict[str, Any] = {"normals3d": outward if normals else None, "seed": k, "time_limit": 10}
+        options: dict[str, Any] = {"normals3d": outward if normals else None, "seed": k, "time_limit": time_limit}
         search = partial(bpnp.solve, pixels, points, camera, **options)
         name = f"device {k // frames}, {'' if normals else 'no '}normals #{k}"
         yield Problem(name, search, [(rotation, translation)], points)
 
 
-def pitch_problems(tilt_deg: float, limit: int, seed: int) -> Iterator[Problem]:
+def pitch_problems(tilt_deg: float, limit: int, seed: int, time_limit: float | None = None) -> Iterator[Problem]:
     """Yield pictures of a part of a playing field from the stands: crossings of its lines with a pixel of noise.
 
-    Gravity is known to 2 degrees, the camera rolled by up to 3 degrees and tilted down by some 15 degrees and up to
-    `tilt_deg` more. Either side of the field may be meant.
+    The direction of gravity is known to 2 degrees. The camera is rolled by up to 3 degrees and tilted down by 15
+    degrees and up to `tilt_deg` more. A half turn maps the field onto itself, so two poses are correct.
     """
     camera = np.array([[1000.0, 0, 640], [0, 1000, 360], [0, 0, 1]])
     half = [(0, 0), (0, 68), (16.5, 13.84), (16.5, 54.16), (5.5, 24.84), (5.5, 43.16), (0, 13.84), (0, 54.16)]
@@ -144,7 +150,7 @@ def pitch_problems(tilt_deg: float, limit: int, seed: int) -> Iterator[Problem]:
             seen = pixels[inside]
         up = Rotation.from_rotvec(np.radians(1.0) * rng.normal(size=3)).as_matrix() @ rotation[:, 2]
         prior = bpnp.GravityPrior(up, np.array([0.0, 0.0, 1.0]), 2.0)
-        options: dict[str, Any] = {"prior": prior, "seed": k, "time_limit": 10}
+        options: dict[str, Any] = {"prior": prior, "seed": k, "time_limit": time_limit}
         search = partial(bpnp.solve, rng.permutation(seen + rng.normal(size=seen.shape)), points, camera, **options)
         half_turn = np.diag([-1.0, -1.0, 1.0])  # which maps the field onto itself
         poses = [(rotation, translation), (rotation @ half_turn, translation)]

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from record import TIME_LIMIT, Array, Pose, Problem, spread
+from record import Array, Pose, Problem, spread
 
 from bpnp import solve
 from bpnp.datamodules.colmap.reconstruction import ImagePoints, Reconstruction, read_reconstruction
@@ -23,7 +23,7 @@ from bpnp.maps.views import View
 REPORTED = ("fountain-P11", "south_building", "tabletop", "walk_4", "walkthrough")
 LEAST_OVERLAP = 0.35
 MOST_POINTS = 1024
-LEAST_MATCHES = 10  # fewer matches count as a failure
+LEAST_MATCHES = 10  # `reliability` and `rigs` leave out photos with fewer
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,20 +147,38 @@ def model_of(data: Path, name: str) -> Reconstruction:
 
 
 def photos(
-    against: Against, outliers: float, limit: int, seed: int, data: Path, *, in_map: bool = True, apart: bool = False
+    against: Against,
+    outliers: float,
+    limit: int,
+    seed: int,
+    data: Path,
+    *,
+    in_map: bool = True,
+    apart: bool = False,
+    time_limit: float | None = None,
 ) -> Iterator[Problem]:
-    """Yield at most `limit` photos of the reported scenes in their maps, without a prior.
+    """Yield at most `limit` photos of the reported scenes, without a prior.
 
-    They are given a view if there is one, or only the points. With `apart`, each photo is put into the map of another
-    problem, half a list away. The error of a centre is in median distances of the points.
+    Args:
+        against: as for `view_problem`.
+        outliers: as for `view_problem`.
+        limit: largest number of photos.
+        seed: seed of the problems and of the search.
+        data: folder with colmap.
+        in_map: localise the photo in the map of these points, with the name of the view if there is one; otherwise
+            `solve` gets the points alone.
+        apart: each photo is put into the map of another problem, half a list away.
+        time_limit: seconds; None for the default of `localize` or `solve`.
+
+    The error of a centre is in median distances of the points.
     """
     each = -(-limit // len(REPORTED))
     drawn = list(scene_problems(data, REPORTED, each, against=against, outliers=outliers, seed=seed))
     half = len(drawn) // 2 if apart else 0
     for photo, shown in islice(zip(drawn, drawn[half:] + drawn[:half], strict=True), limit):
         pixels, camera = shown.pixels
-        search = partial(solve, pixels, photo.points3d, camera, seed=seed)
+        search = partial(solve, pixels, photo.points3d, camera, seed=seed, time_limit=time_limit)
         if in_map:
-            options: dict[str, Any] = {"views": photo.view and [photo.view], "seed": seed, "time_limit": TIME_LIMIT}
+            options: dict[str, Any] = {"views": photo.view and [photo.view], "seed": seed, "time_limit": time_limit}
             search = partial(photo.scene.localize, pixels, camera, **options)
         yield Problem(photo.name, search, [photo.pose], photo.points3d, photo.distance)

@@ -1,5 +1,6 @@
 """The baselines of the benchmarks must be right, or a ratio to them says nothing; and the commands must run."""
 
+import importlib.util
 import json
 import runpy
 import sys
@@ -12,8 +13,11 @@ from unittest.mock import Mock
 
 import bench_city
 import bench_completeness as completeness
+import bench_focal
 import bench_layers
 import bench_left_out
+import bench_rigs
+import bench_stars
 import guard
 import numpy as np
 import pytest
@@ -158,6 +162,64 @@ def test_rows_are_measured_printed_and_written(tmp_path: Path, monkeypatch, caps
     assert written["rows"]["leds, headset, 3 lights"]["right"] == 1
     assert all(row["confident_and_wrong"] == 0 for row in written["rows"].values())
     assert capsys.readouterr().out.count("problems 2, rotation q deg") == 6
+
+
+def test_the_time_limit_of_the_command_holds_for_every_search(tmp_path: Path) -> None:
+    options = SimpleNamespace(
+        limit=1, seed=3, time_limit=4.0, data=tmp_path, scenes=["none"], factors=[0.9], peers=False, what="leds"
+    )
+    rows = [row for each in (reliability, bench_rigs, bench_stars, bench_focal) for row in each.rows(options)]
+    drawn = [
+        row for row in rows if not row.name.startswith(("photos", "maps", "wrong focal, one", "wrong focal, whole"))
+    ]
+    assert len(drawn) > 100
+    for row in drawn:
+        for problem in row.draw():
+            assert problem.solve.keywords["time_limit"] == 4.0, row.name
+
+
+@pytest.mark.parametrize(
+    ("main", "options", "message"),
+    [
+        (reliability.main, "--only nothing", "no row has 'nothing' in its name"),
+        (results.main, "--check --only nothing", "no row has 'nothing' in its name"),
+        (bench_layers.main, "--points 8 --batch 1 --only nothing", "no row has 'nothing' in its name"),
+        (reliability.main, "--only", "expected at least one argument"),
+        (reliability.main, "--limit 0", "'0' is not a positive integer"),
+        (bench_layers.main, "--limit 3", "unrecognized arguments: --limit 3"),
+        (bench_city.main, "castle-P30 --photos walk_4", "photos of walk_4: not a model of this city"),
+        (bench_stars.main, "--peers", "--peers needs tetra3rs"),
+    ],
+)
+def test_options_that_select_nothing_are_errors(main, options: str, message: str, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr("sys.argv", ["benchmark", *options.split()])
+    with pytest.raises(SystemExit) as error:
+        main()
+    assert message in str(error.value) + capsys.readouterr().err
+
+
+def test_items_are_evenly_spread() -> None:
+    assert record.spread(range(10), 5) == [0, 2, 4, 6, 8]
+    assert record.spread(range(10), 5, first=0.5) == [1, 3, 5, 7, 9]
+    assert record.spread(range(3), 5) == [0, 1, 2]
+    assert record.spread([], 5) == []
+
+
+def test_the_first_call_of_a_network_is_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock goes on by 100 seconds in the first call, which loads and compiles, and by one in the others."""
+    clock = SimpleNamespace(now=0.0, step=100.0)
+
+    class Solver(torch.nn.Module):
+        def forward(self, batch):
+            clock.now, clock.step = clock.now + clock.step, 1.0
+            return SimpleNamespace(
+                poses={"it": SimpleNamespace(rotation=batch.rotation, translation=batch.translation)}
+            )
+
+    monkeypatch.setattr(results.time, "process_time", lambda: clock.now)
+    found = list(results.estimates(Solver, "it", {"num_points": 8}, 2, 5, Path()))
+    assert [(outcome.rotation_deg, outcome.cpu_seconds) for outcome in found] == [(pytest.approx(0, abs=1e-4), 1.0)] * 2
 
 
 def test_errors_are_those_to_the_nearest_true_pose() -> None:
@@ -398,13 +460,49 @@ def test_photos_of_a_city_are_seen_where_their_poses_put_them(tmp_path: Path) ->
 
 
 def test_the_guard_notices_a_lost_pose_a_wrong_one_and_slower_code() -> None:
-    pose = {"rotation": np.eye(3).tolist(), "translation": [0.0, 0, 4]}
-    row = {"problem": "a", "verdict": "confident", "right": True, "wrong": False, "cpu_seconds": 1.0} | pose
-    assert guard.compare("kind", [row], [row])[1]
-    for change in ({"cpu_seconds": 1.2}, {"right": False}, {"wrong": True}):
-        assert not guard.compare("kind", [row | change], [row])[1]
-    assert guard.compare("kind", [row | {"verdict": "ambiguous"}], [row])[0].count("confident +0 -1") == 1
-    assert "1 other poses" in guard.compare("kind", [row | {"translation": [0.0, 0, 5]}], [row])[0]
+    row, turn = record.Row("kind", list, 3.0, right_moved=0.1), np.eye(3).tolist()
+    one = record.Outcome("a", 1.0, 0.0, "confident", 1.0, outside=False, rotation=turn, translation=[0.0, 0, 4])
+    assert guard.compare(row, [one], [one])[1]
+    for change in ({"cpu_seconds": 1.2}, {"rotation_deg": 4.0}, {"rotation_deg": 4.0, "outside": True}):
+        assert not guard.compare(row, [replace(one, **change)], [one])[1]
+    assert "wrong +1" in guard.compare(row, [replace(one, moved=0.2, outside=True)], [one])[0]
+    assert "confident +0 -1" in guard.compare(row, [replace(one, verdict="ambiguous")], [one])[0]
+    assert "1 other poses" in guard.compare(row, [replace(one, translation=[0.0, 0, 5])], [one])[0]
+    failed = replace(one, rotation=np.full((3, 3), np.nan).tolist(), translation=[np.nan] * 3)
+    assert "0 other poses" in guard.compare(row, [failed], [failed])[0], "neither found a pose"
+    assert "1 other poses" in guard.compare(row, [failed], [one])[0]
+    assert guard.compare(row, [one], []) == ("no problem in common", False)
+
+
+def test_the_guard_compares_a_file_that_it_wrote(tmp_path: Path, monkeypatch, capsys) -> None:
+    """Problems of a kind have different names, as they are paired by name, and the time limit of the command."""
+    options = SimpleNamespace(limit=20, seed=3, time_limit=4.0, data=tmp_path)
+    kinds = [
+        kind for kind in guard.KINDS if kind.startswith(("symmetric", "leds", "devices", "focal length unknown, L"))
+    ]
+    for kind in [*kinds, "noise", "shapes"]:
+        drawn = list(guard.KINDS[kind](options))
+        assert len({problem.name for problem in drawn}) == len(drawn) == 20, kind
+        assert {problem.solve.keywords["time_limit"] for problem in drawn} == {4.0}, kind
+    file, again = tmp_path / "new" / "before.json", tmp_path / "after.json"
+    command = f"guard --limit 2 --seed 3 --only headset --output {file}".split()
+    monkeypatch.setattr("sys.argv", command)
+    with pytest.raises(SystemExit, match="False"):
+        guard.main()
+    before = guard.read_outcomes(file)
+    assert [outcome.verdict for outcome in before["leds, headset"]] == ["confident"] * 2
+    slower = json.loads(file.read_text())
+    for outcome in slower["rows"]["leds, headset"]["outcomes"]:
+        outcome["cpu_seconds"] *= 1e6
+    again.write_text(json.dumps(slower))
+    monkeypatch.setattr("sys.argv", [*command, "--against", str(again)])
+    with pytest.raises(SystemExit, match="False"):
+        guard.main()
+    assert "leds, headset: CPU 0.00, right +0, wrong +0, confident +0 -0, 0 other poses" in capsys.readouterr().out
+    monkeypatch.setattr("sys.argv", ["guard", "--against", str(tmp_path / "none.json")])
+    with pytest.raises(SystemExit, match="2"):
+        guard.main()
+    assert "there is no file" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("kind", [symmetric.KINDS[1], symmetric.KINDS[20], symmetric.KINDS[-1]])
