@@ -7,7 +7,7 @@ import numpy as np
 
 from bpnp.report.figures import line_style, shown_text
 from bpnp.report.terminal import QUIET
-from bpnp.report.training_run import METRICS
+from bpnp.report.training_run import METRICS, training_logs
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -38,18 +38,15 @@ def read_curves(run: Path | str) -> "DataFrame":
     """
     from pandas import DataFrame, concat, read_csv
 
-    files = sorted(Path(run).glob(f"logs/version_*/{METRICS}"), key=lambda file: int(file.parent.name.split("_")[1]))
     curves = DataFrame()
-    for file in files:
+    for file in training_logs(run):
         try:
             log = read_csv(file)
             steps = log["step"]
         except (ValueError, KeyError) as error:
             raise ValueError(f"{file} is not the log of a training ({error})") from error
-        trained = any(name in log and log[name].notna().any() for name in LOSSES)
-        if trained:
-            earlier = curves[curves["step"] < steps.min()] if len(curves) else curves
-            curves = concat([earlier, log]) if len(earlier) else log
+        earlier = curves[curves["step"] < steps.min()] if len(curves) else curves
+        curves = concat([earlier, log]) if len(earlier) else log
     if curves.empty:
         raise ValueError(f"{run} has no logs/version_*/{METRICS} of a training")
     return curves.copy().groupby("step").mean(numeric_only=True).reset_index()

@@ -9,11 +9,28 @@ METRICS = "metrics.csv"
 WANDB = "wandb.yaml"  # id, project and entity of the W&B run of a training, in its numbered log folder
 
 
+def training_logs(run: Path | str) -> list[Path]:
+    """Return the files with the metrics of each training in a run folder, in their order.
+
+    Only a training logs "train/..."; `bpnp validate` and `bpnp test` log to files of their own.
+
+    Args:
+        run: Folder of the run.
+    """
+    files = sorted(Path(run).glob(f"logs/version_*/{METRICS}"), key=lambda file: int(file.parent.name.split("_")[1]))
+    return [file for file in files if any(name.startswith("train/") for name in _columns(file))]
+
+
+def _columns(file: Path) -> list[str]:
+    with file.open(encoding="utf-8") as lines:
+        return lines.readline().strip().split(",")
+
+
 def training_folder(path: Path | str) -> Path | None:
     """Return the folder of a run with the logs of a training, given it or its test folder; None if there is none."""
     start = Path(path).absolute()
     for folder in (start, start.parent):
-        if any((folder / "logs").glob(f"version_*/{METRICS}")):
+        if training_logs(folder):
             return folder
     return None
 
@@ -21,7 +38,8 @@ def training_folder(path: Path | str) -> Path | None:
 def training_of(folder: Path | str, results: Results) -> Path | None:
     """Return the folder of the training of the network that was tested.
 
-    It is the run of the checkpoint, or, if that file has gone, the run with the results.
+    It is the run of the checkpoint, or, if that file has gone, the run with the results. The training of packaged
+    weights is not recorded.
 
     Args:
         folder: Results folder.
@@ -30,8 +48,10 @@ def training_of(folder: Path | str, results: Results) -> Path | None:
     Returns:
         The folder, None if no checkpoint was tested or no training has logs.
     """
-    checkpoint = results.settings.get("checkpoint", "")
-    if checkpoint is None:
+    if "checkpoint" not in results.settings:
+        return training_folder(folder)
+    checkpoint = results.settings["checkpoint"]
+    if checkpoint is None or not Path(checkpoint).suffix:  # the name of packaged weights has no suffix
         return None
     return training_of_checkpoint(checkpoint) if Path(checkpoint).is_file() else training_folder(folder)
 
@@ -68,9 +88,8 @@ def _last_training(run: Path) -> tuple[Path, dict[str, Any]] | None:
     """Return the numbered log folder of the last training in a run folder and its configuration."""
     import yaml
 
-    files = run.glob("logs/version_*/config.yaml")
-    for file in sorted(files, key=lambda file: int(file.parent.name.split("_")[1]), reverse=True):
-        config = yaml.safe_load(file.read_text(encoding="utf-8"))
-        if not {"verbose", "return_predictions"} & config.keys():  # options of validate, test and predict
-            return file.parent, dict(config)
+    for log in reversed(training_logs(run)):
+        config = log.with_name("config.yaml")
+        if config.is_file():
+            return log.parent, dict(yaml.safe_load(config.read_text(encoding="utf-8")))
     return None

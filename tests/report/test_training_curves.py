@@ -74,6 +74,30 @@ def test_the_report_draws_the_training_of_a_test(run: Path, capsys: pytest.Captu
     assert "Medians and recall with 95 % intervals" in printed
 
 
+def test_a_validation_after_the_training_changes_no_curve(run: Path) -> None:
+    """`bpnp validate` logs to a folder of its own, at step 0."""
+    before = read_curves(run)
+    (run / "logs" / "version_12").mkdir()
+    (run / "logs" / "version_12" / "metrics.csv").write_text("epoch,step,val/correspondence_loss\n0,0,0.5\n")
+    assert read_curves(run).equals(before)
+
+
+def test_a_folder_with_tests_alone_has_no_training(tmp_path: Path) -> None:
+    """`bpnp test` logs to a folder of its own too, of the packaged weights for example."""
+    (tmp_path / "logs" / "version_0").mkdir(parents=True)
+    (tmp_path / "logs" / "version_0" / "metrics.csv").write_text("epoch,step,test/pose_error\n0,0,0.5\n")
+    write_results(tmp_path / "test", rows(12, seed=1), settings={"checkpoint": "procedural-so3"})
+    assert training_folder(tmp_path) is None
+    assert "<h2>Training</h2>" not in page_html([tmp_path])
+
+
+def test_packaged_weights_have_not_the_training_of_the_folder_that_they_are_tested_in(run: Path) -> None:
+    write_results(run / "test", rows(12, seed=1), settings={"checkpoint": "procedural-so3"})
+    assert "<h2>Training</h2>" not in page_html([run])
+    write_results(run / "test", rows(12, seed=1), settings={"checkpoint": "runs/gone/checkpoints/last.ckpt"})
+    assert "<h2>Training</h2>" in page_html([run])
+
+
 def test_a_training_with_two_tests_is_drawn_once(run: Path) -> None:
     for name in ("before", "after"):
         write_results(run / name, rows(12, seed=1))
