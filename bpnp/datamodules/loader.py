@@ -185,25 +185,26 @@ class ProblemLoader(DataLoader[Batch]):
     resumes. The state is (epoch, batches served) and applies to that epoch only.
     """
 
-    served = 0
-    resumed: dict[str, int] | None = None
+    epoch = served = 0
+    resumed = False  # True from the loading of a state to the next iteration
 
     def __iter__(self) -> Iterator[Batch]:  # type: ignore[override]
         assert isinstance(self.sampler, BucketSampler)
-        resumed, self.resumed = self.resumed, None
-        self.served = resumed["served"] if resumed is not None and resumed["epoch"] == self.sampler.epoch else 0
+        if not self.resumed or self.epoch != self.sampler.epoch:
+            self.epoch, self.served = self.sampler.epoch, 0
+        self.resumed = False
         self.sampler.first_batch = self.served
         for batch in super().__iter__():
             self.served += 1
             yield batch
 
     def state_dict(self) -> dict[str, int]:
-        """Return the epoch and the number of batches served in it."""
-        return {"epoch": getattr(self.sampler, "epoch", 0), "served": self.served}
+        """Return the epoch of the last iteration and the number of batches served in it."""
+        return {"epoch": self.epoch, "served": self.served}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Resume the epoch of this state at its next iteration."""
-        self.resumed = dict(state_dict)
+        self.epoch, self.served, self.resumed = state_dict["epoch"], state_dict["served"], True
 
 
 PARTS = ("train", "val", "test", "predict")

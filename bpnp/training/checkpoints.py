@@ -101,6 +101,8 @@ class BestCheckpoint(ModelCheckpoint):
         has_pose_loss = float(getattr(pl_module, "pose_weight", 0)) > 0
         if has_pose_loss and self.has_pose_loss is False:
             if self.dirpath is not None and not trainer.fast_dev_run:  # type: ignore[attr-defined]
+                # The loop does this after the hook; otherwise a resumed run would end its first epoch at once.
+                trainer.fit_loop.epoch_loop.batch_progress.reset_on_run()
                 trainer.save_checkpoint(Path(self.dirpath) / BEFORE_POSE_LOSS)
             self.best_k_models = {}
             self.best_model_path = self.kth_best_model_path = ""

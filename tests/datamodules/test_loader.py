@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.trainer.connectors.data_connector import _DataConnector, _resolve_overfit_batches
 from lightning.pytorch.trainer.states import RunningStage
@@ -15,6 +16,7 @@ from small_data import recorded
 
 from bpnp.datamodules.loader import BucketSampler, ProblemDataModule, ProblemDataset
 from bpnp.datamodules.problem import Counts, Problem, stack_problems
+from bpnp.training import BestCheckpoint
 from bpnp.types import Batch
 
 
@@ -153,3 +155,24 @@ def test_lightning_resumes_with_the_pairs_that_were_left(tmp_path: Path, workers
     assert whole == [tuple(f"{epoch}:{i}" for epoch, i in step) for step in planned]
     for step in (2, 3, 5):  # inside the first epoch, at its end, inside the second
         assert fit(checkpoint=tmp_path / f"step={step}.ckpt") == whole[step:]
+
+
+class Switch(BestCheckpoint):
+    """A pose loss that joins at the second epoch of a task without one."""
+
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        pl_module.pose_weight = float(trainer.current_epoch >= 1)  # type: ignore[assignment]
+        super().on_train_epoch_start(trainer, pl_module)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_the_checkpoint_before_the_pose_loss_resumes_with_the_first_batch_of_its_epoch(tmp_path: Path) -> None:
+    def fit(checkpoint: Path | None = None) -> list[tuple[str, ...]]:
+        options = {"max_epochs": 3, "limit_val_batches": 0, "callbacks": [Switch(tmp_path)], "enable_checkpointing": True}
+        data = Problems(batch_size=6, seed=3)
+        return [batch.ids for batch in recorded(data, tmp_path, checkpoint=checkpoint, **options)]
+
+    whole = fit()
+    assert len(whole) == 9
+    resumed = (tmp_path / "before_pose_loss.ckpt").rename(tmp_path / "resumed.ckpt")
+    assert fit(resumed) == whole[3:]
