@@ -293,7 +293,7 @@ class ResultsWriter(Callback):
             self._write_test(trainer, [(self.rows, self.losses, self.points)], complete=False)
 
     def _write_test(self, trainer: Trainer, gathered: Sequence[Any], *, complete: bool) -> None:
-        if trainer.is_global_zero:
+        if trainer.is_global_zero and not trainer.fast_dev_run:  # type: ignore[attr-defined]
             rows = [row for part, _, _ in gathered for row in part]
             losses = {index: loss for _, part, _ in gathered for index, loss in part.items()}
             mean = sum(losses[i] for i in sorted(losses)) / len(losses) if losses else None
@@ -312,7 +312,7 @@ class ResultsWriter(Callback):
         If the results of another checkpoint will be replaced, print its path.
         """
         summary = self._folder(trainer) / SUMMARY
-        if self.settings is not None or not summary.is_file():
+        if self.settings is not None or trainer.fast_dev_run or not summary.is_file():  # type: ignore[attr-defined]
             return
         checkpoint = json.loads(summary.read_bytes()).get("settings", {}).get("checkpoint")
         if checkpoint is not None and trainer.ckpt_path is None:

@@ -54,6 +54,9 @@ def test_fast_dev_run_takes_one_step_and_writes_nothing(tmp_path: Path) -> None:
     assert len(Observer.problems) == 1
     assert Observer.validated == [0]
     assert not list((tmp_path / "run").rglob("*.ckpt"))
+    for word in ("validate", "test", "predict"):
+        main(command(tmp_path, "--trainer.fast_dev_run=true", word=word))
+    assert not [path for path in (tmp_path / "run").rglob("*") if path.is_file()]
 
 
 def test_overfit_batches_repeats_one_batch(tmp_path: Path) -> None:
