@@ -309,20 +309,18 @@ class BlindPnPTask(LightningModule):
         """Log the fractions of samples without a solved gradient and of clipped columns of the derivative."""
         stats = [getattr(module, "backward_stats", None) for module in self.solver.modules()]
         counts = [each for each in stats if isinstance(each, BackwardStats)]
-        samples = sum(each.samples for each in counts)
-        if samples:
-            failed = sum(each.unconverged for each in counts) / samples
-            self.log("train/backward_failed", failed, on_epoch=True, sync_dist=True)
-        for each in counts:
+        clipped = [module.clipped for module in self.solver.modules() if isinstance(module, WeightedPnP)]
+        self._log_fraction(
+            "backward_failed", sum(each.unconverged for each in counts), sum(each.samples for each in counts)
+        )
+        self._log_fraction(
+            "clipped_columns", sum(each.clipped for each in clipped), sum(each.columns for each in clipped)
+        )
+        for each in (*counts, *clipped):
             each.reset()
         # In the last epoch of StochasticWeightAveraging, which only updates batch norms, Lightning steps without a
         # backward pass, with the remaining gradients.
         self.zero_grad()
-        clipped = [module.clipped for module in self.solver.modules() if isinstance(module, WeightedPnP)]
-        if columns := sum(each.columns for each in clipped):
-            self.log("train/clipped_columns", sum(each.clipped for each in clipped) / columns, sync_dist=True)
-        for column_count in clipped:
-            column_count.reset()
 
     def on_before_optimizer_step(self, optimizer: Optimizer) -> None:
         """Log the gradient norm; if it is not finite, count the step and drop all gradients.
@@ -495,6 +493,14 @@ class BlindPnPTask(LightningModule):
     def _log_train(self, **values: Tensor | float) -> None:
         for name, value in values.items():
             self.log(f"train/{name}", value, on_step=True, on_epoch=False, prog_bar=name == "loss", batch_size=1)
+
+    def _log_fraction(self, name: str, part: int, whole: int) -> None:
+        """Log a fraction over all processes, unless there is nothing in any of them."""
+        counts = torch.tensor([part, whole], device=self.device)
+        # A collective call: all processes make it, also one that has nothing to count.
+        part, whole = self.trainer.strategy.reduce(counts, reduce_op="sum").tolist()  # type: ignore[union-attr]
+        if whole:
+            self.log(f"train/{name}", part / whole, sync_dist=True)
 
     def _figures(self, losses: Losses, prediction: Prediction, batch: Batch) -> dict[str, Tensor]:
         """Return the values that a training step logs in addition to its loss."""

@@ -170,6 +170,22 @@ def test_unconverged_gradients_of_a_layer_are_logged_as_a_fraction_of_the_epoch(
     assert run.callback_metrics["train/backward_failed"] == 0
 
 
+@pytest.mark.parametrize("steps", [1, 0])
+def test_a_fraction_of_the_epoch_is_that_of_all_processes(
+    steps: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """This process fails in 1 of 4 samples, or has none; the other one fails in 5 of 6."""
+
+    class Other(Callback):
+        def on_train_epoch_end(self, trainer: Trainer, task: BlindPnPTask) -> None:
+            counts = task.solver.transport.backward_stats
+            counts.samples, counts.unconverged = 4 * steps, steps
+            monkeypatch.setattr(trainer.strategy, "reduce", lambda counts, **_: counts + torch.tensor([5, 6]))
+
+    run = fit(tmp_path, BlindPnPTask(small_net()), max_epochs=1, limit_train_batches=1, callbacks=[Other()])
+    assert run.callback_metrics["train/backward_failed"] == pytest.approx((5 + steps) / (6 + 4 * steps))
+
+
 def test_many_skipped_steps_in_a_row_end_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bpnp.training.task, "MOST_SKIPPED", 4)
     task = BlindPnPTask(CountingSolver(broken_calls=tuple(range(100))))
