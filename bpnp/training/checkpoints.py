@@ -103,7 +103,7 @@ class BestCheckpoint(ModelCheckpoint):
             if self.dirpath is not None and not trainer.fast_dev_run:  # type: ignore[attr-defined]
                 # The loop does this after the hook; otherwise a resumed run would end its first epoch at once.
                 trainer.fit_loop.epoch_loop.batch_progress.reset_on_run()
-                trainer.save_checkpoint(Path(self.dirpath) / BEFORE_POSE_LOSS)
+                trainer.save_checkpoint(Path(self.dirpath) / BEFORE_POSE_LOSS, weights_only=False)
             self.best_k_models = {}
             self.best_model_path = self.kth_best_model_path = ""
             self.best_model_score = None

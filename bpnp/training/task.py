@@ -528,20 +528,20 @@ class BlindPnPTask(LightningModule):
             values = metrics.compute()
             metrics.reset()
             for prefix in (f"{stage}/{name}", stage) if i == 0 else (f"{stage}/{name}",):
-                # The metrics have already been gathered over processes.
+                # The metrics have already been gathered over processes; without `sync_dist`, Lightning warns of each.
                 figures = {f"{prefix}/{key}": value.float() for key, value in values.items()}
                 # The logs have the estimate's name; without it, callbacks can monitor any solver.
-                self.log_dict(figures, logger=prefix != stage)
+                self.log_dict(figures, logger=prefix != stage, sync_dist=True)
                 self.table_metrics |= figures.keys()
             if name == (POSED if POSED in self.estimates[stage] else self.estimates[stage][0]):
                 # L_p of the median errors (paper Eq. 12), which selects checkpoints.
                 error = torch.deg2rad(values["rotation_q2_deg"]) + values["translation_q2"]
-                self.log(f"{stage}/pose_error", error.float())
+                self.log(f"{stage}/pose_error", error.float(), sync_dist=True)
                 self.table_metrics.add(f"{stage}/pose_error")
         loss = cast(MeanOverProblems, self.metrics[stage])
         # compute() is a collective call: all processes make it, or none.
         if self.trainer.strategy.reduce_boolean_decision(loss.update_called, all=False):
-            self.log(f"{stage}/correspondence_loss", loss.compute().float())
+            self.log(f"{stage}/correspondence_loss", loss.compute().float(), sync_dist=True)
             self.table_metrics.add(f"{stage}/correspondence_loss")
             loss.reset()
 
