@@ -316,8 +316,10 @@ class BlindPnPTask(LightningModule):
         self._log_fraction(
             "clipped_columns", sum(each.clipped for each in clipped), sum(each.columns for each in clipped)
         )
-        for each in (*counts, *clipped):
+        for each in counts:
             each.reset()
+        for column_count in clipped:
+            column_count.reset()
         # In the last epoch of StochasticWeightAveraging, which only updates batch norms, Lightning steps without a
         # backward pass, with the remaining gradients.
         self.zero_grad()
@@ -498,7 +500,7 @@ class BlindPnPTask(LightningModule):
         """Log a fraction over all processes, unless there is nothing in any of them."""
         counts = torch.tensor([part, whole], device=self.device)
         # A collective call: all processes make it, also one that has nothing to count.
-        part, whole = self.trainer.strategy.reduce(counts, reduce_op="sum").tolist()  # type: ignore[union-attr]
+        part, whole = self.trainer.strategy.reduce(counts, reduce_op="sum").tolist()
         if whole:
             self.log(f"train/{name}", part / whole, sync_dist=True)
 

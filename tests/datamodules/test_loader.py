@@ -168,9 +168,9 @@ class Switch(BestCheckpoint):
 @pytest.mark.filterwarnings("ignore")
 def test_the_checkpoint_before_the_pose_loss_resumes_with_the_first_batch_of_its_epoch(tmp_path: Path) -> None:
     def fit(checkpoint: Path | None = None) -> list[tuple[str, ...]]:
-        options = {"max_epochs": 3, "limit_val_batches": 0, "callbacks": [Switch(tmp_path)], "enable_checkpointing": True}
+        options = {"max_epochs": 3, "callbacks": [Switch(tmp_path)], "enable_checkpointing": True}
         data = Problems(batch_size=6, seed=3)
-        return [batch.ids for batch in recorded(data, tmp_path, checkpoint=checkpoint, **options)]
+        return [batch.ids for batch in recorded(data, tmp_path, checkpoint=checkpoint, limit_val_batches=0, **options)]
 
     whole = fit()
     assert len(whole) == 9
