@@ -142,7 +142,3 @@ def main() -> None:
         write(chosen.output, measure(chosen.seed, chosen.limit, chosen.trials))
     tables = {"data": table(json.loads(chosen.output.read_text()))}
     fill_pages(PAGES, "completeness", tables, check=chosen.check, published=is_published(parser, chosen))
-
-
-if __name__ == "__main__":
-    main()

@@ -1,12 +1,12 @@
-"""The method of Campbell, Liu and Gould (ECCV 2020), written plainly from its formulas: what ours is measured against.
+"""Layers of Campbell, Liu and Gould (ECCV 2020), written from the formulas of the paper: the baseline of `layers`.
 
 Sinkhorn: scalings of exp(-lambda M), lambda = 1/mu, and the gradient of Lemma 2 through the inverse of the system of
 its m + n - 1 independent constraints, by blocks. PnP: L-BFGS on Eq. 8 over all m n pairs for the whole batch at once,
 and the gradient of Lemma 1 with the Hessian and the 6 x m n Jacobian from automatic differentiation. Everything stays
 in the dtype of its input.
 
-The inverse is by Cholesky: the block that is left of the symmetric system is positive definite, and in torch 2.13 on
-the CPU `torch.linalg.inv`, `solve` and `lu_factor` of a few hundred rows fail inside oneMKL.
+The inverse uses a Cholesky factor, since the remaining block of the symmetric system is positive definite. In torch
+2.13 on the CPU `torch.linalg.inv`, `solve` and `lu_factor` of a few hundred rows fail inside oneMKL.
 """
 
 from typing import Any
@@ -28,7 +28,10 @@ class PaperSinkhorn(torch.autograd.Function):
         ctx: Any, cost: Tensor, mu: float = MU, iterations: int = SINKHORN_ITERATIONS,
         tolerance: float = SINKHORN_TOLERANCE,
     ) -> Tensor:  # fmt: skip
-        """P = diag(u) exp(-M / mu) diag(v) with uniform marginals, until no row sum is off by more than `tolerance`."""
+        """Return P = diag(u) exp(-M / mu) diag(v) with uniform marginals.
+
+        The iterations end when no row sum is off by more than `tolerance`, if that is positive.
+        """
         b, m, n = cost.shape
         kernel = torch.exp(-cost / mu)
         v = cost.new_full((b, 1, n), 1 / n)
@@ -48,8 +51,8 @@ class PaperSinkhorn(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        """dL/dM = -P (V - a 1^T - 1 b^T)/mu with [a; b] from the inverse of [diag(r) P; P^T diag(c)] less its last
-        column.
+        """Return dL/dM = -P (V - a 1^T - 1 b^T)/mu with [a; b] from the inverse of [diag(r) P; P^T diag(c)] without its
+        last column.
 
         With D = diag(r), Q = P without its last column and S = diag(c) - Q^T D^-1 Q the inverse has the blocks
         [D^-1 + D^-1 Q S^-1 Q^T D^-1, -D^-1 Q S^-1; ., S^-1]. NaN where S has no Cholesky factor.
@@ -72,7 +75,7 @@ class PaperSinkhorn(torch.autograd.Function):
 
 
 def objective(pose: Tensor, assignment: Tensor, rays: Tensor, points3d: Tensor) -> Tensor:
-    """Eq. 8 over all m n pairs, for each sample; `pose` (b, 6) is the angle-axis vector and the translation."""
+    """Return Eq. 8 over all m n pairs for each sample; `pose` (b, 6) is the angle-axis vector and the translation."""
     camera = transform(roma.rotvec_to_rotmat(pose[:, :3]), pose[:, 3:], points3d)
     return (assignment * (1 - rays @ nn.functional.normalize(camera, dim=-1).mT)).sum((-2, -1))
 
@@ -80,11 +83,10 @@ def objective(pose: Tensor, assignment: Tensor, rays: Tensor, points3d: Tensor) 
 class PaperPnP(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, assignment: Tensor, rays: Tensor, points3d: Tensor, start: Tensor) -> Tensor:
-        """Pose (b, 6) by one L-BFGS for the batch, 75 iterations or until the line search finds nothing lower.
+        """Return the poses (b, 6) of one L-BFGS for the batch: 75 iterations, or until the line search fails.
 
-        The tolerances are off: torch's default ones, not relative to anything, end it where it starts if that is
-        RANSAC's pose. In float32 the line search ends it soon, for the values of Eq. 8 have too few digits; in float64
-        it gets on.
+        The tolerances are 0, because torch's absolute defaults stop at the first step from a pose of RANSAC. In float32
+        the line search stops early, because the values of Eq. 8 have too few digits; in float64 it continues.
         """
         pose, fixed = start.clone().requires_grad_(), assignment.detach()
         solver = torch.optim.LBFGS(
@@ -105,7 +107,7 @@ class PaperPnP(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        """dL/dP = dL/dpose D, D = -H^-1 B (b, 6, m n) (Lemma 1)."""
+        """Return dL/dP = dL/dpose D with D = -H^-1 B (b, 6, m n) (Lemma 1)."""
         pose, assignment, rays, points3d = ctx.saved_tensors
         pose, assignment = pose.detach().requires_grad_(), assignment.detach().requires_grad_()
         with torch.enable_grad():

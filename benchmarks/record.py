@@ -316,10 +316,11 @@ def measured_today() -> dict[str, str]:
 def command(words: Sequence[str]) -> str:
     """Return a command line in which absolute paths are shortened to their last part.
 
-    >>> command(["python -m benchmarks table1", "--run", "/tmp/runs/table1", "--steps", "3"])
-    'python -m benchmarks table1 --run table1 --steps 3'
+    >>> command(["python -m benchmarks table1", "--run", "/tmp/runs/table1", "--data=/tmp/data", "--steps", "3"])
+    'python -m benchmarks table1 --run table1 --data=data --steps 3'
     """
-    return " ".join(Path(word).name if word.startswith("/") else word for word in words)
+    parts = (word.rpartition("=") for word in words)
+    return " ".join(name + sign + (Path(value).name if value.startswith("/") else value) for name, sign, value in parts)
 
 
 def processor() -> str:

@@ -19,7 +19,8 @@ from bpnp.datamodules.colmap.reconstruction import ImagePoints, Reconstruction, 
 from bpnp.maps.scene_map import SceneMap
 from bpnp.maps.views import View
 
-# No constant was chosen on these but for two scales of the search near a view, on south_building.
+# No constant was chosen on these, except for two scales of the search near a view, on south_building. walk_4 and
+# walkthrough are parts of the same video as walk_2 and walk_6, on which constants were chosen.
 REPORTED = ("fountain-P11", "south_building", "tabletop", "walk_4", "walkthrough")
 LEAST_OVERLAP = 0.35
 MOST_POINTS = 1024

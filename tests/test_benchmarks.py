@@ -1,4 +1,4 @@
-"""The baselines of the benchmarks must be right, or a ratio to them says nothing; and the commands must run."""
+"""Benchmarks: their baselines are correct, their problems have the planted poses, and their commands run."""
 
 import importlib.util
 import json
@@ -199,6 +199,11 @@ def test_options_that_select_nothing_are_errors(main, options: str, message: str
     assert message in str(error.value) + capsys.readouterr().err
 
 
+def test_a_recorded_command_has_no_folders_of_the_machine() -> None:
+    words = ["python -m benchmarks guard", "--output", "/home/me/runs/a.json", "--data=/home/me/data", "--only", "leds"]
+    assert record.command(words) == "python -m benchmarks guard --output a.json --data=data --only leds"
+
+
 def test_items_are_evenly_spread() -> None:
     assert record.spread(range(10), 5) == [0, 2, 4, 6, 8]
     assert record.spread(range(10), 5, first=0.5) == [1, 3, 5, 7, 9]
@@ -223,7 +228,7 @@ def test_the_first_call_of_a_network_is_not_timed(monkeypatch: pytest.MonkeyPatc
 
 
 def test_errors_are_those_to_the_nearest_true_pose() -> None:
-    """Any of the poses is right; the middle of the scene is seen twice as far away, the centre moved by as much."""
+    """Each of the poses is correct; the centroid is twice as far away, and the camera centre is moved by as much."""
     turn, half, shift = np.eye(3), np.diag([-1.0, -1, 1]), np.array([0.0, 0, 4])
     problem = record.Problem("", Mock(), [(half, shift), (turn, shift)], np.full((5, 3), [0, 0, 1.0]), distance=2.0)
     assert record.nearest(problem, turn, shift + [0, 0, 5])[:3] == (0, 2.5, 1)
