@@ -159,9 +159,14 @@ def main() -> None:
     options.set_defaults(time_limit=10.0)
     options.add_argument("--against", type=Path, help="file of an earlier run")
     chosen = options.parse_args()
-    if chosen.against and not chosen.against.is_file():
-        options.error(f"--against: there is no file {chosen.against}")
-    before = read_outcomes(chosen.against) if chosen.against else {}
+    before: dict[str, list[Outcome]] = {}
+    if chosen.against:
+        try:
+            before = read_outcomes(chosen.against)
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            options.error(
+                f"--against: {chosen.against} is no file that `guard --output` of this version wrote: {error}"
+            )
     held = True
     for row, found in run(rows(chosen), chosen):
         if chosen.against:
