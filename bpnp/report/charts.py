@@ -99,7 +99,8 @@ def recall_chart(runs: Mapping[str, Results], error: Error, *, paper: Paper | No
     # On one to two decades plotly labels every digit, and the labels overlap; with fewer ticks it labels 1, 2 and 5.
     decades = float(np.log10(limits[-1] / limits[0]))
     few = {"nticks": int(decades / 0.31)} if 1 <= decades < 2.2 else {}  # at least 0.3 decades between labels
-    figure.update_xaxes(title={"text": axis_title(runs, error)}, hoverformat=".3~g", type="log", tickformat="~g", **few)
+    axis = axis_title(runs, error).replace(", of", ",<br>of")  # a phone shows half of it in a line
+    figure.update_xaxes(title={"text": axis}, hoverformat=".3~g", type="log", tickformat="~g", **few)
     for index, line in enumerate(lines_of(runs)):
         dash = ",".join(f"{length:g}px" for length in DASHES[line.dashes % len(DASHES)]) or "solid"
         style = {"color": LIGHT[line.colour % len(LIGHT)], "dash": dash, "width": 2}
@@ -149,7 +150,7 @@ def figures() -> dict[str, dict[str, Any]]:
     versus = (
         [_marks(size=5, color=INK["text"], opacity=0.5) | {"hovertemplate": hover}],
         {
-            "title": {"text": "Rotation error of each problem"},
+            "title": {"text": "Rotation errors"},
             "xaxis": degrees,
             "yaxis": degrees | {"matches": "x"},  # equal ranges, so that the diagonal is x = y
             "shapes": [diagonal],

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torch.distributed as dist
 from lightning import LightningModule, Trainer
 from lightning.pytorch import Callback
 from lightning.pytorch.cli import SaveConfigCallback
@@ -23,6 +22,7 @@ from bpnp.report.points import ProblemPoints, points_from, write_points
 from bpnp.report.results import SUMMARY, ProblemRow, rows_from, write_results
 from bpnp.report.tables import read_runs, results_table
 from bpnp.report.terminal import console, say
+from bpnp.training.predictions import gather_objects
 from bpnp.training.task import BlindPnPTask, number_globally
 from bpnp.types import Batch, Prediction, map_tensors
 
@@ -68,8 +68,7 @@ class PoseLossWarmup(Callback):
             )
         if isinstance(pl_module, BlindPnPTask) and (estimates := pl_module.estimates["test"]):
             pl_module.check_pose_loss(estimates)
-        never = 0 <= (trainer.max_epochs or -1) <= self.start_epoch and not trainer.fast_dev_run  # type: ignore[attr-defined]
-        if self.switched_at is None and never:
+        if self.switched_at is None and self._ends_before(trainer):
             rank_zero_warn(
                 f"The pose loss joins at epoch {self.start_epoch}, and the training ends after {trainer.max_epochs} "
                 "epochs without it."
@@ -84,8 +83,17 @@ class PoseLossWarmup(Callback):
         pl_module.pose_weight = 0.0 if self.switched_at is None else weight  # type: ignore[assignment]
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Restore the weight of the task, for another `fit`."""
+        """Restore the weight of the task, for another `fit`; warn if the pose loss has not joined yet."""
         pl_module.pose_weight = self.configured  # type: ignore[assignment]
+        if self.switched_at is None and not self._ends_before(trainer) and not trainer.fast_dev_run:  # type: ignore[attr-defined]
+            rank_zero_warn(
+                f"The training has ended before epoch {self.start_epoch}, at which the pose loss joins. Use a smaller "
+                "start_epoch, or a later end (max_steps, max_time, early stopping)."
+            )
+
+    def _ends_before(self, trainer: Trainer) -> bool:
+        """Return True if the last epoch of the trainer is before the switch."""
+        return 0 <= (trainer.max_epochs or -1) <= self.start_epoch and not trainer.fast_dev_run  # type: ignore[attr-defined]
 
     def state_dict(self) -> dict[str, Any]:
         """Return the epoch of the switch and the options."""
@@ -276,7 +284,7 @@ class ResultsWriter(Callback):
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Gather the rows of all processes, write the files, and print other logged metrics."""
-        gathered = _gather((self.rows, self.losses, self.points))
+        gathered = gather_objects((self.rows, self.losses, self.points))
         table_metrics = getattr(pl_module, "table_metrics", ())
         others = {name: value for name, value in trainer.callback_metrics.items() if name not in table_metrics}
         logged = ", ".join(f"{name} {float(value):.6g}" for name, value in others.items())
@@ -333,12 +341,3 @@ def _settings(trainer: Trainer) -> dict[str, Any]:
     config = {} if saved is None else saved.as_dict()
     checkpoint = str(trainer.ckpt_path) if trainer.ckpt_path else None
     return {"checkpoint": checkpoint, "data": config.get("data"), "solver": config.get("model", {}).get("solver")}
-
-
-def _gather(value: Any) -> list[Any]:
-    """Return the value of every process, in the order of their ranks."""
-    if not dist.is_initialized():
-        return [value]
-    values = [None] * dist.get_world_size()
-    dist.all_gather_object(values, value)
-    return values

@@ -13,7 +13,7 @@ import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import BasePredictionWriter
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
-from torch import Tensor
+from torch import Tensor, distributed
 
 from bpnp.files import write_text
 from bpnp.geometry import quaternion_rotation
@@ -128,17 +128,26 @@ class PredictionWriter(BasePredictionWriter):
 
     def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Gather the poses of all processes and write the file."""
-        gathered: list[Any] = [None] * trainer.world_size
-        if trainer.world_size > 1:
-            torch.distributed.all_gather_object(gathered, self.rows)
-        else:
-            gathered = [self.rows]
+        gathered = gather_objects(self.rows)
         if trainer.is_global_zero and not trainer.fast_dev_run and any(gathered):  # type: ignore[attr-defined]
             # Count problems of several processes once; the sort is stable and keeps the order of the estimates.
             rows = {(row.index, row.estimate): row for part in gathered for row in part}
             ordered = sorted(rows.values(), key=lambda row: row.index)
             path = write_text(self.path(trainer), as_csv(ordered) if self.format == "csv" else as_json(ordered))
             rank_zero_info(f"poses of {len({row.index for row in ordered})} problems in {path}")
+
+
+def gather_objects(value: Any) -> list[Any]:
+    """Return the value of every process, in the order of their ranks.
+
+    Args:
+        value: Object of this process, which can be pickled.
+    """
+    if not distributed.is_available() or not distributed.is_initialized():
+        return [value]
+    values = [None] * distributed.get_world_size()
+    distributed.all_gather_object(values, value)
+    return values
 
 
 def as_csv(rows: Sequence[PoseRow]) -> str:

@@ -85,6 +85,8 @@ def test_the_weight_of_the_task_is_that_after_the_switch_or_refused(tmp_path: Pa
 def test_a_pose_loss_that_never_joins_brings_a_warning_and_one_that_is_lost_an_error(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="joins at epoch 5, and the training ends after 1 epochs without it"):
         fit(tmp_path, BlindPnPTask(CountingSolver()), limit_train_batches=1, callbacks=[PoseLossWarmup(start_epoch=5)])
+    with pytest.warns(UserWarning, match="ended before epoch 5, at which the pose loss joins"):
+        fit(tmp_path, BlindPnPTask(CountingSolver()), max_epochs=9, max_steps=1, callbacks=[PoseLossWarmup(5)])
     run = fit(tmp_path, BlindPnPTask(CountingSolver(), pose_weight=0.5), limit_train_batches=1)
     run.save_checkpoint(file := str(tmp_path / "posed.ckpt"))
     with pytest.raises(ValueError, match="trained with model.pose_weight 0.5, and this run has neither"):
