@@ -21,8 +21,8 @@ SMALLEST = 1e-7  # added to the norm of a gradient, which may be zero
 def orthogonalise(matrices: Float[Tensor, "k r c"]) -> Float[Tensor, "k r c"]:
     """Return approximately the nearest matrices with orthonormal rows or columns, by Newton-Schulz iteration.
 
-    Singular vectors are kept; singular values become 0.7 to 1.2, in bfloat16, those near zero less. For a matrix
-    U S V^T, the exact result is U V^T.
+    Singular vectors are kept; singular values become 0.7 to 1.2, those near zero less. For a matrix U S V^T, the exact
+    result is U V^T. The arithmetic is float32 or better: in bfloat16, many CPUs take ten times as long.
 
     Args:
         matrices: k matrices of one shape.
@@ -33,7 +33,8 @@ def orthogonalise(matrices: Float[Tensor, "k r c"]) -> Float[Tensor, "k r c"]:
     a, b, c = POLYNOMIAL
     tall = matrices.shape[-2] > matrices.shape[-1]
     x = matrices.mT if tall else matrices
-    x = (x / (torch.linalg.matrix_norm(x, keepdim=True) + SMALLEST)).bfloat16()
+    x = x.to(torch.promote_types(x.dtype, torch.float32))
+    x = x / (torch.linalg.matrix_norm(x, keepdim=True) + SMALLEST)
     for _ in range(STEPS):
         gram = x @ x.mT
         x = a * x + (b * gram + c * gram @ gram) @ x
