@@ -21,11 +21,15 @@ CONFIGS = Path(__file__).parent / "configs"  # in a checkout, a link to the fold
 def write_atomically(path: Path) -> Iterator[Path]:
     """Yield a temporary path next to `path`, renamed to `path` on success and deleted on error.
 
-    Parent folders are created. An OSError without a file name gets `path`.
+    Parent folders are created. An OSError without a file name gets `path`. A device or a pipe, such as /dev/stdout, is
+    yielded itself: it is written to, not replaced.
 
     Args:
         path: File or folder to write.
     """
+    if path.exists() and (path.parent == Path("/dev") or not (path.is_file() or path.is_dir())):
+        yield path
+        return
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:

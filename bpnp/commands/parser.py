@@ -11,6 +11,7 @@ import re
 import typing
 from argparse import HelpFormatter
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NoReturn
 
 from docstring_parser import parse as parse_docstring
@@ -85,7 +86,9 @@ def parse_arguments(name: str, command: Callable[..., None], arguments: Sequence
         ValueError: The command does not take these arguments.
     """
     words = [re.sub(r"^--[\w-]+", lambda name: f"--{name[0][2:].replace('-', '_')}", text) for text in arguments]
-    words = [_infinity(before, text) for before, text in itertools.pairwise(["", *words])]
+    hints = typing.get_type_hints(command)
+    numbers = [f"--{name}" for name, kind in hints.items() if float in (kind, *typing.get_args(kind))]
+    words = [_infinity(before, text, numbers) for before, text in itertools.pairwise(["", *words])]
     extra = {}
     if OVERRIDES in inspect.signature(command).parameters:
         rest, words, extra = iter(words), [], {OVERRIDES: list[str]()}
@@ -94,7 +97,6 @@ def parse_arguments(name: str, command: Callable[..., None], arguments: Sequence
                 extra[OVERRIDES].append(text if "=" in text else f"{text}={next(rest, '')}")
             else:
                 words.append(text)
-    hints = typing.get_type_hints(command)
     chosen = {
         key: tuple(value) if value and isinstance(_word(hints[key])[1], int) else value
         for key, value in vars(command_parser(name, command).parse_args(words)).items()
@@ -103,11 +105,12 @@ def parse_arguments(name: str, command: Callable[..., None], arguments: Sequence
     return chosen | extra
 
 
-def _infinity(before: str, text: str) -> str:
-    """Return the YAML form of an infinite value, `--option inf` or `--option=inf`, and any other word unchanged."""
-    if text == "inf" and before.startswith("--"):
-        return ".inf"
-    return re.sub(r"^(--\w+=)inf$", r"\1.inf", text)
+def _infinity(before: str, text: str, numbers: Sequence[str]) -> str:
+    """Return the YAML form of the value `inf` of one of the options `numbers`, and any other word unchanged."""
+    option, _, value = text.rpartition("=")
+    if value != "inf" or (option or before) not in numbers:
+        return text
+    return text.removesuffix("inf") + ".inf"
 
 
 def command_parser(name: str, command: Callable[..., None]) -> OneLineParser:
@@ -169,8 +172,24 @@ def _word(kind: Any) -> tuple[Any, str | int | None]:
     for option in (kind, *typing.get_args(kind)):
         if typing.get_origin(option) in (list, tuple):
             words = typing.get_args(option)
-            return words[0], "+" if typing.get_origin(option) is list else len(words)
-    return kind, None
+            return _parsed(words[0]), "+" if typing.get_origin(option) is list else len(words)
+    return _parsed(kind), None
+
+
+def _parsed(kind: Any) -> Any:
+    """Return the type of a word; for a path or a text, which jsonargparse reads as YAML, a function."""
+    kinds = (kind, *typing.get_args(kind))
+    return _path if Path in kinds else _text if str in kinds else kind
+
+
+def _path(text: str | Path) -> Path:
+    """Return a path, whose bytes may be of any encoding; jsonargparse passes the result to this function again."""
+    return Path(text)
+
+
+def _text(text: str) -> str:
+    """Return a text unchanged."""
+    return text
 
 
 LIGHTNING = {

@@ -44,7 +44,7 @@ def read_points2d(path: Path) -> tuple[Array, Labels | None]:
         points, _, labels = _read_annotation(path, values, names, coordinates, hint=", or u, v")
         return points, labels
     if values.shape[1] < 2:
-        raise ValueError(f"{path} needs points with 2 or 3 columns; its shape is {values.shape}")
+        raise ValueError(f"{_name(path)} needs points with 2 or 3 columns; its shape is {values.shape}")
     return values if values.shape[1] == 3 else values[:, :2], None
 
 
@@ -167,7 +167,7 @@ def read_pairs(path: Path) -> Array:
     _check_suffix(path, ARRAYS)
     values = _columns(path)[0]
     if values.shape[1] != 2:
-        raise ValueError(f"{path} needs two columns; it has {values.shape[1]}")
+        raise ValueError(f"{_name(path)} needs two columns; it has {values.shape[1]}")
     return values
 
 
@@ -178,14 +178,23 @@ def _is_stream(path: Path) -> bool:
 
 def _content(path: Path) -> bytes:
     """Return the bytes of a file, of a pipe, or of standard input."""
-    return sys.stdin.buffer.read() if path == STANDARD_INPUT else path.read_bytes()
+    if path != STANDARD_INPUT:
+        return path.read_bytes()
+    if sys.stdin is None:  # as after `<&-`
+        raise ValueError("it is closed")
+    return sys.stdin.buffer.read()
+
+
+def _name(path: Path) -> str:
+    """Return the name of a file for messages."""
+    return "standard input" if path == STANDARD_INPUT else str(path)
 
 
 def _check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
     if _is_stream(path):
         return
     if not path.is_file():
-        raise ValueError(f"there is no file {path}")
+        raise ValueError(f"{path} is a folder; give a file" if path.is_dir() else f"there is no file {path}")
     if path.suffix.lower() not in suffixes:
         raise ValueError(f"{path} has to end in {', '.join(suffixes)}")
 
@@ -205,11 +214,11 @@ def _read_annotation(
     swapped = " (are the two files swapped?)" if values.shape[1] == 2 else ""
     if not names and values.shape[1] not in COLUMNS:
         expected = "3 to 4 or 6 to 7 columns (x, y, z, normal, label)"
-        raise ValueError(f"{path} needs {expected}; its shape is {values.shape}{swapped}")
+        raise ValueError(f"{_name(path)} needs {expected}; its shape is {values.shape}{swapped}")
     names = names or [*coordinates, *COLUMNS[values.shape[1]]]
     if not set(coordinates) <= set(names):
         raise ValueError(
-            f"{path} needs columns {', '.join(coordinates)}{hint}; its columns are {', '.join(names)}{swapped}"
+            f"{_name(path)} needs columns {', '.join(coordinates)}{hint}; its columns are {', '.join(names)}{swapped}"
         )
     index = {name: column for column, name in enumerate(names)}
     points = values[:, [index[name] for name in coordinates]]
@@ -266,13 +275,13 @@ def _columns(path: Path, wanted: Collection[str] = ()) -> tuple[Array, list[str]
             return array.astype(np.float64), []
         text = content.decode("utf-8-sig")
     except (ValueError, OSError, EOFError) as error:
-        raise ValueError(f"cannot read rows of numbers from {path}: {error}") from error
+        raise ValueError(f"cannot read rows of numbers from {_name(path)}: {error}") from error
     lines = [line for commented in text.splitlines() if (line := commented.partition("#")[0].strip())]
     names = _words(lines[0]) if lines else []
     names = [] if any(_number(name) is not None for name in names) else names
     rows = lines[1:] if names else lines
     if not rows:
-        raise ValueError(f"{path} has no lines of numbers")
+        raise ValueError(f"{_name(path)} has no lines of numbers")
     mark, count = _separator(rows[0]), len(_words(rows[0]))
     if names and count == len(names) + 1:
         names = ["", *names]
@@ -287,7 +296,9 @@ def _columns(path: Path, wanted: Collection[str] = ()) -> tuple[Array, list[str]
         wrong = (
             row for row in rows if len(words := _words(row)) != count or None in [_number(words[i]) for i in needed]
         )
-        raise ValueError(f"{path} needs rows of {count} numbers; it has {next(wrong, rows[0])[:60]!r}") from error
+        raise ValueError(
+            f"{_name(path)} needs rows of {count} numbers; it has {next(wrong, rows[0])[:60]!r}"
+        ) from error
     return values, names
 
 

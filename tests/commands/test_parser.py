@@ -1,5 +1,7 @@
 """Words of the command line that argparse would take for something else."""
 
+from pathlib import Path
+
 import pytest
 
 from bpnp.commands.parser import parse_arguments
@@ -18,3 +20,24 @@ def move(scale: float, *, translation: tuple[float, float, float] | None = None)
 def test_negative_numbers_with_an_exponent_are_numbers(text: str) -> None:
     chosen = parse_arguments("move", move, [text, "--translation", "1", text, "3"])
     assert chosen == {"scale": float(text), "translation": (1.0, float(text), 3.0)}
+
+
+def write(files: list[Path], *, name: str | None = None, output: Path | None = None, limit: float = 1.0) -> None:
+    """Write.
+
+    Args:
+        files: files.
+        name: a name.
+        output: a file.
+        limit: a number.
+    """
+
+
+@pytest.mark.parametrize(
+    "text", ["caf\udce9 é.jpg", "a: b.csv", "null", "#1.csv", "&a", "- x", "[1].csv", "true", "1e3", "'q'", "inf"]
+)
+def test_names_of_files_are_taken_as_they_are(text: str) -> None:
+    """In YAML some of these are null, and \udce9 stands for a byte that is not UTF-8."""
+    expected = {"files": [Path(text)], "name": text, "output": Path(text), "limit": float("inf")}
+    assert parse_arguments("write", write, [text, "--name", text, "--output", text, "--limit", "inf"]) == expected
+    assert parse_arguments("write", write, [text, f"--name={text}", f"--output={text}", "--limit=inf"]) == expected

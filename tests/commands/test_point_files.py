@@ -3,6 +3,7 @@
 import io
 import os
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -258,6 +259,25 @@ def test_a_pipe_is_read(tmp_path: Path) -> None:
         np.testing.assert_array_equal(points_of(pipe), POINTS)
         writer.join()
         pipe.unlink()
+
+
+@pytest.mark.parametrize(
+    ("stdin", "sentence"),
+    [
+        (None, "cannot read rows of numbers from standard input: it is closed"),
+        (io.TextIOWrapper(io.BytesIO(b"")), "standard input has no lines of numbers"),
+    ],
+    ids=["closed", "empty"],
+)
+def test_standard_input_without_points_is_named(
+    stdin: io.TextIOWrapper | None, sentence: str, fails: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.stdin", stdin)
+    assert sentence in fails("solve", "-", "-")
+
+
+def test_a_folder_in_place_of_a_file_is_named(tmp_path: Path, fails: Callable[..., str]) -> None:
+    assert f"{tmp_path} is a folder; give a file" in fails("solve", str(tmp_path), str(tmp_path))
 
 
 def test_standard_input_is_read(monkeypatch: pytest.MonkeyPatch) -> None:

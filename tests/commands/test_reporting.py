@@ -61,6 +61,16 @@ def test_a_reader_that_closes_the_pipe_is_no_error(tmp_path: Path) -> None:
     assert process.returncode == 0
 
 
+@pytest.mark.skipif(not Path("/dev/full").is_char_device(), reason="the system has no /dev/full")
+def test_a_table_that_a_full_disk_does_not_take_is_one_clear_error(
+    tmp_path: Path, fails: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_run(tmp_path, 9, 0)
+    with open("/dev/full", "w", buffering=1) as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        assert "No space left on device" in fails("report", str(tmp_path))
+
+
 def test_a_page_and_the_tables_of_the_terminal_share_their_intervals(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
