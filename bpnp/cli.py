@@ -27,7 +27,8 @@ AFTER_CTRL_C = {
 }
 LIBRARIES = sys.stdlib_module_names | {
     "beartype", "bpnp", "cv2", "filelock", "fsspec", "h5py", "jaxtyping", "jsonargparse", "lightning", "numpy",
-    "pandas", "PIL", "pycolmap", "rich", "scipy", "torch", "torchmetrics", "trimesh", "typeshed_client", "wandb", "yaml",
+    "pandas", "PIL", "pycolmap", "rich", "scipy", "torch", "torchmetrics", "trimesh", "typeshed_client", "wandb",
+    "yaml",
 }  # fmt: skip
 LIGHTNING_MISTAKES = {
     "MisconfigurationException",

@@ -62,13 +62,14 @@ def test_a_reader_that_closes_the_pipe_is_no_error(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not Path("/dev/full").is_char_device(), reason="the system has no /dev/full")
-def test_a_table_that_a_full_disk_does_not_take_is_one_clear_error(
-    tmp_path: Path, fails: Callable[..., str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_table_that_a_full_disk_does_not_take_is_one_clear_error(tmp_path: Path) -> None:
     write_run(tmp_path, 9, 0)
-    with open("/dev/full", "w", buffering=1) as full:
-        monkeypatch.setattr(sys, "stdout", full)
-        assert "No space left on device" in fails("report", str(tmp_path))
+    with Path("/dev/full").open("w") as full:
+        command = [sys.executable, "-m", "bpnp", "report", str(tmp_path)]
+        ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert ended.stderr.splitlines()[0] == "bpnp: error: [Errno 28] No space left on device"
+    assert "Traceback" not in ended.stderr
+    assert ended.returncode == 2
 
 
 def test_a_page_and_the_tables_of_the_terminal_share_their_intervals(
