@@ -14,6 +14,7 @@ import traceback
 import warnings
 from collections.abc import Mapping, Sequence
 from importlib.metadata import metadata, version
+from typing import NoReturn
 
 from bpnp.commands import COMMANDS
 from bpnp.commands.parser import LIGHTNING, first_line, parse_arguments, plain, short_help
@@ -65,14 +66,28 @@ def main(args: Sequence[str] | None = None) -> None:
         if isinstance(error, BrokenPipeError) and _has_no_reader(sys.stdout):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the flush at exit would fail too
             raise SystemExit(0) from None
+        if _follows_interrupt(error):
+            _end_interrupted(arguments)
         if os.environ.get("BPNP_TRACEBACK") or not _is_mistake(error):
             raise
         # File names that are not UTF-8 contain surrogates, which a terminal cannot show.
         print(f"bpnp: error: {plain(str(error))}".encode("utf-8", "replace").decode(), file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt:
-        print(f"bpnp: interrupted{AFTER_CTRL_C.get(arguments[0], '')}", file=sys.stderr)
-        raise SystemExit(130) from None
+        _end_interrupted(arguments)
+
+
+def _end_interrupted(arguments: Sequence[str]) -> NoReturn:
+    """Print that the command was interrupted, and exit with status 130."""
+    print(f"bpnp: interrupted{AFTER_CTRL_C.get(arguments[0], '')}", file=sys.stderr)
+    raise SystemExit(130) from None
+
+
+def _follows_interrupt(error: BaseException | None) -> bool:
+    """Return True if Ctrl-C caused an error, as within the import of a compiled library."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__
+    return error is not None
 
 
 def one_line_warning(message: Warning | str, *_: object, **__: object) -> str:

@@ -50,6 +50,24 @@ def test_only_a_closed_standard_output_ends_a_command_silently(monkeypatch: pyte
         assert stop.value.code == 0
 
 
+def test_ctrl_c_within_the_import_of_a_library_is_no_error_of_the_library(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """pycolmap replaces the ImportError that pybind11 makes of Ctrl-C."""
+
+    def interrupt() -> None:
+        try:
+            raise ImportError("initialization failed") from KeyboardInterrupt()
+        except ImportError as error:
+            raise RuntimeError("Cannot import the C++ backend") from error
+
+    monkeypatch.setitem(COMMANDS, "solve", interrupt)
+    with pytest.raises(SystemExit) as stop:
+        main(["solve"])
+    assert stop.value.code == 130
+    assert capsys.readouterr().err == "bpnp: interrupted\n"
+
+
 @pytest.mark.parametrize(
     ("part", "sentence"),
     [
