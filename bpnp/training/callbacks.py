@@ -114,9 +114,17 @@ class ProgressLines(Callback):
     It replaces the progress bar where output is not a terminal.
     """
 
+    validated = False  # True if the current epoch has a validation
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Note that the metrics are of this epoch."""
+        self.validated = True
+
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Print the epoch, the step and the main metrics."""
-        names = [name for name in LINE if name in trainer.callback_metrics] or list(trainer.callback_metrics)[:4]
+        """Print the epoch, the step and the main metrics, those of a validation only if the epoch had one."""
+        known = [name for name in trainer.callback_metrics if self.validated or not name.startswith("val/")]
+        self.validated = False
+        names = [name for name in LINE if name in known] or known[:4]
         values = ", ".join(f"{name} {float(trainer.callback_metrics[name]):.4g}" for name in names)
         last = f"/{trainer.max_epochs}" if (trainer.max_epochs or 0) > 0 else ""
         self._print(trainer, f"epoch {trainer.current_epoch + 1}{last}, step {trainer.global_step}: {values}")

@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 from lightning import Callback, LightningModule, Trainer
 from planted import plant
-from small_data import quiet_trainer, small_net
+from small_data import quiet_trainer, small_meshes, small_net
 from torch.optim import Optimizer
 from torch.utils.data import DataLoader
 
-from bpnp.training.callbacks import ParameterCount
+from bpnp.training.callbacks import ParameterCount, ProgressLines
 from bpnp.training.task import BlindPnPTask
 
 
@@ -54,3 +54,12 @@ def test_the_parameters_of_each_part_are_printed(capsys: pytest.CaptureFixture[s
     total = sum(parameter.numel() for parameter in task.parameters())
     assert line.startswith(f"BPnPNet: {total:,} parameters, {total - frozen:,} trained (features2d ")
     assert "FLOPs" not in line
+
+
+def test_a_line_has_the_validation_of_its_own_epoch_only(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    options = {"max_epochs": 2, "check_val_every_n_epoch": 2, "limit_train_batches": 1, "limit_val_batches": 1}
+    trainer = quiet_trainer(tmp_path, **options, callbacks=[lines := ProgressLines()])
+    trainer.fit(BlindPnPTask(small_net()), datamodule=small_meshes(tmp_path))
+    lines.on_train_epoch_end(trainer, trainer.lightning_module)  # of an epoch without a validation
+    printed = capsys.readouterr().out.splitlines()
+    assert ["val/correspondence_loss" in line for line in printed if line.startswith("epoch")] == [False, True, False]
