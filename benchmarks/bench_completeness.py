@@ -76,7 +76,7 @@ def leads_back(kind: symmetric.Kind, problem: Problem) -> bool:
     shift = translation - turned @ (other.mean(0) - turn @ one.mean(0))
     (turned, shift), (_, translation) = points.from_user(turned, shift), points.from_user(rotation, translation)
     motions = registered(points, turned, shift, symmetric.NOISE, DEFAULT.evidence)
-    rotations, translations, _ = competing_poses(points, turned, shift, motions, DEFAULT.evidence)
+    rotations, translations, _ = competing_poses(points, turned, shift, symmetric.NOISE, motions, DEFAULT.evidence)
     poses = np.concatenate([rotation[None], rotations]), np.vstack([translation, translations])
     return bool(points.same_pose(*poses, Tolerance(RIGHT_DEG))[1:].any())
 

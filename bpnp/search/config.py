@@ -700,6 +700,37 @@ SYMMETRIES = SymmetrySettings()
 
 
 @dataclass(frozen=True)
+class CollinearSettings:
+    """Rotations about a line of matched points (`bpnp.search.propose.collinear`).
+
+    Attributes:
+        fewest: Smallest number of matched points on the line. [points; not tuned]
+        least: Smallest fraction of the matched points on the line. A wrong pose explains at least half of its matches
+            by independent coincidences, unless so many lie on a line. [fraction; derived]
+        thin: Largest distance from the line through two points of a point that lies on it, in distances between the
+            two. [1; not tuned]
+        pairs: Number of pairs of points whose lines are tried. All pairs miss a line of half of the points with a
+            probability of (1 - 1/4)^256. [pairs; derived]
+        angles: Number of angles of a full turn. [angles; cost]
+        apart: Two angles within this many steps are one, since poses are refined. [steps; not tuned]
+        others: Largest number of points off the line that are rotated, the nearest ones. [points; cost]
+        kept: Largest number of competing poses, those that explain the most points. [poses; cost]
+    """
+
+    fewest: int = 5
+    least: float = 0.5
+    thin: float = 0.05
+    pairs: int = 256
+    angles: int = 360
+    apart: int = 2
+    others: int = 500
+    kept: int = 6
+
+
+COLLINEAR = CollinearSettings()
+
+
+@dataclass(frozen=True)
 class AlarmSettings:
     """Number of false alarms (`bpnp.search.verdict.false_alarms`).
 

@@ -70,10 +70,11 @@ def judge_given_pose(
     scene, few = Scene(one, seed, DEFAULT, deadline), is_enumerable(problem)
     others = _proposed(problem, claim, scene)
     if few:  # as in an enumeration, whose candidates are refined
-        motions = registered(one, rotation, translation, float(claim.scale[0]), settings)
-        copies = competing_poses(one, rotation, translation, motions, settings)[:2]
+        scale = float(claim.scale[0])
+        motions = registered(one, rotation, translation, scale, settings)
+        copies = competing_poses(one, rotation, translation, scale, motions, settings)[:2]
         if len(copies[0]):
-            others = Hypotheses.concatenate([others, anneal_to_end(scene, *copies, float(claim.scale[0]))])
+            others = Hypotheses.concatenate([others, anneal_to_end(scene, *copies, scale)])
     others = _with_new_false_alarms(others, one)
     others = others[np.argsort(others.log10_false_alarms, kind="stable")]
     same = np.array([_is_same(one, claim, others[k : k + 1], settings) for k in range(len(others))], np.bool_)

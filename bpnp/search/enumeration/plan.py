@@ -79,7 +79,7 @@ class EnumeratedPoses:
         pose, verdict_settings = (leader.rotation[0], leader.translation[0]), self.settings.evidence
         scale = max(float(leader.scale[0]), self.problem.floor or ENUMERATION.smallest_scale)
         motions = registered(self.problem, *pose, scale, verdict_settings)
-        rotations, translations, _ = competing_poses(self.problem, *pose, motions, verdict_settings)
+        rotations, translations, _ = competing_poses(self.problem, *pose, scale, motions, verdict_settings)
         for one in zip(rotations, translations, strict=True):
             self.run.propose(*one, self.run.reach)
         return self.run.poses()

@@ -11,6 +11,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 from bpnp.search.config import MATCHES, Evidence, Repetitions
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem
+from bpnp.search.propose.collinear import find_line, rotations_about
 from bpnp.search.propose.symmetries import Motions, matching_tolerance, mirror_pose, self_motions
 from bpnp.search.verdict.false_alarms import SHARES, alarms_of, directions_of, point_evidence
 
@@ -51,13 +52,10 @@ def registered(problem: Problem, rotation: Array, translation: Array, scale: flo
         matched points.
     """
     limits, points = settings.repetitions, problem.points3d
-    camera = points @ rotation.T + translation
-    depth = np.linalg.norm(camera, axis=-1)
-    away, nearest = cKDTree(camera / np.maximum(depth, 1e-300)[:, None]).query(problem.bearings)
-    matched = np.unique(nearest[away < MATCHES.reach * scale])
+    matched = matched_points(problem, rotation, translation, scale)
     if len(matched) < limits.fewest:
         return Motions.none()
-    noise = scale * float(np.median(depth[matched]))
+    noise = scale * float(np.median(np.linalg.norm(points[matched] @ rotation.T + translation, axis=-1)))
     labels, normals = problem.labels3d, problem.normals3d if problem.cosines3d is None else None
     if len(points) <= limits.whole:
         tolerance = matching_tolerance(points, np.arange(len(points)), noise)
@@ -82,6 +80,21 @@ def registered(problem: Problem, rotation: Array, translation: Array, scale: flo
     )
 
 
+def matched_points(problem: Problem, rotation: Array, translation: Array, scale: float) -> NDArray[np.int64]:
+    """Return the indices of the scene points that a pose shows at an image point.
+
+    Args:
+        problem: Points of the problem.
+        rotation: (3, 3) of the pose.
+        translation: (3,) of the pose.
+        scale: Standard deviation of its residuals, radians.
+    """
+    camera = problem.points3d @ rotation.T + translation
+    depth = np.linalg.norm(camera, axis=-1)
+    away, nearest = cKDTree(camera / np.maximum(depth, 1e-300)[:, None]).query(problem.bearings)
+    return np.unique(nearest[away < MATCHES.reach * scale])
+
+
 Frozen = tuple[bytes, str, tuple[int, ...]] | None
 
 
@@ -102,14 +115,16 @@ def _of_scene(
 
 
 def competing_poses(
-    problem: Problem, rotation: Array, translation: Array, motions: Motions, settings: Evidence
+    problem: Problem, rotation: Array, translation: Array, scale: float, motions: Motions, settings: Evidence
 ) -> tuple[Array, Array, Array]:
-    """Return the competing poses of a pose due to motions and to the mirror image of a flat scene.
+    """Return the competing poses of a pose due to motions, to a line of matched points, and to the mirror image of a
+    flat scene.
 
     Args:
         problem: Points of the problem.
         rotation: (3, 3) of the pose.
         translation: (3,) of the pose.
+        scale: Standard deviation of its residuals, radians.
         motions: Motions that map the scene onto itself.
         settings: Constants of the verdict.
 
@@ -119,6 +134,11 @@ def competing_poses(
     """
     poses = motions.competitors(rotation, translation)
     every = [rotation[None], poses[0]], [translation[None], poses[1]], [np.ones(1), motions.scale]
+    matched = matched_points(problem, rotation, translation, scale)
+    if (line := find_line(problem.points3d[matched])) is not None:
+        turned = rotations_about(problem, rotation, translation, line, scale)
+        for parts, some in zip(every, (*turned, np.ones(len(turned[0]))), strict=True):
+            parts.append(some)
     if (mirrored := mirror_pose(problem.points3d, rotation, translation)) is not None:
         for parts, one in zip(every, (*mirrored, np.ones(())), strict=True):
             parts.append(one[None])
@@ -155,7 +175,7 @@ def repeated_poses(
         [-4.0, -2.0]
     """
     motions = registered(problem, rotation, translation, scale, settings).mapping(least)
-    rotations, translations, sizes = competing_poses(problem, rotation, translation, motions, settings)
+    rotations, translations, sizes = competing_poses(problem, rotation, translation, scale, motions, settings)
     scales = np.full(len(rotations), scale)
     alarms = alarms_of(problem, rotations, translations, scales).own
     poses = Hypotheses.from_poses(

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from bpnp.search.config import DEFAULT, Evidence
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem
-from bpnp.search.propose.repetitions import registered
+from bpnp.search.propose.collinear import find_line
+from bpnp.search.propose.repetitions import matched_points, registered
 from bpnp.search.propose.symmetries import Motions
 from bpnp.search.verdict import reasons
 from bpnp.search.verdict.competitors import (
@@ -165,6 +166,9 @@ def missed(
         return 0.0
     decades = -alarms / max(distinct * match_count(candidates), 1.0) if independent else 0.0
     value = log10_missed(count_starts(candidates, problem, settings), decades, local_searches, settings)
+    if value <= settings.missed and decades:
+        fewer = replace(settings, independent=independent_matches(candidates, problem, settings))
+        value = log10_missed(count_starts(candidates, problem, settings), decades, local_searches, fewer)
     if value > settings.missed or not is_symmetric(candidates, problem, settings):
         return value
     basin_count = count_starts(candidates, problem, settings, symmetric=True)
@@ -198,6 +202,20 @@ def is_symmetric(candidates: Hypotheses, problem: Problem, settings: Evidence) -
     motions = motions_of(candidates, problem, settings)
     fraction = motions.fraction[motions.scale == 1] if problem.baseline else motions.fraction
     return float(fraction.max(initial=0)) >= settings.repetitions.symmetric
+
+
+def independent_matches(candidates: Hypotheses, problem: Problem, settings: Evidence) -> int:
+    """Return the number of matches that must be independent coincidences if the first candidate is wrong.
+
+    It is `Evidence.independent`, unless most matched points lie on a line of the scene. Wrong poses then share these
+    matches, one of the other points fixes the rotation about the line, and only the rest are coincidences.
+    """
+    scale = max(float(candidates.scale[0]), float(problem.image.scales[0]))
+    points = problem.points3d[matched_points(problem, candidates.rotation[0], candidates.translation[0], scale)]
+    line = find_line(points)
+    if line is None:
+        return settings.independent
+    return int(np.clip((line.distances(points) > line.radius).sum() - 1, 0, settings.independent))
 
 
 def count_starts(candidates: Hypotheses, problem: Problem, settings: Evidence, *, symmetric: bool = False) -> int:
