@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from planted import degrees_between, directions
 from scipy.spatial.transform import Rotation
 
+import bpnp
 from bpnp.robust.minimal_solvers import p3p
 from bpnp.runtime import Clock
 from bpnp.search.config import ENUMERATION, RULES, Stage
@@ -217,3 +218,19 @@ def test_a_better_pose_is_missed_as_rarely_as_basin_counts_predict(basin_count: 
         assert poses.basin_count[0] >= basin_count
         wrong += degrees_between(poses.rotation[0], rotation) > 3
     assert wrong <= 40 * 0.5**basin_count
+
+
+def test_a_confident_pose_is_not_that_of_the_smaller_of_two_bodies() -> None:
+    """Of one scene, 24 points and 18 others move on their own between the scene and the image."""
+    confident = 0
+    for seed in range(10):
+        rng = np.random.default_rng([2, seed])
+        bodies = rng.uniform(-1, 1, (24, 3)), rng.uniform(-1, 1, (18, 3))
+        rotations = Rotation.random(2, rng=rng).as_matrix()
+        seen = np.concatenate([body @ turn.T + [0, 0, 5] for body, turn in zip(bodies, rotations, strict=True)])
+        image = rng.permutation(seen[:, :2] / seen[:, 2:] + 6e-4 * rng.standard_normal((42, 2)))
+        solution = bpnp.solve(image, rng.permutation(np.concatenate(bodies)), seed=seed, time_limit=math.inf)
+        if solution.verdict == "confident":
+            confident += 1
+            assert degrees_between(solution.rotation, rotations[0]) < 1, (seed, solution.reason)
+    assert confident >= 8

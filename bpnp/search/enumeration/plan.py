@@ -15,7 +15,7 @@ from bpnp.runtime import Deadline
 from bpnp.search.competing_poses import SceneOf, judge_with_competitors
 from bpnp.search.config import ENUMERATION, SearchSettings
 from bpnp.search.enumeration.points import predicted_pose
-from bpnp.search.enumeration.search import Enumeration, margin
+from bpnp.search.enumeration.search import Enumeration, enumerate_poses, margin
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.loop import Step
 from bpnp.search.possible_matches import score_pose
@@ -80,9 +80,25 @@ class EnumeratedPoses:
         scale = max(float(leader.scale[0]), self.problem.floor or ENUMERATION.smallest_scale)
         motions = registered(self.problem, *pose, scale, verdict_settings)
         rotations, translations, _ = competing_poses(self.problem, *pose, scale, motions, verdict_settings)
+        rest = self._poses_of_rest(leader)
+        rotations = np.concatenate([rotations, rest.rotation])
+        translations = np.concatenate([translations, rest.translation])
         for one in zip(rotations, translations, strict=True):
             self.run.propose(*one, self.run.reach)
         return self.run.poses()
+
+    def _poses_of_rest(self, leader: Hypotheses) -> Hypotheses:
+        """Return the poses of a short enumeration of the points without a match, if there may be as many matches.
+
+        If the image shows two bodies that move on their own, the leader may be the pose of the smaller one.
+        """
+        problem, matches = self.run.problem, np.asarray(leader.matches)[0]
+        image = np.flatnonzero(matches < 0)
+        scene = np.setdiff1d(np.arange(len(problem.points3d)), matches)
+        if min(len(image), len(scene)) < leader.match_count[0]:
+            return Hypotheses.empty()
+        settings = replace(ENUMERATION, most=ENUMERATION.patience)
+        return enumerate_poses(problem.choose(image, scene), radius=problem.match_radius, settings=settings).poses
 
     def may_be_decided(self) -> bool:
         """Return True if the best pose leads by a safe margin and passes the cheap tests of the verdict."""
