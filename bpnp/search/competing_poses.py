@@ -90,8 +90,8 @@ def repeated_competitors(
     """Return the competing poses of a repeated structure, refined, with their NFA.
 
     Their NFA is at most that of the leader times the factor by which they explain the image points worse
-    (`repetition_margins`). Poses that were enumerated are refined already. They are scored again under the assumption
-    that the map may end anywhere, which makes them likelier.
+    (`repetition_margins`). Poses that were enumerated are refined already, but for those that a prior excluded. They
+    are scored again under the assumption that the map may end anywhere, which makes them likelier.
 
     Args:
         result: Confident verdict.
@@ -115,7 +115,9 @@ def repeated_competitors(
         return repeated
     poses, limits, rigid = (repeated.rotation, repeated.translation), settings.repetitions, sizes == 1
     if enumerated:
-        refined, limits = repeated, replace(limits, most_missing=1e-12)
+        limits = replace(limits, most_missing=1e-12)
+    if enumerated and problem.prior is None:
+        refined = repeated
     else:
         refined = add_false_alarms(anneal_to_end(scene_of(), *poses, scale), problem)
     others, fraction = (refined.rotation, refined.translation), float(motions.fraction.min(initial=1.0))

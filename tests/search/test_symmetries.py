@@ -309,3 +309,16 @@ def test_a_copy_of_another_size_that_the_image_shows_too_decides(scale: float, u
     found = bpnp.solve(image, np.random.default_rng(6).permutation(points), time_limit=30)
     assert found.verdict == "confident"
     assert np.degrees(Rotation.from_matrix(rotation @ found.rotation.T).magnitude()) < 1
+
+
+@pytest.mark.parametrize("fold", [2, 3])
+def test_a_prior_of_a_wrong_copy_does_not_leave_the_better_pose_without_matches(fold: int) -> None:
+    """The prior is rotated by the symmetry and excludes the planted pose, which two unique points decide."""
+    points, (rotation, translation) = parts(fold, 24 // fold, 2, 6), (np.eye(3), np.array([0.1, 0.0, 5.0]))
+    turn = Rotation.from_rotvec([0, 0, 2 * np.pi / fold]).as_matrix()
+    seen = points @ rotation.T + translation
+    image = seen[:, :2] / seen[:, 2:] + 6e-4 * np.random.default_rng(0).standard_normal((len(points), 2))
+    prior = bpnp.PosePrior(rotation @ turn.T, translation, 15.0)
+    solution = bpnp.solve(image, points, prior=prior, time_limit=np.inf)
+    assert degrees_between(solution.rotation, rotation) < 1
+    assert solution.verdict == "confident", solution.reason
