@@ -125,3 +125,15 @@ def test_a_focal_length_needs_no_more_points_than_its_own_fit() -> None:
             believed.append(np.degrees((Rotation.from_matrix(solution.rotation) * turn.inv()).magnitude()))
     assert len(believed) <= 1  # the test is one at a thousandth: seven points cannot tell more
     assert all(error < 3 for error in believed)
+
+
+def test_points_that_are_given_twice_do_not_make_a_pose_more_certain() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 1, (20, 3))
+    rays = noisy(directions(points + SHIFT), rng)
+    once = local_covariance(linearised(Problem(rays, points), np.eye(3), SHIFT, NOISE))
+    for repeated in (Problem(np.repeat(rays, 4, 0), points), Problem(np.repeat(rays, 4, 0), np.repeat(points, 4, 0))):
+        several = local_covariance(linearised(repeated, np.eye(3), SHIFT, NOISE))
+        assert once is not None
+        assert several is not None
+        np.testing.assert_allclose(several, once, rtol=0.01, atol=1e-9)

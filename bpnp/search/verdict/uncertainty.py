@@ -219,9 +219,10 @@ def local_covariance(linear: "Linearised | None") -> Array | None:
 
 
 def matches_of(linear: "Linearised") -> Linearisation:
-    """Convert the matches of a pose to the input of `covariance_of`."""
+    """Convert the matches of a pose to the input of `covariance_of`. Equal image points are one measurement."""
     chosen = linear.problem.image.chosen
-    weight = np.full(len(chosen), len(linear.problem.bearings) / len(chosen))
+    _, which, copies = np.unique(linear.problem.bearings[chosen], axis=0, return_inverse=True, return_counts=True)
+    weight = len(linear.problem.bearings) / len(chosen) / copies[which.ravel()]
     known = linear.model.information(linear.state)
     return Linearisation(linear.residual, linear.jacobian, linear.probability, linear.image, weight, known)
 
