@@ -191,11 +191,13 @@ def test_a_photo_is_not_replaced_by_its_picture(command: list[str], fails: Calla
     assert photo.read_bytes() == before
 
 
-def test_a_file_name_that_is_not_utf8_is_kept_as_it_is(command: list[str]) -> None:
+@pytest.mark.parametrize("folder", [True, False])
+def test_a_file_name_that_is_not_utf8_is_kept_as_it_is(folder: bool, command: list[str]) -> None:
     name = os.fsdecode(b"caf\xe9.png")
     Path("photos").mkdir()
     Path("a.png").rename(Path("photos", name))
-    main(["photos" if word == "a.png" else word for word in command] + ["--quiet"])
+    photo = "photos" if folder else f"photos/{name}"
+    main([photo if word == "a.png" else word for word in command] + ["--quiet"])
     assert Path("out/pictures", name).is_file()
     assert b"\ncaf\xe9.png " in Path("out/poses.txt").read_bytes()
 
