@@ -5,7 +5,7 @@
 
 DATA is a folder with the shapes of `modelnet10` (docs/data.md). The training is configs/paper/modelnet40.yaml from the
 start, with L_c alone, but for the data, `POINTS` points a shape, and a learning rate of 1e-4. Each row has one of
-`ADDITIONS`, the last all that we use. All have as many points in all, with fewer steps where a step has more points. They
+`ADDITIONS`, the last all that we use. All have as many points in all, with fewer steps where a step has more. They
 are tested as Table 1: 1,000 points, and the paper's inference.
 """
 
@@ -77,9 +77,7 @@ ADDITIONS = {
     "likelihood": Addition(LIKELIHOOD),
     "centred features, scaled points": Addition(FEATURES),
     "drawn shapes, new views": Addition(DRAWN),
-    "all of ours": Addition(
-        (*MUON, *LIKELIHOOD, *FEATURES, *DRAWN), parts=FEW_FIRST, batch=8, schedule=True
-    ),
+    "all of ours": Addition((*MUON, *LIKELIHOOD, *FEATURES, *DRAWN), parts=FEW_FIRST, batch=8, schedule=True),
 }
 
 
