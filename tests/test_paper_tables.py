@@ -10,6 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import additions
 import finetune
 import numpy as np
 import paper_tables
@@ -529,7 +530,7 @@ def test_the_picture_has_a_curve_a_row_and_the_papers_quartiles() -> None:
     assert translation.lines[1].get_xdata().tolist() == [0.04, 0.09, 0.20]
 
 
-@pytest.mark.parametrize("benchmark", [table1, table2, finetune], ids=lambda module: module.__name__)
+@pytest.mark.parametrize("benchmark", [table1, table2, additions, finetune], ids=lambda module: module.__name__)
 def test_the_pages_hold_the_tables_of_their_records(
     benchmark: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
