@@ -1,12 +1,12 @@
-"""What each of our additions to the paper's training brings: short trainings with one addition each.
+"""Short trainings with one of our additions to the paper's training each.
 
     python -m benchmarks additions --data DATA    # 2 CPU hours; a run that was stopped goes on
     python -m benchmarks additions --check        # whether docs/table1.md is what the record says
 
 DATA is a folder with the shapes of `modelnet10` (docs/data.md). The training is configs/paper/modelnet40.yaml from the
 start, with L_c alone, but for the data, `POINTS` points a shape, and a learning rate of 1e-4. Each row has one of
-`ADDITIONS`, the last all that we use. All have as many points in all, with fewer steps where a step has more. They
-are tested as Table 1: 1,000 points, and the paper's inference.
+`ADDITIONS`, the last all that we use. All have the same number of points in total: more points a step mean fewer steps.
+They are tested as Table 1: 1,000 points, and the paper's inference.
 """
 
 import argparse

@@ -32,7 +32,7 @@ import symmetric
 import torch
 from hard_scenes import SCENES
 from paper_tables import is_published, network
-from record import ROOT, TIME_LIMIT, Outcome, Problem, commit, measure_rows, parser, select, write
+from record import ROOT, TIME_LIMIT, Outcome, Problem, measure_rows, measured_today, parser, select, write
 from torch import nn
 from view_problems import REPORTED, photos
 
@@ -370,7 +370,7 @@ def main() -> None:
     seeds = {key(row): seed_of(row, chosen, results) for row in ROWS}
     failures = []
     for row, found, _ in measure_rows(rows(chosen, seeds)):
-        result = found | {"seed": seeds[row.name], "commit": commit()}
+        result = found | {"seed": seeds[row.name]} | measured_today()
         if chosen.check:
             old = results.get(row.name)
             bad = ["never measured"] if old is None else differences(result, old)

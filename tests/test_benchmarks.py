@@ -281,6 +281,7 @@ def test_tables_are_filled_and_checked(tmp_path: Path, monkeypatch: pytest.Monke
     written = json.loads(file.read_text())
     assert written["full"]["leds: two rings"]["seed"] == 506
     assert written["full"]["leds: two rings"]["commit"] == written["commit"]
+    assert {"cpu", "date"} <= written["full"]["leds: two rings"].keys()
     assert written["commit"]
     run("--check")
     run("--seed", "7")
