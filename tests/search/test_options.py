@@ -43,13 +43,14 @@ def which(solution: Solution) -> int:
 def test_scores_and_labels_decide_between_two_equal_objects(likely: int) -> None:
     first = np.repeat([True, False], 80)
     mine = first if likely == 0 else ~first
-    by_score = solve(TWO_IN_THE_IMAGE, OBJECT, scores2d=np.where(mine, 1.0, 0.05))
+    by_score = solve(TWO_IN_THE_IMAGE, OBJECT, scores2d=np.where(mine, 1.0, 0.05), time_limit=600)
     assert which(by_score) == likely
-    by_label = solve(TWO_IN_THE_IMAGE, OBJECT, labels2d=np.where(mine, 3, 5), labels3d=np.full(80, 3))
+    labels = {"labels2d": np.where(mine, 3, 5), "labels3d": np.full(80, 3)}
+    by_label = solve(TWO_IN_THE_IMAGE, OBJECT, **labels, time_limit=600)
     assert which(by_label) == likely
     assert mine[by_label.matches[:, 0]].all()
     image, labels3d = seen(OBJECT, *POSES[0]), np.where(mine, 2, 4)
-    solution = solve(image, TWO_IN_THE_SCENE, labels2d=np.full(80, 2), labels3d=labels3d)
+    solution = solve(image, TWO_IN_THE_SCENE, labels2d=np.full(80, 2), labels3d=labels3d, time_limit=600)
     assert mine[solution.matches[:, 1]].all()
 
 
