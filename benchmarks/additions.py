@@ -18,6 +18,8 @@ from typing import Any
 
 import torch
 from paper_tables import (
+    ESTIMATES,
+    NEVER,
     Training,
     digest,
     effect,
@@ -43,7 +45,7 @@ from bpnp.report.results import ProblemRow
 EPOCH = 50  # steps between checkpoints
 POINTS, BATCH = 256, 16
 FILE, PAGES = ROOT / "benchmarks" / "additions.json", (ROOT / "docs" / "table1.md",)
-ESTIMATES = {"pnp": "", "ransac": " R"}
+TESTED = ("pnp", "ransac")  # of the paper's inference
 
 FEATURES = tuple(word for word in SETTINGS if word.startswith(f"{SOLVER}.features"))
 LIKELIHOOD = ("--model.matching_loss=likelihood",)
@@ -90,7 +92,7 @@ def train(name: str, options: argparse.Namespace) -> Path:
     arguments = (
         "--config=paper/modelnet40", f"--data.root={options.data / 'modelnet10'}", f"--data.batch_size={chosen.batch}",
         "--model.learning_rate=1e-4", f"--seed_everything={options.seed}", f"--data.seed={options.seed}",
-        "--trainer.limit_val_batches=0", "--pose_loss.start_epoch=1000000", *chosen.arguments,
+        "--trainer.limit_val_batches=0", f"--pose_loss.start_epoch={NEVER}", *chosen.arguments,
     )  # fmt: skip
     if chosen.schedule:
         decay = (f"--model.decay_start={total - total // 2}", f"--model.decay_steps={total // 2}")
@@ -116,7 +118,7 @@ def measure(options: argparse.Namespace, record: dict[str, Any]) -> None:
         rows = solve_problems(file, build, data, options.problems, {"weights": digest(checkpoint)})
         steps = trained_steps(checkpoint)
         settings = {"steps": options.steps, "seed": options.seed}
-        found[name] = {key: [row for row in rows if row.estimate == key] for key in ESTIMATES}
+        found[name] = {key: [row for row in rows if row.estimate == key] for key in TESTED}
         for estimate, own in found[name].items():
             key = f"{options.seed}|{name}|{estimate}"
             row = {"steps": steps, "settings": settings, "measured": provenance(file)}
@@ -130,7 +132,7 @@ def measure(options: argparse.Namespace, record: dict[str, Any]) -> None:
 
 def markdown(record: Mapping[str, Any]) -> dict[str, str]:
     """By name, the Markdown of the rows, and of their differences from the row without an addition."""
-    order = [(name, estimate) for estimate in ESTIMATES for name in ADDITIONS]
+    order = [(name, estimate) for estimate in TESTED for name in ADDITIONS]
     seeds = sorted({int(key.split("|")[0]) for key in record["rows"]})
     result = {}
     tables = (("rows", head, row_text), ("effects", effect_head, effect_text))

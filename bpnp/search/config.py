@@ -706,7 +706,7 @@ class CollinearSettings:
     Attributes:
         fewest: Smallest number of matched points on the line. [points; not tuned]
         least: Smallest fraction of the matched points on the line. A wrong pose explains at least half of its matches
-            by independent coincidences, unless so many lie on a line. [fraction; derived]
+            by independent coincidences, unless this fraction lies on a line. [fraction; derived]
         thin: Largest distance from the line through two points of a point that lies on it, in distances between the
             two. [1; not tuned]
         pairs: Number of pairs of points whose lines are tried. All pairs miss a line of half of the points with a

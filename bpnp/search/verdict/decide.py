@@ -165,10 +165,11 @@ def missed(
     if alarms > 0:
         return 0.0
     decades = -alarms / max(distinct * match_count(candidates), 1.0) if independent else 0.0
-    value = log10_missed(count_starts(candidates, problem, settings), decades, local_searches, settings)
+    basin_count = count_starts(candidates, problem, settings)
+    value = log10_missed(basin_count, decades, local_searches, settings)
     if value <= settings.missed and decades:
         fewer = replace(settings, independent=independent_matches(candidates, problem, settings))
-        value = log10_missed(count_starts(candidates, problem, settings), decades, local_searches, fewer)
+        value = log10_missed(basin_count, decades, local_searches, fewer)
     if value > settings.missed or not is_symmetric(candidates, problem, settings):
         return value
     basin_count = count_starts(candidates, problem, settings, symmetric=True)
