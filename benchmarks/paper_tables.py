@@ -8,6 +8,7 @@ the commit, the date and the processor of its measurement. A later measurement o
 import argparse
 import hashlib
 import json
+import os
 import re
 import shlex
 import shutil
@@ -75,6 +76,7 @@ DEFAULTS = {
     "test_seed": 0,
     "epoch": 100,
     "learning_rate": 1e-4,
+    "pose_learning_rate": None,
     "problems": 500,
     "our_problems": 500,
     "baseline_problems": 60,
@@ -183,10 +185,15 @@ class Training:
             sys.executable, "-m", "bpnp", "fit", *self.arguments,
             f"--trainer.limit_train_batches={self.epoch}", f"--trainer.max_epochs={self.steps // self.epoch}",
             "--trainer.enable_progress_bar=false", "--trainer.log_every_n_steps=10",
-            f"--trainer.default_root_dir={self.folder}", *start,
+            f"--trainer.default_root_dir={self.folder}", f"--data.num_workers={workers()}", *start,
         ]  # fmt: skip
         print(f"{self.folder}: {done} of {self.steps} steps\n  {' '.join(command[1:])}", flush=True)
         subprocess.run(command, check=True)
+
+
+def workers() -> int:
+    """Return how many processes draw the problems of a training: none without a GPU, which would wait for them."""
+    return len(os.sched_getaffinity(0)) // 2 if torch.cuda.is_available() else 0
 
 
 def check_beginning(folder: Path, arguments: Iterable[str], starts: Iterable[Path], **settings: Any) -> None:
@@ -322,12 +329,13 @@ def provenance(file: Path) -> dict[str, str]:
     return {"date": f"{datetime.fromtimestamp(file.stat().st_mtime, UTC):%Y-%m-%d}"}
 
 
-def branches(
-    folder: Path, arguments: tuple[str, ...], *, steps: int, pose_steps: int, epoch: int
-) -> dict[str, Training]:
+def branches(folder: Path, arguments: tuple[str, ...], options: argparse.Namespace) -> dict[str, Training]:
     """A training with L_c, and two that go on from it at the switch for as many steps: with L_c, and with L_c + L_p."""
-    without, posed = ((*arguments, f"--pose_loss.start_epoch={at}") for at in (NEVER, steps // epoch))
-    first, end = Training(folder / "lc", without, steps, epoch, forks=True), steps + pose_steps
+    steps, epoch, rate = options.steps, options.epoch, options.pose_learning_rate
+    later = () if rate is None else (f"--model.learning_rate={rate}",)
+    never, switch = f"--pose_loss.start_epoch={NEVER}", f"--pose_loss.start_epoch={steps // epoch}"
+    first, end = Training(folder / "lc", (*arguments, never), steps, epoch, forks=True), steps + options.pose_steps
+    without, posed = (*arguments, never, *later), (*arguments, switch, *later)
     return {
         "first": first,
         "Lc": Training(folder / f"lc-from{steps}", without, end, epoch, first.switch),
@@ -338,6 +346,8 @@ def branches(
 def branch_weights(trained: Mapping[str, Training], options: argparse.Namespace) -> list[Weights]:
     """The checkpoints of the branches that exist."""
     shared = {name: getattr(options, name) for name in ("seed", "steps", "epoch", "learning_rate")}
+    if options.pose_learning_rate is not None:
+        shared["pose_learning_rate"] = options.pose_learning_rate
     found = {label: trained_steps(trained[label].checkpoint) - options.steps for label in BRANCHES}
     return [
         Weights("paper", label, trained[label].checkpoint, shared | {"pose_steps": steps})
@@ -519,19 +529,20 @@ def markdown(table: Table, record: Mapping[str, Any]) -> dict[str, str]:
         result[title] = effect_head(table.recall) + "".join(texts)
     result["commands"] = "```\n" + "".join(f"{line}\n" for line in commands(table, record)) + "```\n"
     names = ("training", "steps until the switch", "steps of Lc", "steps of Lc Lp", "learning rate")
-    trained: dict[tuple[str, int, float, str], dict[str, int]] = {}
+    trained: dict[tuple[str, int, str, str], dict[str, int]] = {}
     for key, found in record["rows"].items():
         _, seed, group, label, _ = split[key]
         if group == "paper":
             settings = found["settings"]
             drawn = " + ".join(f"{steps:,}" for steps in settings.get("drawn_steps", ()))
-            name = (seed, settings["steps"], settings["learning_rate"], drawn)
+            rates = [settings["learning_rate"], *filter(None, [settings.get("pose_learning_rate")])]
+            name = (seed, settings["steps"], ", then ".join(f"{rate:g}" for rate in rates), drawn)
             trained.setdefault(name, {})[label] = found["steps"]
     if trained:
         cells = [
             (f"seed {seed}{f', after {drawn} steps on drawn maps' if drawn else ''}", switch,
-             *(steps.get(label, "") for label in BRANCHES), f"{rate:g}")
-            for (seed, switch, rate, drawn), steps in trained.items()
+             *(steps.get(label, "") for label in BRANCHES), rates)
+            for (seed, switch, rates, drawn), steps in trained.items()
         ]  # fmt: skip
         lines_of_trainings = (names, ["---"] * len(names), *cells)
         result["training"] = "".join(f"| {' | '.join(map(str, cells))} |\n" for cells in lines_of_trainings)
@@ -589,6 +600,7 @@ def options(
     found.add_argument("--pose_steps", type=int, default=pose_steps, help="after it (default: %(default)s)")
     found.add_argument("--epoch", type=int, help="steps between checkpoints (default: %(default)s)")
     found.add_argument("--learning_rate", type=float, help="the paper has 1e-5 (default: %(default)s)")
+    found.add_argument("--pose_learning_rate", type=float, help="after the switch (default: that before it)")
     found.add_argument("--sets", nargs="*", default=list(sets), help="test sets (default: %(default)s)")
     found.add_argument("--only", nargs="*", default=[""], help="parts of names: only methods with one of them")
     found.add_argument("--problems", type=int, help="of a set, at most (default: %(default)s)")

@@ -49,8 +49,7 @@ def trainings(options: argparse.Namespace) -> dict[str, Training]:
         f"--model.learning_rate={options.learning_rate}", f"--seed_everything={options.seed}",
         f"--data.seed={options.seed}",
     )  # fmt: skip
-    folder, schedule = options.run / f"seed{options.seed}", {"steps": options.steps, "pose_steps": options.pose_steps}
-    return paper_tables.branches(folder, arguments, epoch=options.epoch, **schedule)
+    return paper_tables.branches(options.run / f"seed{options.seed}", arguments, options)
 
 
 def methods(options: argparse.Namespace, trained: dict[str, Training]) -> Iterator[Method]:

@@ -71,8 +71,7 @@ def trainings(options: argparse.Namespace) -> dict[str, Training]:
     photos = (f"--data.root={roots}", "--data.test_fraction=0", "--data.val_fraction=0.15")
     rate = f"--model.learning_rate={options.learning_rate}"
     arguments = (*shared, *photos, rate, f"--data.seed={options.seed}", *weights)
-    schedule = {"steps": options.steps, "pose_steps": options.pose_steps}
-    return stages | paper_tables.branches(folder, arguments, epoch=options.epoch, **schedule)
+    return stages | paper_tables.branches(folder, arguments, options)
 
 
 def methods(options: argparse.Namespace, trained: dict[str, Training]) -> Iterator[Method]:

@@ -84,7 +84,7 @@ def plant_steps(checkpoint: Path, steps: int) -> None:
 def test_both_branches_start_at_the_switch_and_have_equal_lengths(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    starts, joins = {}, {}
+    starts, joins, rates = {}, {}, {}
 
     def train(command: list[str], check: bool) -> None:
         options = dict(word.split("=", 1) for word in command if word.startswith("--") and "=" in word)
@@ -92,17 +92,21 @@ def test_both_branches_start_at_the_switch_and_have_equal_lengths(
         if not (folder / "checkpoints" / "last.ckpt").is_file() and "from" in folder.name:
             starts[folder.name] = paper_tables.trained_steps(start)
         joins[folder.name] = int(options["--pose_loss.start_epoch"])
+        rates[folder.name] = options.get("--model.learning_rate")
         steps = int(options["--trainer.limit_train_batches"]) * int(options["--trainer.max_epochs"])
         plant_steps(folder / "checkpoints" / "last.ckpt", steps)
 
     monkeypatch.setattr(paper_tables.subprocess, "run", train)
 
-    def run(**schedule: int) -> dict[str, int]:
-        trained = paper_tables.branches(tmp_path, (), epoch=10, **schedule)
+    def run(rate: float | None = None, **schedule: int) -> dict[str, int]:
+        given = Namespace(epoch=10, pose_learning_rate=rate, **schedule)
+        trained = paper_tables.branches(tmp_path, (), given)
         return {label: paper_tables.trained_steps(one.run()) for label, one in trained.items()}
 
     assert run(steps=20, pose_steps=10) == {"first": 20, "Lc": 30, "Lc Lp": 30}
-    assert run(steps=50, pose_steps=20) == {"first": 50, "Lc": 70, "Lc Lp": 70}
+    assert run(steps=50, pose_steps=20, rate=1e-5) == {"first": 50, "Lc": 70, "Lc Lp": 70}
+    rate = {name: value for name, value in rates.items() if value is not None}
+    assert rate == {"lc-from50": "1e-05", "lclp-from50": "1e-05"}
     assert starts == {"lc-from20": 20, "lclp-from20": 20, "lc-from50": 50, "lclp-from50": 50}
     assert (joins.pop("lclp-from20"), joins.pop("lclp-from50")) == (2, 5)
     assert min(joins.values()) > 1e5  # not the 120 of the recipe, which a longer training reaches
@@ -114,7 +118,7 @@ def test_both_branches_start_at_the_switch_and_have_equal_lengths(
         run(steps=30, pose_steps=10)
     monkeypatch.setattr(paper_tables.subprocess, "run", lambda *_, **__: None)
     with pytest.raises(SystemExit, match="lc-from50 has 70 steps instead of 90; was it begun with another --epoch"):
-        run(steps=50, pose_steps=40)
+        run(steps=50, pose_steps=40, rate=1e-5)
 
 
 def test_a_training_that_was_begun_otherwise_is_not_taken_for_another(

@@ -20,6 +20,7 @@ from bpnp.geometry import bearings, masked_median, retract
 from bpnp.poses import MIN_POINTS
 from bpnp.robust.matches import Matches, distinct_triples, residuals, truncated_scores
 from bpnp.robust.minimal_solvers import poses_of_triples, take
+from bpnp.runtime import in_threads
 from bpnp.search.config import RANSAC
 
 Array = NDArray[np.float64]
@@ -145,14 +146,20 @@ def _jacobian(
 def _each(
     estimate: SingleEstimator, matches: Matches, threshold: float, max_iterations: int, seed: int
 ) -> tuple[Float[Tensor, "b 3 4"], Int[Tensor, " b"]]:
-    """Estimate the samples one by one; those with fewer than 4 matches have no pose and no iterations."""
-    poses, iterations = matches.points3d.new_full((len(matches.real), 3, 4), torch.nan), matches.real.sum(-1)
-    for i, count in enumerate(iterations.tolist()):
-        iterations[i] = 0 if count < MIN_POINTS else max_iterations
-        x, p = (points[i][matches.real[i]].cpu().numpy() for points in matches[:2])
-        if count >= MIN_POINTS and (found := estimate(x, p, threshold, max_iterations, seed)) is not None:
-            poses[i], iterations[i] = torch.as_tensor(found[0], device="cpu"), found[1]
-    return poses, iterations
+    """Estimate each sample by itself, in threads; those with fewer than 4 matches have no pose and no iterations."""
+    points2d, points3d, real = (values.cpu() for values in matches)
+    enough = real.sum(-1) >= MIN_POINTS
+    poses, iterations = points3d.new_full((len(real), 3, 4), torch.nan), max_iterations * enough.long()
+
+    def work(first: int, last: int) -> None:
+        for i in range(first, last):
+            x, p = (points[i][real[i]].numpy() for points in (points2d, points3d))
+            if enough[i] and (found := estimate(x, p, threshold, max_iterations, seed)) is not None:
+                poses[i], iterations[i] = torch.as_tensor(found[0], device="cpu"), found[1]
+
+    in_threads(work, len(real))
+    device = matches.real.device
+    return poses.to(device), iterations.to(device)
 
 
 def _poselib(x: Array, p: Array, threshold: float, max_iterations: int, seed: int) -> tuple[Array, int]:

