@@ -54,6 +54,38 @@ class _Parser(OneLineParser, LightningArgumentParser):
     """Lightning's parser with errors of one line."""
 
 
+class LimitedTrainer(Trainer):
+    """Lightning's Trainer, whose limits are a number of batches (int) or a fraction of them (float), 1 for one batch.
+
+    `typing` may give Lightning's annotation Optional[Union[int, float]] as an equal Optional[Union[float, int]] that it
+    has in its cache. The parser then reads a limit of 1 as 1.0, all batches. An annotation with bars is not cached.
+
+    Args:
+        limit_train_batches: Number or fraction of the training batches of an epoch. Default: all.
+        limit_val_batches: Number or fraction of the validation batches. Default: all.
+        limit_test_batches: Number or fraction of the test batches. Default: all.
+        limit_predict_batches: Number or fraction of the batches of a prediction. Default: all.
+        **kwargs: Other options of the Trainer.
+    """
+
+    def __init__(
+        self,
+        *,
+        limit_train_batches: int | float | None = None,
+        limit_val_batches: int | float | None = None,
+        limit_test_batches: int | float | None = None,
+        limit_predict_batches: int | float | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(
+            limit_train_batches=limit_train_batches,
+            limit_val_batches=limit_val_batches,
+            limit_test_batches=limit_test_batches,
+            limit_predict_batches=limit_predict_batches,
+            **kwargs,
+        )
+
+
 class RunConfig(SaveConfigCallback):
     """Write the configuration into the numbered folder of the CSV log, and log it to the other loggers.
 
@@ -376,6 +408,7 @@ def run_training(arguments: Sequence[str]) -> None:
             subclass_mode_data=True,
             seed_everything_default=0,
             save_config_callback=RunConfig,
+            trainer_class=LimitedTrainer,
             trainer_defaults={"max_epochs": 200, "num_sanity_val_steps": 0},
             parser_kwargs={"prog": "bpnp", "allow_abbrev": False},
             args=list(arguments),

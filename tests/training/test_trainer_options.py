@@ -49,6 +49,16 @@ def state(folder: Path, name: str = "last") -> torch.Tensor:
     return torch.cat([content[key].flatten() for key, _ in Observer.task.named_parameters()])
 
 
+@pytest.mark.parametrize(("limit", "read"), [("1", "1"), ("1.0", "1.0"), ("0.5", "0.5")])
+def test_a_limit_of_one_is_one_batch(limit: str, read: str) -> None:
+    """In a process of its own: the cache of `typing` may have the annotation with int and float in the other order."""
+    names = [f"limit_{part}_batches" for part in ("train", "val", "test", "predict")]
+    words = ["fit", "--config=quickstart", *(f"--trainer.{name}={limit}" for name in names), "--print_config"]
+    ended = subprocess.run([sys.executable, "-m", "bpnp", *words], capture_output=True, text=True, check=True)
+    for name in names:
+        assert f"  {name}: {read}\n" in ended.stdout
+
+
 def test_fast_dev_run_takes_one_step_and_writes_nothing(tmp_path: Path) -> None:
     fit(tmp_path, "--trainer.fast_dev_run=true")
     assert len(Observer.problems) == 1
