@@ -28,7 +28,7 @@ from bpnp.search.config import DEFAULT
 from bpnp.search.inputs import problem_from
 from bpnp.search.plan import Plan
 from bpnp.search.pool import Pool
-from bpnp.search.propose.repetitions import competing_poses, registered
+from bpnp.search.propose.repetitions import competing_poses
 from bpnp.search.search_frame import Scene
 from bpnp.search.verdict.decide import count_starts, no_pose
 
@@ -75,8 +75,7 @@ def leads_back(kind: symmetric.Kind, problem: Problem) -> bool:
     turned = rotation @ turn.T
     shift = translation - turned @ (other.mean(0) - turn @ one.mean(0))
     (turned, shift), (_, translation) = points.from_user(turned, shift), points.from_user(rotation, translation)
-    motions = registered(points, turned, shift, symmetric.NOISE, DEFAULT.evidence)
-    rotations, translations, _ = competing_poses(points, turned, shift, symmetric.NOISE, motions, DEFAULT.evidence)
+    rotations, translations, *_ = competing_poses(points, turned, shift, symmetric.NOISE, DEFAULT.evidence)
     poses = np.concatenate([rotation[None], rotations]), np.vstack([translation, translations])
     return bool(points.same_pose(*poses, Tolerance(RIGHT_DEG))[1:].any())
 

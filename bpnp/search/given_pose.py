@@ -25,7 +25,7 @@ from bpnp.search.pose_model import PoseModel
 from bpnp.search.possible_matches import score_pose
 from bpnp.search.problem import Problem, in_bulk
 from bpnp.search.propose.density_map import perturb_each
-from bpnp.search.propose.repetitions import competing_poses, registered
+from bpnp.search.propose.repetitions import competing_poses
 from bpnp.search.propose.symmetries import mirror_pose
 from bpnp.search.refine.annealing import anneal_on_points, anneal_to_end, finish
 from bpnp.search.search_frame import Scene
@@ -71,8 +71,7 @@ def judge_given_pose(
     others = _proposed(problem, claim, scene)
     if few:  # as in an enumeration, whose candidates are refined
         scale = float(claim.scale[0])
-        motions = registered(one, rotation, translation, scale, settings)
-        copies = competing_poses(one, rotation, translation, scale, motions, settings)[:2]
+        copies = competing_poses(one, rotation, translation, scale, settings)[:2]
         if len(copies[0]):
             others = Hypotheses.concatenate([others, anneal_to_end(scene, *copies, scale)])
     others = _with_new_false_alarms(others, one)

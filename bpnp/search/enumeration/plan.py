@@ -20,7 +20,7 @@ from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.loop import Step
 from bpnp.search.possible_matches import score_pose
 from bpnp.search.problem import Problem
-from bpnp.search.propose.repetitions import competing_poses, registered
+from bpnp.search.propose.repetitions import competing_poses
 from bpnp.search.starts import GravityPrior
 from bpnp.search.verdict.decide import REFINED, SearchResult, add_false_alarms, is_certain, judge, rank_poses
 
@@ -78,8 +78,7 @@ class EnumeratedPoses:
         self._leaders.append(leader)
         pose, verdict_settings = (leader.rotation[0], leader.translation[0]), self.settings.evidence
         scale = max(float(leader.scale[0]), self.problem.floor or ENUMERATION.smallest_scale)
-        motions = registered(self.problem, *pose, scale, verdict_settings)
-        rotations, translations, _ = competing_poses(self.problem, *pose, scale, motions, verdict_settings)
+        rotations, translations, *_ = competing_poses(self.problem, *pose, scale, verdict_settings)
         rest = self._poses_of_rest(leader)
         rotations = np.concatenate([rotations, rest.rotation])
         translations = np.concatenate([translations, rest.translation])

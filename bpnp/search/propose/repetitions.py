@@ -51,8 +51,16 @@ def registered(problem: Problem, rotation: Array, translation: Array, scale: flo
         Motions with the fraction of the matched points that each maps, the largest first; none if there are too few
         matched points.
     """
+    return _motions_of(
+        problem, rotation, translation, scale, matched_points(problem, rotation, translation, scale), settings
+    )
+
+
+def _motions_of(
+    problem: Problem, rotation: Array, translation: Array, scale: float, matched: NDArray[np.int64], settings: Evidence
+) -> Motions:
+    """Return the motions that map the matched points (k,) of a pose onto other scene points; see `registered`."""
     limits, points = settings.repetitions, problem.points3d
-    matched = matched_points(problem, rotation, translation, scale)
     if len(matched) < limits.fewest:
         return Motions.none()
     noise = scale * float(np.median(np.linalg.norm(points[matched] @ rotation.T + translation, axis=-1)))
@@ -115,26 +123,27 @@ def _of_scene(
 
 
 def competing_poses(
-    problem: Problem, rotation: Array, translation: Array, scale: float, motions: Motions, settings: Evidence
-) -> tuple[Array, Array, Array]:
-    """Return the competing poses of a pose due to motions, to a line of matched points, and to the mirror image of a
-    flat scene.
+    problem: Problem, rotation: Array, translation: Array, scale: float, settings: Evidence, *, least: float = 0.0
+) -> tuple[Array, Array, Array, Motions]:
+    """Return the competing poses of a pose: by motions of its matched points, about a line of these, and by the mirror
+    image of a flat scene.
 
     Args:
         problem: Points of the problem.
         rotation: (3, 3) of the pose.
         translation: (3,) of the pose.
         scale: Standard deviation of its residuals, radians.
-        motions: Motions that map the scene onto itself.
         settings: Constants of the verdict.
+        least: Smallest fraction of the matched points that a motion maps, default 0.
 
     Returns:
-        Rotations (c, 3, 3) and translations (c, 3) of poses that differ from the given one by over `settings.same`, and
-        the scales (c,) of their motions.
+        Rotations (c, 3, 3) and translations (c, 3) of poses that differ from the given one by over `settings.same`, the
+        scales (c,) of their motions, and all motions.
     """
+    matched = matched_points(problem, rotation, translation, scale)
+    motions = _motions_of(problem, rotation, translation, scale, matched, settings).mapping(least)
     poses = motions.competitors(rotation, translation)
     every = [rotation[None], poses[0]], [translation[None], poses[1]], [np.ones(1), motions.scale]
-    matched = matched_points(problem, rotation, translation, scale)
     if (line := find_line(problem.points3d[matched])) is not None:
         turned = rotations_about(problem, rotation, translation, line, scale)
         for parts, some in zip(every, (*turned, np.ones(len(turned[0]))), strict=True):
@@ -144,7 +153,7 @@ def competing_poses(
             parts.append(one[None])
     rotations, translations, scales = (np.concatenate(parts) for parts in every)
     other = np.flatnonzero(~problem.same_pose(rotations, translations, settings.same))
-    return rotations[other], translations[other], scales[other]
+    return rotations[other], translations[other], scales[other], motions
 
 
 def repeated_poses(
@@ -174,8 +183,9 @@ def repeated_poses(
         >>> sorted(repeated.poses.translation[:2, 0].round(6).tolist())
         [-4.0, -2.0]
     """
-    motions = registered(problem, rotation, translation, scale, settings).mapping(least)
-    rotations, translations, sizes = competing_poses(problem, rotation, translation, scale, motions, settings)
+    rotations, translations, sizes, motions = competing_poses(
+        problem, rotation, translation, scale, settings, least=least
+    )
     scales = np.full(len(rotations), scale)
     alarms = alarms_of(problem, rotations, translations, scales).own
     poses = Hypotheses.from_poses(
