@@ -17,7 +17,7 @@ from typing import Any
 
 from jsonargparse import Namespace
 from lightning import Callback, LightningDataModule, LightningModule, Trainer
-from lightning.pytorch.callbacks import ModelCheckpoint, ModelSummary, ProgressBar, RichProgressBar
+from lightning.pytorch.callbacks import ModelSummary, ProgressBar, RichProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 from lightning.pytorch.loggers import CSVLogger, Logger, WandbLogger
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
@@ -34,6 +34,7 @@ from bpnp.training.callbacks import ParameterCount, PoseLossWarmup, ProgressLine
 from bpnp.training.checkpoints import (
     BestCheckpoint,
     InterruptedCheckpoint,
+    LastCheckpoint,
     SafeCheckpointIO,
     newest_checkpoint,
     raise_on_interrupt,
@@ -45,8 +46,8 @@ from bpnp.training.task import BlindPnPTask
 DEFAULT_ROOT = "runs/default"
 
 POSE_LOSS: dict[str, tuple[type, str]] = {
-    "start_epoch": (int, "first epoch with the pose loss, counted from 0; none for no switch"),
-    "weight": (float, "gamma_p of the paper after the switch; none for that of the model, or 1"),
+    "start_epoch": (int, "first epoch with the pose loss, counted from 0; null for no switch"),
+    "weight": (float, "gamma_p of the paper after the switch; null for that of the model, or 1"),
 }
 
 
@@ -143,7 +144,7 @@ class BpnpCLI(LightningCLI):
         """Add the options of the callbacks and of the pose loss, and this project's defaults."""
         self.options = parser
         parser.add_lightning_class_args(BestCheckpoint, "best_checkpoint")
-        parser.add_lightning_class_args(ModelCheckpoint, "last_checkpoint")
+        parser.add_lightning_class_args(LastCheckpoint, "last_checkpoint")
         parser.add_lightning_class_args(ResultsWriter, "results")
         parser.add_lightning_class_args(PredictionWriter, "predictions")
         for name, (kind, meaning) in POSE_LOSS.items():
@@ -196,8 +197,14 @@ class BpnpCLI(LightningCLI):
         """Merge `--pose_loss` into the `PoseLossWarmup` of the configuration, or add one.
 
         Raises:
-            ValueError: A weight is set without an epoch.
+            ValueError: A weight is set without an epoch, or a schedule without an optimizer.
         """
+        given = self.config[self.command]
+        if given.get("lr_scheduler") is not None and given.get("optimizer") is None:
+            raise ValueError(
+                "--lr_scheduler needs --optimizer, such as --optimizer Adam --optimizer.lr 1e-4. Without both, "
+                "--model.warmup_steps and --model.decay_start are a schedule."
+            )
         options = {
             name: value for name, value in vars(self.config[self.command]["pose_loss"]).items() if value is not None
         }
@@ -228,7 +235,7 @@ class BpnpCLI(LightningCLI):
             rates = ", ".join(f"{group['lr']:g}" for group in optimizer.param_groups)
             rank_zero_info(
                 f"{type(optimizer).__name__} with learning rate {rates}; model.learning_rate and model.weight_decay "
-                "are not used"
+                f"are not used{', and no schedule of the model' if lr_scheduler is not None else ''}"
             )
             if lr_scheduler is None:
                 return lightning_module.with_schedule(optimizer)
@@ -248,6 +255,9 @@ class BpnpCLI(LightningCLI):
             callbacks.append(ParameterCount())
             kwargs["enable_model_summary"] = False
         self.trainer_defaults["callbacks"] = callbacks
+        if options["enable_checkpointing"] is False:
+            own_keys = ("best_checkpoint", "last_checkpoint")
+            self.options.callback_keys = [key for key in self.options.callback_keys if key not in own_keys]
         # Not a default of the trainer: an object among the defaults could not be written to config.yaml.
         kwargs["plugins"] = [*_as_list(options["plugins"]), SafeCheckpointIO()]
         chosen = options["logger"]
@@ -342,8 +352,8 @@ def _find_class(class_path: str) -> type[Any]:
 def _log_in(logger: Any, root: str) -> None:
     """Set the folder of a configured logger to that of the run where it is still the working directory."""
     if isinstance(logger, Namespace) and "save_dir" in logger.get("init_args", {}):
-        option = signature(_find_class(logger.class_path)).parameters["save_dir"]
-        if logger.init_args.save_dir in (None, option.default):
+        option = signature(_find_class(logger.class_path)).parameters.get("save_dir")
+        if logger.init_args.save_dir in (None, "." if option is None else option.default):
             logger.init_args.save_dir = root
 
 
@@ -397,6 +407,8 @@ def run_training(arguments: Sequence[str]) -> None:
     """
     for name in dir(bpnp.datamodules):  # import them all, so that --help lists them and short names are accepted
         getattr(bpnp.datamodules, name)
+    # The parser reads null; in Python, and in the documentation of the options, it is None.
+    arguments = [re.sub("(^|=)None$", r"\1null", word) for word in arguments]
     own_task = _names_a_task(arguments)
     with ExitStack() as held:
         BpnpCLI(

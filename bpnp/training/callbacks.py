@@ -48,7 +48,12 @@ class PoseLossWarmup(Callback):
             check_within(0, math.inf, weight=weight)
         self.start_epoch, self.weight = start_epoch, weight
         self.switched_at: int | None = None
-        self.configured = 0.0  # `pose_weight` of the task
+        self.configured: float | None = None  # `pose_weight` of the task
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Forget the switch and the weight of an earlier training."""
+        if stage == "fit":
+            self.switched_at = self.configured = None
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Read the weight of the task.
@@ -90,6 +95,11 @@ class PoseLossWarmup(Callback):
                 f"The training has ended before epoch {self.start_epoch}, at which the pose loss joins. Use a smaller "
                 "start_epoch, or a later end (max_steps, max_time, early stopping)."
             )
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Restore the weight of the task after a training that was stopped."""
+        if trainer.state.fn == "fit" and self.configured is not None:
+            pl_module.pose_weight = self.configured  # type: ignore[assignment]
 
     def _ends_before(self, trainer: Trainer) -> bool:
         """Return True if the last epoch of the trainer is before the switch."""
@@ -184,6 +194,10 @@ class TrainingMonitor(Callback):
         check_within(1, math.inf, problems=problems)
         self.problems = problems
         self.watched: Batch | None = None
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Forget the problems of an earlier run, which may have had other data."""
+        self.watched = None
 
     def on_validation_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
@@ -325,27 +339,38 @@ class ResultsWriter(Callback):
     def _check_replaced(self, trainer: Trainer) -> None:
         """Raise ValueError if a test without a checkpoint would replace the results of a checkpoint.
 
-        If the results of another checkpoint will be replaced, print its path.
+        If the results of another network or of other data will be replaced, print which.
         """
         summary = self._folder(trainer) / SUMMARY
         if self.settings is not None or trainer.fast_dev_run or not summary.is_file():  # type: ignore[attr-defined]
             return
-        checkpoint = json.loads(summary.read_bytes()).get("settings", {}).get("checkpoint")
+        before = json.loads(summary.read_bytes()).get("settings", {})
+        checkpoint = before.get("checkpoint")
         if checkpoint is not None and trainer.ckpt_path is None:
             raise ValueError(
                 f"{summary.parent} has the results of {checkpoint}, which a test without --ckpt_path would replace; "
                 "use --ckpt_path last, or --results.folder for another folder"
             )
-        if checkpoint != (None if trainer.ckpt_path is None else str(trainer.ckpt_path)):
-            rank_zero_info(f"the results of {checkpoint} in {summary.parent} are replaced")
+        now = json.loads(json.dumps(_settings(trainer), default=str))
+        changed = [name for name, value in now.items() if name in before and value != before[name]]
+        if changed:
+            what = checkpoint or before.get("weights") or "a test without a checkpoint"
+            others = " and ".join(name for name in ("data", "solver") if changed in ([name], ["data", "solver"]))
+            rank_zero_info(
+                f"the results of {what}{f' with other options of the {others}' if others else ''} in {summary.parent} "
+                "are replaced"
+            )
 
     def _folder(self, trainer: Trainer) -> Path:
         return Path(self.folder) if self.folder else Path(trainer.default_root_dir) / "test"
 
 
 def _settings(trainer: Trainer) -> dict[str, Any]:
-    """Return the checkpoint and, for a test of the command line, its data and solver."""
+    """Return the checkpoint and, for a test of the command line, the initial weights, the data and the solver."""
     saved = next((each.config for each in trainer.callbacks if isinstance(each, SaveConfigCallback)), None)  # type: ignore[attr-defined]
     config = {} if saved is None else saved.as_dict()
+    model = config.get("model", {})
+    options = model.get("init_args", model)
     checkpoint = str(trainer.ckpt_path) if trainer.ckpt_path else None
-    return {"checkpoint": checkpoint, "data": config.get("data"), "solver": config.get("model", {}).get("solver")}
+    found = {"checkpoint": checkpoint, "data": config.get("data"), "solver": options.get("solver")}
+    return found if options.get("weights") is None else found | {"weights": options["weights"]}

@@ -86,6 +86,20 @@ class InterruptedCheckpoint(Callback):
             self.path.unlink(missing_ok=True)
 
 
+class LastCheckpoint(ModelCheckpoint):
+    """Keep the newest checkpoint, also that of the last step, which Lightning leaves out between two validations.
+
+    Arguments are those of Lightning's `ModelCheckpoint`.
+    """
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Save the steps since the last checkpoint."""
+        super().on_train_end(trainer, pl_module)
+        if self._last_global_step_saved != trainer.global_step and not trainer.fast_dev_run:  # type: ignore[attr-defined]
+            counts = {"epoch": torch.tensor(trainer.current_epoch), "step": torch.tensor(trainer.global_step)}
+            trainer.save_checkpoint(self.format_checkpoint_name(trainer.callback_metrics | counts), weights_only=False)
+
+
 class BestCheckpoint(ModelCheckpoint):
     """Keep the checkpoint with the best `monitor` among epochs of one objective.
 

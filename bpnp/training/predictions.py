@@ -133,7 +133,11 @@ class PredictionWriter(BasePredictionWriter):
             # Count problems of several processes once; the sort is stable and keeps the order of the estimates.
             rows = {(row.index, row.estimate): row for part in gathered for row in part}
             ordered = sorted(rows.values(), key=lambda row: row.index)
-            path = write_text(self.path(trainer), as_csv(ordered) if self.format == "csv" else as_json(ordered))
+            path = write_text(
+                self.path(trainer),
+                as_csv(ordered) if self.format == "csv" else as_json(ordered),
+                errors="surrogateescape",
+            )
             rank_zero_info(f"poses of {len({row.index for row in ordered})} problems in {path}")
 
 

@@ -222,6 +222,12 @@ class BlindPnPTask(LightningModule):
         """
         return self.solver(batch)
 
+    def setup(self, stage: str) -> None:
+        """Forget the optimisers and the skipped steps of an earlier training; a resumed one restores its own."""
+        if stage == "fit":
+            self.skipped_steps = self.consecutive_skipped_steps = 0
+            self.optimizer_names = None
+
     def on_train_batch_start(self, batch: object, batch_idx: int) -> None:
         """Check the batch."""
         check_batch(batch)
@@ -258,8 +264,10 @@ class BlindPnPTask(LightningModule):
         return in_scene_frame(self.solver(batch), batch)
 
     def on_validation_epoch_start(self) -> None:
-        """Forget the numbers of the problems of the last epoch."""
+        """Forget the last epoch, which may have been stopped: the numbers of its problems, and their errors."""
         self.numbers.clear()
+        for metric in self.metrics.values():
+            metric.reset()  # type: ignore[operator]
 
     def on_validation_batch_start(self, batch: Any, batch_idx: int, dataloader_idx: int = 0) -> None:
         """Number the problems: a data module that collates with `Batch.from_arrays` counts each batch from 0."""

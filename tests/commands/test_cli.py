@@ -1,5 +1,6 @@
 import contextlib
 import inspect
+import json
 import os
 import re
 import socket
@@ -273,3 +274,22 @@ def test_a_warning_is_one_line() -> None:
     code = "import warnings; from bpnp import cli; cli._run = lambda _: warnings.warn('two\\nlines'); cli.main()"
     shown = subprocess.run([sys.executable, "-c", code, "solve"], capture_output=True, text=True, check=True)
     assert (shown.stdout, shown.stderr) == ("", "bpnp: warning: two lines\n")
+
+
+def test_a_test_of_other_weights_or_data_says_what_it_replaces(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    common = [*MESHES, f"--data.cache_dir={tmp_path}", f"--trainer.default_root_dir={tmp_path}/run"]
+    common += ["--trainer.enable_progress_bar=false", "--trainer.limit_test_batches=1"]
+    weights = "--model.weights=procedural-so3"
+    main(["test", *common, weights])
+    main(["test", *common, weights])
+    assert "are replaced" not in caplog.text
+    main(["test", *common, weights, "--data.seed=3"])
+    assert "the results of procedural-so3 with other options of the data in" in caplog.text
+    main(["test", *common, "--model.weights=paper-lc"])
+    assert caplog.text.count("are replaced") == 2
+    assert f"the results of procedural-so3 in {tmp_path}/run/test are replaced" in caplog.messages
+    settings = json.loads((tmp_path / "run" / "test" / "summary.json").read_bytes())["settings"]
+    assert (settings["checkpoint"], settings["weights"]) == (None, "paper-lc")

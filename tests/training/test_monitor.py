@@ -1,4 +1,5 @@
 import csv
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -84,3 +85,13 @@ def test_a_training_logs_the_monitored_values(tmp_path: Path) -> None:
     assert watched_values(Prediction(), planted(5)) == {}
     with pytest.raises(ValueError, match="`problems` is .*; it must be"):
         TrainingMonitor(problems=0)
+
+
+def test_another_training_has_its_own_problems(tmp_path: Path) -> None:
+    monitor = TrainingMonitor(problems=2)
+    fit(tmp_path, monitor, None, epochs=1)
+    monitor.watched = None if monitor.watched is None else replace(monitor.watched, match3d=monitor.watched.match3d * 0)
+    loader = DataLoader([planted(6)], batch_size=None)  # type: ignore[arg-type]
+    trainer = quiet_trainer(tmp_path, max_epochs=1, callbacks=[monitor])
+    trainer.fit(PlantedModule(), loader, loader)
+    assert float(trainer.callback_metrics["val/true_match_mass"]) == pytest.approx(0.25)

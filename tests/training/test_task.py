@@ -355,3 +355,65 @@ def test_overfit_batches_repeats_the_same_problems(tmp_path: Path) -> None:
     assert len(seen) == 6
     assert len(set(seen)) == 2
     assert seen[:2] * 3 == seen
+
+
+def test_a_switch_is_that_of_one_training(tmp_path: Path) -> None:
+    warmup, first, second = (
+        PoseLossWarmup(start_epoch=1),
+        BlindPnPTask(CountingSolver()),
+        BlindPnPTask(CountingSolver()),
+    )
+    fit(tmp_path, first, max_epochs=2, limit_train_batches=1, callbacks=[warmup])
+    fit(tmp_path, second, max_epochs=2, limit_train_batches=1, callbacks=[warmup])
+    assert first.solver.wanted == second.solver.wanted == [False, True]
+
+
+def test_a_stopped_training_leaves_the_weight_of_the_pose_loss_as_it_was(tmp_path: Path) -> None:
+    class Stop(Callback):
+        def on_train_batch_end(self, *_: object) -> None:
+            raise RuntimeError("stopped")
+
+    task = BlindPnPTask(CountingSolver(), pose_weight=0.5)
+    with pytest.raises(RuntimeError, match="stopped"):
+        fit(tmp_path, task, max_epochs=2, limit_train_batches=1, callbacks=[PoseLossWarmup(start_epoch=1), Stop()])
+    assert task.pose_weight == 0.5
+
+
+class Turned(nn.Module):
+    """A solver whose poses are off by an angle."""
+
+    estimates = ("pnp",)
+    degrees = 100.0
+
+    def forward(self, batch: Batch) -> Prediction:
+        turn = torch.as_tensor(Rotation.from_euler("x", self.degrees, degrees=True).as_matrix())
+        return Prediction(poses={"pnp": posed((turn @ batch.rotation.double()).float(), batch.translation.float())})
+
+
+def test_an_interrupted_validation_does_not_count_in_the_next(tmp_path: Path) -> None:
+    class Stop(Callback):
+        def on_validation_batch_end(self, *_: object) -> None:
+            raise RuntimeError("stopped")
+
+    task, data = BlindPnPTask(Turned()), small_meshes(tmp_path)
+    with pytest.raises(RuntimeError, match="stopped"):
+        quiet_trainer(tmp_path, max_epochs=1, callbacks=[Stop()]).validate(task, datamodule=data, verbose=False)
+    task.solver.degrees = 10.0
+    run = quiet_trainer(tmp_path, max_epochs=1)
+    run.validate(task, datamodule=data, verbose=False)
+    assert float(run.callback_metrics["val/rotation_q3_deg"]) == pytest.approx(10, abs=0.01)
+
+
+def test_another_optimizer_may_follow_where_no_checkpoint_is_resumed(tmp_path: Path) -> None:
+    class WithSGD(BlindPnPTask):
+        def configure_optimizers(self) -> torch.optim.Optimizer:  # type: ignore[override]
+            return torch.optim.SGD(self.parameters(), lr=1e-4)
+
+    adam = fit(tmp_path, BlindPnPTask(small_net()), limit_train_batches=1)
+    adam.save_checkpoint(file := str(tmp_path / "adam.ckpt"))
+    task = WithSGD.load_from_checkpoint(file)
+    task.skipped_steps = 3
+    fit(tmp_path, task, limit_train_batches=1)
+    assert task.skipped_steps == 0
+    with pytest.raises(ValueError, match="trained with Adam, and this run uses SGD"):
+        fit(tmp_path, WithSGD(small_net()), file, max_epochs=2, limit_train_batches=1)

@@ -14,6 +14,7 @@ import torch
 import wandb
 from jsonargparse import Namespace
 from lightning import Callback, Trainer
+from lightning.pytorch.loggers import CSVLogger
 from small_data import SMALL_FEATURES
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch import Tensor
@@ -372,3 +373,52 @@ def test_a_network_two_classes_below_ours_comes_back_from_its_checkpoint(tmp_pat
     for found in (net, task.solver, Observer.task.solver.eval()):
         expected = 2 * BPnPNet.cost(net, batch)
         torch.testing.assert_close(found.cost(batch), expected)
+
+
+@pytest.mark.parametrize("rarely", ["check_val_every_n_epoch=5", "val_check_interval=0.4"])
+def test_the_last_steps_are_saved_and_continued(rarely: str, tmp_path: Path) -> None:
+    """Six steps an epoch; no validation follows the last ones."""
+    options = [f"--trainer.{rarely}", "--model.learning_rate=1e-2"]
+    fit(tmp_path, *options, "--trainer.max_epochs=1")
+    assert saved(tmp_path)["global_step"] == 6
+    fit(tmp_path, *options, "--trainer.max_epochs=2", f"--ckpt_path={tmp_path}/run/checkpoints/last.ckpt")
+    assert saved(tmp_path)["global_step"] == 12
+    resumed = state(tmp_path)
+    fit(tmp_path / "straight", *options, "--trainer.max_epochs=2")
+    torch.testing.assert_close(state(tmp_path / "straight"), resumed, rtol=0, atol=0)
+
+
+def test_no_checkpoints_are_written_without_checkpointing(tmp_path: Path) -> None:
+    fit(tmp_path, *TWO_STEPS, "--trainer.enable_checkpointing=false")
+    assert len(Observer.problems) == 2
+    assert not list(tmp_path.rglob("*.ckpt"))
+
+
+def test_a_schedule_without_an_optimizer_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    schedule = ["--lr_scheduler=torch.optim.lr_scheduler.StepLR", "--lr_scheduler.step_size=10"]
+    with pytest.raises(SystemExit):
+        fit(tmp_path, *TWO_STEPS, *schedule)
+    assert "--lr_scheduler needs --optimizer, such as --optimizer Adam" in capsys.readouterr().err
+
+
+class TaggedLogger(CSVLogger):
+    """A logger whose folder is among its other options."""
+
+    def __init__(self, tag: str = "", **options: Any) -> None:
+        super().__init__(**options)
+
+
+def test_a_logger_has_its_folder_among_other_options(tmp_path: Path) -> None:
+    options = [f"--trainer.logger={TaggedLogger.__module__}.{TaggedLogger.__qualname__}"]
+    options += ["--trainer.logger.name=tagged", f"--trainer.logger.save_dir={tmp_path}/own"]
+    fit(tmp_path, *TWO_STEPS, *options)
+    assert (tmp_path / "own" / "tagged" / "version_0").is_dir()
+
+
+@pytest.mark.parametrize("words", [["--data.cache_dir=None"], ["--data.cache_dir", "None"]])
+def test_none_is_null(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    """Not a folder of this name."""
+    with pytest.raises(SystemExit) as ended:
+        main(["fit", "--config=quickstart", *words, "--print_config"])
+    assert ended.value.code == 0
+    assert "cache_dir: null" in capsys.readouterr().out
