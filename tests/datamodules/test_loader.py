@@ -131,6 +131,8 @@ def test_overfitting_in_two_processes_uses_all_batches_of_each(monkeypatch: pyte
 def test_errors_name_what_is_wrong() -> None:
     with pytest.raises(ValueError, match=r"`batch_size` 15 .* cannot be divided among 2 processes; try 16"):
         sampler([4] * 20, batch_size=15, shuffle=True, replicas=2)
+    with pytest.raises(ValueError, match=r"`eval_batch_size` 5 .* cannot be divided among 2 processes; try 4"):
+        sampler([4] * 20, batch_size=5, shuffle=False, replicas=2)
     with pytest.raises(ValueError, match="no problems"):
         sampler([], batch_size=4, shuffle=False)
     with pytest.raises(ValueError, match=r"max_cells.*shuffle=True"):
