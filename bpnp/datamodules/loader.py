@@ -97,8 +97,9 @@ class BucketSampler(DistributedSampler[list[Key]]):
         if len(dataset) == 0:
             raise ValueError("the data set has no problems")
         if batch_size < 1 or batch_size % num_replicas:
+            name = "batch_size" if shuffle else "eval_batch_size"
             raise ValueError(
-                f"`{'batch_size' if shuffle else 'eval_batch_size'}` {batch_size} (problems in a step over all processes) cannot be divided among "
+                f"`{name}` {batch_size} (problems in a step over all processes) cannot be divided among "
                 f"{num_replicas} processes; try {max(1, round(batch_size / num_replicas)) * num_replicas}"
             )
         if shuffle and max_cells is not None:
