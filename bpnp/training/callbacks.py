@@ -79,6 +79,10 @@ class PoseLossWarmup(Callback):
                 "epochs without it."
             )
 
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Set the weight of the first epoch: Lightning does not start an epoch again that it resumes within."""
+        self.on_train_epoch_start(trainer, pl_module)
+
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Set the weight of this epoch."""
         weight = self.weight if self.weight is not None else self.configured or 1.0

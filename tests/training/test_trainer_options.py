@@ -422,3 +422,28 @@ def test_none_is_null(words: list[str], capsys: pytest.CaptureFixture[str]) -> N
         main(["fit", "--config=quickstart", *words, "--print_config"])
     assert ended.value.code == 0
     assert "cache_dir: null" in capsys.readouterr().out
+
+
+class StopAtStep(Callback):
+    """Interruption within an epoch."""
+
+    def __init__(self, step: int) -> None:
+        self.step = step
+
+    def on_train_batch_end(self, trainer: Trainer, *_: Any) -> None:
+        if trainer.global_step == self.step:
+            raise RuntimeError("stopped")
+
+
+def test_an_epoch_with_the_pose_loss_is_resumed_with_it(tmp_path: Path) -> None:
+    """The second of six-step epochs has the pose loss, and is stopped after two steps."""
+    options = ["--trainer.max_epochs=2", "--pose_loss.start_epoch=1", "--model.learning_rate=1e-3"]
+    stop = f"{StopAtStep.__module__}.{StopAtStep.__qualname__}"
+    with pytest.raises(RuntimeError, match="stopped"):
+        fit(tmp_path, *options, f"--trainer.callbacks+={stop}", "--trainer.callbacks.step=8")
+    fit(tmp_path, *options, "--ckpt_path=last")
+    assert Observer.pose_weights == [1.0] * 4
+    resumed = state(tmp_path)
+    fit(tmp_path / "straight", *options)
+    assert Observer.pose_weights == [0.0] * 6 + [1.0] * 6
+    torch.testing.assert_close(state(tmp_path / "straight"), resumed, rtol=0, atol=0)
