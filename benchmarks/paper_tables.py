@@ -535,7 +535,7 @@ def markdown(table: Table, record: Mapping[str, Any]) -> dict[str, str]:
         if group == "paper":
             settings = found["settings"]
             drawn = " + ".join(f"{steps:,}" for steps in settings.get("drawn_steps", ()))
-            rates = [settings["learning_rate"], *filter(None, [settings.get("pose_learning_rate")])]
+            rates = [settings[name] for name in ("learning_rate", "pose_learning_rate") if name in settings]
             name = (seed, settings["steps"], ", then ".join(f"{rate:g}" for rate in rates), drawn)
             trained.setdefault(name, {})[label] = found["steps"]
     if trained:

@@ -50,6 +50,8 @@ POSE_LOSS: dict[str, tuple[type, str]] = {
     "weight": (float, "gamma_p of the paper after the switch; null for that of the model, or 1"),
 }
 
+CHECKPOINTS = {"best_checkpoint": BestCheckpoint, "last_checkpoint": LastCheckpoint}
+
 
 class _Parser(OneLineParser, LightningArgumentParser):
     """Lightning's parser with errors of one line."""
@@ -143,8 +145,8 @@ class BpnpCLI(LightningCLI):
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
         """Add the options of the callbacks and of the pose loss, and this project's defaults."""
         self.options = parser
-        parser.add_lightning_class_args(BestCheckpoint, "best_checkpoint")
-        parser.add_lightning_class_args(LastCheckpoint, "last_checkpoint")
+        for name, callback in CHECKPOINTS.items():
+            parser.add_lightning_class_args(callback, name)
         parser.add_lightning_class_args(ResultsWriter, "results")
         parser.add_lightning_class_args(PredictionWriter, "predictions")
         for name, (kind, meaning) in POSE_LOSS.items():
@@ -159,7 +161,7 @@ class BpnpCLI(LightningCLI):
                 "last_checkpoint.enable_version_counter": False,
             }
         )
-        for name in ("best_checkpoint", "last_checkpoint"):
+        for name in CHECKPOINTS:
             parser.link_arguments("trainer.default_root_dir", f"{name}.dirpath", compute_fn=_checkpoint_folder)
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
@@ -205,12 +207,10 @@ class BpnpCLI(LightningCLI):
                 "--lr_scheduler needs --optimizer, such as --optimizer Adam --optimizer.lr 1e-4. Without both, "
                 "--model.warmup_steps and --model.decay_start are a schedule."
             )
-        options = {
-            name: value for name, value in vars(self.config[self.command]["pose_loss"]).items() if value is not None
-        }
+        options = {name: value for name, value in vars(given["pose_loss"]).items() if value is not None}
         if not options:
             return
-        trainer = self.config[self.command]["trainer"]
+        trainer = given["trainer"]
         callbacks = trainer.callbacks or []
         trainer.callbacks = list(callbacks) if isinstance(callbacks, list) else [callbacks]
         for callback in trainer.callbacks:
@@ -256,8 +256,7 @@ class BpnpCLI(LightningCLI):
             kwargs["enable_model_summary"] = False
         self.trainer_defaults["callbacks"] = callbacks
         if options["enable_checkpointing"] is False:
-            own_keys = ("best_checkpoint", "last_checkpoint")
-            self.options.callback_keys = [key for key in self.options.callback_keys if key not in own_keys]
+            self.options.callback_keys = [key for key in self.options.callback_keys if key not in CHECKPOINTS]
         # Not a default of the trainer: an object among the defaults could not be written to config.yaml.
         kwargs["plugins"] = [*_as_list(options["plugins"]), SafeCheckpointIO()]
         chosen = options["logger"]

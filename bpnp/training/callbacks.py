@@ -359,7 +359,7 @@ class ResultsWriter(Callback):
         changed = [name for name, value in now.items() if name in before and value != before[name]]
         if changed:
             what = checkpoint or before.get("weights") or "a test without a checkpoint"
-            others = " and ".join(name for name in ("data", "solver") if changed in ([name], ["data", "solver"]))
+            others = " and ".join(changed) if {"data", "solver"}.issuperset(changed) else ""
             rank_zero_info(
                 f"the results of {what}{f' with other options of the {others}' if others else ''} in {summary.parent} "
                 "are replaced"
