@@ -10,7 +10,7 @@ import threading
 import zlib  # noqa: F401
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, SupportsFloat, TypeAlias
 
@@ -28,6 +28,14 @@ FISHEYE = {
     "SIMPLE_RADIAL_FISHEYE": (1, 1),
     "RADIAL_FISHEYE": (1, 2),
     "OPENCV_FISHEYE": (2, 4),
+}
+# Models whose image radius at the radius r in the plane z = 1 is r (1 + k1 r^2 + ...) / (1 + k4 r^2 + ...), but for
+# tangential distortion: indices of the parameters k1, k2, ... above and below.
+RADIAL: dict[str, tuple[list[int], list[int]]] = {
+    "SIMPLE_RADIAL": ([3], []),
+    "RADIAL": ([3, 4], []),
+    "OPENCV": ([4, 5], []),
+    "FULL_OPENCV": ([4, 5, 8], [9, 10, 11]),
 }
 EDGES, STEPS = 1024, 5  # table of fisheye angles, and Newton steps from a table entry to full precision
 CENTRE = 0.5  # centre of the first pixel in COLMAP's coordinates; it is 0 in OpenCV's and hloc's
@@ -147,10 +155,14 @@ class Lens:
     def project(self, points: Array) -> Array:
         """Project points (k, 3) in camera coordinates to pixels (k, 2); NaN unless z > 0.
 
-        A fisheye also projects points with z <= 0, up to the angle at which its radius stops rising.
+        A fisheye also projects points with z <= 0. Points beyond the angle at which the image radius stops rising are
+        NaN, since the polynomial of the model would fold them back into the image.
         """
         if (fisheye := self._fisheye) is None:
-            return np.asarray(self.camera.img_from_cam(np.ascontiguousarray(in_front(points))), dtype=np.float64)
+            plane = in_front(points)
+            widest = _widest_radius(self.camera.model.name, tuple(self.camera.params))
+            plane[np.linalg.norm(plane[:, :2], axis=-1) > widest] = np.nan
+            return np.asarray(self.camera.img_from_cam(np.ascontiguousarray(plane)), dtype=np.float64)
         across = np.linalg.norm(points[:, :2], axis=-1)
         angle = np.arctan2(across, points[:, 2])
         radius = np.where((angle < fisheye.widest) & (points != 0).any(-1), fisheye.distance(angle), np.nan)
@@ -167,9 +179,8 @@ class Lens:
         radial = np.zeros(2 * count + 2)
         radial[1::2] = np.r_[1.0, params[focals + 2 : focals + 2 + count]]
         distance = np.polynomial.Polynomial(radial).trim()
-        roots = distance.deriv().roots()
-        maxima = roots.real[(abs(roots.imag) < 1e-9) & (roots.real > 0)]
-        return _Fisheye(params[:focals], params[focals : focals + 2], distance, min([np.pi, *maxima.tolist()]))
+        widest = min(np.pi, _first_root(distance.deriv()))
+        return _Fisheye(params[:focals], params[focals : focals + 2], distance, widest)
 
 
 Camera = Pinhole | Lens
@@ -187,6 +198,23 @@ if TYPE_CHECKING:  # what `camera_from` converts, which checks it at run time
     ManyCameras: TypeAlias = CameraObject | Sequence[CameraLike | Sequence[SupportsFloat] | None]
 else:
     CameraLike = ManyCameras = Any
+
+
+@lru_cache
+def _widest_radius(model: str, params: tuple[float, ...]) -> float:
+    """Return the radius in the plane z = 1 up to which the image radius rises, infinity for other models."""
+    above, below = RADIAL.get(model, ([], []))
+    odd, even = np.zeros(2 * len(above) + 2), np.zeros(2 * len(below) + 1)
+    odd[1::2], even[::2] = [1.0, *(params[i] for i in above)], [1.0, *(params[i] for i in below)]
+    numerator, denominator = np.polynomial.Polynomial(odd), np.polynomial.Polynomial(even)
+    slope = numerator.deriv() * denominator - numerator * denominator.deriv()
+    return _first_root(slope * denominator)
+
+
+def _first_root(polynomial: np.polynomial.Polynomial) -> float:
+    """Return the first positive root of a polynomial, infinity if it has none."""
+    roots = polynomial.trim().roots()
+    return float(min(roots.real[(abs(roots.imag) < 1e-9) & (roots.real > 0)], default=np.inf))
 
 
 def _of_length_one(rays: Array) -> Array:

@@ -171,3 +171,31 @@ def test_a_fisheye_sees_behind_itself() -> None:
     beyond = np.radians([104.0, 106.0])
     seen = turning.project(np.stack([np.sin(beyond), np.zeros(2), np.cos(beyond)], -1))
     assert np.isfinite(seen).all(-1).tolist() == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_RADIAL", [500.0, 500, 400, -0.3]),
+        ("RADIAL", [500.0, 500, 400, -0.3, 0.02]),
+        ("OPENCV", [500.0, 510, 500, 400, -0.3, 0.02, 0.0, 0.0]),
+        ("FULL_OPENCV", [500.0, 510, 500, 400, 0.1, 0.01, 0.0, 0.0, 0.0, 0.3, 0.2, 0.1]),
+    ],
+)
+def test_a_point_beyond_the_field_of_view_does_not_fold_back_into_the_image(model: str, params: list[float]) -> None:
+    """pycolmap projects a point far off the axis near the centre, where another ray is seen."""
+    slopes = np.linspace(0, 6, 601)
+    points = np.column_stack([slopes, np.zeros_like(slopes), np.ones_like(slopes)])
+    given = pycolmap.Camera(model=model, width=1000, height=800, params=params)
+    pixels = given.img_from_cam(points)
+    rising = np.flatnonzero(np.diff(pixels[:, 0]) <= 0)[0]  # the last pixel before the radius falls
+    seen = camera_from(given).project(2 * points)
+    np.testing.assert_allclose(seen[:rising], pixels[:rising], atol=1e-9)
+    assert np.isnan(seen[rising + 1 :]).all()
+
+
+@pytest.mark.parametrize("params", [[500.0, 500, 400, 0.3], [500.0, 500, 400, 0.0]])
+def test_a_radius_that_rises_everywhere_has_no_limit(params: list[float]) -> None:
+    camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=1000, height=800, params=params)
+    points = np.array([[50.0, 0, 1], [-1e6, 3, 1]])
+    np.testing.assert_allclose(camera_from(camera).project(points), camera.img_from_cam(points), rtol=1e-12)
