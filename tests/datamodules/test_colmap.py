@@ -53,6 +53,16 @@ def test_folders_that_hold_no_scene_are_one_error(tmp_path: Path) -> None:
         find_scenes([tmp_path / "a/whole", tmp_path / "b/whole"])
 
 
+def test_a_model_in_two_roots_is_one_error(tmp_path: Path) -> None:
+    """Under two names it would be two scenes, of which a split may train on one and test on the other."""
+    plant_model(tmp_path / "data/a/castle/sparse/0", images=1)
+    (tmp_path / "link").symlink_to(tmp_path / "data/a/castle")
+    assert list(find_scenes([tmp_path / "data/a", tmp_path / "data/a/castle"])) == ["castle"]
+    for other, name in ((tmp_path / "data/a", "castle"), (tmp_path / "link", "link")):
+        with pytest.raises(ColmapError, match=rf"would be in the scenes 'a/castle' and '{name}'; give"):
+            find_scenes([tmp_path / "data", other])
+
+
 SCENES = [f"s{i}" for i in range(10)]
 
 

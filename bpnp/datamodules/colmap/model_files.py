@@ -304,11 +304,12 @@ def find_scenes(roots: str | Path | Sequence[str | Path]) -> dict[str, dict[str,
         {scene: {name of the model: folder}}, sorted.
 
     Raises:
-        ColmapError: A root is not a folder, holds no model, or two scenes have one name. A folder that lacks one of the
-            three files is skipped with a warning if there are complete ones.
+        ColmapError: A root is not a folder, holds no model, two scenes have one name, or a model is in two scenes. A
+            folder that lacks one of the three files is skipped with a warning if there are complete ones.
     """
     scenes: dict[str, dict[str, Path]] = {}
     homes: dict[str, Path] = {}
+    scene_of: dict[Path, str] = {}
     for root in [roots] if isinstance(roots, (str, Path)) else roots:
         top = Path(root).absolute()
         for folder in _find_models(top):
@@ -317,6 +318,11 @@ def find_scenes(roots: str | Path | Sequence[str | Path]) -> dict[str, dict[str,
             if homes.setdefault(scene, home) != home:
                 raise ColmapError(
                     f"{homes[scene]} and {home} are both named {scene!r}; give their common parent folder as `root`"
+                )
+            if (other := scene_of.setdefault(folder.resolve(), scene)) != scene:
+                raise ColmapError(
+                    f"{folder} is in two folders of `root`, and would be in the scenes {other!r} and {scene!r}; give "
+                    "only one of them"
                 )
             scenes.setdefault(scene, {})["/".join((scene, *folder.relative_to(home).parts))] = folder
     return {
