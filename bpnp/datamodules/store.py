@@ -180,9 +180,14 @@ class StoreWriter:
             name: Name of the row.
             points: Points by bulk column.
             columns: Entries of the other columns.
+
+        Raises:
+            StoreError: Points do not have the width of their column.
         """
-        for key in self._widths:
+        for key, width in self._widths.items():
             part = np.ascontiguousarray(points[key], BULK)
+            if part.ndim != 2 or part.shape[1] != width:
+                raise StoreError(f"`{key}` of {name} has the shape {part.shape}; (k, {width}) is needed")
             self._files[key].write(part.data)
             self._columns[f"{key}_start"].append(self._columns[f"{key}_start"][-1] + len(part))
         for key, value in {"name": name, **columns}.items():

@@ -37,7 +37,7 @@ def write_problems(
         parameters: JSON content for the manifest. None for no additional content.
 
     Raises:
-        StoreError: The folder exists, or there are no problems.
+        StoreError: The folder exists, there are no problems, or points have another number of coordinates.
     """
     with new_store(folder, PROBLEMS, WIDTHS) as writer:
         for scene, problem in problems:

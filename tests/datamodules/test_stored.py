@@ -1,6 +1,7 @@
 """Problems in a store: every problem comes back, small ones are left out, and what does not fit is refused."""
 
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +43,16 @@ def problems(count: int = 12) -> list[tuple[str, Problem]]:
 def test_a_store_without_problems_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=r"there are no problems to write into .*empty; give at least one"):
         write_problems(tmp_path / "empty", iter(()))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("side", "width"), [("points2d", 3), ("points3d", 4), ("points3d", 2)])
+def test_points_with_other_coordinates_are_not_written(tmp_path: Path, side: str, width: int) -> None:
+    """Homogeneous coordinates, one after the other, would be read as other points."""
+    _, problem = problems(1)[0]
+    wrong = replace(problem, **{side: np.ones((len(getattr(problem, side)), width), np.float32)})
+    with pytest.raises(StoreError, match=rf"`{side}` of scène 0/0 has the shape \(\d+, {width}\); \(k, {side[-2]}\)"):
+        write_problems(tmp_path / "store", [("a", wrong)])
     assert list(tmp_path.iterdir()) == []
 
 
