@@ -141,9 +141,9 @@ def _read_shape_list(folder: Path) -> Shapes | None:
         for stem in sorted(names):
             label = stem.rpartition("_")[0]
             name, path = f"{label}/{split}/{stem}", folder / label / f"{stem}.txt"
-            if path.is_file():
-                files[name], samplers[name] = path, partial(_cloud_samples, name, path)
-    return Shapes(samplers, _identity(files)) if samplers else None
+            files[name], samplers[name] = path, partial(_cloud_samples, name, path)
+    present = [path for path in files.values() if path.is_file()]  # a missing one is left out, with a warning
+    return Shapes(samplers, fingerprint([list(files), file_states(present)])) if present else None
 
 
 def _hdf5_shapes(folder: Path) -> Shapes | None:
@@ -159,10 +159,15 @@ def _hdf5_shapes(folder: Path) -> Shapes | None:
         for path in paths:
             try:
                 with h5py.File(path, "r") as file:
-                    labels = np.asarray(file["label"]).reshape(-1).tolist()
+                    labels, count = np.asarray(file["label"]).reshape(-1), len(file["data"])
             except (OSError, KeyError) as error:
                 raise ValueError(f"{path} is not a file of ModelNet40's HDF5 archive ({error})") from error
-            for row, label in enumerate(labels):
+            if len(labels) != count or labels.dtype.kind not in "iu" or labels.min(initial=0) < 0:
+                raise ValueError(
+                    f"{path} has {len(labels)} labels of type {labels.dtype} for {count} shapes; one class number from "
+                    "0 for each shape is needed"
+                )
+            for row, label in enumerate(labels.tolist()):
                 title = classes[label] if label < len(classes) else f"class{label:02d}"
                 name = f"{title}/{split}/{path.stem}_{row:04d}"
                 samplers[name] = partial(_hdf5_samples, name, path, row)

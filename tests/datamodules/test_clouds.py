@@ -167,6 +167,20 @@ def test_the_hdf5_archive_of_modelnet40(tmp_path: Path) -> None:
     assert len(data.datasets["test"]) == 2
 
 
+WRONG_LABELS = [[0, 1], [0, 1, 0, 1], [0.0, 1.0, 0.0], [0, 1, -1], None]
+
+
+@pytest.mark.parametrize("labels", WRONG_LABELS, ids=["few", "many", "floats", "negative", "none"])
+def test_labels_that_do_not_fit_the_shapes_of_an_hdf5_file_are_one_error(tmp_path: Path, labels: list | None) -> None:
+    """With fewer labels than shapes, the last shapes would be left out without a word."""
+    with h5py.File(tmp_path / "ply_data_test0.h5", "w") as file:
+        file["label" if labels is None else "data"] = np.zeros((3, 40, 3), np.float32)
+        if labels is not None:
+            file["label"] = np.array(labels)
+    with pytest.raises(ValueError, match=r"ply_data_test0\.h5 (has \d labels of type|is not a file of ModelNet40's)"):
+        open_shapes(tmp_path)
+
+
 def test_the_normal_resampled_archive_of_modelnet40(tmp_path: Path) -> None:
     root = tmp_path / "modelnet40_normal_resampled"
     for i, name in enumerate(["night_stand_0001", "night_stand_0002", "chair_0001"]):
@@ -181,3 +195,13 @@ def test_the_normal_resampled_archive_of_modelnet40(tmp_path: Path) -> None:
     ]
     samples = shapes.samplers["night_stand/test/night_stand_0002"](40)
     np.testing.assert_allclose(np.sort(samples, axis=0), np.sort(points(1), axis=0), atol=1e-6)
+
+
+def test_a_listed_file_of_the_normal_resampled_archive_that_is_missing_is_named(tmp_path: Path) -> None:
+    root = tmp_path / "modelnet40_normal_resampled"
+    for i in range(3):
+        write(root / "chair" / f"chair_000{i}.txt", points(i))
+    (root / "modelnet40_train.txt").write_text("chair_0000\nchair_0001\ndesk_0001\n")
+    (root / "modelnet40_test.txt").write_text("chair_0002\n")
+    with pytest.warns(UserWarning, match=r"left out 1 of 4, .*desk_0001\.txt"):
+        module(root).prepare_data()
