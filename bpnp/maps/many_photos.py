@@ -9,7 +9,7 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +80,8 @@ def photo_task(
         camera: As for `SceneMap.localize_photo`.
         views: Views to try, by photo name; None for the whole map.
         keypoints: As for `SceneMap.localize_photo`.
-        leave_one_out: Remove the photo, which is a view of the map, from the map.
+        leave_one_out: Remove the photo, which is a view of the map, from the map. The default camera is then that of
+            another view.
         solver: As for `SceneMap.localize_photo`.
         **search: focal_error, distortion, ignore_orientation, seed and time_limit.
 
@@ -89,7 +90,8 @@ def photo_task(
     """
     photo_content, source = content_of(photo), "--camera"
     if camera is None or isinstance(camera, SceneMap):
-        camera, source = (camera or scene).camera_for(photo, exif=camera is None)
+        others = tuple(view for view in scene.views if view.name != name) if leave_one_out else scene.views
+        camera, source = (camera or replace(scene, views=others)).camera_for(photo, exif=camera is None)
     lens = UNKNOWN if camera is None or isinstance(camera, str) else camera_to_json(camera_from(camera))
     source = "unknown focal length" if lens == UNKNOWN else source
     shown = None if views is None else list(views.get(name, ()))

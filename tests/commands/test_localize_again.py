@@ -4,7 +4,7 @@ the planted poses are the answer."""
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from planted_model import HEIGHT, PINHOLE, WIDTH, Planted, plant_keypoints, plan
 from scipy.spatial.transform import Rotation
 
 from bpnp import SceneMap, Solution
+from bpnp.cameras import camera_from
 from bpnp.cli import main
 from bpnp.maps.many_photos import PhotoTask, SolutionFolder, attempt, photo_task
 
@@ -149,6 +150,22 @@ def test_an_edited_file_of_views_is_another_one_for_the_photos_whose_lines_chang
     assert again.changes(task("a.png", "photo 2.jpg")) == []
     assert again.changes(task("a.png", "photo 0.jpg")) == ["views"]
     assert again.changes(task("b.png", "photo 0.jpg")) == []
+
+
+def test_a_photo_that_is_left_out_of_its_map_does_not_get_its_own_camera(place: Place) -> None:
+    """No other view has its size, so that without it nothing is known of its focal length."""
+    scene = SceneMap.from_colmap(place.folder / "map")
+    own = camera_from(("PINHOLE", 2 * WIDTH, HEIGHT, [700, 700, WIDTH, HEIGHT / 2]))
+    scene = replace(scene, views=(replace(scene.views[0], camera=own), *scene.views[1:]))
+    photo = place.folder / "photo 0.jpg"
+    Image.new("L", (2 * WIDTH, HEIGHT)).save(photo)
+    sources = {
+        left_out: photo_task(scene, photo.name, photo, leave_one_out=left_out).made_with["camera_from"]
+        for left_out in (False, True)
+    }
+    assert sources == {False: "view photo 0.jpg of the map", True: "unknown focal length"}
+    of_the_map = photo_task(scene, photo.name, photo, leave_one_out=True, camera=scene)
+    assert of_the_map.arguments["camera"]["params"][0] == 700
 
 
 @pytest.mark.parametrize(("limit", "kept", "used"), [(None, None, 60.0), (7, 7, 7.0), (math.inf, "none", math.inf)])
