@@ -34,6 +34,7 @@ REPORTED += ("log10_false_alarms", "seconds", "rotation", "translation", "camera
 REPORTED += (MADE_WITH,)
 ERROR = "error_to_map"  # key for a photo that was left out of the map
 POSES_HEADER = "# NAME, QW, QX, QY, QZ, TX, TY, TZ (COLMAP's cam_from_world)\n"
+BEGINNINGS = {"results.json": '{\n "map": ', "poses.txt": POSES_HEADER}  # of the files for all photos
 Record = dict[str, Any]  # entry of a photo in results.json
 
 
@@ -274,6 +275,9 @@ class SolutionFolder:
         path: The folder.
         map_content: Fingerprint of the files of the map, whose frame the poses are in.
         records: Entries of results.json, by photo.
+
+    Raises:
+        ValueError: The folder has a results.json or poses.txt that is no result of `bpnp localize`.
     """
 
     path: Path
@@ -281,6 +285,10 @@ class SolutionFolder:
     records: dict[str, Record] = field(default_factory=dict)  # by photo
 
     def __post_init__(self) -> None:
+        for name, beginning in BEGINNINGS.items():
+            file = self.path / name
+            if file.is_file() and not file.read_bytes().startswith(beginning.encode()):
+                raise ValueError(f"{file} is no result of `bpnp localize` and would be replaced; use another folder")
         folder = self.path / "solutions"
         for file in sorted(folder.rglob("*.json")):
             with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # incomplete, or from another version

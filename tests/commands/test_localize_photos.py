@@ -182,6 +182,17 @@ def test_a_solution_without_a_picture_is_kept_and_drawn_by_the_next_run(
     assert "solved again" not in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("name", ["poses.txt", "results.json"])
+def test_a_file_of_another_program_is_not_replaced_by_the_results(
+    name: str, command: list[str], fails: Callable[..., str]
+) -> None:
+    main([*command, "--no_pictures"])
+    main([*command, "--no_pictures"])  # the results of a run are replaced by those of the next
+    Path("out", name).write_text("a.png 1 0 0 0 0 0 4\n")
+    assert f"out/{name} is no result of `bpnp localize` and would be replaced; use" in fails(*command, "--seed", "3")
+    assert Path("out", name).read_text() == "a.png 1 0 0 0 0 0 4\n"
+
+
 def test_a_photo_is_not_replaced_by_its_picture(command: list[str], fails: Callable[..., str]) -> None:
     Path("pictures").mkdir()
     photo = Path("a.png").rename("pictures/a.png")
