@@ -106,6 +106,8 @@ def convert_weights(file: Path, out: Path, *, ransac: Literal["poselib", "opencv
         out: checkpoint to write, *.ckpt.
         ransac: backend of the RANSAC step; opencv is the paper's.
     """
+    if out.resolve() == file.resolve():
+        raise ValueError(f"{out} is an input and would be overwritten; name another file")
     import lightning
     import torch
 

@@ -83,6 +83,20 @@ def test_convert_weights_writes_our_checkpoint(
     torch.testing.assert_close(task.solver.state_dict(), net.state_dict(), rtol=0, atol=0)
 
 
+def test_the_weights_are_not_replaced_by_the_checkpoint_made_of_them(
+    reference: Released, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, link = tmp_path / "released.pth.tar", tmp_path / "link.ckpt"
+    torch.save(checkpoint(reference), file)
+    link.symlink_to(file)
+    before = file.read_bytes()
+    for out in (file, link):
+        with pytest.raises(SystemExit):
+            main(["convert-weights", str(file), str(out)])
+        assert f"{out} is an input and would be overwritten; name another file" in capsys.readouterr().err
+    assert file.read_bytes() == before
+
+
 BIAS = "FeatureExtractor2d.conv_11.conv2.0.bias"
 
 
