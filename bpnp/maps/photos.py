@@ -208,7 +208,7 @@ def read_features(file: Path, photo: str, size: Size | None = None) -> Keypoints
         raise ValueError("HDF5 files need the package h5py; install it with `pip install h5py`") from error
     try:
         with h5py.File(file, "r") as content:
-            if photo not in content or "keypoints" not in content[photo]:
+            if f"{photo}/keypoints" not in content:
                 some = ", ".join(list(content)[:5])
                 raise ValueError(f"{file} has no keypoints of {photo}, but of {some or 'no photo'}")
             group = content[photo]

@@ -97,6 +97,10 @@ def test_keypoints_of_hloc_are_read_and_wrong_files_named(tmp_path: Path) -> Non
     np.testing.assert_array_equal(found.scores, [0.25, 0.5])
     with pytest.raises(ValueError, match=r"features\.h5 has no keypoints of b\.jpg, but of query"):
         read_features(path, "b.jpg")
+    with h5py.File(path, "a") as file:
+        file["c.jpg"] = np.zeros((5, 2))  # an array without a group
+    with pytest.raises(ValueError, match=r"features\.h5 has no keypoints of c\.jpg, but of"):
+        read_features(path, "c.jpg")
     with pytest.raises(ValueError, match=r"those of a photo of size \(100, 50\), but the photo has \(200, 100\)"):
         read_features(path, "query/a.jpg", (200, 100))
     with h5py.File(path, "a") as file:
