@@ -51,6 +51,7 @@ def report(
     from bpnp.report.images import save_figure
     from bpnp.report.intervals import interval_table
     from bpnp.report.page import write_page
+    from bpnp.report.results import SUMMARY
     from bpnp.report.tables import named_runs, read_runs, results_table
 
     if curves is not None:
@@ -62,6 +63,9 @@ def report(
             raise ValueError(f"{runs[0]} and the folder above it have no logs of a training; give the folder of a run")
         say(f"wrote {save_figure(training_curves(folder), curves)}")
     named = named_runs(runs)
+    if curves is not None and not (html or recall or any((path / SUMMARY).is_file() for path in named.values())):
+        say("the run has no test yet, so there are no tables")
+        return
     paths = list(named.values())
     results = read_runs(paths)
     intervals = interval_table(results)

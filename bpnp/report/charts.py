@@ -93,6 +93,8 @@ def recall_chart(runs: Mapping[str, Results], error: Error, *, paper: Paper | No
     if not len(finite):
         return None
     low = max(float(np.quantile(finite, 0.01)), most / 1e5)
+    if error != "translation":  # an axis of angles ends where most poses are wrong, also if all of them are
+        low = min(low, most / 2)
     limits = np.geomspace(low, max(most, 2 * low), POINTS)
     figure = Figure(layout={"title": {"text": title}, "hovermode": "x unified", "template": "none"})
     figure.update_yaxes(title={"text": "problems up to this error"}, range=[0, 1.01], tickformat=".0%")

@@ -37,7 +37,18 @@ from bpnp.report.results import (
     cause_fractions,
     read_results,
 )
-from bpnp.report.tables import CAPTION, LOADING, RESULT_COLUMNS, Line, best_texts, cell, lines_of, named_runs, run_rows
+from bpnp.report.tables import (
+    CAPTION,
+    LOADING,
+    RESULT_COLUMNS,
+    Line,
+    best_texts,
+    cell,
+    lines_of,
+    named_runs,
+    problem_keys,
+    run_rows,
+)
 from bpnp.report.templates import render_page
 from bpnp.report.terminal import DASHES, INKS, Paper
 from bpnp.report.training_curves import training_curves
@@ -245,8 +256,12 @@ def compress_text(text: str) -> str:
 
 
 def page_numbers(runs: Mapping[str, Results]) -> dict[str, Any]:
-    """Return the numbers of all problems: a series for each run and estimate. Equal columns are stored once."""
+    """Return the numbers of all problems: a series for each run and estimate. Equal columns are stored once.
+
+    "problems" numbers the problems: the same number stands for the same problem of the same data, see `problem_keys`.
+    """
     columns: dict[tuple[Any, ...], int] = {}
+    problems: dict[Hashable, int] = {}
 
     def add_column(values: Iterable[Any]) -> int:
         return columns.setdefault(tuple(values), len(columns))
@@ -256,7 +271,10 @@ def page_numbers(runs: Mapping[str, Results]) -> dict[str, Any]:
         rows = runs[line.run].of(line.estimate)
         names = {"run": line.run, "estimate": line.estimate, "name": line.label, "colour": f"c{line.colour}"}
         ids, numbers = add_column(utf8(row.id) or "(no name)" for row in rows), _columns(rows)
-        series.append(names | {"ids": ids, "numbers": {key: add_column(values) for key, values in numbers.items()}})
+        keys = problem_keys(runs[line.run], rows)
+        same = add_column(problems.setdefault(key, len(problems)) for key in keys)
+        columns_of = {key: add_column(values) for key, values in numbers.items()}
+        series.append(names | {"ids": ids, "problems": same, "numbers": columns_of})
     return {"series": series, "columns": list(columns)}
 
 

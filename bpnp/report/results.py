@@ -193,7 +193,8 @@ def count_inliers(pose: Pose, batch: Batch, *, threshold: float = INLIER_THRESHO
         batch: Problems.
         threshold: Distance, normalised image units.
     """
-    camera = transform(pose.rotation.double(), pose.translation.double(), batch.points3d.double())
+    rotation, translation = pose.rotation.detach().double(), pose.translation.detach().double()
+    camera = transform(rotation, translation, batch.points3d.double())
     projected = project(camera)
     visible = batch.mask3d & (camera[..., 2] > 0) & projected.isfinite().all(-1)
     counts = []
@@ -289,7 +290,7 @@ def read_results(folder: Path | str) -> Results:
         folder: Results folder.
 
     Returns:
-        The results.
+        The results, with sorted rows, as they were written; another program may have sorted those of the file.
 
     Raises:
         ValueError: A file is missing, of another format, incomplete, or has a value that is no number. The message
@@ -337,7 +338,8 @@ def _read_rows(path: Path) -> tuple[ProblemRow, ...]:
         raise ValueError(f"cannot read the rows of a test in {path}: {error}") from error
     if frame.empty:
         raise ValueError(f"{path} has no rows")
-    return tuple(ProblemRow(*values) for values in zip(*columns, strict=True))
+    rows = (ProblemRow(*values) for values in zip(*columns, strict=True))
+    return tuple(sorted(rows, key=_sort_key))
 
 
 def _sort_rows(rows: Iterable[ProblemRow]) -> tuple[ProblemRow, ...]:
@@ -357,7 +359,11 @@ def _sort_rows(rows: Iterable[ProblemRow]) -> tuple[ProblemRow, ...]:
         raise ValueError("there are no rows to write; the test set needs at least one problem")
     if len(first) != len(problems) * len(counts):
         raise ValueError(f"an estimate is missing for some of the {len(problems)} problems: {dict(counts)}")
-    return tuple(sorted(first.values(), key=lambda row: (row.index, pipeline_order(row.estimate))))
+    return tuple(sorted(first.values(), key=_sort_key))
+
+
+def _sort_key(row: ProblemRow) -> tuple[int, tuple[int, str]]:
+    return row.index, pipeline_order(row.estimate)
 
 
 def _errors(rows: Iterable[ProblemRow]) -> PoseErrors:

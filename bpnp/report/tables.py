@@ -3,14 +3,14 @@
 import json
 import math
 import os
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from rich.text import Text
 
-from bpnp.report.results import SUMMARY, Results, read_results
+from bpnp.report.results import SUMMARY, ProblemRow, Results, read_results
 from bpnp.report.terminal import DASHES, LIGHT, Paper, SplitTable, number
 
 if TYPE_CHECKING:
@@ -98,14 +98,14 @@ def named_runs(paths: Sequence[Path | str]) -> dict[str, Path]:
 
     Args:
         paths: Results folders. A run's folder stands for its `test`, and a folder of several results, such as that of
-            `bpnp table`, for all of them.
+            `bpnp table`, for all of them. A folder that is given twice counts once.
 
     Raises:
         ValueError: There is no path.
     """
     if not paths:
         raise ValueError("no results folder is given; give one that `bpnp test` wrote")
-    folders = [folder for path in paths for folder in _results_in(Path(path).absolute())]
+    folders = list(dict.fromkeys(folder for path in paths for folder in _results_in(Path(path).absolute())))
     if len(folders) == 1:
         (folder,) = folders
         return {(folder.parent if folder.name == "test" else folder).name: folder}
@@ -218,15 +218,23 @@ def run_rows(runs: Mapping[str, Results], paper: Paper | None = None) -> list[Me
 
 
 def tested_problems(results: Results) -> Hashable:
-    """Return a key that is equal for results of the same problems: the same data, names and numbers of points
-    and matches."""
+    """Return a key that is equal for results of the same problems."""
+    return frozenset(problem_keys(results, results.rows))
+
+
+def problem_keys(results: Results, rows: Iterable[ProblemRow]) -> list[Hashable]:
+    """Return a key of the problem of each row, equal for the same data, index, name and numbers of points and matches.
+
+    Args:
+        results: Results, whose settings have the data.
+        rows: Some of their rows.
+    """
     data = results.settings.get("data")
     if isinstance(data, Mapping) and isinstance(data.get("init_args"), Mapping):
         options = {key: value for key, value in data["init_args"].items() if key not in LOADING}
         data = {**data, "init_args": options}
-    return json.dumps(data, sort_keys=True), frozenset(
-        (row.index, row.id, row.m, row.n, row.matches) for row in results.rows
-    )
+    text = json.dumps(data, sort_keys=True)
+    return [(text, row.index, row.id, row.m, row.n, row.matches) for row in rows]
 
 
 def paper_of(results: Results) -> Paper | None:

@@ -51,7 +51,7 @@ def say(line: object, *, to: Console | None = None) -> None:
         line: Text.
         to: Console. Default: standard output.
     """
-    (to or Terminal()).print(str(line), markup=False, highlight=False, soft_wrap=True)
+    (to or Terminal()).print(str(line), markup=False, emoji=False, highlight=False, soft_wrap=True)
 
 
 def progress(*, items: bool = True, quiet: bool = False) -> Progress:

@@ -45,6 +45,21 @@ def test_report_and_view_write_the_files_that_they_print(
     assert "has no points.npz; run `bpnp test` again" in fails("view", str(tmp_path / "run"))
 
 
+def test_a_run_that_is_given_twice_is_shown_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_run(tmp_path / "run", 9, 0)
+    main(["report", str(tmp_path / "run")])
+    once = capsys.readouterr().out
+    main(["report", str(tmp_path / "run"), str(tmp_path / "run" / "test")])
+    assert capsys.readouterr().out == once
+
+
+def test_a_printed_path_keeps_its_colons(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """rich replaces names such as :car: by pictures."""
+    write_run(tmp_path / "run", 9, 0)
+    main(["report", str(tmp_path / "run"), "--recall", str(tmp_path / "12:100:30.png")])
+    assert f"wrote {tmp_path / '12:100:30.png'}\n" in capsys.readouterr().out
+
+
 def test_a_reader_that_closes_the_pipe_is_no_error(tmp_path: Path) -> None:
     """The pipe is closed before the table is printed, as in `bpnp report RUN | true`."""
     write_run(tmp_path, 9, 0)

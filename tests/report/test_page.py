@@ -1,4 +1,5 @@
 import json
+import math
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -9,8 +10,8 @@ from plotly.offline import get_plotlyjs
 from report_data import HOSTILE, inflated, row, rows, write_run
 
 from bpnp.report import write_page, write_results
-from bpnp.report.charts import chart_text, recall_chart
-from bpnp.report.page import page_html
+from bpnp.report.charts import Error, chart_text, recall_chart
+from bpnp.report.page import page_html, page_numbers
 from bpnp.report.points import write_points
 from bpnp.report.results import CAUSES
 from bpnp.report.terminal import number
@@ -148,3 +149,35 @@ def test_unreadable_results_are_named_and_no_page_is_written(tmp_path: Path) -> 
     with pytest.raises(ValueError, match=r"cannot read the points of a test in .*points.npz"):
         write_page([tmp_path / "run"], output)
     assert not output.exists()
+
+
+def test_problems_of_one_name_in_other_data_are_not_paired(tmp_path: Path) -> None:
+    """Two seeds of a data set draw other views of the same shapes; of two runs on one, some problems may be left."""
+
+    def settings(seed: int) -> dict[str, object]:
+        return {"data": {"class_path": "bpnp.datamodules.MeshDataModule", "init_args": {"seed": seed}}}
+
+    runs = {
+        name: write_results(tmp_path / name, rows(8, seed)[2 * first :], settings=settings(data))
+        for name, seed, first, data in (("a", 0, 0, 1), ("part", 1, 3, 1), ("other", 2, 0, 2))
+    }
+    numbers = page_numbers(runs)
+    problems = {own["name"]: numbers["columns"][own["problems"]] for own in numbers["series"]}
+    assert problems["a: ransac"] == problems["a: pnp"]
+    assert problems["part: ransac"] == problems["a: ransac"][3:]
+    assert not {*problems["other: ransac"]} & {*problems["a: ransac"]}
+    assert len({*problems["other: ransac"]}) == 8
+    twins = write_results(tmp_path / "twins", [row(0, id="x"), row(1, id="x")])
+    numbers = page_numbers({"twins": twins})
+    assert len({*numbers["columns"][numbers["series"][0]["problems"]]}) == 2
+
+
+@pytest.mark.parametrize("error", ["rotation_deg", "reprojection_deg"])
+def test_a_chart_of_a_test_without_a_pose_shows_no_problem_within_a_limit(tmp_path: Path, error: Error) -> None:
+    """Errors of 180 degrees stand for no pose; a curve that reached them would end at 100 %."""
+    lost = {"rotation_error_deg": 180.0, "reprojection_error_deg": 180.0, "translation_error": math.inf}
+    runs = {"lost": write_results(tmp_path, [row(i, **lost, centre_error=math.inf, found=False) for i in range(3)])}
+    chart = recall_chart(runs, error)
+    assert chart is not None
+    assert max(chart.data[0].x) <= 90
+    assert set(chart.data[0].y) == {0}

@@ -5,15 +5,17 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
-from report_data import HOSTILE, drawn_problem, write_run
+from report_data import HOSTILE, drawn_problem, rows, write_run
 
-from bpnp.report import Results, write_page
+from bpnp.report import Results, write_page, write_results
+from bpnp.report.points import write_points
 from bpnp.report.terminal import DARK, LIGHT
 
 pytestmark = pytest.mark.slow
@@ -265,6 +267,8 @@ def test_nothing_sticks_out_sideways(browser: Any, page: Callable[..., Any], wid
         assert all(own <= room for own, room in page(wide + "e.closest('.js-plotly-plot').clientWidth])"))
         assert page(OVERLAPS) == []
         assert page(CUT) == []
+        page("openProblem(0)")  # its name has a word that is wider than a phone
+        assert page("const open = document.getElementById('problem'); return open.scrollWidth <= open.clientWidth")
         colours = page(
             "const curves = document.querySelector('#recall .chart').data.filter((t) => t.mode == 'lines');"
             "return [...new Set(curves.map((t) => t.line.color))]"
@@ -273,3 +277,23 @@ def test_nothing_sticks_out_sideways(browser: Any, page: Callable[..., Any], wid
     finally:
         browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
         browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+
+
+def test_problems_of_one_name_in_other_data_are_not_compared(browser: Any, tmp_path: Path) -> None:
+    missing = (np.full((3, 3), np.nan), np.full(3, np.nan))
+    for seed in (1, 2):
+        data = {"class_path": "bpnp.datamodules.MeshDataModule", "init_args": {"seed": seed}}
+        write_results(tmp_path / str(seed), rows(8, seed), settings={"data": data})
+        without_pose = replace(drawn_problem(6, "scene/0006"), pose=None, estimates={"ransac": missing, "pnp": missing})
+        write_points(tmp_path / str(seed), [without_pose])
+    opened(browser, write_page([tmp_path / "1", tmp_path / "2"], tmp_path / "page.html").as_uri())
+    for other, count in ((1, 8), (2, 0)):
+        browser.execute_script("document.getElementById('b').value = arguments[0]; drawComparison()", other)
+        assert f"of {count} common problems" in browser.execute_script(
+            "return document.getElementById('versus-text').textContent"
+        )
+    browser.execute_script("openProblem(6)")
+    assert len(texts(browser.execute_script, "#problem-numbers tbody tr")) == 2
+    (caption,) = texts(browser.execute_script, "#image-text")
+    assert "0 of 30 3D points reprojected by no pose. Dotted" in caption
+    assert severe(browser) == []

@@ -207,3 +207,18 @@ def test_each_row_names_the_cause_of_its_failure() -> None:
     assert shares == {cause: (2 if cause == "solved" else 1) / 6 for cause in cases}
     with pytest.raises(ValueError, match="no rows to count"):
         cause_fractions([])
+
+
+def test_rows_that_another_program_has_sorted_are_those_that_were_written(tmp_path: Path) -> None:
+    """Estimates and runs are compared problem by problem, in the order of the data set."""
+    written = write_results(tmp_path, [row(i, estimate) for i in range(9) for estimate in ("ransac", "pnp")])
+    head, *lines = (tmp_path / "problems.csv").read_text().splitlines()
+    (tmp_path / "problems.csv").write_text("\n".join([head, *sorted(lines, key=lambda line: line[::-1])]))
+    assert read_results(tmp_path).rows == written.rows
+
+
+def test_inliers_of_a_pose_with_a_gradient_are_those_without() -> None:
+    batch = planted((12, 12), clutter=0)
+    pose = pose_of(batch)
+    with_gradient = dataclasses.replace(pose, rotation=pose.rotation.clone().requires_grad_())
+    assert count_inliers(with_gradient, batch) == count_inliers(pose, batch) == [12, 12]

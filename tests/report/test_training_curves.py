@@ -114,3 +114,12 @@ def test_a_page_without_a_training_has_no_section_for_it_and_curves_are_one_erro
     with pytest.raises(SystemExit):
         main(["report", str(tmp_path), "--curves", str(tmp_path / "curves.png")])
     assert "have no logs of a training; give the folder of a run" in capsys.readouterr().err
+
+
+def test_the_curves_of_a_training_without_a_test_are_no_error(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    main(["report", str(run), "--curves", str(run / "curves.png")])
+    assert (run / "curves.png").read_bytes().startswith(b"\x89PNG")
+    assert capsys.readouterr().out == f"wrote {run / 'curves.png'}\nthe run has no test yet, so there are no tables\n"
+    with pytest.raises(SystemExit):
+        main(["report", str(run), "--curves", str(run / "curves.png"), "--html", str(run / "page.html")])
+    assert "has no summary.json; run `bpnp test` first" in capsys.readouterr().err

@@ -80,10 +80,10 @@ function drawSeries() {
 // Run against run: the rotation errors of two series, of many problems those that differ most and others between.
 function drawComparison() {
   const [a, b] = ["a", "b"].map((id) => SERIES[byId(id).value]);
-  const place = new Map(b.ids.map((id, i) => [id, i]));
+  const place = new Map(b.problems.map((problem, i) => [problem, i]));
   const [x, y] = [a, b].map((series) => column(series, "rotation_error_deg"));
-  const common = [...a.ids.keys()].filter((i) => place.has(a.ids[i]));
-  const problems = common.map((i) => ({ i, id: a.ids[i], x: x[i], y: y[place.get(a.ids[i])] }));
+  const common = [...a.ids.keys()].filter((i) => place.has(a.problems[i]));
+  const problems = common.map((i) => ({ i, id: a.ids[i], x: x[i], y: y[place.get(a.problems[i])] }));
   const share = (part) => `${((100 * part.length) / Math.max(problems.length, 1)).toFixed(1)} %`;
   byId("versus-text").textContent = byId("versus").ariaLabel =
     `${a.name} has the smaller rotation error in ${share(problems.filter(({ x, y }) => x < y))} of ${problems.length} ` +
@@ -144,7 +144,8 @@ async function start() {
   DATA = JSON.parse(await inflated("data"));
   let lines;
   [lines, ...LINES] = (await inflated("points")).split("\n");
-  SERIES = DATA.series.map((own) => ({ ...own, ids: DATA.columns[own.ids], lines: JSON.parse(lines)[own.run] }));
+  SERIES = DATA.series.map((own) => ({ ...own, ids: DATA.columns[own.ids], problems: DATA.columns[own.problems],
+    lines: JSON.parse(lines)[own.run] }));
   setState(Object.fromEntries(new URLSearchParams(location.hash.slice(1))));
   document.addEventListener("input", ({ target }) => {
     if (target.matches("#problem *")) return drawProblem();

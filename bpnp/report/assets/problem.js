@@ -26,7 +26,7 @@ const swatch = (series) => byId(`series${SERIES.indexOf(series)}`).nextElementSi
 
 function openProblem(i) {
   const series = listed();
-  const at = (other) => (other.ids === series.ids ? i : other.ids.indexOf(series.ids[i]));
+  const at = (other) => (other.problems === series.problems ? i : other.problems.indexOf(series.problems[i]));
   setState({ open: series.ids[i] });
   byId("problem-title").textContent = series.ids[i];
   const runs = SERIES.filter((other) => at(other) >= 0);
@@ -66,7 +66,7 @@ function drawProblem() {
       if (curveNumber === 3) pick(open.targets[pointNumber] ?? -1, pointNumber);
     });
   const seen = open.ends.filter(Boolean).length;
-  const hidden = seen < drawn.points3d.length ? "; the others lie behind the camera" : "";
+  const hidden = camera && seen < drawn.points3d.length ? "; the others lie behind the camera" : "";
   say("image", `○ ${drawn.points2d.length} image points, × ${seen} of ${drawn.points3d.length} 3D points reprojected ` +
     `by ${camera?.name ?? "no pose"}${hidden}`, ". Dotted lines are wrong matches.");
   byId("image").show = drawProblem;
