@@ -253,14 +253,15 @@ class Batch(Tensors):
         m, n = max(map(len, sets2d)), max(map(len, sets3d))
         if matches is not None:
             matches = [check_match3d(i, x, len(sets2d[i]), len(sets3d[i])) for i, x in enumerate(matches)]
+        indices = torch.as_tensor(range(size) if index is None else index, dtype=torch.long, device="cpu")
         return cls(
             points2d=pad_sequence(sets2d, batch_first=True),
             points3d=pad_sequence(sets3d, batch_first=True),
             mask2d=torch.stack([torch.arange(m, device="cpu") < len(x) for x in sets2d]),
             mask3d=torch.stack([torch.arange(n, device="cpu") < len(x) for x in sets3d]),
             focal=stack_values("focal", focals, (), dtype),
-            index=torch.as_tensor(range(size) if index is None else index, dtype=torch.long, device="cpu"),
-            ids=tuple(map(str, range(size))) if ids is None else tuple(ids),
+            index=indices,
+            ids=tuple(map(str, indices.tolist())) if ids is None else tuple(ids),
             rotation=None if rotations is None else stack_values("rotation", rotations, (3, 3), dtype),
             translation=None if translations is None else stack_values("translation", translations, (3,), dtype),
             match3d=None if matches is None else pad_sequence(matches, batch_first=True, padding_value=-1),

@@ -36,6 +36,7 @@ def test_lists_of_pairs_are_padded_and_masked() -> None:
     assert (batch.count2d.tolist(), batch.count3d.tolist()) == ([5, 9, 1], [7, 2, 1])
     assert (batch.points2d.shape, batch.points3d.shape) == ((3, 9, 2), (3, 7, 3))
     assert (batch.index.tolist(), batch.ids) == ([4, 0, 9], ("a", "b", "c"))
+    assert Batch.from_arrays(**lists(*samples), index=[4, 0, 9]).ids == ("4", "0", "9")
     assert batch.match3d is not None
     for i, (m, n) in enumerate(sizes):
         assert batch.mask2d[i].tolist() == [True] * m + [False] * (9 - m)
