@@ -5,7 +5,7 @@ import io
 import json
 import re
 import sys
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Set
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ COLUMNS: dict[int, tuple[str, ...]] = {3: (), 4: (LABEL,), 6: NORMAL, 7: (*NORMA
 IMAGE_COLUMNS = (("x", "y", "z"), ("x", "y"), ("u", "v"))
 STANDARD_INPUT = Path("-")
 NUMPY = b"\x93NUMPY"  # first bytes of a .npy file
+LARGEST_LABEL = 2**53  # larger integers are not exact in float64
 
 
 def read_points2d(path: Path) -> tuple[Array, Labels | None]:
@@ -233,8 +234,8 @@ def _normals_and_labels(
     if LABEL not in names:
         return normals, None
     labels = column(LABEL)
-    if len(fractions := labels[labels != np.round(labels)]):
-        raise ValueError(f"the column label of {path} holds {fractions[0]:g}; labels are integers")
+    if len(wrong := labels[(labels != np.round(labels)) | (abs(labels) > LARGEST_LABEL)]):
+        raise ValueError(f"the column label of {path} holds {wrong[0]:g}; labels are integers")
     return normals, labels.astype(np.int64)
 
 
@@ -253,7 +254,7 @@ def _camera_of(path: Path, image: str | None) -> tuple[Any, ...]:
     return camera.model, *camera.size, camera.params
 
 
-def _columns(path: Path, wanted: Collection[str] = ()) -> tuple[Array, list[str]]:
+def _columns(path: Path, wanted: Set[str] = frozenset()) -> tuple[Array, list[str]]:
     """Read columns of numbers from a .npy or a text.
 
     Args:
@@ -264,6 +265,9 @@ def _columns(path: Path, wanted: Collection[str] = ()) -> tuple[Array, list[str]
 
     Returns:
         Numbers (k, c), and the names of the c columns; no name if the first line has none.
+
+    Raises:
+        ValueError: The file cannot be read, or its first line names another number of columns than its rows have.
     """
     try:
         content = _content(path)
@@ -285,6 +289,8 @@ def _columns(path: Path, wanted: Collection[str] = ()) -> tuple[Array, list[str]
     mark, count = _separator(rows[0]), len(_words(rows[0]))
     if names and count == len(names) + 1:
         names = ["", *names]
+    if len(names) != count and wanted & {*names}:
+        raise ValueError(f"{_name(path)} names {len(names)} columns in its first line; its rows have {count}")
     names = names if len(names) == count else []
     others = [i for i, name in enumerate(names) if wanted and name not in wanted]
     decimals = rows if mark == "," else [row.replace(",", ".") for row in rows]

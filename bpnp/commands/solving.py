@@ -254,11 +254,16 @@ def verify(
 
 
 def _check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | None]) -> None:
-    """Create the folders of output files; raise ValueError for a folder, or for a file that is also an input."""
+    """Create the folders of output files.
+
+    Raises:
+        ValueError: An output is a folder, or a file that is also an input or another output.
+    """
     input_files = {path.resolve() for path in inputs if path is not None and path.is_file()}
-    for path in outputs:
-        if path is None:
-            continue
+    files = [path for path in outputs if path is not None]
+    for i, path in enumerate(files):
+        if path.resolve() in {other.resolve() for other in files[:i]}:
+            raise ValueError(f"{path} is the file of two outputs; name another file for one of them")
         if path.is_dir():
             raise ValueError(f"{path} is a folder; give a file name to write to")
         if path.resolve() in input_files:

@@ -198,6 +198,22 @@ def test_a_header_without_x_and_y_is_no_point(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_points2d(tmp_path / "a.csv")[0], [[20, 10], [40, 30]])
 
 
+@pytest.mark.parametrize("text", ["label,x,y,z,size\n3,1,2,4\n", "x y z\n1 2 3 4 5 6\n"])
+def test_a_first_line_that_names_another_number_of_columns_is_refused(text: str, tmp_path: Path) -> None:
+    """Read without the names, the label would be x."""
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(ValueError, match=r"a\.csv names [53] columns in its first line; its rows have [46]$"):
+        read_points3d(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize("label", ["inf", "-1e30"])
+def test_a_label_that_no_integer_holds_is_refused(label: str, tmp_path: Path) -> None:
+    """As an int64 it is negative, a point of unknown label."""
+    (tmp_path / "a.csv").write_text(f"x,y,z,label\n1,2,3,{label}\n")
+    with pytest.raises(ValueError, match="the column label of .* holds .*; labels are integers"):
+        read_points3d(tmp_path / "a.csv")
+
+
 @pytest.mark.parametrize(
     "text",
     [

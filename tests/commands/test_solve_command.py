@@ -212,3 +212,12 @@ def test_with_the_size_of_the_image_the_focal_length_is_estimated(
     solution = Solution.from_json(capsys.readouterr().out)
     assert example.rotation_error_deg(solution.rotation) < 0.5
     assert solution.focal_length == pytest.approx(example.camera[0, 0], rel=0.05)
+
+
+def test_two_outputs_in_one_file_are_refused(
+    tmp_path: Path, fails: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bpnp.search.api.solve", None)
+    same = str(tmp_path / "a.png")
+    message = fails("solve", *write(tmp_path), "--output", same, "--picture", str(tmp_path / "." / "a.png"))
+    assert f"{same} is the file of two outputs; name another file for one of them" in message
