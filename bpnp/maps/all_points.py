@@ -120,7 +120,7 @@ def judge_on_all_points(solution: Solution, refined: Refined | None) -> Solution
     rotations, shifts = (np.stack(both) for both in zip(refined.pose, result.best, strict=True))
     behind = result.log10_false_alarms - solution.log10_false_alarms
     if confident and not problem.same_pose(rotations, shifts, settings.same)[1]:
-        other = competing_pose(rotations[0], rotations[1], behind)
+        other = competing_pose(problem, rotations, shifts, behind)
         return solution if behind >= settings.margin else add_objection(solution, other)
     if behind < 0 or (not confident and result.verdict == "confident"):
         found = finished(problem, result, solution.seconds, None)

@@ -30,6 +30,7 @@ from bpnp.search.propose.symmetries import mirror_pose
 from bpnp.search.refine.annealing import anneal_on_points, anneal_to_end, finish
 from bpnp.search.search_frame import Scene
 from bpnp.search.starts import PosePrior
+from bpnp.search.verdict.competitors import distance_between
 from bpnp.search.verdict.decide import SearchResult, Verdict, add_false_alarms, judge
 from bpnp.search.verdict.false_alarms import likeliest_scale
 from bpnp.search.verdict.reasons import objection
@@ -92,7 +93,7 @@ def judge_given_pose(
     candidates = _with_new_false_alarms(Hypotheses.concatenate([claim, competing]), one)
     result = judge(candidates, one, batches=0, exhaustive=True, settings=settings)
     result = judge_with_competitors(result, one, lambda: scene, settings, exhaustive=True, enumerated=few)
-    result = _of_claim(result, candidates[:1])
+    result = _of_claim(result, candidates[:1], one)
     if result.verdict == "confident":
         result = replace(result, reason=f"{result.reason}; {ONE_POSE}")
     margin = float(claim.log10_false_alarms[0] - optimum.log10_false_alarms[0]) if better else 0.0
@@ -159,7 +160,7 @@ def _is_same(problem: Problem, claim: Hypotheses, pose: Hypotheses, settings: Ev
     return bool(step @ np.linalg.solve(covariance, step) < PRECISION.far)
 
 
-def _of_claim(result: SearchResult, claim: Hypotheses) -> SearchResult:
+def _of_claim(result: SearchResult, claim: Hypotheses, problem: Problem) -> SearchResult:
     """Convert a verdict on several poses into one on the given pose (1,), which becomes the first candidate."""
     candidates = result.candidates
     place = int(np.flatnonzero((candidates.translation == claim.translation[0]).all(-1))[0])
@@ -168,9 +169,11 @@ def _of_claim(result: SearchResult, claim: Hypotheses) -> SearchResult:
     if alarms > 0:
         return ordered.add_objection(objection("chance", what="the pose fits no"), "failed")
     if place:
-        off = math.degrees(rotation_angle(candidates.rotation[0], claim.rotation[0]))
+        rotations = np.concatenate([claim.rotation, candidates.rotation[:1]])
+        translations = np.concatenate([claim.translation, candidates.translation[:1]])
+        away = distance_between(problem, rotations, translations)
         margin = alarms - float(candidates.log10_false_alarms[0])
         refuted = result.verdict == "confident"  # the other pose is confident and refutes the given one
         verdict: Verdict = "failed" if refuted else "ambiguous"
-        return ordered.add_objection(objection("better_pose", margin, degrees=off), verdict)
+        return ordered.add_objection(objection("better_pose", margin, away=away), verdict)
     return ordered

@@ -62,6 +62,17 @@ def test_a_wrong_pose_fails_with_a_reason_and_is_returned_unchanged(view: Any, d
     assert np.array_equal(solution.rotation, turned[0])
 
 
+def test_a_pose_shifted_by_one_window_fails_with_the_shift_to_the_better_pose() -> None:
+    """Windows are 3 m apart and the facade 20 m away; the two poses have the same rotation."""
+    rng = np.random.default_rng(3)
+    window = rng.uniform(-0.7, 0.7, (8, 3))
+    points = np.concatenate([*(window + [3 * k, 0, 0] for k in range(-4, 5)), rng.uniform(-6, 6, (40, 3))])
+    x = seen(points, np.eye(3), np.array([0, 0, 20.0])) + 1e-4 * rng.standard_normal((len(points), 2))
+    shifted = bpnp.verify(x, points, np.eye(3), np.array([3.0, 0, 20.0]))
+    assert (shifted.verdict, shifted.reason_code) == ("failed", "better_pose")
+    assert shifted.reason.startswith("A pose 15 % of the distance away fits better")
+
+
 def test_the_mirror_image_of_a_plane_is_a_competing_pose() -> None:
     """Far away a plane looks nearly as tilted to the other side; with this noise only one of both is right."""
     rng = np.random.default_rng(9)

@@ -39,23 +39,38 @@ def other_pose(candidates: Hypotheses, problem: Problem, settings: Evidence) -> 
         return None
     k = int(others[np.argmin(candidates.log10_false_alarms[others])])
     decades = float(candidates.log10_false_alarms[k] - candidates.log10_false_alarms[0])
-    centres = candidates.rotation[[0, k]] @ problem.centre3d + candidates.translation[[0, k]]
-    shift = float(np.linalg.norm(centres[1] - centres[0]) / max(float(np.linalg.norm(centres[0])), 1e-300))
-    return competing_pose(candidates.rotation[0], candidates.rotation[k], decades, shift)
+    return competing_pose(problem, candidates.rotation[[0, k]], candidates.translation[[0, k]], decades)
 
 
-def competing_pose(rotation: Array, other: Array, decades: float, shift: float = 0.0) -> Objection:
+def competing_pose(problem: Problem, rotations: Array, translations: Array, decades: float) -> Objection:
     """Return a different pose as an objection.
 
     Args:
-        rotation: (3, 3) of the best pose.
-        other: (3, 3) of the competing pose.
+        problem: Points of the problem.
+        rotations: (2, 3, 3) of the best pose and of the competing pose.
+        translations: (2, 3) of both, in the frame of the problem.
         decades: log10 of the ratio of their false alarms.
-        shift: Shift of the scene centroid between them, in distances from the camera; it is shown for equal rotations.
     """
-    degrees = math.degrees(rotation_angle(rotation, other))
-    away = f"{degrees:.0f} deg" if degrees >= REASONS.degrees or not shift else f"{100 * shift:.0f} % of the distance"
-    return objection("competing_pose", decades, away=away)
+    return objection("competing_pose", decades, away=distance_between(problem, rotations, translations))
+
+
+def distance_between(problem: Problem, rotations: Array, translations: Array) -> str:
+    """Return the angle between two poses in words, or for equal rotations the shift of the scene centroid.
+
+    Args:
+        problem: Points of the problem.
+        rotations: (2, 3, 3) of the poses.
+        translations: (2, 3) of the poses, in the frame of the problem.
+
+    Returns:
+        Such as "12 deg" or "15 % of the distance", that of the scene centroid from the camera of the first pose.
+    """
+    degrees = math.degrees(rotation_angle(rotations[0], rotations[1]))
+    if degrees >= REASONS.degrees:
+        return f"{degrees:.0f} deg"
+    centres = rotations @ problem.centre3d + translations
+    shift = float(np.linalg.norm(centres[1] - centres[0]) / max(float(np.linalg.norm(centres[0])), 1e-300))
+    return f"{100 * shift:.0f} % of the distance"
 
 
 def rough_residuals(candidates: Hypotheses) -> Objection | None:
@@ -141,8 +156,8 @@ def unrelated_competitor(cameras: CandidatesOfCameras, settings: Evidence) -> Ob
         if decades < settings.margin and (
             apart or (same & first.near & other.near).sum() < limits.same * other.near.sum()
         ):
-            degrees = math.degrees(rotation_angle(candidates.rotation[0], candidates.rotation[k]))
-            return objection("other_points", decades, degrees=degrees)
+            two = candidates.rotation[[0, k]], candidates.translation[[0, k]]
+            return objection("other_points", decades, away=distance_between(problem, *two))
     return None
 
 

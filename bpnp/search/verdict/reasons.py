@@ -20,9 +20,9 @@ CLAUSES = {
     "the image points about as well (margin {margin:.1f} decades)",
     "better_place": "a pose {distance:.3g} scene units and {degrees:.0f} deg away, elsewhere in the map, explains "
     "the image points better (by {better:.1f} decades)",
-    "better_pose": "a pose {degrees:.0f} deg away fits better (by {margin:.1f} decades)",
+    "better_pose": "a pose {away} away fits better (by {margin:.1f} decades)",
     "better_nearby": "the nearest optimum, {degrees:.2g} deg away, fits better (by {margin:.1f} decades)",
-    "other_points": "a pose {degrees:.0f} deg away explains other points, and the difference may be chance",
+    "other_points": "a pose {away} away explains other points, and the difference may be chance",
     "rough_residuals": "the points fit better with residuals far larger than those of the matches",
     "untested": "there was no time to test its competing poses",
     "incomplete": "a better {what} may exist (miss probability up to {probability})",
