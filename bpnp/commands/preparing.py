@@ -13,7 +13,8 @@ from bpnp.report.terminal import say
 if TYPE_CHECKING:
     from bpnp.datamodules.store import Store
 
-PROCESSES = os.cpu_count() or 1
+# CPUs that this process may use, such as those of a cluster job
+PROCESSES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def prepare_modelnet40(

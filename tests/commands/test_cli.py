@@ -293,3 +293,15 @@ def test_a_test_of_other_weights_or_data_says_what_it_replaces(
     assert f"the results of procedural-so3 in {tmp_path}/run/test are replaced" in caplog.messages
     settings = json.loads((tmp_path / "run" / "test" / "summary.json").read_bytes())["settings"]
     assert (settings["checkpoint"], settings["weights"]) == (None, "paper-lc")
+
+
+def test_a_data_set_is_prepared_with_one_process_for_each_cpu_of_a_cluster_job() -> None:
+    code = (
+        "import os\n"
+        "os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
+        "os.cpu_count = lambda: 128\n"
+        "from bpnp.commands.preparing import PROCESSES\n"
+        "print(PROCESSES)"
+    )
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert shown.split() == ["1"]
