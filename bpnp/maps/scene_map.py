@@ -173,8 +173,9 @@ class SceneMap(ViewedPoints):
                 of the view that is tried, or of the prior.
             seed: Seed of the search, default 0.
             time_limit: Seconds for all views together; math.inf for no limit. Default: None, 60 seconds. After it no
-                search starts, but competing poses of a confident pose are still tested, which takes about a second. A
-                pose that is not confident then has a reason with the number of views that were tried.
+                further view is tried. The best pose is still refined on all map points in view, and competing poses of
+                a confident pose are tested: 1 or 2 CPU seconds with a known camera, up to 15 with an unknown focal
+                length. A pose that is not confident then has a reason with the number of views that were tried.
 
         Returns:
             Solution of the photo. `view` is the view near which the pose was found. `points3d` are the points of
