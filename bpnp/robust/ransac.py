@@ -41,7 +41,8 @@ def consensus(
     float32.
 
     Args:
-        matches: Matches of `bpnp.robust.matches.normalised`, most probable first. A point may be in many matches.
+        matches: Matches of `bpnp.robust.matches.normalise_matches`, most probable first. A point may be in many of
+            them.
         threshold: Largest reprojection error of an inlier.
         hypotheses: Triples for each sample.
         seed: Seed of the draws.
@@ -205,7 +206,7 @@ def _count_inliers(pose: NDArray[Any], x: Array, p: Array, threshold: float) -> 
     return int(residuals(poses, Matches(*matches), threshold**2).inlier.sum())
 
 
-# Matches of `bpnp.robust.matches.normalised`, most probable first, threshold, most hypotheses, seed ->
+# Matches of `bpnp.robust.matches.normalise_matches`, most probable first, threshold, most hypotheses, seed ->
 # poses [R | t], NaN for none, and hypotheses; their bound where the library does not report the number.
 BACKENDS: dict[str, Estimator] = {
     "poselib": partial(_each, _poselib),

@@ -397,7 +397,7 @@ def checked_labels(labels2d: Any, labels3d: Any, counts: tuple[int, int]) -> dic
         return {}
     if missing:
         raise ValueError(f"`{missing[0]}` is missing; give both `labels2d` and `labels3d`, or neither")
-    if all(getattr(values, "ndim", 1) < 2 for values in labels.values()):
+    if all(np.ndim(values) < 2 for values in labels.values()):
         integers = [_integers(name, labels[name], count) for name, count in zip(labels, counts, strict=True)]
         return dict(zip(labels, compact_labels(*integers), strict=True))
     image, scene = (_classes(name, labels[name], count) for name, count in zip(labels, counts, strict=True))

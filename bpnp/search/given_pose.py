@@ -166,7 +166,7 @@ def _of_claim(result: SearchResult, claim: Hypotheses, problem: Problem) -> Sear
     place = int(np.flatnonzero((candidates.translation == claim.translation[0]).all(-1))[0])
     ordered = replace(result, candidates=candidates[np.r_[place, np.delete(np.arange(len(candidates)), place)]])
     alarms = float(claim.log10_false_alarms[0])
-    if alarms > 0:
+    if alarms >= 0:  # exactly 0 if the camera sees no more points than fix a pose
         return ordered.add_objection(objection("chance", what="the pose fits no"), "failed")
     if place:
         rotations = np.concatenate([claim.rotation, candidates.rotation[:1]])

@@ -109,14 +109,16 @@ def verify(
     judged = problem if given is None else _of_matches(problem, given)
     limits: dict[str, Any] = {"inlier_threshold": threshold, "seed": checked_seed(seed), "time_limit": limit}
     solution = verify_problem(judged, *pose, refine=refine, **limits)
-    if given is None or judged.degenerate is not None:
+    if given is None:
         return solution
     return replace(
         solution,
         matches=given[solution.matches[:, 0]],
-        inlier_ratio=solution.inlier_count / len(given),
+        inlier_ratio=solution.inlier_count / max(len(given), 1),
+        stats=replace(solution.stats, dropped2d=problem.dropped2d),
         points2d=problem.all2d,
         points3d=problem.all3d,
+        normals3d=problem.normals3d,
     )
 
 

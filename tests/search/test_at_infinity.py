@@ -3,6 +3,7 @@
 import math
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -156,6 +157,25 @@ def test_points_with_the_largest_scores_are_tried_first() -> None:
     good = np.where(star >= 0, 1.0, 0.1)
     first, last = (look(image, directions, lens(40.0).model, scores2d=s) for s in (good, 1.1 - good))
     assert first.stats.iterations < last.stats.iterations
+
+
+@pytest.mark.parametrize("scored", [0, 1])
+def test_a_camera_of_a_rig_without_scores_has_equal_ones(scored: int) -> None:
+    """The camera with scores sees no star; the points of the other one have larger scores and are tried first."""
+    rotation, turn = Rotation.random(rng=0).as_matrix(), Rotation.from_rotvec([0, 0.5, 0]).as_matrix()
+    directions, false = np.random.default_rng(0).normal(size=(2, 200, 3))
+    directions, false = (each / np.linalg.norm(each, axis=1, keepdims=True) for each in (directions, false))
+    mounts = [(np.eye(3), np.zeros(3)), (turn, np.zeros(3))]
+    images = [directions[:30] @ (mount @ rotation).T for mount, _ in mounts]
+    images[scored] = false[:60]
+    scores: list[Any] = [None, None]
+    scores[scored] = np.r_[0.2, np.full(59, 0.1)]
+    equal = [np.ones(30) if each is None else each for each in scores]
+    for seed in range(4):
+        none, ones = (look(images, directions, rig=mounts, scores2d=each, seed=seed) for each in (scores, equal))
+        assert degrees_between(none.rotation, rotation) < 1e-3
+        assert none.stats.iterations == ones.stats.iterations
+        np.testing.assert_array_equal(none.rotation, ones.rotation)
 
 
 def test_matches_lie_within_the_threshold() -> None:

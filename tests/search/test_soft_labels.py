@@ -44,6 +44,8 @@ def test_probabilities_of_one_act_as_labels_and_equal_ones_as_none(view: Any) ->
         assert soft[0] == pytest.approx(hard[0], abs=1e-3)
         np.testing.assert_allclose(soft[1], hard[1], rtol=1e-4)
     assert certain[0] < equal[0] - 10
+    nested = judge(labels2d=np.eye(4)[labels2d].tolist(), labels3d=np.eye(4)[labels3d].tolist())
+    assert nested[0] == certain[0]
 
 
 def test_class_probabilities_decide_between_two_equal_objects() -> None:

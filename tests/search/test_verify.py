@@ -131,6 +131,29 @@ def test_the_pose_is_judged_on_the_matches_that_are_given(view: Any) -> None:
     assert bpnp.verify(bearings, points, *pose, matches=wrong).verdict == "failed"
 
 
+def test_a_solution_from_some_matches_holds_all_points(view: Any) -> None:
+    """Also where the matches fix no pose: the picture shows the user's points, with their normals."""
+    bearings, points, *pose = view
+    towards = -pose[0].T @ pose[1] - points
+    normals = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    for count, verdict in ((60, "confident"), (0, "failed")):
+        pairs = np.stack([np.arange(count)] * 2, -1)
+        solution = bpnp.verify(bearings, points, *pose, matches=pairs, normals3d=normals)
+        assert (solution.verdict, solution.inlier_count > 0) == (verdict, count > 0)
+        np.testing.assert_array_equal(solution.points3d, points)
+        np.testing.assert_allclose(solution.normals3d, normals)
+        assert len(solution.points2d) == len(bearings)
+        solution.plot()
+
+
+def test_a_pose_that_sees_no_point_fails(view: Any) -> None:
+    bearings, points, *pose = view
+    away = points + pose[0].T @ pose[1]
+    normals = away / np.linalg.norm(away, axis=1, keepdims=True)
+    solution = bpnp.verify(bearings, points, *pose, normals3d=normals)
+    assert (solution.verdict, solution.reason_code, solution.inlier_count) == ("failed", "chance", 0)
+
+
 def test_options_reach_the_verdict(view: Any) -> None:
     bearings, points, *pose = view
     tight = bpnp.verify(bearings, points, *pose, inlier_threshold=1e-3)

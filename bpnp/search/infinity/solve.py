@@ -95,7 +95,8 @@ def prepare_directions(
         cameras: Camera of each of them; None without one.
         unknown: Cameras with an unknown focal length; None if it is known. All have the same factor of the focal length
             of their reference.
-        point_options: Lists of `labels2d` and `scores2d`, one array or None per camera; `labels3d` and `scores3d`.
+        point_options: Lists of `labels2d` and `scores2d`, one array or None per camera; `labels3d` and `scores3d`. The
+            points of a camera without scores have 1 if another camera has scores.
         options: Options of the search.
         camera_rotations: (3, 3) rotations cam_from_rig of the cameras of a rig; None for one camera.
         prior: Prior of the rotation. Its translation is ignored.
@@ -110,6 +111,7 @@ def prepare_directions(
     if unknown is not None:
         lenses = [one.reference for one in unknown]
     images, annotations = [], []
+    is_scored = any(scores is not None for scores in point_options["scores2d"])
     for k, (points, lens) in enumerate(zip(points2d, lenses, strict=True)):
         with about(None if camera_rotations is None else f"camera {k}"):
             image = image_points(points)
@@ -117,9 +119,10 @@ def prepare_directions(
                 "points2d", image, (2, 3) if lens is None else (2,), INFINITY.fewest if camera_rotations is None else 1
             )
             images.append(image)
+            scores = checked_scores("scores2d", point_options["scores2d"][k], len(image))
             annotations.append(
                 checked_labels(point_options["labels2d"][k], point_options["labels3d"], (len(image), len(scene)))
-                | {"scores2d": checked_scores("scores2d", point_options["scores2d"][k], len(image))}
+                | {"scores2d": np.ones(len(image)) if is_scored and scores is None else scores}
             )
     check_points("points3d", scene, (3,), INFINITY.fewest)
     hint = "divide by the lengths, or leave out `at_infinity` for points of a scene"
