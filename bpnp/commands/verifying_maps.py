@@ -68,7 +68,7 @@ def verify_images(
         say(summary(verified), to=out)
     if output is not None:
         text = as_csv(verified) if output.suffix.lower() == ".csv" else as_json(verified, map) + "\n"
-        say(f"wrote {write_text(output, text)}", to=out)
+        say(f"wrote {write_text(output, text, errors='surrogateescape')}", to=out)
     if page is not None:
         say(f"wrote {write_text(page, page_html(verified, scene, map))}", to=out)
 

@@ -161,7 +161,7 @@ def page_html(verified: Sequence[VerifiedView], scene: SceneMap, folder: Path) -
     return render_page(
         "verified_map.html",
         colours=VERDICTS,
-        title=folder,
+        title=str(folder),
         summary=summary(verified),
         rows=[(one, *cells(one)) for one in verified],
         drawing=_drawing(verified, scene),

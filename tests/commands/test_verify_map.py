@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from bpnp import SceneMap
 from bpnp.cli import main
 from bpnp.examples import HOUSES_APART, WRONG_IMAGE, draw_map
-from bpnp.maps.verified_map import verify_map
+from bpnp.maps.verified_map import VerifiedView, verify_map
 
 pytestmark = pytest.mark.slow
 
@@ -159,3 +159,21 @@ def test_a_pipe_gets_a_line_for_each_image(tmp_path: Path, capsys: pytest.Captur
     assert [line.partition(": ")[0] for line in lines] == [f"{k + 1}/3 photo {k}.jpg" for k in range(3)]
     main(["verify", str(tmp_path), "--quiet"])
     assert capsys.readouterr() == ("", "")
+
+
+def test_names_that_are_not_utf8_are_written(
+    houses: tuple[Path, dict[str, tuple[np.ndarray, np.ndarray]]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the folder in the page, and of the images in the table; the verdicts would be lost after the whole search."""
+
+    def untested(folder: Path, scene: SceneMap, **_: object) -> list[VerifiedView]:
+        return [VerifiedView(view.name, "untested", "caf\udce9 <b>") for view in scene.views]
+
+    monkeypatch.setattr("bpnp.maps.verified_map.verify_map", untested)
+    folder = tmp_path / "caf\udce9"
+    shutil.copytree(houses[0], folder)
+    page, table = tmp_path / "page.html", tmp_path / "table.csv"
+    main(["verify", str(folder), "--page", str(page), "--output", str(table), "--quiet"])
+    assert "<h1>Poses of the images of " in page.read_text()
+    assert "caf? &lt;b&gt;" in page.read_text()
+    assert table.read_bytes().count(b"caf\xe9 <b>") == 11
