@@ -332,7 +332,7 @@ def outside_image(pixels: Array, sides: Any) -> npt.NDArray[np.bool_]:
     sides = np.asarray(sides, np.float64)
     slack = max(SLACK * float(sides.max()), 1.0)
     outside = ((pixels < -slack) | (pixels > sides + slack)).any(-1)
-    return np.asarray(outside & (outside.mean() > FEW_OUTSIDE))
+    return np.asarray(outside & (outside.sum() > FEW_OUTSIDE * len(outside)))
 
 
 def resize_camera(camera: Camera, size: tuple[int, int]) -> Camera:

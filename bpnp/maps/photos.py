@@ -2,6 +2,7 @@
 
 import importlib
 import math
+import os
 import sqlite3
 from collections.abc import Collection, Iterable
 from contextlib import closing
@@ -53,7 +54,7 @@ def photo_files(paths: Iterable[Path], besides: Collection[Path] = ()) -> dict[s
     """Return photo files by name: given files by file name, and files in given folders by their path in the folder.
 
     Args:
-        paths: Files and folders; folders are searched recursively.
+        paths: Files and folders; folders are searched recursively, also through links.
         besides: Folders to skip in folders, such as that of the pictures of the results. Default: none.
 
     Raises:
@@ -64,7 +65,7 @@ def photo_files(paths: Iterable[Path], besides: Collection[Path] = ()) -> dict[s
     for path in paths:
         if not path.exists():
             raise ValueError(f"{path} does not exist; give a photo or a folder of photos")
-        inside = (file for file in sorted(path.rglob("*")) if file.suffix.lower() in SUFFIXES)
+        inside = (file for file in _files_in(path) if file.suffix.lower() in SUFFIXES)
         for file in (f for f in inside if left_out.isdisjoint(f.resolve().parents)) if path.is_dir() else [path]:
             name = file.relative_to(path).as_posix() if path.is_dir() else file.name
             if files.setdefault(name, file) != file:
@@ -73,6 +74,18 @@ def photo_files(paths: Iterable[Path], besides: Collection[Path] = ()) -> dict[s
         outside = f" outside {' and '.join(map(str, besides))}" if besides else ""
         raise ValueError(f"there are no photos{outside}; give one or more photos, or folders with photos")
     return files
+
+
+def _files_in(top: Path) -> list[Path]:
+    """Return all files below a folder, sorted; a link to a folder is followed unless it leads back to itself."""
+    files: list[Path] = []
+    for name, children, names in os.walk(top, followlinks=True):
+        folder = Path(name)
+        if folder.resolve() in map(Path.resolve, folder.absolute().parents):
+            children.clear()
+        else:
+            files += (folder / file for file in names)
+    return sorted(files)
 
 
 def photo_size(photo: Path) -> Size:

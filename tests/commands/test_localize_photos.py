@@ -136,6 +136,15 @@ def test_photos_in_folders_within_are_named_by_their_path_and_results_are_no_pho
         photo_files([tmp_path / "pictures"], besides=results)
 
 
+def test_photos_in_linked_folders_are_found(tmp_path: Path) -> None:
+    for name in ("photos/0004.jpg", "elsewhere/0005.jpg", "photos/folder.jpg/notes.txt"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    (tmp_path / "photos/day").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere/back").symlink_to(tmp_path / "photos")
+    assert list(photo_files([tmp_path / "photos"])) == ["0004.jpg", "day/0005.jpg"]
+
+
 @pytest.fixture(scope="module")
 def mesh_solution() -> bpnp.Solution:
     example = load("mesh")

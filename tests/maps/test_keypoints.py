@@ -98,6 +98,9 @@ def test_keypoints_of_hloc_are_read_and_wrong_files_named(tmp_path: Path) -> Non
     with pytest.raises(ValueError, match=r"features\.h5 has no keypoints of b\.jpg, but of query"):
         read_features(path, "b.jpg")
     with h5py.File(path, "a") as file:
+        file["none.jpg/keypoints"] = np.zeros((0, 2))
+    assert read_features(path, "none.jpg", (200, 100)).pixels.shape == (0, 2)
+    with h5py.File(path, "a") as file:
         file["c.jpg"] = np.zeros((5, 2))  # an array without a group
     with pytest.raises(ValueError, match=r"features\.h5 has no keypoints of c\.jpg, but of"):
         read_features(path, "c.jpg")
