@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from bpnp.datamodules.loader import hold_out
 from bpnp.datamodules.problem import Problem
-from bpnp.datamodules.store import JobResult, Recipe, Store, StoreRow, is_store, open_or_prepare, open_store
+from bpnp.datamodules.store import JobResult, Recipe, Store, StoreError, StoreRow, is_store, open_or_prepare, open_store
 from bpnp.datamodules.stored import PROBLEMS, WIDTHS, StoredDataModule, problem_row, scene_rows
 from bpnp.files import file_states, fingerprint
 from bpnp.poses import MIN_POINTS
@@ -64,11 +64,18 @@ class AuthorsDataModule(StoredDataModule):
         if not hasattr(self, "store"):
             if is_store(self.root):
                 self.store = open_store(self.root, PROBLEMS)
+                if self.dataset not in (None, stored := self.store.parameters.get("dataset")):
+                    raise StoreError(
+                        f"`dataset` is {self.dataset}, but {self.root} was made of {stored}; leave it out, or prepare "
+                        f"it again with --dataset {self.dataset}"
+                    )
             else:
                 recipe = authors_recipe(Path(self.root), self.dataset)
                 self.store = open_or_prepare(recipe, str(recipe.parameters["dataset"]), self.cache_dir)
         rows = split_rows(self.store, "train")
-        training, held_out = hold_out(len(rows), self.held_out, seed=self.seed)
+        training = held_out = np.arange(0)
+        if len(rows):  # not if only the test problems were downloaded
+            training, held_out = hold_out(len(rows), self.held_out, seed=self.seed)
         return {"train": rows[training], "val": rows[held_out], "test": split_rows(self.store, "test")}
 
 

@@ -1,6 +1,7 @@
 """The authors' pickles: planted problems come back with their matches, copies dropped, both directions of W_gt."""
 
 import pickle
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -150,3 +151,22 @@ def test_the_data_module_splits_and_augments_the_samples(tmp_path: Path) -> None
     again = AuthorsDataModule(str(next((tmp_path / "cache").iterdir())), **options)
     again.setup("test")
     assert len(again.datasets["test"]) == 20
+
+
+def test_problems_for_testing_alone_are_tested_on(tmp_path: Path) -> None:
+    root = write(tmp_path / "data", [sample(i) for i in range(4)])
+    shutil.rmtree(root / "modelnet40_train")
+    store = prepare_authors(root, tmp_path / "store")
+    for source in (root, store.folder):
+        module = AuthorsDataModule(str(source), cache_dir=str(tmp_path / "cache"))
+        module.setup("test")
+        assert len(module.datasets["test"]) == 4
+        with pytest.raises(StoreError, match="none of the 0 problems in "):
+            module.setup("fit")
+
+
+def test_a_store_of_another_data_set_is_refused(tmp_path: Path) -> None:
+    store = prepare_authors(write(tmp_path / "data", [sample(i) for i in range(4)]), tmp_path / "store")
+    AuthorsDataModule(str(store.folder), dataset="modelnet40").setup("test")
+    with pytest.raises(StoreError, match="`dataset` is megadepth, but .*store was made of modelnet40; leave it out"):
+        AuthorsDataModule(str(store.folder), dataset="megadepth").setup("test")
