@@ -1,8 +1,7 @@
 """Index of a large map in the cache folder: one file with all that is computed when a COLMAP model is opened."""
 
 import json
-import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -94,14 +93,18 @@ def _write_index(folder: Path, stamp: str, index: Index) -> None:
 
 
 def read_index(folder: Path) -> Index | None:
-    """Return the index of the model in a folder; None if there is none, or if its files or constants have changed."""
+    """Return the index of the model in a folder; None if there is none, or a damaged one, or if the model has changed.
+
+    It is also None if the constants of the index have changed.
+    """
     try:
         with index_file(folder).open("rb") as opened, np.load(opened) as file:
-            if file["stamp"].tobytes().decode() != model_stamp(folder):
-                return None
-            arrays = dict(file)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            return _index_of(dict(file)) if file["stamp"].tobytes().decode() == model_stamp(folder) else None
+    except Exception:  # noqa: BLE001 - zipfile and numpy have different errors for a damaged file; it is written again
         return None
+
+
+def _index_of(arrays: Mapping[str, NDArray[Any]]) -> Index:
     cameras = [camera_from(plain) for plain in json.loads(arrays["cameras"].tobytes())]
     views = map(
         View,

@@ -79,6 +79,26 @@ def test_a_large_map_is_indexed_once(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert len(SceneMap.from_colmap(folder).views) == 3
 
 
+def test_a_damaged_index_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Any damage of a file in the cache is noticed; the map is read from its model again."""
+    monkeypatch.setenv("BPNP_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(scene_map, "MAPS", replace(MAPS, indexed=10))
+    truth = plant_model(tmp_path / "model", images=2, points=30, seen=25)
+    SceneMap.from_colmap(tmp_path / "model")
+    (file,) = (tmp_path / "cache").rglob("*.npz")
+    whole, used = file.read_bytes(), 0
+    for place in (*range(0, 200, 2), *range(len(whole) - 400, len(whole), 2)):
+        file.write_bytes(whole[:place] + bytes([whole[place] ^ 0xFF]) + whole[place + 1 :])
+        found = index.read_index(tmp_path / "model")
+        if found is not None:
+            np.testing.assert_allclose([view.rotation for view in found.views], truth.rotations, atol=1e-12)
+            used += 1
+    assert used < 150
+    file.write_bytes(whole[: len(whole) // 2])
+    assert len(SceneMap.from_colmap(tmp_path / "model").views) == 2
+    assert file.read_bytes() == whole
+
+
 def test_a_model_that_is_replaced_while_it_is_read_is_read_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
