@@ -1,5 +1,6 @@
 """Rigs: planted poses of two and three cameras that see too little on their own."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -104,6 +105,22 @@ def test_many_points_are_searched_and_joined() -> None:
     assert degrees_between(solution.rotation, pose[0]) < 0.3
     one = bpnp.solve(images[0], scene, CAMERA, solver="search")
     assert solution.log10_false_alarms < one.log10_false_alarms - 20
+
+
+@pytest.mark.parametrize("degrees", [5.0, 90.0])
+def test_wrong_extrinsics_keep_a_rig_from_being_confident(degrees: float) -> None:
+    """The first camera sees more points than the second, whose own pose contradicts the extrinsics."""
+    images, scene, mounts, pose, _ = planted_rig(1, (14, 9))
+    axis = np.array([0.6, 0.8, 0.0])
+    for k in range(2):
+        turn, shift = mounts[k]
+        wrong = Rotation.from_rotvec(math.radians(degrees) * axis).as_matrix() @ turn
+        given = [(wrong, shift) if other == k else mount for other, mount in enumerate(mounts)]
+        solution = bpnp.solve(images, scene, [CAMERA] * 2, rig=given, time_limit=600)
+        assert (solution.verdict, solution.reason_code) == ("ambiguous", "other_extrinsics")
+    solution = bpnp.solve(images, scene, [CAMERA] * 2, rig=mounts, time_limit=600)
+    assert solution.verdict == "confident"
+    assert degrees_between(solution.rotation, pose[0]) < 0.5
 
 
 def test_a_rig_is_judged_at_the_scale_of_its_residuals() -> None:

@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.poses import distinct, polar_coordinates
+from bpnp.poses import distinct, polar_coordinates, rotation_angle
 from bpnp.runtime import NEVER, Clock, Deadline, one_blas_thread
 from bpnp.search.competing_poses import fitted_lens
 from bpnp.search.config import DEFAULT, ENUMERATION, RIG, SearchSettings
@@ -32,7 +32,8 @@ from bpnp.search.rig.cameras import Array, Pose, Rig
 from bpnp.search.search import lacks_partners
 from bpnp.search.search_frame import Scene
 from bpnp.search.verdict.decide import SearchResult, is_object, judge, match_count, missed, no_pose
-from bpnp.search.verdict.reasons import focal_length_not_fixed, objection
+from bpnp.search.verdict.false_alarms import alarms_of
+from bpnp.search.verdict.reasons import Objection, focal_length_not_fixed, objection
 from bpnp.search.verdict.uncertainty import linearised, share_bound
 
 PROPOSING = replace(ENUMERATION, kept=RIG.proposing)
@@ -256,6 +257,8 @@ class RigPoses:
             copies = self.rig.rig_of(strongest, repeated.rotation, repeated.translation, unit)
             self.add_refined(self.rig.candidates(*copies))
             result = self._judge()
+        if result.verdict == "confident" and (other := self._other_extrinsics()) is not None:
+            result = result.add_objection(other)
         if result.verdict == "confident" and self.rig.model.lens is None:
             strongest, seen = self._strongest()
             pose = seen.rotation[0], seen.translation[0], float(seen.scale[0])
@@ -281,6 +284,35 @@ class RigPoses:
                     result = result.add_objection(focal_length_not_fixed(bound))
         poses = replace(result.candidates, rotation=self.best.rotation, translation=self.best.translation)
         return replace(result, candidates=poses)
+
+    def _other_extrinsics(self) -> Objection | None:
+        """Return a camera whose points fit a pose of its own instead of the best pose, as an objection, or None.
+
+        The best pose fits the points of this camera no better than chance, and a pose that the camera proposed is
+        significant, at the same scale of the residuals. The extrinsics may be wrong, and with them the best pose.
+        """
+        settings = self.verdict_settings
+        for k, found in enumerate(self.found):
+            here = float(self._alarms_alone(k)[0])
+            if here <= 0 or not len(found):
+                continue
+            own = self._alarms_alone(k, found[: RIG.refined])  # those of an enumeration begin with the likeliest
+            if own.min() <= min(settings.false_alarms, here - settings.margin):
+                turn, _ = self.rig.pose_of(k, self.best.rotation[0], self.best.translation[0])
+                degrees = math.degrees(rotation_angle(turn, found.rotation[own.argmin()]))
+                return objection("other_extrinsics", camera=k, degrees=degrees)
+        return None
+
+    def _alarms_alone(self, k: int, poses: Hypotheses | None = None) -> Array:
+        """Return log10 NFA (c,) of poses in one camera alone, at the scale of the residuals of the best pose.
+
+        Args:
+            k: Index of the camera.
+            poses: Poses of this camera; None for the best pose of the rig.
+        """
+        seen = self.rig.seen(k, self.best[:1]) if poses is None else poses
+        problem = replace(self.rig.problems[k], prior=None)
+        return alarms_of(problem, seen.rotation, seen.translation, np.repeat(self.best.scale[:1], len(seen))).own
 
     def _judge(self) -> SearchResult:
         strongest, seen = self._strongest()
