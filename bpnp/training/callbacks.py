@@ -376,5 +376,5 @@ def _settings(trainer: Trainer) -> dict[str, Any]:
     model = config.get("model", {})
     options = model.get("init_args", model)
     checkpoint = str(trainer.ckpt_path) if trainer.ckpt_path else None
-    found = {"checkpoint": checkpoint, "data": config.get("data"), "solver": options.get("solver")}
-    return found if options.get("weights") is None else found | {"weights": options["weights"]}
+    weights, solver = options.get("weights"), options.get("solver")
+    return {"checkpoint": checkpoint, "weights": weights, "data": config.get("data"), "solver": solver}

@@ -293,6 +293,8 @@ def test_a_test_of_other_weights_or_data_says_what_it_replaces(
     assert f"the results of procedural-so3 in {tmp_path}/run/test are replaced" in caplog.messages
     settings = json.loads((tmp_path / "run" / "test" / "summary.json").read_bytes())["settings"]
     assert (settings["checkpoint"], settings["weights"]) == (None, "paper-lc")
+    main(["test", *common])
+    assert f"the results of paper-lc in {tmp_path}/run/test are replaced" in caplog.messages
 
 
 def test_a_data_set_is_prepared_with_one_process_for_each_cpu_of_a_cluster_job() -> None:
