@@ -33,14 +33,18 @@ FILE, PAGES = ROOT / "benchmarks" / "table2.json", (ROOT / "docs" / "table2.md",
 POINTS = 1000
 EPOCH = 18  # batches of the training photos of `TRAINED`; an epoch has no more
 DRAWN_EPOCH = 90  # steps on drawn maps between checkpoints
-SHORT = {"drawn_steps": [90, 90, 90], "steps": 90, "pose_steps": 36, "epoch": EPOCH}  # of a quick run
+SHORT = {"drawn_steps": [90, 90, 90, 90], "steps": 90, "pose_steps": 36, "epoch": EPOCH}  # of a quick run
 BASELINES: dict[str, Callable[[], nn.Module]] = {
     "SoftPOSIT near the truth": partial(SoftPOSIT, start="near_truth"),
     "RANSAC": RandomRansac,
     "GOSMA": GOSMA,
 }
-DRAWN_POINTS = (128, 256, POINTS)
-DRAWN_RATE = 5e-4
+DRAWN_STAGES = {  # points, learning rate, and how far headings are from those of a view, degrees; None for any heading
+    "drawn128": (128, 1e-3, None),
+    "drawn256": (256, 1e-3, None),
+    "near256": (256, 3e-4, 40),
+    "near1000": (POINTS, 3e-4, 40),
+}
 DRAWN = ("outliers=0.0", "frame=y_down", "tilt_deg=8", "val_problems=48", "batch_size=16")
 
 
@@ -58,19 +62,20 @@ def trainings(options: argparse.Namespace) -> dict[str, Training]:
     folder = options.run / f"seed{options.seed}"
     maps = (
         "--data=bpnp.datamodules.SyntheticMapDataModule", *(f"--data.{option}" for option in DRAWN),
-        f"--data.seed={options.seed}", f"--model.learning_rate={DRAWN_RATE}",
-        f"--pose_loss.start_epoch={paper_tables.NEVER}",
+        f"--data.seed={options.seed}",
     )  # fmt: skip
     stages: dict[str, Training] = {}
     weights: tuple[str, ...] = ()
-    for points, steps in zip(DRAWN_POINTS, options.drawn_steps, strict=True):
-        arguments = (*shared, *maps, f"--data.num_points={points}", *weights)
-        stages[f"drawn{points}"] = Training(folder / f"drawn{points}", arguments, steps, DRAWN_EPOCH)
-        weights = (f"--model.weights={stages[f'drawn{points}'].checkpoint}",)
+    for (name, (points, rate, heading)), steps in zip(DRAWN_STAGES.items(), options.drawn_steps, strict=True):
+        headings = () if heading is None else (f"--data.heading_deg={heading}",)
+        alone = f"--pose_loss.start_epoch={paper_tables.NEVER}"
+        drawn = (*maps, f"--model.learning_rate={rate}", alone, f"--data.num_points={points}", *headings)
+        stages[name] = Training(folder / name, (*shared, *drawn, *weights), steps, DRAWN_EPOCH)
+        weights = (f"{paper_tables.WEIGHTS_OPTION}{stages[name].checkpoint}",)
     roots = json.dumps([str(options.data / "colmap" / scene) for scene in TRAINED])
     photos = (f"--data.root={roots}", "--data.test_fraction=0", "--data.val_fraction=0.15")
-    rate = f"--model.learning_rate={options.learning_rate}"
-    arguments = (*shared, *photos, rate, f"--data.seed={options.seed}", *weights)
+    photos_rate = f"--model.learning_rate={options.learning_rate}"
+    arguments = (*shared, *photos, photos_rate, f"--data.seed={options.seed}", *weights)
     return stages | paper_tables.branches(folder, arguments, options)
 
 
@@ -92,8 +97,12 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
 def main() -> None:
     run = ROOT / "runs" / "table2"
     parser = paper_tables.options(__doc__, file=FILE, run=run, sets=TABLE.sets, steps=1980, pose_steps=396, epoch=EPOCH)
-    default = (1800, 1800, 270)
+    default = (1800, 1800, 900, 270)
     parser.add_argument(
-        "--drawn_steps", type=int, nargs=3, default=default, help="of each stage on drawn maps (default: %(default)s)"
+        "--drawn_steps",
+        type=int,
+        nargs=len(DRAWN_STAGES),
+        default=default,
+        help="of each stage on drawn maps (default: %(default)s)",
     )
     paper_tables.run(TABLE, parser, PAGES, measure, QUICK | SHORT)

@@ -95,6 +95,21 @@ def test_an_upright_frame_is_tilted_by_so_many_degrees(frame: Frame, vertical: i
     assert np.sqrt(np.mean(np.square(angles))) == pytest.approx(10 * 2**0.5, rel=0.2)
 
 
+@pytest.mark.parametrize(("frame", "ahead"), [("upright", [0, 1]), ("y_down", [0, 2])])
+def test_headings_vary_by_so_many_degrees_about_that_of_a_view(frame: Frame, ahead: list[int]) -> None:
+    """Each problem is the same but for the heading, whose change is normal; the photo looks almost as the view does."""
+    options = {"num_points": 60, "noise_px": 0.0, "kinds": {"facades": 1.0}, "frame": frame}
+    view, spread = (problems(60, **options, heading_deg=degrees) for degrees in (0.0, 30.0))
+    headings = [np.degrees(np.arctan2(*problem.rotation[2, ahead])) for problem in view]
+    assert np.median(np.abs(headings)) < 25
+    changes = []
+    for before, after in zip(view, spread, strict=True):
+        angles = (np.arctan2(*problem.rotation[2, ahead]) for problem in (before, after))
+        changes.append((np.degrees(np.diff(list(angles)))[0] + 180) % 360 - 180)
+        assert np.abs(errors_px(after)).max() < 0.1
+    assert np.sqrt(np.mean(np.square(changes))) == pytest.approx(30, rel=0.2)
+
+
 def test_the_module_is_configured_by_yaml(tmp_path: Path) -> None:
     (tmp_path / "data.yaml").write_text(
         "{num_points: 48, outliers: [0, 0.5], views: [1, 2], kinds: {statue: 1, street: 2}, noise_px: 1,"
@@ -118,6 +133,7 @@ def test_the_module_is_configured_by_yaml(tmp_path: Path) -> None:
 WRONG: list[tuple[str, object]] = [
     ("min_points", 3), ("min_points", 400), ("outliers", -0.1), ("outliers", (1.0, 0.5)), ("field_of_view", 170.0),
     ("noise_px", (0.0, np.inf)), ("scale_range", (0.0, 1.0)), ("views", (0, 2)), ("tilt_deg", -1.0),
+    ("heading_deg", -1.0),
     ("kinds", {"caves": 1.0}), ("kinds", {"statue": 0.0}), ("train_problems", 0),
 ]  # fmt: skip
 

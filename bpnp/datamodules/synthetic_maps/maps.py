@@ -50,11 +50,12 @@ class MapOptions:
     """Options of `draw_map_problem`; see `SyntheticMapDataModule` for those not listed.
 
     Args:
-        frame: Frame of the map: "upright" for the third axis upwards and any heading, "y_down" for the second axis
-            downwards and any heading, "view" for the coordinates of the first of the cameras whose map points are
-            taken.
+        frame: Frame of the map: "upright" for the third axis upwards, "y_down" for the second axis downwards, "view"
+            for the coordinates of the first of the cameras whose map points are taken.
         tilt_deg: Standard deviation of the rotation about each horizontal axis of a frame "upright" or "y_down",
             degrees, as where the vertical is known roughly.
+        heading_deg: Standard deviation of the heading of such a frame, degrees; at 0 the first of the cameras looks
+            along the second axis ("upright") or the third ("y_down"). None for any heading.
     """
 
     num_points: int = 256
@@ -64,6 +65,7 @@ class MapOptions:
     kinds: Mapping[str, float] = field(default_factory=WEIGHTS.copy)
     frame: Frame = "upright"
     tilt_deg: float = 0.0
+    heading_deg: float | None = None
     scale_range: tuple[float, float] = (0.1, 10.0)
     field_of_view: NumberOrRange = (24.0, 115.0)
     noise_px: NumberOrRange = (0.1, 1.5)
@@ -74,6 +76,8 @@ class MapOptions:
         check_within(0, math.inf, noise_px=self.noise_px, scale_range=self.scale_range)
         check_within(5, 150, field_of_view=self.field_of_view)
         check_within(0, 180, tilt_deg=self.tilt_deg)
+        if self.heading_deg is not None:
+            check_within(0, math.inf, heading_deg=self.heading_deg)
         check_within(1, math.inf, views=self.views)
         check_positive(scale_range=self.scale_range[0])
         if self.frame not in get_args(Frame):
@@ -138,7 +142,12 @@ def _draw(name: str, kind: str, half: float, options: MapOptions, rng: np.random
     matches, extra2d, extra3d = _amounts(len(matched2d), len(others2d), len(others3d), options, rng)
     if matches < options.min_points:
         return None
-    heading = Rotation.from_rotvec([0.0, 0.0, rng.uniform(0, 2 * np.pi)]).as_matrix()
+    if options.heading_deg is None:
+        angle = rng.uniform(0, 2 * np.pi)
+    else:
+        ahead = cameras[0].rotation[2]
+        angle = math.atan2(ahead[0], ahead[1]) + math.radians(options.heading_deg) * rng.standard_normal()
+    heading = Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix()
     tilt = Rotation.from_rotvec([*(math.radians(options.tilt_deg) * rng.standard_normal(2)), 0.0]).as_matrix()
     scale = _log_uniform(options.scale_range, rng)
     map_rotation, origin = tilt @ heading, 20 * scale * rng.standard_normal(3)
@@ -284,11 +293,14 @@ class SyntheticMapDataModule(ProblemDataModule):
             numbers, [low, high], draw it uniformly for each problem.
         views: Smallest and largest number of photos whose map points are taken.
         kinds: Weight of each kind of scene; None for half facades, and a quarter each street and statue.
-        frame: Frame of the map: "any", the default, rotated at random; "upright", the third axis upwards and any
-            heading; "y_down", the second axis downwards and any heading, as in many maps of COLMAP; "view", the
-            coordinates of the first of the cameras whose map points are taken.
+        frame: Frame of the map: "any", the default, rotated at random; "upright", the third axis upwards; "y_down", the
+            second axis downwards, as in many maps of COLMAP; "view", the coordinates of the first of the cameras whose
+            map points are taken.
         tilt_deg: Standard deviation of the rotation about each horizontal axis of a frame "upright" or "y_down",
             degrees.
+        heading_deg: Standard deviation of the heading of such a frame, degrees; at 0 the first of the cameras whose map
+            points are taken looks along the second axis ("upright") or the third ("y_down"), as in a map of COLMAP
+            that began with this photo. None for any heading.
         scale_range: Smallest and largest number of scene units in a metre, drawn for each scene, uniform in its
             logarithm.
         field_of_view: Field of view of the longer side of an image, degrees; a number or [low, high], uniform in the
@@ -313,6 +325,7 @@ class SyntheticMapDataModule(ProblemDataModule):
         kinds: Mapping[str, float] | None = None,
         frame: Literal["any", "upright", "y_down", "view"] = "any",
         tilt_deg: float = 0.0,
+        heading_deg: float | None = None,
         scale_range: tuple[float, float] = (0.1, 10.0),
         field_of_view: NumberOrRange = (24.0, 115.0),
         noise_px: NumberOrRange = (0.1, 1.5),
@@ -321,7 +334,17 @@ class SyntheticMapDataModule(ProblemDataModule):
         super().__init__(**loading)
         weights, axes = WEIGHTS if kinds is None else kinds, "upright" if frame == "any" else frame
         self.options = MapOptions(
-            num_points, min_points, outliers, views, weights, axes, tilt_deg, scale_range, field_of_view, noise_px
+            num_points,
+            min_points,
+            outliers,
+            views,
+            weights,
+            axes,
+            tilt_deg,
+            heading_deg,
+            scale_range,
+            field_of_view,
+            noise_px,
         )
         self.problems = {"train": train_problems, "val": val_problems, "test": test_problems}
         self.fresh = fresh_views
