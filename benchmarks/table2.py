@@ -97,7 +97,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
 def main() -> None:
     run = ROOT / "runs" / "table2"
     parser = paper_tables.options(__doc__, file=FILE, run=run, sets=TABLE.sets, steps=1980, pose_steps=396, epoch=EPOCH)
-    default = (1800, 1800, 900, 270)
+    default = (1800, 1800, 900, 180)
     parser.add_argument(
         "--drawn_steps",
         type=int,
