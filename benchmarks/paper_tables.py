@@ -329,13 +329,19 @@ def provenance(file: Path) -> dict[str, str]:
     return {"date": f"{datetime.fromtimestamp(file.stat().st_mtime, UTC):%Y-%m-%d}"}
 
 
-def branches(folder: Path, arguments: tuple[str, ...], options: argparse.Namespace) -> dict[str, Training]:
-    """A training with L_c, and two that go on from it at the switch for as many steps: with L_c, and with L_c + L_p."""
+def branches(
+    folder: Path, arguments: tuple[str, ...], options: argparse.Namespace, after: tuple[str, ...] | None = None
+) -> dict[str, Training]:
+    """A training with L_c, and two that go on from it at the switch for as many steps: with L_c, and with L_c + L_p.
+
+    after: arguments of these two, if others.
+    """
     steps, epoch, rate = options.steps, options.epoch, options.pose_learning_rate
     later = () if rate is None else (f"--model.learning_rate={rate}",)
     never, switch = f"--pose_loss.start_epoch={NEVER}", f"--pose_loss.start_epoch={steps // epoch}"
     first, end = Training(folder / "lc", (*arguments, never), steps, epoch, forks=True), steps + options.pose_steps
-    without, posed = (*arguments, never, *later), (*arguments, switch, *later)
+    after = arguments if after is None else after
+    without, posed = (*after, never, *later), (*after, switch, *later)
     return {
         "first": first,
         "Lc": Training(folder / f"lc-from{steps}", without, end, epoch, first.switch),

@@ -45,6 +45,8 @@ DRAWN_STAGES = {  # points, learning rate, and how far headings are from those o
     "near256": (256, 3e-4, 40),
     "near1000": (POINTS, 3e-4, 40),
 }
+# After the switch. Translations and their errors are in scene units, here from 0.1 to 0.5 a metre as in the photos.
+AFTER = ("num_points=512", "heading_deg=40", "scale_range=[0.1,0.5]")
 DRAWN = ("outliers=0.0", "frame=y_down", "tilt_deg=8", "val_problems=48", "batch_size=16")
 
 
@@ -60,23 +62,20 @@ def trainings(options: argparse.Namespace) -> dict[str, Training]:
         "--config=paper/megadepth", "--model.solver.features3d.normalise=true", f"--seed_everything={options.seed}",
     )  # fmt: skip
     folder = options.run / f"seed{options.seed}"
-    maps = (
-        "--data=bpnp.datamodules.SyntheticMapDataModule", *(f"--data.{option}" for option in DRAWN),
-        f"--data.seed={options.seed}",
-    )  # fmt: skip
+    maps = ("--data=bpnp.datamodules.SyntheticMapDataModule", *(f"--data.{option}" for option in DRAWN))
+    seed, never = f"--data.seed={options.seed}", f"--pose_loss.start_epoch={paper_tables.NEVER}"
     stages: dict[str, Training] = {}
     weights: tuple[str, ...] = ()
     for (name, (points, rate, heading)), steps in zip(DRAWN_STAGES.items(), options.drawn_steps, strict=True):
         headings = () if heading is None else (f"--data.heading_deg={heading}",)
-        alone = f"--pose_loss.start_epoch={paper_tables.NEVER}"
-        drawn = (*maps, f"--model.learning_rate={rate}", alone, f"--data.num_points={points}", *headings)
+        drawn = (*maps, seed, f"--model.learning_rate={rate}", never, f"--data.num_points={points}", *headings)
         stages[name] = Training(folder / name, (*shared, *drawn, *weights), steps, DRAWN_EPOCH)
         weights = (f"{paper_tables.WEIGHTS_OPTION}{stages[name].checkpoint}",)
     roots = json.dumps([str(options.data / "colmap" / scene) for scene in TRAINED])
     photos = (f"--data.root={roots}", "--data.test_fraction=0", "--data.val_fraction=0.15")
-    photos_rate = f"--model.learning_rate={options.learning_rate}"
-    arguments = (*shared, *photos, photos_rate, f"--data.seed={options.seed}", *weights)
-    return stages | paper_tables.branches(folder, arguments, options)
+    rate_then = f"--model.learning_rate={options.learning_rate}"
+    after = (*shared, *maps, *(f"--data.{option}" for option in AFTER), rate_then, seed)
+    return stages | paper_tables.branches(folder, (*shared, *photos, rate_then, seed, *weights), options, after)
 
 
 def methods(options: argparse.Namespace, trained: dict[str, Training]) -> Iterator[Method]:
