@@ -6,9 +6,9 @@
 
 DATA is a folder with a folder `colmap` of COLMAP models, those of `TRAINED` and `TESTED` (docs/data.md). The training
 is configs/paper/megadepth.yaml but for data, steps, learning rate and normalised scene points (the scenes have
-different units): first on drawn maps of up to 128, 256 and 1,000 points, `--drawn_steps`, at `DRAWN_RATE`, then on the
-photos of `TRAINED`. The landmarks that are tested are apart from those that are trained on. Photos have up to 1,000 of
-the points that they see.
+different units): first on drawn maps, `--drawn_steps` of each of `DRAWN_STAGES`, then on the photos of `TRAINED`, and
+after the switch on drawn maps again. The landmarks that are tested are apart from those that are trained on. Photos
+have up to 1,000 of the points that they see.
 """
 
 import argparse
@@ -57,7 +57,7 @@ def data_module(root: Path, seed: int, _: str) -> ColmapDataModule:
 
 
 def trainings(options: argparse.Namespace) -> dict[str, Training]:
-    """On drawn maps, then on photos, and the two branches."""
+    """On drawn maps, then on photos, and the two branches, on drawn maps again."""
     shared = (
         "--config=paper/megadepth", "--model.solver.features3d.normalise=true", f"--seed_everything={options.seed}",
     )  # fmt: skip
