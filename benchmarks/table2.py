@@ -33,7 +33,7 @@ FILE, PAGES = ROOT / "benchmarks" / "table2.json", (ROOT / "docs" / "table2.md",
 POINTS = 1000
 EPOCH = 18  # batches of the training photos of `TRAINED`; an epoch has no more
 DRAWN_EPOCH = 90  # steps on drawn maps between checkpoints
-SHORT = {"drawn_steps": [90, 90, 90, 90], "steps": 90, "pose_steps": 36, "epoch": EPOCH}  # of a quick run
+SHORT = {"drawn_steps": [90, 90, 90, 90], "steps": 72, "pose_steps": 36, "epoch": EPOCH}  # of a quick run
 BASELINES: dict[str, Callable[[], nn.Module]] = {
     "SoftPOSIT near the truth": partial(SoftPOSIT, start="near_truth"),
     "RANSAC": RandomRansac,

@@ -166,10 +166,11 @@ def test_steps_on_drawn_maps_are_whole_epochs(tmp_path: Path, monkeypatch: pytes
         "--drawn_steps",
         "90",
         "90",
+        "90",
         "600",
     ]
     monkeypatch.setattr("sys.argv", [*command, "--steps", "144", "--pose_steps", "54"])
-    with pytest.raises(SystemExit, match="a multiple of those between checkpoints: drawn1000 has 600 and 90"):
+    with pytest.raises(SystemExit, match="a multiple of those between checkpoints: near1000 has 600 and 90"):
         table2.main()
 
 
