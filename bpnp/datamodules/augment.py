@@ -13,22 +13,12 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from bpnp.checks import check_within
-from bpnp.datamodules.keyed_random import (
-    Generators,
-    Key,
-    Purpose,
-    generators,
-    headings,
-    permutations,
-    rotations,
-    uniform,
-)
+from bpnp.datamodules.keyed_random import Generators, Key, Purpose, generators, permutations, rotations, uniform
 from bpnp.datamodules.problem import Counts
 from bpnp.poses import MIN_POINTS
 from bpnp.types import Batch
 
 Side = Literal["both", "2d", "3d"]
-Rotate = bool | Literal["heading"]
 SideOrRandom = Literal["both", "2d", "3d", "random"]
 NumberOrRange = float | tuple[float, float]  # a number, or (low, high) for one drawn uniformly for each problem
 SIDES = ("2d", "both", "3d")  # the order in which `_on_sides` numbers them
@@ -77,8 +67,7 @@ class Augmentation:
         clutter: Number of points without a correspondence to keep, as a ratio to the matches kept, or all if there are
             fewer; inf for all.
         clutter_side: Side that keeps them, "both", "2d" or "3d".
-        rotate: Rotate the 3D points about their origin: True for a uniformly random rotation, "heading" for one by a
-            uniformly random angle about the second axis, which is near the vertical in most maps of COLMAP.
+        rotate: Rotate the 3D points about their origin by a uniformly random rotation.
         outliers: Synthetic outliers and occlusion.
 
     Raises:
@@ -88,7 +77,7 @@ class Augmentation:
     max_points: int | None = None
     clutter: float = math.inf
     clutter_side: Side = "both"
-    rotate: Rotate = False
+    rotate: bool = False
     outliers: Outliers = field(default_factory=Outliers)
 
     def __post_init__(self) -> None:
@@ -97,8 +86,6 @@ class Augmentation:
         check_clutter(self.clutter)
         if self.clutter_side not in SIDES:
             raise ValueError(f'`clutter_side` is {self.clutter_side!r}; it is one of "both", "2d", "3d"')
-        if self.rotate not in (True, False, "heading"):
-            raise ValueError(f'`rotate` is {self.rotate!r}; it is one of true, false, "heading"')
 
     @property
     def clutter_by_side(self) -> tuple[float, float]:
@@ -163,7 +150,7 @@ def augment(batch: Batch, how: Augmentation, keys: Sequence[Key]) -> Batch:
     match3d = torch.empty_like(order2d).scatter_(1, order2d, slots2d).gather(1, order3d.clamp(max=len(slots2d[0]) - 1))
     rotation, origin = batch.rotation, batch.origin
     if how.rotate:  # scene points become S p, so the rotation becomes R S^T
-        scene_rotation = (headings if how.rotate == "heading" else rotations)(generators(keys, Purpose.TURN))
+        scene_rotation = rotations(generators(keys, Purpose.TURN))
         points3d = (points3d.double() @ scene_rotation.mT).to(points3d)
         rotation = rotation @ scene_rotation.mT.to(rotation)
         origin = None if origin is None else (scene_rotation.to(origin) @ origin[..., None]).squeeze(-1)

@@ -4,7 +4,6 @@ There is a numpy Generator for each problem and purpose, seeded by (seeds, index
 generator do not depend on how many are drawn, so padding changes nothing.
 """
 
-import math
 from collections.abc import Sequence
 from enum import IntEnum
 from typing import Any
@@ -37,13 +36,6 @@ def generators(keys: Sequence[Key], purpose: Purpose) -> list[np.random.Generato
 def rotations(generators: Generators) -> Float[Tensor, "b 3 3"]:
     """Draw one uniformly random rotation from each generator, float64; a normal 4-vector has a uniform direction."""
     return quaternion_rotation(normal(generators, 4))
-
-
-def headings(generators: Generators) -> Float[Tensor, "b 3 3"]:
-    """Draw one rotation about the second axis from each generator, by a uniformly random angle, float64."""
-    half = math.pi * uniform(generators, 1)
-    zero = torch.zeros_like(half)
-    return quaternion_rotation(torch.cat([zero, half.sin(), zero, half.cos()], -1))
 
 
 def uniform(generators: Generators, count: int) -> Float[Tensor, "b count"]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bpnp.checks import check_within
-from bpnp.datamodules.augment import Augmentation, Rotate, Side
+from bpnp.datamodules.augment import Augmentation, Side
 from bpnp.datamodules.loader import STAGES, ProblemDataModule
 from bpnp.datamodules.problem import Counts, Problem, ProblemSource, stack_problems
 from bpnp.datamodules.store import Store, StoreError, StoreRow, new_store, open_store
@@ -115,8 +115,7 @@ class StoredDataModule(ProblemDataModule):
         clutter: Natural clutter, as a ratio to the matches: keypoints without a 3D point, and points of the scene that
             the image does not see.
         clutter_side: Side that gets clutter: "both", "2d" or "3d".
-        rotate: Rotate the scene of each problem at random: True by any rotation, "heading" about its second axis, which
-            is near the vertical in most maps of COLMAP; never in prediction.
+        rotate: Rotate the scene of each problem at random; never in prediction.
         **loading: Options of `ProblemDataModule`: train_outliers, test_outliers, batch_size, eval_batch_size,
             max_cells, num_workers and seed.
     """
@@ -136,7 +135,7 @@ class StoredDataModule(ProblemDataModule):
         eval_max_points: int | None = None,
         clutter: float = 0.0,
         clutter_side: Side = "both",
-        rotate: Rotate = False,
+        rotate: bool = False,
         **loading: Any,
     ) -> None:
         super().__init__(**loading)
