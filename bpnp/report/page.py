@@ -213,7 +213,7 @@ def describe_run(results: Results) -> str:
     best, values = min(results.estimates.items(), key=lambda item: item[1]["rotation_q2_deg"])
     solved = f"{100 * cause_fractions(results.of(best))['solved']:.1f} % within {SOLVED_DEG:g} deg"
     outcome = f"{best}: median rotation error {cell(RESULT_COLUMNS[1], values)} deg, {solved}"
-    return f"{len(rows)} problems with {', '.join(sizes)}. {outcome}"
+    return f"{len(rows)} {'problem' if len(rows) == 1 else 'problems'} with {', '.join(sizes)}. {outcome}"
 
 
 def _settings(settings: Mapping[str, Any]) -> Iterable[str]:

@@ -308,7 +308,8 @@ def results_table(runs: Mapping[str, Results], *, paper: Paper | None = None) ->
         paper: Data set whose published rows are added for orientation. They are of other data and are not compared.
     """
     sizes = " or ".join(str(size) for size in sorted({results.problems for results in runs.values()}))
-    return table_of_rows(f"Pose errors, {sizes} problems", RESULT_COLUMNS, run_rows(runs, paper), CAPTION)
+    noun = "problem" if sizes == "1" else "problems"
+    return table_of_rows(f"Pose errors, {sizes} {noun}", RESULT_COLUMNS, run_rows(runs, paper), CAPTION)
 
 
 def table_of_rows(title: str, columns: Sequence[Column], rows: Sequence[MethodRow], caption: str) -> SplitTable:

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bpnp.report import Results, write_results
-from bpnp.report.page import quartile_rows
+from bpnp.report.page import describe_run, quartile_rows
 from bpnp.report.tables import results_table
 from bpnp.report.terminal import SplitTable, count_items, progress
 
@@ -52,6 +52,13 @@ def test_tables_fit_with_every_name_and_number_whole(tmp_path: Path, scale: floa
     together = "".join("".join(lines).split())
     assert "[red]b[/red]:pnp" in together
     assert "version_0:ransac" in together or width < 160
+
+
+def test_one_problem_is_singular_in_the_table_and_on_the_page(tmp_path: Path) -> None:
+    one, two = (write_results(tmp_path / str(count), [row(i) for i in range(count)]) for count in (1, 2))
+    heads = ["".join(rendered(results_table({"run": results}))[0].split()) for results in (one, two)]
+    assert heads == ["Poseerrors,1problem", "Poseerrors,2problems"]
+    assert [describe_run(results).split(" with ")[0] for results in (one, two)] == ["1 problem", "2 problems"]
 
 
 def test_the_best_of_each_column_is_bold(tmp_path: Path) -> None:
