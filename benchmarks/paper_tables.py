@@ -614,7 +614,7 @@ def options(
     found.add_argument("--baseline_problems", type=int, help="of a set (default: %(default)s)")
     found.add_argument("--only_test", action="store_true", help="no training")
     found.add_argument("--output", type=Path, default=file, help="(default: %(default)s)")
-    found.add_argument("--quick", action="store_true", help="150 + 50 steps, 20 problems, its own folder")
+    found.add_argument("--quick", action="store_true", help="few steps, 20 problems, its own folder")
     found.add_argument("--check", action="store_true", help="compare the pages with the record, measure nothing")
     found.set_defaults(**DEFAULTS | {"epoch": epoch})
     return found

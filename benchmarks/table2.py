@@ -6,9 +6,9 @@
 
 DATA is a folder with a folder `colmap` of COLMAP models, those of `TRAINED` and `TESTED` (docs/data.md). The training
 is configs/paper/megadepth.yaml but for data, steps, learning rate and normalised scene points (the scenes have
-different units): first on drawn maps, `--drawn_steps` of each of `DRAWN_STAGES`, then on the photos of `TRAINED`, and
-after the switch on drawn maps again. The landmarks that are tested are apart from those that are trained on. Photos
-have up to 1,000 of the points that they see.
+different units): first on drawn maps, `--drawn_steps` of each of `DRAWN_STAGES`, then on the photos of `TRAINED` but
+one for validation, and after the switch on drawn maps again. Test landmarks are not in the training. Photos have up to
+1,000 of the points that they see.
 """
 
 import argparse
@@ -39,13 +39,13 @@ BASELINES: dict[str, Callable[[], nn.Module]] = {
     "RANSAC": RandomRansac,
     "GOSMA": GOSMA,
 }
-DRAWN_STAGES = {  # points, learning rate, and how far headings are from those of a view, degrees; None for any heading
+DRAWN_STAGES = {  # points, learning rate, standard deviation of headings about that of a view, degrees (None: any)
     "drawn128": (128, 1e-3, None),
     "drawn256": (256, 1e-3, None),
     "near256": (256, 3e-4, 40),
     "near1000": (POINTS, 3e-4, 40),
 }
-# After the switch. Translations and their errors are in scene units, here from 0.1 to 0.5 a metre as in the photos.
+# After the switch. The loss of translations is in scene units: 0.1 to 0.5 a metre, near those of the photos.
 AFTER = ("num_points=512", "heading_deg=40", "scale_range=[0.1,0.5]")
 DRAWN = ("outliers=0.0", "frame=y_down", "tilt_deg=8", "val_problems=48", "batch_size=16")
 

@@ -118,6 +118,7 @@ def test_wrong_extrinsics_keep_a_rig_from_being_confident(degrees: float) -> Non
         given = [(wrong, shift) if other == k else mount for other, mount in enumerate(mounts)]
         solution = bpnp.solve(images, scene, [CAMERA] * 2, rig=given, time_limit=600)
         assert (solution.verdict, solution.reason_code) == ("ambiguous", "other_extrinsics")
+        assert f"fit another pose, {degrees:.0f} deg away" in solution.reason
     solution = bpnp.solve(images, scene, [CAMERA] * 2, rig=mounts, time_limit=600)
     assert solution.verdict == "confident"
     assert degrees_between(solution.rotation, pose[0]) < 0.5

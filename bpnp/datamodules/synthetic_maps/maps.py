@@ -54,8 +54,8 @@ class MapOptions:
             for the coordinates of the first of the cameras whose map points are taken.
         tilt_deg: Standard deviation of the rotation about each horizontal axis of a frame "upright" or "y_down",
             degrees, as where the vertical is known roughly.
-        heading_deg: Standard deviation of the heading of such a frame, degrees; at 0 the first of the cameras looks
-            along the second axis ("upright") or the third ("y_down"). None for any heading.
+        heading_deg: Standard deviation of the heading of a frame "upright" or "y_down", degrees; at 0 the first of the
+            cameras looks along the second axis ("upright") or the third ("y_down"). None for any heading.
     """
 
     num_points: int = 256
@@ -298,9 +298,9 @@ class SyntheticMapDataModule(ProblemDataModule):
             map points are taken.
         tilt_deg: Standard deviation of the rotation about each horizontal axis of a frame "upright" or "y_down",
             degrees.
-        heading_deg: Standard deviation of the heading of such a frame, degrees; at 0 the first of the cameras whose map
-            points are taken looks along the second axis ("upright") or the third ("y_down"), as in a map of COLMAP
-            that began with this photo. None for any heading.
+        heading_deg: Standard deviation of the heading of a frame "upright" or "y_down", degrees; at 0 the first of the
+            cameras whose map points are taken looks along the second axis ("upright") or the third ("y_down"), as in a
+            map of COLMAP that began with this photo. None for any heading. Other frames do not use it.
         scale_range: Smallest and largest number of scene units in a metre, drawn for each scene, uniform in its
             logarithm.
         field_of_view: Field of view of the longer side of an image, degrees; a number or [low, high], uniform in the

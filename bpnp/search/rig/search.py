@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.poses import distinct, polar_coordinates, rotation_angle
+from bpnp.poses import distinct, polar_coordinates
 from bpnp.runtime import NEVER, Clock, Deadline, one_blas_thread
 from bpnp.search.competing_poses import fitted_lens
 from bpnp.search.config import DEFAULT, ENUMERATION, RIG, SearchSettings
@@ -31,6 +31,7 @@ from bpnp.search.propose.repetitions import repeated_poses
 from bpnp.search.rig.cameras import Array, Pose, Rig
 from bpnp.search.search import lacks_partners
 from bpnp.search.search_frame import Scene
+from bpnp.search.verdict.competitors import distance_between
 from bpnp.search.verdict.decide import SearchResult, is_object, judge, match_count, missed, no_pose
 from bpnp.search.verdict.false_alarms import alarms_of
 from bpnp.search.verdict.reasons import Objection, focal_length_not_fixed, objection
@@ -286,10 +287,11 @@ class RigPoses:
         return replace(result, candidates=poses)
 
     def _other_extrinsics(self) -> Objection | None:
-        """Return a camera whose points fit a pose of its own instead of the best pose, as an objection, or None.
+        """Return an objection if one camera contradicts the best pose, else None.
 
-        The best pose fits the points of this camera no better than chance, and a pose that the camera proposed is
-        significant, at the same scale of the residuals. The extrinsics may be wrong, and with them the best pose.
+        The best pose fits the points of this camera no better than chance (log10 NFA above 0). A pose that the camera
+        proposed is significant, and its log10 NFA lower by the margin of a competing pose, at the same scale of the
+        residuals. Wrong extrinsics are the likely cause.
         """
         settings = self.verdict_settings
         for k, found in enumerate(self.found):
@@ -298,9 +300,11 @@ class RigPoses:
                 continue
             own = self._alarms_alone(k, found[: RIG.refined])  # those of an enumeration begin with the likeliest
             if own.min() <= min(settings.false_alarms, here - settings.margin):
-                turn, _ = self.rig.pose_of(k, self.best.rotation[0], self.best.translation[0])
-                degrees = math.degrees(rotation_angle(turn, found.rotation[own.argmin()]))
-                return objection("other_extrinsics", camera=k, degrees=degrees)
+                seen, best = self.rig.seen(k, self.best[:1]), int(own.argmin())
+                rotations = np.stack([seen.rotation[0], found.rotation[best]])
+                translations = np.stack([seen.translation[0], found.translation[best]])
+                away = distance_between(self.rig.problems[k], rotations, translations)
+                return objection("other_extrinsics", camera=k, away=away)
         return None
 
     def _alarms_alone(self, k: int, poses: Hypotheses | None = None) -> Array:

@@ -32,7 +32,7 @@ CLAUSES = {
     "other_focal_length": "with {zoom:.2f} times the focal length a pose {degrees:.0f} deg away fits about as well "
     "(margin {margin:.1f} decades)",
     "other_camera_by_pixels": "a camera other than the given one, by {pixels:.2g} pixels, explains the points better",
-    "other_extrinsics": "the points of camera {camera} fit another pose, {degrees:.1f} deg away: check the extrinsics",
+    "other_extrinsics": "the points of camera {camera} fit another pose, {away} away: check the extrinsics",
     "camera_untested": "there was no time to try other focal lengths",
     # The points do not determine an unknown.
     "rotation_not_fixed": "its {count:.0f} matches do not fix {what}",
