@@ -48,12 +48,15 @@ def report(
     """
     from bpnp.report.figures import recall_curve
     from bpnp.report.groups import differences, group_table, training_configs
-    from bpnp.report.images import save_figure
+    from bpnp.report.images import check_picture_name, save_figure
     from bpnp.report.intervals import interval_table
     from bpnp.report.page import write_page
     from bpnp.report.results import SUMMARY
     from bpnp.report.tables import named_runs, read_runs, results_table
 
+    for picture in (curves, recall):
+        if picture is not None:
+            check_picture_name(picture)
     if curves is not None:
         from bpnp.report.training_curves import training_curves
         from bpnp.report.training_run import training_folder

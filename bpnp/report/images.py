@@ -31,11 +31,16 @@ def save_figure(figure: "Figure", path: Path | str, *, dpi: int = 110) -> Path:
         ValueError: The name has another suffix.
     """
     path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"the file name {path.name!r} has to end in {', '.join(SUFFIXES)}")
+    check_picture_name(path)
     with write_atomically(path) as temporary, delay_interrupts():  # matplotlib reports Ctrl-C as an input error
         figure.savefig(temporary, format=path.suffix[1:].lower(), dpi=dpi)
     return path
+
+
+def check_picture_name(path: Path) -> None:
+    """Raise ValueError if `save_figure` does not write files of this suffix."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"the file name {path.name!r} has to end in {', '.join(SUFFIXES)}")
 
 
 @contextmanager

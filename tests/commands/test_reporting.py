@@ -45,6 +45,14 @@ def test_report_and_view_write_the_files_that_they_print(
     assert "has no points.npz; run `bpnp test` again" in fails("view", str(tmp_path / "run"))
 
 
+def test_a_wrong_suffix_is_refused_before_anything_is_written(tmp_path: Path, fails: Callable[..., str]) -> None:
+    write_run(tmp_path / "run", 9, 0)
+    page = tmp_path / "report.html"
+    said = fails("report", str(tmp_path / "run"), "--html", str(page), "--recall", str(tmp_path / "recall.bmp"))
+    assert "the file name 'recall.bmp' has to end in .png, .jpg, .jpeg, .svg, .pdf" in said
+    assert not page.exists()
+
+
 def test_a_run_that_is_given_twice_is_shown_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_run(tmp_path / "run", 9, 0)
     main(["report", str(tmp_path / "run")])
