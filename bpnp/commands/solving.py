@@ -260,10 +260,13 @@ def _check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | None]
         ValueError: An output is a folder, or a file that is also an input or another output.
     """
     input_files = {path.resolve() for path in inputs if path is not None and path.is_file()}
-    files = [path for path in outputs if path is not None]
-    for i, path in enumerate(files):
-        if path.resolve() in {other.resolve() for other in files[:i]}:
+    output_files: set[Path] = set()
+    for path in outputs:
+        if path is None:
+            continue
+        if path.resolve() in output_files:
             raise ValueError(f"{path} is the file of two outputs; name another file for one of them")
+        output_files.add(path.resolve())
         if path.is_dir():
             raise ValueError(f"{path} is a folder; give a file name to write to")
         if path.resolve() in input_files:

@@ -290,7 +290,7 @@ def read_results(folder: Path | str) -> Results:
         folder: Results folder.
 
     Returns:
-        The results, with sorted rows, as they were written; another program may have sorted those of the file.
+        The results. Their rows are sorted, since another program may have changed the order in the file.
 
     Raises:
         ValueError: A file is missing, of another format, incomplete, or has a value that is no number. The message

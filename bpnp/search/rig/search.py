@@ -295,28 +295,23 @@ class RigPoses:
         """
         settings = self.verdict_settings
         for k, found in enumerate(self.found):
-            here = float(self._alarms_alone(k)[0])
+            seen = self.rig.seen(k, self.best[:1])
+            here = float(self._alarms_alone(k, seen)[0])
             if here <= 0 or not len(found):
                 continue
             own = self._alarms_alone(k, found[: RIG.refined])  # those of an enumeration begin with the likeliest
             if own.min() <= min(settings.false_alarms, here - settings.margin):
-                seen, best = self.rig.seen(k, self.best[:1]), int(own.argmin())
+                best = int(own.argmin())
                 rotations = np.stack([seen.rotation[0], found.rotation[best]])
                 translations = np.stack([seen.translation[0], found.translation[best]])
                 away = distance_between(self.rig.problems[k], rotations, translations)
                 return objection("other_extrinsics", camera=k, away=away)
         return None
 
-    def _alarms_alone(self, k: int, poses: Hypotheses | None = None) -> Array:
-        """Return log10 NFA (c,) of poses in one camera alone, at the scale of the residuals of the best pose.
-
-        Args:
-            k: Index of the camera.
-            poses: Poses of this camera; None for the best pose of the rig.
-        """
-        seen = self.rig.seen(k, self.best[:1]) if poses is None else poses
+    def _alarms_alone(self, k: int, poses: Hypotheses) -> Array:
+        """Return log10 NFA (c,) of poses of camera k, in this camera alone, at the residual scale of the best pose."""
         problem = replace(self.rig.problems[k], prior=None)
-        return alarms_of(problem, seen.rotation, seen.translation, np.repeat(self.best.scale[:1], len(seen))).own
+        return alarms_of(problem, poses.rotation, poses.translation, np.repeat(self.best.scale[:1], len(poses))).own
 
     def _judge(self) -> SearchResult:
         strongest, seen = self._strongest()
