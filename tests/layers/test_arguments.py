@@ -9,7 +9,7 @@ import torch
 from planted import plant
 
 from bpnp.geometry import rotation_angle
-from bpnp.layers import ransac_pnp, sinkhorn, weighted_pnp
+from bpnp.layers import Sinkhorn, ransac_pnp, sinkhorn, weighted_pnp
 
 PLANTED = plant(2, 8)
 PAIRS = {"assignment": PLANTED.permutation(), "points3d": PLANTED.points3d}
@@ -44,6 +44,13 @@ def as_users_run_it(monkeypatch: pytest.MonkeyPatch) -> None:
             {"dustbin": torch.ones(2, 1)},
             r"`dustbin` has the shape \(2, 1\); a number or a scalar tensor is needed",
         ),
+        (sinkhorn, {"mu": 0.0}, "`mu` is 0.0; it must be above 0"),
+        (
+            sinkhorn,
+            {"mask3d": torch.tensor([[True] * 5, [False] * 5])},
+            "a sample has no real point in `mask3d`; every sample needs one on each side",
+        ),
+        (weighted_pnp, {"solver": "adam"}, "`solver` is 'adam'; it is one of newton, lbfgs"),
         (weighted_pnp, {"bearings": PLANTED.points2d}, r"`bearings` has the shape \(2, 8, 2\), not \(b, m, 3\)"),
         (weighted_pnp, {"bearings": PLANTED.bearings[:, 1:]}, r"`bearings` .* with m = 8 as in `assignment`"),
         (weighted_pnp, {"translation": torch.zeros(2, 3, 1)}, r"`translation` has the shape \(2, 3, 1\), not \(b, 3\)"),
@@ -52,12 +59,18 @@ def as_users_run_it(monkeypatch: pytest.MonkeyPatch) -> None:
         (ransac_pnp, {"points3d": PLANTED.points3d.numpy()}, "`points3d` is a ndarray; a tensor of shape"),
         (ransac_pnp, {"backend": "magsac"}, "`backend` is 'magsac'; it is one of auto, poselib, opencv, torch"),
         (ransac_pnp, {"matches_factor": 0.0}, "`matches_factor` is 0.0; it must be above 0"),
+        (ransac_pnp, {"threshold": 0.0}, "`threshold` is 0.0; it must be above 0"),
         (ransac_pnp, {"max_iterations": 0}, "`max_iterations` is 0; it must be above 0"),
     ],
 )
 def test_wrong_arguments_of_a_layer_are_named(layer: Callable[..., Any], changed: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         layer(**ARGUMENTS[layer] | changed)
+
+
+def test_a_module_refuses_an_entropy_weight_of_zero() -> None:
+    with pytest.raises(ValueError, match="`mu` is 0.0; it must be above 0"):
+        Sinkhorn(mu=0.0)
 
 
 @pytest.mark.parametrize(("dtype", "found"), [(torch.float32, torch.float32), (torch.bfloat16, torch.float32)])

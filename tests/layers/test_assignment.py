@@ -79,6 +79,24 @@ def test_a_dustbin_is_one_more_row_and_column() -> None:
     assert (plan - plain_sinkhorn(augmented, 0.1, rows, cols)[:, :4, :6]).abs().max() < 1e-12
 
 
+@pytest.mark.parametrize("dustbin", [None, 0.9])
+def test_padding_changes_neither_given_marginals_nor_the_room_of_a_dustbin(dustbin: float | None) -> None:
+    """A problem of 4 and 6 points beside one of 7 and 8, with marginals of 5 at its padded points."""
+    cost, rows, cols = random_cost(2, 7, 8), marginals(2, 7, seed=1), marginals(2, 8, seed=2)
+    mask2d, mask3d = (torch.arange(k) < torch.tensor([[small], [k]]) for small, k in ((4, 7), (6, 8)))
+    for marginal, mask in ((rows, mask2d), (cols, mask3d)):
+        marginal[0] /= marginal[0, mask[0]].sum()
+        marginal[~mask] = 5.0
+    given = {"row_marginal": rows, "col_marginal": cols}
+    alone = {name: value[:1, mask[0]] for (name, value), mask in zip(given.items(), (mask2d, mask3d), strict=True)}
+    expected, _ = sinkhorn(cost[:1, :4, :6], dustbin=dustbin, **alone, **EXACT)
+    plan, stats = sinkhorn(cost, dustbin=dustbin, mask2d=mask2d, mask3d=mask3d, **given, **EXACT)
+    assert stats.converged.all()
+    assert (plan[:1, :4, :6] - expected).abs().max() < 1e-12
+    assert not plan[0, 4:].any()
+    assert not plan[0, :, 6:].any()
+
+
 @pytest.mark.parametrize("level", [0.99, 0.999, 0.999999])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_plan_close_to_a_permutation_converges(level: float, dtype: torch.dtype) -> None:
