@@ -11,13 +11,14 @@ import roma
 import torch
 from planted import padded, plant
 from scipy.optimize import linear_sum_assignment
+from small_data import small_net
 
 from bpnp import Batch, BPnPNet
 from bpnp.metrics import rotation_error, translation_error
 from bpnp.models.baselines import GOPAC, GOSMA, Hungarian, RandomRansac, SoftPOSIT
 from bpnp.models.baselines.blind_p3p import probability_of_true_triple
 from bpnp.models.baselines.hungarian import hungarian
-from bpnp.models.baselines.single_problem import SingleSolver
+from bpnp.models.baselines.single_problem import SingleSolver, agreement
 from bpnp.models.baselines.softposit import softposit
 from bpnp.models.nets import ImageFeatures, SceneFeatures
 from bpnp.runtime import NEVER
@@ -112,6 +113,22 @@ def test_softposit_starts_within_the_stated_angle_of_the_truth() -> None:
         SoftPOSIT(start="near_truth")(Batch.from_arrays(problem.points2d, problem.points3d))
 
 
+def test_random_poses_of_softposit_put_the_middle_of_the_scene_at_that_of_the_image() -> None:
+    """Before any step, the best of many poses has more points in place than a single one."""
+    problem = plant(1, 40, seed=3)
+    image, scene = problem.points2d[0], problem.points3d[0]
+    found = []
+    for starts, seed in ((1, 0), (1, 1), (256, 0)):
+        solver = SoftPOSIT(start="random", starts=starts, seed=seed, max_steps=0, time_limit=None)
+        pose = solver(problem.batch()).poses["softposit"]
+        camera = scene.mean(0) @ pose.rotation[0].double().mT + pose.translation[0].double()
+        torch.testing.assert_close(camera[:2] / camera[2], image.mean(0), atol=1e-5, rtol=0)
+        found.append(pose)
+    assert not torch.equal(found[0].rotation, found[1].rotation)
+    placed = [int(agreement(image, scene, one.rotation, one.translation, threshold=0.01).sum()) for one in found]
+    assert placed[2] > max(placed[:2])
+
+
 @pytest.mark.parametrize(
     ("solver", "options", "message"),
     [
@@ -135,6 +152,29 @@ def test_blind_ransac_reaches_its_predicted_success_rate() -> None:
     assert triple == pytest.approx(1 / (6 * 5 * 4))
     predicted = 1 - (1 - triple) ** hypotheses
     assert float(solved) == pytest.approx(predicted, abs=3 * math.sqrt(predicted * (1 - predicted) / problems))
+
+
+@pytest.mark.parametrize("confidence", [0.9, 0.95, 0.99])
+def test_blind_ransac_stops_when_a_true_triple_has_been_drawn_with_its_confidence(confidence: float) -> None:
+    """Of 12 true matches; the triples are drawn 256 at a time."""
+    problem = plant(1, 12, seed=1).batch()
+    pose = RandomRansac(threshold=1e-4, confidence=confidence, time_limit=None, max_hypotheses=50_000)(problem)
+    needed = math.log(1 - confidence) / math.log(1 - 1 / (12 * 11 * 10))
+    stats = pose.poses["random_ransac"].stats
+    assert int(stats.iterations) == 256 * math.ceil(needed / 256)
+    assert stats.converged.all()
+    assert float(stats.residual) == 0
+
+
+def test_blind_ransac_counts_points_within_its_threshold_and_has_other_triples_with_another_seed() -> None:
+    problem = plant(1, 12, seed=1, noise=0.003).batch()
+    options = {"confidence": 1.0, "max_hypotheses": 2048, "time_limit": None}
+    narrow, wide, other = (
+        RandomRansac(**options, **more)(problem).poses["random_ransac"]
+        for more in ({"threshold": 0.005}, {"threshold": 0.05}, {"threshold": 0.05, "seed": 1})
+    )
+    assert float(wide.stats.residual) < float(narrow.stats.residual)
+    assert not torch.equal(wide.rotation, other.rotation)
 
 
 def test_hungarian_is_the_assignment_of_least_cost_among_real_points() -> None:
@@ -164,6 +204,8 @@ def test_hungarian_pairs_lead_to_the_planted_pose() -> None:
     for name in Hungarian.estimates:
         assert prediction.poses[name].stats.converged.all()
         assert (rotation_error(prediction.poses[name].rotation, batch.rotation) < 1e-3).all()
+    ransac = Hungarian(net=small_net(threshold=0.03), ransac_backend="opencv").ransac
+    assert (ransac.backend, ransac.threshold, ransac.matches_factor) == ("opencv", 0.03, 1.0)
     with pytest.raises(FileNotFoundError):
         Hungarian(checkpoint="nothing.ckpt")
 

@@ -1,6 +1,7 @@
 """The learning rate follows its schedule, resumed or not; settings that mean nothing are refused."""
 
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from lightning import Callback, LightningModule, Trainer
@@ -63,3 +64,14 @@ def test_a_line_has_the_validation_of_its_own_epoch_only(capsys: pytest.CaptureF
     lines.on_train_epoch_end(trainer, trainer.lightning_module)  # of an epoch without a validation
     printed = capsys.readouterr().out.splitlines()
     assert ["val/correspondence_loss" in line for line in printed if line.startswith("epoch")] == [False, True, False]
+
+
+@pytest.mark.parametrize("part", ["test", "predict"])
+@pytest.mark.parametrize(("batches", "printed"), [(25, [3, 5, 8, 10, 13, 15, 18, 20, 23, 25]), (3, [1, 2, 3])])
+def test_a_test_and_a_prediction_print_each_tenth(
+    part: str, batches: int, printed: list[int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    trainer = Mock(Trainer, is_global_zero=True, **{f"num_{part}_batches": [1, batches - 1]})  # of two loaders
+    for batch in range(batches):
+        getattr(ProgressLines(), f"on_{part}_batch_end")(trainer, Mock(LightningModule), None, None, batch)
+    assert capsys.readouterr().out.splitlines() == [f"{done} of {batches} batches" for done in printed]

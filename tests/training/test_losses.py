@@ -2,20 +2,23 @@
 
 import math
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 import torch
 from planted import Planted, padded, plant
 from scipy.spatial.transform import Rotation
-from torch import Tensor
+from torch import Tensor, nn
 
 from bpnp import Batch, Prediction
 from bpnp.geometry import bearings
 from bpnp.training.losses import (
+    Losses,
     correspondence_loss,
     correspondence_losses,
     matching_likelihood_loss,
     matching_losses,
+    own_losses,
     pose_terms,
     within_angle,
 )
@@ -58,6 +61,58 @@ def test_correspondence_loss_from_the_pose_is_equation_11_by_a_loop(threshold: f
             expected += float(assignment[b, i, j]) * (1 - 2 * close)
         assert abs(float(found[b]) - expected) < 1e-12
     assert 0 < within.sum() < within.numel()
+
+
+def test_a_point_is_within_its_own_angle_and_not_within_less() -> None:
+    planted = plant(1, 6, noise=0.1)
+    points = planted.points2d, planted.points3d, *planted.pose
+    for i, j in torch.cartesian_prod(torch.arange(6), torch.arange(6)).tolist():
+        exact = angle(planted, 0, i, j)
+        assert within_angle(*points, exact * (1 + 1e-7))[0, i, j]
+        assert not within_angle(*points, exact * (1 - 1e-7))[0, i, j]
+
+
+class Mass(nn.Module):
+    """A user's loss: -log of the mass on the true matches, NaN where it is below a quarter."""
+
+    def forward(self, prediction: Prediction, batch: Batch) -> Tensor:
+        assert prediction.assignment is not None
+        assert batch.match3d is not None
+        mass = prediction.assignment.gather(1, batch.match3d[:, None]).sum((1, 2))
+        return torch.where(mass < 0.25, torch.nan, -mass.log())
+
+
+def test_the_loss_of_a_user_is_the_mean_over_the_samples_that_have_one() -> None:
+    planted = plant(3, 8)
+    masses = torch.tensor([0.8, 0.1, 0.4], dtype=torch.float64)[:, None, None]
+    assignment = (masses * planted.permutation()).requires_grad_()
+    losses = own_losses(Mass(), Prediction(assignment), planted.batch())
+    assert losses.matched.tolist() == [True, False, True]
+    assert losses.total.item() == pytest.approx(-(math.log(0.8) + math.log(0.4)) / 2)
+    losses.total.backward()
+    assert assignment.grad is not None
+    assert assignment.grad.amin((1, 2)).tolist() == pytest.approx([-1 / (2 * 0.8), 0, -1 / (2 * 0.4)])
+
+
+@pytest.mark.parametrize(
+    ("found", "message"),
+    [
+        (torch.zeros(()), r"returned shape \(\); a tensor of shape \(2,\) is needed"),
+        (torch.zeros(2, 1), r"returned shape \(2, 1\); a tensor"),
+        (0.5, "returned float; a tensor"),
+    ],
+    ids=["scalar", "column", "number"],
+)
+def test_a_loss_of_a_user_has_one_value_per_problem(found: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        own_losses(Mock(nn.Module, return_value=found), Prediction(), plant(2, 6).batch())
+
+
+def test_a_batch_without_any_pose_has_no_pose_loss() -> None:
+    matching, none = torch.tensor([0.5, -0.1]), torch.zeros(2, dtype=torch.bool)
+    losses = Losses(matching, ~none, {"rotation": torch.zeros(2)}, none, 2.0)
+    assert losses.pose_means() == {"rotation": 0.0}
+    assert losses.total.item() == pytest.approx(0.2)
 
 
 def test_pose_loss_is_scipys_angle_and_the_distance() -> None:

@@ -17,8 +17,10 @@ from bpnp.training.callbacks import TrainingMonitor, watched_values
 
 
 class PlantedModule(LightningModule):
-    """Puts 0.25 of the mass on the true matches, the rest on a clutter point, and says 7 iterations; the points are
-    their own features, times `feature`."""
+    """A network that puts 0.25 of the mass on the true matches and the rest on a point without one.
+
+    Its iterations are the number of the problem, and its features the points, times `feature`.
+    """
 
     def __init__(self, feature: float = 1.0) -> None:
         super().__init__()
@@ -32,14 +34,13 @@ class PlantedModule(LightningModule):
         assert batch.match3d is not None
         assert batch.rotation is not None
         assert batch.translation is not None
-        b, m, n = len(batch), batch.points2d.shape[1], batch.points3d.shape[1]
-        assignment = torch.zeros(b, m, n)
-        assignment[:, m - 1, n - 1] = 0.75
-        matched = int((batch.match3d[0] >= 0).sum())
-        assignment.scatter_(1, batch.match3d.clamp(min=0)[:, None], 0.25 / matched)
-        assignment[:, :, batch.match3d[0] < 0] = 0
+        matched = batch.match3d >= 0
+        each = 0.25 / matched.sum(1, keepdim=True) * matched
+        assignment = torch.zeros(len(batch), batch.points2d.shape[1], batch.points3d.shape[1])
+        assignment.scatter_(1, batch.match3d.clamp(min=0)[:, None], each[:, None])
+        assignment[torch.arange(len(batch)), 0, batch.count3d - 1] = 0.75
         pose = posed(batch.rotation, batch.translation)
-        pose.stats.iterations.fill_(7)
+        pose.stats.iterations.copy_(batch.index)
         return Prediction(assignment, None, {"pnp": pose})
 
     def training_step(self, batch: Batch, batch_idx: int) -> torch.Tensor:
@@ -53,12 +54,18 @@ class PlantedModule(LightningModule):
 
 
 def planted(size: int) -> Batch:
+    """Problems of 8 and of 6 points in turn, all but the last one with a match."""
     points = np.random.default_rng(0).uniform(-1, 1, (size, 8, 3)) + [0, 0, 4]
-    images = points[..., :2] / points[..., 2:]
-    match = np.r_[np.arange(7), -1]
-    return Batch.from_arrays(
-        list(images.astype("f4")), list(points), [np.eye(3)] * size, [np.zeros(3)] * size, [match] * size
-    )
+    scenes = [each[: 8 - 2 * (k % 2)] for k, each in enumerate(points)]
+    images = [(each[:, :2] / each[:, 2:]).astype("f4") for each in scenes]
+    matches = [np.r_[np.arange(len(each) - 1), -1] for each in scenes]
+    return Batch.from_arrays(images, scenes, [np.eye(3)] * size, [np.zeros(3)] * size, matches)
+
+
+def spread(points: torch.Tensor) -> float:
+    """Mean distance of unit vectors along the points from their mean."""
+    unit = points.numpy() / np.linalg.norm(points.numpy(), axis=-1, keepdims=True)
+    return float(np.linalg.norm(unit - unit.mean(0), axis=-1).mean())
 
 
 def fit(folder: Path, monitor: TrainingMonitor, logger: object, epochs: int = 3) -> None:
@@ -81,7 +88,11 @@ def test_a_training_logs_the_monitored_values(tmp_path: Path) -> None:
     rows = list(csv.DictReader((tmp_path / "logs" / "version_0" / "metrics.csv").open()))
     mass = [float(row["val/true_match_mass"]) for row in rows if row["val/true_match_mass"]]
     assert mass == pytest.approx([0.25] * 3)
-    assert {float(row["val/pnp_iterations"]) for row in rows if row["val/pnp_iterations"]} == {7}
+    assert {float(row["val/pnp_iterations"]) for row in rows if row["val/pnp_iterations"]} == {0.5}  # problems 0, 1
+    watched = planted(6)
+    for side, points in (("2d", watched.points2d), ("3d", watched.points3d)):
+        (found, *_) = (float(row[name]) for row in rows if row[name := f"val/feature_spread_{side}"])
+        assert found == pytest.approx((spread(points[0]) + spread(points[1, :6])) / 2, rel=1e-5)
     assert watched_values(Prediction(), planted(5)) == {}
     with pytest.raises(ValueError, match="`problems` is .*; it must be"):
         TrainingMonitor(problems=0)

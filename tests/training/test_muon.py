@@ -99,8 +99,9 @@ def test_frozen_parameters_stay_and_negative_rates_are_refused() -> None:
     net[2].weight.requires_grad = False
     optimizer = Muon(net.parameters())
     assert sum(len(group["params"]) for group in optimizer.param_groups) == 7
-    with pytest.raises(ValueError, match="adam_lr"):
-        Muon(net.parameters(), adam_lr=-1.0)
+    for name in ("lr", "adam_lr"):
+        with pytest.raises(ValueError, match=f"`{name}` is -1.0; it must be 0 or more"):
+            Muon(net.parameters(), **{name: -1.0})
 
 
 @pytest.mark.slow

@@ -278,6 +278,15 @@ def test_problems_that_are_numbered_within_their_batch_are_all_counted(tmp_path:
     assert float(validated["val/correspondence_loss"]) == pytest.approx(float(expected), rel=1e-5)
 
 
+@pytest.mark.parametrize("refine", [False, True])
+def test_a_validation_refines_poses_on_request(refine: bool, tmp_path: Path) -> None:
+    run = quiet_trainer(tmp_path)
+    task = BlindPnPTask(small_net(), refine_validation=refine)
+    run.validate(task, DataLoader(OWN[:2], 2, collate_fn=padded), verbose=False)
+    assert ("val/refined/rotation_q2_deg" in run.callback_metrics) == refine
+    assert "val/pnp/rotation_q2_deg" in run.callback_metrics
+
+
 @pytest.mark.parametrize(
     ("answer", "estimates", "error"),
     [
