@@ -14,6 +14,7 @@ from lightning.pytorch.trainer.states import RunningStage
 from lightning.pytorch.utilities import CombinedLoader
 from small_data import recorded
 
+from bpnp.datamodules.augment import Outliers
 from bpnp.datamodules.loader import BucketSampler, ProblemDataModule, ProblemDataset
 from bpnp.datamodules.problem import Counts, Problem, stack_problems
 from bpnp.training import BestCheckpoint
@@ -60,6 +61,13 @@ def sampler(sizes: Sequence[int], *, rank: int = 0, replicas: int = 1, **options
     )
 
 
+def is_mixed_but_alike(steps: list, sizes: Sequence[int]) -> tuple[bool, bool]:
+    """Return True for steps in no order of their size, and for problems of about one size in each step."""
+    logs = [np.log([sizes[i] for _, i in step]) for step in steps]
+    order = np.corrcoef(np.arange(len(logs)), [each.mean() for each in logs])[0, 1]
+    return abs(order) < 0.4, np.mean([each.std() for each in logs]) < 0.1 * np.std(np.log(sizes))
+
+
 @pytest.mark.parametrize("count", [1, 7, 24, 1003])
 @pytest.mark.parametrize("replicas", [1, 2, 4])
 def test_training_visits_each_pair_at_most_once_an_epoch(count: int, replicas: int) -> None:
@@ -72,6 +80,7 @@ def test_training_visits_each_pair_at_most_once_an_epoch(count: int, replicas: i
             one.set_epoch(epoch)
         steps = list(alone)
         assert steps == list(alone) != previous
+        assert count < 1000 or all(is_mixed_but_alike(steps, sizes))
         previous = steps
         keys = [key for step in steps for key in step]
         assert {e for e, _ in keys} == {epoch}
@@ -99,9 +108,31 @@ def test_evaluation_covers_every_pair(count: int, replicas: int, max_cells: int 
     assert all(step for share in shares for step in share)
     keys = [key for share in shares for step in share for key in step]
     assert set(keys) == {(0, i) for i in range(count)}
+    if count == 250:
+        assert all(is_mixed_but_alike(shares[0], sizes))
+    for parts in zip(*shares, strict=True):
+        step = [sizes[i] for part in parts for _, i in part]
+        assert max_cells is None or len(step) == replicas or len(step) * max(step) ** 2 <= max_cells
     if max_cells is None:
         alone = [set(step) for step in sampler(sizes, **options)]
         assert [{k for part in parts for k in part} for parts in zip(*shares, strict=True)] == alone
+
+
+def test_each_part_has_its_outliers_and_its_batch_size() -> None:
+    sizes = {"batch_size": 6, "eval_batch_size": 2}
+    data = Problems(train_outliers=Outliers(ratio=1.0), test_outliers=Outliers(ratio=0.5), **sizes)
+    data.setup()
+    for part, ratio, size in (("train", 1.0, 6), ("val", 1.0, 2), ("test", 0.5, 2), ("predict", 0.5, 2)):
+        batch = next(iter(getattr(data, f"{part}_dataloader")()))
+        matches = (batch.match3d >= 0).sum(-1)
+        assert len(batch) == size
+        assert torch.equal(batch.count3d, matches + (ratio * matches).long())
+    single, other = Problems(**sizes, max_cells=1), Problems(**sizes, seed=1)
+    for one in (single, other):
+        one.setup()
+    assert [len(batch) for batch in single.test_dataloader()] == [1] * 20
+    assert len(next(iter(single.train_dataloader()))) == 6
+    assert next(iter(other.test_dataloader())).ids != next(iter(data.test_dataloader())).ids
 
 
 def test_overfitting_in_two_processes_uses_all_batches_of_each(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -89,6 +89,32 @@ def test_poses_have_the_distributions_of_the_paper(tmp_path: Path) -> None:
     assert turn[:2, 0] == pytest.approx([np.cos(b) * np.cos(c), np.cos(b) * np.sin(c)])
 
 
+def test_other_cameras_have_their_own_distributions(tmp_path: Path) -> None:
+    options: dict[str, Any] = {"translation_range": 0.2, "distance": 6.0, "focal": 500.0, "noise_px": 4.0}
+    batch = drawn(source(tmp_path, RandomCameras(euler_range=(-20.0, 10.0), **options), num_points=20), 200)
+    angles = Rotation.from_matrix(batch.rotation).as_euler("xyz", degrees=True)
+    offsets = batch.translation.numpy() - [0, 0, 6]
+    camera = batch.points3d.double() @ batch.rotation.mT + batch.translation[:, None]
+    noise = (batch.points2d - camera[..., :2] / camera[..., 2:]).numpy().ravel()
+    assert stats.kstest(angles.ravel(), stats.uniform(-20, 30).cdf).pvalue > 1e-3
+    assert stats.kstest(offsets.ravel(), stats.uniform(-0.2, 0.4).cdf).pvalue > 1e-3
+    assert stats.kstest(noise, stats.norm(scale=4 / 500).cdf).pvalue > 1e-3
+    assert batch.focal.tolist() == [500.0] * 200
+    # The entries of a uniform rotation have mean 0 and variance 1/3.
+    turns = drawn(source(tmp_path, RandomCameras("so3"), num_points=4), 200).rotation
+    assert turns.mean(0).abs().max() < 4 * (1 / 3 / 200) ** 0.5
+
+
+def test_points_are_of_the_pool_and_few_problems_of_any_mesh(tmp_path: Path) -> None:
+    problems = source(tmp_path, pool_size=10, num_points=4)
+    batch = drawn(problems, 20)
+    for i in range(20):
+        pool = {tuple(point) for point in problems.store.row(i % 5)[POINTS][:10].tolist()}
+        assert {tuple(point) for point in batch.points3d[i].tolist()} <= pool
+    chosen = [drawn(source(tmp_path, count=2, num_points=4, seed=(seed, 0)), 2).ids for seed in range(9)]
+    assert {name for names in chosen for name in names} == {f"c/train/m{i}#0" for i in range(5)}
+
+
 def test_points_behind_the_camera_have_no_image(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="extend 1 from their origin"):
         inside = source(tmp_path, RandomCameras(distance=0.0, noise_px=0.0), count=5)

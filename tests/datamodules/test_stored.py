@@ -134,6 +134,23 @@ def test_every_pair_is_served_once_and_the_same(store: Store, num_workers: int) 
         assert torch.equal(served[problem.name], alone.points3d[0])
 
 
+@pytest.mark.parametrize("fresh", [True, False])
+def test_options_reach_the_problems_of_their_part(store: Store, fresh: bool) -> None:
+    """A training problem is another subset in each epoch if it is asked for, and those of other parts never."""
+    scenes = {"train_scenes": ["s0"], "val_scenes": ["s1"], "test_scenes": ["s2"]}
+    limits = {"max_points": 8, "eval_max_points": 6, "clutter": 1.0, "clutter_side": "3d"}
+    data = StoredDataModule(str(store.folder), fresh_subsets=fresh, **scenes, **limits)
+    data.setup()
+    for part, most, scene in (("train", 8, 0), ("val", 6, 1), ("test", 6, 2), ("predict", 6, 2)):
+        free = [len(problem.points3d) - problem.matched for _, problem in problems()][scene::3]
+        for i in range(4):
+            first, second = (data.datasets[part].problem(i, epoch) for epoch in (0, 1))
+            (matches,) = (first.match3d >= 0).sum(-1).tolist()
+            assert matches == min(most, problems()[scene + 3 * i][1].matched)
+            assert (int(first.count2d), int(first.count3d)) == (matches, matches + min(free[i], matches))
+            assert torch.equal(first.points3d, second.points3d) == (part != "train" or not fresh)
+
+
 def test_a_store_of_anyones_pairs_is_split_by_scene(store: Store) -> None:
     data = StoredDataModule(str(store.folder), test_scenes=["s1"], val_scenes=["s2"])
     data.setup()
