@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -79,7 +78,7 @@ def localize(
         quiet: print only errors, and JSON with --json.
     """
     from bpnp.datamodules.colmap.model_files import model_format
-    from bpnp.maps.many_photos import SolutionFolder, content_of_map, localize_photos, read_views
+    from bpnp.maps.many_photos import SolutionFolder, content_of_map, localize_photos, read_views, results_json
     from bpnp.maps.photos import photo_files
     from bpnp.maps.scene_map import SceneMap
     from bpnp.search.arguments import positive, source_from
@@ -122,7 +121,7 @@ def localize(
     out = console(json=json, quiet=quiet)
     records = {name: folder.records[name] for name in files if name in folder.records and name not in outcome.errors}
     if json:
-        say(dumps({"map": folder.map_content, "photos": records}, indent=1))
+        say(results_json(folder.map_content, records))
     elif records:
         out.print(_table(records, out.width), Text(_caption(records), "dim italic"))
     _report(files, records, folder, outcome, out)

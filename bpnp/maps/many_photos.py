@@ -34,7 +34,6 @@ REPORTED += ("log10_false_alarms", "seconds", "rotation", "translation", "camera
 REPORTED += (MADE_WITH,)
 ERROR = "error_to_map"  # key for a photo that was left out of the map
 POSES_HEADER = "# NAME, QW, QX, QY, QZ, TX, TY, TZ (COLMAP's cam_from_world)\n"
-BEGINNINGS = {"results.json": '{\n "map": ', "poses.txt": POSES_HEADER}  # of the files for all photos
 Record = dict[str, Any]  # entry of a photo in results.json
 
 
@@ -267,6 +266,20 @@ def content_of_map(folder: Path) -> str:
     return "" if suffix is None else content_of(*(folder / f"{name}.{suffix}" for name in FILES))
 
 
+def results_json(map_content: str, photos: Mapping[str, Record]) -> str:
+    """Return the content of results.json.
+
+    Args:
+        map_content: Fingerprint of the files of the map.
+        photos: Entries of the photos, by name.
+    """
+    return json.dumps({"map": map_content, "photos": photos}, indent=1)
+
+
+# Beginnings of the files for all photos, which no other program writes.
+BEGINNINGS = {"results.json": results_json("", {}).partition('""')[0], "poses.txt": POSES_HEADER}
+
+
 @dataclass
 class SolutionFolder:
     """Folder with solutions/<photo>.json for each photo, and results.json and poses.txt for all.
@@ -364,7 +377,7 @@ class SolutionFolder:
     def write(self) -> None:
         """Write results.json, and poses.txt with a line for each confident photo of this map, from all runs."""
         photos = dict(sorted(self.records.items()))
-        write_text(self.path / "results.json", json.dumps({"map": self.map_content, "photos": photos}, indent=1) + "\n")
+        write_text(self.path / "results.json", results_json(self.map_content, photos) + "\n")
         others = self.of_other_maps()
         lines = [POSES_HEADER]
         for name, record in photos.items():
