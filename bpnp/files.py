@@ -27,7 +27,7 @@ def write_atomically(path: Path) -> Iterator[Path]:
     Args:
         path: File or folder to write.
     """
-    if path.exists() and (path.parent == Path("/dev") or not (path.is_file() or path.is_dir())):
+    if _is_device(path):
         yield path
         return
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -46,6 +46,11 @@ def write_atomically(path: Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
+def _is_device(path: Path) -> bool:
+    """Return True for a device or a pipe, such as /dev/stdout."""
+    return path.exists() and (path.parent == Path("/dev") or not (path.is_file() or path.is_dir()))
+
+
 def write_text(path: Path, text: str, *, errors: str = "strict") -> Path:
     """Write a text file atomically, with its line ends unchanged, and return its path.
 
@@ -57,6 +62,38 @@ def write_text(path: Path, text: str, *, errors: str = "strict") -> Path:
     with write_atomically(path) as temporary:
         temporary.write_text(text, encoding="utf-8", errors=errors, newline="")
     return path
+
+
+def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | None] = ()) -> None:
+    """Check that files can be written, before the work whose results they get, and create their folders.
+
+    Args:
+        outputs: Files to write; None is ignored.
+        inputs: Files that are read, or folders; None is ignored. Default: none.
+
+    Raises:
+        ValueError: An output is a folder, a file that is also an input or another output, or in a folder that cannot be
+            created or written to.
+    """
+    input_files = {path.resolve() for path in inputs if path is not None and path.is_file()}
+    output_files: set[Path] = set()
+    for path in outputs:
+        if path is None:
+            continue
+        if path.resolve() in output_files:
+            raise ValueError(f"{path} is the file of two outputs; name another file for one of them")
+        output_files.add(path.resolve())
+        if path.is_dir():
+            raise ValueError(f"{path} is a folder; give a file name to write to")
+        if path.resolve() in input_files:
+            raise ValueError(f"{path} is an input and would be overwritten; name another file")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            reason = error.strerror or error
+            raise ValueError(f"{path} cannot be written: {reason}; name a file in another folder") from error
+        if not os.access(path if _is_device(path) else path.parent, os.W_OK):
+            raise ValueError(f"{path} cannot be written: no permission; name a file in another folder")
 
 
 def require_new_folder(folder: Path) -> None:

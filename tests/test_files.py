@@ -2,7 +2,9 @@ import os
 import threading
 from pathlib import Path
 
-from bpnp.files import write_text
+import pytest
+
+from bpnp.files import check_outputs, write_text
 
 
 def test_a_pipe_is_written_to_and_not_replaced(tmp_path: Path) -> None:
@@ -16,3 +18,24 @@ def test_a_pipe_is_written_to_and_not_replaced(tmp_path: Path) -> None:
     reader.join(60)
     assert read == ["a pose\n"]
     assert list(tmp_path.iterdir()) == [pipe]
+
+
+def test_outputs_that_cannot_be_written_are_refused_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "file"
+    file.write_text("")
+    check_outputs([None, tmp_path / "new" / "r.json", Path(os.devnull)], [None, file, tmp_path])
+    assert (tmp_path / "new").is_dir()
+    for outputs, message in (
+        ([tmp_path], "is a folder; give a file name to write to"),
+        ([file], "file is an input and would be overwritten; name another file"),
+        ([tmp_path / "a", tmp_path / "new" / ".." / "a"], "is the file of two outputs; name another file"),
+        ([file / "a"], "a cannot be written: File exists; name a file in another folder"),
+        ([file / "b" / "a"], "a cannot be written: Not a directory; name a file in another folder"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            check_outputs(outputs, [file])
+    monkeypatch.setattr(os, "access", lambda path, mode: path != tmp_path)  # permissions do not hold for root
+    with pytest.raises(ValueError, match="c cannot be written: no permission; name a file in another folder"):
+        check_outputs([tmp_path / "c"])

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from bpnp.commands.parser import at_least
-from bpnp.files import write_atomically
+from bpnp.files import check_outputs, write_atomically
 from bpnp.report.terminal import say
 
 if TYPE_CHECKING:
@@ -107,8 +107,7 @@ def convert_weights(file: Path, out: Path, *, ransac: Literal["poselib", "opencv
         out: checkpoint to write, *.ckpt.
         ransac: backend of the RANSAC step; opencv is the paper's.
     """
-    if out.resolve() == file.resolve():
-        raise ValueError(f"{out} is an input and would be overwritten; name another file")
+    check_outputs([out], [file])
     import lightning
     import torch
 

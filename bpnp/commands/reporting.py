@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from bpnp.commands.parser import at_least
-from bpnp.files import lock_folder, packaged_config, write_text
+from bpnp.files import check_outputs, lock_folder, packaged_config, write_text
 from bpnp.report.terminal import Paper, console, say
 
 if TYPE_CHECKING:
@@ -57,6 +57,7 @@ def report(
     for picture in (curves, recall):
         if picture is not None:
             check_picture_name(picture)
+    check_outputs([html, recall, curves])
     if curves is not None:
         from bpnp.report.training_curves import training_curves
         from bpnp.report.training_run import training_folder
@@ -132,6 +133,7 @@ def view(
         raise ValueError(f"{run} is one solution, which has no problem {names[0]!r}")
     if photos is not None and (photo is not None or run.is_file()):
         raise ValueError("--photos finds the photos of a test; leave out --photo and --camera")
+    check_outputs([output], [run, photo])
     source = None
     if run.is_file():
         drawn, folder = [_solution(run)], run.absolute().parent

@@ -2,7 +2,7 @@
 
 import re
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bpnp.files import require_new_folder, write_text
+from bpnp.files import check_outputs, require_new_folder, write_text
 from bpnp.report.terminal import console, format_fixed, number, progress, say
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ def solve(
 
         size_in_camera(background, camera_from(lens))
     inputs = [points2d, points3d, prior, photo, *(Path(text) for text in (camera, solver) if text is not None)]
-    _check_outputs([output, picture], inputs)
+    check_outputs([output, picture], inputs)
     if colmap is not None:
         require_new_folder(colmap)
     pose_prior: Any = None if prior is None else read_prior(prior, prior_degrees, prior_distance)
@@ -227,7 +227,7 @@ def verify(
     else:
         raise ValueError("give the JSON of a pose, or --rotation and --translation")
     inputs = [points2d, points3d, pose, matches, None if camera is None else Path(camera)]
-    _check_outputs([output], inputs)
+    check_outputs([output], inputs)
     image_points, scene_points, annotations = _read_sides(points2d, points3d, surface, seed)
     lens = None if camera is None else read_camera(camera, image)
     pairs = None if matches is None else read_pairs(matches)
@@ -251,27 +251,6 @@ def verify(
             time_limit=time_limit,
         )
     _print_solution(solution, annotations, json=json, quiet=quiet, output=output)
-
-
-def _check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | None]) -> None:
-    """Create the folders of output files.
-
-    Raises:
-        ValueError: An output is a folder, or a file that is also an input or another output.
-    """
-    input_files = {path.resolve() for path in inputs if path is not None and path.is_file()}
-    output_files: set[Path] = set()
-    for path in outputs:
-        if path is None:
-            continue
-        if path.resolve() in output_files:
-            raise ValueError(f"{path} is the file of two outputs; name another file for one of them")
-        output_files.add(path.resolve())
-        if path.is_dir():
-            raise ValueError(f"{path} is a folder; give a file name to write to")
-        if path.resolve() in input_files:
-            raise ValueError(f"{path} is an input and would be overwritten; name another file")
-        path.parent.mkdir(parents=True, exist_ok=True)
 
 
 def _read_sides(points2d: Path, points3d: Path, surface: int | None, seed: int) -> tuple[Any, Any, dict[str, Any]]:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.text import Text
 
-from bpnp.files import write_text
+from bpnp.files import check_outputs, write_text
 from bpnp.report.terminal import VERDICTS, WIDTH, SplitTable, console, count_items, say, shorten
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ def verify_images(
             f"{map} {what}; name points2d, points3d and a pose, or the folder of a COLMAP model such as sparse/0"
         )
     for option, path, suffixes in (("--output", output, SUFFIXES), ("--page", page, (".html",))):
-        if path is not None and (path.suffix.lower() not in suffixes or path.is_dir()):
+        if path is not None and path.suffix.lower() not in suffixes:
             raise ValueError(f"{option} is {path}; name a file that ends in {' or '.join(suffixes)}")
     if not model_format(map) and (inside := [path for path in sorted(map.glob("*")) if model_format(path)]):
         raise ValueError(f"{map} has no COLMAP model, but {inside[0]} has; try bpnp verify {inside[0]}")
@@ -53,6 +53,7 @@ def verify_images(
 
     limit = seconds_from(time_limit, TIME.one)
     scene = SceneMap.from_colmap(map)
+    check_outputs([output, page])
     with count_items("verifying", len(scene.views), quiet=quiet) as done:
         verified = verify_map(map, scene, seed=seed, time_limit=limit, done=done)
     out = console(json=json, quiet=quiet)

@@ -147,6 +147,18 @@ def test_a_mistake_is_one_line(
     assert message in fails("verify", *arguments)
 
 
+@pytest.mark.parametrize("option", ["--output", "--page"])
+def test_an_unwritable_output_is_refused_before_the_work(
+    option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fails: Callable[..., str]
+) -> None:
+    monkeypatch.setattr("bpnp.maps.verified_map.verify_map", None)
+    plant_model(tmp_path / "map", camera=PINHOLE)
+    (tmp_path / "file").write_text("")
+    output = tmp_path / "file" / ("table.csv" if option == "--output" else "page.html")
+    message = fails("verify", str(tmp_path / "map"), option, str(output))
+    assert f"{output} cannot be written: File exists; name a file in another folder" in message
+
+
 def test_the_drawn_map_never_replaces_a_folder(houses: tuple[Path, dict[str, tuple[np.ndarray, np.ndarray]]]) -> None:
     with pytest.raises(ValueError, match=r"houses is not empty; name a new folder"):
         draw_map(houses[0])

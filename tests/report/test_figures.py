@@ -141,3 +141,7 @@ def test_a_photo_shows_the_points_where_the_camera_projects_them(tmp_path: Path)
     assert (tmp_path / "view.png").stat().st_size > 5000
     with pytest.raises(SystemExit):
         main(["view", str(tmp_path), *arguments])
+    before = (tmp_path / "photo.png").read_bytes()
+    with pytest.raises(SystemExit):  # the photo would be replaced
+        main(["view", str(tmp_path), *arguments[:3], arguments[1], "--camera", str(tmp_path / "K.txt")])
+    assert (tmp_path / "photo.png").read_bytes() == before
