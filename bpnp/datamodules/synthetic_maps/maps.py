@@ -45,7 +45,7 @@ WEIGHTS = {"facades": 0.5, "street": 0.25, "statue": 0.25}
 WITHIN = "street"  # kind whose camera is within the scene, with a field of view in the upper half of the range
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MapOptions:
     """Options of `draw_map_problem`; see `SyntheticMapDataModule` for those not listed.
 
@@ -332,19 +332,18 @@ class SyntheticMapDataModule(ProblemDataModule):
         **loading: Any,
     ) -> None:
         super().__init__(**loading)
-        weights, axes = WEIGHTS if kinds is None else kinds, "upright" if frame == "any" else frame
         self.options = MapOptions(
-            num_points,
-            min_points,
-            outliers,
-            views,
-            weights,
-            axes,
-            tilt_deg,
-            heading_deg,
-            scale_range,
-            field_of_view,
-            noise_px,
+            num_points=num_points,
+            min_points=min_points,
+            outliers=outliers,
+            views=views,
+            kinds=WEIGHTS if kinds is None else kinds,
+            frame="upright" if frame == "any" else frame,
+            tilt_deg=tilt_deg,
+            heading_deg=heading_deg,
+            scale_range=scale_range,
+            field_of_view=field_of_view,
+            noise_px=noise_px,
         )
         self.problems = {"train": train_problems, "val": val_problems, "test": test_problems}
         self.fresh = fresh_views
