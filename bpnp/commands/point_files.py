@@ -267,7 +267,8 @@ def _columns(path: Path, wanted: Set[str] = frozenset()) -> tuple[Array, list[st
         Numbers (k, c), and the names of the c columns; no name if the first line has none.
 
     Raises:
-        ValueError: The file cannot be read, or its first line names another number of columns than its rows have.
+        ValueError: The file cannot be read, or its first line names another number of columns than its rows have,
+            or two wanted columns alike.
     """
     try:
         content = _content(path)
@@ -292,6 +293,9 @@ def _columns(path: Path, wanted: Set[str] = frozenset()) -> tuple[Array, list[st
     if len(names) != count and wanted & {*names}:
         raise ValueError(f"{_name(path)} names {len(names)} columns in its first line; its rows have {count}")
     names = names if len(names) == count else []
+    if repeated := next((name for name in names if name in wanted and names.count(name) > 1), None):
+        count = names.count(repeated)
+        raise ValueError(f"{_name(path)} names {count} columns {repeated} in its first line; keep one of them")
     others = [i for i, name in enumerate(names) if wanted and name not in wanted]
     decimals = rows if mark == "," else [row.replace(",", ".") for row in rows]
     converters: Any = {i: lambda _: np.nan for i in others}

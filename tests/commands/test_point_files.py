@@ -206,6 +206,18 @@ def test_a_first_line_that_names_another_number_of_columns_is_refused(text: str,
         read_points3d(tmp_path / "a.csv")
 
 
+@pytest.mark.parametrize("header", ["x,y,z,x", "X,y,z,x", "x,y,z,label,label"])
+def test_a_first_line_that_names_a_column_twice_is_refused(header: str, tmp_path: Path) -> None:
+    """Otherwise the last one would be read."""
+    rows = np.arange(2.0 * len(header.split(","))).reshape(2, -1)
+    np.savetxt(tmp_path / "a.csv", rows, delimiter=",", header=header, comments="")
+    name = header.split(",")[-1]
+    with pytest.raises(ValueError, match=rf"a\.csv names 2 columns {name} in its first line; keep one of them$"):
+        read_points3d(tmp_path / "a.csv")
+    (tmp_path / "b.csv").write_text("x,y,z,note,note\n1,2,3,4,5\n")  # of columns that are not read
+    np.testing.assert_array_equal(read_points3d(tmp_path / "b.csv")[0], [[1, 2, 3]])
+
+
 @pytest.mark.parametrize("label", ["inf", "-1e30"])
 def test_a_label_that_no_integer_holds_is_refused(label: str, tmp_path: Path) -> None:
     """As an int64 it is negative, a point of unknown label."""
