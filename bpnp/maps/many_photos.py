@@ -33,6 +33,7 @@ REPORTED: tuple[str, ...] = ("verdict", "reason", "view", "inlier_count", "repro
 REPORTED += ("log10_false_alarms", "seconds", "rotation", "translation", "camera", "focal_length", "focal_length_std")
 REPORTED += (MADE_WITH,)
 ERROR = "error_to_map"  # key for a photo that was left out of the map
+# A name may have spaces: the last seven words of a line are the numbers.
 POSES_HEADER = "# NAME, QW, QX, QY, QZ, TX, TY, TZ (COLMAP's cam_from_world)\n"
 Record = dict[str, Any]  # entry of a photo in results.json
 
@@ -245,7 +246,7 @@ def read_views(path: str | Path) -> dict[str, list[str]]:
         if not (names := line.split()):
             continue
         if len(names) != 2:
-            raise ValueError(f"line {number} of {path} is {line!r}; a line has two names, of a photo and of a view")
+            raise ValueError(f"line {number} of {path} is {line!r}; a line has two names without spaces, of a photo and a view")
         views.setdefault(names[0], []).append(names[1])
     return views
 

@@ -58,7 +58,8 @@ def photo_files(paths: Iterable[Path], besides: Collection[Path] = ()) -> dict[s
         besides: Folders to skip in folders, such as that of the pictures of the results. Default: none.
 
     Raises:
-        ValueError: A path does not exist, there is no photo, or two photos have one name.
+        ValueError: A path does not exist, there is no photo, two photos have one name, or a name cannot begin a line of
+            a text file of poses.
     """
     files: dict[str, Path] = {}
     left_out = {folder.resolve() for folder in besides}
@@ -70,6 +71,8 @@ def photo_files(paths: Iterable[Path], besides: Collection[Path] = ()) -> dict[s
             name = file.relative_to(path).as_posix() if path.is_dir() else file.name
             if files.setdefault(name, file) != file:
                 raise ValueError(f"{files[name]} and {file} have the same name; photos need different names")
+            if name.startswith("#") or len(name.splitlines()) > 1:
+                raise ValueError(f"the photo {name!r} begins with # or has a line break in its name; rename the file")
     if not files:
         outside = f" outside {' and '.join(map(str, besides))}" if besides else ""
         raise ValueError(f"there are no photos{outside}; give one or more photos, or folders with photos")

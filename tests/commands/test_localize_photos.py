@@ -211,6 +211,22 @@ def test_a_photo_is_not_replaced_by_its_picture(command: list[str], fails: Calla
     assert photo.read_bytes() == before
 
 
+def test_a_name_with_spaces_is_read_from_the_line_of_its_pose(tmp_path: Path) -> None:
+    name, numbers = " IMG 12 (2).jpg", [1.0, 0.0, 0.0, 0.0, 0.1, -2.0, 3e-5]
+    record = dict.fromkeys(many_photos.REPORTED) | {"verdict": "confident", "rotation": np.eye(3).tolist()}
+    record |= {"translation": numbers[4:], "made_with": {"map": "m"}}
+    many_photos.SolutionFolder(tmp_path, "m", {name: record}).write()
+    _, line = (tmp_path / "poses.txt").read_text().splitlines()
+    assert [line.rsplit(" ", 7)[0], *map(float, line.rsplit(" ", 7)[1:])] == [name, *numbers]
+
+
+@pytest.mark.parametrize("name", ["#1.jpg", "a\nb.jpg"])
+def test_a_name_that_is_no_line_of_poses_is_refused(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(b"")
+    with pytest.raises(ValueError, match=r"^the photo '.*' begins with # or has a line break in its name; rename the"):
+        photo_files([tmp_path])
+
+
 @pytest.mark.parametrize("folder", [True, False])
 def test_a_file_name_that_is_not_utf8_is_kept_as_it_is(folder: bool, command: list[str]) -> None:
     name = os.fsdecode(b"caf\xe9.png")

@@ -163,7 +163,7 @@ def test_a_file_of_retrieved_views_is_read_and_wrong_lines_named(tmp_path: Path)
     path.write_text("q1.jpg db/a.jpg\nq2.jpg db/b.jpg\n\nq1.jpg db/c.jpg\n")
     assert read_views(path) == {"q1.jpg": ["db/a.jpg", "db/c.jpg"], "q2.jpg": ["db/b.jpg"]}
     path.write_text("q1.jpg db/a.jpg 0.3\n")
-    with pytest.raises(ValueError, match=r"line 1 of .* is 'q1.jpg db/a.jpg 0.3'; a line has two names"):
+    with pytest.raises(ValueError, match=r"line 1 of .* is 'q1.jpg db/a.jpg 0.3'; a line has two names without spaces"):
         read_views(path)
     with pytest.raises(ValueError, match="--views needs a text file of lines `photo view`"):
         read_views(tmp_path / "none.txt")
