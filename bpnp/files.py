@@ -153,6 +153,15 @@ def delay_interrupts() -> Iterator[None]:
             signal.raise_signal(signal.SIGINT)
 
 
+def read_lines(path: Path) -> list[str]:
+    """Return the lines of a text file without white space around them; empty ones are left out.
+
+    Args:
+        path: UTF-8 file.
+    """
+    return [line for text in path.read_text(encoding="utf-8").splitlines() if (line := text.strip())]
+
+
 def name_bytes(name: str) -> bytes:
     r"""Return a name as UTF-8; bytes of a file name that are not UTF-8 become backslash escapes.
 

@@ -20,7 +20,7 @@ from bpnp.datamodules.shapes import (
     shape_files,
     training_meshes_first,
 )
-from bpnp.files import file_states, fingerprint, name_bytes
+from bpnp.files import file_states, fingerprint, name_bytes, read_lines
 
 TEXTS = (".txt", ".xyz")
 CLOUD_SUFFIXES = (".npy", *TEXTS)
@@ -137,7 +137,7 @@ def _read_shape_list(folder: Path) -> Shapes | None:
     files: dict[str, Path] = {}
     for split in SPLITS:
         lists = [folder / f"modelnet{size}_{split}.txt" for size in (40, 10)]
-        names = next((path.read_text(encoding="utf-8").split() for path in lists if path.is_file()), [])
+        names = next((read_lines(path) for path in lists if path.is_file()), [])
         for stem in sorted(names):
             label = stem.rpartition("_")[0]
             name, path = f"{label}/{split}/{stem}", folder / label / f"{stem}.txt"
@@ -153,7 +153,7 @@ def _hdf5_shapes(folder: Path) -> Shapes | None:
         return None
     h5py = _h5py(folder)
     class_list = folder / "shape_names.txt"
-    classes = class_list.read_text(encoding="utf-8").split() if class_list.is_file() else []
+    classes = read_lines(class_list) if class_list.is_file() else []
     samplers: dict[str, Sampler] = {}
     for split, paths in files.items():
         for path in paths:

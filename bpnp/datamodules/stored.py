@@ -17,6 +17,7 @@ from bpnp.datamodules.augment import Augmentation, Side
 from bpnp.datamodules.loader import STAGES, ProblemDataModule
 from bpnp.datamodules.problem import Counts, Problem, ProblemSource, stack_problems
 from bpnp.datamodules.store import Store, StoreError, StoreRow, new_store, open_store
+from bpnp.files import read_lines
 from bpnp.poses import MIN_POINTS
 from bpnp.types import Batch
 
@@ -269,7 +270,7 @@ def _scene_list(name: str, scenes: list[str] | str | None) -> list[str] | None:
     path = Path(scenes)
     if not path.is_file():
         raise ValueError(f"there is no file {path}; `{name}` is a list of scenes, or a text file with one a line")
-    lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+    lines = read_lines(path)
     if not lines:
         raise ValueError(f"{path} is empty; `{name}` needs a file with one scene a line")
     return lines

@@ -197,6 +197,13 @@ def test_the_normal_resampled_archive_of_modelnet40(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.sort(samples, axis=0), np.sort(points(1), axis=0), atol=1e-6)
 
 
+def test_a_class_of_two_words_is_one_class(tmp_path: Path) -> None:
+    (tmp_path / "shape_names.txt").write_text("flower pot\nlamp\n")
+    with h5py.File(tmp_path / "ply_data_train0.h5", "w") as file:
+        file["data"], file["label"] = points(0)[None], np.array([[1]], np.uint8)
+    assert list(open_shapes(tmp_path).samplers) == ["lamp/train/ply_data_train0_0000"]
+
+
 def test_a_listed_file_of_the_normal_resampled_archive_that_is_missing_is_named(tmp_path: Path) -> None:
     root = tmp_path / "modelnet40_normal_resampled"
     for i in range(3):
