@@ -37,6 +37,9 @@ RADIAL: dict[str, tuple[list[int], list[int]]] = {
     "OPENCV": ([4, 5], []),
     "FULL_OPENCV": ([4, 5, 8], [9, 10, 11]),
 }
+# Models whose image radius at the angle t from the axis is t (1 + k1 t^2 + ...), but for tangential and thin-prism
+# distortion, and which see no point at 90 degrees or beyond: indices of the parameters k1, k2, ...
+NARROW_FISHEYE = {"THIN_PRISM_FISHEYE": [4, 5, 8, 9], "RAD_TAN_THIN_PRISM_FISHEYE": [4, 5, 6, 7, 8, 9]}
 EDGES, STEPS = 1024, 5  # table of fisheye angles, and Newton steps from a table entry to full precision
 CENTRE = 0.5  # centre of the first pixel in COLMAP's coordinates; it is 0 in OpenCV's and hloc's
 SLACK, FEW_OUTSIDE = 0.01, 0.02  # margin around an image in larger sides; fraction of points allowed beyond it
@@ -176,9 +179,7 @@ class Lens:
         if name not in FISHEYE:
             return None
         focals, count = FISHEYE[name]
-        radial = np.zeros(2 * count + 2)
-        radial[1::2] = np.r_[1.0, params[focals + 2 : focals + 2 + count]]
-        distance = np.polynomial.Polynomial(radial).trim()
+        distance = _odd_polynomial(params[focals + 2 : focals + 2 + count])
         widest = min(np.pi, _first_root(distance.deriv()))
         return _Fisheye(params[:focals], params[focals : focals + 2], distance, widest)
 
@@ -203,12 +204,22 @@ else:
 @lru_cache
 def _widest_radius(model: str, params: tuple[float, ...]) -> float:
     """Return the radius in the plane z = 1 up to which the image radius rises, infinity for other models."""
+    if model in NARROW_FISHEYE:
+        angle = _first_root(_odd_polynomial([params[i] for i in NARROW_FISHEYE[model]]).deriv())
+        return float(np.tan(angle)) if angle < np.pi / 2 else np.inf
     above, below = RADIAL.get(model, ([], []))
-    odd, even = np.zeros(2 * len(above) + 2), np.zeros(2 * len(below) + 1)
-    odd[1::2], even[::2] = [1.0, *(params[i] for i in above)], [1.0, *(params[i] for i in below)]
-    numerator, denominator = np.polynomial.Polynomial(odd), np.polynomial.Polynomial(even)
+    even = np.zeros(2 * len(below) + 1)
+    even[::2] = [1.0, *(params[i] for i in below)]
+    numerator, denominator = _odd_polynomial([params[i] for i in above]), np.polynomial.Polynomial(even)
     slope = numerator.deriv() * denominator - numerator * denominator.deriv()
     return _first_root(slope * denominator)
+
+
+def _odd_polynomial(coefficients: Sequence[float] | Array) -> np.polynomial.Polynomial:
+    """Return x (1 + k1 x^2 + k2 x^4 + ...) for coefficients k1, k2, ..."""
+    odd = np.zeros(2 * len(coefficients) + 2)
+    odd[1::2] = [1.0, *coefficients]
+    return np.polynomial.Polynomial(odd).trim()
 
 
 def _first_root(polynomial: np.polynomial.Polynomial) -> float:

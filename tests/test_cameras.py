@@ -180,6 +180,8 @@ def test_a_fisheye_sees_behind_itself() -> None:
         ("RADIAL", [500.0, 500, 400, -0.3, 0.02]),
         ("OPENCV", [500.0, 510, 500, 400, -0.3, 0.02, 0.0, 0.0]),
         ("FULL_OPENCV", [500.0, 510, 500, 400, 0.1, 0.01, 0.0, 0.0, 0.0, 0.3, 0.2, 0.1]),
+        ("THIN_PRISM_FISHEYE", [500.0, 510, 500, 400, -0.3, 0.02, 0.0, 0.0, 0.001, 0.001, 0.0, 0.0]),
+        ("RAD_TAN_THIN_PRISM_FISHEYE", [500.0, 510, 500, 400, -0.3, 0.02, 0.001, *[0.0] * 9]),
     ],
 )
 def test_a_point_beyond_the_field_of_view_does_not_fold_back_into_the_image(model: str, params: list[float]) -> None:
@@ -194,8 +196,16 @@ def test_a_point_beyond_the_field_of_view_does_not_fold_back_into_the_image(mode
     assert np.isnan(seen[rising + 1 :]).all()
 
 
-@pytest.mark.parametrize("params", [[500.0, 500, 400, 0.3], [500.0, 500, 400, 0.0]])
-def test_a_radius_that_rises_everywhere_has_no_limit(params: list[float]) -> None:
-    camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=1000, height=800, params=params)
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_RADIAL", [500.0, 500, 400, 0.3]),
+        ("SIMPLE_RADIAL", [500.0, 500, 400, 0.0]),
+        ("THIN_PRISM_FISHEYE", [500.0, 500, 500, 400, *[0.0] * 8]),
+        ("THIN_PRISM_FISHEYE", [500.0, 500, 500, 400, -0.1, *[0.0] * 7]),  # falls only from 105 degrees
+    ],
+)
+def test_a_radius_that_rises_everywhere_has_no_limit(model: str, params: list[float]) -> None:
+    camera = pycolmap.Camera(model=model, width=1000, height=800, params=params)
     points = np.array([[50.0, 0, 1], [-1e6, 3, 1]])
     np.testing.assert_allclose(camera_from(camera).project(points), camera.img_from_cam(points), rtol=1e-12)
