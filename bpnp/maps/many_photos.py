@@ -246,7 +246,9 @@ def read_views(path: str | Path) -> dict[str, list[str]]:
         if not (names := line.split()):
             continue
         if len(names) != 2:
-            raise ValueError(f"line {number} of {path} is {line!r}; a line has two names without spaces, of a photo and a view")
+            raise ValueError(
+                f"line {number} of {path} is {line!r}; a line has two names without spaces, of a photo and a view"
+            )
         views.setdefault(names[0], []).append(names[1])
     return views
 

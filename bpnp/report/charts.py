@@ -83,16 +83,16 @@ def recall_chart(runs: Mapping[str, Results], error: Error, *, paper: Paper | No
             rings.
 
     Returns:
-        The figure, or None if no problem has an error above zero.
+        The figure, or None if no problem has an error of this kind.
     """
     from plotly.graph_objects import Figure
 
     title, _, most = RECALLS[error]
-    finite = np.concatenate([errors_of(runs, line, error).numpy() for line in lines_of(runs)])
-    finite = finite[np.isfinite(finite) & (finite > 0)]
-    if not len(finite):
+    every = np.concatenate([errors_of(runs, line, error).numpy() for line in lines_of(runs)])
+    if not len(every):
         return None
-    low = max(float(np.quantile(finite, 0.01)), most / 1e5)
+    drawn = every[np.isfinite(every) & (every > 0)]  # an axis of logarithms has no place for the others
+    low = max(float(np.quantile(drawn, 0.01)) if len(drawn) else 0.0, most / 1e5)
     if error != "translation":  # an axis of angles ends where most poses are wrong, also if all of them are
         low = min(low, most / 2)
     limits = np.geomspace(low, max(most, 2 * low), POINTS)

@@ -10,7 +10,7 @@ from plotly.offline import get_plotlyjs
 from report_data import HOSTILE, inflated, row, rows, write_run
 
 from bpnp.report import write_page, write_results
-from bpnp.report.charts import Error, chart_text, recall_chart
+from bpnp.report.charts import RECALLS, Error, chart_text, recall_chart
 from bpnp.report.page import page_html, page_numbers
 from bpnp.report.points import write_points
 from bpnp.report.results import CAUSES
@@ -181,3 +181,12 @@ def test_a_chart_of_a_test_without_a_pose_shows_no_problem_within_a_limit(tmp_pa
     assert chart is not None
     assert max(chart.data[0].x) <= 90
     assert set(chart.data[0].y) == {0}
+
+
+def test_a_chart_of_exact_poses_shows_all_problems_within_every_limit(tmp_path: Path) -> None:
+    exact = dict.fromkeys(("rotation_error_deg", "translation_error", "centre_error", "reprojection_error_deg"), 0.0)
+    runs = {"exact": write_results(tmp_path, [row(i, **exact) for i in range(3)])}
+    for error in RECALLS:
+        chart = recall_chart(runs, error)
+        assert chart is not None
+        assert set(chart.data[0].y) == {1}
