@@ -233,7 +233,7 @@ def fitting_state(
         The weights of the solver, and the settings that may differ and do, such as `rounds=0 (saved: 8)`.
 
     Raises:
-        ValueError: The class, another setting, or the shape of a weight differs.
+        ValueError: The class, another setting, or the shape of a weight differs, or a weight is NaN or infinite.
     """
     saved, wanted = content.get("solver", {}), describe_module(solver)
     state, weights = solver_state(content), solver.state_dict()
@@ -256,6 +256,9 @@ def fitting_state(
         )
     if misfits:
         raise ValueError(f"the checkpoint has no {sorted(misfits)[0]} of the shape that this {wanted['class']} needs")
+    trained = sorted(state.keys() & dict(solver.named_parameters()).keys())
+    if broken := next((key for key in trained if not state[key].isfinite().all()), None):
+        raise ValueError(f"{broken} of the checkpoint holds NaN or infinity; use an earlier checkpoint")
     return state | added, adjusted
 
 

@@ -108,7 +108,7 @@ class BlindPnPTask(LightningModule):
         else:
             content = read_checkpoint(weights)
             self.solver = build_solver(content) if solver is None else module_or_default(solver, BPnPNet)
-            self._adopt(content, grown=True)
+            self._adopt(content, weights, grown=True)
         self.loss = None if loss is None else module_or_default(loss, nn.Module)
         self.save_hyperparameters(
             {
@@ -449,7 +449,7 @@ class BlindPnPTask(LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Load the solver's weights, and restore the counts of skipped steps."""
         checkpoint |= upgrade(checkpoint)  # not done yet by a Trainer without SafeCheckpointIO
-        self._adopt(checkpoint)
+        self._adopt(checkpoint, None if self._trainer is None else self.trainer.ckpt_path)
         self._check_pose_loss_continues(checkpoint)
         self.skipped_steps, self.consecutive_skipped_steps = checkpoint.get("skipped_steps", (0, 0))
         self.optimizer_names = checkpoint.get("optimizer_names", ["Adam"])  # older versions only had Adam
@@ -467,9 +467,18 @@ class BlindPnPTask(LightningModule):
                 "Use the configuration of its training, --pose_loss.start_epoch, or --model.weights for a new training."
             )
 
-    def _adopt(self, content: Mapping[str, Any], *, grown: bool = False) -> None:
-        """Load the solver's weights, and print the settings in which it differs from the checkpoint on purpose."""
-        state, adjusted = fitting_state(content, self.solver, grown=grown)
+    def _adopt(self, content: Mapping[str, Any], file: str | Path | None, *, grown: bool = False) -> None:
+        """Load the solver's weights, and print the settings in which it differs from the checkpoint on purpose.
+
+        Args:
+            content: Content of the checkpoint.
+            file: Its file, for messages; None if it is unknown.
+            grown: As for `fitting_state`.
+        """
+        try:
+            state, adjusted = fitting_state(content, self.solver, grown=grown)
+        except ValueError as error:
+            raise ValueError(error if file is None else f"{file}: {error}") from error
         self.solver.load_state_dict(state)
         if adjusted:
             rank_zero_info(f"the network is that of the checkpoint with {', '.join(adjusted)}")

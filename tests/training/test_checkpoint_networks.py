@@ -2,6 +2,7 @@
 
 import json
 import lzma
+import math
 from pathlib import Path
 from typing import Any
 
@@ -156,6 +157,24 @@ def test_a_network_that_contradicts_its_checkpoint_is_refused(changed: Any, mess
         BlindPnPTask.load_from_checkpoint(file, solver=other)
     with pytest.raises(ValueError, match=message):
         run.test(BlindPnPTask(other), datamodule=small_meshes(tmp_path), ckpt_path=file)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_weights_that_are_not_finite_are_refused(value: float, tmp_path: Path) -> None:
+    """With them every pose is NaN, after the whole test."""
+    task = BlindPnPTask(small_net())
+    name, weight = next(iter(task.solver.named_parameters()))
+    weight.data.view(-1)[0] = value
+    file, run = str(save(task, tmp_path / "own.ckpt")), quiet_trainer(tmp_path)
+    message = f"own.ckpt: {name} of the checkpoint holds NaN or infinity; use an earlier checkpoint$"
+    with pytest.raises(ValueError, match=message):
+        BPnPNet.from_checkpoint(file)
+    with pytest.raises(ValueError, match=message):
+        BlindPnPTask(weights=file)
+    with pytest.raises(ValueError, match=message):
+        BlindPnPTask.load_from_checkpoint(file)
+    with pytest.raises(ValueError, match=message):
+        run.test(BlindPnPTask(small_net()), datamodule=small_meshes(tmp_path), ckpt_path=file)
 
 
 def test_settings_that_an_evaluation_may_change_are_printed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
