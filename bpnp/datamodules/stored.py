@@ -125,9 +125,9 @@ class StoredDataModule(ProblemDataModule):
         self,
         root: str,
         *,
-        train_scenes: list[str] | str | None = None,
-        val_scenes: list[str] | str | None = None,
-        test_scenes: list[str] | str | None = None,
+        train_scenes: list[str] | list[int] | str | None = None,
+        val_scenes: list[str] | list[int] | str | None = None,
+        test_scenes: list[str] | list[int] | str | None = None,
         val_fraction: float = 0.1,
         test_fraction: float = 0.2,
         min_points: int = 4,
@@ -263,10 +263,22 @@ def has_enough_matches(matched: NDArray[np.int64], min_points: int, where: str) 
     return large
 
 
-def _scene_list(name: str, scenes: list[str] | str | None) -> list[str] | None:
-    """Return the scenes of a list, or of the lines of a text file."""
+def _scene_list(name: str, scenes: list[str] | list[int] | str | None) -> list[str] | None:
+    """Return the scenes of a list, or of the lines of a text file.
+
+    Raises:
+        ValueError: A name is a number, as YAML reads digits without quotes; or the file is missing or empty.
+    """
+    if scenes is None:
+        return None
     if not isinstance(scenes, str):
-        return scenes
+        names = [scene for scene in scenes if isinstance(scene, str)]
+        if numbers := [scene for scene in scenes if not isinstance(scene, str)]:
+            raise ValueError(
+                f'`{name}` holds the number {numbers[0]}; give names in quotes, such as ["0015"], which YAML reads as '
+                "the number 13 without them"
+            )
+        return names
     path = Path(scenes)
     if not path.is_file():
         raise ValueError(f"there is no file {path}; `{name}` is a list of scenes, or a text file with one a line")

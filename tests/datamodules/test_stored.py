@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 from jsonargparse import ArgumentParser
 from lightning import LightningDataModule
 
@@ -149,6 +150,18 @@ def test_options_reach_the_problems_of_their_part(store: Store, fresh: bool) -> 
             assert matches == min(most, problems()[scene + 3 * i][1].matched)
             assert (int(first.count2d), int(first.count3d)) == (matches, matches + min(free[i], matches))
             assert torch.equal(first.points3d, second.points3d) == (part != "train" or not fresh)
+
+
+def test_a_number_in_a_list_of_scenes_is_refused(store: Store) -> None:
+    """YAML reads [0015] as an octal number, which may be the name of another scene."""
+    scenes = yaml.safe_load("[0015]")
+    assert scenes == [13]
+    with pytest.raises(ValueError, match="^`val_scenes` holds the number 13; give names in quotes, such as"):
+        StoredDataModule(str(store.folder), val_scenes=scenes)
+    parser = ArgumentParser()
+    parser.add_class_arguments(StoredDataModule, "data")
+    chosen = parser.parse_args(["--data.root=x", "--data.val_scenes=[0015]", '--data.test_scenes=["0015"]']).data
+    assert (chosen.val_scenes, chosen.test_scenes) == ([13], ["0015"])
 
 
 def test_a_store_of_anyones_pairs_is_split_by_scene(store: Store) -> None:
