@@ -363,10 +363,12 @@ def _make(recipe: Recipe, output: Path, processes: int) -> None:
     made, console = _make_store(recipe, processes), Console(stderr=True, force_jupyter=False)
     with new_store(output, recipe.kind, recipe.widths) as writer:
         writer.parameters |= recipe.parameters
-        bar, printed = sys.stderr.isatty(), time.monotonic()
+        bar, began = sys.stderr.isatty(), time.monotonic()
+        printed = began
         shown: Any = {"console": console, "transient": True, "disable": not bar}
         for done, (rows, skipped) in enumerate(track(made, f"reading {recipe.source}", len(recipe), **shown), 1):
-            if not bar and time.monotonic() > printed + QUIET_SECONDS:
+            is_last_of_several = done == len(recipe) and printed > began
+            if not bar and (time.monotonic() > printed + QUIET_SECONDS or is_last_of_several):
                 printed = time.monotonic()
                 print(f"reading {recipe.source}: {done} of {len(recipe)}", file=sys.stderr, flush=True)  # noqa: T201
             writer.skipped |= skipped

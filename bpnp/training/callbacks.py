@@ -144,18 +144,32 @@ class ProgressLines(Callback):
         self._print(trainer, f"epoch {trainer.current_epoch + 1}{last}, step {trainer.global_step}: {values}")
 
     def on_test_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
     ) -> None:
         """Print the number of finished batches after each tenth."""
-        self._print_tenth(trainer, batch_idx + 1, sum(trainer.num_test_batches))
+        self._print_tenth(trainer, batch_idx, dataloader_idx, trainer.num_test_batches)
 
     def on_predict_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
     ) -> None:
         """Print the number of finished batches after each tenth."""
-        self._print_tenth(trainer, batch_idx + 1, sum(trainer.num_predict_batches))
+        self._print_tenth(trainer, batch_idx, dataloader_idx, trainer.num_predict_batches)
 
-    def _print_tenth(self, trainer: Trainer, done: int, total: int | float) -> None:
+    def _print_tenth(self, trainer: Trainer, batch_idx: int, loader: int, counts: Sequence[int | float]) -> None:
+        """Print the number of finished batches of all loaders, if it has reached a tenth of their `counts`."""
+        done, total = sum(counts[:loader]) + batch_idx + 1, sum(counts)
         if done * 10 // total > (done - 1) * 10 // total:
             self._print(trainer, f"{done} of {total} batches")
 

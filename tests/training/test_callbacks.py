@@ -1,6 +1,7 @@
 """The learning rate follows its schedule, resumed or not; settings that mean nothing are refused."""
 
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
@@ -75,3 +76,24 @@ def test_a_test_and_a_prediction_print_each_tenth(
     for batch in range(batches):
         getattr(ProgressLines(), f"on_{part}_batch_end")(trainer, Mock(LightningModule), None, None, batch)
     assert capsys.readouterr().out.splitlines() == [f"{done} of {batches} batches" for done in printed]
+
+
+class Idle(LightningModule):
+    """A module that does nothing with a batch."""
+
+    def test_step(self, batch: Any, batch_idx: int, dataloader_idx: int = 0) -> None:
+        pass
+
+    def predict_step(self, batch: Any, batch_idx: int, dataloader_idx: int = 0) -> None:
+        pass
+
+
+def test_the_lines_of_a_test_with_two_loaders_count_all_batches(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    trainer = quiet_trainer(tmp_path, callbacks=[ProgressLines()])
+    loaders = [DataLoader([0.0] * count, batch_size=None) for count in (3, 5)]  # type: ignore[arg-type]
+    for run in (trainer.test, trainer.predict):
+        run(Idle(), loaders)
+        lines = [line for line in capsys.readouterr().out.splitlines() if line.endswith(" batches")]
+        assert lines == [f"{k + 1} of 8 batches" for k in range(8)]
