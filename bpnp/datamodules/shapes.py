@@ -444,11 +444,18 @@ def shape_files(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> dict[str, P
     """Find <class>/{train,test}/<stem><suffix> in a folder, by ``<class>/<split>/<stem>``, training shapes first.
 
     Files of one folder with the same stem are named with their suffix.
+
+    Raises:
+        ValueError: A class has two folders of one split, such as `train` and `Train`.
     """
     named: dict[str, list[Path]] = defaultdict(list)
+    split_folders: dict[str, Path] = {}
     for path in sorted(folder.glob("*/[!.]*/[!.]*")):
         if path.suffix.lower() in suffixes and path.parent.name.lower() in ("train", "test") and path.is_file():
-            named[f"{path.parent.parent.name}/{path.parent.name.lower()}/{path.stem}"].append(path)
+            split = f"{path.parent.parent.name}/{path.parent.name.lower()}"
+            if (other := split_folders.setdefault(split, path.parent)) != path.parent:
+                raise ValueError(f"{other} and {path.parent} are both the folder {split}; move their files into one")
+            named[f"{split}/{path.stem}"].append(path)
     files = {
         name if len(paths) == 1 else f"{name}{path.suffix}": path for name, paths in named.items() for path in paths
     }

@@ -1,5 +1,6 @@
 """Preparing data sets: every form of the same data gives the same store, and no kill leaves a wrong one."""
 
+import itertools
 import multiprocessing
 import os
 import shutil
@@ -7,6 +8,7 @@ import signal
 import time
 import zlib
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -21,7 +23,7 @@ from bpnp.datamodules import ColmapDataModule, MeshDataModule, Outliers
 from bpnp.datamodules.clouds import open_shapes
 from bpnp.datamodules.colmap.module import colmap_recipe
 from bpnp.datamodules.meshes import POINTS, SURFACES, surfaces_recipe
-from bpnp.datamodules.shapes import normalise, read_mesh, sample_surface
+from bpnp.datamodules.shapes import normalise, read_mesh, sample_surface, shape_files
 from bpnp.datamodules.store import JobResult, Recipe, Store, StoreError, is_store, open_store, prepare
 
 pytestmark = pytest.mark.slow
@@ -94,6 +96,28 @@ def test_every_form_of_the_meshes_gives_the_same_store(meshes: Path, tmp_path: P
     data = MeshDataModule(str(prepared.folder), num_points=16, pool_size=32, train_problems=8, val_fraction=0.2)
     data.setup()
     assert (len(data.datasets["train"].source.rows), len(data.datasets["test"])) == (6, 4)
+
+
+@pytest.mark.parametrize(("step", "lines"), [(6.0, [2, 4, 6, 8, 10, 12, 14, 16, 18, 19]), (0.01, [])])
+def test_progress_lines_end_with_the_last_part(
+    step: float, lines: list[int], meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    """Where there is no terminal, a line is printed at most every 10 seconds."""
+    monkeypatch.setattr("bpnp.datamodules.meshes.MESHES_A_PART", 1)
+    monkeypatch.setattr("bpnp.datamodules.store.time", Mock(monotonic=Mock(side_effect=itertools.count(0.0, step))))
+    run(meshes, tmp_path / "store")
+    assert capsys.readouterr().err.splitlines() == [f"reading {meshes}: {k} of 19" for k in lines]
+
+
+def test_two_folders_of_one_split_are_refused(meshes: Path, tmp_path: Path) -> None:
+    """Of two files of one name, the shape of one would be missing without a word."""
+    source = shutil.copytree(meshes, tmp_path / "both")
+    train = next(source.glob("*/train"))
+    shutil.copytree(train, train.with_name("Train"))
+    if len([*train.parent.glob("*")]) < 3:
+        pytest.skip("the file system does not distinguish `train` from `Train`")
+    with pytest.raises(ValueError, match=rf"Train and .*train are both the folder {train.parent.name}/train; move"):
+        shape_files(source)
 
 
 def test_several_processes_give_the_same_bytes(
