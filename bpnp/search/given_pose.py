@@ -5,8 +5,8 @@ poses that are as near to the given one as this optimum.
 
 The competing poses are proposed from the pose and from the scene; no search is run. Some are the optima that annealing
 reaches from the pose, from perturbed copies, and from its mirror image in front of a flat scene. Others come from the
-motions that map the scene onto itself, and from other focal lengths (`bpnp.search.competing_poses`). A better pose
-elsewhere is not searched for.
+motions and reflections that map the scene onto itself, and from other focal lengths
+(`bpnp.search.competing_poses`). A better pose elsewhere is not searched for.
 """
 
 import math

@@ -46,8 +46,8 @@ def verify(
 
     The pose is "confident" if it is significant and no competing pose is about as likely. Only one pose is tested, so
     few points are enough: about one match more than the three that determine a pose. The competing poses are the nearby
-    optimum, the mirror image if the scene is flat, repetitions of the scene, and other focal lengths. No search is run:
-    use `solve` if a better pose may exist far away.
+    optimum, the mirror image of a flat scene or of a distant mirror-symmetric one, repetitions of the scene, and other
+    focal lengths. No search is run: use `solve` if a better pose may exist far away.
 
     Args:
         points2d: (m, 2) pixels with a `camera`, else normalised image coordinates, or (m, 3) bearings; as for `solve`.

@@ -182,6 +182,53 @@ def test_the_mirror_image_of_a_plane_projects_to_the_same_points_from_afar() -> 
     assert mirror_pose(rng.uniform(-1, 1, (20, 3)), rotation, translation) is None
 
 
+def mirrored_object(count: int, unique: int, seed: int) -> tuple[Array, Array, Array]:
+    """Return an object of two mirrored halves and unique points, and the reflection p -> S p + d of the halves."""
+    rng = np.random.default_rng([seed, 6])
+    base, normal = rng.uniform(-1, 1, (count, 3)), rng.normal(size=3)
+    reflection = np.eye(3) - 2 * np.outer(normal, normal) / (normal @ normal)
+    shift = 0.4 * normal / np.linalg.norm(normal)
+    halves = np.concatenate([base, base @ reflection.T + shift])
+    return np.concatenate([halves, rng.uniform(-1, 1, (unique, 3))]), reflection, shift
+
+
+@pytest.mark.parametrize("count", [8, 25, 60])
+def test_the_reflection_of_a_mirror_symmetric_object_is_found(count: int) -> None:
+    points, reflection, shift = mirrored_object(count, 5, count)
+    found = self_motions(points, 0.01, reflected=True)
+    np.testing.assert_allclose(found.rotation[0], reflection, atol=1e-6)
+    np.testing.assert_allclose(found.shift[0], shift, atol=1e-6)
+    np.testing.assert_allclose(found.fraction[0], 2 * count / (2 * count + 5))
+    assert self_motions(points, 0.01).fraction.max(initial=0) < 0.6
+    labels = np.r_[np.zeros(count), np.ones(count + 5)].astype(int)
+    assert self_motions(points, 0.01, labels3d=labels, reflected=True).fraction.max(initial=0) < 0.6
+
+
+def test_a_mirror_image_sees_the_reflected_object_at_the_same_place_from_afar() -> None:
+    points, reflection, shift = mirrored_object(10, 0, 0)
+    motions = Motions(reflection[None], shift[None], np.ones(1), np.ones(1), 0.0)
+    rotation, translation = Rotation.from_euler("xyz", [0.5, 0.2, 0.1]).as_matrix(), np.array([1.0, 2.0, 400.0])
+    (other,), (moved,) = motions.mirror_images(rotation, translation, points.mean(0))
+    np.testing.assert_allclose(np.linalg.det(other), 1)
+    one, two = points @ rotation.T + translation, (points @ reflection.T + shift) @ other.T + moved
+    np.testing.assert_allclose(one[:, :2] / one[:, 2:], two[:, :2] / two[:, 2:], atol=3e-5)
+    assert degrees_between(rotation, other) > 20
+
+
+def seen_from_afar(count: int, seed: int) -> tuple[Array, Array, Array, Array]:
+    """Return an image of a mirror-symmetric object with hidden points and other lights, its points, and the pose.
+
+    The distance is 50 times the size, and the noise a hundredth of the size in the image.
+    """
+    rng = np.random.default_rng([seed, 9])
+    points, _, _ = mirrored_object(count, 0, seed)
+    rotation, translation = Rotation.random(rng=rng).as_matrix(), np.array([0.0, 0.0, 100.0])
+    camera = points[rng.random(len(points)) < 0.8] @ rotation.T + translation
+    image = camera[:, :2] / camera[:, 2:] + 1e-4 * rng.normal(size=(len(camera), 2))
+    others = rng.uniform(image.min(0), image.max(0), (len(image) // 6, 2))
+    return rng.permutation(np.concatenate([image, others])), rng.permutation(points), rotation, translation
+
+
 def solved(points: Array, seed: int) -> tuple[bpnp.Solution, float]:
     rng = np.random.default_rng([seed, 7])
     rotation = Rotation.random(random_state=rng).as_matrix()
@@ -205,6 +252,21 @@ def test_an_exactly_symmetric_object_is_ambiguous(fold: int, each: int) -> None:
     assert found.verdict == "ambiguous"
     assert abs(error - 360 / fold * round(error * fold / 360)) < 3
     assert f"{360 // fold} deg" in found.reason or f"{720 // fold} deg" in found.reason
+
+
+@pytest.mark.parametrize("seed", [2, 3, 6])
+def test_a_mirror_symmetric_object_is_ambiguous_from_afar(seed: int) -> None:
+    image, points, rotation, translation = seen_from_afar(8, seed)
+    _, reflection, shift = mirrored_object(8, 0, seed)
+    motions = Motions(reflection[None], shift[None], np.ones(1), np.ones(1), 0.0)
+    (other,), _ = motions.mirror_images(rotation, translation, points.mean(0))
+    found = bpnp.solve(image, points, seed=seed, time_limit=30)
+    verified = bpnp.verify(image, points, rotation, translation, time_limit=30)
+    for one in (found, verified):
+        assert one.verdict == "ambiguous"
+        assert one.reason_code == "competing_pose"
+        assert min(degrees_between(pose.rotation, rotation) for pose in one.candidates) < 5
+        assert min(degrees_between(pose.rotation, other) for pose in one.candidates) < 5
 
 
 def test_of_a_small_lattice_some_motions_may_be_missing() -> None:

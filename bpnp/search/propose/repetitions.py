@@ -57,7 +57,14 @@ def registered(problem: Problem, rotation: Array, translation: Array, scale: flo
 
 
 def _motions_of(
-    problem: Problem, rotation: Array, translation: Array, scale: float, matched: NDArray[np.int64], settings: Evidence
+    problem: Problem,
+    rotation: Array,
+    translation: Array,
+    scale: float,
+    matched: NDArray[np.int64],
+    settings: Evidence,
+    *,
+    reflected: bool = False,
 ) -> Motions:
     """Return the motions that map the matched points (k,) of a pose onto other scene points; see `registered`."""
     limits, points = settings.repetitions, problem.points3d
@@ -68,7 +75,7 @@ def _motions_of(
     if len(points) <= limits.whole:
         tolerance = matching_tolerance(points, np.arange(len(points)), noise)
         arrays = (_frozen(x) for x in (points, labels, normals))
-        motions = _of_scene(*arrays, tolerance, limits.share_of_scene, limits.bases_of_scene, limits.factor)
+        motions = _of_scene(*arrays, tolerance, limits.share_of_scene, limits.bases_of_scene, limits.factor, reflected)
         return motions.of(points, matched, tolerance, limits.share, labels3d=labels, normals3d=normals)
     centre = np.median(points[matched], 0)
     near = np.sort(np.argsort(np.linalg.norm(points - centre, axis=-1), kind="stable")[: limits.around])
@@ -85,6 +92,7 @@ def _motions_of(
         least=limits.share,
         bases=limits.bases if len(part) <= limits.many else limits.fewer_bases,
         factor=limits.factor if len(part) <= limits.many else 1.0,
+        reflected=reflected,
     )
 
 
@@ -113,20 +121,27 @@ def _frozen(array: NDArray[Any] | None) -> Frozen:
 
 @lru_cache(maxsize=64)
 def _of_scene(
-    points: Frozen, labels: Frozen, normals: Frozen, tolerance: float, least: float, bases: int, factor: float
+    points: Frozen,
+    labels: Frozen,
+    normals: Frozen,
+    tolerance: float,
+    least: float,
+    bases: int,
+    factor: float,
+    reflected: bool,
 ) -> Motions:
     """Return the motions of a whole scene, cached for all problems of it."""
     arrays = [None if x is None else np.frombuffer(x[0], x[1]).reshape(x[2]).copy() for x in (points, labels, normals)]
     assert arrays[0] is not None
-    options: dict[str, Any] = {"labels3d": arrays[1], "normals3d": arrays[2]}
+    options: dict[str, Any] = {"labels3d": arrays[1], "normals3d": arrays[2], "reflected": reflected}
     return self_motions(arrays[0], tolerance, least=least, bases=bases, factor=factor, **options)
 
 
 def competing_poses(
     problem: Problem, rotation: Array, translation: Array, scale: float, settings: Evidence, *, least: float = 0.0
 ) -> tuple[Array, Array, Array, Motions]:
-    """Return the competing poses of a pose: by motions of its matched points, about a line of these, and by the mirror
-    image of a flat scene.
+    """Return the competing poses of a pose: by motions of its matched points, about a line of these, and from afar by
+    reflections of these or the mirror image of a flat scene.
 
     Args:
         problem: Points of the problem.
@@ -151,9 +166,29 @@ def competing_poses(
     if (mirrored := mirror_pose(problem.points3d, rotation, translation)) is not None:
         for parts, one in zip(every, (*mirrored, np.ones(())), strict=True):
             parts.append(one[None])
+    if _is_far(problem, rotation, translation, scale, matched, settings):
+        reflections = _motions_of(problem, rotation, translation, scale, matched, settings, reflected=True)
+        images = reflections.mirror_images(rotation, translation, problem.points3d[matched].mean(0))
+        for parts, some in zip(every, (*images, reflections.scale), strict=True):
+            parts.append(some)
     rotations, translations, scales = (np.concatenate(parts) for parts in every)
     other = np.flatnonzero(~problem.same_pose(rotations, translations, settings.same))
     return rotations[other], translations[other], scales[other], motions
+
+
+def _is_far(
+    problem: Problem, rotation: Array, translation: Array, scale: float, matched: NDArray[np.int64], settings: Evidence
+) -> bool:
+    """Return whether half of the matched points (k,) would still be matched if their depths were reversed."""
+    if len(matched) < settings.repetitions.fewest:
+        return False
+    camera = problem.points3d[matched] @ rotation.T + translation
+    seen = camera.mean(0)
+    sight = seen / max(float(np.linalg.norm(seen)), 1e-300)
+    mirrored = camera - 2 * np.outer((camera - seen) @ sight, sight)
+    one, other = (x / np.maximum(np.linalg.norm(x, axis=-1, keepdims=True), 1e-300) for x in (camera, mirrored))
+    near = np.linalg.norm(one - other, axis=-1) < MATCHES.reach * scale
+    return float(near.mean()) >= settings.repetitions.symmetric
 
 
 def repeated_poses(

@@ -4,6 +4,10 @@ A motion is a similarity p -> s S p + d, with the scale s = 1 if it is rigid. If
 points, the pose (R S^T, s t - R S^T d) projects the images of these points to where (R, t) projects the points
 themselves: R S^T (s S p + d) + s t - R S^T d = s (R p + t). Every such pose is a competitor of (R, t).
 
+From afar an image does not show which of two points is nearer. A pose then looks like its mirror image A in the plane
+through the scene across the line of sight, which has the wrong handedness. If a reflection p -> S p + d with det S = -1
+maps scene points onto others, the pose with the rotation A R S^T sees them at these places and is a competitor too.
+
 The motions are found by registering the scene with itself. A base of three points is matched with every congruent
 triangle of the scene, and for motions of another scale with every similar one. Its edges determine the motion, and a
 sample of the points confirms it. Bases lie in a neighbourhood of some points, so that the cost of a base grows linearly
@@ -35,7 +39,7 @@ class Motions(NamedTuple):
     """Motions p -> scale rotation p + shift of a scene, those that map the largest fraction first.
 
     Attributes:
-        rotation: (k, 3, 3).
+        rotation: (k, 3, 3); those of reflections have the determinant -1.
         shift: (k, 3), in the unit of the scene.
         scale: (k,) size of the copy over that of the part; exactly 1 for rigid motions.
         fraction: (k,) of the source points that come to lie within the tolerance of a scene point. The tolerance of a
@@ -71,6 +75,20 @@ class Motions(NamedTuple):
         """Return the poses (k, 3, 3), (k, 3) that these motions confuse with the pose (3, 3), (3,)."""
         rotations = rotation @ self.rotation.transpose(0, 2, 1)
         return rotations, self.scale[:, None] * translation - np.einsum("kij,kj->ki", rotations, self.shift)
+
+    def mirror_images(self, rotation: Array, translation: Array, centre3d: Array) -> tuple[Array, Array]:
+        """Return the poses (k, 3, 3), (k, 3) that these reflections confuse with the pose (3, 3), (3,) from afar.
+
+        Args:
+            rotation: (3, 3) of the pose.
+            translation: (3,) of the pose.
+            centre3d: (3,) scene point whose distance from the camera remains; the line of sight goes through it.
+        """
+        seen = rotation @ centre3d + translation
+        sight = seen / max(float(np.linalg.norm(seen)), 1e-300)
+        across = np.eye(3) - 2 * np.outer(sight, sight)
+        rotations = across @ rotation @ self.rotation.transpose(0, 2, 1)
+        return rotations, seen + across @ (translation - seen) - np.einsum("kij,kj->ki", rotations, self.shift)
 
     def apply(self, points3d: Array) -> Array:
         """Return the points (n, 3) moved by each motion, (k, n, 3)."""
@@ -134,11 +152,10 @@ def mirror_pose(points3d: Array, rotation: Array, translation: Array) -> tuple[A
     _, extents, axes = np.linalg.svd(points3d - centroid, full_matrices=False)
     if len(points3d) < 3 or extents[2] > SYMMETRIES.flat * extents[1]:
         return None
-    seen = rotation @ centroid + translation
-    sight = seen / max(float(np.linalg.norm(seen)), 1e-300)
-    across, flipped = (np.eye(3) - 2 * np.outer(axis, axis) for axis in (sight, axes[2]))
-    turned = across @ rotation @ flipped
-    return turned, seen - turned @ centroid
+    flipped = np.eye(3) - 2 * np.outer(axes[2], axes[2])
+    reflection = Motions(flipped[None], (centroid - flipped @ centroid)[None], np.ones(1), np.ones(1), 0.0)
+    rotations, translations = reflection.mirror_images(rotation, translation, centroid)
+    return rotations[0], translations[0]
 
 
 def self_motions(
@@ -151,6 +168,7 @@ def self_motions(
     least: float = 0.3,
     bases: int = SYMMETRIES.bases,
     factor: float | int = 1,
+    reflected: bool = False,
 ) -> Motions:
     """Find motions that map a fraction of a scene's points onto its points.
 
@@ -163,9 +181,11 @@ def self_motions(
         least: smallest fraction of the sources that a motion maps.
         bases: number of bases that are matched.
         factor: largest ratio of the sizes of a part and its copy; 1 for rigid motions only.
+        reflected: True for motions with a reflection instead, of the same size only. Default False.
 
     Returns:
-        Distinct motions without the identity, the largest fraction first.
+        Distinct motions without the identity, the largest fraction first. Reflections that hardly move the sources, as
+        in a flat scene, are left out.
 
     Examples:
         >>> import numpy as np
@@ -190,12 +210,13 @@ def self_motions(
     scene = SceneIndex(points, hashed(points, 2 * tolerance), distance, index.astype(np.int64), labels, normals)
     chosen = _bases(points, moved, bases)
     features = labels3d, normals3d
-    rigid = _motions(scene, tree, moved, chosen, tolerance, least, 1.0, features)
-    if factor == 1:
+    hand = -1.0 if reflected else 1.0
+    rigid = _motions(scene, tree, moved, chosen, tolerance, least, 1.0, hand, features)
+    if factor == 1 or reflected:
         return rigid
     several = min(bases // 3, SYMMETRIES.bases_scaled, SYMMETRIES.most_scaled // len(points))
     chosen = _longer_first(points, chosen[:several])
-    scaled = _motions(scene, tree, moved, chosen, tolerance, least, float(factor), features)
+    scaled = _motions(scene, tree, moved, chosen, tolerance, least, float(factor), hand, features)
     both = Motions.concatenate([rigid, scaled])
     return both.select(_distinct(both, points[moved], tolerance, len(both.scale)))
 
@@ -208,9 +229,13 @@ def _motions(
     tolerance: float,
     least: float,
     factor: float,
+    hand: float,
     features: tuple[Indices | None, Array | None],
 ) -> Motions:
-    """Return the distinct motions that map bases, refined: rigid ones, or scaled ones if the factor is above 1."""
+    """Return the distinct motions that map bases, refined: rigid ones, or scaled ones if the factor is above 1.
+
+    With the hand -1 they are reflections.
+    """
     rigid, own = factor == 1, scene.points[moved]
     fewest, count = SYMMETRIES.fewest, SYMMETRIES.refined
     if not rigid:
@@ -219,7 +244,9 @@ def _motions(
     sample, room = _sample(moved), SYMMETRIES.most_found
     found = Found(np.zeros((room, 3, 3)), np.zeros((room, 3)), np.zeros(room))
     confirming, most = math.ceil(0.7 * least * len(sample)), SYMMETRIES.most_work // max(len(bases), 1)
-    total, complete = _register(scene, bases, sample, tolerance, confirming, factor, most, found, np.empty((4, 3, 3)))
+    total, complete = _register(
+        scene, bases, sample, tolerance, confirming, factor, hand, most, found, np.empty((4, 3, 3))
+    )
     linear, shift, score = (part[: min(total, room)] for part in found)
     scale = np.ones(len(linear)) if rigid else np.cbrt(np.linalg.det(linear))
     motions = Motions(linear / scale[:, None, None], shift, scale, score, 0.0)
@@ -369,7 +396,7 @@ def _refine(
         one, other = own[near], points[target[near]]
         centre, onto = one.mean(0), other.mean(0)
         left, stretch, right = np.linalg.svd((other - onto).T @ (one - centre))
-        sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+        sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right) * np.linalg.det(motion.rotation[0]))])
         rotation = (left * sign) @ right
         scale = 1.0 if rigid else float((stretch * sign).sum() / max(((one - centre) ** 2).sum(), 1e-300))
         shift = onto - scale * rotation @ centre
@@ -426,6 +453,7 @@ def _register(
     tolerance: float,
     least: int,
     factor: float,
+    hand: float,
     most: int,
     found: Any,
     work: Any,
@@ -440,6 +468,7 @@ def _register(
         least: Sampled points that must confirm a motion.
         factor: Largest ratio of the sizes of two similar bases, which differ by more than the tolerance; 1 for
             congruent bases.
+        hand: -1 to reflect a base in its plane before it is mapped, else 1.
         most: Largest work for a base.
         found: A `Found`, written; the motions with the most confirming points are kept.
         work: (4, 3, 3), overwritten.
@@ -485,7 +514,7 @@ def _register(
                 for at_l in range(first_l, last_l):
                     l = scene.neighbours[i, at_l]  # noqa: E741
                     work_done += 1
-                    if l in (i, j) or not _fits(scene, c, l) or (i == a and j == b and l == c):
+                    if l in (i, j) or not _fits(scene, c, l) or (hand > 0 and i == a and j == b and l == c):
                         continue
                     jl = _between(points, j, l)
                     if abs(jl - scale * bc) > near:
@@ -496,7 +525,9 @@ def _register(
                     for p in range(3):
                         for q in range(3):
                             linear[p, q] = size * (
-                                target[0, p] * frame[0, q] + target[1, p] * frame[1, q] + target[2, p] * frame[2, q]
+                                target[0, p] * frame[0, q]
+                                + hand * target[1, p] * frame[1, q]
+                                + target[2, p] * frame[2, q]
                             )
                     for p in range(3):
                         x = (points[a, 0] + points[b, 0] + points[c, 0]) / 3
