@@ -29,7 +29,8 @@ from bpnp.search.refine.annealing import anneal_to_end, finish
 from bpnp.search.search_frame import Scene
 from bpnp.search.solution import Candidate, Solution, add_objection, candidates_of
 from bpnp.search.starts import PosePrior
-from bpnp.search.verdict.decide import rank_poses
+from bpnp.search.verdict.competitors import sign_margins
+from bpnp.search.verdict.decide import add_false_alarms, rank_poses
 from bpnp.search.verdict.reasons import objection
 
 Pose = tuple[Array, Array]  # rotation (3, 3) and translation (3,), in the frame of a problem
@@ -64,15 +65,37 @@ def best_competitor(
     Returns:
         The competing pose with the smallest margin; None if there is no different pose.
     """
-    problem = replace(photo, view_count=1).problem(place, solution.camera)
+    problem = replace(photo, view_count=1).problem(place, solution.camera, photo.prior)
     proposals = propose_elsewhere(photo, problem, place, solution, earlier, regions)
     competing = refine_elsewhere(problem, solution, proposals, photo.seed)
     if not len(competing):
         return None
-    best, poses = _pose_of(problem, solution), (competing.rotation, competing.translation)
-    margins = repetition_margins(problem, best, poses, poses, _scale_of(problem, solution))
+    margins = margins_elsewhere(problem, solution, competing)
     k = int(np.argmin(margins))
     return Competitor(float(margins[k]), _candidate(problem, solution, competing[k : k + 1], float(margins[k])))
+
+
+def margins_elsewhere(problem: Problem, solution: Solution, competing: Hypotheses) -> Array:
+    """Return the margins (c,), in decades, by which poses elsewhere explain the image points worse than a solution.
+
+    A map lacks points, and other ones of each place. Where each pose explains image points that the other one does not,
+    the difference has to be significant by a sign test (`sign_margins`). A prior adds the ratio of the fractions of
+    poses that are as near to it.
+
+    Args:
+        problem: Problem of the keypoints and the points on which the poses are compared, with the prior.
+        solution: The solution.
+        competing: Refined poses (c,) elsewhere.
+    """
+    best, scale = _pose_of(problem, solution), _scale_of(problem, solution)
+    poses = competing.rotation, competing.translation
+    margins = repetition_margins(problem, best, poses, poses, scale)
+    leader = Hypotheses.from_poses(best[0][None], best[1][None], scale=np.array([scale]))
+    candidates = add_false_alarms(Hypotheses.concatenate([leader, competing]), problem)
+    signs = sign_margins([(candidates, problem)], DEFAULT.evidence)[1:]
+    margins = np.where(np.abs(signs) < np.abs(margins), signs, margins)
+    fractions = [problem.log10_prior_fraction(*pose) for pose in zip(*poses, strict=True)]
+    return margins + fractions - problem.log10_prior_fraction(*best)
 
 
 def propose_elsewhere(

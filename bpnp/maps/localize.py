@@ -123,14 +123,14 @@ def _localize_in(
         own = search_near(scene.region(place.view, place.points), photo, place.camera, options, settings)
         found = ViewSolution(place, own, False)
         if own.verdict == "confident" or own.log10_false_alarms < 0:
-            found = judge_in_map(scene, photo, views, found, earlier)
+            found = judge_in_map(scene, photo, found, earlier)
         if "confident" in (own.verdict, found.solution.verdict):
             return LoopResult(found.solution, True)
         earlier += significant(found.solution)
         best = sorted([*best, found], key=lambda one: one.rank, reverse=True)[: MAPS.promising]
         again = [found] if found.solution.log10_false_alarms < MAPS.likely and len(longer) < MAPS.promising else []
         if not queue:  # not significant so far, but perhaps with all points of the map
-            best = [judge_in_map(scene, photo, views, one, earlier) for one in best]
+            best = [judge_in_map(scene, photo, one, earlier) for one in best]
             best.sort(key=lambda one: one.rank, reverse=True)
             if best[0].solution.verdict == "confident":
                 return LoopResult(best[0].solution, True)
@@ -141,7 +141,7 @@ def _localize_in(
                 queue.appendleft((one.place._replace(camera=_camera_near(photo.camera, one.solution)), LONGER))
     if not queue:
         return LoopResult(best[0].solution, True)
-    return LoopResult(judge_in_map(scene, photo, views, best[0], earlier).solution, False)
+    return LoopResult(judge_in_map(scene, photo, best[0], earlier).solution, False)
 
 
 def search_near(
@@ -169,18 +169,15 @@ def search_near(
     return with_ids(solution, region)
 
 
-def judge_in_map(
-    scene: ViewedPoints, photo: Photo, views: Sequence[str] | None, found: ViewSolution, earlier: Sequence[Candidate]
-) -> ViewSolution:
+def judge_in_map(scene: ViewedPoints, photo: Photo, found: ViewSolution, earlier: Sequence[Candidate]) -> ViewSolution:
     """Refine and judge a pose on all map points in view and, if it is confident, against poses elsewhere in the map.
 
     If a pose elsewhere is more likely by `Evidence.margin`, it is refined and judged in the same way, and used instead
-    if it is confident. With a prior, which excludes poses elsewhere, these are not tested.
+    if it is confident.
 
     Args:
         scene: The map.
         photo: The photo.
-        views: Names of the views to try; None for all views of the map.
         found: The pose; returned unchanged if it was judged before.
         earlier: Significant poses that were found with the points of other views.
     """
@@ -189,52 +186,42 @@ def judge_in_map(
     place, own = found.place, found.solution
     whole = scene.region(place.view)
     solution = judge_on_all_points(own, refine_on_all_points(own, photo, whole))
-    if photo.prior is None and solution.verdict == "confident":
+    if solution.verdict == "confident":
         earlier = [*earlier, *significant(own)]
-        competitor = find_competitor(scene, photo, views, place, solution, earlier)
+        competitor = find_competitor(scene, photo, place, solution, earlier)
         if competitor is not None and competitor.margin <= -DEFAULT.evidence.margin:
-            better = _judge_competitor(scene, photo, views, solution, competitor.pose)
+            better = _judge_competitor(scene, photo, solution, competitor.pose)
             if better.verdict == "confident":
                 earlier = [*earlier, *significant(solution)]
-                competitor = find_competitor(scene, photo, views, place, better, earlier)
+                competitor = find_competitor(scene, photo, place, better, earlier)
                 solution = better
         solution = judge_against(solution, competitor)
     return ViewSolution(place, solution, True)
 
 
 def find_competitor(
-    scene: ViewedPoints,
-    photo: Photo,
-    views: Sequence[str] | None,
-    place: Place,
-    solution: Solution,
-    earlier: Sequence[Candidate],
+    scene: ViewedPoints, photo: Photo, place: Place, solution: Solution, earlier: Sequence[Candidate]
 ) -> Competitor | None:
-    """Return the best pose elsewhere in the map, or among the given views, that explains the same image points.
+    """Return the best pose elsewhere in the map that explains the same image points.
 
     Args:
         scene: The map.
         photo: The photo.
-        views: Names of the views to try; None for all views of the map.
-        place: View and points of the solution.
+        place: View near which the solution was found.
         solution: Confident solution.
         earlier: Significant poses that were found with the points of other views.
     """
-    compared = scene.region(place.view, None if views is None else place.points)
     explained = explained_keypoints(photo, solution)
-    regions = scene.ranked_regions(views, camera_from(solution.camera), explained, photo.rank_views)
-    return best_competitor(photo, compared, solution, earlier, regions)
+    regions = scene.ranked_regions(camera_from(solution.camera), explained, photo.rank_views)
+    return best_competitor(photo, scene.region(place.view), solution, earlier, regions)
 
 
-def _judge_competitor(
-    scene: ViewedPoints, photo: Photo, views: Sequence[str] | None, solution: Solution, pose: Candidate
-) -> Solution:
+def _judge_competitor(scene: ViewedPoints, photo: Photo, solution: Solution, pose: Candidate) -> Solution:
     """Return the solution of a competing pose of a solution, refined and judged on all map points in view."""
     whole, camera = scene.region(scene.views[0]), camera_from(solution.camera)
     seen = np.zeros(len(scene.points3d), bool)
     seen[whole.in_view(pose.rotation, pose.translation, camera, photo.keypoints)] = True
-    tried = scene.views if views is None else scene.named(views)
-    whole = replace(whole, view=max(tried, key=lambda view: int(seen[view.points].sum())))
+    whole = replace(whole, view=max(scene.views, key=lambda view: int(seen[view.points].sum())))
     proposed = replace(
         solution,
         rotation=pose.rotation,

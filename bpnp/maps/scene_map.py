@@ -144,8 +144,8 @@ class SceneMap(ViewedPoints):
         the pose is still not confident, the one with the fewest false alarms is returned.
 
         A confident pose is compared with poses elsewhere in the map that explain the same image points
-        (`bpnp.maps.aliasing`), unless a prior is given. It is "ambiguous" if one of them is about as likely. Both are
-        then the first `candidates`.
+        (`bpnp.maps.aliasing`). It is "ambiguous" if one of them is about as likely. Both are then the first
+        `candidates`.
 
         Args:
             keypoints: (m, 2) pixels in COLMAP's convention: (0.5, 0.5) is the centre of the first pixel. Or a list of
@@ -157,12 +157,13 @@ class SceneMap(ViewedPoints):
             focal_error: Relative standard deviation of the focal length of `camera`, as for `bpnp.solve`.
             distortion: Always fit a radial distortion coefficient, as for `bpnp.solve`. Default False.
             views: Names of views that may show the same place, best first, from any image retrieval. The search near
-                each uses the points that any of them sees. None to try all views of the map, each with its own points,
-                in the order in which their point density resembles that of the keypoints.
+                each uses the points that any of them sees; competing poses may be anywhere in the map. None to try all
+                views of the map, each with its own points, in the order in which their point density resembles that of
+                the keypoints.
             rank_views: Function `(points2d, views) -> scores` that ranks the views instead, such as an image retrieval:
                 `points2d` (m, 2) are the keypoints in normalised image coordinates, `views` the views of the map, and
                 `scores` one number per view, the largest for the view to try first. It is called again with the
-                keypoints that a confident pose explains, for the competing poses. No effect with `views`.
+                keypoints that a confident pose explains, for the competing poses. With `views` only for these.
             scores: (m,) strengths of the keypoints; the strongest 2,048 are used. None to use all keypoints.
             prior: Prior of the photo's pose, as for `bpnp.solve`; None to use the pose of the view that is tried.
             up_camera: (3,) direction up in the camera frame of the photo, of any length, such as from the EXIF
@@ -241,7 +242,7 @@ class SceneMap(ViewedPoints):
         limit = seconds_from(time_limit, TIME.one)
         view, rest = self.named([name])[0], self.without([name])
         pixels = np.asarray(pixels_from(keypoints, view.camera), np.float64)
-        regions = partial(rest.ranked_regions, None, view.camera)
+        regions = partial(rest.ranked_regions, view.camera)
         photo = Photo(pixels, view.camera, seed=checked_seed(seed))
         return verify_pose(photo, view, replace(rest.region(rest.views[0]), view=view), regions, time_limit=limit)
 

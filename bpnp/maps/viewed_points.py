@@ -237,24 +237,18 @@ class ViewedPoints:
         whole = Region(view, self.points3d, self.point_ids, self.cones, distance)
         return whole if points is None else whole.part(points)
 
-    def ranked_regions(
-        self, views: Iterable[str] | None, camera: Camera, keypoints: Array, rank_views: RankViews | None = None
-    ) -> Iterator[Region]:
-        """Yield the points seen by the given views, or by all views ranked for the keypoints of a known camera.
+    def ranked_regions(self, camera: Camera, keypoints: Array, rank_views: RankViews | None = None) -> Iterator[Region]:
+        """Yield the points seen by each view, in the order of the views' scores for the keypoints of a known camera.
 
         Several views may show the same place.
 
         Args:
-            views: Names of views, in the order of the result; None for all views of the map.
             camera: Camera of the photo.
             keypoints: (m, 2) pixels.
             rank_views: Function that scores the views, as for `SceneMap.localize`; None for their point density.
         """
-        if views is not None:
-            order = self.named(views)
-        else:
-            scores = self.scores(camera, keypoints, rank_views=rank_views)
-            order = [self.views[k] for k in np.argsort(-scores, kind="stable")]
+        scores = self.scores(camera, keypoints, rank_views=rank_views)
+        order = [self.views[k] for k in np.argsort(-scores, kind="stable")]
         yield from (self.region(view, view.points) for view in order if len(view.points) >= MIN_POINTS)
 
     def match_orientation(self: Map, up_camera: Array) -> Map:

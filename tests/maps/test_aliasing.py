@@ -1,13 +1,15 @@
 """A place of the map that looks like another one: a box with two faces printed alike, seen from all around."""
 
+import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from planted import degrees_between, seen
 from scipy.spatial.transform import Rotation
 
-from bpnp import PosePrior, SceneMap
+from bpnp import GravityPrior, PosePrior, SceneMap
 from bpnp.cameras import camera_from
 from bpnp.maps.aliasing import best_competitor
 from bpnp.maps.localize import ONCE, ViewSolution, judge_in_map, search_near
@@ -108,19 +110,23 @@ def test_faces_that_are_alike_in_all_points_are_ambiguous_and_both_poses_are_can
     np.testing.assert_array_equal(solution.candidates[0].rotation, solution.rotation)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_a_place_that_occurs_twice_is_ambiguous_at_any_size(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    points, normals = box(rng, ())
-    size, turn, shift = 1.4, Rotation.random(rng=rng).as_matrix(), np.array([40.0, -10.0, 25.0])
-    one = map_of(points, normals)
+def map_twice(one: SceneMap, size: float, turn: Array, shift: Array) -> SceneMap:
+    """Return a map with a second place of these points, `size * turn @ p + shift`, seen by as many views."""
     again = []
     for view in one.views:
         turned, places = view.rotation @ turn.T, view.points + np.int32(len(one.points3d))
         moved = size * view.translation - turned @ shift
         again.append(View(f"again {view.name}", view.camera, turned, moved, places))
     both = np.concatenate([one.points3d, size * one.points3d @ turn.T + shift])
-    twice = SceneMap(both, np.arange(len(both)), np.zeros(len(both), np.int32), (*one.views, *again)).seen_by(2)
+    return SceneMap(both, np.arange(len(both)), np.zeros(len(both), np.int32), (*one.views, *again)).seen_by(2)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_place_that_occurs_twice_is_ambiguous_at_any_size(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points, normals = box(rng, ())
+    turn = Rotation.random(rng=rng).as_matrix()
+    twice = map_twice(map_of(points, normals), 1.4, turn, np.array([40.0, -10.0, 25.0]))
     rotation, translation = pose_at(14.0, 4.2, -3.0)
     pixels = photo_of(rng, points, normals, rotation, translation)
     solution = twice.localize(pixels, CAMERA, solver="search", seed=seed, time_limit=60)
@@ -129,6 +135,49 @@ def test_a_place_that_occurs_twice_is_ambiguous_at_any_size(seed: int) -> None:
     other = [degrees_between(one.rotation, rotation @ turn.T) for one in solution.candidates[:2]]
     assert min(found) < 1
     assert min(other) < 1
+
+
+def test_only_a_prior_of_the_position_excludes_an_equal_place() -> None:
+    """Neither views of one place, nor the vertical, nor a vague position decide between two equal places."""
+    rng = np.random.default_rng(0)
+    points, normals = box(rng, ())
+    turn, shift = about_y(40.0), np.array([9.0, 0.0, 1.0])
+    twice = map_twice(map_of(points, normals), 1.0, turn, shift)
+    rotation, translation = pose_at(4.0, 4.2, -3.0)
+    pixels, down = photo_of(rng, points, normals, rotation, translation), np.array([0.0, 1.0, 0.0])
+    other = rotation @ turn.T
+    undecided: list[dict[str, Any]] = [
+        {"views": [f"again {view}.jpg" for view in (8, 0, 1)]},
+        {"prior": GravityPrior(rotation @ down, down)},
+        {"prior": PosePrior(other, translation - other @ shift, 40.0, 8.0)},
+    ]
+    for known in undecided:
+        solution = twice.localize(pixels, CAMERA, solver="search", time_limit=math.inf, **known)
+        assert (solution.verdict, solution.reason_code) == ("ambiguous", "competing_place")
+        found = [degrees_between(one.rotation, rotation) for one in solution.candidates[:2]]
+        assert min(found) < 1
+    prior = PosePrior(rotation, translation, 5.0, 0.3)
+    solution = twice.localize(pixels, CAMERA, solver="search", time_limit=math.inf, prior=prior)
+    assert solution.verdict == "confident"
+    assert degrees_between(solution.rotation, rotation) < 1
+
+
+@pytest.mark.parametrize("seed", [1, 2, 5])
+def test_two_equal_places_that_lack_different_points_are_ambiguous(seed: int) -> None:
+    """The map has 6 of 10 points of each place, and a point in both, or in one of them, by chance."""
+    rng = np.random.default_rng(seed)
+    points, normals = box(rng, ())
+    twice = map_twice(map_of(points, normals), 1.0, about_y(40.0), np.array([9.0, 0.0, 1.0]))
+    kept = np.flatnonzero(rng.random(len(twice.points3d)) < 0.6)
+    number = np.full(len(twice.points3d), -1, np.int32)
+    number[kept] = np.arange(len(kept))
+    views = tuple(replace(view, points=number[view.points][number[view.points] >= 0]) for view in twice.views)
+    scene = SceneMap(twice.points3d[kept], kept, np.zeros(len(kept), np.int32), views).seen_by(2)
+    rotation, translation = pose_at(4.0, 4.2, -3.0)
+    pixels = photo_of(rng, points, normals, rotation, translation)
+    clutter = rng.uniform(pixels.min(0), pixels.max(0), pixels.shape)
+    solution = scene.localize(np.concatenate([pixels, clutter]), CAMERA, solver="search", time_limit=math.inf)
+    assert (solution.verdict, solution.reason_code) == ("ambiguous", "competing_place")
 
 
 def test_a_better_pose_elsewhere_takes_the_place_of_a_confident_one() -> None:
@@ -142,7 +191,7 @@ def test_a_better_pose_elsewhere_takes_the_place_of_a_confident_one() -> None:
     wrong = search_near(scene.region(view, view.points), replace(photo, prior=opposite), photo.camera, Options(), ONCE)
     assert degrees_between(wrong.rotation, opposite.rotation) < 1
     attempt = ViewSolution(Place(view, view.points, photo.camera), replace(wrong, verdict="confident"), is_judged=False)
-    solution = judge_in_map(scene, photo, None, attempt, []).solution
+    solution = judge_in_map(scene, photo, attempt, []).solution
     assert solution.verdict == "confident"
     assert degrees_between(solution.rotation, pose[0]) < 1
     assert solution.view in ("0.jpg", "1.jpg", "8.jpg")  # which see the front

@@ -109,6 +109,22 @@ def other_camera(off: Misfit, settings: Evidence) -> Objection | None:
 def unrelated_competitor(cameras: CandidatesOfCameras, settings: Evidence) -> Objection | None:
     """Return a far candidate whose likelihood is not significantly below that of the first one, or None.
 
+    Args:
+        cameras: Candidates, best first, and points of each camera of a rig.
+        settings: Constants of the verdict.
+    """
+    margins = sign_margins(cameras, settings)
+    weaker = np.flatnonzero(margins < settings.margin)
+    if not len(weaker):
+        return None
+    k, (candidates, problem) = int(weaker[0]), cameras[0]
+    two = candidates.rotation[[0, k]], candidates.translation[[0, k]]
+    return objection("other_points", max(float(margins[k]), 0.0), away=distance_between(problem, *two))
+
+
+def sign_margins(cameras: CandidatesOfCameras, settings: Evidence) -> Array:
+    """Compute the margins of the first candidate over far ones by a sign test of the evidence of the image points.
+
     The number of false alarms assumes independent image points. Points on lines or curves are dependent: a pose that
     aligns one line with another explains all its points. A pose may then explain more points than another one by
     chance. Let d_i be the evidence of image point i for the one pose less that for the other. If either sign of each
@@ -120,18 +136,23 @@ def unrelated_competitor(cameras: CandidatesOfCameras, settings: Evidence) -> Ob
 
     A pose is compared by its false alarms alone if half of its correspondences coincide with those of the first pose.
     It is then that pose, its mirror image, or a repetition of it. The exception is a pose that explains other points as
-    well, at least half as many as it leaves unexplained: both poses then slide along a curve.
+    well, at least half as many as it leaves unexplained: both poses then slide along a curve, or see two places of
+    which the scene lacks different points.
 
     Args:
         cameras: Candidates, best first, and points of each camera of a rig; cameras with too few points are left out.
         settings: Constants of the verdict.
 
+    Returns:
+        Margins (c,) in decades, negative if the other candidate explains more; infinite where there is no such test.
+
     Source: W. Hoeffding, Probability inequalities for sums of bounded random variables, JASA 1963.
     """
     limits, least = settings.contested, 2 * math.log(10) * settings.margin
+    margins = np.full(len(cameras[0][0]), math.inf)
     cameras = [(candidates, problem) for candidates, problem in cameras if len(problem.image.chosen) >= least]
     if not cameras:
-        return None
+        return margins
     candidates, problem = cameras[0]
     poses, chosen = (candidates.rotation, candidates.translation), sum(len(each.image.chosen) for _, each in cameras)
     others = np.flatnonzero(~problem.same_pose(*poses, settings.same.times(limits.far)))
@@ -139,7 +160,7 @@ def unrelated_competitor(cameras: CandidatesOfCameras, settings: Evidence) -> Ob
     decisive = limits.most * math.sqrt(least * chosen) / math.log(10)
     others = others[candidates.log10_false_alarms[others] - candidates.log10_false_alarms[0] < decisive]
     if not len(others):
-        return None
+        return margins
     scales = np.maximum(candidates.scale, problem.image.scales[0])
     best, first = _explained(cameras, 0, scales[0], MATCHES.reach)
     for k in others.tolist():
@@ -152,13 +173,10 @@ def unrelated_competitor(cameras: CandidatesOfCameras, settings: Evidence) -> Ob
         same = (first.points == other.points) | (np.linalg.norm(first.places - other.places, axis=-1) < reach)
         alone, others_alone = int((first.near & ~other.near).sum()), int((other.near & ~first.near).sum())
         apart = others_alone >= limits.alone * alone and alone + others_alone >= least
-        decades = max(float(gap.sum()), 0.0) ** 2 / max(squared, 1e-300) / (2 * math.log(10))
-        if decades < settings.margin and (
-            apart or (same & first.near & other.near).sum() < limits.same * other.near.sum()
-        ):
-            two = candidates.rotation[[0, k]], candidates.translation[[0, k]]
-            return objection("other_points", decades, away=distance_between(problem, *two))
-    return None
+        if apart or (same & first.near & other.near).sum() < limits.same * other.near.sum():
+            total = float(gap.sum())
+            margins[k] = total * abs(total) / max(squared, 1e-300) / (2 * math.log(10))
+    return margins
 
 
 class _Partners(NamedTuple):
