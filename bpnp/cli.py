@@ -112,10 +112,11 @@ def _is_mistake(error: Exception) -> bool:
     """
     if isinstance(error, BrokenPipeError):
         return False
-    if not isinstance(error, (ValueError, OSError)) and type(error).__name__ not in LIGHTNING_MISTAKES:
-        return False
-    modules = (frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__))
-    return {module.partition(".")[0] for module in modules} <= LIBRARIES
+    frames = traceback.walk_tb(error.__traceback__)
+    modules = [frame.f_globals.get("__name__", "").partition(".")[0] for frame, _ in frames]
+    of_lightning = isinstance(error, RuntimeError) and modules[-1:] == ["lightning"]  # such as an unknown `monitor`
+    named = isinstance(error, (ValueError, OSError)) or type(error).__name__ in LIGHTNING_MISTAKES
+    return (named or of_lightning) and set(modules) <= LIBRARIES
 
 
 def _run(arguments: list[str]) -> None:

@@ -2,7 +2,7 @@
 
 import io
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -86,11 +86,50 @@ class InterruptedCheckpoint(Callback):
             self.path.unlink(missing_ok=True)
 
 
-class LastCheckpoint(ModelCheckpoint):
+class RunCheckpoint(ModelCheckpoint):
+    """Checkpoints in the folder of a run, which may be moved.
+
+    Arguments are those of Lightning's `ModelCheckpoint`.
+    """
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore the state, with the paths of this folder if it holds the files that the state names."""
+        super().load_state_dict(state_dict if self.dirpath is None else with_folder(state_dict, Path(self.dirpath)))
+
+
+def with_folder(state: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return the state of a `ModelCheckpoint` whose files are in another folder than before.
+
+    Args:
+        state: State of the callback.
+        folder: Folder of the checkpoints.
+
+    Returns:
+        The state with paths in the folder; unchanged unless the folder has all files that the state names.
+    """
+    names = {key: Path(str(path)).name for key, path in state.items() if key.endswith("_path") and path}
+    scores = {str(folder / Path(path).name): score for path, score in state.get("best_k_models", {}).items()}
+    paths = {key: str(folder / name) for key, name in names.items()}
+    if not all(Path(path).is_file() for path in (*scores, *paths.values())):
+        return dict(state)
+    return {**state, **paths, "best_k_models": scores, "dirpath": str(folder)}
+
+
+class LastCheckpoint(RunCheckpoint):
     """Keep the newest checkpoint, also that of the last step, which Lightning leaves out between two validations.
 
     Arguments are those of Lightning's `ModelCheckpoint`.
     """
+
+    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        """Let a resumed run finish an epoch that `max_steps` ended, which Lightning counts as a whole epoch."""
+        loop = checkpoint["loops"]["fit_loop"]
+        batches, epochs = loop["epoch_loop.batch_progress"], loop["epoch_progress"]
+        counted = epochs["current"]["processed"] == epochs["current"]["ready"]
+        if counted and batches["current"]["ready"] > 0 and not batches["is_last_batch"]:
+            for counts in (epochs["current"], epochs["total"]):
+                counts["processed"] = counts["completed"] = counts["ready"] - 1
+            checkpoint["epoch"] = epochs["current"]["completed"]
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Save the steps since the last checkpoint."""
@@ -100,7 +139,7 @@ class LastCheckpoint(ModelCheckpoint):
             trainer.save_checkpoint(self.format_checkpoint_name(trainer.callback_metrics | counts), weights_only=False)
 
 
-class BestCheckpoint(ModelCheckpoint):
+class BestCheckpoint(RunCheckpoint):
     """Keep the checkpoint with the best `monitor` among epochs of one objective.
 
     When the pose loss joins the correspondence loss, the choice starts again, because earlier values are of another
@@ -109,6 +148,19 @@ class BestCheckpoint(ModelCheckpoint):
     """
 
     has_pose_loss: bool | None = None  # True if the last epoch had the pose loss
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Prepare the folder.
+
+        Raises:
+            ValueError: Several checkpoints would have the same name.
+        """
+        if self.save_top_k not in (0, 1) and "{" not in (self.filename or "{") and not self._enable_version_counter:
+            raise ValueError(
+                f"save_top_k is {self.save_top_k} and each checkpoint would be {self.filename}.ckpt. Give a name with "
+                f"the epoch, such as --best_checkpoint.filename '{self.filename}-{{epoch}}'."
+            )
+        super().setup(trainer, pl_module, stage)
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Restart the choice when the pose loss joins, and keep the network before it."""

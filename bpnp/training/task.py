@@ -10,6 +10,7 @@ from typing import Any, Literal, cast
 
 import torch
 from lightning import LightningModule
+from lightning.pytorch.callbacks import StochasticWeightAveraging
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
@@ -47,6 +48,7 @@ POSED = "pnp"  # estimate of the pose loss, which has a derivative
 WARMUP = "PoseLossWarmup"  # callback that sets `pose_weight`; its module imports this one
 DECAYED = 0.02  # factor on the learning rate after the decay
 WIDEST_MATCH = 0.5  # largest `correspondence_angle`, radians; larger values are probably degrees
+MOMENTUM = {"momentum", "betas"}  # settings of an optimizer that `OneCycleLR` and `CyclicLR` change
 MOST_SKIPPED = 20  # consecutive steps without a finite gradient that end the run
 
 
@@ -200,7 +202,7 @@ class BlindPnPTask(LightningModule):
         if hparams_file is not None or weights_only is False:
             raise ValueError("hparams_file and weights_only=False are not accepted: a checkpoint is read as data")
         content = read_checkpoint(checkpoint_path, map_location=map_location)
-        accepted = inspect.signature(cls.__init__).parameters
+        accepted = constructor_arguments(cls)
         options = {key: value for key, value in content.get("task", {}).items() if key in accepted} | kwargs
         try:
             if is_description(options.get("loss")):
@@ -402,18 +404,22 @@ class BlindPnPTask(LightningModule):
     def on_train_start(self) -> None:
         """Apply the configured optimizer settings to the state that came from a checkpoint.
 
-        A scheduled learning rate keeps its ratio to the initial one.
+        A scheduled learning rate keeps its ratio to the initial one. A scheduled momentum, and the learning rate of
+        `StochasticWeightAveraging`, keep their values.
         """
         schedulers = [config.scheduler for config in self.trainer.lr_scheduler_configs]
         scheduled = {id(scheduler.optimizer) for scheduler in schedulers}
+        cycled = {id(each.optimizer) for each in schedulers if getattr(each, "cycle_momentum", False)}
+        averaged = any(isinstance(each, StochasticWeightAveraging) for each in self.trainer.callbacks)  # type: ignore[attr-defined]
         for optimizer, configured in zip(self.trainer.optimizers, self.optimizer_settings, strict=False):
             for group, settings in zip(optimizer.param_groups, configured, strict=True):
-                rate = settings["lr"]
+                rate = group["lr"] if averaged and "swa_lr" in group else settings["lr"]
                 if id(optimizer) in scheduled and group.get("initial_lr"):
                     rate = group["lr"] * settings.get("initial_lr", rate) / group["initial_lr"]
                 elif id(optimizer) in scheduled and "initial_lr" not in settings:
                     rate = group["lr"]  # `ReduceLROnPlateau` has no initial rate
-                group.update(settings, lr=rate)
+                momentum = {key: group[key] for key in MOMENTUM & group.keys() if id(optimizer) in cycled}
+                group.update(settings | momentum, lr=rate)
         for scheduler in schedulers:
             if hasattr(scheduler, "base_lrs"):
                 scheduler.base_lrs = [group["initial_lr"] for group in scheduler.optimizer.param_groups]
@@ -563,6 +569,17 @@ class BlindPnPTask(LightningModule):
             self.log(f"{stage}/correspondence_loss", loss.compute().float(), sync_dist=True)
             self.table_metrics.add(f"{stage}/correspondence_loss")
             loss.reset()
+
+
+def constructor_arguments(cls: type) -> set[str]:
+    """Return the names of the arguments of a constructor, and of the base classes that its `**kwargs` pass them to."""
+    names: set[str] = set()
+    for each in cls.__mro__:
+        parameters = inspect.signature(each.__init__).parameters.values()  # type: ignore[misc]
+        names |= {parameter.name for parameter in parameters}
+        if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
+            break
+    return names
 
 
 def _scale_schedule(scheduler: Any) -> None:

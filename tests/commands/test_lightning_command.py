@@ -254,6 +254,30 @@ class Worse(Callback):
         pl_module.log("val/pose_error", float(trainer.current_epoch))
 
 
+def test_a_moved_run_keeps_its_best_checkpoint(tmp_path: Path) -> None:
+    """The first epoch is the best one by its number; an epoch has two steps."""
+    options = [*SMALL_NET, *SHORT, "--best_checkpoint.monitor=epoch"]
+    main(words("fit", tmp_path, *options))
+    moved = (tmp_path / "run").rename(tmp_path / "moved")
+    more = ["--ckpt_path=last", "--trainer.max_epochs=2", f"--trainer.default_root_dir={moved}"]
+    main(words("fit", tmp_path, *options, *more))
+    files = (moved / "checkpoints").iterdir()
+    steps = {file.stem: torch.load(file, weights_only=True)["global_step"] for file in files}
+    assert steps == {"best": 2, "last": 4}
+
+
+def test_best_checkpoints_of_one_name_are_refused(tmp_path: Path, fails: Callable[..., str]) -> None:
+    several = words("fit", tmp_path, *SMALL_NET, *SHORT, "--best_checkpoint.save_top_k=2")
+    assert "each checkpoint would be best.ckpt. Give a name with the epoch" in fails(*several)
+    main([*several, "--best_checkpoint.filename=best-{epoch}"])
+    assert (tmp_path / "run/checkpoints/best-epoch=0.ckpt").is_file()
+
+
+def test_an_unknown_metric_of_a_callback_is_one_clear_error(tmp_path: Path, fails: Callable[..., str]) -> None:
+    stop = ["--trainer.callbacks=EarlyStopping", "--trainer.callbacks.monitor=val/nothing"]
+    assert "metric `val/nothing` which is not available" in fails(*words("fit", tmp_path, *SMALL_NET, *SHORT, *stop))
+
+
 def test_the_pose_error_is_the_pose_loss_of_the_medians(trained: Path) -> None:
     (file,) = (trained / "run").glob("logs/version_0/metrics.csv")
     rows = [row for row in csv.DictReader(file.open()) if row["val/pose_error"]]

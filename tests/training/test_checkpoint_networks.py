@@ -118,6 +118,32 @@ def test_the_task_of_a_checkpoint_has_its_solver_and_its_options(tmp_path: Path)
         BlindPnPTask.load_from_checkpoint(file)
 
 
+class Named(BlindPnPTask):
+    """A user's task with one more option."""
+
+    def __init__(self, *arguments: Any, label: str = "", **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.label = label
+        self.save_hyperparameters("label")
+
+
+class NamedTwice(Named):
+    """A task two classes below ours."""
+
+    def __init__(self, *, second: str = "", **options: Any) -> None:
+        super().__init__(**options)
+        self.second = second
+
+
+def test_the_options_that_a_users_task_passes_on_come_back(tmp_path: Path) -> None:
+    options: dict[str, Any] = {"learning_rate": 3e-4, "pose_weight": 0.5, "matching_loss": "likelihood"}
+    for kind in (Named, NamedTwice):
+        file = save(kind(solver=small_net(), label="mine", **options), tmp_path / "task.ckpt")
+        again = kind.load_from_checkpoint(file)
+        assert {name: getattr(again, name) for name in options} == options
+        assert again.label == "mine"
+
+
 def test_hyperparameters_are_plain_data(tmp_path: Path) -> None:
     net = BPnPNet(Flat(2), Flat(3), ransac=RansacPnP(threshold=0.02))
     hparams = dict(BlindPnPTask(net, learning_rate=2e-4).hparams)

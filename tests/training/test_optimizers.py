@@ -6,11 +6,14 @@ from pathlib import Path
 import pytest
 import torch
 from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint, StochasticWeightAveraging
+from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from planted import plant
 from small_data import quiet_trainer, small_net
-from torch.optim import Optimizer
+from torch.optim import SGD, Adam, Optimizer
+from torch.optim.lr_scheduler import CyclicLR, OneCycleLR
 from torch.utils.data import DataLoader
-from trainer_observer import Observer, fit
+from trainer_observer import Observer, fit, flat
 
 from bpnp.training.task import BlindPnPTask
 
@@ -124,3 +127,46 @@ def test_gradients_scaled_by_mixed_precision_are_clipped(tmp_path: Path) -> None
     trainer.fit(task, data)
     assert task.skipped_steps == 0
     assert norms.seen[-1] == pytest.approx(1e-3, rel=1e-2)
+
+
+class OneCycle(BlindPnPTask):
+    """A user's task, whose schedule also changes the momentum of Adam."""
+
+    def configure_optimizers(self) -> OptimizerLRScheduler:
+        optimizer = Adam(self.parameters(), lr=1e-3)
+        schedule = OneCycleLR(optimizer, 1e-2, total_steps=12)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+class Cyclic(BlindPnPTask):
+    """A user's task, whose schedule also changes the momentum of SGD."""
+
+    def configure_optimizers(self) -> OptimizerLRScheduler:
+        optimizer = SGD(self.parameters(), lr=1e-3, momentum=0.9)
+        schedule = CyclicLR(optimizer, 1e-3, 1e-2, step_size_up=4)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+class Averaged(BlindPnPTask):
+    """A task with weights that are averaged, at a learning rate of their own, from the second epoch on."""
+
+    def configure_callbacks(self) -> list[Callback]:
+        return [StochasticWeightAveraging(swa_lrs=5e-3, swa_epoch_start=1)]
+
+
+@pytest.mark.parametrize(("kind", "warmup_steps"), [(OneCycle, 0), (Cyclic, 0), (Averaged, 0), (Averaged, 9)])
+def test_a_resumed_training_equals_an_uninterrupted_one(
+    kind: type[BlindPnPTask], warmup_steps: int, tmp_path: Path
+) -> None:
+    data = DataLoader([plant(2, 10, dtype=torch.float32).batch()] * 3, batch_size=None)  # type: ignore[arg-type]
+
+    def train(checkpoint: Path | None = None) -> torch.Tensor:
+        torch.manual_seed(0)
+        task = kind(small_net(8, 1), learning_rate=1e-3, warmup_steps=warmup_steps)
+        keep = ModelCheckpoint(tmp_path, filename="{epoch}", save_top_k=-1, enable_version_counter=False)
+        trainer = quiet_trainer(tmp_path, max_epochs=4, callbacks=[keep], enable_checkpointing=True)
+        trainer.fit(task, data, ckpt_path=checkpoint)
+        return flat(task)
+
+    whole = train()
+    torch.testing.assert_close(train(tmp_path / "epoch=1.ckpt"), whole, rtol=0, atol=0)

@@ -388,6 +388,19 @@ def test_the_last_steps_are_saved_and_continued(rarely: str, tmp_path: Path) -> 
     torch.testing.assert_close(state(tmp_path / "straight"), resumed, rtol=0, atol=0)
 
 
+@pytest.mark.parametrize("validated", ["limit_val_batches=1", "limit_val_batches=0"])
+def test_an_epoch_that_max_steps_ended_is_finished_by_the_next_run(validated: str, tmp_path: Path) -> None:
+    """The second of six-step epochs is stopped after two steps."""
+    options = [f"--trainer.{validated}", "--model.learning_rate=1e-2", "--trainer.max_epochs=3"]
+    fit(tmp_path, *options, "--trainer.max_steps=8")
+    assert (saved(tmp_path)["epoch"], saved(tmp_path)["global_step"]) == (1, 8)
+    fit(tmp_path, *options, "--ckpt_path=last")
+    assert saved(tmp_path)["global_step"] == 18
+    resumed = state(tmp_path)
+    fit(tmp_path / "straight", *options)
+    torch.testing.assert_close(state(tmp_path / "straight"), resumed, rtol=0, atol=0)
+
+
 def test_no_checkpoints_are_written_without_checkpointing(tmp_path: Path) -> None:
     fit(tmp_path, *TWO_STEPS, "--trainer.enable_checkpointing=false")
     assert len(Observer.problems) == 2
