@@ -269,6 +269,14 @@ def test_a_mirror_symmetric_object_is_ambiguous_from_afar(seed: int) -> None:
         assert min(degrees_between(pose.rotation, other) for pose in one.candidates) < 5
 
 
+@pytest.mark.parametrize("seed", [1, 3, 7])
+def test_many_points_decide_between_the_two_poses_of_a_distant_mirror_symmetric_object(seed: int) -> None:
+    image, points, rotation, _ = seen_from_afar(45, seed)
+    found = bpnp.solve(image, points, seed=seed, time_limit=30)
+    assert found.verdict == "confident"
+    assert degrees_between(found.rotation, rotation) < 2
+
+
 def test_of_a_small_lattice_some_motions_may_be_missing() -> None:
     """24 rotations, each with dozens of shifts that map over a fifth of the 64 points."""
     points = np.stack(np.meshgrid(*[np.arange(4.0)] * 3), -1).reshape(-1, 3)

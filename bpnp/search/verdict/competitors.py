@@ -135,9 +135,10 @@ def sign_margins(cameras: CandidatesOfCameras, settings: Evidence) -> Array:
     If even equal signs of all differences would not reach the required margin, the points are too few for this test.
 
     A pose is compared by its false alarms alone if half of its correspondences coincide with those of the first pose.
-    It is then that pose, its mirror image, or a repetition of it. The exception is a pose that explains other points as
-    well, at least half as many as it leaves unexplained: both poses then slide along a curve, or see two places of
-    which the scene lacks different points.
+    It is then that pose, its mirror image, or a repetition of it. Of a mirror image from afar, they coincide up to the
+    order of their depths. The exception is a pose that explains other points as well, at least half as many as it
+    leaves unexplained: both poses then slide along a curve, or see two places of which the scene lacks different
+    points.
 
     Args:
         cameras: Candidates, best first, and points of each camera of a rig; cameras with too few points are left out.
@@ -171,6 +172,7 @@ def sign_margins(cameras: CandidatesOfCameras, settings: Evidence) -> Array:
             continue
         reach = MATCHES.reach * max(scales[0], scales[k]) * np.linalg.norm(first.places, axis=-1)
         same = (first.points == other.points) | (np.linalg.norm(first.places - other.places, axis=-1) < reach)
+        same |= _with_reversed_depths(first, other, reach)
         alone, others_alone = int((first.near & ~other.near).sum()), int((other.near & ~first.near).sum())
         apart = others_alone >= limits.alone * alone and alone + others_alone >= least
         if apart or (same & first.near & other.near).sum() < limits.same * other.near.sum():
@@ -205,6 +207,21 @@ def _explained(cameras: CandidatesOfCameras, k: int, scale: float, near: float) 
     poses = [(problem, candidates.rotation[k], candidates.translation[k], scale) for candidates, problem in cameras]
     parts = zip(*(_partners(near, *pose) for pose in poses), strict=True)
     return np.concatenate([own_evidence(*pose) for pose in poses]), _Partners(*map(np.concatenate, parts))
+
+
+def _with_reversed_depths(first: _Partners, other: _Partners, reach: Array) -> NDArray[np.bool_]:
+    """Return which image points (k,) have correspondences that only the order of their depths distinguishes.
+
+    The one is then the mirror image of the other in a plane across the line of sight, and differs from it by more than
+    `reach` (k,). Depths are relative to their mean over the image points that both poses explain.
+    """
+    both = first.near & other.near
+    if not both.any():
+        return both
+    centre = first.places[both].mean(0)
+    sight = centre / max(float(np.linalg.norm(centre)), 1e-300)
+    one, two = (places @ sight - float((places[both] @ sight).mean()) for places in (first.places, other.places))
+    return np.asarray((np.abs(one + two) < reach) & (np.abs(one - two) >= reach))
 
 
 def _partners(near: float, problem: Problem, rotation: Array, translation: Array, scale: float) -> _Partners:
