@@ -40,7 +40,9 @@ class OneLineParser(ArgumentParser):
                 command = f"{self.prog} {parent}".rstrip()
                 options.append(f"--{name}" if parent or f"--{name}" in option_strings else name)
             start = f"{command} --config quickstart, or " if parent in LIGHTNING else ""
-            raise ValueError(f"missing {', '.join(options)}; try: {start}{command} --help") from ex
+            # A class that an option names has a parser of its own, without a command.
+            advice = f"; try: {start}{command} --help" if " " in command else ""
+            raise ValueError(f"missing {', '.join(options)}{advice}") from ex
         close = difflib.get_close_matches(unknown.split("=")[0].split(" ")[0], option_strings, n=1) if found else []
         hint = f"; did you mean {close[0]}?" if close else f"; try: {self.prog} --help" if found else ""
         renamed = (new for old, new in RENAMED.items() if text.endswith(f"Option '{old}' is not accepted"))
@@ -57,6 +59,11 @@ NOISE = (
     "Given value type:",
     "Given value: Namespace(",
     "Given value: NestedArg(",
+    "Given value: [Namespace(",
+    "- Not a valid subclass of",
+    "Subclass types expect one of",
+    "- a class path (str)",
+    "- a dict with",
     "- Does not validate against",
     "- Expected a <class 'NoneType'>",
     "- Expected a path but",

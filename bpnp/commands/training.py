@@ -5,6 +5,7 @@ The network is that of the checkpoint: the description in `--ckpt_path` or `--mo
 that contradict it.
 """
 
+import math
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,6 +26,7 @@ from lightning.pytorch.utilities.types import LRSchedulerTypeUnion
 from torch.optim import Optimizer
 
 import bpnp.datamodules
+from bpnp.checks import check_within
 from bpnp.commands.parser import OneLineParser
 from bpnp.files import config_content, lock_folder, write_text
 from bpnp.models.weights import PARTS, class_name, is_description, networks, read_checkpoint
@@ -80,6 +82,7 @@ class LimitedTrainer(Trainer):
         limit_predict_batches: int | float | None = None,
         **kwargs: Any,
     ) -> None:
+        check_within(1, math.inf, accumulate_grad_batches=kwargs.get("accumulate_grad_batches", 1))
         super().__init__(
             limit_train_batches=limit_train_batches,
             limit_val_batches=limit_val_batches,

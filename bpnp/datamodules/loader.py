@@ -247,7 +247,7 @@ class ProblemDataModule(LightningDataModule):
         super().__init__()
         sizes = {"batch_size": batch_size, "eval_batch_size": eval_batch_size, "max_cells": max_cells}
         check_within(1, math.inf, **{name: size for name, size in sizes.items() if size is not None})
-        check_within(0, math.inf, num_workers=num_workers)
+        check_within(0, math.inf, num_workers=num_workers, seed=seed)
         train, test = train_outliers or Outliers(), test_outliers or Outliers()
         self.outliers = {"train": train, "val": train, "test": test, "predict": test}
         self.batch_size = batch_size

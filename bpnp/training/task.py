@@ -129,6 +129,7 @@ class BlindPnPTask(LightningModule):
             }
         )
         self.learning_rate, self.weight_decay, self.pose_weight = learning_rate, weight_decay, pose_weight
+        check_within(0, math.inf, learning_rate=learning_rate, weight_decay=weight_decay, pose_weight=pose_weight)
         check_within(0, math.inf, warmup_steps=warmup_steps, decay_start=decay_start or 0)
         check_within(1, math.inf, decay_steps=decay_steps)
         self.warmup_steps, self.decay_start, self.decay_steps = warmup_steps, decay_start, decay_steps

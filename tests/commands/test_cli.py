@@ -108,6 +108,14 @@ def test_options_of_the_network_and_its_parts_are_explained(
         (["fit", *MESHES, "--data.train_pairs=3"], "'train_pairs' is not accepted; it is now train_problems\n"),
         (["fit", *MESHES, "--data.num_points=many"], "\"num_points\": Expected a <class 'int'>. Got value: many\n"),
         (["fit", *MESHES, "--data.batch_size=0"], "error: `batch_size` is 0; it must be 1 or more\n"),
+        (["fit", *MESHES, "--data.seed=-1"], "error: `seed` is -1; it must be 0 or more\n"),
+        (["fit", *MESHES, "--model.learning_rate=-1"], "error: `learning_rate` is -1.0; it must be 0 or more\n"),
+        (["fit", *MESHES, "--model.pose_weight=-1"], "error: `pose_weight` is -1.0; it must be 0 or more\n"),
+        (
+            ["fit", *MESHES, "--trainer.accumulate_grad_batches=0"],
+            "error: `accumulate_grad_batches` is 0; it must be 1 or more\n",
+        ),
+        (["fit", *MESHES, "--trainer.callbacks+=EarlyStopping"], 'Parser key "trainer.callbacks": missing --monitor\n'),
         (["fit", *MESHES, "--model.loss=torch.nn.Nothing"], "'torch.nn' has no attribute 'Nothing' "),
         (["fit", *MESHES, "--data.root=nowhere"], "nowhere is not a folder; a folder with <class>/{train,test}"),
         (
