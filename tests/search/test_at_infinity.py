@@ -80,6 +80,15 @@ def test_a_wrong_focal_length_is_no_confident_wrong_rotation(factor: float, fiel
     assert solution.verdict != "confident" or degrees_between(solution.rotation, rotation) < 0.1
 
 
+@pytest.mark.parametrize(("factor", "shift"), [(1.01, (0, 0)), (1.0, (40, -25))], ids=["focal length", "centre"])
+def test_rotations_that_fit_parts_of_a_fisheye_image_are_a_wrong_camera(factor: float, shift: tuple[int, int]) -> None:
+    """The focal length is 1 % too long, or the principal point 47 pixels off: no rotation fits the whole image."""
+    image, directions, rotation, _ = sky(0, field=180.0, count=3000)
+    solution = look(image + shift, directions, lens(180.0, factor).model)
+    assert degrees_between(solution.rotation, rotation) > 0.3
+    assert (solution.verdict, solution.reason_code) == ("ambiguous", "other_camera_by_pixels")
+
+
 @pytest.mark.parametrize(("field", "count", "factor"), [(40.0, 600, 0.85), (180.0, 300, 1.1), (220.0, 200, 1.02)])
 def test_an_unknown_focal_length_is_found_with_the_rotation(field: float, count: int, factor: float) -> None:
     image, directions, rotation, _ = sky(4, field=field, count=count)

@@ -481,6 +481,33 @@ def _merge(found: Hypotheses, new: Hypotheses, sight: Sight) -> Hypotheses:
     return every[(every.log10_false_alarms <= 0) | (np.arange(len(every)) == 0)][: DEFAULT.kept]
 
 
+def _shift_between_parts(found: Hypotheses, sight: Sight) -> float:
+    """Return the largest shift, pixels, between the best rotation and one that explains another part of the image.
+
+    With the right camera one rotation explains all stars, and the other image points fit none better than chance. With
+    another camera, such as a fisheye of another focal length, different rotations fit different parts of the image.
+
+    Args:
+        found: Rotations, best first, with their matches and the evidence of the image points.
+        sight: The problem.
+
+    Returns:
+        Shift of the points that only the other rotation matches; 0 if none is significant by the points that the best
+            one does not match.
+    """
+    assert found.matches is not None
+    assert found.point_evidence is not None
+    largest, matched = 0.0, found.matches[0] >= 0
+    for k in range(1, len(found)):
+        rest = float(found.log10_false_alarms[k] + found.point_evidence[k, matched].sum() / math.log(10))
+        if rest <= DEFAULT.evidence.false_alarms:
+            alone = ~matched & (found.matches[k] >= 0)
+            bearings = sight.image.bearings[alone]
+            moved = bearings - bearings @ found.rotation[k] @ found.rotation[0].T
+            largest = max(largest, float((np.linalg.norm(moved, axis=-1) / sight.image.pixel[alone]).max(initial=0)))
+    return largest
+
+
 def _judge(found: Hypotheses, sight: Sight, iterations: int) -> SearchResult:
     """Judge rotations, best first, by the rules of `bpnp.search.verdict.decide`."""
     verdict_settings = DEFAULT.evidence
@@ -503,6 +530,9 @@ def _judge(found: Hypotheses, sight: Sight, iterations: int) -> SearchResult:
     missed = log10_missed(iterations, count, min(least, count), sight.settings.power)
     if missed > verdict_settings.missed:
         return result.add_objection(objection("incomplete", what="rotation", probability=reasons.number(missed)))
+    apart = _shift_between_parts(found, sight)
+    if apart > sight.reach:
+        return result.add_objection(objection("other_camera_by_pixels", pixels=apart))
     directions, bearings, pixel = _matches(sight, found)
     some = np.linspace(0, len(hit) - 1, min(len(hit), sight.settings.strained)).astype(np.int64)
     strain = strain_of(directions[some], bearings[some], pixel[some], sight.image.bearings)
