@@ -123,10 +123,10 @@ def test_each_part_has_its_outliers_and_its_batch_size() -> None:
     data = Problems(train_outliers=Outliers(ratio=1.0), test_outliers=Outliers(ratio=0.5), **sizes)
     data.setup()
     for part, ratio, size in (("train", 1.0, 6), ("val", 1.0, 2), ("test", 0.5, 2), ("predict", 0.5, 2)):
-        batch = next(iter(getattr(data, f"{part}_dataloader")()))
-        matches = (batch.match3d >= 0).sum(-1)
-        assert len(batch) == size
-        assert torch.equal(batch.count3d, matches + (ratio * matches).long())
+        for batch in getattr(data, f"{part}_dataloader")():
+            matches = (batch.match3d >= 0).sum(-1)
+            assert len(batch) == size
+            assert torch.equal(batch.count3d, matches + (ratio * matches).long())
     single, other = Problems(**sizes, max_cells=1), Problems(**sizes, seed=1)
     for one in (single, other):
         one.setup()

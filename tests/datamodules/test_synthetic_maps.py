@@ -110,6 +110,18 @@ def test_headings_vary_by_so_many_degrees_about_that_of_a_view(frame: Frame, ahe
     assert np.sqrt(np.mean(np.square(changes))) == pytest.approx(30, rel=0.2)
 
 
+def test_scale_field_of_view_and_number_of_photos_are_those_of_the_options() -> None:
+    options = {"num_points": 60, "kinds": {"facades": 1.0}, "field_of_view": 60.0}
+    one, two = (problems(3, **options, scale_range=(scale, scale)) for scale in (1.0, 2.0))
+    for small, large in zip(one, two, strict=True):
+        np.testing.assert_allclose(large.points3d, 2 * small.points3d, rtol=1e-5, atol=1e-4)
+        np.testing.assert_allclose(large.translation, 2 * small.translation, atol=1e-6)
+        assert small.focal == pytest.approx(600 / np.tan(np.radians(30)))
+    fewer, more = (problems(12, **options, outliers=1.0, views=(count, count)) for count in (1, 5))
+    ratios = [np.median([len(each.points3d) / len(each.points2d) for each in some]) for some in (fewer, more)]
+    assert ratios[1] > 1.3 * ratios[0]  # more photos have more points of the map
+
+
 def test_the_module_is_configured_by_yaml(tmp_path: Path) -> None:
     (tmp_path / "data.yaml").write_text(
         "{num_points: 48, outliers: [0, 0.5], views: [1, 2], kinds: {statue: 1, street: 2}, noise_px: 1,"

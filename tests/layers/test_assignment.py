@@ -118,6 +118,14 @@ def test_an_unconverged_plan_is_reported() -> None:
     torch.testing.assert_close(stats.residual, (plan.sum(-1) - 1 / 20).abs().sum(-1))
 
 
+def test_the_sweeps_of_both_precisions_are_counted() -> None:
+    """Float32 does not reach this tolerance: the samples are solved again in float64."""
+    cost = random_cost(2, 20, 20).float()
+    single, double = (sinkhorn(values, mu=0.01, tolerance=1e-10)[1] for values in (cost, cost.double()))
+    assert single.converged.all()
+    assert (single.iterations > double.iterations).all()
+
+
 def test_a_sample_with_nan_is_flagged_and_alone() -> None:
     cost = random_cost(3, 6, 6)
     expected, _ = sinkhorn(cost)

@@ -21,9 +21,13 @@ def apart(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> float:
     return torch.maximum(rotation_angle(a[0], b[0]), (a[1] - b[1]).norm(dim=-1)).max().item()
 
 
-def test_weighted_pnp_recovers_a_planted_pose() -> None:
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
+def test_weighted_pnp_recovers_a_planted_pose(dtype: torch.dtype) -> None:
+    """In half precision, the initial rotation is orthogonal to two digits."""
     planted = plant(12, 25, outliers2d=6, outliers3d=9)
-    *found, stats = solve(planted, planted.permutation(), planted.near(0.15), tolerance=1e-12)
+    rotation, translation = planted.near(0.15)
+    start = rotation.to(dtype), translation.to(dtype)
+    *found, stats = solve(planted, planted.permutation(), start, tolerance=1e-12)
     assert stats.converged.all()
     assert apart((found[0], found[1]), planted.pose) < 1e-9
     assert torch.linalg.det(found[0]).sub(1).abs().max() < 1e-11
@@ -125,6 +129,18 @@ def test_minimal_and_flat_scenes_have_a_pose(kind: str) -> None:
     *found, stats = solve(planted, assignment, planted.near(0.02), tolerance=1e-12)
     assert stats.converged.all()
     assert apart((found[0], found[1]), planted.pose) < 1e-5
+
+
+@pytest.mark.parametrize(("radii", "near"), [(8e3, True), (1.2e4, False)])
+def test_a_camera_beyond_ten_thousand_radii_is_flagged(radii: float, near: bool) -> None:
+    """Exact bearings, from the true pose."""
+    planted = plant(1, 30, seed=13)
+    centred = planted.points3d - planted.points3d.mean(1, keepdim=True)
+    points3d = centred / centred.square().sum(-1).mean().sqrt()
+    translation = torch.tensor([[0.0, 0.0, radii]], dtype=torch.float64)
+    bearings = torch.nn.functional.normalize(transform(planted.rotation, translation, points3d), dim=-1)
+    assignment = torch.eye(30, dtype=torch.float64)[None] / 30
+    assert weighted_pnp(assignment, bearings, points3d, planted.rotation, translation)[2].converged.item() == near
 
 
 def test_an_initial_pose_behind_the_points_ends_in_front_or_is_flagged() -> None:

@@ -52,6 +52,7 @@ def test_the_support_of_a_pose_is_the_likelihood_ratio_of_the_bearings(bins: boo
     left = torch.rand(2, 9, generator=generator, dtype=torch.float64) * batch.mask2d
     prediction = Prediction(p, unmatched2d=left if bins else None)
     pose = posed(batch.rotation, batch.translation + 0.02)
+    batch.points2d[1, 0] = pose.translation[1, :2] / pose.translation[1, 2]  # where padded scene points would be seen
     found = log_support(prediction, batch, pose)
     for b, (m, n) in enumerate(((9, 9), (8, 7))):
         rays = np.column_stack([batch.points2d[b, :m].numpy(), np.ones(m)])
@@ -77,7 +78,7 @@ def test_rounds_find_the_matches_that_no_feature_tells_apart() -> None:
     prediction = Prediction(torch.full((2, 20, 20), 1 / 400), poses={"ransac": start, "pnp": start})
     cost = torch.ones(2, 20, 20, dtype=torch.float64)
     layers: dict[str, Any] = {"transport": Sinkhorn(), "pnp": WeightedPnP()}
-    found = match_again(prediction, cost, batch, **layers, widths=[0.05, 0.005])
+    found = match_again(prediction, cost, batch, **layers, widths=[0.05, 0.01, 0.002])
     assert found.rematched is not None
     assert batch.match3d is not None
     assert (found.rematched.argmax(1) == batch.match3d).double().mean() > 0.9
@@ -94,13 +95,14 @@ def test_an_unsupported_refined_pose_gives_way_to_a_supported_one(monkeypatch: p
     The second search, from the poses of the network, finds it in the first two samples.
     """
     planted = plant(3, 20, seed=4)
-    batch, elsewhere = planted.batch(), planted.near(1.0)
+    batch, wrong = planted.batch(), (planted.near(1.0), planted.near(2.0))
     results: list[tuple[Tensor, Tensor]] = []
 
     def refined(batch: Batch, rotation: Tensor, translation: Tensor) -> Pose:
         results.append((rotation, translation))
         right = torch.tensor([True, len(results) == 2, False])
-        return posed(*(choose(right, true, wrong) for true, wrong in zip(planted.pose, elsewhere, strict=True)))
+        pairs = zip(planted.pose, wrong[len(results) - 1], strict=True)
+        return posed(*(choose(right, true, other) for true, other in pairs))
 
     monkeypatch.setattr(bpnp.models.evaluation, "refine", refined)
     network = posed(*planted.near(0.01))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from planted import Planted, plant
+from planted import Planted, padded, plant, posed
 from torch import Tensor
 
 from bpnp.layers import weighted_pnp
@@ -67,6 +67,15 @@ def test_labels_do_not_matter_and_a_sample_without_a_pose_has_no_loss() -> None:
     pose = prediction.poses["pnp"]
     missing = Pose(pose.rotation, pose.translation, SolveStats.of(torch.tensor([False, True])))
     assert ReprojectionLoss()(replace(prediction, poses={"pnp": missing}), labelled).isnan().tolist() == [True, False]
+
+
+def test_mass_at_padded_points_does_not_count() -> None:
+    large, small = plant(1, 10), plant(1, 6, seed=1)
+    assignment = torch.rand(2, 10, 10, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    poses = [torch.cat(values) for values in zip(large.near(0.1), small.near(0.1), strict=True)]
+    both = ReprojectionLoss()(Prediction(assignment, poses={"pnp": posed(*poses)}), padded([large, small]))
+    alone = Prediction(assignment[1:, :6, :6], poses={"pnp": posed(*small.near(0.1))})
+    torch.testing.assert_close(both[1:], ReprojectionLoss()(alone, small.batch()))
 
 
 def test_a_solver_without_an_assignment_is_one_error() -> None:

@@ -1,5 +1,6 @@
 import math
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -17,6 +18,7 @@ from torch.utils.data import DataLoader
 import bpnp.metrics
 import bpnp.training.task
 from bpnp import Batch, Matcher, Prediction
+from bpnp.layers import Sinkhorn
 from bpnp.report import read_results
 from bpnp.training.callbacks import PoseLossWarmup, ResultsWriter
 from bpnp.training.losses import correspondence_loss
@@ -217,12 +219,57 @@ def test_the_pose_loss_is_the_mean_over_the_samples_with_a_pose(tmp_path: Path) 
     assert float(losses.pose_means()["translation"]) == pytest.approx(float(distances.mean()), rel=1e-5)
 
 
-def test_the_terms_of_the_pose_loss_are_logged(tmp_path: Path) -> None:
-    run = fit(tmp_path, BlindPnPTask(small_net(), pose_weight=0.5), limit_train_batches=1)
+def test_the_terms_of_the_pose_loss_and_the_samples_without_a_pose_are_logged(tmp_path: Path) -> None:
+    batch = padded([plant(1, points, seed=points, dtype=torch.float32) for points in (20, 3, 21, 3)])
+    task = BlindPnPTask(small_net(), pose_weight=0.5)
+    solved = task.solver(batch).poses["pnp"].stats.converged.float().mean()
+    run = quiet_trainer(tmp_path, max_epochs=1)
+    run.fit(task, DataLoader([batch], batch_size=None))  # type: ignore[arg-type]
     logged = {name: float(value) for name, value in run.callback_metrics.items()}
     pose = logged["train/rotation_loss"] + logged["train/translation_loss"]
     assert logged["train/pose_loss"] == pytest.approx(pose)
     assert logged["train/loss"] == pytest.approx(logged["train/correspondence_loss"] + 0.5 * pose, rel=1e-5)
+    assert logged["train/without_pose"] == pytest.approx(1 - float(solved))
+
+
+class ThreeOfFour(nn.Module):
+    """The sum of the squares of P, of three samples in four."""
+
+    def forward(self, prediction: Prediction, batch: Batch) -> torch.Tensor:
+        assert prediction.assignment is not None
+        values = prediction.assignment.square().sum((1, 2))
+        return values.where(torch.arange(len(batch)) % 4 < 3, torch.nan)
+
+
+@pytest.mark.parametrize("needs_pose", [None, False])
+def test_the_samples_that_a_loss_leaves_out_are_logged(needs_pose: bool | None, tmp_path: Path) -> None:
+    """Without the attribute, a loss gets the poses."""
+    task = BlindPnPTask(CountingSolver(), loss=ThreeOfFour())
+    task.solver.net.transport = Sinkhorn(tolerance=1e-9, max_iterations=1)
+    if needs_pose is not None:
+        task.loss.needs_pose = needs_pose
+    run = fit(tmp_path, task, limit_train_batches=1)
+    logged = {name.removeprefix("train/"): float(value) for name, value in run.callback_metrics.items()}
+    assert task.solver.wanted == [needs_pose is None]
+    assert logged["left_out"] == 0.25
+    assert logged["matching_loss"] == pytest.approx(logged["loss"])
+    assert (logged["sinkhorn_iterations"], logged["sinkhorn_unconverged"]) == (1, 1)
+
+
+def test_an_angle_replaces_the_true_matches_in_training_and_validation(tmp_path: Path) -> None:
+    """P is uniform: the loss is 1 - 2 times the fraction of pairs within the angle, counted by numpy."""
+    batch = replace(padded(OWN), match3d=None)
+    task = BlindPnPTask(small_net(transport=Sinkhorn(mu=1e6)), correspondence_angle=0.2)
+    rays = np.concatenate([batch.points2d.numpy(), np.ones((10, 12, 1))], -1)
+    camera = batch.points3d.numpy() @ batch.rotation.numpy().transpose(0, 2, 1) + batch.translation.numpy()[:, None]
+    rays, camera = (values / np.linalg.norm(values, axis=-1, keepdims=True) for values in (rays, camera))
+    within = np.arccos(np.clip(rays @ camera.transpose(0, 2, 1), -1, 1)) <= 0.2
+    expected = 1 - 2 * within.mean()
+    assert float(task.losses(task.solver.match(batch), batch).total) == pytest.approx(expected, abs=1e-4)
+    run, data = quiet_trainer(tmp_path, max_epochs=1), DataLoader([batch], batch_size=None)  # type: ignore[arg-type]
+    run.fit(task, data, data)
+    for part in ("train", "val"):
+        assert float(run.callback_metrics[f"{part}/correspondence_loss"]) == pytest.approx(expected, abs=1e-4)
 
 
 def test_a_pose_loss_without_its_pose_is_refused(tmp_path: Path) -> None:
