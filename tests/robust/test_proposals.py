@@ -5,11 +5,12 @@ import math
 import numpy as np
 import pytest
 import torch
-from planted import plant
+from planted import Planted, plant
 from torch import Tensor
 
-from bpnp.geometry import retract, rotation_angle, transform
-from bpnp.robust.matches import Matches, truncated_scores, weighted_draws
+from bpnp.geometry import bearings, retract, rotation_angle, transform
+from bpnp.robust.matches import Matches, distinct_triples, truncated_scores, weighted_draws
+from bpnp.robust.minimal_solvers import p3p
 from bpnp.robust.proposals import drawn_poses, pose_hypotheses
 
 
@@ -34,28 +35,33 @@ def masks(points2d: Tensor, points3d: Tensor) -> tuple[Tensor, Tensor]:
     return torch.ones(points2d.shape[:2]) > 0, torch.ones(points3d.shape[:2]) > 0
 
 
-def test_the_best_hypothesis_is_the_planted_pose_and_the_others_are_apart() -> None:
-    assignment, *points, rotation, translation = half_true()
+@pytest.mark.parametrize("far", [0.0, 1e6])
+def test_the_best_hypothesis_is_the_planted_pose_and_the_others_are_apart(far: float) -> None:
+    """Scores are in float32, which has no digits for a scene of unit size that is a million units away."""
+    assignment, points2d, points3d, rotation, translation = half_true()
+    points = points2d, points3d + far
     r, t = pose_hypotheses(assignment, *points, *masks(*points), count=9)
     assert r.shape == (1, 9, 3, 3)
     assert torch.rad2deg(rotation_angle(r[:, 0], rotation)) < 0.01
-    assert (t[:, 0] - translation).norm() < 1e-3
+    found = transform(r[:, 0], t[:, 0], points[1])
+    assert (found - transform(rotation, translation, points3d)).norm(dim=-1).max() < 1e-3
     apart = torch.stack([rotation_angle(r[0], one.expand_as(r[0])) for one in r[0]])
     assert torch.rad2deg(apart[~torch.eye(9, dtype=torch.bool)]).min() > 14.9
 
 
 def test_hypotheses_depend_neither_on_padding_nor_on_samples_without_a_pose() -> None:
-    """Padded entries have most of the mass. The other samples have no mass, NaN, and two points on a side."""
+    """Padded entries have most of the mass. The others have no mass, NaN, two points on a side, and infinity."""
     assignment, *points, _, _ = half_true()
     expected = pose_hypotheses(assignment, *points, *masks(*points), count=5)
     pad = torch.nn.functional.pad
-    wide = pad(assignment, (0, 4, 0, 2), value=1.0).repeat(4, 1, 1)
-    padded = [pad(x, (0, 0, 0, more), value=9.0).repeat(4, 1, 1) for x, more in zip(points, (2, 4), strict=True)]
+    wide = pad(assignment, (0, 4, 0, 2), value=1.0).repeat(5, 1, 1)
+    padded = [pad(x, (0, 0, 0, more), value=9.0).repeat(5, 1, 1) for x, more in zip(points, (2, 4), strict=True)]
     mask2d, mask3d = masks(*padded)
     mask2d[:, -2:], mask3d[:, -4:] = False, False
     wide[1] = 0
     wide[2, 0, 0] = torch.nan
     mask3d[3, 2:] = False
+    wide[4, 0, 0] = torch.inf
     r, t = pose_hypotheses(wide, *padded, mask2d, mask3d, count=5)
     for found, alone in zip((r, t), expected, strict=True):
         torch.testing.assert_close(found[:1], alone, rtol=0, atol=1e-9)
@@ -72,24 +78,45 @@ def test_drawn_poses_have_the_planted_one_in_any_unit_and_origin() -> None:
         camera = scene[0] @ best[:, :3].mT + best[:, 3]
         near = torch.cdist(camera[:, :2] / camera[:, 2:], points2d[0]).amin(1)
         assert near[:24].max() < 1e-5
-    other = drawn_poses(assignment, points2d, points3d, triples=256, seed=1)
+    again, other = (drawn_poses(assignment, points2d, scene, triples=256, seed=seed) for seed in (0, 1))
+    assert torch.equal(again.nan_to_num(), poses.nan_to_num())
     assert not torch.equal(other.nan_to_num(), poses.nan_to_num())
 
 
-def test_aligned_triples_are_oftener_true() -> None:
-    """A camera almost in the axes of the scene; a tenth of the mass is on true matches."""
-    planted = plant(1, 30, seed=2)
+def in_camera_axes(noise: float) -> tuple[Planted, Tensor, Tensor]:
+    """A planted problem, its scene almost in the axes of the camera, and the rotation of this scene."""
+    planted = plant(1, 30, noise=noise, seed=2)
     step = torch.tensor([[0.05, -0.05, 0.05, 0, 0, 0]], dtype=torch.float64)
     rotation, translation = retract(step, torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3).double())
-    scene = transform(rotation.mT, translation, transform(*planted.pose, planted.points3d))
-    assignment = 0.1 * planted.permutation() + 0.9 / 900
-    near = []
+    return planted, transform(rotation.mT, translation, transform(*planted.pose, planted.points3d)), rotation
+
+
+def fraction_near(poses: Tensor, rotation: Tensor) -> float:
+    """Fraction of the poses that are within 0.02 radians of a rotation."""
+    angle = rotation_angle(poses[..., :3], rotation.unsqueeze(1).expand_as(poses[..., :3]))
+    return int((angle < 0.02).sum()) / int(angle.isfinite().sum())
+
+
+def test_aligned_triples_are_oftener_true() -> None:
+    """A tenth of the mass is on true matches."""
+    planted, scene, rotation = in_camera_axes(0.0)
+    assignment, near = 0.1 * planted.permutation() + 0.9 / 900, []
     for aligned in (False, True):
         poses = drawn_poses(assignment, planted.points2d, scene, triples=2048, seed=0, aligned=aligned)
         assert poses.shape[1] == 2 * 2048 // (8 if aligned else 4) + 2
-        angle = rotation_angle(poses[..., :3], rotation.unsqueeze(1).expand_as(poses[..., :3]))
-        near.append(int((angle < 0.02).sum()) / int(angle.isfinite().sum()))
+        near.append(fraction_near(poses, rotation))
     assert near[1] > 3 * near[0]
+
+
+def test_the_triangles_that_are_solved_are_wide() -> None:
+    """Their poses are nearer to the planted one than those of all triples, with noise and true matches only."""
+    planted, scene, rotation = in_camera_axes(0.003)
+    poses = drawn_poses(planted.permutation(), planted.points2d, scene, triples=1024, seed=0)
+    triples = distinct_triples(torch.full((1, 1024), 30.0), 0)[0]
+    rays = bearings(planted.points2d[0, planted.match3d[0]])
+    solved = p3p(rays[triples], scene[0, triples])
+    every = torch.cat([solved.rotation, solved.translation[..., None]], -1).flatten(0, 1)[None]
+    assert fraction_near(poses, rotation) > fraction_near(every, rotation)
 
 
 @pytest.mark.parametrize("threshold", [0.02, 0.3])
