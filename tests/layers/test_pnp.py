@@ -134,13 +134,14 @@ def test_minimal_and_flat_scenes_have_a_pose(kind: str) -> None:
 @pytest.mark.parametrize(("radii", "near"), [(8e3, True), (1.2e4, False)])
 def test_a_camera_beyond_ten_thousand_radii_is_flagged(radii: float, near: bool) -> None:
     """Exact bearings, from the true pose."""
-    planted = plant(1, 30, seed=13)
+    planted = plant(4, 30, seed=13)
     centred = planted.points3d - planted.points3d.mean(1, keepdim=True)
-    points3d = centred / centred.square().sum(-1).mean().sqrt()
-    translation = torch.tensor([[0.0, 0.0, radii]], dtype=torch.float64)
+    points3d = centred / centred.square().sum(-1).mean(-1).sqrt()[:, None, None]
+    translation = torch.tensor([[0.0, 0.0, radii]], dtype=torch.float64).expand(4, 3)
     bearings = torch.nn.functional.normalize(transform(planted.rotation, translation, points3d), dim=-1)
-    assignment = torch.eye(30, dtype=torch.float64)[None] / 30
-    assert weighted_pnp(assignment, bearings, points3d, planted.rotation, translation)[2].converged.item() == near
+    assignment = torch.eye(30, dtype=torch.float64).expand(4, 30, 30) / 30
+    stats = weighted_pnp(assignment, bearings, points3d, planted.rotation, translation)[2]
+    assert stats.converged.tolist() == [near] * 4
 
 
 def test_an_initial_pose_behind_the_points_ends_in_front_or_is_flagged() -> None:
