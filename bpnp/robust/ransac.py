@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bpnp.geometry import bearings, masked_median, retract
+from bpnp.geometry import bearings, retract
 from bpnp.poses import MIN_POINTS
 from bpnp.robust.matches import Matches, distinct_triples, residuals, truncated_scores
 from bpnp.robust.minimal_solvers import poses_of_triples, take
@@ -35,10 +35,8 @@ def consensus(
     """Estimate the pose [R | t] of lowest truncated squared reprojection error sum_i min(r_i^2, threshold^2).
 
     Triples come from a pool of the most probable matches that grows to all matches (PROSAC; Chum, Matas, CVPR 2005).
-    `p3p` solves each, all poses are scored (MSAC; a point behind the camera is an outlier), and the best are refined. A
-    last fit uses Cauchy's loss with a scale of four times the median squared residual of the inliers (95 % efficient
-    for normal noise). It reduces the influence of wrong matches below the threshold. Only the scores are computed in
-    float32.
+    `p3p` solves each, all poses are scored (MSAC; a point behind the camera is an outlier), and the best are refined.
+    Only the scores are computed in float32.
 
     Args:
         matches: Matches of `bpnp.robust.matches.normalise_matches`, most probable first. A point may be in many of
@@ -67,9 +65,6 @@ def consensus(
     poses = refine_locally(poses, subset, threshold2, RANSAC.local_steps)
     pose = _best(poses, truncated_scores(poses, matches, threshold2), 1)
     pose = refine_locally(pose, matches, threshold2, RANSAC.final_steps)
-    squared, inlier, *_ = residuals(pose, matches, threshold2)
-    median = masked_median(squared, inlier).nan_to_num(threshold2)
-    pose = refine_locally(pose, matches, threshold2, RANSAC.final_steps, cauchy=4 * median)
     return pose.squeeze(1), matches.real.sum(-1).fill_(hypotheses)
 
 
@@ -79,45 +74,33 @@ def _best(poses: Float[Tensor, "b c 3 4"], score: Float[Tensor, "b c"], size: in
 
 
 def refine_locally(
-    poses: Float[Tensor, "b c 3 4"],
-    matches: Matches,
-    threshold2: float,
-    steps: int,
-    *,
-    cauchy: Float[Tensor, "b c"] | None = None,
+    poses: Float[Tensor, "b c 3 4"], matches: Matches, threshold2: float, steps: int
 ) -> Float[Tensor, "b c 3 4"]:
-    """Reduce sum_i min(r_i^2, threshold2), or with Cauchy's loss sum_i min(s log(1 + r_i^2 / s), s log(1 + t / s)).
+    """Reduce sum_i min(r_i^2, threshold2) by Gauss-Newton steps on the inliers of the current pose.
 
-    Each step is a Gauss-Newton step on the inliers of the current pose, weighted by the derivative of the loss in r^2.
     Poses are refined independently.
 
     Args:
         poses: (b, c, 3, 4) initial poses [R | t].
         matches: Candidate matches.
-        threshold2: Squared reprojection error t of an inlier.
+        threshold2: Largest squared reprojection error of an inlier.
         steps: Number of steps.
-        cauchy: (b, c) scale s, squared residual units; None for the squared error.
 
     Returns:
         The best pose visited, which may be the initial one.
     """
-    scale = None if cauchy is None else cauchy.clamp(min=1e-24).unsqueeze(-1)
     best = poses
     lowest = torch.full(poses.shape[:2], torch.inf, dtype=poses.dtype, device=poses.device)
     damping = RANSAC.damping * torch.eye(6, dtype=poses.dtype, device=poses.device)
     for _ in range(steps + 1):
         squared, inlier, residual, camera = residuals(poses, matches, threshold2)
-        loss, weight = torch.where(inlier, squared, threshold2), inlier.to(squared.dtype)
-        if scale is not None:
-            loss, weight = scale * (loss / scale).log1p(), weight / (1 + loss / scale)
-        score = loss.mul(matches.real.unsqueeze(1)).sum(-1)
+        score = torch.where(inlier, squared, threshold2).mul(matches.real.unsqueeze(1)).sum(-1)
         better = score < lowest
         best, lowest = torch.where(better[..., None, None], poses, best), torch.where(better, score, lowest)
         jacobian = _jacobian(camera, camera - poses[..., None, :, 3], inlier)
         residual = torch.where(inlier.unsqueeze(-1), residual, 0)
-        weighted = jacobian * weight.repeat(1, 1, 2).unsqueeze(-2)
-        hessian = weighted @ jacobian.mT
-        gradient = weighted @ residual.mT.flatten(-2).unsqueeze(-1)
+        hessian = jacobian @ jacobian.mT
+        gradient = jacobian @ residual.mT.flatten(-2).unsqueeze(-1)
         hessian = hessian + damping * (1e-9 + hessian.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None])
         step = -torch.cholesky_solve(gradient, torch.linalg.cholesky_ex(hessian).L).squeeze(-1)
         rotation, translation = retract(step, poses[..., :3], poses[..., 3])
