@@ -19,6 +19,7 @@ from bpnp.maps.scene_map import SceneMap
 from bpnp.report.templates import render_page
 from bpnp.report.terminal import VERDICTS, number
 from bpnp.search.config import DRAWING, TIME
+from bpnp.search.verdict.decide import fits_by_chance
 
 UNTESTED = "untested"
 MATCHED_ONLY = "Significant on the matched keypoints alone, log10 NFA {0:.1f}, but not on all {2} keypoints, {1:.1f}"
@@ -91,7 +92,7 @@ def verify_map(
         image = images[view.name]
         usable = np.isfinite(image.keypoints).all(-1)
         one = _verify_view(scene, view.name, np.unique(image.keypoints[usable], axis=0), seed, time_limit)
-        if one.verdict == "failed" and one.log10_false_alarms > 0:
+        if one.verdict == "failed" and fits_by_chance(one.log10_false_alarms):
             matched = np.unique(image.keypoints[usable & (image.point_ids >= 0)], axis=0)
             again = _verify_view(scene, view.name, matched, seed, time_limit)
             if again.verdict != "failed":

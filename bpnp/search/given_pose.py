@@ -31,7 +31,7 @@ from bpnp.search.refine.annealing import anneal_on_points, anneal_to_end, finish
 from bpnp.search.search_frame import Scene
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict.competitors import distance_between
-from bpnp.search.verdict.decide import SearchResult, Verdict, add_false_alarms, judge
+from bpnp.search.verdict.decide import SearchResult, Verdict, add_false_alarms, fits_by_chance, judge
 from bpnp.search.verdict.false_alarms import likeliest_scale
 from bpnp.search.verdict.reasons import objection
 from bpnp.search.verdict.uncertainty import linearised, local_covariance
@@ -89,7 +89,7 @@ def judge_given_pose(
         near = replace(problem, prior=prior).log10_prior_fraction(optimum.rotation[0], optimum.translation[0])
         one = replace(problem, log10_tried=max(PoseModel.of(problem).log10_tests([problem]) + near, 0.0))
         claim = optimum
-    competing = others[~same & (others.log10_false_alarms <= 0)]  # insignificant poses do not compete
+    competing = others[~same & (others.log10_false_alarms < 0)]  # insignificant poses do not compete
     candidates = _with_new_false_alarms(Hypotheses.concatenate([claim, competing]), one)
     result = judge(candidates, one, batches=0, exhaustive=True, settings=settings)
     result = judge_with_competitors(result, one, lambda: scene, settings, exhaustive=True, enumerated=few)
@@ -166,7 +166,7 @@ def _of_claim(result: SearchResult, claim: Hypotheses, problem: Problem) -> Sear
     place = int(np.flatnonzero((candidates.translation == claim.translation[0]).all(-1))[0])
     ordered = replace(result, candidates=candidates[np.r_[place, np.delete(np.arange(len(candidates)), place)]])
     alarms = float(claim.log10_false_alarms[0])
-    if alarms >= 0:  # exactly 0 if the camera sees no more points than fix a pose
+    if fits_by_chance(alarms):
         return ordered.add_objection(objection("chance", what="the pose fits no"), "failed")
     if place:
         rotations = np.concatenate([claim.rotation, candidates.rotation[:1]])

@@ -192,7 +192,7 @@ class Plan:
         while True:
             if (step := self._next_in_surroundings()) is not None:
                 return step
-            unaided = self.rounds > self.pool.scene.settings.schedule.unaided and self.pool.alarms > 0
+            unaided = self.rounds > self.pool.scene.settings.schedule.unaided and self.pool.alarms >= 0
             if unaided and self.proposals is not None:
                 return self._and_surroundings(Step(self._take_proposals()))
             self.rounds += 1

@@ -27,7 +27,7 @@ from bpnp.search.propose.symmetries import self_motions
 from bpnp.search.refine.annealing import run_batch
 from bpnp.search.search_frame import Scene, degenerate
 from bpnp.search.starts import Prior
-from bpnp.search.verdict.decide import SearchResult, degenerate_points, judge, no_pose
+from bpnp.search.verdict.decide import SearchResult, degenerate_points, fits_by_chance, judge, no_pose
 
 
 @one_blas_thread
@@ -93,12 +93,13 @@ def search_poses(
     if not only_proposals and is_enumerable(problem) and not deadline.passed():
         poses = EnumeratedPoses(problem, scene_of, settings)
         enumerated = run(EnumerationPlan(poses, deadline), poses, most=1, deadline=NEVER)
-        if matches is not None and enumerated.log10_false_alarms > 0:  # residuals may exceed its match radius
+        by_chance = fits_by_chance(enumerated.log10_false_alarms)
+        if matches is not None and by_chance:  # residuals may exceed its match radius
             return _of_known_matches(problem, *matches, scene_of, seed, settings)
         tell(0)
         # More search helps only if no pose is significant yet, and there are enough points to anneal.
         small = min(len(problem.bearings), len(problem.points3d)) < settings.least_annealed
-        settled = poses.is_exhausted or enumerated.log10_false_alarms <= 0
+        settled = poses.is_exhausted or not by_chance
         if enumerated.verdict == "confident" or small or (settled and not many):
             return enumerated
     if degenerate(problem.bearings) or degenerate(problem.points3d):

@@ -198,3 +198,15 @@ def test_a_pose_is_not_confident_if_there_was_no_time_to_refine_its_competing_po
     assert (in_time.verdict, in_time.code) == ("confident", "confident")
     assert (late.verdict, late.code) == ("ambiguous", "untested")
     assert late.reason.startswith("There was no time to test its competing poses")
+
+
+def test_a_pose_that_sees_no_more_points_than_fix_it_fails() -> None:
+    """Three points fit some pose exactly. As the only pose that was tested, it has an NFA of exactly 1."""
+    points = np.random.default_rng(4).uniform(-1, 1, (12, 3))
+    away = points + SHIFT
+    normals = away / np.linalg.norm(away, axis=1, keepdims=True)
+    normals[:3] *= -1  # only these face the camera
+    problem = Problem(directions(away), points, normals3d=normals, log10_tried=0.0)
+    result = verdict_on(problem, np.eye(3)[None], SHIFT[None], 1e-3, 0.25)
+    assert result.log10_false_alarms == 0
+    assert (result.verdict, result.code) == ("failed", "chance")

@@ -44,7 +44,7 @@ from bpnp.search.pose_model import FIXING_ROTATION
 from bpnp.search.problem import Problem
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import reasons
-from bpnp.search.verdict.decide import SearchResult, no_pose
+from bpnp.search.verdict.decide import SearchResult, fits_by_chance, no_pose
 from bpnp.search.verdict.reasons import CONFIDENT, objection
 
 NO_LABELS = np.empty(0, np.int64)
@@ -478,7 +478,7 @@ def _merge(found: Hypotheses, new: Hypotheses, sight: Sight) -> Hypotheses:
         return found
     every = Hypotheses.concatenate([found[~alike], new]) if len(found) else new
     every = every[np.argsort(every.log10_false_alarms, kind="stable")]
-    return every[(every.log10_false_alarms <= 0) | (np.arange(len(every)) == 0)][: DEFAULT.kept]
+    return every[(every.log10_false_alarms < 0) | (np.arange(len(every)) == 0)][: DEFAULT.kept]
 
 
 def _shift_between_parts(found: Hypotheses, sight: Sight) -> float:
@@ -515,7 +515,7 @@ def _judge(found: Hypotheses, sight: Sight, iterations: int) -> SearchResult:
         return no_pose("no rotation was found", iterations)
     alarms = float(found.log10_false_alarms[0])
     result = SearchResult(found, "confident", "", iterations, CONFIDENT)
-    if alarms > 0:
+    if fits_by_chance(alarms):
         return result.add_objection(objection("chance", what="no rotation fits"), "failed")
     if alarms > verdict_settings.false_alarms:
         return result.as_insignificant(verdict_settings.false_alarms)

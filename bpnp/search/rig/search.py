@@ -32,7 +32,7 @@ from bpnp.search.rig.cameras import Array, Pose, Rig
 from bpnp.search.search import lacks_partners
 from bpnp.search.search_frame import Scene
 from bpnp.search.verdict.competitors import distance_between
-from bpnp.search.verdict.decide import SearchResult, is_object, judge, match_count, missed, no_pose
+from bpnp.search.verdict.decide import SearchResult, fits_by_chance, is_object, judge, match_count, missed, no_pose
 from bpnp.search.verdict.false_alarms import alarms_of
 from bpnp.search.verdict.reasons import Objection, focal_length_not_fixed, objection
 from bpnp.search.verdict.uncertainty import linearised, share_bound
@@ -289,7 +289,7 @@ class RigPoses:
     def _other_extrinsics(self) -> Objection | None:
         """Return an objection if one camera contradicts the best pose, else None.
 
-        The best pose fits the points of this camera no better than chance (log10 NFA above 0). A pose that the camera
+        The best pose fits the points of this camera no better than chance (an NFA of at least 1). A pose that the camera
         proposed is significant, and its log10 NFA lower by the margin of a competing pose, at the same scale of the
         residuals. Wrong extrinsics are the likely cause.
         """
@@ -297,7 +297,7 @@ class RigPoses:
         for k, found in enumerate(self.found):
             seen = self.rig.seen(k, self.best[:1])
             here = float(self._alarms_alone(k, seen)[0])
-            if here <= 0 or not len(found):
+            if not fits_by_chance(here) or not len(found):
                 continue
             own = self._alarms_alone(k, found[: RIG.refined])  # those of an enumeration begin with the likeliest
             if own.min() <= min(settings.false_alarms, here - settings.margin):

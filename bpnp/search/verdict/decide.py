@@ -6,7 +6,7 @@ that fit as well if image and scene are unrelated.
 - "confident": log10 NFA is at most `Evidence.false_alarms`. The margin to every competing pose is at least
   `Evidence.margin` decades. log10 of the probability that the search missed a better optimum is at most
   `Evidence.missed` (`bpnp.search.verdict.completeness`).
-- "ambiguous": The best pose fits better than chance (log10 NFA at most 0), but one of the three conditions does not
+- "ambiguous": The best pose fits better than chance (log10 NFA below 0), but one of the three conditions does not
   hold. Points that do not fix the rotation or the focal length give this verdict too.
 - "failed": No pose was found, or none fits better than chance.
 """
@@ -90,6 +90,14 @@ class SearchResult:
         return float(self.candidates.log10_false_alarms[0]) if len(self.candidates) else math.inf
 
 
+def fits_by_chance(log10_false_alarms: float) -> bool:
+    """Return True if a pose fits no better than chance: its NFA is at least 1.
+
+    It is exactly 1 for a single tested pose that sees no more points than fix it.
+    """
+    return log10_false_alarms >= 0
+
+
 def add_false_alarms(candidates: Hypotheses, problem: Problem) -> Hypotheses:
     """Compute the NFA of the candidates that lack it.
 
@@ -162,7 +170,7 @@ def missed(
         matches of a wrong pose are not independent coincidences. Only basin counts reduce the value then.
     """
     alarms = float(candidates.log10_false_alarms[0]) if len(candidates) else math.inf
-    if alarms > 0:
+    if fits_by_chance(alarms):
         return 0.0
     decades = -alarms / max(distinct * match_count(candidates), 1.0) if independent else 0.0
     basin_count = count_starts(candidates, problem, settings)
@@ -272,7 +280,7 @@ def judge(
     alarms = float(candidates.log10_false_alarms[0])
     settled = exhaustive or missed(candidates, problem, local_searches, settings, independent=False) <= settings.missed
     result = SearchResult(candidates, "confident", "", batches, CONFIDENT, settled)
-    if alarms > 0:
+    if fits_by_chance(alarms):
         return result.add_objection(objection("chance", what="no pose fits"), "failed")
     unseen = -math.inf if exhaustive else missed(candidates, problem, local_searches, settings, distinct=distinct)
     # Costly tests run only if the verdict depends on them.
