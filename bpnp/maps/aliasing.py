@@ -183,7 +183,7 @@ def _scale_of(problem: Problem, solution: Solution) -> float:
 
 def _candidate(problem: Problem, solution: Solution, pose: Hypotheses, margin: float) -> Candidate:
     """Return a competing pose (1,) as a candidate in the user's frame."""
-    seen = problem.project_scene(pose.rotation[0], pose.translation[0])
+    seen = problem.project_scene(*pose.pose())
     inliers = count_one_to_one(problem.image_points, seen, solution.inlier_threshold)
     rotation, translation = problem.to_user(pose.rotation, pose.translation)
     alarms = np.array([solution.log10_false_alarms + margin])
@@ -224,7 +224,7 @@ def _find_poses_in(regions: Iterable[Region], photo: Photo, problem: Problem, so
             start = Hypotheses.from_poses(*scene.enter(found.rotation, found.translation))
             local = _likeliest(finish(scene, search_around(scene, start, DEFAULT.local)), scene, near)
             for one in (found, local):
-                yield problem.from_user(*near.to_user(one.rotation[0], one.translation[0]))
+                yield problem.from_user(*near.to_user(*one.pose()))
 
 
 def _likeliest(poses: Hypotheses, scene: Scene, problem: Problem) -> Hypotheses:

@@ -76,7 +76,7 @@ def refine_on_all_points(solution: Solution, photo: Photo, whole: Region) -> Ref
         camera = camera.seen_by(problem_at(camera.reference))
         fitted = fit_camera(problem_at, camera, found, pose, scale, photo.seed, AROUND)
         problem, poses = fitted.problem, fitted.poses
-        rotation, shift = poses.rotation[0], poses.translation[0]
+        rotation, shift = poses.pose()
     else:
         problem = problem_at(camera)
         rotation, shift = problem.from_user(*pose)
@@ -120,7 +120,7 @@ def judge_on_all_points(solution: Solution, refined: Refined | None) -> Solution
     rotations, shifts = (np.stack(both) for both in zip(refined.pose, result.best, strict=True))
     behind = result.log10_false_alarms - solution.log10_false_alarms
     if confident and not problem.same_pose(rotations, shifts, settings.same)[1]:
-        other = competing_pose(problem, rotations, shifts, behind)
+        other = competing_pose(problem, refined.pose, result.best, behind)
         return solution if behind >= settings.margin else add_objection(solution, other)
     if behind < 0 or (not confident and result.verdict == "confident"):
         found = finished(problem, result, solution.seconds, None)

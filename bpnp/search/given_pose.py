@@ -86,7 +86,7 @@ def judge_given_pose(
         prior = PosePrior(
             rotation, translation, math.degrees(scale) / PROBLEM.sigmas, scale * distance / PROBLEM.sigmas
         )
-        near = replace(problem, prior=prior).log10_prior_fraction(optimum.rotation[0], optimum.translation[0])
+        near = replace(problem, prior=prior).log10_prior_fraction(*optimum.pose())
         one = replace(problem, log10_tried=max(PoseModel.of(problem).log10_tests([problem]) + near, 0.0))
         claim = optimum
     competing = others[~same & (others.log10_false_alarms < 0)]  # insignificant poses do not compete
@@ -112,7 +112,7 @@ def _proposed(problem: Problem, claim: Hypotheses, scene: Scene) -> Hypotheses:
     start = to_scene_frame(claim, scene)
     wide = scene.settings.middle[-1].last_scale * scene.spread
     bulk = problem.points3d[in_bulk(problem.points3d)]
-    mirrored = mirror_pose(bulk, claim.rotation[0], claim.translation[0])
+    mirrored = mirror_pose(bulk, *claim.pose())
     starts = [start, perturb_each(scene, start)]
     if mirrored is not None:
         starts.append(to_scene_frame(Hypotheses.from_poses(mirrored[0][None], mirrored[1][None]), scene))
@@ -150,7 +150,7 @@ def _is_same(problem: Problem, claim: Hypotheses, pose: Hypotheses, settings: Ev
     turn = claim.rotation[0] @ pose.rotation[0].T
     if pose.log10_false_alarms[0] > settings.false_alarms or np.trace(turn) <= 1:  # over 90 degrees away
         return False
-    linear = linearised(problem, pose.rotation[0], pose.translation[0], float(pose.scale[0]))
+    linear = linearised(problem, *pose.pose(), float(pose.scale[0]))
     covariance = local_covariance(linear)
     if covariance is None:
         return False
@@ -169,9 +169,7 @@ def _of_claim(result: SearchResult, claim: Hypotheses, problem: Problem) -> Sear
     if fits_by_chance(alarms):
         return ordered.add_objection(objection("chance", what="the pose fits no"), "failed")
     if place:
-        rotations = np.concatenate([claim.rotation, candidates.rotation[:1]])
-        translations = np.concatenate([claim.translation, candidates.translation[:1]])
-        away = distance_between(problem, rotations, translations)
+        away = distance_between(problem, claim.pose(), candidates.pose())
         margin = alarms - float(candidates.log10_false_alarms[0])
         refuted = result.verdict == "confident"  # the other pose is confident and refutes the given one
         verdict: Verdict = "failed" if refuted else "ambiguous"

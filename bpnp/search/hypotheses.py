@@ -87,6 +87,10 @@ class Hypotheses:
         unknown = np.full(len(self), math.nan)
         return replace(self, log10_false_alarms=unknown, log10_rough=unknown)
 
+    def pose(self, k: int = 0) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return rotation (3, 3) and translation (3,) of hypothesis k, default the first."""
+        return self.rotation[k], self.translation[k]
+
     def __len__(self) -> int:
         return len(self.rotation)
 

@@ -76,7 +76,7 @@ class EnumeratedPoses:
         """Refine the competing poses of the best pose, and return all poses."""
         leader = self.found[:1]
         self._leaders.append(leader)
-        pose, verdict_settings = (leader.rotation[0], leader.translation[0]), self.settings.evidence
+        pose, verdict_settings = leader.pose(), self.settings.evidence
         scale = max(float(leader.scale[0]), self.problem.floor or ENUMERATION.smallest_scale)
         rotations, translations, *_ = competing_poses(self.problem, *pose, scale, verdict_settings)
         rest = self._poses_of_rest(leader)

@@ -250,7 +250,7 @@ class RigPoses:
         result = self._judge()
         if result.verdict == "confident":
             strongest, seen = self._strongest()
-            pose_and_scale = seen.rotation[0], seen.translation[0], float(seen.scale[0])
+            pose_and_scale = *seen.pose(), float(seen.scale[0])
             repeated, sizes, _ = repeated_poses(self.rig.problems[strongest], *pose_and_scale, self.verdict_settings)
             unit = self.best.translation[0, 3]
             if self.rig.model.scale:  # a copy of another size looks the same if the rig is larger as well
@@ -262,7 +262,7 @@ class RigPoses:
             result = result.add_objection(other)
         if result.verdict == "confident" and self.rig.model.lens is None:
             strongest, seen = self._strongest()
-            pose = seen.rotation[0], seen.translation[0], float(seen.scale[0])
+            pose = *seen.pose(), float(seen.scale[0])
             linear = linearised(self.rig.problems[strongest], *pose)
             other = fitted_lens(linear, match_count(seen), self.verdict_settings)
             result = result if other is None else result.add_objection(other)
@@ -289,7 +289,7 @@ class RigPoses:
     def _other_extrinsics(self) -> Objection | None:
         """Return an objection if one camera contradicts the best pose, else None.
 
-        The best pose fits the points of this camera no better than chance (an NFA of at least 1). A pose that the camera
+        The best pose fits the points of this camera no better than chance (NFA at least 1). A pose that the camera
         proposed is significant, and its log10 NFA lower by the margin of a competing pose, at the same scale of the
         residuals. Wrong extrinsics are the likely cause.
         """
@@ -301,10 +301,7 @@ class RigPoses:
                 continue
             own = self._alarms_alone(k, found[: RIG.refined])  # those of an enumeration begin with the likeliest
             if own.min() <= min(settings.false_alarms, here - settings.margin):
-                best = int(own.argmin())
-                rotations = np.stack([seen.rotation[0], found.rotation[best]])
-                translations = np.stack([seen.translation[0], found.translation[best]])
-                away = distance_between(self.rig.problems[k], rotations, translations)
+                away = distance_between(self.rig.problems[k], seen.pose(), found.pose(int(own.argmin())))
                 return objection("other_extrinsics", camera=k, away=away)
         return None
 

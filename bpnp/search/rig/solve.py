@@ -199,7 +199,7 @@ def _finished(rig: Rig, problems: Sequence[Problem], result: SearchResult, inlie
     )
     if not len(found):
         return solution
-    rotation, translation = found.rotation[0], found.translation[0]
+    rotation, translation = found.pose()
     matches, errors, angles, count = [], [], [], 0
     counts = np.zeros(len(found), np.int64)  # inliers of each pose in all cameras
     for k, problem in enumerate(problems):

@@ -22,6 +22,7 @@ from bpnp.search.verdict.reasons import Objection, objection
 from bpnp.search.verdict.uncertainty import Misfit
 
 Array = NDArray[np.float64]
+Pose = tuple[Array, Array]
 CandidatesOfCameras = Sequence[tuple[Hypotheses, Problem]]
 
 
@@ -39,37 +40,37 @@ def other_pose(candidates: Hypotheses, problem: Problem, settings: Evidence) -> 
         return None
     k = int(others[np.argmin(candidates.log10_false_alarms[others])])
     decades = float(candidates.log10_false_alarms[k] - candidates.log10_false_alarms[0])
-    return competing_pose(problem, candidates.rotation[[0, k]], candidates.translation[[0, k]], decades)
+    return competing_pose(problem, candidates.pose(), candidates.pose(k), decades)
 
 
-def competing_pose(problem: Problem, rotations: Array, translations: Array, decades: float) -> Objection:
+def competing_pose(problem: Problem, best: Pose, other: Pose, decades: float) -> Objection:
     """Return a different pose as an objection.
 
     Args:
         problem: Points of the problem.
-        rotations: (2, 3, 3) of the best pose and of the competing pose.
-        translations: (2, 3) of both, in the frame of the problem.
+        best: Rotation (3, 3) and translation (3,) of the best pose, in the frame of the problem.
+        other: Likewise of the competing pose.
         decades: log10 of the ratio of their false alarms.
     """
-    return objection("competing_pose", decades, away=distance_between(problem, rotations, translations))
+    return objection("competing_pose", decades, away=distance_between(problem, best, other))
 
 
-def distance_between(problem: Problem, rotations: Array, translations: Array) -> str:
+def distance_between(problem: Problem, first: Pose, second: Pose) -> str:
     """Return the angle between two poses in words, or for equal rotations the shift of the scene centroid.
 
     Args:
         problem: Points of the problem.
-        rotations: (2, 3, 3) of the poses.
-        translations: (2, 3) of the poses, in the frame of the problem.
+        first: Rotation (3, 3) and translation (3,) of a pose, in the frame of the problem.
+        second: Likewise of the other pose.
 
     Returns:
         Such as "12 deg" or "15 % of the distance", that of the scene centroid from the camera of the first pose.
     """
-    degrees = math.degrees(rotation_angle(rotations[0], rotations[1]))
+    degrees = math.degrees(rotation_angle(first[0], second[0]))
     if degrees >= REASONS.degrees:
         return f"{degrees:.0f} deg"
-    centres = rotations @ problem.centre3d + translations
-    shift = float(np.linalg.norm(centres[1] - centres[0]) / max(float(np.linalg.norm(centres[0])), 1e-300))
+    centre, moved = (rotation @ problem.centre3d + translation for rotation, translation in (first, second))
+    shift = float(np.linalg.norm(moved - centre) / max(float(np.linalg.norm(centre)), 1e-300))
     return f"{100 * shift:.0f} % of the distance"
 
 
@@ -118,8 +119,8 @@ def unrelated_competitor(cameras: CandidatesOfCameras, settings: Evidence) -> Ob
     if not len(weaker):
         return None
     k, (candidates, problem) = int(weaker[0]), cameras[0]
-    two = candidates.rotation[[0, k]], candidates.translation[[0, k]]
-    return objection("other_points", max(float(margins[k]), 0.0), away=distance_between(problem, *two))
+    away = distance_between(problem, candidates.pose(), candidates.pose(k))
+    return objection("other_points", max(float(margins[k]), 0.0), away=away)
 
 
 def sign_margins(cameras: CandidatesOfCameras, settings: Evidence) -> Array:
@@ -204,7 +205,7 @@ def _explained(cameras: CandidatesOfCameras, k: int, scale: float, near: float) 
         scale: Scale of the residuals, radians.
         near: Reach of a correspondence, in scales.
     """
-    poses = [(problem, candidates.rotation[k], candidates.translation[k], scale) for candidates, problem in cameras]
+    poses = [(problem, *candidates.pose(k), scale) for candidates, problem in cameras]
     parts = zip(*(_partners(near, *pose) for pose in poses), strict=True)
     return np.concatenate([own_evidence(*pose) for pose in poses]), _Partners(*map(np.concatenate, parts))
 

@@ -77,7 +77,7 @@ class SearchResult:
         """Rotation (3, 3) and translation (3,) of the best pose; NaN if there is none."""
         if not len(self.candidates):
             return np.full((3, 3), math.nan), np.full(3, math.nan)
-        return self.candidates.rotation[0], self.candidates.translation[0]
+        return self.candidates.pose()
 
     @property
     def residual(self) -> float:
@@ -182,11 +182,11 @@ def missed(
         return value
     basin_count = count_starts(candidates, problem, settings, symmetric=True)
     # A prior reduces the probability of a better pose elsewhere.
-    fraction = problem.log10_prior_fraction(candidates.rotation[0], candidates.translation[0])
+    fraction = problem.log10_prior_fraction(*candidates.pose())
     return min(log10_missed(basin_count, 0.0, local_searches, settings, symmetric=True) + fraction, 0.0)
 
 
-def motions_of(candidates: Hypotheses, problem: Problem, settings: Evidence) -> Motions:
+def cached_motions(candidates: Hypotheses, problem: Problem, settings: Evidence) -> Motions:
     """Return the motions that map the matched points of the first candidate onto other scene points.
 
     The result is stored in `Problem.registered` and reused for equal poses.
@@ -208,7 +208,7 @@ def is_symmetric(candidates: Hypotheses, problem: Problem, settings: Evidence) -
     The motion could by itself explain a better pose. The fraction is compared with `Evidence.repetitions`. Motions of
     another scale could not if there is a baseline.
     """
-    motions = motions_of(candidates, problem, settings)
+    motions = cached_motions(candidates, problem, settings)
     fraction = motions.fraction[motions.scale == 1] if problem.baseline else motions.fraction
     return float(fraction.max(initial=0)) >= settings.repetitions.symmetric
 
@@ -220,7 +220,7 @@ def independent_matches(candidates: Hypotheses, problem: Problem, settings: Evid
     matches, one of the other points fixes the rotation about the line, and only the rest are coincidences.
     """
     scale = max(float(candidates.scale[0]), float(problem.image.scales[0]))
-    points = problem.points3d[matched_points(problem, candidates.rotation[0], candidates.translation[0], scale)]
+    points = problem.points3d[matched_points(problem, *candidates.pose(), scale)]
     line = find_line(points)
     if line is None:
         return settings.independent
@@ -239,7 +239,7 @@ def count_starts(candidates: Hypotheses, problem: Problem, settings: Evidence, *
     """
     first = candidates.rotation[:1], candidates.translation[:1]
     if symmetric:
-        copies = motions_of(candidates, problem, settings).competitors(first[0][0], first[1][0])
+        copies = cached_motions(candidates, problem, settings).competitors(first[0][0], first[1][0])
         first = np.concatenate([first[0], copies[0]]), np.concatenate([first[1], copies[1]])
     counted = np.zeros(len(candidates), bool)
     for rotation, translation in zip(*first, strict=True):
@@ -290,7 +290,7 @@ def judge(
     off = share = math.nan
     if certain and all(one is None or one.margin >= settings.margin for one in against):
         count = match_count(candidates)
-        linear = linearised(problem, candidates.rotation[0], candidates.translation[0], float(candidates.scale[0]))
+        linear = linearised(problem, *candidates.pose(), float(candidates.scale[0]))
         turned, share = error_bounds(problem, linear, count)
         off = math.degrees(turned)
         if off >= HALF_TURN or not (rig or is_redundant(problem, count)):
