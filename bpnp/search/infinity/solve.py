@@ -298,18 +298,8 @@ def _solve(sky: Sky, options: Options, settings: InfinitySettings = INFINITY) ->
     hit = np.flatnonzero(found.matches[0] >= 0)
     residual = noise_of(rotated[0][found.matches[0, hit]], every[hit], pixel[hit])
     threshold = inlier_threshold or MATCHES.reach * residual * float(median_pixel[one] * per_radian[one])
-    pairs, counts = [], np.zeros(len(rotated), np.int64)
-    for k in np.unique(owner).tolist():
-        own = np.flatnonzero(owner == k)
-
-        def may_match(i: Any, j: Any, own: Any = own) -> Any:
-            return problem.may_match(own[i], j)
-
-        radius = threshold / float(per_radian[k])
-        i, j = one_to_one(every[own], rotated[0], radius, may_match).T
-        pairs.append(np.stack([own[i], j], -1))
-        counts += [len(i), *(count_one_to_one(every[own], each, radius, may_match) for each in rotated[1:])]
-    i, j = np.concatenate(pairs).T
+    pairs, counts = _match_in_cameras(problem, rotated, owner, threshold / per_radian)
+    i, j = pairs.T
     matches = np.stack([usable[i], j], -1)
     if sky.unknown is None:
         information = prior_information(problem)
@@ -331,6 +321,31 @@ def _solve(sky: Sky, options: Options, settings: InfinitySettings = INFINITY) ->
         covariance=np.full_like(covariance, math.nan) if result.verdict == "failed" else covariance,
     )
     return replace(solution, seconds=Clock.now() - begun)
+
+
+def _match_in_cameras(problem: Problem, rotated: Sequence[Array], owner: Labels, radii: Array) -> tuple[Labels, Labels]:
+    """Match the image points of each camera one to one to rotated directions.
+
+    Args:
+        problem: Points of the problem, bearings of all cameras.
+        rotated: Directions (n, 3) rotated by each of c rotations.
+        owner: Camera (m,) of each bearing.
+        radii: Largest angle of a match in each camera, radians.
+
+    Returns:
+        Matches (k, 2) of the first rotation, and the numbers (c,) of matches of all.
+    """
+    every, pairs, counts = problem.bearings, [], np.zeros(len(rotated), np.int64)
+    for k in np.unique(owner).tolist():
+        own, radius = np.flatnonzero(owner == k), float(radii[k])
+
+        def may_match(i: Any, j: Any, own: Any = own) -> Any:
+            return problem.may_match(own[i], j)
+
+        i, j = one_to_one(every[own], rotated[0], radius, may_match).T
+        pairs.append(np.stack([own[i], j], -1))
+        counts += [len(i), *(count_one_to_one(every[own], each, radius, may_match) for each in rotated[1:])]
+    return np.concatenate(pairs), counts
 
 
 def _bearings(image: Array, camera: Camera | None) -> tuple[Array, Array, Array]:

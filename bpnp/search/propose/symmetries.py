@@ -544,22 +544,35 @@ def _register(
                         work_done += SYMMETRIES.confirming
                         score += _on(scene, linear, shift, sample[s], 2 * near)
                     if score >= least:
-                        place = count if count < len(found.score) else -1
-                        if place < 0:
-                            place = 0
-                            for e in range(1, len(found.score)):
-                                if found.score[e] < found.score[place]:
-                                    place = e
-                            if found.score[place] >= score:
-                                place = -1
+                        _keep(found, count, score, linear, shift)
                         count += 1
-                        if place >= 0:
-                            found.score[place] = score
-                            for p in range(3):
-                                found.shift[place, p] = shift[p]
-                                for q in range(3):
-                                    found.linear[place, p, q] = linear[p, q]
     return count, complete
+
+
+@part
+def _keep(found: Any, count: int, score: int, linear: Any, shift: Any) -> None:
+    """Write a motion into a free slot of `found`, or into that of the worst motion if it is better.
+
+    Args:
+        found: A `Found`, written.
+        count: Number of motions found before.
+        score: Number of sampled points that confirm the motion.
+        linear: (3, 3) of the motion.
+        shift: (3,) of the motion.
+    """
+    slot = count
+    if count >= len(found.score):
+        slot = 0
+        for e in range(1, len(found.score)):
+            if found.score[e] < found.score[slot]:
+                slot = e
+        if found.score[slot] >= score:
+            return
+    found.score[slot] = score
+    for p in range(3):
+        found.shift[slot, p] = shift[p]
+        for q in range(3):
+            found.linear[slot, p, q] = linear[p, q]
 
 
 @part
