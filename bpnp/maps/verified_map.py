@@ -114,16 +114,16 @@ def _verify_view(
     turn = Rotation.from_matrix(solution.rotation @ view.rotation.T).magnitude() if solution.found else math.nan
     others = [tuple(one.centre.tolist()) for one in solution.candidates[1:2]] if solution.verdict != "confident" else []
     return VerifiedView(
-        name,
-        solution.verdict,
-        solution.reason,
-        len(solution.points3d),
-        len(solution.matches),
-        solution.reprojection_error,
-        solution.log10_false_alarms,
-        math.degrees(turn),
-        float(np.linalg.norm(solution.centre - view.centre)),
-        others[0] if others else None,
+        name=name,
+        verdict=solution.verdict,
+        reason=solution.reason,
+        points=len(solution.points3d),
+        matches=len(solution.matches),
+        reprojection_error=solution.reprojection_error,
+        log10_false_alarms=solution.log10_false_alarms,
+        rotation_change_deg=math.degrees(turn),
+        centre_change=float(np.linalg.norm(solution.centre - view.centre)),
+        other_centre=others[0] if others else None,
     )
 
 

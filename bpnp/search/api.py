@@ -179,7 +179,16 @@ def solve(
                 time_limit=seconds,
                 progress=progress,
             ),
-            Mode(at_infinity, rig, scale, image_size, focal_error, distortion, solver, device),
+            Mode(
+                at_infinity=at_infinity,
+                rig=rig,
+                scale=scale,
+                image_size=image_size,
+                focal_error=focal_error,
+                distortion=distortion,
+                solver=solver,
+                device=device,
+            ),
             prior,
         )
         return solve_one()
@@ -278,14 +287,14 @@ def solve_many(
     count = len(images)
     seconds = seconds_from(time_limit, TIME.of_many)
     options = Options(
-        None if at_infinity or rig is not None else source_from(solver),
-        solver == "auto",
-        positive("inlier_threshold", inlier_threshold, finite=True),
-        checked_clutter(clutter),
-        checked_seed(seed),
-        seconds,
-        device_from(device),
-        progress,
+        solver=None if at_infinity or rig is not None else source_from(solver),
+        asks=solver == "auto",
+        inlier_threshold=positive("inlier_threshold", inlier_threshold, finite=True),
+        clutter=checked_clutter(clutter),
+        seed=checked_seed(seed),
+        time_limit=seconds,
+        device=device_from(device),
+        progress=progress,
         until=Deadline(begun + seconds) if count == 1 else Deadline(),
     )
     if scale and rig is None and not at_infinity:
@@ -299,7 +308,16 @@ def solve_many(
     }
     scenes = each_set("points3d", points3d, count)
     if at_infinity or rig is not None:
-        mode = Mode(at_infinity, rig, scale, image_size, focal_error, distortion, solver, device)
+        mode = Mode(
+            at_infinity=at_infinity,
+            rig=rig,
+            scale=scale,
+            image_size=image_size,
+            focal_error=focal_error,
+            distortion=distortion,
+            solver=solver,
+            device=device,
+        )
         one_each = [camera] * count if rig is not None else each_camera(camera, count)
         ready = []
         for i, each in enumerate(each_prior(prior, count)):

@@ -85,16 +85,16 @@ class Enumeration:
         m, n, kept = len(image.arrays.rays), len(scene.arrays.points), settings.kept
         self.tables = EnumerationTables(scene.arrays, image.arrays, prior, heading, fixing, image.density)
         self.kept = Kept(
-            np.zeros((kept, 4, 3)),
-            np.full(kept, -math.inf),
-            np.zeros(kept, np.int64),
-            np.full((kept, m), -1),
-            np.zeros((kept, m)),
-            np.zeros(1, np.int64),
-            np.zeros(1),
-            np.zeros(kept, np.int64),
-            np.full(kept, -1),
-            np.zeros(1, np.int64),
+            poses=np.zeros((kept, 4, 3)),
+            evidence=np.full(kept, -math.inf),
+            counts=np.zeros(kept, np.int64),
+            point=np.full((kept, m), -1),
+            distance2=np.zeros((kept, m)),
+            best=np.zeros(1, np.int64),
+            most=np.zeros(1),
+            basin_count=np.zeros(kept, np.int64),
+            last=np.full(kept, -1),
+            at=np.zeros(1, np.int64),
         )
         self._may_match = fit_any(image.arrays.grid.labels, scene.arrays.labels)
         matches = Matches(np.empty(m, np.int64), np.empty(m))
@@ -108,7 +108,19 @@ class Enumeration:
         none = np.empty((0, fixing), np.int64)
         empty = np.zeros(m, np.int64)
         self._block = Block(
-            fixing, none, ORDERS[fixing], pairs(none), empty[:0], empty, empty, 0, 0, 0, self._witnesses, 0, 1.0
+            size=fixing,
+            sets=none,
+            orders=ORDERS[fixing],
+            triangles=pairs(none),
+            by_label=empty[:0],
+            low=empty,
+            high=empty,
+            free=0,
+            old_image=0,
+            old_scene=0,
+            witnesses=self._witnesses,
+            need=0,
+            reach=1.0,
         )
 
     @property
