@@ -117,9 +117,9 @@ def judge_on_all_points(solution: Solution, refined: Refined | None) -> Solution
 
     alone = judge(refined.poses, problem, batches=1, exhaustive=True, settings=settings)
     result = judge_with_competitors(alone, problem, lambda: refined.scene, settings, exhaustive=True)
-    rotations, shifts = (np.stack(both) for both in zip(refined.pose, result.best, strict=True))
+    rotation, translation = result.best
     behind = result.log10_false_alarms - solution.log10_false_alarms
-    if confident and not problem.same_pose(rotations, shifts, settings.same)[1]:
+    if confident and not problem.same_as(refined.pose, rotation[None], translation[None], settings.same)[0]:
         other = competing_pose(problem, refined.pose, result.best, behind)
         return solution if behind >= settings.margin else add_objection(solution, other)
     if behind < 0 or (not confident and result.verdict == "confident"):

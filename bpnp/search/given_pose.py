@@ -143,9 +143,7 @@ def _unrefined(problem: Problem, rotation: Array, translation: Array) -> Hypothe
 
 def _is_same(problem: Problem, claim: Hypotheses, pose: Hypotheses, settings: Evidence) -> bool:
     """Return whether a pose (1,) is the given one, within the tolerance or within its uncertainty."""
-    rotations = np.concatenate([claim.rotation, pose.rotation])
-    translations = np.concatenate([claim.translation, pose.translation])
-    if problem.same_pose(rotations, translations, settings.same)[1]:
+    if problem.same_as(claim.pose(), pose.rotation, pose.translation, settings.same)[0]:
         return True
     turn = claim.rotation[0] @ pose.rotation[0].T
     if pose.log10_false_alarms[0] > settings.false_alarms or np.trace(turn) <= 1:  # over 90 degrees away
@@ -155,8 +153,8 @@ def _is_same(problem: Problem, claim: Hypotheses, pose: Hypotheses, settings: Ev
     if covariance is None:
         return False
     vector = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    centres = rotations @ problem.centre3d + translations
-    step = np.r_[vector, centres[0] - centres[1]]
+    centre, other = (one.rotation[0] @ problem.centre3d + one.translation[0] for one in (claim, pose))
+    step = np.r_[vector, centre - other]
     return bool(step @ np.linalg.solve(covariance, step) < PRECISION.far)
 
 

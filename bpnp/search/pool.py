@@ -124,9 +124,8 @@ class Pool:
         if not len(leaders) or not len(self.surrounded):
             return 0
         verdict_settings, around = self.scene.settings.evidence, to_problem_frame(self.surrounded, self.scene)
-        rotation = np.concatenate([leaders.rotation[:1], around.rotation])
-        translation = np.concatenate([leaders.translation[:1], around.translation])
-        return int(self.problem.same_pose(rotation, translation, verdict_settings.same).sum()) - 1
+        same = self.problem.same_as(leaders.pose(), around.rotation, around.translation, verdict_settings.same)
+        return int(same.sum())
 
     def is_searched(self, pose: Hypotheses) -> bool:
         """Return True if the surroundings of a pose (1,), or of one equal to it, were searched before."""

@@ -323,6 +323,13 @@ class Problem:
         """Return a mask of the poses (c, 3, 3), (c, 3) that are equal to the first one."""
         return same_pose(rotation, rotation @ self.centre3d + translation, 0, tolerance)
 
+    def same_as(
+        self, pose: tuple[Array, Array], rotation: Array, translation: Array, tolerance: Tolerance = SAME
+    ) -> NDArray[np.bool_]:
+        """Return a mask of the poses (c, 3, 3), (c, 3) that are equal to a given one, (3, 3) and (3,)."""
+        rotations = np.concatenate([pose[0][None], rotation])
+        return self.same_pose(rotations, np.concatenate([pose[1][None], translation]), tolerance)[1:]
+
     @property
     def has_known_rotation(self) -> bool:
         """True if a prior has the rotation to 5 degrees: a half turn then has 10^3.5 times the false alarms."""

@@ -221,9 +221,8 @@ class RigPoses:
 
     def _as_best(self, k: int, poses: Hypotheses) -> NDArray[np.bool_]:
         """Return which poses of camera k are the same as the best pose."""
-        turn, shift = self.rig.pose_of(k, self.best.rotation[:1], self.best.translation[:1])
-        both = np.concatenate([turn, poses.rotation]), np.concatenate([shift, poses.translation])
-        return self.rig.problems[k].same_pose(*both, self.verdict_settings.same)[1:]
+        best, tolerance = self.rig.pose_of(k, *self.best.pose()), self.verdict_settings.same
+        return self.rig.problems[k].same_as(best, poses.rotation, poses.translation, tolerance)
 
     def is_significant(self) -> bool:
         """Return whether the number of false alarms of the best pose is small enough."""

@@ -191,14 +191,13 @@ def cached_motions(candidates: Hypotheses, problem: Problem, settings: Evidence)
 
     The result is stored in `Problem.registered` and reused for equal poses.
     """
-    pose = candidates.rotation[:1], candidates.translation[:1]
+    pose = candidates.pose()
     for rotation, translation, motions in problem.registered:
-        poses = np.concatenate([pose[0], rotation[None]]), np.vstack([pose[1], translation])
-        if problem.same_pose(*poses, settings.same)[1]:
+        if problem.same_as(pose, rotation[None], translation[None], settings.same)[0]:
             return motions
     scale = max(float(candidates.scale[0]), float(problem.image.scales[0]))
-    motions = registered(problem, pose[0][0], pose[1][0], scale, settings)
-    problem.registered.append((pose[0][0], pose[1][0], motions))
+    motions = registered(problem, *pose, scale, settings)
+    problem.registered.append((*pose, motions))
     return motions
 
 
@@ -243,8 +242,7 @@ def count_starts(candidates: Hypotheses, problem: Problem, settings: Evidence, *
         first = np.concatenate([first[0], copies[0]]), np.concatenate([first[1], copies[1]])
     counted = np.zeros(len(candidates), bool)
     for rotation, translation in zip(*first, strict=True):
-        poses = np.concatenate([rotation[None], candidates.rotation]), np.vstack([translation, candidates.translation])
-        counted |= problem.same_pose(*poses, settings.same)[1:]
+        counted |= problem.same_as((rotation, translation), candidates.rotation, candidates.translation, settings.same)
     return int(candidates.basin_count[counted].sum())
 
 
