@@ -1,12 +1,12 @@
 """Losses of an assignment and of a pose (paper Eqs. 11 to 15), one value per sample."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor, distributed, nn
 
 from bpnp.geometry import bearings, chords, rotation_angle
 from bpnp.types import Batch, Pose, Prediction
@@ -27,6 +27,8 @@ class Losses:
         pose: Terms of L_p by name, (b,) each; None without a pose loss.
         posed: Samples that have a pose loss (b,).
         pose_weight: gamma_p.
+        counts: Numbers of samples (2,) to divide by, with a matching loss and with a pose loss. None: those of these
+            samples.
     """
 
     matching: Float[Tensor, " b"]
@@ -34,6 +36,26 @@ class Losses:
     pose: dict[str, Float[Tensor, " b"]] | None = None
     posed: Bool[Tensor, " b"] | None = None
     pose_weight: float = 0.0
+    counts: Float[Tensor, " 2"] | None = None
+
+    def over_processes(self) -> "Losses":
+        """Divide by the mean numbers of samples of all processes, each of which has a part of the batch.
+
+        The mean of the processes' totals, and of their gradients, is then that of one process with the whole batch.
+
+        Returns:
+            The same losses with `counts`; unchanged in a single process.
+        """
+        if not (distributed.is_available() and distributed.is_initialized()):
+            return self
+        counts = self._counts().float()
+        distributed.all_reduce(counts)
+        return replace(self, counts=counts / distributed.get_world_size())
+
+    def _counts(self) -> Tensor:
+        if self.counts is not None:
+            return self.counts
+        return torch.stack([mask.sum() for mask in (self.matched, self.matched if self.posed is None else self.posed)])
 
     @property
     def total(self) -> Float[Tensor, ""]:
@@ -41,14 +63,15 @@ class Losses:
 
         NaN if no sample has a matching loss.
         """
-        total = self.matching.sum() / self.matched.sum()
+        total = self.matching.sum() / self._counts()[0]
         return total if self.pose is None else total + self.pose_weight * sum(self.pose_means().values())
 
     def pose_means(self) -> dict[str, Float[Tensor, ""]]:
         """Return the mean of each term of L_p over the samples that have one; zero if there are none."""
         if self.pose is None or self.posed is None:
             return {}
-        count = self.posed.sum().clamp_min(1)
+        count = self._counts()[1]
+        count = torch.where(count > 0, count, 1)
         return {name: values.sum() / count for name, values in self.pose.items()}
 
 

@@ -241,7 +241,7 @@ class BlindPnPTask(LightningModule):
         solve = self.solver if needs_pose else getattr(self.solver, "match", self.solver)
         prediction = solve(batch)
         with exact_products(self.device):
-            losses = self.losses(prediction, batch)
+            losses = self.losses(prediction, batch).over_processes()
             figures = self._figures(losses, prediction, batch)
         loss = losses.total
         self._log_train(loss=loss, skipped_steps=float(self.skipped_steps), **figures)

@@ -115,6 +115,27 @@ def test_a_batch_without_any_pose_has_no_pose_loss() -> None:
     assert losses.total.item() == pytest.approx(0.2)
 
 
+def test_the_mean_over_processes_is_the_loss_of_the_whole_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also its gradient, where the processes have other numbers of samples with a loss, or none."""
+    values = torch.tensor([0.3, 0.0, 0.5, 0.2, 0.9, 0.4], requires_grad=True)
+    matched = torch.tensor([True, False, True, True, True, True])
+    posed = torch.tensor([False, False, False, True, True, False])
+
+    def losses(part: slice) -> Losses:
+        kept = values[part]
+        return Losses(kept * matched[part], matched[part], {"rotation": kept**2 * posed[part]}, posed[part], 2.0)
+
+    whole = losses(slice(0, 6)).total
+    halves = [losses(slice(0, 3)), losses(slice(3, 6))]
+    numbers = sum(torch.stack([half.matched.sum(), half.posed.sum()]) for half in halves)
+    monkeypatch.setattr("torch.distributed.is_initialized", lambda: True)
+    monkeypatch.setattr("torch.distributed.get_world_size", lambda: 2)
+    monkeypatch.setattr("torch.distributed.all_reduce", lambda counts: counts.copy_(numbers))
+    mean = sum(half.over_processes().total for half in halves) / 2
+    torch.testing.assert_close(mean, whole)
+    torch.testing.assert_close(*(torch.autograd.grad(loss, values)[0] for loss in (mean, whole)))
+
+
 def test_pose_loss_is_scipys_angle_and_the_distance() -> None:
     planted = plant(50, 4)
     rotation, translation = planted.near(0.7)
