@@ -279,10 +279,6 @@ def results_json(map_content: str, photos: Mapping[str, Record]) -> str:
     return json.dumps({"map": map_content, "photos": photos}, indent=1)
 
 
-# Beginnings of the files for all photos, which no other program writes.
-BEGINNINGS = {"results.json": results_json("", {}).partition('""')[0], "poses.txt": POSES_HEADER}
-
-
 @dataclass
 class SolutionFolder:
     """Folder with solutions/<photo>.json for each photo, and results.json and poses.txt for all.
@@ -301,7 +297,9 @@ class SolutionFolder:
     records: dict[str, Record] = field(default_factory=dict)  # by photo
 
     def __post_init__(self) -> None:
-        for name, beginning in BEGINNINGS.items():
+        # Beginnings of the files for all photos, which no other program writes.
+        results_beginning, _, _ = results_json("", {}).partition('""')
+        for name, beginning in (("results.json", results_beginning), ("poses.txt", POSES_HEADER)):
             file = self.path / name
             if file.is_file() and not file.read_bytes().startswith(beginning.encode()):
                 raise ValueError(f"{file} is no result of `bpnp localize` and would be replaced; use another folder")
