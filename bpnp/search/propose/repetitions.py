@@ -12,7 +12,7 @@ from bpnp.search.config import MATCHES, Evidence, Repetitions
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem
 from bpnp.search.propose.collinear import find_line, rotations_about
-from bpnp.search.propose.symmetries import Motions, matching_tolerance, mirror_pose, self_motions
+from bpnp.search.propose.symmetries import Motions, matching_tolerance, mirror_pose, reflection, self_motions
 from bpnp.search.verdict.false_alarms import SHARES, alarms_of, directions_of, point_evidence
 
 Array = NDArray[np.float64]
@@ -184,8 +184,7 @@ def _is_far(
         return False
     camera = problem.points3d[matched] @ rotation.T + translation
     seen = camera.mean(0)
-    sight = seen / max(float(np.linalg.norm(seen)), 1e-300)
-    mirrored = camera - 2 * np.outer((camera - seen) @ sight, sight)
+    mirrored = seen + (camera - seen) @ reflection(seen)
     one, other = (x / np.maximum(np.linalg.norm(x, axis=-1, keepdims=True), 1e-300) for x in (camera, mirrored))
     near = np.linalg.norm(one - other, axis=-1) < MATCHES.reach * scale
     return float(near.mean()) >= settings.repetitions.symmetric

@@ -85,8 +85,7 @@ class Motions(NamedTuple):
             centre3d: (3,) scene point whose distance from the camera remains; the line of sight goes through it.
         """
         seen = rotation @ centre3d + translation
-        sight = seen / max(float(np.linalg.norm(seen)), 1e-300)
-        across = np.eye(3) - 2 * np.outer(sight, sight)
+        across = reflection(seen)
         rotations = across @ rotation @ self.rotation.transpose(0, 2, 1)
         return rotations, seen + across @ (translation - seen) - np.einsum("kij,kj->ki", rotations, self.shift)
 
@@ -136,6 +135,12 @@ class Motions(NamedTuple):
         return self._replace(fraction=fraction, left_out=left_out).select(order)
 
 
+def reflection(normal: Array) -> Array:
+    """Return the reflection (3, 3) in the plane through the origin across a vector (3,) of any length."""
+    axis = normal / max(float(np.linalg.norm(normal)), 1e-300)
+    return np.eye(3) - 2 * np.outer(axis, axis)
+
+
 def mirror_pose(points3d: Array, rotation: Array, translation: Array) -> tuple[Array, Array] | None:
     """Return the pose that sees a flat scene nearly the same, its normal on the other side of the line of sight.
 
@@ -152,9 +157,9 @@ def mirror_pose(points3d: Array, rotation: Array, translation: Array) -> tuple[A
     _, extents, axes = np.linalg.svd(points3d - centroid, full_matrices=False)
     if len(points3d) < 3 or extents[2] > SYMMETRIES.flat * extents[1]:
         return None
-    flipped = np.eye(3) - 2 * np.outer(axes[2], axes[2])
-    reflection = Motions(flipped[None], (centroid - flipped @ centroid)[None], np.ones(1), np.ones(1), 0.0)
-    rotations, translations = reflection.mirror_images(rotation, translation, centroid)
+    flipped = reflection(axes[2])
+    motions = Motions(flipped[None], (centroid - flipped @ centroid)[None], np.ones(1), np.ones(1), 0.0)
+    rotations, translations = motions.mirror_images(rotation, translation, centroid)
     return rotations[0], translations[0]
 
 

@@ -138,8 +138,8 @@ def sign_margins(cameras: CandidatesOfCameras, settings: Evidence) -> Array:
     A pose is compared by its false alarms alone if half of its correspondences coincide with those of the first pose.
     It is then that pose, its mirror image, or a repetition of it. Of a mirror image from afar, they coincide up to the
     order of their depths. The exception is a pose that explains other points as well, at least half as many as it
-    leaves unexplained: both poses then slide along a curve, or see two places of which the scene lacks different
-    points.
+    leaves unexplained: both poses then slide along a curve, or see two places, and the scene lacks other points of
+    each.
 
     Args:
         cameras: Candidates, best first, and points of each camera of a rig; cameras with too few points are left out.
