@@ -39,7 +39,7 @@ class Losses:
     counts: Float[Tensor, " 2"] | None = None
 
     def over_processes(self) -> "Losses":
-        """Divide by the mean numbers of samples of all processes, each of which has a part of the batch.
+        """Divide by the mean numbers of samples of all processes; each has a part of the batch.
 
         The mean of the processes' totals, and of their gradients, is then that of one process with the whole batch.
 
@@ -63,8 +63,13 @@ class Losses:
 
         NaN if no sample has a matching loss.
         """
-        total = self.matching.sum() / self._counts()[0]
+        total = self.matching_mean
         return total if self.pose is None else total + self.pose_weight * sum(self.pose_means().values())
+
+    @property
+    def matching_mean(self) -> Float[Tensor, ""]:
+        """Mean of L_c over the samples that have one; NaN if there are none."""
+        return self.matching.sum() / self._counts()[0]
 
     def pose_means(self) -> dict[str, Float[Tensor, ""]]:
         """Return the mean of each term of L_p over the samples that have one; zero if there are none."""

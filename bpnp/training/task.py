@@ -535,7 +535,7 @@ class BlindPnPTask(LightningModule):
         if correspondence is not None:
             figures["correspondence_loss"] = correspondence.detach().mean()
         if self.loss is not None or self.matching_loss != "correspondence":
-            figures["matching_loss"] = losses.matching.sum() / losses.matched.sum()
+            figures["matching_loss"] = losses.matching_mean
             figures["left_out"] = 1 - losses.matched.float().mean()
         if losses.pose is not None and losses.posed is not None:
             figures["without_pose"] = 1 - losses.posed.float().mean()

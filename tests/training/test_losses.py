@@ -133,6 +133,8 @@ def test_the_mean_over_processes_is_the_loss_of_the_whole_batch(monkeypatch: pyt
     monkeypatch.setattr("torch.distributed.all_reduce", lambda counts: counts.copy_(numbers))
     mean = sum(half.over_processes().total for half in halves) / 2
     torch.testing.assert_close(mean, whole)
+    means = [half.over_processes().matching_mean for half in halves]
+    torch.testing.assert_close(sum(means) / 2, losses(slice(0, 6)).matching_mean)
     torch.testing.assert_close(*(torch.autograd.grad(loss, values)[0] for loss in (mean, whole)))
 
 
