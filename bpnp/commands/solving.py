@@ -98,10 +98,9 @@ def solve(
     if photo is not None and (picture is None or camera is None):
         raise ValueError("--photo needs --picture and --camera")
     if picture is not None:
-        from bpnp.report.images import SUFFIXES, read_photo, save_figure, size_in_camera
+        from bpnp.report.images import check_picture_name, read_photo, save_figure, size_in_camera
 
-        if picture.suffix.lower() not in SUFFIXES:
-            raise ValueError(f"--picture {picture.name!r} has to end in {', '.join(SUFFIXES)}")
+        check_picture_name(picture, "--picture")
     image_points, scene_points, annotations = _read_sides(points2d, points3d, surface, seed)
     lens = None if camera is None else read_camera(camera, image)
     size = None if image_size is None else _size(image_size)

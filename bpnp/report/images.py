@@ -37,10 +37,10 @@ def save_figure(figure: "Figure", path: Path | str, *, dpi: int = 110) -> Path:
     return path
 
 
-def check_picture_name(path: Path) -> None:
-    """Raise ValueError if `save_figure` does not write files of this suffix."""
+def check_picture_name(path: Path, what: str = "the file name") -> None:
+    """Raise ValueError, which begins with `what`, if `save_figure` does not write files of this suffix."""
     if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"the file name {path.name!r} has to end in {', '.join(SUFFIXES)}")
+        raise ValueError(f"{what} {path.name!r} has to end in {', '.join(SUFFIXES)}")
 
 
 @contextmanager

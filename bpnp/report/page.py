@@ -47,6 +47,7 @@ from bpnp.report.tables import (
     lines_of,
     named_runs,
     problem_keys,
+    problems_text,
     run_rows,
 )
 from bpnp.report.templates import render_page
@@ -213,7 +214,7 @@ def describe_run(results: Results) -> str:
     best, values = min(results.estimates.items(), key=lambda item: item[1]["rotation_q2_deg"])
     solved = f"{100 * cause_fractions(results.of(best))['solved']:.1f} % within {SOLVED_DEG:g} deg"
     outcome = f"{best}: median rotation error {cell(RESULT_COLUMNS[1], values)} deg, {solved}"
-    return f"{len(rows)} {'problem' if len(rows) == 1 else 'problems'} with {', '.join(sizes)}. {outcome}"
+    return f"{problems_text(str(len(rows)))} with {', '.join(sizes)}. {outcome}"
 
 
 def _settings(settings: Mapping[str, Any]) -> Iterable[str]:

@@ -308,8 +308,12 @@ def results_table(runs: Mapping[str, Results], *, paper: Paper | None = None) ->
         paper: Data set whose published rows are added for orientation. They are of other data and are not compared.
     """
     sizes = " or ".join(str(size) for size in sorted({results.problems for results in runs.values()}))
-    noun = "problem" if sizes == "1" else "problems"
-    return table_of_rows(f"Pose errors, {sizes} {noun}", RESULT_COLUMNS, run_rows(runs, paper), CAPTION)
+    return table_of_rows(f"Pose errors, {problems_text(sizes)}", RESULT_COLUMNS, run_rows(runs, paper), CAPTION)
+
+
+def problems_text(number: str) -> str:
+    """Return a number of problems in words: "1 problem", "20 problems" or "20 or 30 problems"."""
+    return f"{number} problem" if number == "1" else f"{number} problems"
 
 
 def table_of_rows(title: str, columns: Sequence[Column], rows: Sequence[MethodRow], caption: str) -> SplitTable:
