@@ -41,13 +41,20 @@ def thread_count() -> int:
 def in_threads(work: Callable[[int, int], object], count: int) -> None:
     """Call work(first, last) on consecutive parts of range(count), one a thread, and wait for all of them.
 
-    Only work that releases the GIL gains, such as numba's `nogil` functions. Each call writes to its own part of an
-    array. Python's threads are used because numba's pool does not survive the fork of a data loader's workers.
+    Only work that releases the GIL gains, such as numba's `nogil` functions. Each call reads numpy arrays and writes to
+    its own part of one, never to a tensor: a thread starts without the inference mode, grad mode, autocast, default
+    type and default device of its caller. Python's threads are used because numba's pool does not survive the fork of a
+    data loader's workers.
 
     Args:
         work: Called with the first index and the index after the last.
         count: Number of items; at most `thread_count` parts are formed, none of them empty.
+
+    Raises:
+        TypeError: `work` refers to a tensor. It is raised with one thread, too.
     """
+    if (name := _tensor_of(work)) is not None:
+        raise TypeError(f"the tensor {name!r} is used in threads; pass its numpy array")
     shares = max(1, min(thread_count(), count))
     if shares == 1:
         work(0, count)
@@ -57,6 +64,33 @@ def in_threads(work: Callable[[int, int], object], count: int) -> None:
     work(*edges[:2])
     for other in others:
         other.result()
+
+
+def _tensor_of(work: Callable[..., object]) -> str | None:
+    """Return the name of a tensor that a function, or a function that it calls by closure, refers to, or None."""
+    torch, waiting, seen = sys.modules.get("torch"), [work], set[int]()
+    while torch is not None and waiting:
+        function = inspect.unwrap(waiting.pop())  # without a type checker's wrapper
+        if id(function) in seen or not inspect.isfunction(function):
+            continue
+        seen.add(id(function))
+        cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
+        values = [(name, value) for name, cell in cells for value in _members(cell)]
+        values += [("a default", value) for value in function.__defaults__ or ()]
+        waiting += [value for _, value in values if callable(value)]
+        found = next((name for name, value in values if isinstance(value, torch.Tensor)), None)
+        if found is not None:
+            return found
+    return None
+
+
+def _members(cell: Any) -> tuple[Any, ...]:
+    """Return the value of a closure's cell, or the members of a tuple or list in it; nothing for an empty cell."""
+    try:
+        value = cell.cell_contents
+    except ValueError:
+        return ()
+    return tuple(value) if isinstance(value, tuple | list) else (value,)
 
 
 @lru_cache(1)

@@ -57,6 +57,22 @@ def test_an_error_in_any_part_is_raised(threads: int) -> None:
         in_threads(fail, 10)
 
 
+def test_a_tensor_in_the_work_is_refused_with_any_number_of_threads(threads: int) -> None:
+    """A worker thread has no inference mode, so that it could not fill the tensor of a caller that has."""
+    result = torch.zeros(10)
+
+    def fill(first: int, last: int) -> None:
+        result[first:last] = 1
+
+    def one_of_several(first: int, last: int, parts: tuple[object, ...] = ()) -> None:
+        fill(first, last)
+
+    for work in (fill, one_of_several, lambda i, j: fill(i, j)):
+        with pytest.raises(TypeError, match="'result'"):
+            in_threads(work, 10)
+    assert not result.any()
+
+
 def _square(results: "multiprocessing.Queue[float]") -> None:
     torch.set_num_threads(2)
     squares = np.zeros(10)

@@ -6,7 +6,6 @@ solved on the CPU, those of all samples at once.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
 
 import cv2
 import numpy as np
@@ -131,19 +130,18 @@ def _each(
     estimate: SingleEstimator, matches: Matches, threshold: float, max_iterations: int, seed: int
 ) -> tuple[Float[Tensor, "b 3 4"], Int[Tensor, " b"]]:
     """Estimate each sample by itself, in threads; those with fewer than 4 matches have no pose and no iterations."""
-    points2d, points3d, real = (values.cpu() for values in matches)
+    points2d, points3d, real = (values.cpu().numpy() for values in matches)
     enough = real.sum(-1) >= MIN_POINTS
-    poses, iterations = points3d.new_full((len(real), 3, 4), torch.nan), max_iterations * enough.long()
+    poses, iterations = np.full((len(real), 3, 4), np.nan), np.where(enough, max_iterations, 0)
 
     def work(first: int, last: int) -> None:
         for i in range(first, last):
-            x, p = (points[i][real[i]].numpy() for points in (points2d, points3d))
+            x, p = points2d[i][real[i]], points3d[i][real[i]]
             if enough[i] and (found := estimate(x, p, threshold, max_iterations, seed)) is not None:
-                poses[i], iterations[i] = torch.as_tensor(found[0], device="cpu"), found[1]
+                poses[i], iterations[i] = found
 
     in_threads(work, len(real))
-    device = matches.real.device
-    return poses.to(device), iterations.to(device)
+    return torch.from_numpy(poses).to(matches.points3d), torch.from_numpy(iterations).to(matches.real.device)
 
 
 def _poselib(x: Array, p: Array, threshold: float, max_iterations: int, seed: int) -> tuple[Array, int]:
@@ -182,11 +180,12 @@ def _opencv(x: Array, p: Array, threshold: float, max_iterations: int, seed: int
     return pose, max_iterations
 
 
-def _count_inliers(pose: NDArray[Any], x: Array, p: Array, threshold: float) -> int:
+def _count_inliers(pose: Array, x: Array, p: Array, threshold: float) -> int:
     """Return the number of inliers of one pose [R | t]."""
-    arrays = pose[None], x, p, np.ones(len(x), bool)
-    poses, *matches = (torch.as_tensor(values, device="cpu")[None] for values in arrays)
-    return int(residuals(poses, Matches(*matches), threshold**2).inlier.sum())
+    camera = p @ pose[:, :3].T + pose[:, 3]
+    front = camera[:, 2] > 0
+    errors = camera[front, :2] / camera[front, 2:] - x[front]
+    return int((np.square(errors).sum(-1) < threshold**2).sum())
 
 
 # Matches of `bpnp.robust.matches.normalise_matches`, most probable first, threshold, most hypotheses, seed ->
