@@ -2,10 +2,14 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 RUN := runs/quickstart
+# The proofs: a thread a process. The user's world has no variable set, and its tests start processes of their own.
+PROOFS := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -rs --ignore=tests/user
+AS_USER := test ! -d tests/user || $(BIN)/python -m pytest -rs tests/user
+EVERYWHERE := --jaxtyping-packages=bpnp,beartype.beartype
 # Percent of lines and branches that the tests run; compiled loops are not counted.
 FLOOR := 88
 
-.PHONY: quickstart show-report check test coverage results lint docs notebooks wheel install clean
+.PHONY: quickstart show-report check test nightly coverage results lint docs notebooks wheel install clean
 
 install: $(VENV)/.installed
 
@@ -34,13 +38,19 @@ lint: install
 	$(BIN)/mypy
 
 check: lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -m "not slow"
+	$(PROOFS) -m "not slow and not nightly"
 
 test: lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -rs
+	$(PROOFS) -m "not nightly"
+	$(AS_USER) -m "not nightly"
+
+# What `make test` leaves out, with the types of the whole package checked.
+nightly: install
+	$(PROOFS) $(EVERYWHERE) -m "nightly"
+	$(AS_USER) -m "nightly"
 
 coverage: lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -rs --cov --cov-report=term --cov-fail-under=$(FLOOR)
+	$(PROOFS) --cov --cov-report=term --cov-fail-under=$(FLOOR)
 
 results: install
 	$(BIN)/python -m benchmarks results --quick --check

@@ -5,6 +5,20 @@ import lightning  # noqa: F401, its log handler keeps the stderr of its first im
 import pytest
 import torch
 
+MARKS = pytest.StashKey[dict[str, frozenset[str]]]()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Keep the marks of all tests that were collected, before `-m` removes some."""
+    config.stash[MARKS] = {item.nodeid: frozenset(mark.name for mark in item.iter_markers()) for item in items}
+
+
+@pytest.fixture(scope="session")
+def marks(pytestconfig: pytest.Config) -> dict[str, frozenset[str]]:
+    """Names of the marks of each collected test."""
+    return pytestconfig.stash[MARKS]
+
 
 @pytest.fixture(autouse=True)
 def _seed() -> None:

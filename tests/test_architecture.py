@@ -2,6 +2,8 @@
 
 import ast
 import functools
+import re
+from collections.abc import Mapping, Set
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "bpnp"
@@ -123,3 +125,30 @@ def test_one_function_imports_pycolmap() -> None:
     """`import_pycolmap` imports zlib first, without which Python aborts, and restores the handler of SIGTERM."""
     for file in FILES:
         assert "pycolmap" not in imports(file) or named(file) == "bpnp/cameras.py", named(file)
+
+
+def test_each_test_is_run_by_make_test_or_by_make_nightly_and_never_by_both(marks: Mapping[str, Set[str]]) -> None:
+    """`.ci/run` runs both; `make check` runs a part of `make test`."""
+    makefile = (PACKAGE.parent / "Makefile").read_text()
+    selections = {}
+    for target, calls in (("check", ["PROOFS"]), ("test", ["PROOFS", "AS_USER"]), ("nightly", ["PROOFS", "AS_USER"])):
+        recipe = re.search(rf"^{target}:.*\n((\t.*\n)+)", makefile, re.MULTILINE)
+        assert recipe is not None
+        found = re.findall(r'\$\((PROOFS|AS_USER)\).* -m "(.*)"$', recipe[1], re.MULTILINE)
+        assert [call for call, _ in found] == calls
+        assert len({expression for _, expression in found}) == 1
+        selections[target] = found[0][1]
+        assert f"make {target}\n" in (PACKAGE.parent / ".ci" / "run").read_text() or target == "check"
+    assert len(re.findall("--ignore", makefile)) == 1
+    assert re.search(r"^PROOFS := .* --ignore=tests/user$", makefile, re.MULTILINE)
+    assert re.search(r"^AS_USER := .* tests/user$", makefile, re.MULTILINE)
+    for test, names in marks.items():
+        known = {name: name in names for name in ("slow", "nightly")}
+        chosen = {target for target, expression in selections.items() if eval(expression, {}, known)}
+        assert chosen in ({"check", "test"}, {"test"}, {"nightly"}), f"{test} is run by {chosen}"
+
+
+def test_tests_are_in_files_that_pytest_collects() -> None:
+    for file in (PACKAGE.parent / "tests").rglob("*.py"):
+        has_tests = re.search(r"^def test_", file.read_text(), re.MULTILINE)
+        assert not has_tests or file.name.startswith("test_"), file

@@ -42,7 +42,7 @@ from bpnp.geometry import bearings, rotation_angle
 from bpnp.layers import ransac_pnp, sinkhorn, weighted_pnp
 from bpnp.maps.views import View
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 ROOT = Path(__file__).parents[1]
 

@@ -10,7 +10,7 @@ import pytest
 
 import bpnp.runtime
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 FACTOR = """
 from typing import NamedTuple

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from mypy import api
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 ROOT = Path(__file__).parents[1]
 HEAD = """

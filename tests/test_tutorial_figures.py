@@ -16,7 +16,7 @@ from rich.console import Console
 from bpnp.report import ProblemRow, write_results
 from bpnp.report.tables import read_runs, results_table
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 PAGE = """
 ```

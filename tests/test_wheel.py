@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = {str(file.relative_to(ROOT)): file.read_bytes() for file in (ROOT / "configs").rglob("*.yaml")}

@@ -92,3 +92,34 @@ def settings(config: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, An
             yield from settings(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", str(value)
+
+
+def printed(recipe: str, capsys: pytest.CaptureFixture[str]) -> dict[str, str]:
+    """Return all settings that `bpnp fit` takes from a recipe, without `init_args` in their names."""
+    with pytest.raises(SystemExit):
+        main(["fit", f"--config={recipe}", "--print_config"])
+    found = settings(yaml.safe_load(capsys.readouterr().out))
+    return {name.replace("init_args.", ""): value for name, value in found}
+
+
+@pytest.mark.parametrize("name", ["modelnet40", "megadepth"])
+def test_the_experiments_of_the_paper_have_none_of_our_additions(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """docs/paper.md lists the additions; a test then computes the paper's two estimates."""
+    paper = printed(f"paper/{name}", capsys)
+    assert paper["model.solver.refinement.enabled"] == "False"
+    assert (paper["model.solver.rounds"], paper["model.matching_loss"]) == ("0", "correspondence")
+    unset = (paper["model.warmup_steps"], paper["trainer.gradient_clip_val"], paper["optimizer"])
+    assert unset == ("0", "None", "None")
+    assert [paper[f"model.solver.features{size}d"] for size in (2, 3)] == ["None", "None"]
+    net = BPnPNet()
+    assert not net.features2d.centre
+    assert not net.features3d.centre
+
+
+def test_the_preset_has_the_loss_and_the_ransac_of_the_paper(capsys: pytest.CaptureFixture[str]) -> None:
+    preset = dict(settings(yaml.safe_load((CONFIGS / "presets" / "correspondence.yaml").read_text())))
+    paper = printed("paper/modelnet40", capsys)
+    names = {f"model.solver.ransac.{name}" for name in ("backend", "matches_factor", "threshold")}
+    names |= {"model.solver.rounds", "model.matching_loss"}
+    preset = {name.replace("init_args.", ""): value for name, value in preset.items()}
+    assert {name: preset.get(name) for name in names} == {name: paper[name] for name in names}

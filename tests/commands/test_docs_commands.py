@@ -14,7 +14,7 @@ from small_data import SMALL_FEATURES, write_mesh_tree
 
 from bpnp.cli import main
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 ROOT = Path(__file__).parents[2]
 SHORT = {"trainer": {"max_epochs": 1, "limit_train_batches": 1, "limit_val_batches": 1, "limit_test_batches": 1}}

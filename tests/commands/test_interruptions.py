@@ -15,7 +15,7 @@ from bpnp.report import read_results
 from bpnp.report.points import read_points
 from bpnp.training.checkpoints import SafeCheckpointIO
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 
 class Stop(Callback):

@@ -21,7 +21,7 @@ from bpnp.maps.many_photos import PhotoTask, attempts, photo_task
 from bpnp.maps.on_cluster import attempts_on_cluster
 from bpnp.maps.photos import photo_files
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 PHOTOS = 6
 VIEWS = {f"new{k}.png": [f"photo {k % 3}.jpg"] for k in range(PHOTOS)}

@@ -18,7 +18,7 @@ from bpnp.report import Results, write_page, write_results
 from bpnp.report.points import write_points
 from bpnp.report.terminal import DARK, LIGHT
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 REQUIRED = bool(os.environ.get("BPNP_REQUIRE_BROWSER"))
 if not REQUIRED:
