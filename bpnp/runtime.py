@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ContextDecorator, ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, update_wrapper
 from pathlib import Path
 from typing import Any
@@ -152,19 +152,51 @@ class Deadline:
     A stage that has begun completes its current item and drops the rest.
 
     Attributes:
-        at: Seconds of `Clock`; infinite for no deadline.
+        at: Time at which a search stops, seconds of `Clock`; infinite for no deadline.
+        end: Time at which the verdict and the matching after it stop too; None for `at`.
+        unfinished: Stages that were cut short, as in `SolutionStats.unfinished`.
     """
 
     at: float = math.inf
+    end: float | None = None
+    unfinished: set[str] = field(default_factory=set, compare=False)
 
     @classmethod
     def after(cls, seconds: float | None) -> "Deadline":
         """Return the deadline after a number of seconds; None for no deadline."""
         return cls() if seconds is None else cls(Clock.now() + seconds)
 
-    def passed(self) -> bool:
-        """Return whether the deadline is over."""
-        return Clock.now() >= self.at
+    def before(self, ending: float) -> "Deadline":
+        """Return a copy that leaves some seconds, at most half of the time that is left, for the ending."""
+        begun = Clock.now()
+        at = max(self.at - ending, (begun + self.at) / 2) if self.at > begun else self.at
+        return replace(self, at=at, end=self.at if self.end is None else self.end)
+
+    def share(self, fraction: float) -> "Deadline":
+        """Return a copy for the search that may take a fraction of the time that is left."""
+        if math.isinf(self.at):
+            return self
+        begun = Clock.now()
+        return replace(self, at=min(begun + fraction * (self.at - begun), self.at), end=self.final)
+
+    @property
+    def final(self) -> float:
+        """The time `end`, or `at` without one."""
+        return self.at if self.end is None else self.end
+
+    def passed(self, stage: str | None = None) -> bool:
+        """Return whether the search has to stop; the stage that this cuts short is noted."""
+        return self._is_over(self.at, stage)
+
+    def ended(self, stage: str | None = None) -> bool:
+        """Return whether the verdict and the matching have to stop too; the stage that this cuts short is noted."""
+        return self._is_over(self.final, stage)
+
+    def _is_over(self, time_to_stop: float, stage: str | None) -> bool:
+        is_over = Clock.now() >= time_to_stop
+        if is_over and stage is not None:
+            self.unfinished.add(stage)
+        return is_over
 
 
 def in_time(work: Callable[[int, int], None], count: int, deadline: Deadline, at_once: int) -> int:

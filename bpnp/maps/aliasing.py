@@ -17,7 +17,7 @@ from bpnp.maps.photo_problem import Photo
 from bpnp.maps.viewed_points import Region
 from bpnp.maps.views import Array
 from bpnp.poses import rotation_angle, same_pose
-from bpnp.runtime import one_blas_thread
+from bpnp.runtime import NEVER, Deadline, one_blas_thread
 from bpnp.search.config import ALIASING, DEFAULT, DensityShape
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
 from bpnp.search.kernels.density_map import DensityMap
@@ -31,7 +31,7 @@ from bpnp.search.solution import Candidate, Solution, add_objection, candidates_
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict.competitors import sign_margins
 from bpnp.search.verdict.decide import add_false_alarms, rank_poses
-from bpnp.search.verdict.reasons import objection
+from bpnp.search.verdict.reasons import Unfinished, objection
 
 Pose = tuple[Array, Array]  # rotation (3, 3) and translation (3,), in the frame of a problem
 
@@ -51,7 +51,12 @@ class Competitor:
 
 @one_blas_thread
 def best_competitor(
-    photo: Photo, place: Region, solution: Solution, earlier: Sequence[Candidate], regions: Iterable[Region]
+    photo: Photo,
+    place: Region,
+    solution: Solution,
+    earlier: Sequence[Candidate],
+    regions: Iterable[Region],
+    deadline: Deadline = NEVER,
 ) -> Competitor | None:
     """Propose, refine and score the poses elsewhere in a map that explain the image points of a confident solution.
 
@@ -61,13 +66,14 @@ def best_competitor(
         solution: Confident solution.
         earlier: Significant poses that were found with the points of other views (`significant`).
         regions: Regions of the map, ranked for the explained image points (`explained_keypoints`).
+        deadline: Deadline, after which the rest is left out; its `unfinished` then names the competing poses.
 
     Returns:
         The competing pose with the smallest margin; None if there is no different pose.
     """
     problem = replace(photo, view_count=1).problem(place, solution.camera, photo.prior)
-    proposals = propose_elsewhere(photo, problem, place, solution, earlier, regions)
-    competing = refine_elsewhere(problem, solution, proposals, photo.seed)
+    proposals = propose_elsewhere(photo, problem, place, solution, earlier, regions, deadline)
+    competing = refine_elsewhere(problem, solution, proposals, photo.seed, deadline)
     if not len(competing):
         return None
     margins = margins_elsewhere(problem, solution, competing)
@@ -105,6 +111,7 @@ def propose_elsewhere(
     solution: Solution,
     earlier: Sequence[Candidate],
     regions: Iterable[Region],
+    deadline: Deadline,
 ) -> list[Pose]:
     """Return poses elsewhere in the map that may explain the image points of a solution, unrefined.
 
@@ -115,17 +122,21 @@ def propose_elsewhere(
         solution: The solution.
         earlier: Significant poses that were found with the points of other views; they are proposed.
         regions: Regions of the map, ranked for the explained image points; the first ones of other points are searched.
+        deadline: Deadline, after which no further region is searched.
     """
     scale = _scale_of(problem, solution)
-    repeated = repeated_poses(problem, *_pose_of(problem, solution), scale, DEFAULT.evidence).poses
+    best = _pose_of(problem, solution)
+    repeated = repeated_poses(problem, *best, scale, DEFAULT.evidence, deadline=deadline).poses
     return [
         *(_pose_of(problem, one) for one in earlier),
         *zip(repeated.rotation, repeated.translation, strict=True),
-        *_find_poses_in(_other_regions(regions, place, problem, solution), photo, problem, solution),
+        *_find_poses_in(_other_regions(regions, place, problem, solution), photo, problem, solution, deadline),
     ]
 
 
-def refine_elsewhere(problem: Problem, solution: Solution, proposals: Sequence[Pose], seed: int) -> Hypotheses:
+def refine_elsewhere(
+    problem: Problem, solution: Solution, proposals: Sequence[Pose], seed: int, deadline: Deadline
+) -> Hypotheses:
     """Return the proposals that differ from a solution before and after their refinement, refined."""
     best = _pose_of(problem, solution)
     centroid = np.median(problem.points_from_user(solution.points3d[solution.matches[:, 1]]), 0)
@@ -139,8 +150,9 @@ def refine_elsewhere(problem: Problem, solution: Solution, proposals: Sequence[P
     other = differ(rotations, translations)
     if not other.any():
         return Hypotheses.from_poses(rotations[other], translations[other])
-    scene = Scene(problem, seed, DEFAULT)
+    scene = Scene(problem, seed, DEFAULT, deadline)
     refined = anneal_to_end(scene, rotations[other], translations[other], _scale_of(problem, solution))
+    deadline.passed(Unfinished.competing_poses)  # noted: then not all of them were refined
     return refined[differ(refined.rotation, refined.translation)]
 
 
@@ -208,13 +220,17 @@ def _other_regions(regions: Iterable[Region], place: Region, problem: Problem, s
             return
 
 
-def _find_poses_in(regions: Iterable[Region], photo: Photo, problem: Problem, solution: Solution) -> Iterator[Pose]:
+def _find_poses_in(
+    regions: Iterable[Region], photo: Photo, problem: Problem, solution: Solution, deadline: Deadline
+) -> Iterator[Pose]:
     """Yield the poses that short searches in other regions find for the explained image points of a solution."""
     explained = replace(photo, keypoints=explained_keypoints(photo, solution), view_count=1)
     density_maps: dict[tuple[DensityShape, float], DensityMap] = {}  # shared, since the image points are the same
     for region in regions:
+        if deadline.passed(Unfinished.competing_poses):
+            return
         near = explained.problem(region, solution.camera, region.prior())
-        scene = Scene(near, photo.seed, DEFAULT)
+        scene = Scene(near, photo.seed, DEFAULT, deadline)
         scene.density_maps = density_maps
         assert near.prior is not None
         prior = scene.enter_prior(near.prior)

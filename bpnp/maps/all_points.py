@@ -10,7 +10,7 @@ from bpnp.maps.photo_problem import Photo, with_ids
 from bpnp.maps.viewed_points import Region
 from bpnp.maps.views import Array
 from bpnp.poses import MIN_POINTS
-from bpnp.runtime import one_blas_thread
+from bpnp.runtime import NEVER, Deadline, one_blas_thread
 from bpnp.search.competing_poses import judge_with_competitors, other_lens
 from bpnp.search.config import DEFAULT, MAPS, Evidence
 from bpnp.search.focal_length import AROUND, UnknownCamera, fit_camera
@@ -23,6 +23,7 @@ from bpnp.search.search_frame import Scene
 from bpnp.search.solution import Solution, add_objection, change_verdict
 from bpnp.search.verdict.competitors import competing_pose
 from bpnp.search.verdict.decide import judge
+from bpnp.search.verdict.reasons import Unfinished
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +46,7 @@ class Refined:
 
 
 @one_blas_thread
-def refine_on_all_points(solution: Solution, photo: Photo, whole: Region) -> Refined | None:
+def refine_on_all_points(solution: Solution, photo: Photo, whole: Region, deadline: Deadline = NEVER) -> Refined | None:
     """Refine a pose on all map points in view; an unknown focal length is fitted to them too.
 
     The competing poses of a pose that is not confident yet are refined as well. Local searches around it propose more:
@@ -56,6 +57,7 @@ def refine_on_all_points(solution: Solution, photo: Photo, whole: Region) -> Ref
         solution: Pose that was found with the points of one view.
         photo: The photo.
         whole: All points of the map.
+        deadline: Deadline, after which the rest is left unrefined.
 
     Returns:
         The refined poses; None if there is no pose, or fewer points in view than it has matches.
@@ -74,15 +76,17 @@ def refine_on_all_points(solution: Solution, photo: Photo, whole: Region) -> Ref
 
     if isinstance(camera, UnknownCamera):
         camera = camera.seen_by(problem_at(camera.reference))
-        fitted = fit_camera(problem_at, camera, found, pose, scale, photo.seed, AROUND)
+        fitted = fit_camera(problem_at, camera, found, pose, scale, photo.seed, AROUND, deadline=deadline)
         problem, poses = fitted.problem, fitted.poses
         rotation, shift = poses.pose()
     else:
         problem = problem_at(camera)
         rotation, shift = problem.from_user(*pose)
         least = problem.image.scales[0]
-        poses = anneal_to_end(Scene(problem, photo.seed, DEFAULT), rotation[None], shift[None], max(scale, least))
-    scene, confident = Scene(problem, photo.seed, DEFAULT), solution.verdict == "confident"
+        poses = anneal_to_end(
+            Scene(problem, photo.seed, DEFAULT, deadline), rotation[None], shift[None], max(scale, least)
+        )
+    scene, confident = Scene(problem, photo.seed, DEFAULT, deadline), solution.verdict == "confident"
     local_searches = int(poses.scale[0] > scale) if confident else local_searches_for_certainty(DEFAULT.evidence)
     significant = [one for one in solution.candidates[1:] if one.log10_false_alarms < 0]
     others = [] if confident else significant[: MAPS.competitors]
@@ -94,6 +98,8 @@ def refine_on_all_points(solution: Solution, photo: Photo, whole: Region) -> Ref
         poses = Hypotheses.concatenate([poses, competing])
     start = Hypotheses.from_poses(*scene.enter(rotation[None], shift[None]))
     for _ in range(local_searches):
+        if deadline.passed(Unfinished.competing_poses):
+            break
         local = finish(scene, search_around(scene, start, DEFAULT.local), DEFAULT.finished)
         poses = Hypotheses.concatenate([poses, to_problem_frame(local, scene)])
     return Refined(region, problem, (rotation, shift), poses, scene)
@@ -116,21 +122,22 @@ def judge_on_all_points(solution: Solution, refined: Refined | None) -> Solution
     problem, settings, confident = refined.problem, DEFAULT.evidence, solution.verdict == "confident"
 
     alone = judge(refined.poses, problem, batches=1, exhaustive=True, settings=settings)
-    result = judge_with_competitors(alone, problem, lambda: refined.scene, settings, exhaustive=True)
+    deadline = refined.scene.deadline
+    result = judge_with_competitors(alone, problem, lambda: refined.scene, settings, exhaustive=True, deadline=deadline)
     rotation, translation = result.best
     behind = result.log10_false_alarms - solution.log10_false_alarms
     if confident and not problem.same_as(refined.pose, rotation[None], translation[None], settings.same)[0]:
         other = competing_pose(problem, refined.pose, result.best, behind)
         return solution if behind >= settings.margin else add_objection(solution, other)
     if behind < 0 or (not confident and result.verdict == "confident"):
-        found = finished(problem, result, solution.seconds, None)
+        found = finished(problem, result, solution.seconds, None, deadline)
         stats = replace(found.stats, iterations=solution.stats.iterations)
         candidates = (*found.candidates, *solution.candidates[1:])
         return with_ids(replace(found, stats=stats, candidates=candidates), refined.region)
     if not confident:
         return solution
     if alone.verdict != "confident":  # other cameras have not been tested for it
-        lens_objection = other_lens(alone, problem, lambda: refined.scene, settings)
+        lens_objection = other_lens(alone, problem, lambda: refined.scene, settings, deadline)
         return solution if lens_objection is None else add_objection(solution, lens_objection)
     if result.verdict == "confident":
         return solution

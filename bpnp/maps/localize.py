@@ -18,14 +18,16 @@ from bpnp.maps.aliasing import Competitor, best_competitor, explained_keypoints,
 from bpnp.maps.all_points import judge_on_all_points, refine_on_all_points
 from bpnp.maps.photo_problem import Photo, with_ids
 from bpnp.maps.viewed_points import Place, Region, ViewedPoints
-from bpnp.runtime import Clock, Deadline
+from bpnp.runtime import NEVER, Clock, Deadline
 from bpnp.search.arguments import checked_prior
-from bpnp.search.config import DEFAULT, MAPS, SearchSettings
+from bpnp.search.config import DEFAULT, MAPS, TIME, SearchSettings
 from bpnp.search.focal_length import UnknownCamera, solve_with_focal_length
+from bpnp.search.matching import with_unfinished
 from bpnp.search.problem import Problem, UnknownFocal
-from bpnp.search.solution import Candidate, Solution
+from bpnp.search.solution import Candidate, Solution, add_objection
 from bpnp.search.solvers import Options, solve_problems
 from bpnp.search.verdict import reasons
+from bpnp.search.verdict.reasons import objection
 
 # The search stays near the view's pose, not near the best pose of an unsuccessful earlier search.
 # A search in a fourth of the time finds four fifths as many poses, so that short searches near many views pay.
@@ -81,18 +83,20 @@ def localize(
     Raises:
         ValueError: No view sees 4 or more points.
     """
-    start, deadline, tried = Clock.now(), Deadline.after(time_limit), set[str]()
+    start, deadline, tried = Clock.now(), Deadline.after(time_limit).before(TIME.judging), set[str]()
     results = list[LoopResult]()
     for k, scene in enumerate(maps):
-        half = Deadline.after((deadline.at - Clock.now()) / 2) if k + 1 < len(maps) else deadline
-        results.append(_localize_in(scene, photo, views, options._replace(time_limit=time_limit, until=half), tried))
+        until = deadline if k + 1 == len(maps) else replace(deadline.share(1 / 2), unfinished=set())
+        results.append(_localize_in(scene, photo, views, options._replace(time_limit=time_limit, until=until), tried))
         if results[-1].solution.verdict == "confident":
             break
     solution = max((result.solution for result in results), key=rank)
     is_complete = solution.verdict == "confident" or all(result.is_complete for result in results)
     if not is_complete:
         count = len(maps[-1].views if views is None else views)
+        deadline.unfinished.add(reasons.Unfinished.views)
         solution = replace(solution, reason=reasons.unfinished(solution.reason, time_limit, len(tried), count))
+        solution = with_unfinished(solution, deadline)
     return LoopResult(replace(solution, seconds=Clock.now() - start), is_complete)
 
 
@@ -123,14 +127,14 @@ def _localize_in(
         own = search_near(scene.region(place.view, place.points), photo, place.camera, options, settings)
         found = ViewSolution(place, own, False)
         if own.verdict == "confident" or own.log10_false_alarms < 0:
-            found = judge_in_map(scene, photo, found, earlier)
+            found = judge_in_map(scene, photo, found, earlier, options.until)
         if "confident" in (own.verdict, found.solution.verdict):
-            return LoopResult(found.solution, True)
+            return LoopResult(found.solution, found.solution.reason_code not in reasons.UNTESTED)
         earlier += significant(found.solution)
         best = sorted([*best, found], key=lambda one: one.rank, reverse=True)[: MAPS.promising]
         again = [found] if found.solution.log10_false_alarms < MAPS.likely and len(longer) < MAPS.promising else []
         if not queue:  # not significant so far, but perhaps with all points of the map
-            best = [judge_in_map(scene, photo, one, earlier) for one in best]
+            best = [judge_in_map(scene, photo, one, earlier, options.until) for one in best]
             best.sort(key=lambda one: one.rank, reverse=True)
             if best[0].solution.verdict == "confident":
                 return LoopResult(best[0].solution, True)
@@ -141,7 +145,7 @@ def _localize_in(
                 queue.appendleft((one.place._replace(camera=_camera_near(photo.camera, one.solution)), LONGER))
     if not queue:
         return LoopResult(best[0].solution, True)
-    return LoopResult(judge_in_map(scene, photo, best[0], earlier).solution, False)
+    return LoopResult(judge_in_map(scene, photo, best[0], earlier, options.until).solution, False)
 
 
 def search_near(
@@ -169,7 +173,9 @@ def search_near(
     return with_ids(solution, region)
 
 
-def judge_in_map(scene: ViewedPoints, photo: Photo, found: ViewSolution, earlier: Sequence[Candidate]) -> ViewSolution:
+def judge_in_map(
+    scene: ViewedPoints, photo: Photo, found: ViewSolution, earlier: Sequence[Candidate], until: Deadline = NEVER
+) -> ViewSolution:
     """Refine and judge a pose on all map points in view and, if it is confident, against poses elsewhere in the map.
 
     If a pose elsewhere is more likely by `Evidence.margin`, it is refined and judged in the same way, and used instead
@@ -180,27 +186,45 @@ def judge_in_map(scene: ViewedPoints, photo: Photo, found: ViewSolution, earlier
         photo: The photo.
         found: The pose; returned unchanged if it was judged before.
         earlier: Significant poses that were found with the points of other views.
+        until: Deadline, to whose end this may last; a pose whose competing poses were not all tested by then is
+            "ambiguous" at best.
     """
     if found.is_judged:
         return found
     place, own = found.place, found.solution
+    deadline = Deadline(until.final)
+    if deadline.passed(reasons.Unfinished.competing_poses):
+        return ViewSolution(place, _if_tested(own, deadline, until), False)
     whole = scene.region(place.view)
-    solution = judge_on_all_points(own, refine_on_all_points(own, photo, whole))
+    solution = judge_on_all_points(own, refine_on_all_points(own, photo, whole, deadline))
     if solution.verdict == "confident":
         earlier = [*earlier, *significant(own)]
-        competitor = find_competitor(scene, photo, place, solution, earlier)
+        competitor = find_competitor(scene, photo, place, solution, earlier, deadline)
         if competitor is not None and competitor.margin <= -DEFAULT.evidence.margin:
-            better = _judge_competitor(scene, photo, solution, competitor.pose)
+            better = _judge_competitor(scene, photo, solution, competitor.pose, deadline)
             if better.verdict == "confident":
                 earlier = [*earlier, *significant(solution)]
-                competitor = find_competitor(scene, photo, place, better, earlier)
+                competitor = find_competitor(scene, photo, place, better, earlier, deadline)
                 solution = better
         solution = judge_against(solution, competitor)
-    return ViewSolution(place, solution, True)
+    return ViewSolution(place, _if_tested(solution, deadline, until), True)
+
+
+def _if_tested(solution: Solution, deadline: Deadline, until: Deadline) -> Solution:
+    """Return a solution, ambiguous if the deadline of its verdict cut off a test; a longer one takes note of it."""
+    until.unfinished.update(deadline.unfinished)
+    if solution.verdict == "confident" and deadline.unfinished & reasons.TESTS:
+        solution = add_objection(solution, objection("untested"))
+    return with_unfinished(solution, deadline)
 
 
 def find_competitor(
-    scene: ViewedPoints, photo: Photo, place: Place, solution: Solution, earlier: Sequence[Candidate]
+    scene: ViewedPoints,
+    photo: Photo,
+    place: Place,
+    solution: Solution,
+    earlier: Sequence[Candidate],
+    deadline: Deadline = NEVER,
 ) -> Competitor | None:
     """Return the best pose elsewhere in the map that explains the same image points.
 
@@ -210,13 +234,18 @@ def find_competitor(
         place: View near which the solution was found.
         solution: Confident solution.
         earlier: Significant poses that were found with the points of other views.
+        deadline: As for `best_competitor`.
     """
+    if deadline.passed(reasons.Unfinished.competing_poses):
+        return None
     explained = explained_keypoints(photo, solution)
     regions = scene.ranked_regions(camera_from(solution.camera), explained, photo.rank_views)
-    return best_competitor(photo, scene.region(place.view), solution, earlier, regions)
+    return best_competitor(photo, scene.region(place.view), solution, earlier, regions, deadline)
 
 
-def _judge_competitor(scene: ViewedPoints, photo: Photo, solution: Solution, pose: Candidate) -> Solution:
+def _judge_competitor(
+    scene: ViewedPoints, photo: Photo, solution: Solution, pose: Candidate, deadline: Deadline
+) -> Solution:
     """Return the solution of a competing pose of a solution, refined and judged on all map points in view."""
     whole, camera = scene.region(scene.views[0]), camera_from(solution.camera)
     seen = np.zeros(len(scene.points3d), bool)
@@ -231,7 +260,7 @@ def _judge_competitor(scene: ViewedPoints, photo: Photo, solution: Solution, pos
         verdict="failed",
         log10_false_alarms=np.inf,
     )
-    return judge_on_all_points(proposed, refine_on_all_points(proposed, photo, whole))
+    return judge_on_all_points(proposed, refine_on_all_points(proposed, photo, whole, deadline))
 
 
 def rank(solution: Solution) -> tuple[int, float]:

@@ -1,6 +1,7 @@
 """Verification of the pose of a view: against the points that other views see, and against the rest of the map."""
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 
 from bpnp.cameras import camera_from
 from bpnp.maps.aliasing import best_competitor, explained_keypoints, judge_against
@@ -8,8 +9,11 @@ from bpnp.maps.photo_problem import Photo, with_ids
 from bpnp.maps.viewed_points import Region
 from bpnp.maps.views import Array, View
 from bpnp.poses import MIN_POINTS
+from bpnp.runtime import Deadline
 from bpnp.search.config import DEFAULT
-from bpnp.search.solution import Solution, change_verdict
+from bpnp.search.matching import with_unfinished
+from bpnp.search.solution import Solution, add_objection, change_verdict
+from bpnp.search.verdict.reasons import Unfinished, objection, undecided
 from bpnp.search.verify import verify_problem
 
 
@@ -26,11 +30,12 @@ def verify_pose(
         view: View with the pose.
         place: All points of the map without the view.
         regions: Returns the regions of this map, ranked for keypoints (k, 2).
-        time_limit: Seconds for `verify_problem`; math.inf for no limit.
+        time_limit: Seconds, of which `verify_problem` takes half at most; math.inf for no limit.
 
     Raises:
         ValueError: There are fewer than 4 keypoints, or fewer than 4 map points in view.
     """
+    deadline = Deadline.after(time_limit)
     if len(photo.keypoints) < MIN_POINTS:
         raise ValueError(f"{view.name} has {len(photo.keypoints)} keypoints; at least {MIN_POINTS} are needed")
     seen = place.in_view(view.rotation, view.translation, camera_from(photo.camera), photo.keypoints)
@@ -40,11 +45,19 @@ def verify_pose(
         )
     region = place.part(seen)
     problem = photo.problem(region, photo.camera)
-    solution = verify_problem(problem, view.rotation, view.translation, seed=photo.seed, time_limit=time_limit)
+    until = deadline.share(1 / 2)
+    solution = verify_problem(
+        problem, view.rotation, view.translation, seed=photo.seed, time_limit=time_limit, until=until
+    )
     solution = with_ids(solution, region)
     if solution.verdict == "failed":
         return solution
-    competitor = best_competitor(photo, place, solution, [], regions(explained_keypoints(photo, solution)))
+    explained = regions(explained_keypoints(photo, solution))
+    competitor = None if deadline.passed() else best_competitor(photo, place, solution, [], explained, deadline)
     compared = judge_against(solution, competitor)
+    if compared.verdict == "confident" and deadline.passed(Unfinished.competing_poses):
+        compared = add_objection(compared, objection("untested"))
+        compared = replace(compared, reason=undecided(compared.reason, time_limit))
+    compared = with_unfinished(compared, deadline)
     refuted = competitor is not None and competitor.margin <= -DEFAULT.evidence.margin
     return change_verdict(compared, "failed", compared.reason, compared.reason_code) if refuted else compared

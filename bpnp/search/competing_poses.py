@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.poses import rotation_angle
+from bpnp.runtime import NEVER, Deadline
 from bpnp.search.config import Evidence, OtherFocal
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
 from bpnp.search.pose_model import undistort
@@ -25,7 +26,7 @@ from bpnp.search.search_frame import Scene
 from bpnp.search.verdict.competitors import other_camera
 from bpnp.search.verdict.decide import SearchResult, add_false_alarms, is_symmetric, judge, match_count
 from bpnp.search.verdict.false_alarms import alarms_of, likeliest_scale
-from bpnp.search.verdict.reasons import Objection, objection
+from bpnp.search.verdict.reasons import Objection, Unfinished, objection
 from bpnp.search.verdict.uncertainty import Linearised, Misfit, bends_significantly, linearised, systematic_misfit
 
 Array = NDArray[np.float64]
@@ -41,6 +42,7 @@ def judge_with_competitors(
     local_searches: float | int = 0,
     exhaustive: bool = False,
     enumerated: bool = False,
+    deadline: Deadline = NEVER,
 ) -> SearchResult:
     """Judge a confident pose again with its competing poses among the candidates.
 
@@ -57,16 +59,24 @@ def judge_with_competitors(
         local_searches: Number of local searches around the best pose that found no better one.
         exhaustive: True if every pose was tried.
         enumerated: True if the competing poses of a repeated structure are among the candidates already.
+        deadline: Deadline of the scene, after whose end nothing more is tested.
 
     Returns:
         The verdict, with the competing poses among its candidates.
     """
     untested = False
     while result.verdict == "confident":
-        competitors = repeated_competitors(result, problem, scene_of, settings, enumerated=enumerated)
-        if not len(competitors):
+        if deadline.ended(Unfinished.competing_poses):
+            untested = True
             break
-        untested = not enumerated and scene_of().deadline.passed()  # then not all of them were refined
+        competitors = repeated_competitors(
+            result, problem, scene_of, settings, enumerated=enumerated, deadline=deadline
+        )
+        if not len(competitors):
+            untested = Unfinished.competing_poses in deadline.unfinished
+            break
+        # Then not all of them were refined.
+        untested = not enumerated and deadline.passed(Unfinished.competing_poses)
         candidates, leader = Hypotheses.concatenate([result.candidates, competitors]), result.best[1]
         result = judge(
             candidates,
@@ -80,12 +90,18 @@ def judge_with_competitors(
             break
     if untested and result.verdict == "confident":
         return result.add_objection(objection("untested"))
-    other = other_lens(result, problem, scene_of, settings) if result.verdict == "confident" else None
+    other = other_lens(result, problem, scene_of, settings, deadline) if result.verdict == "confident" else None
     return result if other is None else result.add_objection(other)
 
 
 def repeated_competitors(
-    result: SearchResult, problem: Problem, scene_of: SceneOf, settings: Evidence, *, enumerated: bool = False
+    result: SearchResult,
+    problem: Problem,
+    scene_of: SceneOf,
+    settings: Evidence,
+    *,
+    enumerated: bool = False,
+    deadline: Deadline = NEVER,
 ) -> Hypotheses:
     """Return the competing poses of a repeated structure, refined, with their NFA.
 
@@ -99,6 +115,7 @@ def repeated_competitors(
         scene_of: Function that returns the scene for the refinement.
         settings: Constants of the verdict.
         enumerated: True if they are among the candidates already.
+        deadline: Deadline, after whose end none is proposed.
 
     Returns:
         Competing poses; none if the verdict does not depend on them.
@@ -110,9 +127,9 @@ def repeated_competitors(
     scale = result.residual if enumerated else min(result.residual, likeliest_scale(problem, *best))
     scale = max(scale, problem.image.scales[0])
     least = settings.repetitions.symmetric if enumerated else 0.0
-    repeated, sizes, motions = repeated_poses(problem, *best, scale, settings, least=least)
-    if not len(repeated):
-        return repeated
+    repeated, sizes, motions = repeated_poses(problem, *best, scale, settings, least=least, deadline=deadline)
+    if not len(repeated) or deadline.ended(Unfinished.competing_poses):
+        return repeated[:0]
     poses, limits, rigid = (repeated.rotation, repeated.translation), settings.repetitions, sizes == 1
     if enumerated:
         limits = replace(limits, most_missing=1e-12)
@@ -131,7 +148,9 @@ def repeated_competitors(
     return replace(refined, log10_false_alarms=alarms)
 
 
-def other_lens(result: SearchResult, problem: Problem, scene_of: SceneOf, settings: Evidence) -> Objection | None:
+def other_lens(
+    result: SearchResult, problem: Problem, scene_of: SceneOf, settings: Evidence, deadline: Deadline = NEVER
+) -> Objection | None:
     """Return another lens with which a different pose fits better than the best one, or None.
 
     Better means fewer false alarms by the factor `focal_chance`, with focal length and radial coefficient counted as
@@ -143,9 +162,12 @@ def other_lens(result: SearchResult, problem: Problem, scene_of: SceneOf, settin
         problem: Points of the problem.
         scene_of: Function that returns the scene, whose settings and deadline are used.
         settings: Constants of the verdict.
+        deadline: Deadline of the scene.
     """
     if problem.focal is not None:
         return None
+    if deadline.ended(Unfinished.focal_lengths):
+        return objection("camera_untested")
     count, (rotation, translation) = match_count(result.candidates), result.best
     linear = linearised(problem, rotation, translation, result.residual)
     other = fitted_lens(linear, count, settings)
@@ -165,13 +187,14 @@ def other_lens(result: SearchResult, problem: Problem, scene_of: SceneOf, settin
             return None
         return other_camera(misfit_of(rotation, centre, others[int(np.argmin(alarms))]), settings)
 
+    if deadline.ended(Unfinished.focal_lengths):
+        return objection("camera_untested")
     leader = AtZoom(1.0, problem, result.candidates[:1])
     other = better(leader)
     if other is not None or settings.independent * result.log10_false_alarms / count <= settings.missed:
         return other
-    scene = scene_of()
-    likeliest = likeliest_zoom(leader, scene, settings.other_focal)
-    if scene.deadline.passed():
+    likeliest = None if deadline.passed() else likeliest_zoom(leader, scene_of(), settings.other_focal)
+    if likeliest is None or deadline.passed(Unfinished.focal_lengths):
         return objection("camera_untested")
     return better(likeliest)
 
@@ -257,6 +280,8 @@ def search_at_zoom(found: AtZoom, zoom: float, scene: Scene) -> AtZoom:
         zoom: Factor on this focal length.
         scene: Scene whose settings and deadline are used.
     """
+    if scene.deadline.passed():
+        return found
     problem = at_focal_length(found.problem, zoom)
     there = Scene(problem, 0, scene.settings, scene.deadline)
     shift = found.centre3d * (1, 1, zoom) - found.pose.rotation[0] @ problem.centre3d

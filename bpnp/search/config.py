@@ -97,6 +97,7 @@ class Repetitions:
         factor: Largest ratio of the sizes of a part and its copy, in a registration of at most `many` points. [factor;
             not tuned]
         kept: Largest number of competing poses; those with the fewest false alarms are kept. [poses; cost]
+        scored_points: Number of points, times poses, that are scored between two checks of the deadline. [points; cost]
         most_missing: Largest fraction of its points that a map may lack. [fraction; not tuned]
     """
 
@@ -113,6 +114,7 @@ class Repetitions:
     fewer_bases: int = 8
     factor: float = 4.0
     kept: int = 6
+    scored_points: int = 100_000
     most_missing: float = 1 / 3
 
 
@@ -336,6 +338,8 @@ class TimeSettings:
         ending: Time of the verdict and of the matching after a search; at most half of a limit is kept for it.
             [seconds; cost]
         ending_a_point: Time that each 2D or 3D point adds to `ending`. [seconds per point; cost]
+        judging: Time to judge the pose of a photo on all points of a map after the searches; at most half of a limit is
+            kept for it. [seconds; cost]
         hypothesis: Time of a hypothesis of the enumeration before it is measured. [seconds; cost]
         least_pace: Least measured time of a hypothesis; a coarse clock may measure 0. [seconds; numerics]
         built: Time of a set of points when a stage of the enumeration begins. [seconds; cost]
@@ -349,6 +353,7 @@ class TimeSettings:
     photo: float = 60.0
     ending: float = 4e-3
     ending_a_point: float = 8e-6
+    judging: float = 1.5
     hypothesis: float = 2e-6
     least_pace: float = 1e-9
     built: float = 5e-7
@@ -448,6 +453,11 @@ class MatchSettings:
         farthest: Distance within which a scene point counts as a possible correspondence in a weighted fit, where each
             counts by its likelihood; beyond, it is below e^-8. [scales of the residuals; derived]
         few_neighbours: Number of nearest scene points of an image point that are tried first. [points; cost]
+        asked: Number of points whose neighbours are looked up, or that are assigned, between two checks of the
+            deadline. [points; cost]
+        assignment: Time of an optimal assignment, over the product of its numbers of points and of possible matches.
+            With less time left, points get their mutual nearest neighbours. [seconds; cost]
+        counting: Time of a maximum matching, over its number of possible matches. [seconds; cost]
         neighbours: Number that is tried if all of these are in reach. [points; cost]
         dense: Number of possible matches up to which all distances are computed. [matches; cost]
         fit_rounds: Rounds of the last fit, each with new matches. [rounds; not tuned]
@@ -472,6 +482,9 @@ class MatchSettings:
     reach: float = 3.0
     farthest: float = 4.0
     few_neighbours: int = 8
+    asked: int = 5000
+    assignment: float = 1e-9
+    counting: float = 2e-6
     neighbours: int = 64
     dense: int = 4096
     fit_rounds: int = 5
@@ -504,6 +517,9 @@ class NetworkSettings:
         sigma_shift: Standard deviation of its translation, as a fraction of the distance. [fraction; not tuned]
         together: Largest assignment matrix of a batch on a GPU, 2D points times 3D points. [entries; cost]
         most_cells: Largest assignment matrix of a packaged matcher; larger ones take seconds. [entries; cost]
+        seconds_a_square: Time of a packaged matcher, over the sum of the squared numbers of 2D and of 3D points; it is
+            not asked with less time left. [seconds; cost]
+        loading: Time to import torch and to load the weights. [seconds; cost]
     """
 
     far: float = 100.0
@@ -512,6 +528,8 @@ class NetworkSettings:
     sigma_shift: float = 0.1
     together: int = 2**26
     most_cells: int = 2**22
+    seconds_a_square: float = 2e-7
+    loading: float = 2.0
 
 
 NETWORKS = NetworkSettings()
@@ -855,7 +873,6 @@ class FocalSettings:
         quartic_sigma: Standard deviation of the displacement at the image corner by the second radial coefficient, as a
             fraction of the distance to the corner. [fraction; not tuned]
         least_reach: Smallest distance from the principal point to the image corner. [focal lengths; numerics]
-        least_limit: Smallest time limit of a search. [seconds; numerics]
     """
 
     smallest: float = 0.5
@@ -878,7 +895,6 @@ class FocalSettings:
     tangential_sigma: float = 0.002
     quartic_sigma: float = 0.01
     least_reach: float = 1e-3
-    least_limit: float = 1e-3
 
 
 FOCAL = FocalSettings()

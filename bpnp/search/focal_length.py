@@ -11,6 +11,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,11 +27,12 @@ from bpnp.cameras import (
     with_radial_distortion,
 )
 from bpnp.poses import rotation_angle, same_pose
-from bpnp.runtime import Clock, one_blas_thread
+from bpnp.runtime import NEVER, Clock, Deadline, one_blas_thread
 from bpnp.search.arguments import Array, checked_size
 from bpnp.search.config import DEFAULT, FOCAL, FocalSettings, OtherFocal
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.hypotheses import Hypotheses
+from bpnp.search.matching import with_unfinished
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.propose.lens import fit_lens
 from bpnp.search.refine.annealing import anneal_to_end
@@ -38,7 +40,7 @@ from bpnp.search.search_frame import Scene
 from bpnp.search.solution import FOCAL_LENGTH, ROTATION_PARAMETERS, Solution, add_objection
 from bpnp.search.solvers import Options, solve_problems
 from bpnp.search.verdict.decide import match_count, rank_poses
-from bpnp.search.verdict.reasons import objection
+from bpnp.search.verdict.reasons import Unfinished, objection, undecided
 from bpnp.search.verdict.uncertainty import is_within
 
 ProblemAt = Callable[[Camera, UnknownFocal], Problem]
@@ -204,14 +206,14 @@ class FocalSweep(ABC):
         unknown: Camera with an unknown focal length.
         options: Options of the searches.
         constants: Constants of the sweep.
-        begun: Time at which the sweep began, seconds of `Clock`.
+        deadline: Deadline of the sweep; None before it.
         ends: Final solution of each focal length so far.
     """
 
     unknown: UnknownCamera
     options: Options
     constants: FocalSettings = FOCAL
-    begun: float = 0.0
+    deadline: Deadline = NEVER
     ends: list[Solution] = field(default_factory=list)
 
     @abstractmethod
@@ -228,19 +230,28 @@ class FocalSweep(ABC):
 
     def sweep(self, *, few: bool = False) -> Solution:
         """Return the solution with the fewest false alarms; `few` is True for points that are enumerated."""
-        most, constants, self.begun = self.options.settings.schedule.iterations, self.constants, Clock.now()
+        most, constants, begun = self.options.settings.schedule.iterations, self.constants, Clock.now()
+        self.deadline = self.options.limit()
         for camera in (focal_steps := self.unknown.focal_steps(constants.step_few if few else constants.step)):
             self.search_from(self.preselect(camera), min(constants.iterations, most), len(focal_steps))
-            if (self.best.verdict == "confident" and not few) or self.time_left(1) == 0:
+            if self.best.verdict == "confident" and not few:
+                break
+            if len(self.ends) < len(focal_steps) and self.deadline.passed(Unfinished.focal_lengths):
                 break
         if (
             self.best.verdict != "confident"
             and not few
             and most > constants.iterations
             and self.best.camera is not None
+            and not self.deadline.passed(Unfinished.focal_lengths)
         ):
             self.search_from(self.best.camera, most, 1)
-        return replace(self.contested(), seconds=Clock.now() - self.begun)
+        best = self.contested()
+        if best.verdict == "confident" and few and Unfinished.focal_lengths in self.deadline.unfinished:
+            best = add_objection(best, objection("camera_untested"))
+        if best.reason_code == "camera_untested" and self.options.time_limit is not None:
+            best = replace(best, reason=undecided(best.reason, self.options.time_limit))
+        return replace(with_unfinished(best, self.deadline), seconds=Clock.now() - begun)
 
     @property
     def best(self) -> Solution:
@@ -255,6 +266,9 @@ class FocalSweep(ABC):
             better, settled = self._refined(found, camera)
             if settled:  # a better optimum may lie at a slightly different focal length
                 better, settled = self._refined(found, camera, AROUND)
+            if self.deadline.passed(Unfinished.focal_lengths):
+                found = add_objection(found, objection("camera_untested")) if found.verdict == "confident" else found
+                break
             if settled:
                 break
             again = self._search(better, iterations, steps)
@@ -263,19 +277,16 @@ class FocalSweep(ABC):
             found, camera = again, better
         self.ends.append(found)
 
-    def time_left(self, steps: int) -> float | None:
-        """Return the seconds for the next one of a number of focal lengths; None without a time limit."""
-        limit, waiting = self.options.time_limit, max(steps - len(self.ends), 1) if self.constants.divides_time else 1
-        return None if limit is None else max(limit - (Clock.now() - self.begun), 0.0) / waiting
-
     def _search(self, camera: Camera, iterations: int, steps: int) -> Solution:
-        limit = self.time_left(steps)
-        limit = None if limit is None else max(limit, self.constants.least_limit)
-        options = self.options._replace(settings=self.options.settings.limited(iterations), time_limit=limit)
-        return self.solve_with(camera, options)
+        """Search with a camera, in an equal part of the time that is left for the focal lengths."""
+        waiting = max(steps - len(self.ends), 1) if self.constants.divides_time else 1
+        settings = self.options.settings.limited(iterations)
+        return self.solve_with(camera, self.options._replace(settings=settings, until=self.deadline.share(1 / waiting)))
 
     def _refined(self, solution: Solution, camera: Camera, zooms: Sequence[float] = (1.0,)) -> tuple[Camera, bool]:
         """Return the camera that fits best near a pose, and True if it equals the given one."""
+        if self.deadline.passed(Unfinished.focal_lengths):
+            return camera, False
         fitted = self.refine(solution, camera, zooms)
         (zoom, radial), (before, old) = self.unknown.parts(fitted), self.unknown.parts(camera)
         bend = abs((radial or 0.0) - (old or 0.0)) * self.unknown.outermost(zoom) ** 2
@@ -318,7 +329,8 @@ class _OneCamera(FocalSweep):
 
     def refine(self, solution: Solution, camera: Camera, zooms: Sequence[float] = (1.0,)) -> Camera:
         pose, scale = (solution.rotation, solution.translation), solution.stats.residual
-        return fit_camera(self.problem_at, self.unknown, camera, pose, scale, self.options.seed, zooms).camera
+        fit = partial(fit_camera, self.problem_at, self.unknown, camera, pose, scale, self.options.seed, zooms)
+        return fit(deadline=self.deadline).camera
 
 
 def is_within_bound(solution: Solution, rotation: Array, zoom: float) -> bool:
@@ -355,6 +367,8 @@ def fit_camera(
     scale: float,
     seed: int,
     zooms: Sequence[float] = (1.0,),
+    *,
+    deadline: Deadline = NEVER,
 ) -> FittedCamera:
     """Fit focal length, distortion and pose to the points, starting from a pose and a camera.
 
@@ -370,15 +384,21 @@ def fit_camera(
         seed: Seed of the refinement.
         zooms: Factors of the focal length and of the distance to start from; the fit with the fewest false alarms is
             used.
+        deadline: Deadline, after which no fit begins and no step is taken.
     """
     zoom, radial = unknown.parts(camera)
 
     def fit(starts: list[tuple[float, float | None]]) -> FittedCamera:
-        fits = (_fit_track(problem_at, unknown, (zoom * z, k), pose, scale, seed, z) for z, k in starts)
+        fits = list[FittedCamera]()
+        for z, k in starts:
+            if fits and deadline.passed(Unfinished.focal_lengths):
+                break
+            fits.append(_fit_track(problem_at, unknown, (zoom * z, k), pose, scale, seed, z, deadline))
         return min(fits, key=lambda one: one.log10_false_alarms)
 
     plain = fit([(each, None) for each in zooms])
-    if unknown.bends and min(len(plain.problem.bearings), len(plain.problem.points3d)) >= FOCAL.fewest_bent:
+    few = min(len(plain.problem.bearings), len(plain.problem.points3d)) < FOCAL.fewest_bent
+    if unknown.bends and not few and not deadline.passed(Unfinished.focal_lengths):
         others = [] if radial is not None else [each / unknown.outermost(zoom) ** 2 for each in FOCAL.bends]
         bent = fit([*((each, radial or 0.0) for each in zooms), *((1.0, each) for each in others)])
         matches = match_count(bent.poses)
@@ -396,6 +416,7 @@ def _fit_track(
     scale: float,
     seed: int,
     farther: float,
+    deadline: Deadline,
 ) -> FittedCamera:
     """Alternate fits of the lens and annealing of the pose, with or without a radial coefficient.
 
@@ -407,6 +428,7 @@ def _fit_track(
         scale: Scale of the residuals, radians.
         seed: Seed of the annealing.
         farther: Factor of the initial distance of the scene.
+        deadline: Deadline, after which no step is taken.
     """
     first, radial = start
     zoom, camera = first, unknown.at(*start)
@@ -414,8 +436,10 @@ def _fit_track(
     rotation, translation = problem.from_user(*pose)
     centre = (rotation @ problem.centre3d + translation) * (1, 1, farther)
     translation = centre - rotation @ problem.centre3d
-    end = _anneal_pose(problem, rotation, translation, scale, seed)
+    end = _anneal_pose(problem, rotation, translation, scale, seed, deadline)
     for _ in range(FOCAL.rounds):
+        if deadline.passed(Unfinished.focal_lengths):
+            break
         pinhole = unknown.at(zoom)
         flat = problem if radial is None else problem_at(pinhole, unknown.focal(pinhole))
         centre = rotation @ flat.centre3d + translation
@@ -428,7 +452,7 @@ def _fit_track(
         zoom, radial, camera = zoom * fitted.zoom, fitted.radial, unknown.at(zoom * fitted.zoom, fitted.radial)
         problem = problem_at(camera, unknown.focal(camera))
         rotation = fitted.rotation
-        end = _anneal_pose(problem, rotation, fitted.centre3d - rotation @ problem.centre3d, scale, seed)
+        end = _anneal_pose(problem, rotation, fitted.centre3d - rotation @ problem.centre3d, scale, seed, deadline)
         rotation, scale = end.rotation[0], min(scale, float(end.scale[0]))
         translation = end.translation[0]
         if max(abs(math.log(fitted.zoom)), bend) < FOCAL.same:
@@ -436,6 +460,8 @@ def _fit_track(
     return FittedCamera(camera, problem, end)
 
 
-def _anneal_pose(problem: Problem, rotation: Array, translation: Array, scale: float, seed: int) -> Hypotheses:
-    scene = Scene(problem, seed, DEFAULT)
+def _anneal_pose(
+    problem: Problem, rotation: Array, translation: Array, scale: float, seed: int, deadline: Deadline
+) -> Hypotheses:
+    scene = Scene(problem, seed, DEFAULT, deadline)
     return rank_poses(anneal_to_end(scene, rotation[None], translation[None], scale), problem)[:1]

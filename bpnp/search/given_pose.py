@@ -33,7 +33,7 @@ from bpnp.search.starts import PosePrior
 from bpnp.search.verdict.competitors import distance_between
 from bpnp.search.verdict.decide import SearchResult, Verdict, add_false_alarms, fits_by_chance, judge
 from bpnp.search.verdict.false_alarms import likeliest_scale
-from bpnp.search.verdict.reasons import objection
+from bpnp.search.verdict.reasons import Unfinished, objection
 from bpnp.search.verdict.uncertainty import linearised, local_covariance
 
 Array = NDArray[np.float64]
@@ -75,6 +75,7 @@ def judge_given_pose(
         copies = competing_poses(one, rotation, translation, scale, settings)[:2]
         if len(copies[0]):
             others = Hypotheses.concatenate([others, anneal_to_end(scene, *copies, scale)])
+    deadline.passed(Unfinished.competing_poses)  # noted: then not all of them were refined
     others = _with_new_false_alarms(others, one)
     others = others[np.argsort(others.log10_false_alarms, kind="stable")]
     same = np.array([_is_same(one, claim, others[k : k + 1], settings) for k in range(len(others))], np.bool_)
@@ -92,7 +93,9 @@ def judge_given_pose(
     competing = others[~same & (others.log10_false_alarms < 0)]  # insignificant poses do not compete
     candidates = _with_new_false_alarms(Hypotheses.concatenate([claim, competing]), one)
     result = judge(candidates, one, batches=0, exhaustive=True, settings=settings)
-    result = judge_with_competitors(result, one, lambda: scene, settings, exhaustive=True, enumerated=few)
+    result = judge_with_competitors(
+        result, one, lambda: scene, settings, exhaustive=True, enumerated=few, deadline=deadline
+    )
     result = _of_claim(result, candidates[:1], one)
     if result.verdict == "confident":
         result = replace(result, reason=f"{result.reason}; {ONE_POSE}")

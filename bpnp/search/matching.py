@@ -2,16 +2,21 @@
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import maximum_bipartite_matching, min_weight_full_bipartite_matching
+from scipy.sparse.csgraph import (
+    connected_components,
+    maximum_bipartite_matching,
+    min_weight_full_bipartite_matching,
+)
 from scipy.spatial import cKDTree
 
 from bpnp.poses import MIN_POINTS
+from bpnp.runtime import NEVER, Clock, Deadline
 from bpnp.search.arguments import Array, Labels
 from bpnp.search.config import MATCHES, PRECISION
 from bpnp.search.pose_model import PoseModel
@@ -19,12 +24,19 @@ from bpnp.search.problem import Problem
 from bpnp.search.refine.gauss_newton import ImageMatches, Iteration, image_equations, refine
 from bpnp.search.solution import FOCAL_LENGTH, POSE_PARAMETERS, Solution, SolutionStats, add_pose
 from bpnp.search.verdict.decide import SearchResult
+from bpnp.search.verdict.reasons import Unfinished
 from bpnp.search.verdict.uncertainty import linearised, pose_covariance
 
 Allowed = Callable[[Labels, Labels], NDArray[np.bool_]]
 
 
-def finished(problem: Problem, result: SearchResult, seconds: float, inlier_threshold: float | None) -> Solution:
+def finished(
+    problem: Problem,
+    result: SearchResult,
+    seconds: float,
+    inlier_threshold: float | None,
+    deadline: Deadline = NEVER,
+) -> Solution:
     """Build a `Solution` of a search result: refine the best pose, match points, count the inliers of each candidate.
 
     Args:
@@ -33,26 +45,27 @@ def finished(problem: Problem, result: SearchResult, seconds: float, inlier_thre
         seconds: Run time of the search; the run time of this function is added.
         inlier_threshold: Largest error of an inlier, in the unit of the problem; None for three times the residual
             scale.
+        deadline: Deadline; after its end, points get their mutual nearest neighbours, and candidates no inliers.
     """
     start, found = time.perf_counter(), result.candidates
+    failed = failed_solution(problem, _note_duplicates(problem, result), inlier_threshold, seconds, code=result.code)
     if not len(found):
-        reason = _note_duplicates(problem, result)
-        return failed_solution(problem, reason, inlier_threshold, seconds, code=result.code)
+        return with_unfinished(failed, deadline)
     threshold = inlier_threshold or MATCHES.reach * result.residual * problem.per_radian
     poses = list(zip(found.rotation, found.translation, strict=True))
     if result.batches:  # an enumerated pose is a least-squares fit in float64 already
-        poses[0] = _fitted(problem, *poses[0], threshold)
-    projected, *others = (problem.project_scene(*pose) for pose in poses)
-    matches = one_to_one(problem.image_points, projected, threshold, problem.may_match)
-    image, may_match = problem.image_points, problem.may_match
-    counts = [len(matches), *(count_one_to_one(image, seen, threshold, may_match) for seen in others)]
+        poses[0] = _fitted(problem, *poses[0], threshold, deadline)
+    projected, image, may_match = problem.project_scene(*poses[0]), problem.image_points, problem.may_match
+    matches = one_to_one(image, projected, threshold, may_match, deadline)
+    others = (problem.project_scene(*pose) for pose in poses[1:])
+    counts = [len(matches), *(count_one_to_one(image, seen, threshold, may_match, deadline) for seen in others)]
     rotation, translation = problem.to_user(*map(np.stack, zip(*poses, strict=True)))
     i, j = matches.T
     camera = problem.points3d[j] @ poses[0][0].T + poses[0][1]
     matched = float(found.match_count[0])
     linear = None if result.verdict == "failed" else linearised(problem, *poses[0], result.residual)
     solution = add_pose(
-        failed_solution(problem, _note_duplicates(problem, result), None),
+        replace(failed, inlier_threshold=math.nan),
         result,
         replace(found, rotation=rotation, translation=translation),
         counts,
@@ -64,7 +77,13 @@ def finished(problem: Problem, result: SearchResult, seconds: float, inlier_thre
         residual=result.residual,
         covariance=_of_pixels(problem, pose_covariance(problem, linear, matched)),
     )
-    return replace(solution, seconds=seconds + time.perf_counter() - start)
+    return with_unfinished(replace(solution, seconds=seconds + time.perf_counter() - start), deadline)
+
+
+def with_unfinished(solution: Solution, deadline: Deadline) -> Solution:
+    """Return a solution whose statistics name the stages that a deadline cut short, besides those that they have."""
+    unfinished = tuple(sorted({*solution.stats.unfinished, *deadline.unfinished}))
+    return replace(solution, stats=replace(solution.stats, unfinished=unfinished))
 
 
 def _note_duplicates(problem: Problem, result: SearchResult) -> str:
@@ -118,7 +137,9 @@ def _of_pixels(problem: Problem, covariance: Array | None) -> Array:
     return np.asarray(covariance * np.outer(unit, unit))
 
 
-def _fitted(problem: Problem, rotation: Array, translation: Array, threshold: float) -> tuple[Array, Array]:
+def _fitted(
+    problem: Problem, rotation: Array, translation: Array, threshold: float, deadline: Deadline
+) -> tuple[Array, Array]:
     """Fit the pose to mutual nearest neighbours by least squares; keep the search's pose unless the fit is better.
 
     The difference must be significant. The search weights all matches by their probability. This is the better estimate
@@ -127,8 +148,10 @@ def _fitted(problem: Problem, rotation: Array, translation: Array, threshold: fl
     """
     image = problem.image_points
     for _ in range(MATCHES.fit_rounds):
+        if deadline.ended(Unfinished.refinement):
+            break
         projected = problem.project_scene(rotation, translation)
-        i, j = mutual_nearest(image, projected, threshold, problem.may_match).T
+        i, j = mutual_nearest(image, projected, threshold, problem.may_match, deadline).T
         if len(i) < MIN_POINTS:
             break
         target, points = image[i], problem.points3d[j]
@@ -141,24 +164,78 @@ def _fitted(problem: Problem, rotation: Array, translation: Array, threshold: fl
     return rotation, translation
 
 
-def one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed | None = None) -> Labels:
+def one_to_one(
+    image: Array, projected: Array, radius: float, allowed: Allowed | None = None, deadline: Deadline = NEVER
+) -> Labels:
     """Return a maximum one-to-one matching of image points and projected points within a radius (paper Eq. 1).
 
     The matches (i, j) satisfy |image_i - projected_j| <= radius, and no point is in two of them. Among the maximum
     matchings it has the least sum of squared distances. It is a minimum-weight matching in which an unmatched image
-    point costs more than all distances together. With many points only the `MATCHES.few_neighbours` nearest neighbours
-    of each are edges.
+    point costs more than all distances together. Points that share no possible match are assigned separately. With many
+    points only the `MATCHES.few_neighbours` nearest neighbours of each are edges.
 
     Args:
         image: (m, 2) image points.
         projected: (n, 2) projected points; a NaN point has no match.
         radius: Largest distance of a match.
         allowed: Returns which indices i and j may match; None for all.
+        deadline: Deadline; points for whose assignment no time is left get their mutual nearest neighbours.
 
     Returns:
         Indices (k, 2), ordered by i.
     """
-    matches, distance = _near(image, projected, radius, allowed)
+    matches, distance = _near(image, projected, radius, allowed, deadline)
+    chosen = [matches[:0]]
+    for part in _components(matches, len(image)):
+        chosen.append(_assigned(matches[part], distance[part], radius, deadline))
+    both = np.concatenate(chosen)
+    return np.asarray(both[np.argsort(both[:, 0])])
+
+
+def count_one_to_one(
+    image: Array, projected: Array, radius: float, allowed: Allowed | None = None, deadline: Deadline = NEVER
+) -> int:
+    """Return the number of matches of `one_to_one`, by a maximum matching, which is faster than one of least cost."""
+    if deadline.ended(Unfinished.matches):
+        return 0
+    matches, distance = _near(image, projected, radius, allowed, deadline)
+    if all(np.bincount(side).max(initial=0) <= 1 for side in matches.T):
+        return len(matches)  # no point has several candidates
+    if _is_too_long(MATCHES.counting * len(matches), deadline):
+        return len(_mutual(matches, distance))
+    graph = csr_array((np.ones(len(matches)), tuple(matches.T)), shape=(len(image), len(projected)))
+    return int((maximum_bipartite_matching(graph, perm_type="column") >= 0).sum())
+
+
+def _components(matches: Labels, count: int) -> Iterator[Labels | slice]:
+    """Yield the indices of the possible matches (e, 2) of points that share none with others, in groups.
+
+    A group has one component, or several with together at most `MATCHES.asked` matches.
+
+    Args:
+        matches: Indices of `count` image points and of scene points.
+        count: Number of image points.
+    """
+    if len(matches) <= MATCHES.asked:
+        yield slice(None)
+        return
+    size = count + int(matches[:, 1].max()) + 1
+    graph = csr_array((np.ones(len(matches), np.bool_), (matches[:, 0], count + matches[:, 1])), shape=(size, size))
+    component = connected_components(graph, directed=False)[1][matches[:, 0]]
+    sizes = np.bincount(component)
+    order = np.lexsort((component, sizes[component]))  # small ones first: the deadline may cut off the large ones
+    ends = np.cumsum(sizes[component[order]][np.r_[True, np.diff(component[order]) != 0]])
+    first = 0
+    while first < len(order):
+        last = int(
+            ends[max(np.searchsorted(ends, first + MATCHES.asked, "right") - 1, np.searchsorted(ends, first + 1))]
+        )
+        yield order[first:last]
+        first = last
+
+
+def _assigned(matches: Labels, distance: Array, radius: float, deadline: Deadline) -> Labels:
+    """Return the maximum matching with the least squared distances among possible matches (e, 2), in any order."""
     alone = np.logical_and(*(np.bincount(side)[side] == 1 for side in matches.T)) if len(matches) else np.ones(0, bool)
     if alone.all():
         return matches
@@ -167,30 +244,36 @@ def one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed |
     rows, row = np.unique(matches[:, 0], return_inverse=True)
     columns, column = np.unique(matches[:, 1], return_inverse=True)
     count, every = len(columns), np.arange(len(rows))
+    if _is_too_long(MATCHES.assignment * len(matches) * len(rows), deadline):
+        return np.concatenate([sure, _mutual(matches, distance)])
     cost = (distance / radius) ** 2 + 1e-9  # a zero would be no edge
     out = np.full(len(rows), float(min(len(rows), count) + 2))
     graph = csr_array((np.r_[cost, out], (np.r_[row, every], np.r_[column, count + every])))
     i, j = min_weight_full_bipartite_matching(graph)
     real = j < count
-    chosen = np.concatenate([sure, np.stack([rows[i[real]], columns[j[real]]], -1)])
-    return np.asarray(chosen[np.argsort(chosen[:, 0])])
+    return np.concatenate([sure, np.stack([rows[i[real]], columns[j[real]]], -1)])
 
 
-def count_one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed | None = None) -> int:
-    """Return the number of matches of `one_to_one`, by a maximum matching, which is faster than one of least cost."""
-    matches, _ = _near(image, projected, radius, allowed)
-    if all(np.bincount(side).max(initial=0) <= 1 for side in matches.T):
-        return len(matches)  # no point has several candidates
-    graph = csr_array((np.ones(len(matches)), tuple(matches.T)), shape=(len(image), len(projected)))
-    return int((maximum_bipartite_matching(graph, perm_type="column") >= 0).sum())
+def _is_too_long(seconds: float, deadline: Deadline) -> bool:
+    """Return whether an assignment, which cannot be interrupted, would end after the end of a deadline; note this."""
+    if Clock.now() + seconds < deadline.final:
+        return False
+    deadline.unfinished.add(Unfinished.matches)
+    return True
 
 
-def mutual_nearest(image: Array, projected: Array, radius: float, allowed: Allowed | None = None) -> Labels:
+def mutual_nearest(
+    image: Array, projected: Array, radius: float, allowed: Allowed | None = None, deadline: Deadline = NEVER
+) -> Labels:
     """Return the mutual nearest neighbours within `radius`: fewer matches than `one_to_one`, and fewer wrong ones."""
-    matches, distance = _near(image, projected, radius, allowed)
+    return _mutual(*_near(image, projected, radius, allowed, deadline))
+
+
+def _mutual(matches: Labels, distance: Array) -> Labels:
+    """Return those of possible matches (e, 2) that are the nearest ones of both points."""
     nearest = np.ones(len(matches), np.bool_)
-    for side, size in zip(matches.T, (len(image), len(projected)), strict=True):
-        least = np.full(size, np.inf)
+    for side in matches.T:
+        least = np.full(int(side.max(initial=-1)) + 1, np.inf)
         np.minimum.at(least, side, distance)
         nearest &= distance == least[side]
     return matches[nearest]
@@ -237,16 +320,18 @@ def fit_pose(
     return model.pose(end.state)
 
 
-def _near(image: Array, projected: Array, radius: float, allowed: Allowed | None) -> tuple[Labels, Array]:
+def _near(
+    image: Array, projected: Array, radius: float, allowed: Allowed | None, deadline: Deadline
+) -> tuple[Labels, Array]:
     """Return the allowed matches (e, 2) within `radius`, ordered, and their distances; nearest neighbours if many."""
     seen = np.flatnonzero(np.isfinite(projected).all(-1))
     if len(image) * len(seen) <= MATCHES.dense:
         distance = np.sqrt(((image[:, None] - projected[seen]) ** 2).sum(-1))
         matches = np.argwhere(distance <= radius)
     else:
-        both = _neighbours(image, projected[seen], radius)
+        both = _neighbours(image, projected[seen], radius, deadline)
         if np.bincount(both[:, 0]).max(initial=0) == MATCHES.few_neighbours:  # there may be more
-            both = np.concatenate([both, _neighbours(projected[seen], image, radius)[:, ::-1]])
+            both = np.concatenate([both, _neighbours(projected[seen], image, radius, deadline)[:, ::-1]])
         # One number per match: sorting unique rows as records takes ten times as long.
         matches = np.stack(np.divmod(np.unique(both[:, 0] * len(seen) + both[:, 1]), len(seen)), -1)
     matches[:, 1] = seen[matches[:, 1]]
@@ -254,9 +339,17 @@ def _near(image: Array, projected: Array, radius: float, allowed: Allowed | None
     return matches, np.linalg.norm(image[matches[:, 0]] - projected[matches[:, 1]], axis=-1)
 
 
-def _neighbours(points: Array, others: Array, radius: float) -> Labels:
-    """Return the indices (e, 2) of each point and of its nearest neighbours within `radius`."""
-    count = min(MATCHES.few_neighbours, len(others))
-    distance, index = cKDTree(others).query(points, range(1, count + 1), distance_upper_bound=radius)
-    point, nth = np.nonzero(np.isfinite(distance))
-    return np.stack([point, index[point, nth]], -1)
+def _neighbours(points: Array, others: Array, radius: float, deadline: Deadline) -> Labels:
+    """Return the indices (e, 2) of each point and of its nearest neighbours within `radius`.
+
+    Points that are not looked up before the end of a deadline have none.
+    """
+    count, tree, found = min(MATCHES.few_neighbours, len(others)), cKDTree(others), list[Labels]()
+    step = len(points) if math.isinf(deadline.final) else MATCHES.asked
+    for first in range(0, len(points), step):
+        if first and deadline.ended(Unfinished.matches):
+            break
+        distance, index = tree.query(points[first : first + step], range(1, count + 1), distance_upper_bound=radius)
+        point, nth = np.nonzero(np.isfinite(distance))
+        found.append(np.stack([first + point, index[point, nth]], -1))
+    return np.concatenate(found)

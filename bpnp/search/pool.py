@@ -159,4 +159,11 @@ class Pool:
         )
         if self.enumerated.log10_false_alarms < result.log10_false_alarms:
             return replace(self.enumerated, batches=self.iterations)
-        return judge_with_competitors(result, problem, lambda: scene, verdict_settings, local_searches=local_searches)
+        return judge_with_competitors(
+            result,
+            problem,
+            lambda: scene,
+            verdict_settings,
+            local_searches=local_searches,
+            deadline=scene.deadline,
+        )

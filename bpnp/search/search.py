@@ -87,7 +87,7 @@ def search_poses(
     many = exceeds_enumeration(problem)
     matches = None if only_proposals else known_matches(problem)
     if matches is not None and (problem.prior is None or not is_enumerable(problem)):
-        return _of_known_matches(problem, *matches, scene_of, seed, settings)
+        return _of_known_matches(problem, *matches, scene_of, seed, settings, deadline)
     if not many:
         settings = settings.limited(min(settings.schedule.iterations, settings.schedule.enumerated))
     if not only_proposals and is_enumerable(problem) and not deadline.passed():
@@ -95,7 +95,7 @@ def search_poses(
         enumerated = run(EnumerationPlan(poses, deadline), poses, most=1, deadline=NEVER)
         by_chance = fits_by_chance(enumerated.log10_false_alarms)
         if matches is not None and by_chance:  # residuals may exceed its match radius
-            return _of_known_matches(problem, *matches, scene_of, seed, settings)
+            return _of_known_matches(problem, *matches, scene_of, seed, settings, deadline)
         tell(0)
         # More search helps only if no pose is significant yet, and there are enough points to anneal.
         small = min(len(problem.bearings), len(problem.points3d)) < settings.least_annealed
@@ -121,11 +121,12 @@ def _of_known_matches(
     scene_of: SceneOf,
     seed: int,
     settings: SearchSettings,
+    deadline: Deadline,
 ) -> SearchResult:
     """Compute the verdict on the poses that known matches, indices (k,) of image and of scene points, fit best."""
     found, verdict_settings = poses_of_matches(problem, i, j, seed), settings.evidence
     result = judge(found, problem, batches=0, exhaustive=True, settings=verdict_settings)
-    return judge_with_competitors(result, problem, scene_of, verdict_settings, exhaustive=True)
+    return judge_with_competitors(result, problem, scene_of, verdict_settings, exhaustive=True, deadline=deadline)
 
 
 def lacks_partners(scene: Scene) -> bool:

@@ -68,6 +68,8 @@ class SolutionStats:
         converged: True if the verdict is "confident".
         dropped2d: Number of 2D points that could not be undistorted and were dropped.
         taken2d: Number of 2D points that other problems of the same image use (`solve_many`).
+        unfinished: Stages that the time limit cut short: "search", "matcher" (it was not asked), "refinement",
+            "focal lengths", "competing poses", "views", "matches" (some points have none, or their nearest one).
     """
 
     iterations: int = 0
@@ -75,6 +77,7 @@ class SolutionStats:
     converged: bool = False
     dropped2d: int = 0
     taken2d: int = 0
+    unfinished: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -466,7 +469,7 @@ def _float(value: float | None, *, missing: float = math.nan) -> float:
     return missing if value is None else value
 
 
-LATER = {"covariance", "scale", "taken2d", "reason_code"}  # fields added after version 0.1.0
+LATER = {"covariance", "scale", "taken2d", "reason_code", "unfinished"}  # fields added after version 0.1.0
 READERS: dict[str, Callable[[Any], Any]] = {  # of the fields with another form in JSON
     "rotation": partial(_array, shape=(3, 3)),
     "translation": partial(_array, shape=(3,)),
@@ -475,6 +478,7 @@ READERS: dict[str, Callable[[Any], Any]] = {  # of the fields with another form 
     "points3d": partial(_array, shape=(-1, 3)),
     "normals3d": lambda values: None if values is None else _array(values, shape=(-1, 3)),
     "parameters": tuple,
+    "unfinished": tuple,
     "points_per_camera": lambda values: None if values is None else tuple(values),
     "matches": lambda values: np.array(values, np.int64).reshape(-1, 2),
     "camera": lambda value: None if value is None else camera_from(value),

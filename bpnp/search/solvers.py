@@ -1,10 +1,14 @@
 """Solutions of problems: by the search, or by a trained module."""
 
+import math
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
 
 from bpnp.runtime import Clock, Deadline
 from bpnp.search.arguments import Array
@@ -18,6 +22,7 @@ from bpnp.search.search import search_poses
 from bpnp.search.solution import Solution
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import reasons
+from bpnp.search.verdict.decide import SearchResult
 
 if TYPE_CHECKING:
     import torch
@@ -35,11 +40,11 @@ class Options(NamedTuple):
         inlier_threshold: Largest reprojection error of a match; None for the default.
         clutter: Expected outlier fraction; None if it is unknown.
         seed: Seed of the search, default 0.
-        time_limit: Seconds per problem; None for no limit.
+        time_limit: Seconds per problem, of which reasons speak; None for no limit.
         device: Device of the modules; None for that of each module.
         progress: Callback with (problem index, batches of initial poses, seconds).
         settings: Settings of the search.
-        until: Deadline for all problems together.
+        until: Deadline for all searches together.
     """
 
     solver: "torch.nn.Module | None" = None
@@ -66,10 +71,19 @@ class Options(NamedTuple):
 
     def deadline(self, problem: Problem) -> Deadline:
         """Return when the search of a problem that starts now has to stop, so that verdict and matching end in time."""
-        begun = Clock.now()
-        end = min(self.until.at, Deadline.after(self.time_limit).at)
-        ending = TIME.ending + TIME.ending_a_point * (len(problem.bearings) + len(problem.points3d))
-        return Deadline(max(end - ending, (begun + end) / 2))
+        return self.limit().before(ending_seconds(problem))
+
+    def limit(self) -> Deadline:
+        """Return the deadline of what starts now, without time for its ending."""
+        own, until = Deadline.after(self.time_limit).at, self.until
+        unfinished = set[str]() if math.isinf(until.final) else until.unfinished
+        return Deadline(min(own, until.at), min(own, until.final), unfinished)
+
+
+def ending_seconds(*problems: Problem) -> float:
+    """Return the expected time of the verdict and the matching after a search."""
+    points = sum(len(problem.bearings) + len(problem.points3d) for problem in problems)
+    return TIME.ending + TIME.ending_a_point * points
 
 
 def solve_problems(problems: Mapping[int, Problem], options: Options) -> dict[int, Solution]:
@@ -98,13 +112,18 @@ def solve_problems(problems: Mapping[int, Problem], options: Options) -> dict[in
     return solutions | {i: _by_search(i, problem, options) for i, problem in solvable.items()}
 
 
+def may_be_decided(result: SearchResult) -> bool:
+    """Return True if more time may change a verdict."""
+    return result.verdict != "confident" and (not result.settled or result.code in reasons.UNTESTED)
+
+
 def _by_search(i: int, problem: Problem, options: Options) -> Solution:
     start, deadline = time.perf_counter(), options.deadline(problem)
     result = search_poses(
         problem,
         around=None if problem.network is None else _pose_of_network(problem.network, problem, deadline),
         clutter=options.clutter,
-        proposals=_proposals_of_matcher(problem, options.seed) if options.asks else None,
+        proposals=_proposals_of_matcher(problem, options.seed, deadline) if options.asks else None,
         seed=options.seed,
         deadline=deadline,
         settings=options.settings,
@@ -114,11 +133,12 @@ def _by_search(i: int, problem: Problem, options: Options) -> Solution:
     if not len(result.candidates) and deadline.passed():
         limit = options.time_limit or seconds
         result = replace(result, reason=f"no pose was found in {limit:.3g} s; try a longer time limit")
-    elif result.verdict == "ambiguous" and not result.settled and deadline.passed():
+    elif deadline.passed() and may_be_decided(result):
+        deadline.unfinished.add(reasons.Unfinished.search)
         result = replace(result, reason=reasons.undecided(result.reason, options.time_limit or seconds))
     if result.verdict == "failed" and mirrored_alarms(problem, deadline) <= options.settings.evidence.false_alarms:
         result = replace(result, reason=f"{result.reason}; {reasons.MIRRORED}")
-    return finished(problem, result, seconds, options.inlier_threshold)
+    return finished(problem, result, seconds, options.inlier_threshold, deadline)
 
 
 def _pose_of_network(net: "torch.nn.Module", problem: Problem, deadline: Deadline) -> PosePrior | None:
@@ -127,12 +147,12 @@ def _pose_of_network(net: "torch.nn.Module", problem: Problem, deadline: Deadlin
     return pose_prior(net, problem, deadline)
 
 
-def _proposals_of_matcher(problem: Problem, seed: int) -> Proposals | None:
+def _proposals_of_matcher(problem: Problem, seed: int, deadline: Deadline) -> Proposals | None:
     """Return a function that proposes poses of the packaged matcher for a problem; None if no matcher applies.
 
     The matcher for views near a known pose applies with a `PosePrior`. The matcher for scenes in any axes applies
     without a prior and with few enough points. Networks are imported only when the function is called, if the search is
-    undecided.
+    undecided and there is time for them.
     """
     weights = VIEW_MATCHER if isinstance(problem.prior, PosePrior) else SCENE_MATCHER
     too_many = len(problem.bearings) * len(problem.points3d) > NETWORKS.most_cells
@@ -140,11 +160,20 @@ def _proposals_of_matcher(problem: Problem, seed: int) -> Proposals | None:
         return None
 
     def propose() -> tuple[Array, Array]:
+        if Clock.now() + _seconds_of_matcher(problem) > deadline.at:
+            deadline.unfinished.add(reasons.Unfinished.matcher)
+            return np.empty((0, 3, 3)), np.empty((0, 3))
         from bpnp.search.propose.networks import packaged_matcher, proposed
 
         return proposed(packaged_matcher(weights), problem, seed)
 
     return propose
+
+
+def _seconds_of_matcher(problem: Problem) -> float:
+    """Return the expected time of a packaged matcher, which cannot be interrupted."""
+    squares = len(problem.bearings) ** 2 + len(problem.points3d) ** 2
+    return NETWORKS.seconds_a_square * squares + (0.0 if "torch" in sys.modules else NETWORKS.loading)
 
 
 def _by_module(
@@ -163,24 +192,26 @@ def _by_module(
     for i in sorted(problems, key=cells.__getitem__):
         start, problem = time.perf_counter(), problems[i]
         if isinstance(net, Matcher) and exceeds_enumeration(problem):
+            deadline = options.deadline(problem)
             result = search_poses(
                 problem,
                 proposals=partial(proposed, net, problem, options.seed),
                 only_proposals=True,
                 clutter=options.clutter,
                 seed=options.seed,
-                deadline=options.deadline(problem),
+                deadline=deadline,
                 settings=options.settings,
                 progress=options.progress_of(i),
             )
-            yield i, finished(problem, result, time.perf_counter() - start, options.inlier_threshold)
+            yield i, finished(problem, result, time.perf_counter() - start, options.inlier_threshold, deadline)
         elif groups and device_of(net).type != "cpu" and cells[i] * (len(groups[-1]) + 1) <= NETWORKS.together:
             groups[-1].append(i)
         else:
             groups.append([i])
     for group in groups:
         start, members = time.perf_counter(), [problems[i] for i in group]
-        results = predicted(net, members, options.deadline(members[-1]))
+        deadline = options.deadline(members[-1])
+        results = predicted(net, members, deadline)
         seconds = (time.perf_counter() - start) / len(group)
         for i, result in zip(group, results, strict=True):
-            yield i, finished(problems[i], result, seconds, options.inlier_threshold)
+            yield i, finished(problems[i], result, seconds, options.inlier_threshold, deadline)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.argument_types import ArrayLike, PointsLike
 from bpnp.cameras import CameraLike, camera_from
-from bpnp.runtime import Deadline
+from bpnp.runtime import NEVER, Deadline
 from bpnp.search.arguments import Array, Labels, checked_pose, checked_seed, numbers, positive, seconds_from
 from bpnp.search.config import TIME
 from bpnp.search.given_pose import judge_given_pose
@@ -19,8 +19,9 @@ from bpnp.search.inputs import problem_from
 from bpnp.search.matching import failed_solution, finished
 from bpnp.search.problem import Problem
 from bpnp.search.solution import Solution
+from bpnp.search.solvers import Options
 from bpnp.search.verdict.decide import match_count
-from bpnp.search.verdict.reasons import objection, undecided
+from bpnp.search.verdict.reasons import UNTESTED, Unfinished, objection, undecided
 from bpnp.search.verdict.uncertainty import linearised, pose_covariance
 
 
@@ -131,6 +132,7 @@ def verify_problem(
     inlier_threshold: float | None = None,
     seed: int = 0,
     time_limit: float = TIME.one,
+    until: Deadline = NEVER,
 ) -> Solution:
     """Verify a pose of a problem whose points have been checked; see `verify`.
 
@@ -142,20 +144,22 @@ def verify_problem(
         inlier_threshold: Largest reprojection error of a match, as for `verify`.
         seed: Seed of the refinement, default 0.
         time_limit: Seconds, 10 by default; math.inf for no limit.
+        until: Deadline of a longer task with this time limit.
 
     Returns:
         Solution with this pose, as of `verify`.
     """
-    begun, deadline = time.perf_counter(), Deadline.after(time_limit)
+    begun = time.perf_counter()
+    deadline = Options(time_limit=time_limit, until=until).deadline(problem)
     if problem.degenerate is not None:
         return failed_solution(problem, problem.degenerate, inlier_threshold, code="degenerate")
     claim = problem.from_user(rotation, translation)
     result, optimum = judge_given_pose(problem, *claim, refine=refine, seed=seed, deadline=deadline)
-    if result.verdict == "confident" and deadline.passed():
+    if result.verdict == "confident" and Unfinished.competing_poses in deadline.unfinished:
         result = result.add_objection(objection("untested"))
-    if result.code == "untested":
+    if result.code in UNTESTED:
         result = replace(result, reason=undecided(result.reason, time_limit))
-    solution = finished(problem, result, time.perf_counter() - begun, inlier_threshold)
+    solution = finished(problem, result, time.perf_counter() - begun, inlier_threshold, deadline)
     if not refine and solution.found:  # to the last digit
         first = replace(solution.candidates[0], translation=translation)
         solution = replace(solution, translation=translation, candidates=(first, *solution.candidates[1:]))

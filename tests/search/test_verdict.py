@@ -168,7 +168,7 @@ def test_a_focal_length_sweep_reaches_the_true_focal_length(factor: float) -> No
     assert np.degrees(Rotation.from_matrix(climbed.pose.rotation[0]).magnitude()) < 0.5
     seen = verdict_on(problem, np.eye(3)[None], met.centre3d[None], 4e-3, 0.6)
     scenes = [Scene(problem, 0, DEFAULT, end) for end in (NEVER, Deadline(0.0))]
-    other, untried = (other_lens(seen, problem, lambda one=one: one, DEFAULT.evidence) for one in scenes)
+    other, untried = (other_lens(seen, problem, lambda one=one: one, DEFAULT.evidence, one.deadline) for one in scenes)
     assert untried is not None
     if other is None:
         assert (factor, untried.clause) == (1.0, "there was no time to try other focal lengths")
@@ -189,7 +189,7 @@ def test_a_pose_is_not_confident_if_there_was_no_time_to_refine_its_competing_po
     assert (alone.verdict, len(alone.candidates)) == ("confident", 1)
     in_time, late = (
         judge_with_competitors(
-            alone, problem, partial(Scene, problem, 0, DEFAULT, end), DEFAULT.evidence, exhaustive=True
+            alone, problem, partial(Scene, problem, 0, DEFAULT, end), DEFAULT.evidence, exhaustive=True, deadline=end
         )
         for end in (NEVER, Deadline(0.0))
     )

@@ -72,21 +72,21 @@ class EnumeratedPoses:
         self.run.advance(deadline)
         return self.run.poses()
 
-    def propose_competitors(self) -> Hypotheses:
+    def propose_competitors(self, deadline: float) -> Hypotheses:
         """Refine the competing poses of the best pose, and return all poses."""
         leader = self.found[:1]
         self._leaders.append(leader)
         pose, verdict_settings = leader.pose(), self.settings.evidence
         scale = max(float(leader.scale[0]), self.problem.floor or ENUMERATION.smallest_scale)
         rotations, translations, *_ = competing_poses(self.problem, *pose, scale, verdict_settings)
-        rest = self._poses_of_rest(leader)
+        rest = self._poses_of_rest(leader, deadline)
         rotations = np.concatenate([rotations, rest.rotation])
         translations = np.concatenate([translations, rest.translation])
         for one in zip(rotations, translations, strict=True):
             self.run.propose(*one, self.run.reach)
         return self.run.poses()
 
-    def _poses_of_rest(self, leader: Hypotheses) -> Hypotheses:
+    def _poses_of_rest(self, leader: Hypotheses, deadline: float) -> Hypotheses:
         """Return the poses of a short enumeration of the points without a match, if there may be as many matches.
 
         If the image shows two bodies that move on their own, the leader may be the pose of the smaller one.
@@ -97,7 +97,8 @@ class EnumeratedPoses:
         if min(len(image), len(scene)) < leader.match_count[0]:
             return Hypotheses.empty()
         settings = replace(ENUMERATION, most=ENUMERATION.patience)
-        return enumerate_poses(problem.choose(image, scene), radius=problem.match_radius, settings=settings).poses
+        rest = problem.choose(image, scene)
+        return enumerate_poses(rest, radius=problem.match_radius, deadline=deadline, settings=settings).poses
 
     def may_be_decided(self) -> bool:
         """Return True if the best pose leads by a safe margin and passes the cheap tests of the verdict."""
@@ -192,7 +193,7 @@ class EnumerationPlan:
         if poses.is_certain:
             return None
         if run.is_significant and not poses.has_competitors and run.ended is None:
-            return Step(poses.propose_competitors)
+            return Step(partial(poses.propose_competitors, self._deadline.at))
         if run.ended is None and run.is_significant and run.is_long:
             run.ended = "most"
         if run.ended is None:

@@ -32,7 +32,7 @@ from bpnp.search.focal_length import FocalSweep, UnknownCamera
 from bpnp.search.infinity.evidence import how_well_known, noise_of, prior_information, uncertainty_of
 from bpnp.search.infinity.search import search_rotation
 from bpnp.search.inputs import bearings_of, check_seen, check_view, unit_of
-from bpnp.search.matching import angles_between, count_one_to_one, one_to_one
+from bpnp.search.matching import angles_between, count_one_to_one, one_to_one, with_unfinished
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.refine.gauss_newton import ImageMatches, Iteration, image_equations, image_rows, refine
@@ -167,7 +167,7 @@ class _SkySweep(FocalSweep):
 
     def preselect(self, camera: Camera) -> Camera:
         sky = self.sky.at(*self.unknown.parts(camera))
-        found = _solve(sky, self.options._replace(time_limit=self.time_left(1)), COARSE)
+        found = _solve(sky, self.options._replace(until=self.deadline), COARSE)
         return camera if found.verdict == "failed" else self.refine(found, camera)
 
     def solve_with(self, camera: Camera, options: Options) -> Solution:
@@ -243,7 +243,7 @@ def _with_focal_length(sky: Sky, rotation: Array, matches: Labels) -> Array:
 
 def _solve(sky: Sky, options: Options, settings: InfinitySettings = INFINITY) -> Solution:
     """Return the solution for given cameras, which are some of the sweep if the focal length is unknown."""
-    begun, deadline = Clock.now(), Deadline.after(options.time_limit)
+    begun, deadline = Clock.now(), options.limit()
     inlier_threshold = None if settings is COARSE else options.inlier_threshold
     scene, lens = sky.problem.points3d, sky.lenses[0]
     parts = [_bearings(image, own) for image, own in zip(sky.images, sky.lenses, strict=True)]
@@ -298,7 +298,7 @@ def _solve(sky: Sky, options: Options, settings: InfinitySettings = INFINITY) ->
     hit = np.flatnonzero(found.matches[0] >= 0)
     residual = noise_of(rotated[0][found.matches[0, hit]], every[hit], pixel[hit])
     threshold = inlier_threshold or MATCHES.reach * residual * float(median_pixel[one] * per_radian[one])
-    pairs, counts = _match_in_cameras(problem, rotated, owner, threshold / per_radian)
+    pairs, counts = _match_in_cameras(problem, rotated, owner, threshold / per_radian, deadline)
     i, j = pairs.T
     matches = np.stack([usable[i], j], -1)
     if sky.unknown is None:
@@ -320,10 +320,12 @@ def _solve(sky: Sky, options: Options, settings: InfinitySettings = INFINITY) ->
         residual=residual * float(median_pixel[one]),
         covariance=np.full_like(covariance, math.nan) if result.verdict == "failed" else covariance,
     )
-    return replace(solution, seconds=Clock.now() - begun)
+    return with_unfinished(replace(solution, seconds=Clock.now() - begun), deadline)
 
 
-def _match_in_cameras(problem: Problem, rotated: Sequence[Array], owner: Labels, radii: Array) -> tuple[Labels, Labels]:
+def _match_in_cameras(
+    problem: Problem, rotated: Sequence[Array], owner: Labels, radii: Array, deadline: Deadline
+) -> tuple[Labels, Labels]:
     """Match the image points of each camera one to one to rotated directions.
 
     Args:
@@ -331,6 +333,7 @@ def _match_in_cameras(problem: Problem, rotated: Sequence[Array], owner: Labels,
         rotated: Directions (n, 3) rotated by each of c rotations.
         owner: Camera (m,) of each bearing.
         radii: Largest angle of a match in each camera, radians.
+        deadline: As for `one_to_one`.
 
     Returns:
         Matches (k, 2) of the first rotation, and the numbers (c,) of matches of all.
@@ -342,9 +345,9 @@ def _match_in_cameras(problem: Problem, rotated: Sequence[Array], owner: Labels,
         def may_match(i: Any, j: Any, own: Any = own) -> Any:
             return problem.may_match(own[i], j)
 
-        i, j = one_to_one(every[own], rotated[0], radius, may_match).T
+        i, j = one_to_one(every[own], rotated[0], radius, may_match, deadline).T
         pairs.append(np.stack([own[i], j], -1))
-        counts += [len(i), *(count_one_to_one(every[own], each, radius, may_match) for each in rotated[1:])]
+        counts += [len(i), *(count_one_to_one(every[own], each, radius, may_match, deadline) for each in rotated[1:])]
     return np.concatenate(pairs), counts
 
 

@@ -78,7 +78,7 @@ def _judge(problem: Problem, rotation: Array, translation: Array, deadline: Dead
     if not len(poses):
         return no_pose("the module found no pose")
     result = judge(poses, problem, batches=len(rotation), settings=DEFAULT.evidence)
-    return judge_with_competitors(result, problem, lambda: scene, DEFAULT.evidence)
+    return judge_with_competitors(result, problem, lambda: scene, DEFAULT.evidence, deadline=deadline)
 
 
 def proposed(net: "Matcher", problem: Problem, seed: int) -> tuple[Array, Array]:

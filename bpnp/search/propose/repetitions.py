@@ -8,12 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
+from bpnp.runtime import NEVER, Deadline
 from bpnp.search.config import MATCHES, Evidence, Repetitions
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem
 from bpnp.search.propose.collinear import find_line, rotations_about
 from bpnp.search.propose.symmetries import Motions, matching_tolerance, mirror_pose, reflection, self_motions
 from bpnp.search.verdict.false_alarms import SHARES, alarms_of, directions_of, point_evidence
+from bpnp.search.verdict.reasons import Unfinished
 
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]
@@ -191,7 +193,14 @@ def _is_far(
 
 
 def repeated_poses(
-    problem: Problem, rotation: Array, translation: Array, scale: float, settings: Evidence, *, least: float = 0.0
+    problem: Problem,
+    rotation: Array,
+    translation: Array,
+    scale: float,
+    settings: Evidence,
+    *,
+    least: float = 0.0,
+    deadline: Deadline = NEVER,
 ) -> Repeated:
     """Return the competing poses of a pose due to the motions of the scene, and these motions.
 
@@ -202,6 +211,7 @@ def repeated_poses(
         scale: Standard deviation of its residuals, radians.
         settings: Constants of the verdict.
         least: Smallest fraction of the matched points that a motion maps, default 0.
+        deadline: Deadline, after whose end the poses that are not scored yet are left out.
 
     Returns:
         Unrefined poses that differ from the given one (`Evidence.same`), at most `Repetitions.kept`, the fewest false
@@ -221,11 +231,18 @@ def repeated_poses(
         problem, rotation, translation, scale, settings, least=least
     )
     scales = np.full(len(rotations), scale)
-    alarms = alarms_of(problem, rotations, translations, scales).own
+    alarms = np.full(len(scales), math.inf)
+    step = max(settings.repetitions.scored_points // (len(problem.bearings) + len(problem.points3d)), 1)
+    for k in range(0, len(scales), step):
+        if k and deadline.ended(Unfinished.competing_poses):
+            break
+        part = slice(k, k + step)
+        alarms[part] = alarms_of(problem, rotations[part], translations[part], scales[part]).own
     poses = Hypotheses.from_poses(
         rotations, translations, scale=scales, log10_false_alarms=alarms, log10_rough=alarms.copy()
     )
     kept = np.argsort(alarms, kind="stable")[: settings.repetitions.kept]
+    kept = kept[np.isfinite(alarms[kept])]
     return Repeated(poses[kept], sizes[kept], motions)
 
 

@@ -34,7 +34,7 @@ from bpnp.search.search_frame import Scene
 from bpnp.search.verdict.competitors import distance_between
 from bpnp.search.verdict.decide import SearchResult, fits_by_chance, is_object, judge, match_count, missed, no_pose
 from bpnp.search.verdict.false_alarms import alarms_of
-from bpnp.search.verdict.reasons import Objection, focal_length_not_fixed, objection
+from bpnp.search.verdict.reasons import Objection, Unfinished, focal_length_not_fixed, objection
 from bpnp.search.verdict.uncertainty import linearised, share_bound
 
 PROPOSING = replace(ENUMERATION, kept=RIG.proposing)
@@ -66,7 +66,7 @@ def search_rig(
         Distinct poses of the rig, best first, and the verdict on the first one.
     """
     settings = settings if clutter is None else settings.expecting(clutter)
-    poses, tell = RigPoses(rig), teller(progress)
+    poses, tell = RigPoses(rig, deadline), teller(progress)
     for k, problem in enumerate(rig.problems):
         if exceeds_enumeration(problem):
             scene = Scene(problem, seed + k, settings, deadline)
@@ -139,9 +139,11 @@ class RigPoses:
         searched: Initial poses that had a local search.
         best: Distinct refined poses, best first.
         exhaustive: True if every pose was tried.
+        deadline: Deadline of the search.
     """
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: Rig, deadline: Deadline = NEVER) -> None:
+        self.deadline = deadline
         self.rig, self.verdict_settings, self.exhaustive = rig, DEFAULT.evidence, True
         self.found = [Hypotheses.empty() for _ in rig.problems]
         self.starts = Hypotheses.empty(4)
@@ -247,6 +249,8 @@ class RigPoses:
         if not len(self.best):
             return no_pose()
         result = self._judge()
+        if result.verdict == "confident" and self.deadline.ended(Unfinished.competing_poses):
+            result = result.add_objection(objection("untested"))
         if result.verdict == "confident":
             strongest, seen = self._strongest()
             pose_and_scale = *seen.pose(), float(seen.scale[0])

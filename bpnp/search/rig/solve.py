@@ -9,22 +9,23 @@ from typing import Any
 import numpy as np
 
 from bpnp.cameras import Camera, camera_from
-from bpnp.runtime import Clock, Deadline
+from bpnp.runtime import NEVER, Clock, Deadline
 from bpnp.search.arguments import Array, about, checked_pose, pose_of
 from bpnp.search.config import MATCHES
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.focal_length import FocalSweep, UnknownCamera
 from bpnp.search.inputs import problem_from
-from bpnp.search.matching import count_one_to_one, failed_solution, one_to_one
+from bpnp.search.matching import count_one_to_one, failed_solution, one_to_one, with_unfinished
 from bpnp.search.pose_model import crossed
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.rig.cameras import Pose, Rig
 from bpnp.search.rig.search import search_rig
 from bpnp.search.solution import FOCAL_LENGTH, POSE_PARAMETERS, SCALE, Solution, add_pose
-from bpnp.search.solvers import Options
+from bpnp.search.solvers import Options, ending_seconds, may_be_decided
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
 from bpnp.search.verdict.covariance import student_factor
 from bpnp.search.verdict.decide import SearchResult, no_pose
+from bpnp.search.verdict.reasons import Unfinished, undecided
 
 
 def prepare_rig(
@@ -150,12 +151,12 @@ class _RigSweep(FocalSweep):
 
 
 def _solve(rig: Rig, options: Options) -> Solution:
-    begun = Clock.now()
+    begun, deadline = Clock.now(), NEVER
     reasons = [problem.degenerate for problem in rig.problems if problem.degenerate is not None]
     if reasons:
         result = no_pose(reasons[0], code="degenerate", settled=True)
     else:
-        deadline = Deadline.after(options.time_limit)
+        deadline = options.limit().before(ending_seconds(*rig.problems))
         result = search_rig(
             rig,
             clutter=options.clutter,
@@ -164,7 +165,10 @@ def _solve(rig: Rig, options: Options) -> Solution:
             settings=options.settings,
             progress=options.progress_of(0),
         )
-    solution = _finished(rig, rig.problems, result, options.inlier_threshold)
+        if options.time_limit is not None and deadline.passed() and may_be_decided(result):
+            deadline.unfinished.add(Unfinished.search)
+            result = replace(result, reason=undecided(result.reason, options.time_limit))
+    solution = with_unfinished(_finished(rig, rig.problems, result, options.inlier_threshold, deadline), deadline)
     return replace(solution, seconds=Clock.now() - begun)
 
 
@@ -179,7 +183,13 @@ def mount_from(name: str, value: Any) -> Pose:
     return checked_pose(f"{name}.", *pose)
 
 
-def _finished(rig: Rig, problems: Sequence[Problem], result: SearchResult, inlier_threshold: float | None) -> Solution:
+def _finished(
+    rig: Rig,
+    problems: Sequence[Problem],
+    result: SearchResult,
+    inlier_threshold: float | None,
+    deadline: Deadline,
+) -> Solution:
     """Build the solution with the matches of all cameras; 2D points are indexed over all cameras, concatenated."""
     found, first = result.candidates, problems[0]
     solution = replace(failed_solution(first, result.reason, inlier_threshold, code=result.code), camera=None)
@@ -206,8 +216,8 @@ def _finished(rig: Rig, problems: Sequence[Problem], result: SearchResult, inlie
         threshold = inlier_threshold or MATCHES.reach * result.residual * problem.per_radian
         image, may_match = problem.image_points, problem.may_match
         seen, *others = map(problem.project_scene, *rig.pose_of(k, found.rotation, found.translation))
-        i, j = one_to_one(image, seen, threshold, may_match).T
-        counts += [len(i), *(count_one_to_one(image, other, threshold, may_match) for other in others)]
+        i, j = one_to_one(image, seen, threshold, may_match, deadline).T
+        counts += [len(i), *(count_one_to_one(image, other, threshold, may_match, deadline) for other in others)]
         errors.append(np.linalg.norm(image[i] - seen[j], axis=-1))
         angles.append(errors[-1] / problem.per_radian)
         matches.append(np.stack([problem.usable[i] + count, j], -1))

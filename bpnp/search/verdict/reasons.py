@@ -7,6 +7,7 @@ from bpnp.search.config import REASONS
 
 MIRRORED = "the mirror image of the scene has a significant pose: check the directions of its axes"
 CONFIDENT = "confident"  # code of a pose without an objection
+UNTESTED = {"untested", "camera_untested"}  # codes of poses for whose competitors there was no time
 CLAUSES = {
     # There is no pose, or it is not significant.
     "no_pose": "no pose was found",
@@ -39,6 +40,21 @@ CLAUSES = {
     "focal_length_not_fixed": "the points do not fix the focal length: it and the distance may be {off}",
     "scale_not_fixed": "the points do not fix the scale of the scene: it may be more than {percent:.0f} % off",
 }
+
+
+class Unfinished:
+    """Stages that a time limit may cut short, as `SolutionStats.unfinished` names them."""
+
+    search = "search"
+    matcher = "matcher"
+    refinement = "refinement"
+    focal_lengths = "focal lengths"
+    competing_poses = "competing poses"
+    views = "views"
+    matches = "matches"
+
+
+TESTS = {Unfinished.competing_poses, Unfinished.focal_lengths}  # stages without which no pose is confident
 
 
 class Objection(NamedTuple):
