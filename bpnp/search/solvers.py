@@ -134,7 +134,8 @@ def _by_search(i: int, problem: Problem, options: Options) -> Solution:
         limit = options.time_limit or seconds
         result = replace(result, reason=f"no pose was found in {limit:.3g} s; try a longer time limit")
     elif deadline.passed() and may_be_decided(result):
-        deadline.unfinished.add(reasons.Unfinished.search)
+        if not result.settled:
+            deadline.unfinished.add(reasons.Unfinished.search)
         result = replace(result, reason=reasons.undecided(result.reason, options.time_limit or seconds))
     if result.verdict == "failed" and mirrored_alarms(problem, deadline) <= options.settings.evidence.false_alarms:
         result = replace(result, reason=f"{result.reason}; {reasons.MIRRORED}")

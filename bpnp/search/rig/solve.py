@@ -166,7 +166,8 @@ def _solve(rig: Rig, options: Options) -> Solution:
             progress=options.progress_of(0),
         )
         if options.time_limit is not None and deadline.passed() and may_be_decided(result):
-            deadline.unfinished.add(Unfinished.search)
+            if not result.settled:
+                deadline.unfinished.add(Unfinished.search)
             result = replace(result, reason=undecided(result.reason, options.time_limit))
     solution = with_unfinished(_finished(rig, rig.problems, result, options.inlier_threshold, deadline), deadline)
     return replace(solution, seconds=Clock.now() - begun)
