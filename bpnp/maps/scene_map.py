@@ -173,10 +173,10 @@ class SceneMap(ViewedPoints):
             solver: As for `bpnp.solve`. A network that was trained in the frame of a view gets the points in the frame
                 of the view that is tried, or of the prior.
             seed: Seed of the search, default 0.
-            time_limit: Seconds for all views together; math.inf for no limit. Default: None, 60 seconds. After it no
-                further view is tried. The best pose is still refined on all map points in view, and competing poses of
-                a confident pose are tested: 1 or 2 CPU seconds with a known camera, up to 15 with an unknown focal
-                length. A pose that is not confident then has a reason with the number of views that were tried.
+            time_limit: Seconds in total; math.inf for no limit. Default: None, 60 seconds. The last 1.5 seconds are
+                kept to refine the best pose on all map points in view and to test its competing poses; a pose for which
+                that was cut short is "ambiguous" at best. A pose that is not confident then has a reason with the
+                number of views that were tried.
 
         Returns:
             Solution of the photo. `view` is the view near which the pose was found. `points3d` are the points of
@@ -225,9 +225,8 @@ class SceneMap(ViewedPoints):
             keypoints: (m, 2) pixels, all that were detected in its image, in COLMAP's convention: (0.5, 0.5) is the
                 centre of the first pixel.
             seed: Seed of the perturbed copies of the pose from which it is refined, default 0.
-            time_limit: Seconds until competing poses in view are no longer tested, 10 by default; math.inf for no
-                limit. A pose for which they were not all tested is "ambiguous" at best. None is deprecated: it warns
-                and stands for 10 seconds.
+            time_limit: Seconds, 10 by default; math.inf for no limit. A pose whose competing poses were not all tested
+                by then is "ambiguous" at best. None is deprecated: it warns and stands for 10 seconds.
 
         Returns:
             Solution as of `bpnp.verify`. `points3d` and `point_ids` are the points in view.

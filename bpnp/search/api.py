@@ -126,8 +126,9 @@ def solve(
             `Solution.scale` satisfies rig = scale R p + t, with t in the unit of the rig. The rig needs a non-zero
             baseline, and a `prior` has no `translation_sigma`. Default False.
         seed: Seed of the search, default 0.
-        time_limit: Seconds in total, 10 by default; math.inf for no limit. At the limit each stage of the search ends
-            with its current poses, and the best pose is returned.
+        time_limit: Seconds in total, 10 by default; math.inf for no limit. At the limit each stage ends with its
+            current poses, and the best pose is returned. `stats.unfinished` names the stages that were cut short. A
+            pose whose competing poses were not all tested is "ambiguous" at best.
         device: Device on which a copy of a module runs; None for the module's own device. The search runs on the CPU.
         progress: Callback with (problem index, batches of initial poses, seconds), called after each batch and after
             the enumeration of a small problem (0 batches). With `at_infinity` the image points that were tried count
