@@ -71,7 +71,8 @@ def main(args: Sequence[str] | None = None) -> None:
         if os.environ.get("BPNP_TRACEBACK") or not _is_mistake(error):
             raise
         # File names that are not UTF-8 contain surrogates, which a terminal cannot show.
-        print(f"bpnp: error: {plain(str(error))}".encode("utf-8", "replace").decode(), file=sys.stderr)
+        text = plain(str(error)) or "there is too little memory for this command; give it less data"
+        print(f"bpnp: error: {text}".encode("utf-8", "replace").decode(), file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt:
         _end_interrupted(arguments)
@@ -115,7 +116,7 @@ def _is_mistake(error: Exception) -> bool:
     frames = traceback.walk_tb(error.__traceback__)
     modules = [frame.f_globals.get("__name__", "").partition(".")[0] for frame, _ in frames]
     of_lightning = isinstance(error, RuntimeError) and modules[-1:] == ["lightning"]  # such as an unknown `monitor`
-    named = isinstance(error, (ValueError, OSError)) or type(error).__name__ in LIGHTNING_MISTAKES
+    named = isinstance(error, (ValueError, OSError, MemoryError)) or type(error).__name__ in LIGHTNING_MISTAKES
     return (named or of_lightning) and set(modules) <= LIBRARIES
 
 

@@ -14,6 +14,8 @@ from typing import Any
 from filelock import FileLock, Timeout
 from platformdirs import user_cache_path
 
+from bpnp.bounded_files import read_text, read_yaml
+
 CONFIGS = Path(__file__).parent / "configs"  # in a checkout, a link to the folder `configs` at the top
 
 
@@ -159,7 +161,7 @@ def read_lines(path: Path) -> list[str]:
     Args:
         path: UTF-8 file.
     """
-    return [line for text in path.read_text(encoding="utf-8").splitlines() if (line := text.strip())]
+    return [line for text in read_text(path).splitlines() if (line := text.strip())]
 
 
 def name_bytes(name: str) -> bytes:
@@ -222,12 +224,7 @@ def config_content(file: Path) -> dict[str, Any]:
     Raises:
         ValueError: The file is not YAML, or holds no options.
     """
-    import yaml
-
-    try:
-        content = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{file} is not YAML: {' '.join(str(error).split())}") from error
+    content = read_yaml(file)
     if not isinstance(content, dict):
         raise ValueError(f"{file} has no options such as `model:` and `data:`; its content is {content!r:.60}")
     return content

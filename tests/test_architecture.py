@@ -15,6 +15,7 @@ GROUND = {
     "poses",
     "cameras",
     "files",
+    "bounded_files",
     "metrics",
     "runtime",
     "precision",

@@ -16,7 +16,7 @@ from pathlib import Path
 from pydoc import locate
 from typing import Any
 
-from jsonargparse import Namespace
+from jsonargparse import Namespace, get_loader, set_loader
 from lightning import Callback, LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelSummary, ProgressBar, RichProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
@@ -24,8 +24,10 @@ from lightning.pytorch.loggers import CSVLogger, Logger, WandbLogger
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
 from lightning.pytorch.utilities.types import LRSchedulerTypeUnion
 from torch.optim import Optimizer
+from yaml import YAMLError
 
 import bpnp.datamodules
+from bpnp.bounded_files import check_yaml
 from bpnp.checks import check_within
 from bpnp.commands.parser import OneLineParser
 from bpnp.files import config_content, lock_folder, write_text
@@ -46,6 +48,7 @@ from bpnp.training.predictions import PredictionWriter
 from bpnp.training.task import BlindPnPTask
 
 DEFAULT_ROOT = "runs/default"
+YAML_VALUE = get_loader("yaml")  # jsonargparse's own
 
 POSE_LOSS: dict[str, tuple[type, str]] = {
     "start_epoch": (int, "first epoch with the pose loss, counted from 0; null for no switch"),
@@ -407,6 +410,7 @@ def run_training(arguments: Sequence[str]) -> None:
     Raises:
         ValueError: The options are wrong, or the training diverged.
     """
+    set_loader("yaml", _load_bounded, (YAMLError,))
     for name in dir(bpnp.datamodules):  # import them all, so that --help lists them and short names are accepted
         getattr(bpnp.datamodules, name)
     # The parser reads null; in Python, and in the documentation of the options, it is None.
@@ -427,6 +431,12 @@ def run_training(arguments: Sequence[str]) -> None:
             parser_kwargs={"prog": "bpnp", "allow_abbrev": False},
             args=list(arguments),
         )
+
+
+def _load_bounded(text: str) -> Any:
+    """Return jsonargparse's value of a YAML text, of a file or an option, whose aliases stand for few values."""
+    check_yaml(text)
+    return YAML_VALUE(text)
 
 
 def _names_a_task(arguments: Sequence[str]) -> bool:

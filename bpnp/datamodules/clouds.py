@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.bounded_files import MOST_TEXT, check_size, file_inside, read_npy, read_text
 from bpnp.datamodules.shapes import (
     SUFFIXES,
     MeshError,
@@ -44,9 +45,9 @@ def read_cloud(path: Path) -> NDArray[np.float64]:
         return _check_cloud(points, path)
     try:
         if path.suffix.lower() == ".npy":
-            values = np.load(path, allow_pickle=False)
+            values = read_npy(path)
         else:
-            text = path.read_text(encoding="utf-8-sig")
+            text = read_text(path)
             values = np.loadtxt(text.replace(",", " ").splitlines(), np.float64, ndmin=2)
     except Exception as error:
         raise MeshError(f"{path}: not a point cloud ({' '.join(str(error).split())})") from error
@@ -140,7 +141,9 @@ def _read_shape_list(folder: Path) -> Shapes | None:
         names = next((read_lines(path) for path in lists if path.is_file()), [])
         for stem in sorted(names):
             label = stem.rpartition("_")[0]
-            name, path = f"{label}/{split}/{stem}", folder / label / f"{stem}.txt"
+            name, path = f"{label}/{split}/{stem}", file_inside(folder, f"{label}/{stem}.txt")
+            if path is None:
+                raise ValueError(f"the lists of {folder} name the shape {stem!r}, which leads out of the folder")
             files[name], samplers[name] = path, partial(_cloud_samples, name, path)
     present = [path for path in files.values() if path.is_file()]  # a missing one is left out, with a warning
     return Shapes(samplers, fingerprint([list(files), file_states(present)])) if present else None
@@ -159,6 +162,7 @@ def _hdf5_shapes(folder: Path) -> Shapes | None:
         for path in paths:
             try:
                 with h5py.File(path, "r") as file:
+                    check_size(f"{path}, label,", file["label"].shape, file["label"].dtype, MOST_TEXT)
                     labels, count = np.asarray(file["label"]).reshape(-1), len(file["data"])
             except (OSError, KeyError) as error:
                 raise ValueError(f"{path} is not a file of ModelNet40's HDF5 archive ({error})") from error
@@ -177,6 +181,7 @@ def _hdf5_shapes(folder: Path) -> Shapes | None:
 
 def _hdf5_samples(name: str, path: Path, row: int, count: int) -> NDArray[np.float64]:
     with _h5py(path).File(path, "r") as file:
+        check_size(f"{path}, data,", file["data"].shape[1:], file["data"].dtype, MOST_TEXT)
         return draw_points(_check_cloud(np.asarray(file["data"][row]), f"{path}, shape {row}"), count, name)
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from bpnp.bounded_files import MOST_BINARY, read_bytes
 from bpnp.checks import check_within
 from bpnp.files import fingerprint, name_bytes
 from bpnp.geometry import random_rotations
@@ -93,7 +94,7 @@ def read_mesh(path: Path) -> Mesh:
 def open_mesh(path: Path) -> Iterator[tuple[bytes, str]]:
     """Yield the bytes and the suffix of a file; a MeshError of the block gets its name."""
     try:
-        yield path.read_bytes(), path.suffix.lower()
+        yield read_bytes(path, MOST_BINARY), path.suffix.lower()
     except MeshError as error:
         raise MeshError(f"{path}: {error}") from error
 

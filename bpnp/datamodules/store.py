@@ -26,6 +26,7 @@ from rich.console import Console
 from rich.progress import track
 from torch.utils.data import DataLoader, Dataset
 
+from bpnp.bounded_files import read_json, read_npy
 from bpnp.files import cache_folder, delay_interrupts, fingerprint, lock_folder, name_bytes, write_atomically
 
 MANIFEST = "manifest.json"
@@ -114,8 +115,8 @@ def open_store(folder: str | Path, kind: str, *, check: bool = True) -> Store:
 def _map_file(folder: Path, kind: str) -> Store:
     manifest = _manifest(folder, kind)
     bulk = {name: np.asarray(np.load(folder / f"{name}.npy", mmap_mode="r")) for name in manifest["bulk"]}
-    starts = {name: np.load(folder / f"{name}_start.npy") for name in manifest["bulk"]}
-    columns = {name: np.load(folder / f"{name}.npy") for name in manifest["columns"]}
+    starts = {name: read_npy(folder / f"{name}_start.npy") for name in manifest["bulk"]}
+    columns = {name: read_npy(folder / f"{name}.npy") for name in manifest["columns"]}
     return Store(folder, kind, bulk, starts, columns, manifest["parameters"], manifest["skipped"])
 
 
@@ -127,7 +128,7 @@ def _manifest(folder: Path, kind: str) -> dict[str, Any]:
             has no rows.
     """
     try:
-        manifest = dict(json.loads((folder / MANIFEST).read_text(encoding="utf-8")))
+        manifest = dict(read_json(folder / MANIFEST))
         whole = manifest.pop("checksum") == fingerprint(manifest)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise StoreError(f"{folder} is no store made by `bpnp prepare` ({error})") from error

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.bounded_files import read_npz
 from bpnp.cameras import camera_from, camera_to_json
 from bpnp.datamodules.colmap.model_files import FILES
 from bpnp.files import cache_folder, file_states, fingerprint, lock_folder, write_atomically
@@ -98,8 +99,8 @@ def read_index(folder: Path) -> Index | None:
     It is also None if the constants of the index have changed.
     """
     try:
-        with index_file(folder).open("rb") as opened, np.load(opened) as file:
-            return _index_of(dict(file)) if file["stamp"].tobytes().decode() == model_stamp(folder) else None
+        arrays = read_npz(index_file(folder))
+        return _index_of(arrays) if arrays["stamp"].tobytes().decode() == model_stamp(folder) else None
     except Exception:  # noqa: BLE001 - zipfile and numpy have different errors for a damaged file; it is written again
         return None
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.bounded_files import MOST_TEXT, check_size, open_input
 from bpnp.cameras import CENTRE, outside_image, same_aspect_ratio
 from bpnp.report.images import open_photo
 from bpnp.search.config import MAPS
@@ -166,7 +167,7 @@ def photo_keypoints(photo: Path, file: str | Path | None, name: str) -> Keypoint
     if file is None:
         return detected_keypoints(photo)
     path, size = Path(file), photo_size(photo)
-    with path.open("rb") as content:
+    with open_input(path, pipes=False) as content:
         head = content.read(len(SQLITE))
     if not head:
         raise ValueError(f"{path} is empty; give hloc's HDF5 file of keypoints, or a database of COLMAP")
@@ -228,6 +229,8 @@ def read_features(file: Path, photo: str, size: Size | None = None) -> Keypoints
                 some = ", ".join(list(content)[:5])
                 raise ValueError(f"{file} has no keypoints of {photo}, but of {some or 'no photo'}")
             group = content[photo]
+            for part in set(group) & {"keypoints", "scores"}:
+                check_size(f"{photo}/{part} in {file}", group[part].shape, group[part].dtype, MOST_TEXT)
             pixels = np.asarray(group["keypoints"], np.float64)
             scores = np.asarray(group["scores"], np.float64) if "scores" in group else np.ones(len(pixels))
             stored = tuple(int(value) for value in group["image_size"]) if "image_size" in group else None

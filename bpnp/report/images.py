@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from bpnp.bounded_files import open_input
 from bpnp.cameras import Camera, image_size, same_aspect_ratio
 from bpnp.files import delay_interrupts, write_atomically
 
@@ -59,7 +60,7 @@ def open_photo(path: Path | str) -> "Iterator[Image]":
     from PIL import Image
 
     try:
-        with Image.open(path) as photo:
+        with open_input(Path(path), pipes=False) as file, Image.open(file) as photo:
             yield photo
     except Image.DecompressionBombError as error:
         raise ValueError(f"the photo {path} is too large: {error}; reduce its size") from error

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
+from bpnp.bounded_files import read_npz
 from bpnp.cameras import Camera
 from bpnp.files import write_atomically
 from bpnp.metrics import PoseErrors, prediction_errors
@@ -181,8 +182,7 @@ def read_points(folder: Path | str) -> tuple[ProblemPoints, ...]:
     if not path.is_file():
         return ()
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = dict(archive)
+        arrays = read_npz(path)
         version = int(arrays["format"])
         if version == FORMAT:
             return tuple(_unpack_problems(arrays))

@@ -18,6 +18,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from bpnp import __version__
+from bpnp.bounded_files import read_json
 from bpnp.files import write_atomically, write_text
 from bpnp.geometry import project, transform
 from bpnp.metrics import PoseErrors, pose_quartiles, pose_recalls, prediction_errors
@@ -302,7 +303,7 @@ def read_results(folder: Path | str) -> Results:
             raise ValueError(f"{folder} is no results folder: it has no {file.name}; run `bpnp test` first")
     rows = _read_rows(table)
     try:
-        summary = dict(json.loads(path.read_bytes()))
+        summary = dict(read_json(path))
         if (version := summary.pop("format", None)) != FORMAT:
             raise ValueError(f"format {version!r} in place of {FORMAT}; run `bpnp test` again")
         count, loss = summary.pop("problems"), summary.pop("correspondence_loss")

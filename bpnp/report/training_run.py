@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from bpnp.files import config_content
 from bpnp.report.results import Results
 
 METRICS = "metrics.csv"
@@ -76,20 +77,16 @@ def wandb_run(run: Path) -> dict[str, str] | None:
     Returns:
         "id", "project" and, if it is known, "entity" of the W&B run; None if the training was not logged to W&B.
     """
-    import yaml
-
     last = _last_training(run)
     if last is None or not (file := last[0] / WANDB).is_file():
         return None
-    return dict(yaml.safe_load(file.read_text(encoding="utf-8")))
+    return config_content(file)
 
 
 def _last_training(run: Path) -> tuple[Path, dict[str, Any]] | None:
     """Return the numbered log folder of the last training in a run folder and its configuration."""
-    import yaml
-
     for log in reversed(training_logs(run)):
         config = log.with_name("config.yaml")
         if config.is_file():
-            return log.parent, dict(yaml.safe_load(config.read_text(encoding="utf-8")))
+            return log.parent, config_content(config)
     return None

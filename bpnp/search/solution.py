@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 import numpy.typing as npt
 
+from bpnp.argument_types import short_repr
+from bpnp.bounded_files import parse_json, read_json
 from bpnp.cameras import Camera, CameraLike, camera_from, camera_to_json, check_single_camera
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Unit
@@ -316,14 +318,21 @@ class Solution:
         """
         name = f" in {text}" if isinstance(text, Path) else ""
         try:
-            content = json.loads(text.read_bytes() if isinstance(text, Path) else text)
+            content = read_json(text) if isinstance(text, Path) else parse_json(text)
+            if not isinstance(content, dict):
+                raise ValueError(f"it holds {short_repr(content)}")
             if content["format"] not in (MATCHES_ARE_IDS, FORMAT):
                 raise ValueError(f"format {content['format']}, try the bpnp that wrote it")
             if content["verdict"] not in get_args(Verdict):
                 raise ValueError(f"verdict {content['verdict']!r}")
-            return _read(cls, content if content["format"] == FORMAT else _converted(content))
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"this is not the JSON of a solution{name}: {error}") from error
+            solution = _read(cls, content if content["format"] == FORMAT else _converted(content))
+            counts = [len(solution.points2d), len(solution.points3d)]
+            if ((solution.matches < 0) | (solution.matches >= counts)).any():
+                raise ValueError("a match has an index without a point")
+            return solution
+        except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+            reason = f"its field {error} is missing" if isinstance(error, KeyError) else error
+            raise ValueError(f"this is not the JSON of a solution{name}: {reason}") from error
 
 
 def add_objection(solution: Solution, one: Objection) -> Solution:

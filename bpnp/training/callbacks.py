@@ -15,6 +15,7 @@ from lightning.pytorch.cli import SaveConfigCallback
 from lightning.pytorch.utilities.rank_zero import rank_zero_info, rank_zero_warn
 from torch import Tensor, nn
 
+from bpnp.bounded_files import read_json
 from bpnp.checks import check_within
 from bpnp.models.evaluation import refinement_enabled
 from bpnp.models.nets import subtract_mean
@@ -362,7 +363,7 @@ class ResultsWriter(Callback):
         summary = self._folder(trainer) / SUMMARY
         if self.settings is not None or trainer.fast_dev_run or not summary.is_file():  # type: ignore[attr-defined]
             return
-        before = json.loads(summary.read_bytes()).get("settings", {})
+        before = read_json(summary).get("settings", {})
         checkpoint = before.get("checkpoint")
         if checkpoint is not None and trainer.ckpt_path is None:
             raise ValueError(
