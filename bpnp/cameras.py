@@ -515,19 +515,33 @@ def _check_focal_length(lens: Lens, shown: str) -> Lens:
 
 def _opencv(matrix: Any, distortion: Any) -> Camera:
     """Return the camera of OpenCV's matrix and coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]]."""
+    model, params = opencv_model(matrix, distortion)
+    return _pinhole(matrix) if model == "PINHOLE" else colmap_camera(model, params)
+
+
+def opencv_model(matrix: Any, distortion: Any) -> tuple[str, list[float]]:
+    """Return the COLMAP model of an OpenCV camera and its parameters; PINHOLE, without the skew, if all are 0.
+
+    Args:
+        matrix: K (3, 3).
+        distortion: k1, k2, p1, p2[, k3[, k4, k5, k6]]; None for none.
+
+    Raises:
+        ValueError: As `camera_from`.
+    """
     pinhole = _pinhole(matrix)
+    (fx, skew, cx), (_, fy, cy), _ = pinhole.matrix.tolist()
     values = np.asarray([] if distortion is None else distortion, np.float64).ravel()
     if len(values) not in (0, 4, 5, 8) and (len(values) not in (12, 14) or values[8:].any()):
         raise ValueError(f"OpenCV's distortion has 4, 5 or 8 coefficients, not {values.tolist()}")
     if not values.any():
-        return pinhole
-    if pinhole.matrix[0, 1]:
+        return "PINHOLE", [fx, fy, cx, cy]
+    if skew:
         raise ValueError(f"a `camera` with distortion cannot have skew; its matrix is {pinhole.matrix.tolist()}")
-    (fx, _, cx), (_, fy, cy), _ = pinhole.matrix.tolist()
     coefficients = np.zeros(8)
     coefficients[: len(values[:8])] = values[:8]
     count = 8 if coefficients[4:].any() else 4
-    return colmap_camera("FULL_OPENCV" if count == 8 else "OPENCV", [fx, fy, cx, cy, *coefficients[:count].tolist()])
+    return "FULL_OPENCV" if count == 8 else "OPENCV", [fx, fy, cx, cy, *coefficients[:count].tolist()]
 
 
 def _pinhole(values: Any) -> Pinhole:

@@ -1,8 +1,6 @@
 """Readers of files of points, cameras and poses."""
 
 import csv
-import io
-import json
 import re
 import sys
 from collections.abc import Callable, Collection, Set
@@ -12,16 +10,24 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from bpnp.argument_types import short_repr
+from bpnp.bounded_files import MOST_BINARY, MOST_TEXT, parse_json, parse_npy, read_bytes, read_stream
+from bpnp.commands.calibration_files import is_calibration, parse_calibration
+
 Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]
 ARRAYS = (".npy", ".csv", ".txt", ".xyz")
+CLOUD = ".pcd"
+CALIBRATIONS = (".yaml", ".yml", ".json")
 COLMAP_POINTS, COLMAP_CAMERAS = ("points3D.bin", "points3D.txt"), ("cameras.bin", "cameras.txt")
 NORMAL, LABEL = ("nx", "ny", "nz"), "label"
 # Columns after x, y, z in a file that does not name them, by the number of columns.
 COLUMNS: dict[int, tuple[str, ...]] = {3: (), 4: (LABEL,), 6: NORMAL, 7: (*NORMAL, LABEL)}
+NAME_COLUMNS = "remove it, or name the columns in the first line, such as"
 IMAGE_COLUMNS = (("x", "y", "z"), ("x", "y"), ("u", "v"))
 STANDARD_INPUT = Path("-")
 NUMPY = b"\x93NUMPY"  # first bytes of a .npy file
+FEW_ROWS = 3  # an index column has at least so many rows
 LARGEST_LABEL = 2**53  # larger integers are not exact in float64
 
 
@@ -30,7 +36,8 @@ def read_points2d(path: Path) -> tuple[Array, Labels | None]:
 
     Args:
         path: .npy or text as for `read_points3d`. Named columns x and y are read, and z if there is one, or u and v; of
-            unnamed columns the first two, since a detector's rows continue with scale and angle.
+            unnamed columns the first two, since a detector's rows continue with scale and angle; or three, unit
+            bearings, or a count of the rows before x and y.
 
     Returns:
         Points (m, 2) or unit bearings (m, 3), and labels (m,) of a column named label, else None.
@@ -39,13 +46,22 @@ def read_points2d(path: Path) -> tuple[Array, Labels | None]:
         ValueError: As `read_points3d`.
     """
     _check_suffix(path, ARRAYS)
-    values, names = _columns(path, {name for columns in IMAGE_COLUMNS for name in columns} | {LABEL})
+    values, names = _columns(path, {name for columns in IMAGE_COLUMNS for name in columns} | {LABEL}, needs="x, y")
     if names:
         coordinates = next((columns for columns in IMAGE_COLUMNS if set(columns) <= set(names)), ("x", "y"))
         points, _, labels = _read_annotation(path, values, names, coordinates, hint=", or u, v")
         return points, labels
     if values.shape[1] < 2:
         raise ValueError(f"{_name(path)} needs points with 2 or 3 columns; its shape is {values.shape}")
+    if values.shape[1] > 2 and _counts_rows(values[:, 0]):
+        if values.shape[1] > 3:
+            raise ValueError(f"the first column of {_name(path)} counts its rows; {NAME_COLUMNS} `index x y`")
+        return values[:, 1:], None
+    if values.shape[1] == 3 and (values[:, 0] == np.round(values[:, 0])).all() and (abs(values) > 2).any():
+        raise ValueError(
+            f"{_name(path)} has 3 columns, which are read as unit bearings, but the first row is {values[0].tolist()} "
+            f"(are the two files swapped?); if the first column is an index, {NAME_COLUMNS} `index x y`"
+        )
     return values if values.shape[1] == 3 else values[:, :2], None
 
 
@@ -59,6 +75,7 @@ def read_points3d(
             .npy; .csv, .txt or .xyz with columns of numbers separated by commas, semicolons, tabs or spaces (a comma is
             a decimal mark if the separator is a semicolon or a tab). The first line may name the columns; otherwise
             they are x, y, z, then nx, ny, nz or label or both. # starts a comment.
+            .pcd, ASCII or binary.
             .ply or a mesh (.obj, .off, .stl, .glb): its distinct vertices, or `surface` points drawn from its
             triangles. A COLMAP model: its folder, or its points3D.bin or points3D.txt.
             `-` or a pipe with the content of a .npy or of a text.
@@ -76,29 +93,41 @@ def read_points3d(
         from bpnp.datamodules.colmap.model_files import read_records
 
         return read_records(path if path.is_dir() else path.parent).points3d, None, None
-    if path.suffix.lower() not in ARRAYS and not _is_stream(path):
+    if path.suffix.lower() not in (*ARRAYS, CLOUD) and not _is_stream(path):
         from bpnp.datamodules.shapes import SUFFIXES, read_mesh, read_vertices, sample_surface
 
-        _check_suffix(path, (*ARRAYS, *SUFFIXES))
+        _check_suffix(path, (*ARRAYS, CLOUD, *SUFFIXES))
         if surface is not None:
             return sample_surface(read_mesh(path), surface, np.random.default_rng(seed)), None, None
         points, columns = read_vertices(path)
         normals, labels = _normals_and_labels(path, columns.__getitem__, [*columns])
         return points, None if normals is None or not normals.any() else normals, labels
-    _check_suffix(path, ARRAYS)
+    _check_suffix(path, (*ARRAYS, CLOUD))
     if surface is not None:
         raise ValueError(f"--surface draws points from a mesh, and {path} is none; leave it out")
-    return _read_annotation(path, *_columns(path, {*"xyz", *NORMAL, LABEL}), ("x", "y", "z"))
+    if path.suffix.lower() == CLOUD:
+        from bpnp.commands.pcd_files import parse_pcd
+
+        try:
+            points, columns = parse_pcd(_content(path))
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+        return points, *_normals_and_labels(path, columns.__getitem__, [*columns])
+    values, names = _columns(path, {*"xyz", *NORMAL, LABEL}, needs="x, y, z")
+    return _read_annotation(path, values if names else _without_index(path, values), names, ("x", "y", "z"))
 
 
-def read_camera(text: str, image: str | None = None) -> Any:
+def read_camera(text: str, image: str | None = None, *, centre: float = 0.0) -> Any:
     """Read the camera that `--camera` names.
 
     Args:
-        text: A file with a 3x3 matrix; a COLMAP camera model with its parameters, "PINHOLE 500 500 320 240" or
+        text: A file with a 3x3 matrix; a YAML file of ROS (camera_info) or OpenCV, see
+            `parse_calibration`; a COLMAP camera model with its parameters, "PINHOLE 500 500 320 240" or
             "PINHOLE,640,480,500,500,320,240" (with width and height, as in cameras.txt); or a COLMAP model, its folder
             or its cameras.bin or cameras.txt.
         image: Name of the image of the COLMAP model whose camera is read. Default: the only camera of the model.
+        centre: Coordinate of the centre of the first pixel in the image points, for the camera of a YAML file: 0 as in
+            OpenCV and ROS, the default, or 0.5 as in COLMAP.
 
     Raises:
         ValueError: The text is something else.
@@ -108,14 +137,14 @@ def read_camera(text: str, image: str | None = None) -> Any:
         return _camera_of(path, image)
     if image is not None:
         raise ValueError(f"--image needs a COLMAP model as --camera, which is {text!r}")
-    if path.is_file() or _is_stream(path):
-        return _columns(path)[0]
+    if _is_stream(path) or (text and path.exists()):
+        return _camera_in(path, centre)
     model, *words = text.replace(",", " ").split() or [""]
     numbers = [_number(word) for word in words]
     if not numbers or None in numbers or not model.replace("_", "").isalnum() or model[0].isdigit():
         raise ValueError(
-            f"--camera {text!r} is neither a file with a 3x3 matrix nor MODEL,PARAMETERS such as "
-            "SIMPLE_PINHOLE,800,320,240"
+            f"--camera {text!r} is neither a file with a 3x3 matrix or ROS's camera_info nor MODEL,PARAMETERS such "
+            "as SIMPLE_PINHOLE,800,320,240"
         )
     from bpnp.cameras import camera_models
 
@@ -154,7 +183,9 @@ def read_pose(path: Path) -> tuple[Array, Array]:
         ValueError: The file has no pose.
     """
     try:
-        content = json.loads(_content(path))
+        content = parse_json(_content(path))
+        if not isinstance(content, dict):
+            raise ValueError(f"it holds {short_repr(content)}")
         return np.array(content["rotation"], np.float64), np.array(content["translation"], np.float64)
     except (OSError, ValueError, KeyError, TypeError) as error:
         if isinstance(error, FileNotFoundError):
@@ -166,24 +197,25 @@ def read_pose(path: Path) -> tuple[Array, Array]:
 def read_pairs(path: Path) -> Array:
     """Read rows of two numbers, such as matches, from a .npy or a text as for `read_points3d`."""
     _check_suffix(path, ARRAYS)
-    values = _columns(path)[0]
+    values = _columns(path, needs="two indices, of a 2D and of a 3D point")[0]
     if values.shape[1] != 2:
-        raise ValueError(f"{_name(path)} needs two columns; it has {values.shape[1]}")
+        count = values.shape[1]
+        raise ValueError(f"{_name(path)} needs two columns; it has {count}; give indices of a 2D and of a 3D point")
     return values
 
 
 def _is_stream(path: Path) -> bool:
     """Return True for standard input and for pipes, which have no suffix: `-`, /dev/stdin, a process substitution."""
-    return path == STANDARD_INPUT or (not path.suffix and path.exists() and not path.is_dir())
+    return path == STANDARD_INPUT or path.is_fifo() or (not path.suffix and path.exists() and not path.is_dir())
 
 
 def _content(path: Path) -> bytes:
     """Return the bytes of a file, of a pipe, or of standard input."""
     if path != STANDARD_INPUT:
-        return path.read_bytes()
+        return read_bytes(path, MOST_BINARY if path.suffix.lower() in (".npy", CLOUD) else MOST_TEXT)
     if sys.stdin is None:  # as after `<&-`
-        raise ValueError("it is closed")
-    return sys.stdin.buffer.read()
+        raise ValueError("standard input is closed")
+    return read_stream(sys.stdin.buffer, _name(path))
 
 
 def _name(path: Path) -> str:
@@ -195,7 +227,8 @@ def _check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
     if _is_stream(path):
         return
     if not path.is_file():
-        raise ValueError(f"{path} is a folder; give a file" if path.is_dir() else f"there is no file {path}")
+        kind = "folder" if path.is_dir() else "device" if path.exists() else ""
+        raise ValueError(f"{path} is a {kind}; give a file" if kind else f"there is no file {path}")
     if path.suffix.lower() not in suffixes:
         raise ValueError(f"{path} has to end in {', '.join(suffixes)}")
 
@@ -235,7 +268,10 @@ def _normals_and_labels(
         return normals, None
     labels = column(LABEL)
     if len(wrong := labels[(labels != np.round(labels)) | (abs(labels) > LARGEST_LABEL)]):
-        raise ValueError(f"the column label of {path} holds {wrong[0]:g}; labels are integers")
+        raise ValueError(
+            f"the column label of {path} holds {wrong[0]:g}; labels are integers; if a column without a name is an "
+            f"index or something else, {NAME_COLUMNS} `x y z`"
+        )
     return normals, labels.astype(np.int64)
 
 
@@ -254,14 +290,64 @@ def _camera_of(path: Path, image: str | None) -> tuple[Any, ...]:
     return camera.model, *camera.size, camera.params
 
 
-def _columns(path: Path, wanted: Set[str] = frozenset()) -> tuple[Array, list[str]]:
-    """Read columns of numbers from a .npy or a text.
+def _camera_in(path: Path, centre: float) -> Any:
+    """Return the camera in a file with a matrix, or in a YAML file."""
+    content = _content(path)
+    if not content.startswith(NUMPY) and path.suffix.lower() != ".npy":
+        text = content.decode("utf-8", errors="replace")
+        if path.suffix.lower() in CALIBRATIONS or is_calibration(text):
+            try:
+                return parse_calibration(text, centre=centre)
+            except ValueError as error:
+                raise ValueError(f"--camera {_name(path)}: {error}") from error
+    return _parse_columns(path, content, needs="the numbers of a 3x3 matrix")[0]
+
+
+def _counts_rows(column: Array) -> bool:
+    """Return True for the numbers 0, 1, 2, ... or 1, 2, 3, ..., as of an index."""
+    return len(column) >= FEW_ROWS and any((column == np.arange(len(column)) + first).all() for first in (0, 1))
+
+
+def _without_index(path: Path, values: Array) -> Array:
+    """Return columns without names, of scene points, without a first one that counts the rows.
+
+    Raises:
+        ValueError: The first column may also be x.
+    """
+    count = values.shape[1]
+    if count - 1 not in COLUMNS or not _counts_rows(values[:, 0]):
+        return values
+    is_label = (values[:, -1] == np.round(values[:, -1])).all()
+    if count not in COLUMNS or (LABEL in COLUMNS[count] and not is_label):
+        return values[:, 1:]
+    first, second = (" ".join(("x", "y", "z", *COLUMNS[c])) for c in (count, count - 1))
+    raise ValueError(
+        f"the first column of {_name(path)} counts its rows, and may be x or an index; {NAME_COLUMNS} `{first}` or "
+        f"`index {second}`"
+    )
+
+
+def _columns(path: Path, wanted: Set[str] = frozenset(), *, needs: str) -> tuple[Array, list[str]]:
+    """Read columns of numbers from a .npy or a text, as `_parse_columns`."""
+    try:
+        content = _content(path)
+    except OSError as error:
+        raise ValueError(f"cannot read rows of numbers from {_name(path)}: {error}") from error
+    return _parse_columns(path, content, wanted, needs=needs)
+
+
+def _parse_columns(
+    path: Path, content: bytes, wanted: Set[str] = frozenset(), *, needs: str
+) -> tuple[Array, list[str]]:
+    """Parse columns of numbers of a .npy or a text.
 
     Args:
-        path: File, pipe or standard input.
+        path: File, pipe or standard input, for messages.
+        content: Its bytes.
         wanted: Names of the columns that have to be numbers, where the first line names them; all by default. A column
             of another name is NaN. Rows may have one more word than the first line, before the others, as R writes
             their names.
+        needs: What a row has to hold, for messages.
 
     Returns:
         Numbers (k, c), and the names of the c columns; no name if the first line has none.
@@ -271,15 +357,14 @@ def _columns(path: Path, wanted: Set[str] = frozenset()) -> tuple[Array, list[st
             or two wanted columns alike.
     """
     try:
-        content = _content(path)
         if path.suffix.lower() == ".npy" or content.startswith(NUMPY):
-            array = np.load(io.BytesIO(content), allow_pickle=False)
+            array = parse_npy(content)
             array = array[:, 0] if array.ndim == 3 and array.shape[1] == 1 else array  # OpenCV points are (k, 1, 2)
             if array.dtype.kind not in "fiu" or array.ndim != 2:
-                raise ValueError(f"{array.dtype} of shape {array.shape}")
+                raise ValueError(f"it holds {array.dtype} of shape {array.shape}; rows of real numbers are needed")
             return array.astype(np.float64), []
         text = content.decode("utf-8-sig")
-    except (ValueError, OSError, EOFError) as error:
+    except ValueError as error:
         raise ValueError(f"cannot read rows of numbers from {_name(path)}: {error}") from error
     lines = [line for commented in text.splitlines() if (line := commented.partition("#")[0].strip())]
     names = _words(lines[0]) if lines else []
@@ -306,9 +391,13 @@ def _columns(path: Path, wanted: Set[str] = frozenset()) -> tuple[Array, list[st
         wrong = (
             row for row in rows if len(words := _words(row)) != count or None in [_number(words[i]) for i in needed]
         )
-        raise ValueError(
-            f"{_name(path)} needs rows of {count} numbers; it has {next(wrong, rows[0])[:60]!r}"
-        ) from error
+        row = next(wrong, rows[0])
+        if (other := len(_words(row))) != count:
+            raise ValueError(
+                f"{_name(path)} has rows of {count} and of {other} columns, such as {rows[0][:40]!r} and {row[:40]!r}; "
+                f"each row needs the same, {needs}"
+            ) from error
+        raise ValueError(f"{_name(path)} needs rows of numbers, {needs}; it has {row[:60]!r}") from error
     return values, names
 
 

@@ -10,6 +10,7 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from bpnp.bounded_files import read_bytes
 from bpnp.commands.parser import at_least
 from bpnp.files import check_outputs, lock_folder, packaged_config, write_text
 from bpnp.report.terminal import Paper, console, say
@@ -114,7 +115,8 @@ def view(
         estimate: estimate whose pose projects the 3D points; the first by default.
         lines: which matches to draw.
         photo: photo of the problem; needs --camera.
-        camera: camera of the photo: a 3x3 matrix in a file, MODEL,PARAMETERS, or a COLMAP model that has the photo.
+        camera: camera of the photo: a 3x3 matrix in a file, YAML of ROS or OpenCV, MODEL,PARAMETERS, or a COLMAP model
+            that has the photo.
         photos: folder of the photos of the COLMAP models that were tested, in place of --photo and --camera.
     """
     from bpnp.report.figures import plot_photo, plot_problem
@@ -129,13 +131,14 @@ def view(
         raise ValueError("a photo is drawn with its camera; give --photo and --camera together")
     if not run.exists():
         raise ValueError(f"{run} does not exist; give the folder of a test or the JSON of a solution")
-    if run.is_file() and names:
+    is_solution = not run.is_dir()
+    if is_solution and names:
         raise ValueError(f"{run} is one solution, which has no problem {names[0]!r}")
-    if photos is not None and (photo is not None or run.is_file()):
+    if photos is not None and (photo is not None or is_solution):
         raise ValueError("--photos finds the photos of a test; leave out --photo and --camera")
     check_outputs([output], [run, photo])
     source = None
-    if run.is_file():
+    if is_solution:
         drawn, folder = [_solution(run)], run.absolute().parent
         file_names = {0: run.stem}
     else:
@@ -191,11 +194,11 @@ def merge_estimates(problems: "Sequence[ProblemPoints]", folders: Mapping[str, P
 
 def _camera_of(text: str, photo: Path) -> "Camera":
     """Return the camera of a photo, as `--camera` names it."""
-    from bpnp.cameras import camera_from
+    from bpnp.cameras import CENTRE, camera_from
     from bpnp.commands.point_files import COLMAP_CAMERAS, read_camera
 
     of_model = Path(text).is_dir() or Path(text).name in COLMAP_CAMERAS
-    return camera_from(read_camera(text, photo.name if of_model else None))
+    return camera_from(read_camera(text, photo.name if of_model else None, centre=CENTRE))
 
 
 def _solution(path: Path) -> "ProblemPoints":
@@ -204,7 +207,7 @@ def _solution(path: Path) -> "ProblemPoints":
     from bpnp.search.solution import Solution
 
     try:
-        return solution_points(Solution.from_json(path.read_bytes()), title=path.stem)
+        return solution_points(Solution.from_json(read_bytes(path)), title=path.stem)
     except ValueError as error:
         pictures = path.parent / "pictures"
         there = f"; the pictures of `bpnp localize` are in {pictures}" if pictures.is_dir() else ""

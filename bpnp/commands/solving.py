@@ -55,10 +55,10 @@ def solve(
     Args:
         points2d: .npy, .csv or .txt with columns x y or u v; pixels with --camera or --image_size, else x/z y/z; a
             column named label.
-        points3d: .npy, .csv, .txt, .xyz, .ply, or a mesh (.obj, .off, .stl, .glb); columns x y z, nx ny nz, label; or a
-            COLMAP model (its folder, or points3D.bin or .txt). `-` reads standard input, for points2d too.
-        camera: file with a 3x3 matrix, COLMAP's MODEL,PARAMETERS such as SIMPLE_PINHOLE,f,cx,cy, or a COLMAP model with
-            one camera (its folder, or cameras.bin or .txt).
+        points3d: .npy, .csv, .txt, .xyz, .pcd, .ply, or a mesh (.obj, .off, .stl, .glb); columns x y z, nx ny nz,
+            label; or a COLMAP model (its folder, or points3D.bin or .txt). `-` reads standard input, for points2d too.
+        camera: file with a 3x3 matrix, YAML of ROS (camera_info) or OpenCV, COLMAP's MODEL,PARAMETERS such as
+            SIMPLE_PINHOLE,f,cx,cy, or a COLMAP model with one camera (its folder, or cameras.bin or .txt).
         image: name of the image whose camera is used, if the --camera model has several.
         image_size: WIDTH,HEIGHT or WIDTHxHEIGHT of the image in pixels, if its focal length is unknown; it is found
             with the pose.

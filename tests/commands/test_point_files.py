@@ -75,21 +75,25 @@ def test_a_mesh_gives_its_corners_or_its_surface(suffix: str, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.csv", b"1,2,3\n4,5\n", "needs rows of 3 numbers; it has '4,5'"),
-        ("a.csv", b"1,2,3\n4,,6\n", "needs rows of 3 numbers; it has '4,,6'"),
-        ("a.csv", b"1,2,3\nx,y,z\n", "needs rows of 3 numbers; it has 'x,y,z'"),
+        (
+            "a.csv",
+            b"1,2,3\n4,5\n",
+            "has rows of 3 and of 2 columns, such as '1,2,3' and '4,5'; each row needs the same, x, y, z",
+        ),
+        ("a.csv", b"1,2,3\n4,,6\n", "needs rows of numbers, x, y, z; it has '4,,6'"),
+        ("a.csv", b"1,2,3\nx,y,z\n", "needs rows of numbers, x, y, z; it has 'x,y,z'"),
         ("a.csv", b"", "a.csv has no lines of numbers"),
         ("a.csv", b"x,y,z\n", "lines of numbers"),
         ("a.csv", b"1,2\n3,4\n", r"needs 3 to 4 or .*its shape is \(2, 2\) \(are the two files swapped\?\)"),
         ("a.csv", b"1,2,3,4,5\n", r"needs 3 to 4 or 6 to 7 columns .*its shape is \(1, 5\)$"),
-        ("a.csv", b"x,y,z\nLED,2,3\n", "needs rows of 3 numbers; it has 'LED,2,3'"),
-        ("a.csv", b"x;y;z\n1.000,5;2;3\n", "needs rows of 3 numbers; it has '1.000,5;2;3'"),
+        ("a.csv", b"x,y,z\nLED,2,3\n", "needs rows of numbers, x, y, z; it has 'LED,2,3'"),
+        ("a.csv", b"x;y;z\n1.000,5;2;3\n", "needs rows of numbers, x, y, z; it has '1.000,5;2;3'"),
         ("a.csv", b"a,b,label\n1,2,3\n", "a.csv needs columns x, y, z; its columns are a, b, label"),
         ("a.csv", b"x,y,z,label\n1,2,3,0.5\n", "the column label of .*a.csv holds 0.5; labels are integers"),
         ("a.txt", b"\xff\xfe\x00", "rows of numbers from .*a.txt"),
         ("a.npy", b"not numpy", "rows of numbers from .*a.npy"),
         ("a.npy", b"", "rows of numbers from .*a.npy"),
-        ("a.jpg", b"", "a.jpg has to end in .npy, .csv, .txt, .xyz, .glb, .obj, .off, .ply, .stl"),
+        ("a.jpg", b"", "a.jpg has to end in .npy, .csv, .txt, .xyz, .pcd, .glb, .obj, .off, .ply, .stl"),
         ("a.ply", b"", "a.ply: the file is empty"),
         (
             "a.ply",
@@ -170,7 +174,9 @@ def test_files_of_other_formats_with_the_names_of_colmap_are_read(tmp_path: Path
 
 @pytest.mark.parametrize("text", ["k.npy", "PINHOLE", "500,500,320,240", "PINHOLE,wide", ""])
 def test_a_text_that_is_no_camera_is_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="is neither a file with a 3x3 matrix nor MODEL,PARAMETERS"):
+    with pytest.raises(
+        ValueError, match="is neither a file with a 3x3 matrix or ROS.s camera_info nor MODEL,PARAMETERS"
+    ):
         read_camera(text)
 
 
@@ -292,7 +298,7 @@ def test_a_pipe_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("stdin", "sentence"),
     [
-        (None, "cannot read rows of numbers from standard input: it is closed"),
+        (None, "standard input is closed"),
         (io.TextIOWrapper(io.BytesIO(b"")), "standard input has no lines of numbers"),
     ],
     ids=["closed", "empty"],
@@ -316,3 +322,65 @@ def test_standard_input_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
     ):
         monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(content)))
         assert read() == [[1, 2], [3, 4]]
+
+
+def test_an_index_column_is_left_out_where_it_is_one(tmp_path: Path) -> None:
+    """The first column counts the rows, and the others have too few or too many columns without it."""
+    path = tmp_path / "a.txt"
+    count, labels = np.arange(20), np.arange(20) % 3
+    for first in (0, 1):
+        path.write_text(rows(np.column_stack([count + first, POINTS]), " "))
+        np.testing.assert_array_equal(points_of(path), POINTS)
+        path.write_text(rows(np.column_stack([count + first, POINTS[:, :2]]), " "))
+        np.testing.assert_array_equal(read_points2d(path)[0], POINTS[:, :2])
+        path.write_text(rows(np.column_stack([count + first, POINTS, labels]), " "))
+        points, _, found = read_points3d(path)
+        np.testing.assert_array_equal(points, POINTS)
+        np.testing.assert_array_equal(found, labels)
+    path.write_text("id x y z\n" + rows(np.column_stack([count + 5, POINTS]), " "))
+    np.testing.assert_array_equal(points_of(path), POINTS)
+
+
+def test_a_column_that_may_be_an_index_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text("1 0 0 0\n2 30 0 0\n3 0 30 5\n4 30 30 0\n")  # millimetres, or a row of labelled points
+    message = "a.txt counts its rows, and may be x or an index; .* such as `x y z label` or `index x y z`"
+    with pytest.raises(ValueError, match=message):
+        read_points3d(path)
+    path.write_text("0 1.5 2.5 3\n1 2.5 3.5 3\n2 3.5 4.5 3\n")
+    with pytest.raises(ValueError, match="a.txt counts its rows; remove it, or name the columns .* `index x y`"):
+        read_points2d(path)
+    path.write_text("7 120.5 80\n12 121 90\n33 300 7\n")
+    with pytest.raises(ValueError, match="has 3 columns, which are read as unit bearings, .* `index x y`"):
+        read_points2d(path)
+    path.write_text("7 1.5 8 2.5\n12 1 2 3\n")
+    with pytest.raises(ValueError, match="label of .*a.txt holds 2.5; labels are integers; if a column without a name"):
+        read_points3d(path)
+    path.write_text("photo\n1\n1 2\n2\n3 4\n")
+    with pytest.raises(ValueError, match="has rows of 1 and of 2 columns, such as '1' and '1 2'; .* the same, x, y$"):
+        read_points2d(path)
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.npy", "a.pcd", "a.ply", "a.txt"])
+def test_devices_and_arrays_that_claim_too_much_are_refused(
+    name: str, tmp_path: Path, fails: Callable[..., str]
+) -> None:
+    (tmp_path / "p2.csv").write_text("u,v\n1,2\n3,4\n5,9\n7,3\n")
+    (tmp_path / name).symlink_to("/dev/zero")
+    assert f"{name} is a device; give a file" in fails("solve", str(tmp_path / "p2.csv"), str(tmp_path / name))
+    (tmp_path / name).unlink()
+    with (tmp_path / name).open("wb") as file:
+        file.truncate(10**13)
+    assert "MiB that are read of such a file" in fails("solve", str(tmp_path / "p2.csv"), str(tmp_path / name))
+
+
+def test_a_pose_that_is_nested_or_has_no_fields_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "pose.json"
+    for text, message in (
+        ("[" * 100_000, "nested too deeply"),
+        ("[]", r"it holds \[\]"),
+        ('{"rotation": []}', "'translation' is missing"),
+    ):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=f"pose.json is no JSON with `rotation` and `translation`: .*{message}"):
+            read_pose(path)
