@@ -7,6 +7,7 @@ values themselves, and raise a ValueError that names the argument.
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Protocol, SupportsFloat, TypeAlias, runtime_checkable
 
+import numpy as np
 import numpy.typing as npt
 
 
@@ -85,6 +86,20 @@ if TYPE_CHECKING:
     ImageSize: TypeAlias = HasArray | Sequence[int]
 else:
     Numbers = ArrayLike = ManyArrays = PointsLike = ManyPoints = PoseObject = PoseLike = ImageSize = Any
+
+
+def check_unmasked(name: str, values: object) -> None:
+    """Raise ValueError for a masked array with masked values, whose mask NumPy drops in a conversion.
+
+    Args:
+        name: Name of the argument, for the message.
+        values: Its value.
+    """
+    if isinstance(values, np.ma.MaskedArray) and (count := int(np.ma.count_masked(values))):
+        raise ValueError(
+            f"`{name}` is a masked array with {count} masked values; give only the rows to use, such as "
+            f"`{name}[~{name}.mask.any(1)].data`"
+        )
 
 
 def short_repr(value: object) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bpnp.argument_types import ManyArrays, short_repr
+from bpnp.argument_types import ManyArrays, check_unmasked, short_repr
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
@@ -171,7 +171,10 @@ def as_tensor_list(name: str, values: ManyArrays | float, ndim: int) -> list[Ten
 
 def as_tensor(name: str, values: ManyArrays | float) -> Tensor:
     """Convert an array to a CPU tensor, in this machine's byte order."""
+    check_unmasked(name, values)
     if isinstance(values, Tensor):
+        if values.layout != torch.strided:
+            raise ValueError(f"`{name}` is a sparse tensor; use .to_dense()")
         return values.cpu()
     try:
         array = np.asarray(values)
@@ -195,6 +198,7 @@ def check_points(name: str, i: int | str, points: Tensor, dim: int) -> Tensor:
     if points.ndim != 2 or points.shape[1] != dim:
         hint = " (are points2d and points3d swapped?)" if points.ndim == 2 and points.shape[1] in (2, 3) else ""
         raise ValueError(f"`{name}` has the shape {tuple(points.shape)} in problem {i}, not (k, {dim}){hint}")
+    _check_numbers(name, i, points)
     if len(points) == 0:
         raise ValueError(f"`{name}` has no points in problem {i}; at least one is needed")
     if not points.isfinite().all():
@@ -203,6 +207,12 @@ def check_points(name: str, i: int | str, points: Tensor, dim: int) -> Tensor:
             f"`{name}` is {points[bad].tolist()} at point {bad} of problem {i}; all numbers must be finite"
         )
     return points
+
+
+def _check_numbers(name: str, i: int | str, values: Tensor) -> None:
+    """Raise ValueError for truth values and complex numbers."""
+    if values.dtype == torch.bool or values.is_complex():
+        raise ValueError(f"`{name}` has the type {values.dtype} in problem {i}; real numbers are needed")
 
 
 def check_match3d(i: int | str, match: Tensor, m: int, n: int) -> Tensor:
@@ -248,6 +258,7 @@ def stack_values(name: str, values: list[Tensor], shape: tuple[int, ...], dtype:
     for i, value in enumerate(values):
         if value.shape != shape:
             raise ValueError(f"`{name}` has the shape {tuple(value.shape)} in problem {i}, not {shape}")
+        _check_numbers(name, i, value)
         if not value.isfinite().all():
             raise ValueError(f"`{name}` is {value.tolist()} in problem {i}; all numbers must be finite")
     return torch.stack([v.to(dtype) for v in values])

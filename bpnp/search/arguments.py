@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from bpnp.argument_types import PoseObject, short_repr
+from bpnp.argument_types import PoseObject, check_unmasked, short_repr
 from bpnp.cameras import CENTRE, Camera, check_normalised, is_opencv, outside_image
 from bpnp.search.config import INPUTS
 from bpnp.search.starts import GravityPrior, PosePrior
@@ -203,6 +203,7 @@ def checked_prior(prior: Any) -> Prior | None:
         camera, scene = (_finite(f"prior.{name}", getattr(prior, name), (3,)) for name in ("up_camera", "up_scene"))
         if not (camera.any() and scene.any()):
             raise ValueError(f"`prior` is {short_repr(prior)}; its directions must not be zero")
+        camera, scene = (direction / np.abs(direction).max() for direction in (camera, scene))
         return GravityPrior(camera, scene, _sigma(prior, "sigma_deg"))
     from bpnp.models.weights import LEARNED, TrainedNet  # imports torch, so only if a network is named
 
@@ -216,11 +217,16 @@ def checked_prior(prior: Any) -> Prior | None:
 
 
 def _sigma(prior: PosePrior | GravityPrior, name: str) -> float:
-    """Return a standard deviation of a prior."""
+    """Return a standard deviation of a prior; one of 180 degrees and more tells nothing."""
     sigma = positive(f"prior.{name}", getattr(prior, name))
     if sigma is None:
         raise ValueError(f"`prior.{name}` is None; it must be a positive number")
-    return sigma
+    if name == "translation_sigma":  # in the unit of the scene, whose size is not known here
+        return sigma
+    if sigma < INPUTS.least_sigma_deg:
+        least = f"{INPUTS.least_sigma_deg:g}"
+        raise ValueError(f"`prior.{name}` is {sigma:g} degrees; give {least} or more, even where it is known exactly")
+    return min(sigma, 180.0)
 
 
 def checked_pose(prefix: str, rotation: Any, translation: Any) -> tuple[Array, Any]:
@@ -235,13 +241,14 @@ def checked_pose(prefix: str, rotation: Any, translation: Any) -> tuple[Array, A
 
 def numbers(name: str, values: Any) -> Array:
     """Return the values as a float64 array."""
-    values = _on_host(values)
+    check_unmasked(name, values)
     try:
+        values = _on_host(values)
         array = np.asarray(values)
         if array.dtype.kind not in "fiu":
             raise TypeError(f"{array.dtype}")
         return array.astype(np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"`{name}` is {short_repr(values)}; an array of numbers is needed") from error
 
 
@@ -321,7 +328,7 @@ def image_points(values: Any) -> Array:
 
 def scene_points(values: Any, name: str = "points3d") -> Array:
     """Return points (k, d) from arrays, OpenCV's (k, 1, d), or clouds and meshes of trimesh and Open3D."""
-    if not isinstance(values, np.ndarray):
+    if not hasattr(values, "__array__"):
         values = getattr(values, "vertices", getattr(values, "points", values))
     points = numbers(name, values)
     return points[:, 0] if points.ndim == 3 and points.shape[1] == 1 else points
@@ -446,6 +453,7 @@ def _classes(name: str, values: Any, count: int) -> Array:
 
 
 def _integers(name: str, values: Any, count: int) -> Labels:
+    check_unmasked(name, values)
     labels = _one_each(name, np.asarray(_on_host(values)), (count,))
     if labels.dtype.kind not in "iu":
         raise ValueError(f"`{name}` has the type {labels.dtype}; labels are integers: use .astype(int)")

@@ -374,6 +374,9 @@ class InputSettings:
         unit: Largest error of a unit length, of a rotation, and of a sum of probabilities. [1; convention]
         sure: Probability of a class from which on points match only within the class. [probability; not tuned]
         prior_deg: Default standard deviation of a given rotation about each axis. [degrees; convention]
+        least_sigma_deg: Least standard deviation of an angle of a prior. [degrees; numerics, float64]
+        least_sigma: Least standard deviation of a translation of a prior. [size of the scene; numerics, float64]
+        widest_sigma: Standard deviation of a translation above which it is unknown. [size of the scene; numerics]
         one_pixel: Largest coordinate of image points that are refused as normalised coordinates if a camera in
             pixels is given. [pixels; convention]
         widest_row: Largest number of columns of an array of keypoints whose first two columns are positions. [columns;
@@ -388,6 +391,9 @@ class InputSettings:
     unit: float = 1e-3
     sure: float = 0.97
     prior_deg: float = 10.0
+    least_sigma_deg: float = 1e-6
+    least_sigma: float = 1e-6
+    widest_sigma: float = 1e9
     one_pixel: float = 3.0
     widest_row: int = 8
     floor_pixels: float = 0.1

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from bpnp.cameras import Camera, in_front
 from bpnp.poses import MIN_POINTS, SAME, Tolerance, rotation_angle, same_pose
-from bpnp.search.config import PROBLEM
+from bpnp.search.config import INPUTS, PROBLEM
 from bpnp.search.image_statistics import ImageStatistics
 from bpnp.search.propose.symmetries import Motions
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
@@ -169,9 +169,15 @@ class Problem:
         if isinstance(prior, GravityPrior) or prior.translation is None:
             return prior
         rotation, translation = self.from_user(np.asarray(prior.rotation), np.asarray(prior.translation))
-        return prior._replace(
-            rotation=rotation, translation=translation, translation_sigma=prior.translation_sigma / self.size
-        )
+        sigma = prior.translation_sigma / self.size
+        if sigma < INPUTS.least_sigma:
+            least = 10.0 ** math.ceil(math.log10(INPUTS.least_sigma * self.size))
+            raise ValueError(
+                f"`prior.translation_sigma` is {prior.translation_sigma:g}, for a scene of size {self.size:.2g}; give "
+                f"{least:g} or more, even where the translation is known exactly"
+            )
+        sigma = sigma if sigma <= INPUTS.widest_sigma else math.inf
+        return prior._replace(rotation=rotation, translation=translation, translation_sigma=sigma)
 
     def choose(self, image: Labels | slice = slice(None), scene: Labels | slice = slice(None)) -> "Problem":
         """Return the problem restricted to these image points and scene points.
