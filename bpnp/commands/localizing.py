@@ -56,9 +56,10 @@ def localize(
     Args:
         map: folder of a COLMAP model, such as sparse/0.
         photos: photos, or folders of them; a photo in a folder is named by its path within it, as in hloc.
-        camera: camera of the photos: a file with a 3x3 matrix; COLMAP's MODEL,PARAMETERS; a COLMAP model, such as MAP
-            itself, for the camera of its images, scaled to the photo's size; or unknown, to find the focal length with
-            the pose. By default that of EXIF, else of images of the map with the photo's size, else unknown.
+        camera: camera of the photos: a file with a 3x3 matrix; YAML of ROS (camera_info) or OpenCV; COLMAP's
+            MODEL,PARAMETERS; a COLMAP model, such as MAP itself, for the camera of its images, scaled to the photo's
+            size; or unknown, to find the focal length with the pose. By default that of EXIF, else of images of the map
+            with the photo's size, else unknown.
         focal_error: relative standard deviation of the focal length of the camera, such as 0.1; it is then found with
             the pose. No effect on photos whose camera is unknown.
         distortion: fit a radial coefficient with an unknown focal length even where it is not significantly better.
@@ -149,6 +150,8 @@ def _report(
         say(f"solved again, with {change}: {name}", to=out)
     if others := folder.of_other_maps():
         say(f"not in poses.txt: {len(others)} solutions in another map, such as {others[0]}", to=out)
+    for name, reason in folder.damaged.items():
+        say(f"not in results.json: solutions/{name}.json, since {reason}", to=out)
     for name, reason in outcome.not_drawn.items():
         say(f"no picture of {name}: {reason}", to=out)
     written = ["poses.txt", "results.json", *(["solutions/"] if records else [])]
@@ -158,7 +161,7 @@ def _report(
 
 def _camera(text: str, map: Path, scene: "SceneMap") -> Any:
     """Return the camera of all photos, or the map whose cameras are scaled to each."""
-    from bpnp.cameras import camera_from
+    from bpnp.cameras import CENTRE, camera_from
     from bpnp.commands.point_files import COLMAP_CAMERAS, read_camera
     from bpnp.maps.scene_map import UNKNOWN, SceneMap
 
@@ -169,7 +172,7 @@ def _camera(text: str, map: Path, scene: "SceneMap") -> Any:
         path = path.parent
     if text in ("map", "MAP") or (text and path.is_dir()):
         return scene if not path.is_dir() or path.resolve() == map.resolve() else SceneMap.from_colmap(path)
-    return camera_from(read_camera(text))
+    return camera_from(read_camera(text, centre=CENTRE))
 
 
 def _attempts(cluster: str | None) -> Callable[..., Any]:

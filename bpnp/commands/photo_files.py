@@ -6,6 +6,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
+from bpnp.bounded_files import file_inside
 from bpnp.cameras import Camera, camera_from
 from bpnp.datamodules.colmap.model_files import find_scenes
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
@@ -114,10 +115,10 @@ class ColmapPhotos:
         """Yield the images that a problem may be of, each with its file, if there is one."""
         for image in self.images(problem):
             if self.folder is None:
-                paths = [parent / "images" / image.name for parent in image.folder.parents[:LEVELS]]
+                paths = [file_inside(parent / "images", image.name) for parent in image.folder.parents[:LEVELS]]
             else:
-                paths = [self.folder / image.name, self.folder / image.model / image.name]
-            if (path := next((path for path in paths if path.is_file()), None)) is not None:
+                paths = [file_inside(self.folder, name) for name in (image.name, f"{image.model}/{image.name}")]
+            if (path := next((path for path in paths if path is not None and path.is_file()), None)) is not None:
                 yield image, path
 
 

@@ -4,18 +4,19 @@ A solution is identified by the content of all its inputs, not by their names. A
 new content under the same name is a new input.
 """
 
-import contextlib
 import hashlib
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from bpnp.argument_types import short_repr
+from bpnp.bounded_files import open_input, parse_json, read_json, read_text
 from bpnp.cameras import camera_from, camera_to_json
 from bpnp.datamodules.colmap.model_files import FILES, model_format
 from bpnp.files import delay_interrupts, fingerprint, write_text
@@ -26,12 +27,16 @@ from bpnp.report.images import read_photo, save_figure
 from bpnp.search.arguments import seconds_from
 from bpnp.search.config import TIME
 from bpnp.search.solution import Solution
+from bpnp.search.verdict.decide import Verdict
 
 CHANGES = {"photo": "another photo", "map": "another map", "views": "other views", "keypoints": "other keypoints"}
 MADE_WITH = "made_with"  # key in a solution's file, added to the fields of the solution
 REPORTED: tuple[str, ...] = ("verdict", "reason", "view", "inlier_count", "reprojection_error", "inlier_threshold")
 REPORTED += ("log10_false_alarms", "seconds", "rotation", "translation", "camera", "focal_length", "focal_length_std")
 REPORTED += (MADE_WITH,)
+NUMBERS: tuple[str, ...] = ("inlier_count", "reprojection_error", "inlier_threshold", "log10_false_alarms", "seconds")
+NUMBERS += ("focal_length", "focal_length_std")
+INPUTS_OF_ALL = ("photo", "map", "camera_from", "leave_one_out")  # entries of MADE_WITH that are used by name
 ERROR = "error_to_map"  # key for a photo that was left out of the map
 # A name may have spaces: the last seven words of a line are the numbers.
 POSES_HEADER = "# NAME, QW, QX, QY, QZ, TX, TY, TZ (COLMAP's cam_from_world)\n"
@@ -238,8 +243,8 @@ def read_views(path: str | Path) -> dict[str, list[str]]:
         ValueError: The file cannot be read, or a line does not have two names.
     """
     try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        lines = read_text(Path(path)).splitlines()
+    except (OSError, ValueError) as error:
         raise ValueError(f"--views needs a text file of lines `photo view`: {error}") from error
     views: dict[str, list[str]] = {}
     for number, line in enumerate(lines, 1):
@@ -257,7 +262,7 @@ def content_of(*files: Path) -> str:
     """Return the sizes and a hash of the content of files."""
     digest, sizes = hashlib.blake2b(digest_size=16), []
     for file in files:
-        with file.open("rb") as content:
+        with open_input(file, pipes=False) as content:
             digest.update(hashlib.file_digest(content, "blake2b").digest())
         sizes.append(str(file.stat().st_size))
     return f"{'+'.join(sizes)} bytes, {digest.hexdigest()}"
@@ -279,6 +284,31 @@ def results_json(map_content: str, photos: Mapping[str, Record]) -> str:
     return json.dumps({"map": map_content, "photos": photos}, indent=1)
 
 
+def _record(content: Any) -> Record:
+    """Return the entry of results.json of a solution's file; raise ValueError if a field is missing or damaged."""
+    if not isinstance(content, dict):
+        raise ValueError(f"it holds {short_repr(content)}")
+    try:
+        record: Record = {key: content[key] for key in REPORTED}
+        missing = [key for key in INPUTS_OF_ALL if key not in dict(record[MADE_WITH])]
+        rotation, translation = (np.asarray(record[key], np.float64) for key in ("rotation", "translation"))
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        reason = f"its field {error} is missing" if isinstance(error, KeyError) else f"a field is damaged: {error}"
+        raise ValueError(reason) from error
+    if missing:
+        raise ValueError(f"its field {MADE_WITH!r} has no {missing[0]!r}")
+    if record["verdict"] not in get_args(Verdict):
+        raise ValueError(f"its verdict is {record['verdict']!r:.40}")
+    has_pose = rotation.shape == (3, 3) and translation.shape == (3,) and np.isfinite([*rotation, translation]).all()
+    is_empty = record["rotation"] is None and record["translation"] is None and record["verdict"] == "failed"
+    if not is_empty and not (has_pose and np.linalg.det(rotation) > 0):
+        raise ValueError(f"its pose is {short_repr((record['rotation'], record['translation']))}")
+    for name in NUMBERS:
+        if record[name] is not None and not isinstance(record[name], (int, float)):
+            raise ValueError(f"its {name} is {record[name]!r:.40} instead of a number")
+    return record | {ERROR: None}
+
+
 @dataclass
 class SolutionFolder:
     """Folder with solutions/<photo>.json for each photo, and results.json and poses.txt for all.
@@ -287,6 +317,7 @@ class SolutionFolder:
         path: The folder.
         map_content: Fingerprint of the files of the map, whose frame the poses are in.
         records: Entries of results.json, by photo.
+        damaged: What is wrong with each file of a solution that is not in results.json, by photo.
 
     Raises:
         ValueError: The folder has a results.json or poses.txt that is no result of `bpnp localize`.
@@ -294,19 +325,28 @@ class SolutionFolder:
 
     path: Path
     map_content: str
-    records: dict[str, Record] = field(default_factory=dict)  # by photo
+    records: dict[str, Record] = field(default_factory=dict)
+    damaged: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         # Beginnings of the files for all photos, which no other program writes.
         results_beginning, _, _ = results_json("", {}).partition('""')
         for name, beginning in (("results.json", results_beginning), ("poses.txt", POSES_HEADER)):
             file = self.path / name
-            if file.is_file() and not file.read_bytes().startswith(beginning.encode()):
-                raise ValueError(f"{file} is no result of `bpnp localize` and would be replaced; use another folder")
+            if not file.is_file():
+                continue
+            with file.open("rb") as content:
+                if content.read(len(beginning.encode())) != beginning.encode():
+                    raise ValueError(
+                        f"{file} is no result of `bpnp localize` and would be replaced; use another folder"
+                    )
         folder = self.path / "solutions"
         for file in sorted(folder.rglob("*.json")):
-            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # incomplete, or from another version
-                self._record(file.relative_to(folder).as_posix().removesuffix(".json"), file.read_text("utf-8"))
+            name = file.relative_to(folder).as_posix().removesuffix(".json")
+            try:
+                self.records[name] = _record(read_json(file))
+            except (OSError, ValueError) as error:
+                self.damaged[name] = str(error)
 
     def changes(self, task: PhotoTask) -> list[str] | None:
         """Return the names of the inputs that have changed since the photo's solution; None if there is no solution."""
@@ -330,7 +370,8 @@ class SolutionFolder:
         self.picture(task.name).unlink(missing_ok=True)
         text = f'{solution.to_json()[:-1]}, "{MADE_WITH}": {json.dumps(task.made_with)}}}'
         write_text(self._file("solutions", task.name, "json"), text + "\n")
-        self._record(task.name, text)
+        self.records[task.name] = _record(parse_json(text))
+        self.damaged.pop(task.name, None)
 
     def draw(self, task: PhotoTask, scene: SceneMap) -> None:
         """Draw the picture of a photo from its solution.
@@ -350,7 +391,7 @@ class SolutionFolder:
         """Delete the solution and the picture of a photo if they belong to another photo of that name."""
         try:
             content = content_of(photo)
-        except OSError:
+        except (OSError, ValueError):
             return
         if name in self.records and self.records[name][MADE_WITH]["photo"] != content:
             del self.records[name]
@@ -386,10 +427,6 @@ class SolutionFolder:
                 x, y, z, w = Rotation.from_matrix(record["rotation"]).as_quat(canonical=True).tolist()
                 lines.append(f"{name} {' '.join(map(repr, (w, x, y, z, *record['translation'])))}\n")
         write_text(self.path / "poses.txt", "".join(lines), errors="surrogateescape")  # keeps names of photos
-
-    def _record(self, name: str, text: str) -> None:
-        content = json.loads(text)
-        self.records[name] = {key: content[key] for key in REPORTED} | {ERROR: None}
 
     def _file(self, folder: str, name: str, suffix: str) -> Path:
         return self.path / folder / f"{name}.{suffix}"

@@ -261,3 +261,38 @@ def test_json_is_all_that_is_printed_and_a_pipe_gets_a_line_for_each_photo(
     printed = capsys.readouterr()
     assert list(json.loads(printed.out)["photos"]) == ["a.png"]
     assert printed.err == ""
+
+
+def test_a_damaged_solution_is_one_line_and_the_others_are_localized(
+    place: Place, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The file of a photo that is solved again is replaced; that of another photo, here a view of the map, is named."""
+    first, second = "photo 0.jpg", "photo 1.jpg"
+    place.write({first: 0, second: 1})
+    for name in (first, second):
+        shot(place.folder / name, 0)
+    place.run(first, second)
+    solutions = place.folder / "out/solutions"
+    text = (solutions / f"{first}.json").read_text()
+    whole = json.loads(text)
+    damages = {
+        "its field 'rotation' is missing": {key: value for key, value in whole.items() if key != "rotation"},
+        "its field 'made_with' has no 'leave_one_out'": whole
+        | {"made_with": {"photo": "", "map": "", "camera_from": ""}},
+        "its pose is": whole | {"rotation": [[1, 0], [0, 1]]},
+        "its inlier_count is 'many' instead of a number": whole | {"inlier_count": "many"},
+        "its verdict is None": whole | {"verdict": None},
+        "it holds []": [],
+    }
+    capsys.readouterr()
+    for reason, content in damages.items():
+        (solutions / f"{first}.json").write_text(json.dumps(content))
+        place.run(second)
+        shown = " ".join(capsys.readouterr().out.split())
+        assert f"not in results.json: solutions/{first}.json, since {reason}" in shown
+        assert [*json.loads((place.folder / "out/results.json").read_text())["photos"]] == [second]
+    (solutions / f"{first}.json").write_text("[" * 100_000)
+    place.run(first, second)
+    assert "not in results.json" not in capsys.readouterr().out
+    again = json.loads((solutions / f"{first}.json").read_text())
+    np.testing.assert_allclose(again["rotation"], whole["rotation"], atol=1e-9)

@@ -19,7 +19,7 @@ from report_data import inflated
 from bpnp import Pose, Prediction, SolveStats
 from bpnp.cameras import camera_from
 from bpnp.cli import main
-from bpnp.commands.photo_files import find_photos
+from bpnp.commands.photo_files import ColmapPhotos, ModelImage, find_photos
 from bpnp.datamodules import ColmapDataModule
 from bpnp.datamodules.colmap.module import ColmapSource
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
@@ -222,3 +222,18 @@ def test_the_poses_of_several_tests_are_drawn_over_one_photo(
     assert "leave out --photo and --camera" in fails(
         "view", str(tested / "table"), "--photos", "x", "--photo", "y.png", "--camera", "K.txt"
     )
+
+
+@pytest.mark.parametrize("name", ["../secret.jpg", "{folder}/secret.jpg"])
+def test_the_name_of_an_image_does_not_lead_out_of_the_folder_of_photos(name: str, tmp_path: Path) -> None:
+    name = name.format(folder=tmp_path)
+    plant_model(tmp_path / "castle" / "sparse" / "0", camera=OPENCV, clutter=0)
+    (tmp_path / "castle" / "images").mkdir()
+    for folder in (tmp_path, tmp_path / "castle"):
+        Image.new("L", (WIDTH, HEIGHT)).save(folder / "secret.jpg")
+    image = ModelImage(name, "castle", tmp_path / "castle" / "sparse" / "0", lambda: LENS)
+    for photos in (None, tmp_path / "castle" / "images"):
+        source = ColmapPhotos(lambda _: iter([image]), photos)
+        assert not source.has_file(f"castle/{name}")
+    inside = ColmapPhotos(lambda _: iter([image._replace(name="secret.jpg")]), tmp_path)
+    assert inside.has_file("castle/secret.jpg")
