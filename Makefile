@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 RUN := runs/quickstart
 # The proofs: a thread a process. The user's world has no variable set, and its tests start processes of their own.
 PROOFS := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -rs --ignore=tests/user
-AS_USER := test ! -d tests/user || $(BIN)/python -m pytest -rs tests/user
+AS_USER := $(BIN)/python -m pytest -rs tests/user
 EVERYWHERE := --jaxtyping-packages=bpnp,beartype.beartype
 # Percent of lines and branches that the tests run; compiled loops are not counted.
 FLOOR := 88

@@ -58,10 +58,11 @@ def main(args: Sequence[str] | None = None) -> None:
         if args is None and arguments and arguments[0] in LIGHTNING:
             keep_freed_memory()
             let_threads_sleep()
-        if not {"", os.getcwd()} & set(sys.path):
-            sys.path.append(os.getcwd())  # for the user's own classes; last, so that they hide no module
+        if not {"", folder := _working_folder()} & set(sys.path):
+            sys.path.append(folder)  # for the user's own classes; last, so that they hide no module
         _run(arguments)
-        sys.stdout.flush()
+        if sys.stdout is not None:  # it is None where the shell closed it
+            sys.stdout.flush()
     except Exception as error:
         if isinstance(error, BrokenPipeError) and _has_no_reader(sys.stdout):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the flush at exit would fail too
@@ -76,6 +77,14 @@ def main(args: Sequence[str] | None = None) -> None:
         raise SystemExit(2) from None
     except KeyboardInterrupt:
         _end_interrupted(arguments)
+
+
+def _working_folder() -> str:
+    """Return the working folder; raise ValueError if it was deleted."""
+    try:
+        return os.getcwd()
+    except FileNotFoundError as error:
+        raise ValueError("the working folder was deleted; change to a folder that exists") from error
 
 
 def _end_interrupted(arguments: Sequence[str]) -> NoReturn:

@@ -13,11 +13,12 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ContextDecorator, ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cache, lru_cache, update_wrapper
+from functools import cache, lru_cache, update_wrapper, wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import numba
+import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from bpnp.files import cache_folder, lock_folder
@@ -128,6 +129,22 @@ def _blas() -> ThreadpoolController:
 
 
 one_blas_thread = _OneBlasThread()
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+
+def default_float_errors(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Decorate a function to run with numpy's default for floating-point errors, whatever the caller chose.
+
+    With `numpy.seterr(all="raise")`, an underflow of exp(-x) would end a search.
+    """
+
+    @wraps(function)
+    def run(*args: _P.args, **options: _P.kwargs) -> _R:
+        with np.errstate(divide="warn", over="warn", invalid="warn", under="ignore"):
+            return function(*args, **options)
+
+    return run
 
 
 class Clock:

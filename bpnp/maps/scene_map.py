@@ -23,6 +23,7 @@ from bpnp.maps.photos import focal_from_exif, photo_keypoints, photo_size, up_fr
 from bpnp.maps.verify_view import verify_pose
 from bpnp.maps.viewed_points import RankViews, ViewedPoints
 from bpnp.maps.views import Array, View
+from bpnp.runtime import default_float_errors
 from bpnp.search.arguments import (
     PriorLike,
     check_inside,
@@ -119,6 +120,7 @@ class SceneMap(ViewedPoints):
         vars(scene).update(pictures=stored.pictures, cones=stored.cones)
         return scene
 
+    @default_float_errors
     def localize(
         self,
         keypoints: PointsLike,
@@ -205,6 +207,7 @@ class SceneMap(ViewedPoints):
         solution = result.solution
         return solution if strongest is None else among_all(solution, strongest, pixels)
 
+    @default_float_errors
     def verify_view(
         self,
         name: str,
@@ -260,6 +263,7 @@ class SceneMap(ViewedPoints):
         smallest, largest = min([unknown.smallest, *ratios]), max([unknown.largest, *ratios])
         return unknown._replace(smallest=smallest, largest=largest, usual=float(np.median(ratios or [unknown.usual])))
 
+    @default_float_errors
     def localize_photo(
         self,
         photo: str | Path,

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from bpnp.checks import check_positive, check_within
 from bpnp.geometry import bearings, choose, chords
 from bpnp.robust.proposals import pose_hypotheses
-from bpnp.runtime import Deadline
+from bpnp.runtime import Deadline, default_float_errors
 from bpnp.search.config import DEFAULT, SearchSettings
 from bpnp.search.problem import Problem
 from bpnp.search.propose.given import anneal_given
@@ -63,6 +63,7 @@ class Search(nn.Module):
         check_positive(time_limit=math.inf if time_limit is None else time_limit)
         self.seed, self.time_limit, self.settings = seed, time_limit, settings
 
+    @default_float_errors
     def forward(self, batch: Batch) -> Prediction:
         """Return the pose "search" of each problem.
 
@@ -79,6 +80,7 @@ class Search(nn.Module):
         return Deadline.after(self.time_limit)
 
 
+@default_float_errors
 def refine(batch: Batch, rotation: Float[Tensor, "b s 3 3"], translation: Float[Tensor, "b s 3"]) -> Pose:
     """Anneal poses (`anneal_given`) and return the best one of each sample.
 
@@ -127,11 +129,11 @@ def best_poses(results: Iterable[tuple[Problem, SearchResult]], like: Tensor) ->
     """
     solved = list(results)
     poses = [problem.to_user(*result.best) for problem, result in solved]
-    rotation = torch.tensor(np.array([pose[0] for pose in poses]).reshape(-1, 3, 3)).to(like)
-    translation = torch.tensor(np.array([pose[1] for pose in poses]).reshape(-1, 3)).to(like)
+    rotation = torch.from_numpy(np.array([pose[0] for pose in poses]).reshape(-1, 3, 3)).to(like)
+    translation = torch.from_numpy(np.array([pose[1] for pose in poses]).reshape(-1, 3)).to(like)
     stats = SolveStats(
         torch.tensor([result.batches for _, result in solved], device=like.device, dtype=torch.int64),
-        torch.tensor([result.residual for _, result in solved]).to(like),
+        like.new_tensor([result.residual for _, result in solved]),
         torch.tensor([result.verdict == "confident" for _, result in solved], device=like.device, dtype=torch.bool),
     )
     return Pose(rotation, translation, stats)

@@ -8,7 +8,7 @@ import numpy as np
 
 from bpnp.argument_types import ArrayLike, ImageSize, ManyArrays, ManyPoints, PointsLike, PoseLike
 from bpnp.cameras import Camera, ManyCameras, camera_from
-from bpnp.runtime import Clock, Deadline
+from bpnp.runtime import Clock, Deadline, default_float_errors
 from bpnp.search.arguments import (
     Labels,
     ManyPriors,
@@ -212,6 +212,7 @@ def solve(
     )[0]
 
 
+@default_float_errors
 def solve_many(
     points2d: ManyPoints,
     points3d: ManyPoints,

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.argument_types import ArrayLike, PointsLike
 from bpnp.cameras import CameraLike, camera_from
-from bpnp.runtime import NEVER, Deadline
+from bpnp.runtime import NEVER, Deadline, default_float_errors
 from bpnp.search.arguments import Array, Labels, checked_pose, checked_seed, numbers, positive, seconds_from
 from bpnp.search.config import TIME
 from bpnp.search.given_pose import judge_given_pose
@@ -25,6 +25,7 @@ from bpnp.search.verdict.reasons import UNTESTED, Unfinished, objection, undecid
 from bpnp.search.verdict.uncertainty import linearised, pose_covariance
 
 
+@default_float_errors
 def verify(
     points2d: PointsLike,
     points3d: PointsLike,

@@ -93,7 +93,8 @@ class SingleSolver(nn.Module):
             missing = like.new_full((3, 3), math.nan), like.new_full((3,), math.nan)
             poses = zip(*(answer.pose or missing for answer in answers), strict=True)
             rotation, translation = (torch.stack([value.to(like) for value in values]) for values in poses)
-            stats = SolveStats(*(torch.tensor(values) for values in zip(*(a[1:] for a in answers), strict=True)))
+            columns = zip(*(a[1:] for a in answers), strict=True)
+            stats = SolveStats(*(torch.tensor(values, device=like.device) for values in columns))
             return Prediction(poses={self.estimates[0]: Pose(rotation, translation, stats.to(like))})
 
     def solve(self, problem: SingleProblem, deadline: Deadline) -> Answer:

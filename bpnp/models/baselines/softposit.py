@@ -1,7 +1,7 @@
 """SoftPOSIT: alternating soft assignment and scaled-orthographic pose (David, DeMenthon et al., IJCV 2004)."""
 
 import math
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import roma
 import torch
@@ -95,7 +95,7 @@ class SoftPOSIT(SingleSolver):
     def _starts(self, problem: SingleProblem) -> tuple[Float[Tensor, "s 3 3"], Float[Tensor, "s 3"]]:
         like = problem.points3d
         if self.start == "mean":  # Rz Ry Rx of 22.5 degrees each
-            rotation = roma.euler_to_rotmat("xyz", torch.full((3,), 22.5, dtype=torch.float64), degrees=True)
+            rotation = roma.euler_to_rotmat("xyz", like.new_full((3,), 22.5, dtype=torch.float64), degrees=True)
             return rotation.unsqueeze(0).to(like), like.new_tensor([[0.0, 0.0, 4.5]])
         generator = torch.Generator().manual_seed(problem.seed(self.seed))
         if self.start == "random":
@@ -106,9 +106,10 @@ class SoftPOSIT(SingleSolver):
         if problem.rotation is None or problem.translation is None:
             raise ValueError("`start` near_truth needs the true poses, which the batch lacks; use start 'random'")
         # Rotate by up to 10 degrees about a random axis and move by up to 0.5 in a random direction, uniformly.
-        directions = torch.nn.functional.normalize(torch.randn(2, 3, generator=generator, dtype=torch.float64), dim=-1)
-        amounts = 2 * torch.rand(2, generator=generator, dtype=torch.float64) - 1
-        step = (amounts * torch.tensor([math.radians(10), 0.5])).unsqueeze(-1) * directions
+        drawn: dict[str, Any] = {"generator": generator, "dtype": torch.float64, "device": "cpu"}
+        directions = torch.nn.functional.normalize(torch.randn(2, 3, **drawn), dim=-1)
+        amounts = (2 * torch.rand(2, **drawn) - 1) * torch.tensor([math.radians(10), 0.5], device="cpu")
+        step = amounts.unsqueeze(-1) * directions
         rotation, translation = retract(step.flatten().to(like), problem.rotation, problem.translation)
         return rotation.unsqueeze(0), translation.unsqueeze(0)
 
