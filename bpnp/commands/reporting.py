@@ -206,8 +206,9 @@ def _solution(path: Path) -> "ProblemPoints":
     from bpnp.report.solutions import solution_points
     from bpnp.search.solution import Solution
 
+    content = read_bytes(path)
     try:
-        return solution_points(Solution.from_json(read_bytes(path)), title=path.stem)
+        return solution_points(Solution.from_json(content), title=path.stem)
     except ValueError as error:
         pictures = path.parent / "pictures"
         there = f"; the pictures of `bpnp localize` are in {pictures}" if pictures.is_dir() else ""

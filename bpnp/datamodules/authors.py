@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.bounded_files import open_input
 from bpnp.datamodules.loader import hold_out
 from bpnp.datamodules.problem import Problem
 from bpnp.datamodules.store import JobResult, Recipe, Store, StoreError, StoreRow, is_store, open_or_prepare, open_store
@@ -273,7 +274,7 @@ def load_pickle(path: Path) -> Any:
         PickleError: The content is something else.
         OSError: The file cannot be read.
     """
-    with path.open("rb") as file:
+    with open_input(path, pipes=False) as file:
         try:
             content = _Unpickler(file, encoding="bytes").load()
             if not isinstance(content, (dict, list, tuple, np.ndarray)):
@@ -286,7 +287,7 @@ def load_pickle(path: Path) -> Any:
     return content
 
 
-class _Unpickler(pickle.Unpickler):
+class _Unpickler(pickle._Unpickler):  # in Python: the memo of that in C is as large as the largest index in the file
     def find_class(self, module: str, name: str) -> Any:
         full = f"{module}.{name}".replace("_core.", "").replace("core.", "").replace("__builtin__", "builtins")
         if full not in ALLOWED:

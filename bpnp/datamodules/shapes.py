@@ -176,6 +176,8 @@ def _triangles(rows: Sequence[str]) -> NDArray[np.int64]:
     fans = [np.empty((0, 3), np.int64)]
     for count in np.unique(corners[corners >= 3]):
         same = [row for row, k in zip(rows, corners, strict=True) if k == count]
+        if any(len(row.split()) <= count for row in same):
+            raise ValueError(f"a face states {count} corners, and has fewer")
         polygons = np.loadtxt(same, usecols=range(1, count + 1), dtype=np.int64, ndmin=2)
         second, third = polygons[:, 1:-1], polygons[:, 2:]
         fans.append(np.stack([np.broadcast_to(polygons[:, :1], second.shape), second, third], -1).reshape(-1, 3))
@@ -193,7 +195,8 @@ def _load(content: bytes, suffix: str, *, force: Literal["mesh"] | None = "mesh"
         file = io.BytesIO(content)
         return trimesh.load(file, file_type=suffix[1:], force=force, process=False, skip_materials=True)
     except Exception as error:
-        raise MeshError(f"trimesh cannot read it as a {suffix} mesh ({error})") from error
+        reason = str(error) or type(error).__name__
+        raise MeshError(f"trimesh cannot read it as a {suffix} mesh ({reason})") from error
 
 
 def _check_ply_rows(content: bytes) -> None:

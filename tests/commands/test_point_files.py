@@ -103,6 +103,7 @@ def test_a_mesh_gives_its_corners_or_its_surface(suffix: str, tmp_path: Path) ->
         ),
         ("a.stl", b"no mesh", "a.stl: the file has 0 points"),
         ("a.off", b"OFF\n3 1 0\n0 0 0\n", "truncated"),
+        ("a.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n1000000000000 0 1 2\n", "a face states 1000000000000 corners"),
     ],
 )
 def test_a_broken_file_is_named(name: str, content: bytes, message: str, tmp_path: Path) -> None:

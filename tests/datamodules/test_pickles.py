@@ -159,3 +159,8 @@ def test_random_damage_is_an_error_or_plain_data(tmp_path: Path) -> None:
         except PickleError:
             continue
         assert isinstance(value, (dict, list, tuple, np.ndarray))
+
+
+def test_a_large_index_of_the_memo_takes_no_memory(tmp_path: Path) -> None:
+    (tmp_path / "x.pkl").write_bytes(b"\x80\x04}r\xff\xff\xff\x7f.")  # an empty dict, kept under the index 2^31 - 1
+    assert load_pickle(tmp_path / "x.pkl") == {}

@@ -115,3 +115,13 @@ def test_keypoints_of_hloc_are_read_and_wrong_files_named(tmp_path: Path) -> Non
     path.write_bytes(b"something else")
     with pytest.raises(ValueError, match="is neither an HDF5 file of keypoints nor a database of COLMAP"):
         read_features(path, "query/a.jpg")
+
+
+def test_features_that_claim_terabytes_are_refused(tmp_path: Path) -> None:
+    """A chunked data set has a size without a value stored."""
+    with h5py.File(tmp_path / "features.h5", "w") as file:
+        file.create_dataset("a.jpg/keypoints", (10**12, 2), "f4", chunks=(1024, 2))
+    with pytest.raises(
+        ValueError, match=r"a.jpg/keypoints in .*features.h5 states float32 of shape \(1000000000000, 2\)"
+    ):
+        read_features(tmp_path / "features.h5", "a.jpg")
