@@ -40,7 +40,7 @@ from bpnp.search.search_frame import Scene
 from bpnp.search.solution import FOCAL_LENGTH, ROTATION_PARAMETERS, Solution, add_objection
 from bpnp.search.solvers import Options, solve_problems
 from bpnp.search.verdict.decide import match_count, rank_poses
-from bpnp.search.verdict.reasons import Unfinished, objection, undecided
+from bpnp.search.verdict.reasons import TESTS, Unfinished, objection, undecided
 from bpnp.search.verdict.uncertainty import is_within
 
 ProblemAt = Callable[[Camera, UnknownFocal], Problem]
@@ -249,7 +249,9 @@ class FocalSweep(ABC):
         best = self.contested()
         if best.verdict == "confident" and few and Unfinished.focal_lengths in self.deadline.unfinished:
             best = add_objection(best, objection("camera_untested"))
-        if best.reason_code == "camera_untested" and self.options.time_limit is not None:
+        unfinished = self.deadline.unfinished & {Unfinished.search, *TESTS}
+        is_open = best.verdict != "confident" and bool(unfinished)
+        if is_open and not self.options.is_part and self.options.time_limit is not None:
             best = replace(best, reason=undecided(best.reason, self.options.time_limit))
         return replace(with_unfinished(best, self.deadline), seconds=Clock.now() - begun)
 

@@ -69,6 +69,11 @@ class Options(NamedTuple):
             return self
         return self._replace(progress=lambda _, batches, seconds: progress(i, batches, seconds))
 
+    @property
+    def is_part(self) -> bool:
+        """True for one search of several within a time limit; their reason then speaks of it."""
+        return self.until.end is not None
+
     def deadline(self, problem: Problem) -> Deadline:
         """Return when the search of a problem that starts now has to stop, so that verdict and matching end in time."""
         return self.limit().before(ending_seconds(problem))
@@ -130,13 +135,11 @@ def _by_search(i: int, problem: Problem, options: Options) -> Solution:
         progress=options.progress_of(i),
     )
     seconds = time.perf_counter() - start
-    if not len(result.candidates) and deadline.passed():
-        limit = options.time_limit or seconds
-        result = replace(result, reason=f"no pose was found in {limit:.3g} s; try a longer time limit")
-    elif deadline.passed() and may_be_decided(result):
+    if deadline.passed() and may_be_decided(result):
         if not result.settled:
             deadline.unfinished.add(reasons.Unfinished.search)
-        result = replace(result, reason=reasons.undecided(result.reason, options.time_limit or seconds))
+        if not options.is_part:
+            result = replace(result, reason=reasons.undecided(result.reason, options.time_limit or seconds))
     if result.verdict == "failed" and mirrored_alarms(problem, deadline) <= options.settings.evidence.false_alarms:
         result = replace(result, reason=f"{result.reason}; {reasons.MIRRORED}")
     return finished(problem, result, seconds, options.inlier_threshold, deadline)

@@ -165,10 +165,11 @@ def _solve(rig: Rig, options: Options) -> Solution:
             settings=options.settings,
             progress=options.progress_of(0),
         )
-        if options.time_limit is not None and deadline.passed() and may_be_decided(result):
+        if deadline.passed() and may_be_decided(result):
             if not result.settled:
                 deadline.unfinished.add(Unfinished.search)
-            result = replace(result, reason=undecided(result.reason, options.time_limit))
+            if not options.is_part and options.time_limit is not None:
+                result = replace(result, reason=undecided(result.reason, options.time_limit))
     solution = with_unfinished(_finished(rig, rig.problems, result, options.inlier_threshold, deadline), deadline)
     return replace(solution, seconds=Clock.now() - begun)
 
