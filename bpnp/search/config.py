@@ -338,6 +338,8 @@ class TimeSettings:
         ending: Time of the verdict and of the matching after a search; at most half of a limit is kept for it.
             [seconds; cost]
         ending_a_point: Time that each 2D or 3D point adds to `ending`. [seconds per point; cost]
+        grace: Time by which verdict and matching may exceed a limit, before what is left of them is cut off. [seconds;
+            convention]
         judging: Time to judge the pose of a photo on all points of a map after the searches; at most half of a limit is
             kept for it. [seconds; cost]
         hypothesis: Time of a hypothesis of the enumeration before it is measured. [seconds; cost]
@@ -353,6 +355,7 @@ class TimeSettings:
     photo: float = 60.0
     ending: float = 4e-3
     ending_a_point: float = 8e-6
+    grace: float = 0.3
     judging: float = 1.5
     hypothesis: float = 2e-6
     least_pace: float = 1e-9

@@ -79,10 +79,10 @@ class Options(NamedTuple):
         return self.limit().before(ending_seconds(problem))
 
     def limit(self) -> Deadline:
-        """Return the deadline of what starts now, without time for its ending."""
-        own, until = Deadline.after(self.time_limit).at, self.until
+        """Return the deadline of what starts now, without time for its ending, which may last `TIME.grace` longer."""
+        until, at = self.until, min(Deadline.after(self.time_limit).at, self.until.at)
         unfinished = set[str]() if math.isinf(until.final) else until.unfinished
-        return Deadline(min(own, until.at), min(own, until.final), unfinished)
+        return Deadline(at, until.end if until.end is not None else at + TIME.grace, unfinished)
 
 
 def ending_seconds(*problems: Problem) -> float:

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from bpnp.runtime import NEVER, Deadline
 from bpnp.search.config import ALARMS, RIG
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.pose_model import PoseModel
@@ -278,10 +279,17 @@ class Rig:
                 return np.asarray(covariance[np.ix_(kept, kept)] / sharper**2)
         return None
 
-    def candidates(self, rotations: Array, translations: Array) -> Hypotheses:
-        """Return poses refined on all cameras, each at the scale with the fewest false alarms."""
+    def candidates(
+        self, rotations: Array, translations: Array, deadline: Deadline = NEVER, stage: str | None = None
+    ) -> Hypotheses:
+        """Return poses refined on all cameras, each at the scale with the fewest false alarms.
+
+        After the deadline, which notes the stage, the others are left out.
+        """
         ends = []
-        for rotation, translation in zip(rotations, translations, strict=True):
+        for k, (rotation, translation) in enumerate(zip(rotations, translations, strict=True)):
+            if k and deadline.passed(stage):
+                break
             last = list(self.refined(rotation, translation))[RIG.again - 1 :: RIG.again][-RIG.weighed :]
             if last:
                 ends.append(min(((*self.alarms(*end[:3]), *end) for end in last), key=lambda scored: scored[0]))

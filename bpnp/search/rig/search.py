@@ -178,7 +178,7 @@ class RigPoses:
         every = Hypotheses.concatenate([self.starts, poses])
         order = self._distinct(every, np.r_[np.full(earlier, BEFORE), score], earlier + most)[earlier:]
         self.starts = every[np.r_[:earlier, order]]
-        self.add_refined(self.rig.candidates(every.rotation[order], every.translation[order]))
+        self.add_refined(self.rig.candidates(every.rotation[order], every.translation[order], self.deadline))
 
     def next_local_search(self) -> Step | None:
         """Return a local search around the best unused initial pose; None if a pose is significant."""
@@ -254,13 +254,17 @@ class RigPoses:
         if result.verdict == "confident":
             strongest, seen = self._strongest()
             pose_and_scale = *seen.pose(), float(seen.scale[0])
-            repeated, sizes, _ = repeated_poses(self.rig.problems[strongest], *pose_and_scale, self.verdict_settings)
+            problem = self.rig.problems[strongest]
+            repeated, sizes, _ = repeated_poses(problem, *pose_and_scale, self.verdict_settings, deadline=self.deadline)
             unit = self.best.translation[0, 3]
             if self.rig.model.scale:  # a copy of another size looks the same if the rig is larger as well
                 unit = unit * sizes[:, None]
             copies = self.rig.rig_of(strongest, repeated.rotation, repeated.translation, unit)
-            self.add_refined(self.rig.candidates(*copies))
+            end = replace(self.deadline, at=self.deadline.final)
+            self.add_refined(self.rig.candidates(*copies, end, Unfinished.competing_poses))
             result = self._judge()
+        if result.verdict == "confident" and Unfinished.competing_poses in self.deadline.unfinished:
+            result = result.add_objection(objection("untested"))
         if result.verdict == "confident" and (other := self._other_extrinsics()) is not None:
             result = result.add_objection(other)
         if result.verdict == "confident" and self.rig.model.lens is None:
