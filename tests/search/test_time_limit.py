@@ -161,7 +161,7 @@ def test_no_competing_pose_is_proposed_after_the_limit(clock: MovedClock) -> Non
 
 
 def test_no_other_focal_length_is_searched_after_the_limit(clock: MovedClock) -> None:
-    """Thirty points leave a chance that another focal length fits, for which the search runs again."""
+    """Seventy points leave a chance that another focal length fits, for which the search runs again."""
     points, pixels, turn = scene_and_pixels(70)
     clock.stop_at("search.competing_poses.repeated_competitors", after=True)
     searches = clock.count_late("search.competing_poses.search_around")
