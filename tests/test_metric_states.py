@@ -73,6 +73,7 @@ def _process(rank: int, folder: Path, shards: list[list[list[list[int]]]]) -> No
     torch.distributed.destroy_process_group()
 
 
+@pytest.mark.nightly
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_two_processes_give_the_metrics_of_one(tmp_path: Path) -> None:
     shards = [

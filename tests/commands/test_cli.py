@@ -284,6 +284,7 @@ def test_a_warning_is_one_line() -> None:
     assert (shown.stdout, shown.stderr) == ("", "bpnp: warning: two lines\n")
 
 
+@pytest.mark.nightly
 def test_a_test_of_other_weights_or_data_says_what_it_replaces(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

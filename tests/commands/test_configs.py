@@ -20,6 +20,7 @@ RECIPES = sorted(
     for folder in (".", "paper")
     for path in CONFIGS.glob(f"{folder}/*.yaml")
 )
+DAILY = {"quickstart", "matcher", "paper/modelnet40", "paper/megadepth"}  # in `make test` too
 
 
 def data_for(recipe: str, folder: Path) -> list[str]:
@@ -38,7 +39,10 @@ def data_for(recipe: str, folder: Path) -> list[str]:
     return [*small, f"--data.root={write_mesh_tree(folder / 'meshes', train=4)}", "--data.val_fraction=0.3"]
 
 
-@pytest.mark.parametrize("recipe", RECIPES)
+@pytest.mark.parametrize(
+    "recipe",
+    [pytest.param(recipe, marks=() if recipe in DAILY else pytest.mark.nightly) for recipe in RECIPES],
+)
 def test_every_recipe_trains_and_tests(recipe: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.chdir(tmp_path)
@@ -73,6 +77,7 @@ def test_a_part_is_swapped_in_the_recipe(tmp_path: Path) -> None:
     assert (net.features3d.size, net.transport.mu, net.rounds) == (3, 0.2, 8)  # 8 rounds are the recipe's
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("preset", sorted(path.name for path in (CONFIGS / "presets").glob("*.yaml")))
 def test_every_preset_joins_a_recipe(preset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)

@@ -266,6 +266,7 @@ def test_ctrl_c_while_a_picture_is_drawn_ends_the_run_and_keeps_the_photo(
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+@pytest.mark.nightly
 def test_a_rough_focal_length_and_distortion_are_found(tmp_path: Path, fails: Callable[..., str]) -> None:
     pinhole = ("PINHOLE", [520.0, 520.0, WIDTH / 2, HEIGHT / 2])
     truth = plant_model(tmp_path / "map", camera=pinhole, images=2, points=140, seen=90, clutter=0)

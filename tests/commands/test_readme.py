@@ -66,7 +66,19 @@ def parse_benchmark(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
         runpy.run_path(str(ROOT / "benchmarks" / "__main__.py"))["main"]()
 
 
-@pytest.mark.parametrize(("text", "line"), COMMAND_LINES)
+def of_lightning(line: str) -> bool:
+    """Return whether all options of Lightning are parsed for a command, in a fifth of a second."""
+    words = line.split()
+    return words[0] in ("bpnp", "lightning") and words[1] in LIGHTNING and len(words) > 2
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        pytest.param(text, line, marks=pytest.mark.nightly if of_lightning(line) and text != "README.md" else ())
+        for text, line in COMMAND_LINES
+    ],
+)
 def test_commands_are_parsed(
     text: str, line: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

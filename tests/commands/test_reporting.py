@@ -68,6 +68,7 @@ def test_a_printed_path_keeps_its_colons(tmp_path: Path, capsys: pytest.CaptureF
     assert f"wrote {tmp_path / '12:100:30.png'}\n" in capsys.readouterr().out
 
 
+@pytest.mark.nightly
 def test_a_reader_that_closes_the_pipe_is_no_error(tmp_path: Path) -> None:
     """The pipe is closed before the table is printed, as in `bpnp report RUN | true`."""
     write_run(tmp_path, 9, 0)
@@ -84,6 +85,7 @@ def test_a_reader_that_closes_the_pipe_is_no_error(tmp_path: Path) -> None:
     assert process.returncode == 0
 
 
+@pytest.mark.nightly
 @pytest.mark.skipif(not Path("/dev/full").is_char_device(), reason="the system has no /dev/full")
 def test_a_table_that_a_full_disk_does_not_take_is_one_clear_error(tmp_path: Path) -> None:
     write_run(tmp_path, 9, 0)
@@ -113,6 +115,7 @@ def test_a_page_and_the_tables_of_the_terminal_share_their_intervals(
     assert drawn == alone
 
 
+@pytest.mark.slow
 def test_every_problem_of_a_test_can_be_viewed_by_name(tmp_path: Path, fails: Callable[..., str]) -> None:
     write_run(tmp_path, 9, 0)
     names = {row.index: row.id for row in rows(9, 0)}

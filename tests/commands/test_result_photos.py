@@ -176,6 +176,7 @@ def test_missing_photos_are_counted_once(tested: Path, capsys: pytest.CaptureFix
     assert f"the COLMAP models of the test are no longer in {tested / 'castle'}" in shown
 
 
+@pytest.mark.nightly
 def test_pictures_for_wandb_have_the_photo(tested: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("WANDB_MODE", raising=False)
     drawn: list[str] = []

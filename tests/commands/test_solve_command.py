@@ -132,6 +132,7 @@ def test_an_unwritable_output_is_refused_before_the_search(
     assert "file" in fails("solve", *write(tmp_path), "--output", str(tmp_path / "file" / "r.json"))
 
 
+@pytest.mark.slow
 def test_a_colmap_model_is_scene_and_camera_and_the_photo_lies_under_the_picture(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -203,6 +204,7 @@ def test_coordinates_have_fixed_decimals_and_the_points_are_counted() -> None:
     assert "40 image points, 40 scene points with normals" in console.export_text()
 
 
+@pytest.mark.slow
 def test_with_the_size_of_the_image_the_focal_length_is_estimated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

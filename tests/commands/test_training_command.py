@@ -121,6 +121,7 @@ def test_solver_and_metric_of_the_contributing_guide(
     assert float(value) == pytest.approx(float((4 / away - 1).abs().median()), rel=1e-4)
 
 
+@pytest.mark.nightly
 def test_weights_of_a_task_by_class_path_are_trained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     task = "--model=bpnp.training.task.BlindPnPTask"
     main(["test", task, "--model.init_args.weights=procedural-so3", *MESHES, *folders(tmp_path / "trained")])
@@ -230,6 +231,7 @@ def test_a_weight_without_an_epoch_is_refused(tmp_path: Path, capsys: pytest.Cap
     assert "--pose_loss.weight needs --pose_loss.start_epoch" in capsys.readouterr().err
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("user_policy", "policy"), [(None, "PASSIVE"), ("active", "ACTIVE")])
 def test_threads_of_the_command_sleep_while_they_wait(user_policy: str | None, policy: str, tmp_path: Path) -> None:
     """OpenMP prints its settings when torch loads it."""

@@ -92,6 +92,7 @@ def test_an_image_is_judged_without_the_points_that_it_made(tmp_path: Path) -> N
     assert len(scene.points3d) == 180
 
 
+@pytest.mark.nightly
 def test_thousands_of_other_keypoints_do_not_refute_a_pose(tmp_path: Path) -> None:
     """One image at its place and the wrong one get 8,000 keypoints without a point: one in six pixels to each side."""
     draw_map(tmp_path / "drawn")

@@ -163,6 +163,7 @@ def test_preparing_again_keeps_the_store_and_other_options_are_refused(meshes: P
         run(meshes, tmp_path / "ModelNet40")
 
 
+@pytest.mark.nightly
 def test_a_kill_at_any_time_leaves_no_wrong_store(
     meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -244,6 +245,7 @@ def test_files_of_one_stem_are_shapes_of_their_own(tmp_path: Path) -> None:
     assert heights == pytest.approx([5, 4, 6, 3], abs=0.05)
 
 
+@pytest.mark.nightly
 def test_a_worker_that_is_killed_is_one_error(meshes: Path, tmp_path: Path) -> None:
     """End this process like the system ends one that takes too much memory."""
     recipe = Recipe("toy", {"points": 3}, {}, [(os.getpid(),)] * 4, end_worker, "mesh", "here")

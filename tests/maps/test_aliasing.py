@@ -78,6 +78,7 @@ def photo_of(rng: np.random.Generator, points: Array, normals: Array, rotation: 
 OPPOSITE, ADJACENT = (0.0, 180.0), (0.0, 90.0)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("turns", [OPPOSITE, ADJACENT])
 def test_a_face_that_is_printed_like_another_one_is_never_taken_for_it(turns: tuple[float, float], seed: int) -> None:
@@ -137,6 +138,7 @@ def test_a_place_that_occurs_twice_is_ambiguous_at_any_size(seed: int) -> None:
     assert min(other) < 1
 
 
+@pytest.mark.nightly
 def test_only_a_prior_of_the_position_excludes_an_equal_place() -> None:
     """Neither views of one place, nor the vertical, nor a vague position decide between two equal places."""
     rng = np.random.default_rng(0)

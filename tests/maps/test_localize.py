@@ -169,6 +169,7 @@ def test_the_default_time_limit_warns_where_there_was_none(
         scene.localize(noise, PINHOLE, solver="search", time_limit=1e-9)
 
 
+@pytest.mark.slow
 def test_the_warning_of_the_default_time_limit_reaches_a_script(tmp_path: Path) -> None:
     """Python shows a DeprecationWarning where the line that causes it is in the script itself."""
     plant_model(tmp_path / "map", camera=PINHOLE, images=3, points=140, seen=90)
@@ -215,6 +216,7 @@ def not_sure(*known: Any, **options: Any) -> SearchResult:
     return replace(judge(*known, **options), verdict="ambiguous")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stages", "reason"),
     [
@@ -251,6 +253,7 @@ def test_only_strong_keypoints_are_tried_and_matches_are_among_all_of_them(
     np.testing.assert_allclose(solution.points2d, (keypoints[shuffled] - [400, 300]) / 520)
 
 
+@pytest.mark.nightly
 def test_a_prior_decides_on_which_side_the_photo_was_taken(planted: tuple[SceneMap, Planted]) -> None:
     """Points and their copies turned by 180 degrees about the axis: two poses explain a photo, the prior names one."""
     scene, truth = planted
@@ -281,6 +284,7 @@ def test_localize_uses_the_given_solver(planted: tuple[SceneMap, Planted]) -> No
         scene.localize(photo_of(truth, 0)[0], PINHOLE, solver=Refuses())
 
 
+@pytest.mark.nightly
 def test_the_seed_decides_where_nothing_else_does(
     planted: tuple[SceneMap, Planted], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -295,6 +299,7 @@ def test_the_seed_decides_where_nothing_else_does(
     assert not np.array_equal(guesses[0].rotation, guesses[2].rotation)
 
 
+@pytest.mark.slow
 def test_keypoints_of_another_place_are_never_confident(planted: tuple[SceneMap, Planted]) -> None:
     scene, _ = planted
     for seed in range(3):
@@ -330,6 +335,7 @@ def found_with_few_points(found: Solution) -> Solution:
     return replace(found, verdict="failed", reason="no pose fits better than chance", log10_false_alarms=3.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [{"camera": PINHOLE}, {"image_size": (800, 600)}], ids=["camera", "focal length"])
 def test_a_pose_that_one_view_does_not_decide_is_judged_on_all_points(
     planted: tuple[SceneMap, Planted], monkeypatch: pytest.MonkeyPatch, known: dict[str, Any]
@@ -346,6 +352,7 @@ def test_a_pose_that_one_view_does_not_decide_is_judged_on_all_points(
     assert (~np.isin(solution.matched_point_ids, truth.seen[1] + 1)).sum() > 4
 
 
+@pytest.mark.slow
 def test_an_unknown_lens_is_fitted_to_all_points(planted: tuple[SceneMap, Planted]) -> None:
     scene, truth = planted
     in_camera = truth.points3d @ truth.rotations[1].T + truth.translations[1]
@@ -392,6 +399,7 @@ def test_a_competing_pose_of_one_view_competes_on_all_points(planted: tuple[Scen
     assert solution.verdict == "confident"
 
 
+@pytest.mark.slow
 def test_a_photo_is_localised_without_its_focal_length(tmp_path: Path) -> None:
     pinhole = ("PINHOLE", [520.0, 520.0, WIDTH / 2, HEIGHT / 2])
     truth = plant_model(tmp_path, camera=pinhole, images=2, points=140, seen=90, clutter=0)

@@ -87,6 +87,7 @@ def test_views_with_different_focal_lengths_give_no_camera(tmp_path: Path) -> No
         scene.camera_for(tmp_path / "b.jpg", exif=False)
 
 
+@pytest.mark.slow
 def test_a_photo_is_localised_with_any_of_its_cameras(shared_data: Path) -> None:
     """Camera of the map at twice the size, scaled; the same as OpenCV has it. The model has the photo's pose."""
     scene = SceneMap.from_colmap(shared_data / "colmap/fountain-P11/sparse/0")

@@ -97,6 +97,7 @@ def test_a_photo_on_its_side_is_found_with_its_orientation() -> None:
     assert degrees_between(solution.rotation, rotation) < 0.5
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("orientation", [1, 8])
 def test_a_wrong_orientation_does_not_lose_a_photo(orientation: int) -> None:
     scene, points = street()

@@ -69,6 +69,7 @@ def released_poses(assignment: Array, points2d: Array, points3d: Array) -> tuple
     return ransac, least
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ransac", ["opencv", "poselib"])
 def test_poses_are_those_of_the_released_pipeline(reference: Released, tmp_path: Path, ransac: str) -> None:
     torch.save(checkpoint(reference), tmp_path / "x.pth.tar")

@@ -46,6 +46,7 @@ def test_parameter_counts_are_those_of_the_paper_code(reference: Released) -> No
     assert sum(p.numel() for p in BPnPNet().parameters()) == 1_992_841
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("zipped", [True, False])
 def test_converted_weights_give_the_cost_and_assignment_of_the_released_code(
     reference: Released, tmp_path: Path, zipped: bool

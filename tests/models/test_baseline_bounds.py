@@ -2,6 +2,7 @@
 
 import math
 
+import pytest
 import roma
 import torch
 from planted import plant
@@ -63,6 +64,7 @@ def planted_mixtures() -> tuple[SceneMixture, RayMixture, Tensor, Tensor]:
     return scene, rays, rotation, place
 
 
+@pytest.mark.slow
 def test_gosma_finds_the_planted_pose_with_a_certificate_that_a_grid_confirms() -> None:
     scene, rays, rotation, place = planted_mixtures()
     domain = whole(torch.zeros(3).double(), 0.45, torch.tensor([0.3, -0.2, -4.1]).double(), 0.2)

@@ -32,6 +32,7 @@ QUICK: dict[str, SingleSolver] = {
 each_solver = pytest.mark.parametrize("name", QUICK)
 
 
+@pytest.mark.slow
 @each_solver
 def test_a_pose_depends_neither_on_neighbours_nor_on_padding_nor_on_the_modules_history(name: str) -> None:
     small, large = plant(1, 12, seed=1), plant(1, 20, seed=2)
@@ -60,6 +61,7 @@ def test_a_limit_of_time_ends_in_an_unconverged_answer(name: str) -> None:
         solver(time_limit=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(set(QUICK) - {"softposit"}))  # whose initial poses are in scene units
 def test_unit_and_origin_of_the_scene_change_only_the_translation(name: str) -> None:
     problem = plant(1, 14, seed=4, dtype=torch.float64)
@@ -70,6 +72,7 @@ def test_unit_and_origin_of_the_scene_change_only_the_translation(name: str) -> 
     torch.testing.assert_close(first.rotation, second.rotation, rtol=0, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_softposit_scales_with_the_unit_of_the_scene_and_of_its_initial_poses() -> None:
     problem = plant(1, 25, seed=4, dtype=torch.float64)
     shift = torch.tensor([[0.1, -0.1, 0.2]], dtype=torch.float64)

@@ -119,6 +119,7 @@ def test_normalised_scenes_do_not_depend_on_their_unit_and_origin() -> None:
     torch.testing.assert_close(moved, normalised, atol=1e-10, rtol=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("padded", [True, False])
 @pytest.mark.parametrize("residual", [True, False])
 def test_the_normed_map_has_the_gradient_of_its_formula(residual: bool, padded: bool) -> None:

@@ -57,6 +57,7 @@ def test_a_point_alone_has_the_same_features_in_a_padded_batch() -> None:
     assert alone.shape == (1, 1, 8)
 
 
+@pytest.mark.nightly
 def test_the_matcher_overfits_matches_and_outliers_of_one_problem() -> None:
     torch.manual_seed(0)
     batch = plant(1, 12, outliers2d=4, outliers3d=4, seed=3, dtype=torch.float32).batch()

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import wandb
 from pandas import DataFrame
 from report_data import rows, write_run
 from small_data import is_written
@@ -32,7 +31,10 @@ def test_scalars_are_those_of_the_summary(tmp_path: Path) -> None:
     assert values["test/correspondence_loss"] == 0.25
 
 
+@pytest.mark.slow
 def test_a_run_is_written_to_a_folder_with_its_tables_and_pictures(tmp_path: Path) -> None:
+    import wandb  # takes a second to import
+
     results, open_run = write_run(tmp_path, 20, 0), wandb.init(mode="offline", dir=str(tmp_path))
     run = log_results(tmp_path / "test", name="planted", directory=tmp_path / "wandb")
     assert wandb.run is open_run  # of the user, who goes on with it
@@ -99,8 +101,11 @@ def trained(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_a_test_joins_the_run_of_its_training(trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two tests of one training are in its run, under the names of their folders; its name and group stay."""
+    import wandb
+
     write_run(trained, 20, 0)
     (trained / "test").rename(trained / "Lc")
     write_run(trained, 20, 1)

@@ -102,6 +102,7 @@ def test_the_true_pose_reprojects_each_point_onto_its_match() -> None:
     assert plot_problem(planted, estimate="pnp").axes[1].get_title() == "no pose"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])
 def test_figures_are_written_whole(tmp_path: Path, suffix: str) -> None:
     path = save_figure(plot_problem(drawn_problem(0, HOSTILE)), tmp_path / "new" / f"pair{suffix}")

@@ -105,6 +105,7 @@ def write_training(run: Path, seed: int = 0, epochs: int = 3, start_epoch: int |
     (folder / "config.yaml").write_text(json.dumps(config))  # YAML contains JSON
 
 
+@pytest.mark.slow
 def test_what_the_trainings_changed_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Learning rate, loss, epochs and seed, but no folder; on the page and on the terminal."""
     write_training(tmp_path / "quickstart")

@@ -63,6 +63,7 @@ def test_problems_without_a_pose_are_infinite_and_leave_the_rest_alone() -> None
     assert bootstrap(values, quantile(0.25)).value == 2
 
 
+@pytest.mark.slow
 def test_what_is_interpolated_with_infinity_is_infinite() -> None:
     """The third quartile of 500 problems, 375 with a pose, lies between the last of these and infinity."""
     found = bootstrap(np.r_[np.linspace(0, 1, 375), np.full(125, np.inf)], quantile(0.75))

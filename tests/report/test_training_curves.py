@@ -64,6 +64,7 @@ def test_the_figure_shows_the_losses_the_validation_and_the_switch(run: Path) ->
     assert translation.lines[0].get_ydata().tolist() == [1 / step for step in range(10, 101, 10)]
 
 
+@pytest.mark.slow
 def test_the_report_draws_the_training_of_a_test(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_results(run / "test", rows(12, seed=1))
     assert training_folder(run / "test") == training_folder(run) == run.absolute()

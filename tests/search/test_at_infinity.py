@@ -46,6 +46,7 @@ def test_bearings_and_normalised_points_are_as_good_as_pixels() -> None:
         assert degrees_between(solution.rotation, rotation) < 0.02
 
 
+@pytest.mark.nightly
 def test_noise_and_a_mirrored_image_of_stars_are_not_confident() -> None:
     """Points that are not stars, and the image in a mirror, which has the same angles."""
     image, directions, _, _ = sky(0, count=300)
@@ -72,6 +73,7 @@ def test_a_star_pattern_that_occurs_twice_in_the_catalogue_is_ambiguous() -> Non
         assert degrees_between(solution.candidates[0].rotation, solution.candidates[1].rotation) > 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("field", [40.0, 180.0])
 @pytest.mark.parametrize("factor", [0.8, 0.95, 1.02, 1.1])
 def test_a_wrong_focal_length_is_no_confident_wrong_rotation(factor: float, field: float) -> None:
@@ -80,6 +82,7 @@ def test_a_wrong_focal_length_is_no_confident_wrong_rotation(factor: float, fiel
     assert solution.verdict != "confident" or degrees_between(solution.rotation, rotation) < 0.1
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("factor", "shift"), [(1.01, (0, 0)), (1.0, (40, -25))], ids=["focal length", "centre"])
 def test_rotations_that_fit_parts_of_a_fisheye_image_are_a_wrong_camera(factor: float, shift: tuple[int, int]) -> None:
     """The focal length is 1 % too long, or the principal point 47 pixels off: no rotation fits the whole image."""
@@ -89,6 +92,7 @@ def test_rotations_that_fit_parts_of_a_fisheye_image_are_a_wrong_camera(factor: 
     assert (solution.verdict, solution.reason_code) == ("ambiguous", "other_camera_by_pixels")
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("field", "count", "factor"), [(40.0, 600, 0.85), (180.0, 300, 1.1), (220.0, 200, 1.02)])
 def test_an_unknown_focal_length_is_found_with_the_rotation(field: float, count: int, factor: float) -> None:
     image, directions, rotation, _ = sky(4, field=field, count=count)
@@ -102,6 +106,7 @@ def test_an_unknown_focal_length_is_found_with_the_rotation(field: float, count:
     assert math.isnan(solution.centre_std)
 
 
+@pytest.mark.nightly
 def test_an_unknown_focal_length_is_found_with_a_threshold_of_the_noise() -> None:
     """The coarse search has a wrong focal length, whose residuals are many times the threshold."""
     image, directions, rotation, star = sky(4)
@@ -116,6 +121,7 @@ def test_an_unknown_focal_length_is_found_with_a_threshold_of_the_noise() -> Non
     assert narrow.verdict != "confident" or degrees_between(narrow.rotation, rotation) < 0.05
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("error", [0.003, 0.01, 0.1])
 @pytest.mark.parametrize("factor", [1.0, 1.004])
 def test_a_rough_focal_length_gives_the_verdict_of_the_exact_one(error: float, factor: float) -> None:
@@ -145,6 +151,7 @@ def test_an_image_of_stars_is_solved_from_its_size_alone() -> None:
     assert solution.focal_length == pytest.approx(lens(52.0).focal, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_the_covariance_is_that_of_the_errors() -> None:
     sigmas = []
     for seed in range(40):
@@ -168,6 +175,7 @@ def test_points_with_the_largest_scores_are_tried_first() -> None:
     assert first.stats.iterations < last.stats.iterations
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scored", [0, 1])
 def test_a_camera_of_a_rig_without_scores_has_equal_ones(scored: int) -> None:
     """The camera with scores sees no star; the points of the other one have larger scores and are tried first."""

@@ -22,6 +22,7 @@ def strip(rng: np.random.Generator, on_line: int, others: int) -> Array:
     return np.concatenate([line, rng.uniform(-1, 1, (others, 3))])
 
 
+@pytest.mark.slow
 def test_confident_poses_of_a_strip_are_those_planted() -> None:
     """Of 20 or 40 points on a line and 3 to 6 others, a tenth is hidden. The rotation about the line depends on a few
     points."""

@@ -26,6 +26,7 @@ def pixels(points: np.ndarray, rotation: np.ndarray, translation: np.ndarray) ->
     return Camera().project(points @ rotation.T + translation)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_normals", [True, False])
 def test_a_device_is_found_among_background_lights(with_normals: bool) -> None:
     right = 0
@@ -69,6 +70,7 @@ def test_three_points_are_enough_with_gravity() -> None:
         solve(pixels(points, rotation, translation), points, CAMERA)
 
 
+@pytest.mark.slow
 def test_verify_confirms_a_confident_pose_of_a_ring_and_rejects_its_half_turn() -> None:
     """A half turn of a ring maps many of its LEDs near others."""
     rng, checked = np.random.default_rng(45), 0
@@ -105,6 +107,7 @@ def pitch_from_the_stand(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return points, image[inside] + 0.5 * rng.standard_normal((inside.sum(), 2)), rotation
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("sigma", [2.0, 10.0, 30.0])
 def test_a_right_gravity_prior_finds_what_is_found_without_it(sigma: float) -> None:
     """A tilt of 2.4 degrees moves points of a flat scene that is seen at a low angle by many pixels."""

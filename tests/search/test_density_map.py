@@ -39,6 +39,7 @@ def off(rotation: Array, translation: Array, points: Array, rng: np.random.Gener
     return PosePrior(turned, moved, 4.0, 0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_a_rough_prior_is_certain_among_seven_outliers_a_true_pair(seed: int) -> None:
     """Likelier poses that chance explains come up in every batch annealed around the prior."""
@@ -59,6 +60,7 @@ def test_noise_beyond_the_radius_of_an_enumeration_is_confident_near_a_prior() -
     assert degrees_between(found.best[0], rotation) < 0.5
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("translation_sigma", "degrees"), [(0.3, 6.0), (30.0, 120.0), (math.inf, 6.0)],
     ids=["wrong", "uninformative", "wrong rotation alone"],
@@ -104,6 +106,7 @@ def telephoto(rng: np.random.Generator) -> tuple[Problem, Array]:
     return Problem.of(rng.permutation(bearings[image]), rng.permutation(points[scene]), prior=prior), rotation
 
 
+@pytest.mark.slow
 def test_one_search_near_a_prior_finds_a_telephoto_view() -> None:
     """The prior is as wide as for an ordinary lens, many times the view: from most of its poses no point is in view."""
     for seed in range(10):

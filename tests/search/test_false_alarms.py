@@ -81,6 +81,7 @@ def test_clusters_of_points_count_as_one_observation_each(width: float) -> None:
     assert np.median(clumps) > np.median(alone)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [5, 20, 200])
 def test_the_bound_of_markov_holds_for_unrelated_points(count: int) -> None:
     """A pose that was not chosen by the points has a product above b in at most one of b cases.
@@ -172,6 +173,7 @@ def test_a_prior_does_not_change_the_number_of_tests() -> None:
             assert alarms(known, turn, SHIFT) == pytest.approx(alarms(problem, turn, SHIFT) + fraction)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", range(4))
 def test_the_bound_of_markov_holds_with_a_prior(kind: int) -> None:
     """Without the number of tests, a pose that was not chosen by the points exceeds b in at most one of b cases."""
@@ -213,6 +215,7 @@ def test_an_image_point_whose_label_no_scene_point_has_is_an_outlier(
         assert (logs[1:] > 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("labels", [1, 3])
 def test_the_bound_of_markov_holds_for_rotations(labels: int) -> None:
     """Image points and directions that have nothing to do with each other: without the number of tests, the evidence of

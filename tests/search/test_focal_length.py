@@ -45,6 +45,7 @@ def found() -> tuple[Solution, Array]:
     return solve(pixels, scene, image_size=SIZE, solver="search", time_limit=LIMIT), rotation
 
 
+@pytest.mark.slow
 def test_pose_and_focal_length_are_found_together(found: tuple[Solution, Array]) -> None:
     solution, rotation = found
     assert degrees_between(solution.rotation, rotation) < 0.5
@@ -79,6 +80,7 @@ def test_the_nfa_and_the_covariance_count_the_focal_length(found: tuple[Solution
     assert known.centre_std < found[0].centre_std
 
 
+@pytest.mark.slow
 def test_the_verdict_names_a_wrong_focal_length() -> None:
     pixels, scene, _ = planted(800.0, points=150)
     right, wrong = (solve(pixels, scene, ("SIMPLE_PINHOLE", (focal, 320.0, 240.0))) for focal in (800.0, 1000.0))
@@ -88,6 +90,7 @@ def test_the_verdict_names_a_wrong_focal_length() -> None:
     assert float(named[1]) == pytest.approx(0.8, rel=0.03)
 
 
+@pytest.mark.nightly
 def test_a_plane_seen_from_the_front_leaves_the_focal_length_open() -> None:
     pixels, scene, rotation = planted(700.0, depth=0.0)
     solution = solve(pixels, scene, image_size=SIZE, solver="search", time_limit=LIMIT)
@@ -96,6 +99,7 @@ def test_a_plane_seen_from_the_front_leaves_the_focal_length_open() -> None:
     assert not solution.focal_length_std < 0.05 * solution.focal_length
 
 
+@pytest.mark.nightly
 def test_a_rough_focal_length_is_a_prior() -> None:
     """A distant scene shows little perspective, so that the given focal length counts."""
     pixels, scene, rotation = planted(700.0, distance=12.0)
@@ -109,6 +113,7 @@ def test_a_rough_focal_length_is_a_prior() -> None:
     assert stds[1] > stds[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radial", [-0.3, 0.25, 0.0])
 def test_distortion_is_found_where_it_is_significantly_better(radial: float) -> None:
     """The distortion is not given. Without its coefficient the focal length would be wrong by many sigma."""
@@ -122,6 +127,7 @@ def test_distortion_is_found_where_it_is_significantly_better(radial: float) -> 
     assert solution.verdict == "confident"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radial", [-0.4, 0.4])
 def test_a_strong_distortion_is_found_among_dense_points(radial: float) -> None:
     """The fit starts from the true pose and focal length. Without distortion few of 1,200 points match correctly."""
@@ -143,6 +149,7 @@ def test_a_strong_distortion_is_found_among_dense_points(radial: float) -> None:
     assert fitted["params"] == pytest.approx([600, 320, 240, radial], rel=0.01)
 
 
+@pytest.mark.nightly
 def test_distortion_true_always_fits_a_coefficient() -> None:
     pixels, scene, _ = planted(600.0, points=150, distance=3.0)
     solution = solve(pixels, scene, image_size=SIZE, distortion=True, solver="search", time_limit=LIMIT)
@@ -153,6 +160,7 @@ def test_distortion_true_always_fits_a_coefficient() -> None:
     assert without.log10_false_alarms < solution.log10_false_alarms  # which counts one unknown less
 
 
+@pytest.mark.slow
 def test_a_rough_pinhole_camera_may_be_distorted_and_one_with_distortion_keeps_it() -> None:
     pixels, scene, rotation = planted(600.0, points=150, radial=-0.3, distance=3.0)
     known: dict[str, Any] = {"focal_error": 0.1, "solver": "search", "time_limit": LIMIT}

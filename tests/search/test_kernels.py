@@ -58,6 +58,7 @@ class View:
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spread", [0.5, 0.1, 0.01, 0.0008])
 @pytest.mark.parametrize("relative", [0.3, 0.05])
 def test_the_assignment_on_clusters_is_the_product_form(spread: float, relative: float) -> None:
@@ -78,6 +79,7 @@ def test_the_assignment_on_clusters_is_the_product_form(spread: float, relative:
     np.testing.assert_allclose(q[:3].T, residual, atol=2e-3 * scale * max(1.0, weight.sum(0).max()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spread", [0.5, 0.01, 0.0008])
 def test_the_likelihood_on_tiles_is_the_mixture_and_close_to_that_on_clusters(spread: float) -> None:
     view, scale, outlier = View(spread), 0.05 * spread, 0.002
@@ -94,6 +96,7 @@ def test_the_likelihood_on_tiles_is_the_mixture_and_close_to_that_on_clusters(sp
     assert entry(assign)(*sides, *at, dense) == pytest.approx(likelihood, abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spread", [0.5, 0.01])
 def test_gradient_and_hessian_are_those_of_the_objective(spread: float) -> None:
     """The Hessian is that of Gauss and Newton: the whole one where each sum points at its point."""

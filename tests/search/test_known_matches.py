@@ -39,6 +39,7 @@ def opencv_error(points: np.ndarray, image: np.ndarray, flat: bool) -> float:
     return least
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flat", [False, True])
 @pytest.mark.parametrize("count", [4, 5, 6, 20])
 @pytest.mark.parametrize("noise", [1.0, 10.0])
@@ -80,6 +81,7 @@ def test_known_matches_with_a_prior_have_a_pose() -> None:
     assert degrees_between(solution.rotation, rotation) < 10
 
 
+@pytest.mark.slow
 def test_the_inlier_threshold_is_the_radius_of_an_enumeration() -> None:
     """Noise of 5 pixels is beyond the 3 pixels within which few points are matched by default."""
     right = {None: 0, 30.0: 0}
@@ -109,6 +111,7 @@ def test_clutter_and_scores_count_for_few_points() -> None:
     assert alarms(scores3d=likely) < alarms() < alarms(scores3d=1.1 - likely)
 
 
+@pytest.mark.nightly
 def test_a_scene_whose_mirror_image_fits_is_named() -> None:
     """Axes of the wrong handedness: no pose fits, and the reason names it; not for points that are unrelated."""
     named = []

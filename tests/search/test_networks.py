@@ -79,6 +79,7 @@ class Knowing(Matcher):
         raise AssertionError("the assignment is needed, not the poses")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frame", ["any", "view"])
 def test_a_matcher_with_one_inlier_in_twenty_solves_a_problem_alone_and_in_a_batch(
     frame: Literal["any", "view"],
@@ -96,6 +97,7 @@ def test_a_matcher_with_one_inlier_in_twenty_solves_a_problem_alone_and_in_a_bat
     np.testing.assert_array_equal(alone.matches, found.matches)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("prior", "name"),
     [

@@ -220,6 +220,7 @@ def name_of(pair: Options) -> str:
     return "+".join(sorted(pair))
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("pair", [pair for pair in PAIRS if pair not in REFUSED], ids=name_of)
 def test_a_pair_recovers_the_pose_and_uses_both_options(pair: Options) -> None:
     planted = plant(pair)

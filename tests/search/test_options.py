@@ -39,6 +39,7 @@ def which(solution: Solution) -> int:
     return int(np.argmin([degrees_between(solution.rotation, rotation) for rotation, _ in POSES]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("likely", [0, 1])
 def test_scores_and_labels_decide_between_two_equal_objects(likely: int) -> None:
     first = np.repeat([True, False], 80)
@@ -100,6 +101,7 @@ def prior_forms(rotation: Array, translation: Array) -> dict[str, object]:
     return forms | {"Rigid3d": pose, "Solution": solution, "Candidate": solution.candidates[0]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("likely", [0, 1])
 def test_every_object_that_holds_a_pose_is_a_prior(likely: int) -> None:
     rotation, translation = POSES[likely]

@@ -26,21 +26,25 @@ from bpnp.search.matching import failed_solution
 from bpnp.solving import solution as module
 
 EXAMPLE = load("mesh")
-SOLUTION = bpnp.solve(EXAMPLE.points2d, EXAMPLE.points3d, EXAMPLE.camera)
 PLANTED = plant(1, 40, seed=2)
 LENS = ("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.05))
 MATRIX = np.array([[500.0, 0.0, 320.0], [0.0, 480.0, 240.0], [0.0, 0.0, 1.0]])
 OPENCV = ("OPENCV", (800.0, 810.0, 640.0, 480.0, -0.1, 0.02, 0.001, -0.001))
 
 
+@pytest.fixture(scope="module")
+def solved() -> bpnp.Solution:
+    return bpnp.solve(EXAMPLE.points2d, EXAMPLE.points3d, EXAMPLE.camera)
+
+
 @pytest.mark.parametrize("camera", [EXAMPLE.camera, OPENCV, None])
-def test_pycolmap_reads_a_complete_model(camera: Any, tmp_path: Path) -> None:
+def test_pycolmap_reads_a_complete_model(camera: Any, solved: bpnp.Solution, tmp_path: Path) -> None:
     points2d = EXAMPLE.points2d
     if camera is OPENCV:
         lens = pycolmap.Camera(model="OPENCV", params=list(OPENCV[1]))
         rays = np.c_[points2d, np.ones(len(points2d))] @ np.linalg.inv(EXAMPLE.camera).T
         points2d = np.asarray(lens.img_from_cam(rays))
-    solution = bpnp.solve(points2d, EXAMPLE.points3d, camera) if camera is OPENCV else SOLUTION
+    solution = bpnp.solve(points2d, EXAMPLE.points3d, camera) if camera is OPENCV else solved
     folder = solution.to_colmap(tmp_path / "model", camera=camera, name="photo.jpg", size=(1280, 960))
     model = pycolmap.Reconstruction(str(folder))
     (image,) = model.images.values()
@@ -76,10 +80,10 @@ def test_a_solution_without_a_pose_cannot_be_exported(tmp_path: Path) -> None:
 
 
 def test_the_file_of_a_solution_is_drawn_and_broken_ones_are_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    solved: bpnp.Solution, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "castle.json"
-    path.write_text(SOLUTION.to_json())
+    path.write_text(solved.to_json())
     main(["view", str(path)])
     assert (tmp_path / "views" / "castle.png").stat().st_size > 5000
     (tmp_path / "pictures").mkdir()
@@ -204,5 +208,5 @@ def test_an_ambiguous_solution_is_drawn_with_its_next_candidate(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".jpeg"])
-def test_a_picture_may_be_a_jpeg(suffix: str, tmp_path: Path) -> None:
-    assert Image.open(save_figure(SOLUTION.plot(), tmp_path / f"a{suffix}")).format == "JPEG"
+def test_a_picture_may_be_a_jpeg(suffix: str, solved: bpnp.Solution, tmp_path: Path) -> None:
+    assert Image.open(save_figure(solved.plot(), tmp_path / f"a{suffix}")).format == "JPEG"

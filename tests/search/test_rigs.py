@@ -39,6 +39,7 @@ def planted_rig(seed: int, seen: tuple[int, ...], points: int = 20) -> Any:
     return images, scene, mounts, pose, chosen
 
 
+@pytest.mark.slow
 def test_a_rig_is_confident_where_no_single_camera_is() -> None:
     alone = together = 0
     for seed in range(4):
@@ -56,6 +57,7 @@ def test_a_rig_is_confident_where_no_single_camera_is() -> None:
     assert together > alone
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("cameras", "baseline", "count"), [(3, 0.02, 20), (2, 0.02, 8), (2, 0.5, 20)])
 def test_cameras_that_see_the_same_unrelated_objects_are_no_evidence_for_each_other(
     cameras: int, baseline: float, count: int
@@ -73,6 +75,7 @@ def test_cameras_that_see_the_same_unrelated_objects_are_no_evidence_for_each_ot
         assert solution.log10_false_alarms > -2
 
 
+@pytest.mark.slow
 def test_a_camera_that_is_given_twice_counts_once() -> None:
     """The second one adds its tests, and another mean over scales and outlier fractions: one decade in all."""
     images, scene, mounts, _, _ = planted_rig(0, (10,))
@@ -81,6 +84,7 @@ def test_a_camera_that_is_given_twice_counts_once() -> None:
     assert 0 < twice.log10_false_alarms - once.log10_false_alarms < 1.5
 
 
+@pytest.mark.slow
 def test_a_rig_of_one_camera_is_that_camera() -> None:
     images, scene, mounts, pose, _ = planted_rig(0, (10,))
     matrix = np.vstack([np.column_stack(mounts[0]), [0, 0, 0, 1]])
@@ -96,6 +100,7 @@ def test_a_rig_of_one_camera_is_that_camera() -> None:
         assert rig.log10_false_alarms == pytest.approx(one.log10_false_alarms, abs=1.5)
 
 
+@pytest.mark.slow
 def test_many_points_are_searched_and_joined() -> None:
     images, scene, mounts, pose, _ = planted_rig(1, (80, 80), points=120)
     clutter = np.random.default_rng(9).uniform((150, 100), (490, 380), (2, 40, 2))
@@ -107,6 +112,7 @@ def test_many_points_are_searched_and_joined() -> None:
     assert solution.log10_false_alarms < one.log10_false_alarms - 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [5.0, 90.0])
 def test_wrong_extrinsics_keep_a_rig_from_being_confident(degrees: float) -> None:
     """The first camera sees more points than the second, whose own pose contradicts the extrinsics."""
@@ -124,6 +130,7 @@ def test_wrong_extrinsics_keep_a_rig_from_being_confident(degrees: float) -> Non
     assert degrees_between(solution.rotation, pose[0]) < 0.5
 
 
+@pytest.mark.slow
 def test_a_rig_is_judged_at_the_scale_of_its_residuals() -> None:
     """The noise of 0.8 pixels is far above the smallest scale; unmatched points contest it in no single camera."""
     for seed in (0, 3):
@@ -137,6 +144,7 @@ def test_a_rig_is_judged_at_the_scale_of_its_residuals() -> None:
         assert degrees_between(solution.rotation, pose[0]) < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [0.2, 5.0])
 def test_a_rig_with_a_baseline_finds_the_scale_of_the_scene(scale: float) -> None:
     errors = []
@@ -209,6 +217,7 @@ def test_candidates_of_a_rig_count_the_inliers_of_all_cameras() -> None:
     assert [one.inlier_count for one in solution.candidates[:2]] == [24, 24]
 
 
+@pytest.mark.slow
 def test_the_prior_of_a_rig_counts_once() -> None:
     """A rig of two equal cameras: the rotation is as accurate as one prior, which is better than the image."""
     images, scene, mounts, pose, _ = planted_rig(3, (10,))
@@ -220,6 +229,7 @@ def test_the_prior_of_a_rig_counts_once() -> None:
     assert rough.rotation_std_deg > 10 * sigma
 
 
+@pytest.mark.slow
 def test_a_solution_of_a_rig_is_neither_drawn_nor_exported_as_one_image(tmp_path: Path) -> None:
     """Each camera alone can be: its pose is cam_from_rig times that of the rig."""
     images, scene, mounts, _, _ = planted_rig(1, (9, 8))
@@ -259,6 +269,7 @@ def test_the_threshold_is_the_search_radius_of_each_camera() -> None:
         assert [problem.match_radius for problem in points.rig(lenses).problems] == pytest.approx(radii, rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "is_metric"), [(0, True), (2, True), (2, False), (3, False)])
 def test_a_rig_of_known_size_decides_between_a_part_and_its_copy_of_half_the_size(seed: int, is_metric: bool) -> None:
     rng = np.random.default_rng([9, seed])

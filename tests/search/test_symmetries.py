@@ -246,6 +246,7 @@ def test_unique_points_decide_between_the_rotations_of_an_object(fold: int, each
     assert error < 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("fold", "each"), [(3, 30), (2, 45), (3, 7), (5, 6)])
 def test_an_exactly_symmetric_object_is_ambiguous(fold: int, each: int) -> None:
     found, error = solved(parts(fold, each, 0, 11), 0)
@@ -254,6 +255,7 @@ def test_an_exactly_symmetric_object_is_ambiguous(fold: int, each: int) -> None:
     assert f"{360 // fold} deg" in found.reason or f"{720 // fold} deg" in found.reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 3, 6])
 def test_a_mirror_symmetric_object_is_ambiguous_from_afar(seed: int) -> None:
     image, points, rotation, translation = seen_from_afar(8, seed)
@@ -269,6 +271,7 @@ def test_a_mirror_symmetric_object_is_ambiguous_from_afar(seed: int) -> None:
         assert min(degrees_between(pose.rotation, other) for pose in one.candidates) < 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 3, 7])
 def test_many_points_decide_between_the_two_poses_of_a_distant_mirror_symmetric_object(seed: int) -> None:
     image, points, rotation, _ = seen_from_afar(45, seed)
@@ -361,6 +364,7 @@ def image_of(points: Array, seed: int) -> tuple[Array, Array, Array]:
     return rng.permutation(image), rotation, translation
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scale", "unique"), [(0.5, 0), (0.5, 15), (1.5, 15), (0.33, 15)])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_copy_of_another_size_makes_a_pose_ambiguous(scale: float, unique: int, seed: int) -> None:

@@ -12,9 +12,6 @@ from bpnp.examples import load
 
 pytestmark = pytest.mark.slow
 
-EXAMPLES = [load("photo", seed=seed) for seed in range(6)]
-SETS = [e.points2d for e in EXAMPLES], [e.points3d for e in EXAMPLES], [e.camera for e in EXAMPLES]
-
 
 @pytest.fixture
 def two_threads() -> Iterator[None]:
@@ -30,9 +27,11 @@ def alike(one: bpnp.Solution, other: bpnp.Solution) -> bool:
 
 
 def test_solve_many_equals_single_calls_for_any_number_of_threads(two_threads: None) -> None:
-    shared = bpnp.solve_many(*SETS, time_limit=math.inf)
+    examples = [load("photo", seed=seed) for seed in range(6)]
+    sets = [e.points2d for e in examples], [e.points3d for e in examples], [e.camera for e in examples]
+    shared = bpnp.solve_many(*sets, time_limit=math.inf)
     torch.set_num_threads(1)
-    single = [bpnp.solve(*pair, time_limit=math.inf) for pair in zip(*SETS, strict=True)]
+    single = [bpnp.solve(*pair, time_limit=math.inf) for pair in zip(*sets, strict=True)]
     assert all(map(alike, shared, single))
-    for example, solution in zip(EXAMPLES, shared, strict=True):
+    for example, solution in zip(examples, shared, strict=True):
         assert example.rotation_error_deg(solution.rotation) < 0.5

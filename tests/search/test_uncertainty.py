@@ -113,6 +113,7 @@ def test_a_prior_bounds_what_the_points_do_not_fix() -> None:
 CAMERA = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
 
 
+@pytest.mark.slow
 def test_a_focal_length_needs_no_more_points_than_its_own_fit() -> None:
     """Seven points leave 7 numbers to test a focal length, and 3 to test it together with five strains."""
     rng, believed = np.random.default_rng(3), []

@@ -21,6 +21,7 @@ def view(focal: float, noise: float, count: int = 90) -> Any:
     return points, image, rotation
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("unit", [1e-9, 1e6, 1e9])
 def test_a_wrong_camera_is_noticed_in_any_unit(unit: float) -> None:
     """The misfit of a focal length 15 % off, as a law of the residuals and as a verdict."""
@@ -63,6 +64,7 @@ def test_subpixel_noise_is_estimated_at_any_resolution(focal: float) -> None:
     assert 0.05 < off @ np.linalg.solve(solution.covariance[:3, :3], off) / 3 < 4
 
 
+@pytest.mark.slow
 def test_bearings_all_around_the_camera_are_searched() -> None:
     for seed in range(4):
         rng = np.random.default_rng(seed)

@@ -152,6 +152,7 @@ def test_two_poses_that_explain_different_points_are_ambiguous(others: int, verd
     assert ("50 deg away explains" in found.reason) == (verdict == "ambiguous")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [1.0, 1.3, 0.75])
 def test_a_focal_length_sweep_reaches_the_true_focal_length(factor: float) -> None:
     """1,500 dense points, seen with `factor` times the true focal length by a pose that is three degrees off. It is an

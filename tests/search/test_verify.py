@@ -104,6 +104,7 @@ def test_a_wrong_focal_length_keeps_a_pose_from_being_confident(view: Any) -> No
     assert bpnp.verify(pixels, points[:60], *pose, camera=("SIMPLE_PINHOLE", [500, 320, 240])).verdict == "confident"
 
 
+@pytest.mark.slow
 def test_few_points_that_no_search_is_confident_of_confirm_a_pose() -> None:
     """One hypothesis costs less than all that eight points allow."""
     sure = {"solve": 0, "verify": 0}
@@ -191,6 +192,7 @@ def cluttered_shape(seed: int) -> Any:
     return image, np.concatenate([points, rng.uniform(points.min(0), points.max(0), (150, 3))]), rotation, translation
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_a_true_pose_among_clutter_is_confident_and_one_25_degrees_off_is_not(seed: int) -> None:
     """One pose is tested: that a search might have missed a better one is not asked, and the reason states it."""
@@ -215,6 +217,7 @@ def test_a_pose_that_solve_is_confident_of_is_confident() -> None:
     assert solved >= 10
 
 
+@pytest.mark.slow
 def test_four_matches_without_redundancy_do_not_fix_a_pose() -> None:
     """Without one of four coplanar matches the others fix several poses. Their spread is that of simulated noise."""
     rng = np.random.default_rng(0)

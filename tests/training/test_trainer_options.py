@@ -108,6 +108,7 @@ def test_a_checkpoint_callback_of_the_user_writes_in_addition_to_ours(tmp_path: 
     assert saved(tmp_path)["global_step"] == 2
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("warmup_steps", "factors"), [(0, [1, 1]), (9, [0.1, 0.2])])
 def test_the_rate_finder_sets_the_rate_of_the_training(warmup_steps: int, factors: list[float], tmp_path: Path) -> None:
     find = ["--trainer.callbacks+=LearningRateFinder", "--trainer.callbacks.num_training_steps=20"]
@@ -120,6 +121,7 @@ def test_the_rate_finder_sets_the_rate_of_the_training(warmup_steps: int, factor
     assert Observer.rates == pytest.approx([suggested * factor for factor in factors])
 
 
+@pytest.mark.nightly
 def test_stochastic_weight_averaging_ends_at_the_mean_of_the_epochs(tmp_path: Path) -> None:
     average = ["--trainer.callbacks+=StochasticWeightAveraging", "--trainer.callbacks.swa_lrs=1e-3"]
     average += ["--trainer.callbacks.swa_epoch_start=2", "--trainer.callbacks.annealing_epochs=1"]
@@ -129,6 +131,7 @@ def test_stochastic_weight_averaging_ends_at_the_mean_of_the_epochs(tmp_path: Pa
     torch.testing.assert_close(flat(Observer.task), expected)
 
 
+@pytest.mark.nightly
 def test_an_exponential_moving_average_is_what_is_saved(tmp_path: Path) -> None:
     average = ["--trainer.callbacks+=EMAWeightAveraging", "--trainer.callbacks.decay=0.75"]
     fit(tmp_path, *TWO_STEPS, *average, "--model.learning_rate=1e-2")
@@ -158,6 +161,7 @@ class Ranks(Callback):
             file.write(f"{trainer.world_size} {len(batch)} {','.join(batch.ids)}\n")
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("strategy", ["ddp", "ddp_spawn"])
 def test_two_processes_share_each_batch(strategy: str, tmp_path: Path) -> None:
     options = [*TWO_STEPS, f"--trainer.strategy={strategy}", "--trainer.devices=2", "--trainer.accelerator=cpu"]
@@ -202,6 +206,7 @@ def test_the_tensorboard_logger_has_the_loss_of_each_step(tmp_path: Path) -> Non
     assert losses[-1] == pytest.approx(float(Observer.trainer.callback_metrics["train/loss"]), rel=1e-6)
 
 
+@pytest.mark.nightly
 def test_the_wandb_logger_has_the_loss_of_the_last_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WANDB_MODE", "offline")  # Lightning's logger sets it too, for the whole process
     logger = ["--trainer.logger=WandbLogger", f"--trainer.logger.save_dir={tmp_path}/wandb"]
@@ -230,6 +235,7 @@ def run_id(folder: Path) -> str:
     return file.stem.removeprefix("run-")
 
 
+@pytest.mark.nightly
 def test_a_test_is_logged_into_the_wandb_run_of_its_training(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -262,6 +268,7 @@ def test_a_test_is_logged_into_the_wandb_run_of_its_training(
     assert "epoch" not in metrics
 
 
+@pytest.mark.nightly
 def test_a_training_that_goes_on_stays_in_its_wandb_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -285,6 +292,7 @@ def test_a_training_that_goes_on_stays_in_its_wandb_run(
     assert run_id(folder) != name
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("options", "joined"),
     [
@@ -324,6 +332,7 @@ class Stop(Callback):
         raise KeyboardInterrupt
 
 
+@pytest.mark.nightly
 def test_a_run_goes_on_after_ctrl_c(tmp_path: Path) -> None:
     with pytest.raises(SystemExit) as ended:
         fit(tmp_path, "--trainer.callbacks+=test_trainer_options.Stop", "--trainer.max_steps=2")
@@ -375,6 +384,7 @@ def test_a_network_two_classes_below_ours_comes_back_from_its_checkpoint(tmp_pat
         torch.testing.assert_close(found.cost(batch), expected)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("rarely", ["check_val_every_n_epoch=5", "val_check_interval=0.4"])
 def test_the_last_steps_are_saved_and_continued(rarely: str, tmp_path: Path) -> None:
     """Six steps an epoch; no validation follows the last ones."""
@@ -388,6 +398,7 @@ def test_the_last_steps_are_saved_and_continued(rarely: str, tmp_path: Path) -> 
     torch.testing.assert_close(state(tmp_path / "straight"), resumed, rtol=0, atol=0)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("validated", ["limit_val_batches=1", "limit_val_batches=0"])
 def test_an_epoch_that_max_steps_ended_is_finished_by_the_next_run(validated: str, tmp_path: Path) -> None:
     """The second of six-step epochs is stopped after two steps."""

@@ -16,7 +16,7 @@ from small_data import MESHES, SMALL_NET
 from bpnp.cli import main
 from bpnp.report import read_results
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.nightly
 
 ARGUMENTS = [
     *MESHES,
