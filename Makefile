@@ -44,10 +44,12 @@ test: lint
 	$(PROOFS) -m "not nightly"
 	$(AS_USER) -m "not nightly"
 
-# What `make test` leaves out, with the types of the whole package checked.
+# What `make test` leaves out. The types of the whole package are checked, also in the quick proofs of the parts whose
+# types `make test` does not check.
 nightly: install
 	$(PROOFS) $(EVERYWHERE) -m "nightly"
 	$(AS_USER) -m "nightly"
+	$(PROOFS) $(EVERYWHERE) -m "not slow and not nightly" tests/search tests/maps tests/robust tests/report tests/datamodules
 
 coverage: lint
 	$(PROOFS) --cov --cov-report=term --cov-fail-under=$(FLOOR)

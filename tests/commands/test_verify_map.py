@@ -59,6 +59,7 @@ def test_the_image_at_the_copy_of_its_building_is_the_only_doubtful_one(
     assert dict(others) == dict.fromkeys(set(poses) - {WRONG_IMAGE}, "confident")
 
 
+@pytest.mark.nightly
 def test_json_has_a_record_for_each_image(
     houses: tuple[Path, dict[str, tuple[np.ndarray, np.ndarray]]], capsys: pytest.CaptureFixture[str]
 ) -> None:
