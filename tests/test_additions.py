@@ -15,6 +15,7 @@ from bpnp.cli import main
 from bpnp.datamodules import MeshDataModule
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.filterwarnings(
     "ignore:The pose loss joins at epoch", "ignore:`ModelCheckpoint", "ignore:It is recommended"

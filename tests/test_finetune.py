@@ -16,6 +16,7 @@ from bpnp.models import TrainedNet
 from bpnp.models.weights import describe_module
 
 
+@pytest.mark.nightly
 def test_photos_and_shapes_are_tested_before_and_after_and_the_page_is_filled(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

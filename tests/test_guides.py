@@ -47,6 +47,7 @@ def test_a_comment_names_the_inputs_of_an_example(page: Path) -> None:
         assert unnamed == set(), f"{page.name}: {unnamed} in\n{code}"
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", RUN)
 def test_the_examples_run(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -66,16 +66,16 @@ def parse_benchmark(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
         runpy.run_path(str(ROOT / "benchmarks" / "__main__.py"))["main"]()
 
 
-def of_lightning(line: str) -> bool:
-    """Return whether all options of Lightning are parsed for a command, in a fifth of a second."""
+def is_long(line: str) -> bool:
+    """Return whether the options of a benchmark or all those of Lightning are parsed, for a fifth of a second."""
     words = line.split()
-    return words[0] in ("bpnp", "lightning") and words[1] in LIGHTNING and len(words) > 2
+    return words[0] == "python" or (words[0] != "make" and words[1] in LIGHTNING and len(words) > 2)
 
 
 @pytest.mark.parametrize(
     ("text", "line"),
     [
-        pytest.param(text, line, marks=pytest.mark.nightly if of_lightning(line) and text != "README.md" else ())
+        pytest.param(text, line, marks=pytest.mark.nightly if is_long(line) and text != "README.md" else ())
         for text, line in COMMAND_LINES
     ],
 )

@@ -335,6 +335,7 @@ def found_with_few_points(found: Solution) -> Solution:
     return replace(found, verdict="failed", reason="no pose fits better than chance", log10_false_alarms=3.0)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("known", [{"camera": PINHOLE}, {"image_size": (800, 600)}], ids=["camera", "focal length"])
 def test_a_pose_that_one_view_does_not_decide_is_judged_on_all_points(

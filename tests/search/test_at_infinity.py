@@ -21,6 +21,7 @@ def sky(seed: int, *, field: float = 40.0, count: int = 600, false: float = 0.3)
     return frame(count, field, 9, seed, false)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("field", "count"), [(12.0, 4000), (40.0, 600), (75.0, 300), (180.0, 200), (220.0, 900)])
 def test_a_planted_rotation_of_stars_is_found(field: float, count: int) -> None:
     for seed in range(3):

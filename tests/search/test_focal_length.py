@@ -113,6 +113,7 @@ def test_a_rough_focal_length_is_a_prior() -> None:
     assert stds[1] > stds[0]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("radial", [-0.3, 0.25, 0.0])
 def test_distortion_is_found_where_it_is_significantly_better(radial: float) -> None:

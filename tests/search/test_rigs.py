@@ -100,6 +100,7 @@ def test_a_rig_of_one_camera_is_that_camera() -> None:
         assert rig.log10_false_alarms == pytest.approx(one.log10_false_alarms, abs=1.5)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_many_points_are_searched_and_joined() -> None:
     images, scene, mounts, pose, _ = planted_rig(1, (80, 80), points=120)
@@ -130,6 +131,7 @@ def test_wrong_extrinsics_keep_a_rig_from_being_confident(degrees: float) -> Non
     assert degrees_between(solution.rotation, pose[0]) < 0.5
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_rig_is_judged_at_the_scale_of_its_residuals() -> None:
     """The noise of 0.8 pixels is far above the smallest scale; unmatched points contest it in no single camera."""

@@ -60,6 +60,7 @@ def scored(seed: int) -> tuple[Problem, Array]:
     return Problem.of(bearings, points, scores2d=scores2d, scores3d=scores3d), rotation
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("known", "seed"), [(wall, 1), (labelled, 0), (scored, 0)])
 def test_annotations_of_the_points_find_a_pose_that_the_points_alone_do_not(known, seed: int) -> None:
     """In as many batches of starts, before any other source is asked."""

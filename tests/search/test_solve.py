@@ -178,6 +178,7 @@ def test_a_module_solves_and_is_judged_by_the_points() -> None:
     assert degrees(searched, planted) < 0.1
 
 
+@pytest.mark.nightly
 def test_errors_follow_the_covariance_of_the_solution() -> None:
     """60 planted poses, 20 to 80 points, an outlier for every third of them: errors over their standard deviations."""
     rng, whitened, turns, centres = np.random.default_rng(0), [], [], []
@@ -213,6 +214,7 @@ def test_progress_has_the_index_of_the_problem() -> None:
     assert first == second == [batch for pair, batch in calls if pair == 2]
 
 
+@pytest.mark.slow
 def test_progress_is_called_in_every_mode_with_the_index_of_the_problem() -> None:
     """With a rig, directions, an unknown focal length and a prior of the rig; twice the same problem."""
     rng = np.random.default_rng(4)

@@ -49,6 +49,7 @@ def test_a_module_keeps_the_mode_of_each_of_its_parts(fails: bool) -> None:
     assert {name: part.training for name, part in module.named_modules()} == before
 
 
+@pytest.mark.slow
 def test_several_threads_find_what_one_does() -> None:
     problems = [plant(1, 120, seed=seed, noise=0.001, outliers2d=30, outliers3d=30) for seed in range(4)]
 

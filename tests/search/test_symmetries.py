@@ -238,6 +238,7 @@ def solved(points: Array, seed: int) -> tuple[bpnp.Solution, float]:
     return found, float(np.degrees(Rotation.from_matrix(rotation @ found.rotation.T).magnitude()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("fold", "each", "unique"), [(3, 30, 8), (5, 18, 8), (2, 45, 8), (3, 7, 4), (5, 6, 4)])
 @pytest.mark.parametrize("seed", range(2))
 def test_unique_points_decide_between_the_rotations_of_an_object(fold: int, each: int, unique: int, seed: int) -> None:
