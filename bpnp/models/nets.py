@@ -9,7 +9,6 @@ from typing import Any
 
 import torch
 import torch.distributed as dist
-import torch.distributed.nn.functional as collectives
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
@@ -104,6 +103,20 @@ def _zero_padding(x: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"] | None) -
     return x if mask is None else x.masked_fill(~mask.unsqueeze(-1), 0)
 
 
+class _SumOverProcesses(torch.autograd.Function):
+    """Sum of a tensor over all processes; its gradient is the sum of theirs."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor) -> Tensor:
+        total = values.clone(memory_format=torch.contiguous_format)
+        dist.all_reduce(total)
+        return total
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        return _SumOverProcesses.apply(gradient)
+
+
 class MaskedBatchNorm(nn.BatchNorm1d):
     """Batch norm over the real points of (b, k, c), or over the samples of (b, c).
 
@@ -136,11 +149,11 @@ class MaskedBatchNorm(nn.BatchNorm1d):
         weight, axes = real.to(self.running_mean), tuple(range(x.ndim - 1))  # in the dtype of the statistics, not half
         count, total = weight.sum().reshape(1), (x * weight).sum(axes)
         if dist.is_initialized():
-            count, total = collectives.all_reduce(count), collectives.all_reduce(total)
+            count, total = _SumOverProcesses.apply(count), _SumOverProcesses.apply(total)
         mean = total / count
         scatter = (((x - mean) * weight) ** 2).sum(axes)
         if dist.is_initialized():
-            scatter = collectives.all_reduce(scatter)
+            scatter = _SumOverProcesses.apply(scatter)
         enough = count > 1
         with torch.no_grad():
             self.num_batches_tracked += enough.squeeze()

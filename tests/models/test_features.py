@@ -1,5 +1,6 @@
 """Nets of padded point sets against plain ones in torch, in double precision but where rounding is the subject."""
 
+import warnings
 from copy import deepcopy
 
 import pytest
@@ -129,3 +130,22 @@ def test_the_normed_map_has_the_gradient_of_its_formula(residual: bool, padded: 
     assert torch.autograd.gradcheck(
         lambda x, w, b, s: linear_context_norm(x, w, b, mask if padded else None, s if residual else None), inputs
     )
+
+
+def test_a_batch_norm_of_two_processes_is_that_of_both_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The other process has the same batch: each sum over processes is twice the own one, and so is its gradient."""
+    own = torch.randn(3, 5, dtype=torch.float64)
+    weight = torch.randn(3, 5, dtype=torch.float64)
+
+    def step(x: torch.Tensor, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        norm, x = MaskedBatchNorm(5).double(), x.clone().requires_grad_()
+        y = norm(x)
+        return y.detach(), torch.autograd.grad((y * weight).sum(), x)[0]
+
+    both = step(torch.cat([own, own]), torch.cat([weight, weight]))
+    monkeypatch.setattr("torch.distributed.is_initialized", lambda: True)
+    monkeypatch.setattr("torch.distributed.all_reduce", lambda values, *_: values.mul_(2))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for split, whole in zip(step(own, weight), both, strict=True):
+            torch.testing.assert_close(split, whole[:3])
