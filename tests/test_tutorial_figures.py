@@ -95,8 +95,8 @@ def test_the_page_is_filled_with_what_its_commands_give(
     assert ran == [line for line in PAGE.splitlines() if line.startswith("bpnp ")][:-1]
     text = (tmp_path / "train.md").read_text()
     lines = [line.split() for line in text.splitlines()]
-    assert ["LcLp:", "pnp", *["8.00"] * 3, *["0.125"] * 3, *["1.00"] * 3] in [line[:11] for line in lines]
-    assert ["Lc:", "refined", *["2.00"] * 3, *["0.100"] * 3, *["1.00"] * 3] in [line[:11] for line in lines]
+    assert ["LcLp:", "pnp", *["8.00"] * 3, *["0.12"] * 3, *["1.00"] * 3] in [line[:11] for line in lines]
+    assert ["Lc:", "refined", *["2.00"] * 3, *["0.10"] * 3, *["1.00"] * 3] in [line[:11] for line in lines]
     assert "| `pnp` | 8 | +1 [+1, +1], better in 0 % | -0.28 [-0.28, -0.28], better in 100 % |" in text
     assert "| `refined` | 8 | +0 [+0, +0], better in 0 % | +0 [+0, +0], better in 0 % |" in text
     assert "| search |  | 8 | 0.5 / 0.5 [0.5, 0.5] / 0.5 | 0.01 / 0.01 [0.01, 0.01] / 0.01 |" in text

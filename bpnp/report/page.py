@@ -195,7 +195,7 @@ def training_pictures(folders: Mapping[str, Path], runs: Mapping[str, Results]) 
 
 
 def quartile_rows(runs: Mapping[str, Results], paper: Paper | None) -> list[TableRow]:
-    """Return the rows of the table of quartiles, with the texts of the terminal."""
+    """Return the rows of the table of quartiles, with three digits."""
     rows = run_rows(runs, paper)
     best = best_texts(RESULT_COLUMNS, rows)
     shown = []

@@ -18,9 +18,10 @@ if TYPE_CHECKING:
 
 Values = Mapping[str, float | int | str]
 HERE = "here"
+POSES = "pose: % of problems with a pose; none counts as 180° and inf."
 CAPTION = (
-    "rot, repr: errors in degrees; trans: in scene units; quartiles Q1, Q2, Q3. 15deg 0.5, 10deg 1.0: % of problems "
-    "with both rotation and translation error within. sec: mean seconds a problem. No pose counts as 180 deg and inf."
+    "rot, repr: errors in degrees; trans: in scene units; quartiles Q1, Q2, Q3. 15° 0.5, 10° 1.0: % of problems with "
+    f"both rotation and translation error within. {POSES} sec: mean seconds a problem."
 )
 PAPERS: dict[str, Paper] = {"MeshDataModule": "modelnet40", "ColmapDataModule": "megadepth"}  # by data module
 JOINT_LIMITS: dict[Paper, tuple[float, float]] = {"modelnet40": (15.0, 0.5), "megadepth": (10.0, 1.0)}
@@ -170,11 +171,12 @@ QUARTILES = tuple(
     Column(f"{error}_q{i}{unit}", f"{short}\nQ{i}") for error, unit, short in ERRORS for i in (1, 2, 3)
 )  # fmt: skip
 RECALLS = (
-    Column("recall_joint_15deg_0.5", "15deg\n0.5", percent=True),
-    Column("recall_joint_10deg_1", "10deg\n1.0", percent=True),
+    Column("recall_joint_15deg_0.5", "15°\n0.5", percent=True),
+    Column("recall_joint_10deg_1", "10°\n1.0", percent=True),
 )
 SECONDS = Column("seconds_mean", "sec")
-RESULT_COLUMNS = (*QUARTILES, *RECALLS, Column("found", "found\n%", percent=True), SECONDS)
+FOUND = Column("found", "pose\n%", percent=True)
+RESULT_COLUMNS = (*QUARTILES, *RECALLS, FOUND, SECONDS)
 FILE_COLUMNS = (Column("problems", "problems", count=True), *RESULT_COLUMNS)
 HEADS = ("Rotation Error", "Translation Error", "Reproj. Error")
 LATEX_COLUMNS = {
@@ -269,17 +271,28 @@ def paper_quartiles(paper: Paper | None, error: str) -> dict[str, list[float]]:
     return {row.label: [float(row.values[key]) for key in keys] for row in rows}
 
 
-def cell(column: Column, values: Values) -> str:
-    """Return the text of a cell: fractions in percent, counts whole, published texts unchanged, else `number`."""
+def cell(column: Column, values: Values, *, short: bool = False) -> str:
+    """Return the text of a cell: fractions in percent, counts whole, published texts unchanged, else `number`.
+
+    Args:
+        column: Column.
+        values: Numbers of the row.
+        short: Write at most four characters of a percentage and two digits of a number below 1.
+    """
     value = values.get(column.key)
     if value is None or isinstance(value, str):
         return value or "-"
     if column.count:
         return f"{value:.0f}"
-    return f"{100 * value:.1f}" if column.percent else number(value)
+    if column.percent:
+        text = f"{100 * value:.1f}"
+        return "100" if short and text == "100.0" else text
+    return number(value, short=short)
 
 
-def best_texts(columns: Sequence[Column], rows: Sequence[MethodRow]) -> dict[tuple[Hashable, str], str]:
+def best_texts(
+    columns: Sequence[Column], rows: Sequence[MethodRow], *, short: bool = False
+) -> dict[tuple[Hashable, str], str]:
     """Return the best number of each column among rows of the same problems, as text.
 
     Comparing texts marks all cells that read the same.
@@ -294,21 +307,27 @@ def best_texts(columns: Sequence[Column], rows: Sequence[MethodRow]) -> dict[tup
             numbers = [value for values in alike if isinstance(value := values.get(column.key), float)]
             finite = [value for value in numbers if math.isfinite(value)]
             if len(alike) > 1 and finite and not column.count:
-                best[problems, column.key] = cell(column, {column.key: (max if column.percent else min)(finite)})
+                most = (max if column.percent else min)(finite)
+                best[problems, column.key] = cell(column, {column.key: most}, short=short)
     return best
 
 
 def results_table(runs: Mapping[str, Results], *, paper: Paper | None = None) -> SplitTable:
     """Return quartiles, joint recalls, the fraction of problems with a pose and seconds, a row per run and estimate.
 
-    The best number of each column is bold, among runs of the same problems.
+    The best number of each column is bold, among runs of the same problems. The column of the fraction is left out if
+    every problem has a pose.
 
     Args:
         runs: Results by name.
         paper: Data set whose published rows are added for orientation. They are of other data and are not compared.
     """
     sizes = " or ".join(str(size) for size in sorted({results.problems for results in runs.values()}))
-    return table_of_rows(f"Pose errors, {problems_text(sizes)}", RESULT_COLUMNS, run_rows(runs, paper), CAPTION)
+    title, rows = f"Pose errors, {problems_text(sizes)}", run_rows(runs, paper)
+    if not all(row.values["found"] == 1 for row in rows if row.source == HERE):
+        return table_of_rows(title, RESULT_COLUMNS, rows, CAPTION)
+    columns = [column for column in RESULT_COLUMNS if column != FOUND]
+    return table_of_rows(title, columns, rows, CAPTION.replace(POSES, "Every problem has a pose."))
 
 
 def problems_text(number: str) -> str:
@@ -318,11 +337,11 @@ def problems_text(number: str) -> str:
 
 def table_of_rows(title: str, columns: Sequence[Column], rows: Sequence[MethodRow], caption: str) -> SplitTable:
     """Return a table for the terminal: our rows with the best numbers bold, below them those of the paper."""
-    best = best_texts(columns, rows)
+    best = best_texts(columns, rows, short=True)
     groups: tuple[list[tuple[Text, list[Text]]], ...] = ([], [])
     for row in rows:
         dim = "" if row.source == HERE else "dim"
-        texts = [(best.get((row.problems, column.key)), cell(column, row.values)) for column in columns]
+        texts = [(best.get((row.problems, column.key)), cell(column, row.values, short=True)) for column in columns]
         cells = [Text(text, "bold" if text == most else dim) for most, text in texts]
         groups[row.source != HERE].append((Text(row.name, dim), cells))
     return SplitTable(title, [column.header for column in columns], groups, caption)

@@ -107,6 +107,8 @@ def console(*, json: bool = False, quiet: bool = False) -> Console:
 class SplitTable:
     """Table that is split into several, one below the other, where its columns do not fit side by side.
 
+    Names are folded between words before it is split.
+
     Attributes:
         title: Title.
         headers: Headers of the number columns.
@@ -121,16 +123,22 @@ class SplitTable:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table | Text]:
         rows = [row for group in self.groups for row in group]
-        name = min(max([9, *(len(label) for label, _ in rows)]), options.max_width // 3)
+        widths = [
+            1 + max(len(text) for it in (header, *(cells[i].plain for _, cells in rows)) for text in it.split("\n"))
+            for i, header in enumerate(self.headers)
+        ]
+        longest = max((len(label) for label, _ in rows), default=0)
+        longest_word = max((len(word) for label, _ in rows for word in label.plain.split()), default=0)
+        room = options.max_width - 2
+        name = min(longest, room - sum(widths))
+        if name < longest_word:  # the columns do not fit
+            name = min(max(longest, 9), options.max_width // 3)
         parts: list[list[int]] = [[]]
-        left = options.max_width - name - 2
-        for i, header in enumerate(self.headers):
-            width = 1 + max(
-                len(text) for it in (header, *(cells[i].plain for _, cells in rows)) for text in it.split("\n")
-            )
+        left = room - name
+        for i, width in enumerate(widths):
             if width > left and parts[-1]:
                 parts.append([])
-                left = options.max_width - name - 2
+                left = room - name
             parts[-1].append(i)
             left -= width
         for part in parts:
@@ -176,14 +184,20 @@ def format_fixed(values: Sequence[float | int]) -> list[str]:
     return [f"{value:.{max(6 - before, 3)}f}" for value in values]
 
 
-def number(value: float | None) -> str:
+def number(value: float | None, *, short: bool = False) -> str:
     """Format a number with three significant digits in at most six characters.
 
     Below 0.01 there are two digits. None gives "-".
 
+    Args:
+        value: Number.
+        short: Write two digits below 1, for a narrow column.
+
     >>> from bpnp.report.terminal import number
     >>> [number(value) for value in (12.34, 0.00126, 12345.6, None)]
     ['12.3', '0.0013', '12346', '-']
+    >>> [number(value, short=True) for value in (12.34, 0.0126)]
+    ['12.3', '0.013']
     """
     if value is None:
         return "-"
@@ -191,7 +205,7 @@ def number(value: float | None) -> str:
     if size == 0 or not math.isfinite(value):
         return f"{value:g}"
     if 0.01 <= size < 999.5:
-        return f"{value:#.3g}".rstrip(".")
+        return f"{value:#.{2 if short and size < 0.995 else 3}g}".rstrip(".")
     if 0.001 <= size < 0.01:
         return f"{value:.4f}"
     if 999.5 <= size < 99_999.5:

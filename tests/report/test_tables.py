@@ -47,11 +47,25 @@ def test_tables_fit_with_every_name_and_number_whole(tmp_path: Path, scale: floa
     rows_shown = [cells for group in table.groups for _, cells in group]
     numbers = [cell.plain for cells in rows_shown for cell in cells]
     words = " ".join(lines).split()
-    assert len(numbers) == 13 * len(rows_shown)
+    assert len(numbers) == 12 * len(rows_shown)  # every problem has a pose
     assert all(words.count(cell) >= numbers.count(cell) for cell in numbers)
     together = "".join("".join(lines).split())
     assert "[red]b[/red]:pnp" in together
     assert "version_0:ransac" in together or width < 160
+
+
+def test_the_results_of_a_run_are_one_table_in_80_columns(tmp_path: Path) -> None:
+    """Also two runs, whose names are folded."""
+    errors = {"rotation_error_deg": 0.2531, "translation_error": 0.00852, "reprojection_error_deg": 0.1634}
+    rows = [row(0, "ransac", seconds=0.0263), row(0, "pnp"), row(0, "refined", seconds=0.152, **errors)]
+    runs = {name: write_results(tmp_path / name, rows) for name in ("Lc", "LcLp")}
+    for shown in ({"LcLp": runs["LcLp"]}, runs):
+        lines = rendered(results_table(shown))
+        assert max(map(len, lines)) <= 80
+        assert sum("Q1" in line and "quartiles" not in line for line in lines) == 1
+        numbers = next(line for line in lines if "0.0085" in line)
+        assert numbers.split()[-12:] == [*["0.25"] * 3, *["0.0085"] * 3, *["0.16"] * 3, *["100"] * 2, "0.15"]
+        assert "Every problem has a pose." in " ".join(lines)
 
 
 def test_one_problem_is_singular_in_the_table_and_on_the_page(tmp_path: Path) -> None:
@@ -66,7 +80,7 @@ def test_the_best_of_each_column_is_bold(tmp_path: Path) -> None:
     bad = {"rotation_error_deg": 180.0, "translation_error": math.inf, "reprojection_error_deg": 180.0, "seconds": 1.0}
     results = write_results(tmp_path, [row(0, "ransac", **good), row(0, "pnp", **bad, found=False)])
     table = results_table({"run": results}, paper="modelnet40")
-    best = ["1.00"] * 3 + ["0.100"] * 3 + ["0.500"] * 3 + ["100.0"] * 3
+    best = ["1.00"] * 3 + ["0.10"] * 3 + ["0.50"] * 3 + ["100"] * 3
     assert bold(table) == [best, ["1.00"], *[[]] * 7]
     alone = write_results(tmp_path, [row(0, **good)])
     assert bold(results_table({"run": alone})) == [[]]
