@@ -17,6 +17,7 @@ from platformdirs import user_cache_path
 from bpnp.bounded_files import read_text, read_yaml
 
 CONFIGS = Path(__file__).parent / "configs"  # in a checkout, a link to the folder `configs` at the top
+REMOVALS = 100  # times that a folder to lock may have been removed by another process
 
 
 @contextmanager
@@ -115,15 +116,19 @@ def lock_folder(folder: Path, *, wait: bool = False) -> Iterator[None]:
         wait: Wait for another process that holds the lock, instead of raising.
 
     Raises:
-        ValueError: `folder` is or lies in a file, or another process holds the lock.
+        ValueError: `folder` is or lies in a file, cannot be created, or another process holds the lock.
     """
     lock = FileLock(folder / ".lock", timeout=-1 if wait else 0)
+    tries = 0
     while not lock.is_locked:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             lock.acquire()
-        except FileNotFoundError:
-            continue  # another process has just removed the folder
+        except FileNotFoundError as error:
+            tries += 1
+            if tries == REMOVALS:  # such as in /proc
+                raise ValueError(f"cannot create the folder {folder}; name another one") from error
+            # another process has just removed the folder
         except (FileExistsError, NotADirectoryError) as error:
             raise ValueError(f"cannot write to {folder}: it is a file, or lies in one") from error
         except Timeout:

@@ -290,13 +290,14 @@ class Loop:
                 return
             stack.enter_context(_clock_stopped())
             folder = _folder_of(self.function, arguments)
+            kept = True
             try:
                 stack.enter_context(lock_folder(folder, wait=True))
                 compiled = _njit_into(folder, self.function, self.options)
             except (OSError, ValueError, RuntimeError):  # not a folder, read-only, or too full for numba
-                compiled = numba.njit(self.function, **self.options)
+                compiled, kept = numba.njit(self.function, **self.options), False
             if not any(folder.glob("*/*.nbc")):
-                _announce(folder.parent)
+                _announce(folder.parent, kept)
                 stack.enter_context(_collection_paused())
             types = tuple(map(numba.typeof, arguments))
             try:
@@ -386,8 +387,10 @@ def _collection_paused() -> Iterator[None]:
 
 
 @cache
-def _announce(root: Path) -> None:
-    """Log once a process that a loop is compiled: that takes seconds."""
-    logging.getLogger(__name__).warning(
-        "compiling bpnp's loops, which takes some seconds once an installation; they are kept in %s", root
-    )
+def _announce(root: Path, kept: bool) -> None:
+    """Log once a process that loops are compiled, which takes seconds, and whether the next process finds them."""
+    if kept:
+        message = "compiling bpnp's loops that are used for the first time (some seconds); they are kept in %s"
+    else:
+        message = "compiling bpnp's loops (some seconds) in every process, since %s cannot be written; set BPNP_CACHE"
+    logging.getLogger(__name__).warning(message, root)

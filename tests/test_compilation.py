@@ -113,6 +113,7 @@ def test_a_loop_runs_where_nothing_can_be_written(package: Path, tmp_path: Path)
     out, log = called(package, cache)
     assert out == "8 10 True \n"
     assert "compiling" in log
+    assert f"in every process, since {cache}/loops cannot be written" in log
 
 
 FULL = """

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from bpnp.files import check_outputs, write_text
+from bpnp.files import check_outputs, lock_folder, write_text
 
 
 def test_a_pipe_is_written_to_and_not_replaced(tmp_path: Path) -> None:
@@ -39,3 +39,20 @@ def test_outputs_that_cannot_be_written_are_refused_before_the_work(
     monkeypatch.setattr(os, "access", lambda path, mode: path != tmp_path)  # permissions do not hold for root
     with pytest.raises(ValueError, match="c cannot be written: no permission; name a file in another folder"):
         check_outputs([tmp_path / "c"])
+
+
+def test_a_folder_that_cannot_be_created_is_not_tried_forever(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in /proc, where each new folder is missing at once."""
+    tried: list[Path] = []
+
+    def vanish(folder: Path, **_: object) -> None:
+        tried.append(folder)
+        assert len(tried) < 1000
+        raise FileNotFoundError(folder)
+
+    monkeypatch.setattr(Path, "mkdir", vanish)
+    with (
+        pytest.raises(ValueError, match="cannot create the folder .*nowhere; name another one"),
+        lock_folder(tmp_path / "nowhere", wait=True),
+    ):
+        pass
