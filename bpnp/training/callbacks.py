@@ -4,7 +4,7 @@ import json
 import math
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from bpnp.report.results import SUMMARY, ProblemRow, rows_from, write_results
 from bpnp.report.tables import read_runs, results_table
 from bpnp.report.terminal import console, say
 from bpnp.training.predictions import gather_objects
-from bpnp.training.task import BlindPnPTask, number_globally
+from bpnp.training.task import WARMUP, BlindPnPTask, number_globally
 from bpnp.types import Batch, Prediction, map_tensors
 
 COLLAPSED = 0.05  # spread of unit features below which the assignment is nearly uniform
@@ -50,6 +50,11 @@ class PoseLossWarmup(Callback):
         self.start_epoch, self.weight = start_epoch, weight
         self.switched_at: int | None = None
         self.configured: float | None = None  # `pose_weight` of the task
+
+    @property
+    def state_key(self) -> str:
+        """Key of the state in a checkpoint, which subclasses share, so that one can continue another's training."""
+        return WARMUP
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Forget the switch and the weight of an earlier training."""
@@ -282,17 +287,27 @@ def watched_values(prediction: Prediction, batch: Batch) -> dict[str, Tensor]:
     return values
 
 
+@dataclass
+class TestedProblems:
+    """Problems of one test loader."""
+
+    rows: list[ProblemRow] = field(default_factory=list)
+    losses: dict[int, float] = field(default_factory=dict)
+    points: list[ProblemPoints] = field(default_factory=list)
+    numbers: set[int] = field(default_factory=set)  # indices of the problems so far
+
+
 class ResultsWriter(Callback):
     """Write `problems.csv`, `summary.json` and the points of every problem after a test.
+
+    Of several test loaders, each has a folder of its own there, such as `dataloader_idx_0`.
 
     Args:
         folder: Folder of the files. Default: None, the folder `test` in the default_root_dir of the trainer.
     """
 
-    rows: list[ProblemRow]
-    losses: dict[int, float]
-    points: list[ProblemPoints]
-    numbers: set[int]  # indices of the problems so far
+    tested: list[TestedProblems]  # by loader
+    note = ""  # line above the table
 
     settings: Mapping[str, Any] | None = None  # recorded instead of those of the command; if set, no table is printed
 
@@ -301,35 +316,42 @@ class ResultsWriter(Callback):
 
     def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start with no rows, and check which results will be replaced."""
-        self.rows, self.losses, self.points, self.numbers = [], {}, [], set()
+        self.tested = [TestedProblems() for _ in trainer.num_test_batches]
         self._check_replaced(trainer)
 
     def on_test_batch_start(
-        self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int, *_: int
+        self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int, dataloader_idx: int = 0
     ) -> None:
-        """Number the problems over all batches."""
+        """Number the problems over all batches of a loader."""
         if isinstance(batch, Batch):  # a user's own task may have other batches
-            number_globally(batch, self.numbers, processes=trainer.world_size)
+            number_globally(batch, self.tested[dataloader_idx].numbers, processes=trainer.world_size)
 
     def on_test_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int = 0,
     ) -> None:
         """Keep the rows and the points of the batch."""
         if not isinstance(outputs, dict) or not {"prediction", "seconds", "losses"} <= outputs.keys():
             return  # a user's own task
         errors = outputs.get("errors")  # absent in some users' own tasks
-        self.rows += rows_from(outputs["prediction"], batch, outputs["seconds"], errors)
-        self.points += points_from(outputs["prediction"], batch, errors)
+        tested = self.tested[dataloader_idx]
+        tested.rows += rows_from(outputs["prediction"], batch, outputs["seconds"], errors)
+        tested.points += points_from(outputs["prediction"], batch, errors)
         if outputs["losses"] is not None:
-            self.losses |= dict(zip(batch.index.tolist(), outputs["losses"].tolist(), strict=True))
+            tested.losses |= dict(zip(batch.index.tolist(), outputs["losses"].tolist(), strict=True))
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Gather the rows of all processes, write the files, and print other logged metrics."""
-        gathered = gather_objects((self.rows, self.losses, self.points))
+        gathered = gather_objects(self.tested)
         table_metrics = getattr(pl_module, "table_metrics", ())
         others = {name: value for name, value in trainer.callback_metrics.items() if name not in table_metrics}
         logged = ", ".join(f"{name} {float(value):.6g}" for name, value in others.items())
-        if any(rows for rows, *_ in gathered):
+        if any(tested.rows for process in gathered for tested in process):
             self._write_test(trainer, gathered, complete=True)
             if logged:
                 rank_zero_info(f"logged: {logged}")
@@ -338,22 +360,33 @@ class ResultsWriter(Callback):
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         """Write the finished problems of an interrupted test; with several processes, those of the first."""
-        if isinstance(exception, KeyboardInterrupt) and trainer.state.fn == "test" and self.rows:
-            self._write_test(trainer, [(self.rows, self.losses, self.points)], complete=False)
+        if (
+            isinstance(exception, KeyboardInterrupt)
+            and trainer.state.fn == "test"
+            and any(tested.rows for tested in self.tested)
+        ):
+            self._write_test(trainer, [self.tested], complete=False)
 
-    def _write_test(self, trainer: Trainer, gathered: Sequence[Any], *, complete: bool) -> None:
-        if trainer.is_global_zero and not trainer.fast_dev_run:  # type: ignore[attr-defined]
-            rows = [row for part, _, _ in gathered for row in part]
-            losses = {index: loss for _, part, _ in gathered for index, loss in part.items()}
+    def _write_test(self, trainer: Trainer, gathered: Sequence[list[TestedProblems]], *, complete: bool) -> None:
+        """Write the files of each loader, of which every process has a part, and print their table."""
+        if not trainer.is_global_zero or trainer.fast_dev_run:  # type: ignore[attr-defined]
+            return
+        top, folders, count = self._folder(trainer), list[Path](), 0
+        settings = _settings(trainer) if self.settings is None else self.settings
+        for loader, parts in enumerate(zip(*gathered, strict=True)):
+            rows = [row for part in parts for row in part.rows]
+            losses = {index: loss for part in parts for index, loss in part.losses.items()}
             mean = sum(losses[i] for i in sorted(losses)) / len(losses) if losses else None
-            folder = self._folder(trainer)
-            settings = _settings(trainer) if self.settings is None else self.settings
-            write_results(folder, rows, correspondence_loss=mean, settings={**settings, "complete": complete})
-            write_points(folder, (problem for *_, part in gathered for problem in part))
-            if self.settings is None:
-                console().print(results_table(read_runs([folder])))
-            count = len({row.index for row in rows})
-            rank_zero_info(f"{'' if complete else 'interrupted: '}results of {count} problems in {folder}")
+            if rows:
+                folders.append(top / f"dataloader_idx_{loader}" if len(self.tested) > 1 else top)
+                count += len({row.index for row in rows})
+                write_results(folders[-1], rows, correspondence_loss=mean, settings={**settings, "complete": complete})
+                write_points(folders[-1], (problem for part in parts for problem in part.points))
+        if self.settings is None:
+            if self.note:
+                say(self.note)
+            console().print(results_table(read_runs(folders)))
+        rank_zero_info(f"{'' if complete else 'interrupted: '}results of {count} problems in {top}")
 
     def _check_replaced(self, trainer: Trainer) -> None:
         """Raise ValueError if a test without a checkpoint would replace the results of a checkpoint.

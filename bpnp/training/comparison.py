@@ -236,7 +236,7 @@ class MethodTest:
         finally:
             messages.setLevel(level)
             torch.set_num_threads(threads)
-        if not writer.rows:
+        if not writer.tested[0].rows:
             raise ValueError(f"the predictions of {self.method.label!r} have no pose")
 
 

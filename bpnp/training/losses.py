@@ -27,8 +27,8 @@ class Losses:
         pose: Terms of L_p by name, (b,) each; None without a pose loss.
         posed: Samples that have a pose loss (b,).
         pose_weight: gamma_p.
-        counts: Numbers of samples (2,) to divide by, with a matching loss and with a pose loss. None: those of these
-            samples.
+        counts: Numbers of samples (3,) to divide by: with a matching loss, with a pose loss, and all. None: those of
+            these samples.
     """
 
     matching: Float[Tensor, " b"]
@@ -36,7 +36,7 @@ class Losses:
     pose: dict[str, Float[Tensor, " b"]] | None = None
     posed: Bool[Tensor, " b"] | None = None
     pose_weight: float = 0.0
-    counts: Float[Tensor, " 2"] | None = None
+    counts: Float[Tensor, " 3"] | None = None
 
     def over_processes(self) -> "Losses":
         """Divide by the mean numbers of samples of all processes; each has a part of the batch.
@@ -44,18 +44,15 @@ class Losses:
         The mean of the processes' totals, and of their gradients, is then that of one process with the whole batch.
 
         Returns:
-            The same losses with `counts`; unchanged in a single process.
+            The same losses with `counts`.
         """
-        if not (distributed.is_available() and distributed.is_initialized()):
-            return self
-        counts = self._counts().float()
-        distributed.all_reduce(counts)
-        return replace(self, counts=counts / distributed.get_world_size())
+        return replace(self, counts=mean_over_processes(self._counts().float()))
 
     def _counts(self) -> Tensor:
         if self.counts is not None:
             return self.counts
-        return torch.stack([mask.sum() for mask in (self.matched, self.matched if self.posed is None else self.posed)])
+        posed = self.matched if self.posed is None else self.posed
+        return torch.stack([self.matched.sum(), posed.sum(), torch.ones_like(posed).sum()])
 
     @property
     def total(self) -> Float[Tensor, ""]:
@@ -71,6 +68,14 @@ class Losses:
         """Mean of L_c over the samples that have one; NaN if there are none."""
         return self.matching.sum() / self._counts()[0]
 
+    def mean(self, values: Tensor) -> Float[Tensor, ""]:
+        """Return the mean of one value per sample.
+
+        Args:
+            values: Values (b,).
+        """
+        return values.sum() / self._counts()[2]
+
     def pose_means(self) -> dict[str, Float[Tensor, ""]]:
         """Return the mean of each term of L_p over the samples that have one; zero if there are none."""
         if self.pose is None or self.posed is None:
@@ -78,6 +83,15 @@ class Losses:
         count = self._counts()[1]
         count = torch.where(count > 0, count, 1)
         return {name: values.sum() / count for name, values in self.pose.items()}
+
+
+def mean_over_processes(values: Tensor) -> Tensor:
+    """Return the mean of a tensor over all processes; the tensor itself in a single process."""
+    if not (distributed.is_available() and distributed.is_initialized()):
+        return values
+    total = values.clone()
+    distributed.all_reduce(total)
+    return total / distributed.get_world_size()
 
 
 def matching_losses(prediction: Prediction, batch: Batch, *, kind: MatchingLoss, angle: float | None) -> Losses:

@@ -81,6 +81,8 @@ def pose_rows(prediction: Prediction) -> list[PoseRow]:
 class PredictionWriter(BasePredictionWriter):
     """Write the poses of a prediction atomically when it ends, sorted by problem.
 
+    Of several loaders, each has a folder of its own, such as `dataloader_idx_0`.
+
     Args:
         folder: Folder of the file. Default: None, the default_root_dir of the trainer.
         format: "csv", the default, for quaternions (w, x, y, z) and translations; "json" for rotation matrices and
@@ -93,24 +95,26 @@ class PredictionWriter(BasePredictionWriter):
     ) -> None:
         super().__init__("batch")
         self.folder, self.format, self.overwrite = folder, format, overwrite
-        self.rows: list[PoseRow] = []
+        self.rows: list[list[PoseRow]] = []  # by loader
 
-    def path(self, trainer: Trainer) -> Path:
+    def path(self, trainer: Trainer, loader: int = 0) -> Path:
         """Return the path of the file.
 
         Args:
             trainer: Trainer of the prediction, whose default_root_dir is the default folder.
+            loader: Index of the loader. Default: 0.
         """
-        return Path(self.folder or trainer.default_root_dir) / f"predictions.{self.format}"
+        part = f"dataloader_idx_{loader}" if len(trainer.num_predict_batches) > 1 else ""
+        return Path(self.folder or trainer.default_root_dir, part, f"predictions.{self.format}")
 
     def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Raise ValueError if the file exists and must not be replaced."""
-        self.rows = []
-        if self.path(trainer).exists() and not self.overwrite and not trainer.fast_dev_run:  # type: ignore[attr-defined]
-            raise ValueError(
-                f"{self.path(trainer)} exists. Use --predictions.folder for another folder, or --predictions.overwrite "
-                "true."
-            )
+        self.rows = [[] for _ in trainer.num_predict_batches]
+        for path in (self.path(trainer, loader) for loader in range(len(self.rows))):
+            if path.exists() and not self.overwrite and not trainer.fast_dev_run:  # type: ignore[attr-defined]
+                raise ValueError(
+                    f"{path} exists. Use --predictions.folder for another folder, or --predictions.overwrite true."
+                )
 
     def write_on_batch_end(
         self,
@@ -124,17 +128,19 @@ class PredictionWriter(BasePredictionWriter):
     ) -> None:
         """Keep the poses of the batch."""
         if isinstance(prediction, Prediction) and prediction.ids:  # a user's own task may predict something else
-            self.rows += pose_rows(prediction)
+            self.rows[dataloader_idx] += pose_rows(prediction)
 
     def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Gather the poses of all processes and write the file."""
+        """Gather the poses of all processes and write the file of each loader."""
         gathered = gather_objects(self.rows)
-        if trainer.is_global_zero and not trainer.fast_dev_run and any(gathered):  # type: ignore[attr-defined]
+        for loader, parts in enumerate(zip(*gathered, strict=True)):
+            if not trainer.is_global_zero or trainer.fast_dev_run or not any(parts):  # type: ignore[attr-defined]
+                continue
             # Count problems of several processes once; the sort is stable and keeps the order of the estimates.
-            rows = {(row.index, row.estimate): row for part in gathered for row in part}
+            rows = {(row.index, row.estimate): row for part in parts for row in part}
             ordered = sorted(rows.values(), key=lambda row: row.index)
             path = write_text(
-                self.path(trainer),
+                self.path(trainer, loader),
                 as_csv(ordered) if self.format == "csv" else as_json(ordered),
                 errors="surrogateescape",
             )

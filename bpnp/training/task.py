@@ -3,10 +3,10 @@
 import inspect
 import math
 import time
-from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import torch
 from lightning import LightningModule
@@ -38,22 +38,40 @@ from bpnp.models.weights import (
     read_checkpoint,
 )
 from bpnp.precision import exact_products
-from bpnp.training.losses import Losses, MatchingLoss, correspondence_losses, matching_losses, own_losses, pose_losses
+from bpnp.training.losses import (
+    Losses,
+    MatchingLoss,
+    correspondence_losses,
+    matching_losses,
+    mean_over_processes,
+    own_losses,
+    pose_losses,
+)
 from bpnp.training.predictions import in_scene_frame
 from bpnp.types import Batch, Prediction
 
 Stage = Literal["val", "test"]
 REBUILT = {"solver", "weights"}  # options that are not saved under "task": the checkpoint has their result
 POSED = "pnp"  # estimate of the pose loss, which has a derivative
-WARMUP = "PoseLossWarmup"  # callback that sets `pose_weight`; its module imports this one
+WARMUP = "PoseLossWarmup"  # `state_key` of the callback that sets `pose_weight`; its module imports this one
 DECAYED = 0.02  # factor on the learning rate after the decay
 WIDEST_MATCH = 0.5  # largest `correspondence_angle`, radians; larger values are probably degrees
 MOMENTUM = {"momentum", "betas"}  # settings of an optimizer that `OneCycleLR` and `CyclicLR` change
 MOST_SKIPPED = 20  # consecutive steps without a finite gradient that end the run
+TOO_COARSE = ("bf16-true", "16-true")  # precisions in which even the points would have three digits
 
 
 class TrainingDivergedError(RuntimeError):
     """Error after 20 consecutive optimiser steps without a finite loss and gradient."""
+
+
+@dataclass
+class Evaluation:
+    """Metrics of the problems of one loader in an epoch."""
+
+    poses: dict[str, MetricCollection]  # by estimate
+    loss: MeanOverProblems
+    numbers: set[int] = field(default_factory=set)  # indices of the problems so far
 
 
 class BlindPnPTask(LightningModule):
@@ -148,7 +166,7 @@ class BlindPnPTask(LightningModule):
         self.optimizer_names: list[str] | None = None  # optimiser classes of this run or of its checkpoint
         self.optimizer_settings: list[list[dict[str, Any]]] = []  # configured settings by optimizer and group
         self.refine_validation = refine_validation
-        self.numbers: set[int] = set()  # indices of the problems of this evaluation epoch
+        self.evaluations: list[Evaluation] = []  # of the loaders of this epoch
         self.table_metrics: set[str] = set()  # names of the metrics in the tables of a test
         estimates: tuple[str, ...] | str = getattr(self.solver, "estimates", ())
         if isinstance(estimates, str):
@@ -156,10 +174,6 @@ class BlindPnPTask(LightningModule):
         estimates = tuple(estimates)
         validated = tuple(name for name in estimates if refine_validation or name != REFINED)
         self.estimates: dict[Stage, tuple[str, ...]] = {"val": validated, "test": estimates}
-        self.metrics = nn.ModuleDict({stage: MeanOverProblems() for stage in self.estimates})
-        for stage, names in self.estimates.items():
-            for name in names:
-                self.metrics[f"{stage}_{name}"] = MetricCollection([PoseQuartiles(), PoseRecall()])
         if pose_weight > 0 and estimates:
             self.check_pose_loss(estimates)
 
@@ -226,7 +240,16 @@ class BlindPnPTask(LightningModule):
         return self.solver(batch)
 
     def setup(self, stage: str) -> None:
-        """Forget the optimisers and the skipped steps of an earlier training; a resumed one restores its own."""
+        """Forget the optimisers and the skipped steps of an earlier training; a resumed one restores its own.
+
+        Raises:
+            ValueError: The precision of the trainer is too coarse for points and poses.
+        """
+        if (precision := self.trainer.precision) in TOO_COARSE:
+            raise ValueError(
+                f"trainer.precision is {precision}, in which points and poses have three digits; use "
+                f"{precision.removesuffix('true')}mixed, 32-true or 64-true"
+            )
         if stage == "fit":
             self.skipped_steps = self.consecutive_skipped_steps = 0
             self.optimizer_names = None
@@ -244,41 +267,56 @@ class BlindPnPTask(LightningModule):
             losses = self.losses(prediction, batch).over_processes()
             figures = self._figures(losses, prediction, batch)
         loss = losses.total
-        self._log_train(loss=loss, skipped_steps=float(self.skipped_steps), **figures)
+        self._log_train(skipped_steps=float(self.skipped_steps), **figures)
         # Make every gradient NaN in every process if the loss is not finite; the step is then skipped.
         return loss * torch.where(loss.isfinite(), 1.0, torch.nan)
 
-    def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
+    def validation_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> dict[str, Any]:
         """Return the prediction, its seconds, L_c of each problem or None, and the errors of each estimate.
 
         L_c (paper Eq. 11) is computed whatever the loss of the training; it is None if it is undefined.
         """
-        return self._evaluate(batch, "val", first=batch_idx == 0)
+        return self._evaluate(batch, "val", dataloader_idx, first=batch_idx == 0)
 
-    def test_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
+    def test_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> dict[str, Any]:
         """Return the prediction, its seconds, L_c of each problem or None, and the errors of each estimate.
 
         L_c (paper Eq. 11) is computed whatever the loss of the training; it is None if it is undefined.
         """
-        return self._evaluate(batch, "test", first=batch_idx == 0)
+        return self._evaluate(batch, "test", dataloader_idx, first=batch_idx == 0)
 
-    def predict_step(self, batch: Batch, batch_idx: int) -> Prediction:
+    def predict_step(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> Prediction:
         """Return the prediction with `ids`, and with poses in the coordinates that the scene was given in."""
         return in_scene_frame(self.solver(batch), batch)
 
     def on_validation_epoch_start(self) -> None:
-        """Forget the last epoch, which may have been stopped: the numbers of its problems, and their errors."""
-        self.numbers.clear()
-        for metric in self.metrics.values():
-            metric.reset()  # type: ignore[operator]
+        """Start the metrics of each loader."""
+        self._start_evaluation(self.estimates["val"], self.trainer.num_val_batches)
+
+    def on_test_epoch_start(self) -> None:
+        """Start the metrics of each loader."""
+        self._start_evaluation(self.estimates["test"], self.trainer.num_test_batches)
+
+    def on_predict_epoch_start(self) -> None:
+        """Start the numbers of the problems of each loader."""
+        self._start_evaluation((), self.trainer.num_predict_batches)
 
     def on_validation_batch_start(self, batch: Any, batch_idx: int, dataloader_idx: int = 0) -> None:
         """Number the problems: a data module that collates with `Batch.from_arrays` counts each batch from 0."""
         check_batch(batch)
-        number_globally(batch, self.numbers, processes=self.trainer.world_size)
+        number_globally(batch, self.evaluations[dataloader_idx].numbers, processes=self.trainer.world_size)
 
-    on_test_epoch_start = on_predict_epoch_start = on_validation_epoch_start
     on_test_batch_start = on_predict_batch_start = on_validation_batch_start
+
+    def on_validation_batch_end(self, outputs: Any, batch: Any, batch_idx: int, dataloader_idx: int = 0) -> None:
+        """Log the metrics of one of several loaders after its last batch, as Lightning then returns them by loader."""
+        if len(self.evaluations) > 1 and batch_idx + 1 == self.trainer.num_val_batches[dataloader_idx]:
+            self._log_metrics("val", dataloader_idx)
+
+    def on_test_batch_end(self, outputs: Any, batch: Any, batch_idx: int, dataloader_idx: int = 0) -> None:
+        """Log the metrics of one of several loaders after its last batch, as Lightning then returns them by loader."""
+        if len(self.evaluations) > 1 and batch_idx + 1 == self.trainer.num_test_batches[dataloader_idx]:
+            self._log_metrics("test", dataloader_idx)
 
     def losses(self, prediction: Prediction, batch: Batch) -> Losses:
         """Return the matching loss and, with a `pose_weight`, the pose loss of the samples whose pose converged.
@@ -465,9 +503,9 @@ class BlindPnPTask(LightningModule):
         """Raise ValueError if a training with a pose loss, now or later, is resumed without one."""
         if self._trainer is None or self.trainer.state.fn != "fit" or self.pose_weight > 0:
             return
-        names = {type(callback).__name__ for callback in self.trainer.callbacks}  # type: ignore[attr-defined]
+        keys = {callback.state_key for callback in self.trainer.callbacks}  # type: ignore[attr-defined]
         trained = checkpoint.get("pose_weight", 0.0)
-        if WARMUP not in names and (WARMUP in checkpoint.get("callbacks", {}) or trained > 0):
+        if WARMUP not in keys and (WARMUP in checkpoint.get("callbacks", {}) or trained > 0):
             how = WARMUP if WARMUP in checkpoint.get("callbacks", {}) else f"model.pose_weight {trained:g}"
             raise ValueError(
                 f"The checkpoint was trained with {how}, and this run has neither {WARMUP} nor a model.pose_weight. "
@@ -491,14 +529,28 @@ class BlindPnPTask(LightningModule):
             rank_zero_info(f"the network is that of the checkpoint with {', '.join(adjusted)}")
 
     def on_validation_epoch_end(self) -> None:
-        """Log the metrics of the validation."""
-        self._log_metrics("val")
+        """Log the metrics of the only loader of a validation."""
+        if len(self.evaluations) == 1:
+            self._log_metrics("val", 0)
 
     def on_test_epoch_end(self) -> None:
-        """Log the metrics of the test."""
-        self._log_metrics("test")
+        """Log the metrics of the only loader of a test."""
+        if len(self.evaluations) == 1:
+            self._log_metrics("test", 0)
 
-    def _evaluate(self, batch: Batch, stage: Stage, *, first: bool) -> dict[str, Any]:
+    def _start_evaluation(self, estimates: tuple[str, ...], batches: Sequence[int | float]) -> None:
+        """Start new metrics of the estimates for each loader, which has a number of batches."""
+        if len(batches) > 1 and math.inf in batches:
+            raise ValueError("one of several loaders has no length; set trainer.limit_val_batches, or that of the test")
+        self.evaluations = [
+            Evaluation(
+                {name: MetricCollection([PoseQuartiles(), PoseRecall()]).to(self.device) for name in estimates},
+                MeanOverProblems().to(self.device),
+            )
+            for _ in batches
+        ]
+
+    def _evaluate(self, batch: Batch, stage: Stage, loader: int, *, first: bool) -> dict[str, Any]:
         with refinement_enabled(self.solver, stage == "test" or self.refine_validation):
             _wait(self.device)
             start = time.perf_counter()
@@ -510,10 +562,10 @@ class BlindPnPTask(LightningModule):
         with exact_products(self.device):
             errors = prediction_errors(prediction, batch)
             for name in self.estimates[stage]:
-                self.metrics[f"{stage}_{name}"].update(errors[name])  # type: ignore[operator]
+                self.evaluations[loader].poses[name].update(errors[name])
             losses = correspondence_losses(prediction, batch, angle=self.correspondence_angle)
         if losses is not None:
-            self.metrics[stage].update(losses, batch.index)  # type: ignore[operator]
+            self.evaluations[loader].loss.update(losses, batch.index)
         return {"prediction": prediction, "seconds": seconds, "losses": losses, "errors": errors}
 
     def _log_train(self, **values: Tensor | float) -> None:
@@ -528,48 +580,61 @@ class BlindPnPTask(LightningModule):
         if whole:
             self.log(f"train/{name}", part / whole, sync_dist=True)
 
+    @torch.no_grad()
     def _figures(self, losses: Losses, prediction: Prediction, batch: Batch) -> dict[str, Tensor]:
-        """Return the values that a training step logs in addition to its loss."""
-        figures: dict[str, Tensor] = {}
-        correspondence = correspondence_losses(prediction, batch, angle=self.correspondence_angle)
-        if correspondence is not None:
-            figures["correspondence_loss"] = correspondence.detach().mean()
-        if self.loss is not None or self.matching_loss != "correspondence":
+        """Return the values that a training step logs, of the batches of all processes."""
+        figures = {"loss": losses.total}
+        replaced = self.loss is not None or self.matching_loss != "correspondence"
+        correspondence: Tensor | None = losses.matching
+        if replaced:
+            correspondence = correspondence_losses(prediction, batch, angle=self.correspondence_angle)
             figures["matching_loss"] = losses.matching_mean
-            figures["left_out"] = 1 - losses.matched.float().mean()
+            figures["left_out"] = 1 - losses.mean(losses.matched)
+        if correspondence is not None:
+            figures["correspondence_loss"] = losses.mean(correspondence)
         if losses.pose is not None and losses.posed is not None:
-            figures["without_pose"] = 1 - losses.posed.float().mean()
-            means = {name: value.detach() for name, value in losses.pose_means().items()}
+            figures["without_pose"] = 1 - losses.mean(losses.posed)
+            means = losses.pose_means()
             figures |= {f"{name}_loss": value for name, value in means.items()}
             figures["pose_loss"] = torch.stack(list(means.values())).sum()
         stats = prediction.assignment_stats
         if stats is not None:
-            figures["sinkhorn_iterations"] = stats.iterations.float().mean()
-            figures["sinkhorn_unconverged"] = 1 - stats.converged.float().mean()
-        return figures
+            figures["sinkhorn_iterations"] = losses.mean(stats.iterations)
+            figures["sinkhorn_unconverged"] = 1 - losses.mean(stats.converged)
+        shares = torch.stack([value.to(losses.matching) for value in figures.values()])
+        return dict(zip(figures, mean_over_processes(shares), strict=True))
 
-    def _log_metrics(self, stage: Stage) -> None:
+    def _log_metrics(self, stage: Stage, loader: int) -> None:
+        """Log the metrics of a loader, to whose names Lightning adds its index if there are several."""
+        evaluation = self.evaluations[loader]
+        suffix = f"/dataloader_idx_{loader}" if len(self.evaluations) > 1 else ""
+
+        def log(figures: Mapping[str, Tensor], *, logger: bool | None = None) -> None:
+            # The metrics have already been gathered over processes; without `sync_dist`, Lightning warns of each.
+            self.log_dict(
+                {key: value.float() for key, value in figures.items()},
+                logger=logger,
+                sync_dist=True,
+                on_step=False,
+                on_epoch=True,
+                batch_size=1,
+            )
+            self.table_metrics |= {f"{key}{suffix}" for key in figures}
+
         for i, name in enumerate(self.estimates[stage]):
-            metrics = cast(MetricCollection, self.metrics[f"{stage}_{name}"])
-            values = metrics.compute()
-            metrics.reset()
+            values = evaluation.poses[name].compute()
             for prefix in (f"{stage}/{name}", stage) if i == 0 else (f"{stage}/{name}",):
-                # The metrics have already been gathered over processes; without `sync_dist`, Lightning warns of each.
-                figures = {f"{prefix}/{key}": value.float() for key, value in values.items()}
                 # The logs have the estimate's name; without it, callbacks can monitor any solver.
-                self.log_dict(figures, logger=prefix != stage, sync_dist=True)
-                self.table_metrics |= figures.keys()
+                log(
+                    {f"{prefix}/{key}": value for key, value in values.items()},
+                    logger=False if prefix == stage else None,
+                )
             if name == (POSED if POSED in self.estimates[stage] else self.estimates[stage][0]):
                 # L_p of the median errors (paper Eq. 12), which selects checkpoints.
-                error = torch.deg2rad(values["rotation_q2_deg"]) + values["translation_q2"]
-                self.log(f"{stage}/pose_error", error.float(), sync_dist=True)
-                self.table_metrics.add(f"{stage}/pose_error")
-        loss = cast(MeanOverProblems, self.metrics[stage])
+                log({f"{stage}/pose_error": torch.deg2rad(values["rotation_q2_deg"]) + values["translation_q2"]})
         # compute() is a collective call: all processes make it, or none.
-        if self.trainer.strategy.reduce_boolean_decision(loss.update_called, all=False):
-            self.log(f"{stage}/correspondence_loss", loss.compute().float(), sync_dist=True)
-            self.table_metrics.add(f"{stage}/correspondence_loss")
-            loss.reset()
+        if self.trainer.strategy.reduce_boolean_decision(evaluation.loss.update_called, all=False):
+            log({f"{stage}/correspondence_loss": evaluation.loss.compute()})
 
 
 def constructor_arguments(cls: type) -> set[str]:

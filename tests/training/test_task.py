@@ -16,12 +16,14 @@ from torch import nn
 from torch.utils.data import DataLoader
 
 import bpnp.metrics
+import bpnp.training.losses
 import bpnp.training.task
 from bpnp import Batch, Matcher, Prediction
 from bpnp.layers import Sinkhorn
 from bpnp.report import read_results
 from bpnp.training.callbacks import PoseLossWarmup, ResultsWriter
-from bpnp.training.losses import correspondence_loss
+from bpnp.training.losses import Losses, correspondence_loss
+from bpnp.training.predictions import PredictionWriter
 from bpnp.training.task import BlindPnPTask, TrainingDivergedError, number_globally
 
 pytestmark = pytest.mark.slow
@@ -103,6 +105,22 @@ def test_the_switch_survives_resuming_with_another_start(tmp_path: Path) -> None
     run.save_checkpoint(file)
     fit(tmp_path, resumed, file, max_epochs=3, limit_train_batches=1, callbacks=[PoseLossWarmup(start_epoch=50)])
     assert resumed.solver.wanted == [True]
+
+
+class OwnWarmup(PoseLossWarmup):
+    """A switch of a user's."""
+
+
+@pytest.mark.parametrize("kind", [OwnWarmup, PoseLossWarmup])
+def test_a_training_with_a_switch_of_the_users_is_resumed(kind: type[PoseLossWarmup], tmp_path: Path) -> None:
+    """Also by the class that it is derived from."""
+    first, resumed, file = BlindPnPTask(CountingSolver()), BlindPnPTask(CountingSolver()), str(tmp_path / "one.ckpt")
+    run = fit(tmp_path, first, limit_train_batches=1, callbacks=[OwnWarmup(start_epoch=0)])
+    run.save_checkpoint(file)
+    fit(tmp_path, resumed, file, max_epochs=2, limit_train_batches=1, callbacks=[switch := kind(start_epoch=50)])
+    assert (resumed.solver.wanted, switch.switched_at) == ([True], 0)
+    with pytest.raises(ValueError, match="trained with PoseLossWarmup, and this run has neither"):
+        fit(tmp_path, BlindPnPTask(CountingSolver()), file, max_epochs=2, limit_train_batches=1)
 
 
 def test_a_training_does_not_lose_its_pose_loss(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -230,6 +248,82 @@ def test_the_terms_of_the_pose_loss_and_the_samples_without_a_pose_are_logged(tm
     assert logged["train/pose_loss"] == pytest.approx(pose)
     assert logged["train/loss"] == pytest.approx(logged["train/correspondence_loss"] + 0.5 * pose, rel=1e-5)
     assert logged["train/without_pose"] == pytest.approx(1 - float(solved))
+
+
+def test_the_figures_of_a_step_are_those_of_the_batches_of_all_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One process has four problems, two of them without a pose, the other one has two."""
+    task, values = BlindPnPTask(small_net(), pose_weight=2.0), torch.tensor([0.3, 0.1, 0.5, 0.2, 0.9, 0.4])
+    posed = torch.tensor([False, True, False, True, True, True])
+
+    def losses(part: slice) -> Losses:
+        pose = {"rotation": values[part] ** 2 * posed[part]}
+        return Losses(values[part], torch.ones_like(posed[part]), pose, posed[part], 2.0, torch.tensor([3.0, 2.0, 3.0]))
+
+    def figures(part: slice) -> dict[str, torch.Tensor]:
+        return task._figures(losses(part), Prediction(), padded(OWN))
+
+    other = torch.stack(list(figures(slice(4, 6)).values()))
+    monkeypatch.setattr("torch.distributed.is_initialized", lambda: True)
+    monkeypatch.setattr("torch.distributed.get_world_size", lambda: 2)
+    monkeypatch.setattr("torch.distributed.all_reduce", lambda shares: shares.add_(other))
+    rotation = float((values**2)[posed].mean())
+    assert {name: float(value) for name, value in figures(slice(0, 4)).items()} == pytest.approx(
+        {
+            "loss": float(values.mean()) + 2 * rotation,
+            "correspondence_loss": float(values.mean()),
+            "without_pose": 2 / 6,
+            "rotation_loss": rotation,
+            "pose_loss": rotation,
+        },
+        abs=1e-6,
+    )
+
+
+@pytest.mark.parametrize("kind", ["correspondence", "likelihood"])
+def test_the_correspondence_loss_of_a_step_is_computed_once(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counted = Mock(side_effect=bpnp.training.losses.correspondence_loss)
+    monkeypatch.setattr(bpnp.training.losses, "correspondence_loss", counted)
+    run = fit(tmp_path, BlindPnPTask(small_net(), matching_loss=kind), limit_train_batches=2)  # type: ignore[arg-type]
+    assert counted.call_count == 2
+    assert "train/correspondence_loss" in run.callback_metrics
+
+
+def test_a_training_without_a_logger_brings_no_warning_of_it(tmp_path: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="You called `self.log")
+        fit(tmp_path, BlindPnPTask(small_net()), limit_train_batches=1, limit_val_batches=1)
+
+
+@pytest.mark.parametrize("precision", ["bf16-true", "16-true"])
+def test_a_precision_of_three_digits_is_refused(precision: str, tmp_path: Path) -> None:
+    instead = precision.replace("true", "mixed")
+    with pytest.raises(ValueError, match=f"trainer.precision is {precision}, in which .* use {instead}, 32-true or"):
+        fit(tmp_path, BlindPnPTask(small_net()), precision=precision)
+
+
+def test_each_of_several_loaders_has_its_own_metrics_and_files(tmp_path: Path) -> None:
+    """The problems of both are numbered from 0."""
+    task, parts = BlindPnPTask(small_net()), (padded(OWN[:3]), padded(OWN[3:8]))
+    loaders = [DataLoader([part], batch_size=None) for part in parts]  # type: ignore[arg-type]
+    run = quiet_trainer(tmp_path, callbacks=[ResultsWriter(), PredictionWriter()])
+    run.predict(task, loaders)
+    tested, validated = run.test(task, loaders, verbose=False), run.validate(task, loaders, verbose=False)
+    for i, part in enumerate(parts):
+        with torch.no_grad():
+            expected = correspondence_loss(task.solver.eval().match(part).assignment, part.match3d).mean()
+        for stage, found in (("test", tested), ("val", validated)):
+            own = {name for name in found[i] if name.startswith(f"{stage}/")}
+            assert all(name.endswith(f"/dataloader_idx_{i}") for name in own)
+            loss = found[i][f"{stage}/correspondence_loss/dataloader_idx_{i}"]
+            assert loss == pytest.approx(float(expected), rel=1e-5)
+        results = read_results(tmp_path / "test" / f"dataloader_idx_{i}")
+        assert [row.index for row in results.of("pnp")] == list(range(len(part)))
+        median = tested[i][f"test/pnp/rotation_q2_deg/dataloader_idx_{i}"]
+        assert median == pytest.approx(results.estimates["pnp"]["rotation_q2_deg"], rel=1e-6)
+        lines = (tmp_path / f"dataloader_idx_{i}" / "predictions.csv").read_text().splitlines()
+        assert len(lines) == 1 + 3 * len(part)
 
 
 class ThreeOfFour(nn.Module):

@@ -91,6 +91,8 @@ def test_two_processes_give_the_figures_of_one(tmp_path: Path) -> None:
         test = ["test", folder, *more[folder], double, f"--ckpt_path={folder}/checkpoints/last.ckpt"]
         for arguments in (fit, test):
             main(words(*arguments)) if folder is one else finish(start(*arguments))
+    for metric in ("train/loss", "train/correspondence_loss", "train/sinkhorn_iterations"):
+        assert logged(two, metric, 1) == pytest.approx(logged(one, metric, 1), rel=1e-6), metric
     alone, split = read_results(one / "test"), read_results(two / "test")
     # Seven test pairs in batches of four: the second process repeats some, which count once.
     assert [row.id for row in split.rows] == [row.id for row in alone.rows]
