@@ -32,7 +32,7 @@ class OneLineParser(ArgumentParser):
         """Raise ValueError with the message in one line, and a hint."""
         text = plain(message)
         _, found, unknown = text.rpartition("nrecognized arguments: ")
-        option_strings = [option for action in self._actions for option in action.option_strings]
+        option_strings = [name for action in self._actions for name in action.option_strings if name.startswith("-")]
         if required := text.partition("arguments are required: ")[2]:
             command, options = self.prog, []
             for path in required.split(", "):
@@ -43,12 +43,41 @@ class OneLineParser(ArgumentParser):
             # A class that an option names has a parser of its own, without a command.
             advice = f"; try: {start}{command} --help" if " " in command else ""
             raise ValueError(f"missing {', '.join(options)}{advice}") from ex
-        close = difflib.get_close_matches(unknown.split("=")[0].split(" ")[0], option_strings, n=1) if found else []
-        hint = f"; did you mean {close[0]}?" if close else f"; try: {self.prog} --help" if found else ""
+        close = closest_option(unknown.split("=")[0].split(" ")[0], option_strings) if found else None
+        program = self.prog.replace(" [options]", "")
+        hint = f"; did you mean {close}?" if close else f"; try: {program} --help" if found else ""
+        text, of_no_class, _ = text.partition(" Expected an instantiatable class, but bpnp.models.weights.AnyModule")
+        if of_no_class:
+            hint = ", since there is no class; name one first, such as --model.solver bpnp.models.BPnPNet"
         renamed = (new for old, new in RENAMED.items() if text.endswith(f"Option '{old}' is not accepted"))
         if new := next(renamed, None):
             hint = f"; it is now {new}"
         raise ValueError(text + hint) from ex
+
+
+def closest_option(unknown: str, options: Sequence[str]) -> str | None:
+    """Return the option that was probably meant, or None.
+
+    Names are compared without their group, such as `--model`. Options of the same group come first, and initials count.
+
+    >>> from bpnp.commands.parser import closest_option
+    >>> closest_option("--model.lr", ["--model.solver", "--model.learning_rate"])
+    '--model.learning_rate'
+    """
+    group, _, name = unknown.lstrip("-").rpartition(".")
+    names: dict[str, list[str]] = {}
+    siblings: dict[str, list[str]] = {}
+    for option in options:
+        own_group, _, own = option.lstrip("-").rpartition(".")
+        names.setdefault(own, []).append(option)
+        if own_group == group:
+            siblings.setdefault(own, []).append(option)
+    for among in (siblings, names):
+        initials = [own for own in among if "_" in own and name == "".join(word[:1] for word in own.split("_"))]
+        close = initials or sorted(among, key=lambda own: -difflib.SequenceMatcher(None, name, own).ratio())
+        if close and (initials or difflib.get_close_matches(name, close[:1])):
+            return among[close[0]][0]
+    return None
 
 
 # Beginnings of lines of jsonargparse's messages that list other types of an option, and its value.

@@ -16,6 +16,7 @@ from pathlib import Path
 from pydoc import locate
 from typing import Any
 
+import yaml
 from jsonargparse import Namespace, get_loader, set_loader
 from lightning import Callback, LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelSummary, ProgressBar, RichProgressBar
@@ -31,6 +32,7 @@ from bpnp.bounded_files import check_yaml
 from bpnp.checks import check_within
 from bpnp.commands.parser import OneLineParser
 from bpnp.files import config_content, lock_folder, write_text
+from bpnp.models.bpnpnet import BPnPNet
 from bpnp.models.weights import PARTS, class_name, is_description, networks, read_checkpoint
 from bpnp.report.terminal import console, say
 from bpnp.report.training_run import training_of_checkpoint, wandb_run
@@ -54,6 +56,10 @@ POSE_LOSS: dict[str, tuple[type, str]] = {
     "start_epoch": (int, "first epoch with the pose loss, counted from 0; null for no switch"),
     "weight": (float, "gamma_p of the paper after the switch; null for that of the model, or 1"),
 }
+
+UNTRAINED = (
+    "The network is untrained (no --ckpt_path, no --model.weights); a search such as `refined` can do without it."
+)
 
 CHECKPOINTS = {"best_checkpoint": BestCheckpoint, "last_checkpoint": LastCheckpoint}
 
@@ -122,6 +128,16 @@ class RunConfig(SaveConfigCallback):
                 record_wandb_run(logger, Path(numbered[0]))
 
 
+class Bar(RichProgressBar):
+    """Progress bar without the number of the log folder, which it would show as `v_num: 0.000`."""
+
+    def get_metrics(
+        self, trainer: Trainer, pl_module: LightningModule
+    ) -> dict[str, int | str | float | dict[str, float]]:
+        """Return the logged values."""
+        return {name: value for name, value in super().get_metrics(trainer, pl_module).items() if name != "v_num"}
+
+
 class BpnpCLI(LightningCLI):
     """Lightning's CLI with the run folder of this project: checkpoints, logs and results in trainer.default_root_dir.
 
@@ -171,12 +187,15 @@ class BpnpCLI(LightningCLI):
             parser.link_arguments("trainer.default_root_dir", f"{name}.dirpath", compute_fn=_checkpoint_folder)
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
-        """Parse the arguments with the network of the checkpoint as the default of `model.solver`."""
+        """Parse the arguments; options of `model.solver` that are not given are those of the checkpoint."""
         if self.command == "test":
             self.options.set_defaults({"verbose": False})  # disable Lightning's table of all metrics
         elif self.command == "predict":
             self.options.set_defaults({"return_predictions": False})  # PredictionWriter writes them
-        self.config = parser.parse_args([word for word in args if not word.startswith("--print_config")])
+        words = [word for word in args if not word.startswith("--print_config")]
+        # Options of a part need a class of the solver, which may be that of the checkpoint; its parts are then read.
+        network = [] if self.subclass_mode_model else [f"--model.solver={BPnPNet.__module__}.{BPnPNet.__qualname__}"]
+        self.config = parser.parse_args([self.command, *network, *words[1:]])
         config = self.config[self.command]
         path = config.get("ckpt_path")
         folder = Path(_checkpoint_folder(config["trainer.default_root_dir"]))
@@ -185,13 +204,19 @@ class BpnpCLI(LightningCLI):
         elif path == "best" and (folder / "best.ckpt").is_file():
             path = str(folder / "best.ckpt")
         named = config.get("model.class_path")
-        solver = None
-        if named is None or issubclass(_find_class(named), BlindPnPTask):
-            weights = path or config.get("model.weights" if named is None else "model.init_args.weights")
-            solver = _solver_options(weights, config["model"]) if weights else None
-        if solver is not None:
-            model = {"class_path": named, "init_args": {"solver": solver}}
-            self.options.set_defaults({"model.solver": solver} if named is None else {"model": model})
+        options = "model" if named is None else "model.init_args"
+        weights = path or config.get(f"{options}.weights")
+        saved = None
+        if weights and (named is None or issubclass(_find_class(named), BlindPnPTask)):
+            saved = _solver_options(weights, config["model"])
+        if saved is not None:
+            network = [f"--model.solver={saved['class_path']}"] if network else []
+            root = f"--trainer.default_root_dir={config['trainer.default_root_dir']}"  # other options refer to it
+            given = parser.parse_args([self.command, root, *network, *words[1:]], defaults=False)
+            chosen = given[self.command].get(f"{options}.solver")
+            solver = _with_options(saved, chosen.as_dict() if isinstance(chosen, Namespace) else chosen)
+            full = f"--model.solver={yaml.safe_dump(solver, default_flow_style=True)}"
+            args = [self.command, *network, *args[1:], full]
         self.config = parser.parse_args(args)
         config = self.config[self.command]
         config["ckpt_path"] = path
@@ -220,7 +245,7 @@ class BpnpCLI(LightningCLI):
         callbacks = trainer.callbacks or []
         trainer.callbacks = list(callbacks) if isinstance(callbacks, list) else [callbacks]
         for callback in trainer.callbacks:
-            if callback.class_path.rpartition(".")[2] == PoseLossWarmup.__name__:
+            if issubclass(_find_class(callback.class_path), PoseLossWarmup):
                 callback.init_args.update(Namespace(**options))
                 return
         if "start_epoch" not in options:
@@ -254,7 +279,7 @@ class BpnpCLI(LightningCLI):
         callbacks: list[Callback] = [InterruptedCheckpoint(_checkpoint_folder(root))]
         bar = options["enable_progress_bar"] is not False and console().is_interactive
         if not any(isinstance(callback, ProgressBar) for callback in _as_list(options["callbacks"])):
-            callbacks.append(RichProgressBar() if bar else ProgressLines())
+            callbacks.append(Bar() if bar else ProgressLines())
             kwargs["enable_progress_bar"] = bar
         own = any(isinstance(callback, ModelSummary) for callback in _as_list(options["callbacks"]))
         if options["enable_model_summary"] is None and not own:  # Lightning's ends with "Total FLOPs: 0"
@@ -306,6 +331,9 @@ class BpnpCLI(LightningCLI):
         weights = config["ckpt_path"] or config.get(f"{options}.weights") or trained
         if not weights and list(self.model.parameters()):
             sys.stderr.write("bpnp: no --ckpt_path: the weights of the solver are untrained\n")
+            for callback in self.trainer.callbacks:  # type: ignore[attr-defined]
+                if isinstance(callback, ResultsWriter):
+                    callback.note = UNTRAINED
 
     before_test = before_predict = before_validate
 
@@ -337,6 +365,19 @@ def _solver_options(path: str, model: Namespace) -> dict[str, Any] | None:
         return {"class_path": f"{cls.__module__}.{cls.__qualname__}", "init_args": arguments}
 
     return options_of(description) if is_description(description) else None
+
+
+def _with_options(saved: Any, given: Any) -> Any:
+    """Return the options of a part of a checkpoint, changed by those that are given; of another class, only these."""
+    if not isinstance(saved, Mapping) or "class_path" not in saved:
+        return given
+    if given is None:
+        return saved
+    if _find_class(given["class_path"]) is not _find_class(saved["class_path"]):
+        return given
+    arguments = given.get("init_args", {})
+    changed = {key: _with_options(saved["init_args"].get(key), value) for key, value in arguments.items()}
+    return {**saved, "init_args": saved["init_args"] | changed}
 
 
 def _class_paths(options: Any) -> Iterator[str]:

@@ -144,6 +144,20 @@ def test_a_part_of_the_users_is_named_by_the_configuration(tmp_path: Path, fails
     main(words("test", tmp_path, checkpoint, *part))
     message = fails(*words("test", tmp_path, checkpoint))
     assert "last.ckpt has a test_lightning_command.Flat, which is not a class of bpnp. Name it" in message
+    # The options of the checkpoint stay where a configuration before has another class, and without the network's name.
+    other = tmp_path / "other.yaml"
+    other.write_text(
+        "model:\n  solver:\n    class_path: bpnp.models.BPnPNet\n    init_args:\n      features2d:\n"
+        "        class_path: bpnp.models.nets.ImageFeatures\n        init_args:\n          scale: 4.0\n"
+    )
+    for options in ([f"--config={other}", part[-1]], part[-1:]):
+        main(words("test", tmp_path, checkpoint, *options))
+    assert read_results(tmp_path / "run/test").settings["solver"]["init_args"]["features2d"]["init_args"] == {
+        "coordinates": 2,
+        "channels": 16,
+    }
+    message = fails(*words("test", tmp_path, checkpoint, part[-1], "--model.solver.features2d.channels=8"))
+    assert "features2d.channels=8 (saved: 16)" in message
 
 
 class Flat(nn.Module):

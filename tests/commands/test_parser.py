@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from bpnp.commands.parser import parse_arguments
+from bpnp.commands.parser import closest_option, parse_arguments
 
 
 def move(scale: float, *, translation: tuple[float, float, float] | None = None) -> None:
@@ -41,3 +41,21 @@ def test_names_of_files_are_taken_as_they_are(text: str) -> None:
     expected = {"files": [Path(text)], "name": text, "output": Path(text), "limit": float("inf")}
     assert parse_arguments("write", write, [text, "--name", text, "--output", text, "--limit", "inf"]) == expected
     assert parse_arguments("write", write, [text, f"--name={text}", f"--output={text}", "--limit=inf"]) == expected
+
+
+@pytest.mark.parametrize(
+    ("unknown", "meant"),
+    [
+        ("--model.lr", "--model.learning_rate"),
+        ("--model.learnign_rate", "--model.learning_rate"),
+        ("--lr", "--model.learning_rate"),
+        ("--modle.solver", "--model.solver"),
+        ("--epochs", "--trainer.max_epochs"),
+        ("--ckpt", "--ckpt_path"),
+        ("--model.xyz", None),
+    ],
+)
+def test_a_misspelt_option_is_found_by_its_name_in_the_group(unknown: str, meant: str | None) -> None:
+    options = ["--config", "--model", "--model.solver", "--model.learning_rate", "--model.loss"]
+    options += ["--trainer.max_epochs", "--trainer.min_epochs", "--optimizer.lr_decay", "--ckpt_path"]
+    assert closest_option(unknown, options) == meant

@@ -125,9 +125,11 @@ def test_solver_and_metric_of_the_contributing_guide(
 def test_weights_of_a_task_by_class_path_are_trained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     task = "--model=bpnp.training.task.BlindPnPTask"
     main(["test", task, "--model.init_args.weights=procedural-so3", *MESHES, *folders(tmp_path / "trained")])
-    assert "untrained" not in capsys.readouterr().err
+    assert "untrained" not in "".join(capsys.readouterr())
     main(["test", task, *SMALL_NET, *MESHES, *folders(tmp_path / "untrained")])
-    assert "untrained" in capsys.readouterr().err
+    shown = capsys.readouterr()
+    assert "untrained" in shown.err
+    assert shown.out.index("The network is untrained") < shown.out.index("Pose errors")
 
 
 @pytest.mark.parametrize(("name", "kind"), [("procedural-so3", BPnPNet), ("matcher-sfm", Matcher)])
@@ -145,6 +147,7 @@ def test_the_progress_bar_shows_the_loss_and_the_end_the_checkpoints(
     main(["fit", *MESHES, *SMALL_NET, *SHORT, *folders(tmp_path)])
     printed = capsys.readouterr().out
     assert "train/loss:" in printed
+    assert "v_num" not in printed
     for name in ("best", "last"):
         assert f"wrote {tmp_path}/run/checkpoints/{name}.ckpt" in printed.replace("\n", " ")
 
@@ -200,7 +203,14 @@ class Watch(Callback):
         self.weights.append(pl_module.pose_weight)
 
 
+class OwnWarmup(PoseLossWarmup):
+    """A switch of a user's."""
+
+
 EPOCHS = ["--trainer.max_epochs=3", "--trainer.limit_train_batches=1", "--trainer.limit_val_batches=0"]
+
+
+OWN_SWITCH = ["--trainer.callbacks+=test_training_command.OwnWarmup"]
 
 
 def test_the_switch_to_the_pose_loss_has_options_of_its_own(tmp_path: Path) -> None:
@@ -217,6 +227,7 @@ def test_the_switch_to_the_pose_loss_has_options_of_its_own(tmp_path: Path) -> N
         ("weight", [*alone, "--pose_loss.start_epoch=2", "--pose_loss.weight=0.5"], [0, 0, 0.5], 1),
         ("of the model", [*alone, "--pose_loss.start_epoch=1", "--model.pose_weight=0.25"], [0, 0.25, 0.25], 1),
         ("merged", [f"--config={own}", "--pose_loss.start_epoch=1", "--pose_loss.weight=2"], [0, 2, 2], 1),
+        ("of the user's", [*alone, *OWN_SWITCH, "--pose_loss.start_epoch=1"], [0, 1, 1], 1),
     ):
         main([*common, *options, *folders(tmp_path / name)])
         assert (Watch.weights, Watch.switches) == (weights, [switches]), name
