@@ -50,7 +50,7 @@ def package(tmp_path: Path) -> Path:
     folder = tmp_path / "installed" / "bpnp"
     source = Path(bpnp.runtime.__file__).parent
     folder.mkdir(parents=True)
-    for name in ("runtime.py", "files.py"):
+    for name in ("runtime.py", "files.py", "bounded_files.py"):
         shutil.copy(source / name, folder)
     (folder / "__init__.py").touch()
     (folder / "factor.py").write_text(FACTOR)
@@ -113,7 +113,7 @@ def test_a_loop_runs_where_nothing_can_be_written(package: Path, tmp_path: Path)
     out, log = called(package, cache)
     assert out == "8 10 True \n"
     assert "compiling" in log
-    assert f"in every process, since {cache}/loops cannot be written" in log
+    assert f"in every process, since {cache}/bpnp/loops cannot be written" in log
 
 
 FULL = """
