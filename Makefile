@@ -20,9 +20,10 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	@touch $@
 
 quickstart: install
-	$(BIN)/bpnp fit --config quickstart
-	$(BIN)/bpnp test --config quickstart --ckpt_path $(RUN)/checkpoints/before_pose_loss.ckpt --results.folder $(RUN)/Lc
-	$(BIN)/bpnp test --config quickstart --ckpt_path $(RUN)/checkpoints/best.ckpt --results.folder $(RUN)/LcLp
+	$(BIN)/bpnp fit --config quickstart --model.weights procedural-euler
+	$(BIN)/bpnp fit --config quickstart --model.weights procedural-euler --pose_loss.start_epoch 6 --trainer.default_root_dir $(RUN)_lc
+	$(BIN)/bpnp test --config quickstart --ckpt_path $(RUN)_lc/checkpoints/last.ckpt --results.folder $(RUN)/Lc
+	$(BIN)/bpnp test --config quickstart --ckpt_path $(RUN)/checkpoints/last.ckpt --results.folder $(RUN)/LcLp
 	$(BIN)/bpnp report $(RUN)/Lc $(RUN)/LcLp --html $(RUN)/report.html --curves $(RUN)/curves.png
 	@$(MAKE) --no-print-directory show-report
 

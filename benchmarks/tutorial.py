@@ -26,6 +26,7 @@ from bpnp.report.results import ProblemRow, read_results
 from bpnp.report.tables import named_runs
 
 PAGE = ROOT / "docs" / "tutorials" / "train.md"
+README = ROOT / "README.md"  # has its first table
 FILE = ROOT / "benchmarks" / "tutorial.json"
 END = "## Change something"
 BEFORE, AFTER, COMPARED = "runs/quickstart/Lc", "runs/quickstart/LcLp", "runs/table"
@@ -119,4 +120,4 @@ def main() -> None:
         write_json(chosen.output, record)
         for name in DRAWN if published or not is_published(parser, chosen, "pictures") else ():
             shutil.copyfile(chosen.run / name, chosen.pictures / name)
-    fill_pages([PAGE], "tutorial", tables(record), check=chosen.check, published=published)
+    fill_pages([PAGE, README], "tutorial", tables(record), check=chosen.check, published=published)

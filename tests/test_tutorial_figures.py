@@ -77,7 +77,9 @@ def ran(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     (tmp_path / "train.md").write_text(PAGE)
     (tmp_path / "pictures").mkdir()
+    (tmp_path / "README.md").write_text("<!-- tutorial: test -->\nold\n<!-- end of tutorial -->\n")
     monkeypatch.setattr(tutorial, "PAGE", tmp_path / "train.md")
+    monkeypatch.setattr(tutorial, "README", tmp_path / "README.md")
     monkeypatch.setattr(tutorial, "FILE", tmp_path / "record.json")
     monkeypatch.setattr(tutorial.subprocess, "run", run)
     paths = {name: str(tmp_path / name) for name in ("run", "pictures")}
@@ -101,6 +103,8 @@ def test_the_page_is_filled_with_what_its_commands_give(
     assert "| `refined` | 8 | +0 [+0, +0], better in 0 % | +0 [+0, +0], better in 0 % |" in text
     assert "| search |  | 8 | 0.5 / 0.5 [0.5, 0.5] / 0.5 | 0.01 / 0.01 [0.01, 0.01] / 0.01 |" in text
     assert "\nold\n" not in text
+    table = text.split("<!-- tutorial: test -->\n")[1].split("<!-- end")[0]
+    assert table in (tmp_path / "README.md").read_text()
     assert text.index("| `pnp` |") < text.index("| `refined` |")
     assert (tmp_path / "pictures" / "recall.png").read_text() == "recall.png, 4 commands"
     assert json.loads((tmp_path / "record.json").read_text())["measured"]["commit"] == "commit 0"
@@ -137,7 +141,8 @@ def test_a_page_that_is_not_the_records_is_found(
 def test_the_page_is_that_of_the_record_and_says_what_it_shows() -> None:
     record = json.loads(tutorial.FILE.read_text())
     text = tutorial.PAGE.read_text(encoding="utf-8")
-    assert fill_tables(text, "tutorial", tutorial.tables(record)) == text
+    for page in (text, tutorial.README.read_text(encoding="utf-8")):
+        assert fill_tables(page, "tutorial", tutorial.tables(record)) == page
     assert "lowers the translation error of `pnp`" in text
     value, low, high = record["effects"]["pnp"]["translation"]
     assert low <= value <= high < 0
