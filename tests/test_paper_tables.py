@@ -45,6 +45,7 @@ from bpnp.models.weights import pack_weights
 SHAPES = {"num_points": 20, "pool_size": 20, "train_shapes": 4, "val_shapes": 2, "test_shapes": 6, "train_problems": 4}
 
 
+@pytest.mark.nightly
 def test_a_training_goes_on_from_its_own_checkpoint_and_a_branch_from_anothers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
