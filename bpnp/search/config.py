@@ -354,7 +354,7 @@ class TimeSettings:
     of_many: float = 5.0
     photo: float = 60.0
     ending: float = 4e-3
-    ending_a_point: float = 8e-6
+    ending_a_point: float = 1.2e-5
     grace: float = 0.3
     judging: float = 1.5
     hypothesis: float = 2e-6
