@@ -24,7 +24,7 @@ def test_a_solution_of_the_last_release_is_read() -> None:
     assert Solution.from_json(solution.to_json()).reason == solution.reason
     cut = json.loads((RELEASED / "solution-0.1.0.json").read_text())
     del cut["rotation"]
-    with pytest.raises(ValueError, match="not the JSON of a solution: 'rotation'"):
+    with pytest.raises(ValueError, match="not the JSON of a solution: its field 'rotation' is missing"):
         Solution.from_json(json.dumps(cut))
 
 

@@ -42,10 +42,6 @@ def solution_points(solution: Solution, *, title: str | None = None) -> ProblemP
     matches, points2d, points3d = solution.matches, solution.points2d, solution.points3d
     assigned = np.full(len(points3d), -1, np.int32)
     if len(matches):
-        most = np.max(matches, axis=0)
-        if np.min(matches) < 0 or most[0] >= len(points2d) or most[1] >= len(points3d):
-            sizes = f"{len(points2d)} 2D and {len(points3d)} 3D points"
-            raise ValueError(f"`matches` has indices up to {most.tolist()}, but there are {sizes}")
         assigned[matches[:, 1]] = matches[:, 0]
     verdict = [f"{solution.verdict}: {shown}", solution.reason]
     if solution.verdict == "failed":

@@ -328,7 +328,8 @@ class Solution:
             solution = _read(cls, content if content["format"] == FORMAT else _converted(content))
             counts = [len(solution.points2d), len(solution.points3d)]
             if ((solution.matches < 0) | (solution.matches >= counts)).any():
-                raise ValueError("a match has an index without a point")
+                most = solution.matches.max(0).tolist()
+                raise ValueError(f"`matches` has indices up to {most}, but there are {counts} 2D and 3D points")
             return solution
         except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
             reason = f"its field {error} is missing" if isinstance(error, KeyError) else error

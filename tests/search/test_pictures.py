@@ -94,7 +94,7 @@ def test_the_file_of_a_solution_is_drawn_and_broken_ones_are_named(
         (json.dumps(content | {"points2d": [[1, 2, 3]]}), "castle.json: this is not the JSON of a solution:"),
         (
             json.dumps(content | {"matches": [[0, 999]]}),
-            "`matches` has indices up to [0, 999], but there are 200 2D and 200 3D points",
+            "`matches` has indices up to [0, 999], but there are [200, 200] 2D and 3D points",
         ),
     ):
         path.write_text(text)

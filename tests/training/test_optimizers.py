@@ -73,7 +73,7 @@ def test_a_resumed_run_has_the_settings_of_its_command(tmp_path: Path) -> None:
     fit(tmp_path, *SHORT, "--model.learning_rate=1e-4", "--model.weight_decay=0.1", "--trainer.max_steps=2")
     last = f"--ckpt_path={tmp_path}/run/checkpoints/last.ckpt"
     fit(tmp_path, *SHORT, "--model.learning_rate=3e-6", "--model.weight_decay=0.2", last)
-    assert Observer.rates == [3e-6, 3e-6]
+    assert Observer.rates == pytest.approx([3e-6, 3e-6], rel=1e-12)
     assert Observer.trainer.optimizers[0].param_groups[0]["weight_decay"] == 0.2
     assert (Observer.weights[1] - Observer.weights[0]).abs().max() < 4e-6  # a step of Adam is at most its rate
 
