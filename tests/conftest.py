@@ -1,4 +1,5 @@
 import os
+import signal
 from pathlib import Path
 
 import lightning  # noqa: F401, its log handler keeps the stderr of its first import, which a test would close
@@ -18,6 +19,13 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def marks(pytestconfig: pytest.Config) -> dict[str, frozenset[str]]:
     """Names of the marks of each collected test."""
     return pytestconfig.stash[MARKS]
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _interrupts() -> None:
+    """Let Ctrl-C interrupt where the shell of a background job has switched it off."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(autouse=True)
