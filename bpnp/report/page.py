@@ -40,6 +40,7 @@ from bpnp.report.results import (
 from bpnp.report.tables import (
     CAPTION,
     LOADING,
+    QUARTILES,
     RESULT_COLUMNS,
     Line,
     best_texts,
@@ -211,9 +212,9 @@ def describe_run(results: Results) -> str:
     rows = results.of(next(iter(results.estimates)))
     spans = {what: sorted(getattr(row, key) for row in rows) for key, what in SIZES.items()}
     sizes = (f"{span[0] if span[0] == span[-1] else f'{span[0]} to {span[-1]}'} {what}" for what, span in spans.items())
-    best, values = min(results.estimates.items(), key=lambda item: item[1]["rotation_q2_deg"])
-    solved = f"{100 * cause_fractions(results.of(best))['solved']:.1f} % within {SOLVED_DEG:g} deg"
-    outcome = f"{best}: median rotation error {cell(RESULT_COLUMNS[1], values)} deg, {solved}"
+    rotation, translation = QUARTILES[1], QUARTILES[4]
+    errors = (f"{name} {cell(rotation, v)} deg, {cell(translation, v)}" for name, v in results.estimates.items())
+    outcome = f"Estimates by median rotation error and translation error: {'; '.join(errors)}"
     return f"{problems_text(str(len(rows)))} with {', '.join(sizes)}. {outcome}"
 
 
