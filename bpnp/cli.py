@@ -65,7 +65,7 @@ def main(args: Sequence[str] | None = None) -> None:
             sys.stdout.flush()
     except Exception as error:
         if isinstance(error, BrokenPipeError) and _has_no_reader(sys.stdout):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the flush at exit would fail too
+            _discard_output()
             raise SystemExit(0) from None
         if _follows_interrupt(error):
             _end_interrupted(arguments)
@@ -74,9 +74,19 @@ def main(args: Sequence[str] | None = None) -> None:
         # File names that are not UTF-8 contain surrogates, which a terminal cannot show.
         text = plain(str(error)) or "there is too little memory for this command; give it less data"
         print(f"bpnp: error: {text}".encode("utf-8", "replace").decode(), file=sys.stderr)
+        try:
+            if sys.stdout is not None:
+                sys.stdout.flush()
+        except OSError:  # as on a full disk
+            _discard_output()
         raise SystemExit(2) from None
     except KeyboardInterrupt:
         _end_interrupted(arguments)
+
+
+def _discard_output() -> None:
+    """Send what is left of standard output nowhere: where it cannot be written, its flush at exit would fail too."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _working_folder() -> str:

@@ -342,6 +342,8 @@ class TimeSettings:
             convention]
         judging: Time to judge the pose of a photo on all points of a map after the searches; at most half of a limit is
             kept for it. [seconds; cost]
+        timed_pairs: Pairs of bearings and points from which the first step of an annealing on all of them is timed.
+            [count; cost]
         hypothesis: Time of a hypothesis of the enumeration before it is measured. [seconds; cost]
         least_pace: Least measured time of a hypothesis; a coarse clock may measure 0. [seconds; numerics]
         built: Time of a set of points when a stage of the enumeration begins. [seconds; cost]
@@ -357,6 +359,7 @@ class TimeSettings:
     ending_a_point: float = 1.2e-5
     grace: float = 0.3
     judging: float = 1.5
+    timed_pairs: float = 3e8
     hypothesis: float = 2e-6
     least_pace: float = 1e-9
     built: float = 5e-7

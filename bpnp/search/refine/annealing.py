@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.runtime import in_time, thread_count
-from bpnp.search.config import Stages
+from bpnp.runtime import Clock, in_time, thread_count
+from bpnp.search.config import TIME, Stages
 from bpnp.search.hypotheses import Hypotheses, select_distinct, to_problem_frame
 from bpnp.search.kernels.dense import dense_scratch, descend
 from bpnp.search.kernels.sparse import descend_sparse, sparse_scratch
@@ -77,7 +77,13 @@ def _annealed(scene: Scene, starts: Hypotheses, sides: Sides, scales: Array, out
 
 
 def anneal_on_points(
-    scene: Scene, starts: Hypotheses, first_scale: float, *, outliers: float | None = None, every: bool = False
+    scene: Scene,
+    starts: Hypotheses,
+    first_scale: float,
+    *,
+    outliers: float | None = None,
+    every: bool = False,
+    steps: int | None = None,
 ) -> Hypotheses:
     """Anneal poses on all 3D points.
 
@@ -87,6 +93,7 @@ def anneal_on_points(
         first_scale: Scale of the first step, radians.
         outliers: Expected outlier fraction; None for that of the settings.
         every: True to use all bearings; False for the number of the fine stage.
+        steps: Number of scales; None for all down to the smallest one.
 
     Returns:
         Distinct poses, without an NFA.
@@ -94,7 +101,7 @@ def anneal_on_points(
     fine, bearings = scene.settings.fine, None if every else scene.settings.fine.bearings
     outliers = scene.settings.outliers if outliers is None else outliers
     rounds = max(4, math.ceil(math.log(scene.smallest_scale / first_scale) / math.log(fine.cooling)))
-    scales = (first_scale * fine.cooling ** np.arange(rounds)).astype(np.float32)
+    scales = (first_scale * fine.cooling ** np.arange(rounds if steps is None else steps)).astype(np.float32)
     tiles, points = scene.tiles(bearings)
     tiles, outlier = tiles.with_margin(first_scale), scene.outlier_density(outliers)
     rotation, translation = starts.rotation.copy(), starts.translation.copy()
@@ -168,6 +175,8 @@ def finish(scene: Scene, poses: Hypotheses, annealed: int | None = None) -> Hypo
         if scene.deadline.passed():
             break
         first_scale = settings.end_scale * float(poses.scale[i])
+        if _outlasts_deadline(scene, poses[i : i + 1], first_scale):
+            break
         end = anneal_on_points(scene, poses[i : i + 1], first_scale, outliers=share, every=True)
         ends.append(end if len(ends) < count else end.as_dependent())
     return select_distinct(Hypotheses.concatenate([*ends, poses[min(len(ends), count) :]]), scene, settings.kept)
@@ -191,3 +200,16 @@ def anneal_to_end(
     starts = replace(starts, scale=np.full(len(starts), scale, np.float32))
     ends = finish(scene, starts)  # none after the deadline
     return to_problem_frame(ends if len(ends) else starts, scene)
+
+
+def _outlasts_deadline(scene: Scene, pose: Hypotheses, first_scale: float) -> bool:
+    """Return whether annealing a pose (1,) on every bearing would last beyond the deadline; False for few points.
+
+    The time is that of one step at the first scale, and of further ones whose close points become fewer.
+    """
+    if math.isinf(scene.deadline.at) or len(scene.offsets) * len(scene.points3d) < TIME.timed_pairs:
+        return False
+    begun = Clock.now()
+    anneal_on_points(scene, pose, first_scale, every=True, steps=1)
+    now = Clock.now()
+    return now + (now - begun) / (1 - scene.settings.fine.cooling**2) > scene.deadline.at
