@@ -2,6 +2,7 @@
 compare. The clock is that of the test; work is counted, not timed."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,13 @@ from scipy.spatial.transform import Rotation
 from bpnp import Solution, solve, solve_many, verify
 from bpnp.runtime import Clock, Deadline
 from bpnp.search import matching
-from bpnp.search.config import MATCHES
+from bpnp.search.config import DEFAULT, MATCHES, TIME
+from bpnp.search.hypotheses import Hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.inputs import problem_from
 from bpnp.search.matching import count_one_to_one, one_to_one
+from bpnp.search.problem import Problem
+from bpnp.search.refine import annealing
+from bpnp.search.search_frame import Scene
 from bpnp.search.solvers import _proposals_of_matcher
 
 K = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])
@@ -231,3 +236,30 @@ def test_an_ending_leaves_the_search_half_of_the_time() -> None:
     assert past.unfinished == {"search"}
     assert not Deadline().before(10.0).passed()
     assert Deadline().share(0.5).at == np.inf
+
+
+@pytest.mark.parametrize(("seconds", "fits"), [(1.0, False), (0.001, True)])
+def test_an_annealing_on_many_points_is_begun_only_if_it_ends_in_time(
+    seconds: float, fits: bool, clock: MovedClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A step takes so many seconds of 2.5; the steps after it would take more than one of them."""
+    monkeypatch.setattr(annealing, "TIME", replace(TIME, timed_pairs=0))
+    points, pixels, turn = scene_and_pixels(60)
+    rays = np.column_stack([(pixels - K[:2, 2]) / K[0, 0], np.ones(60)])
+    problem = Problem.of(rays / np.linalg.norm(rays, axis=1, keepdims=True), points)
+    scene = Scene(problem, 0, DEFAULT, Deadline.after(2.5))
+    problem_turn, shift = problem.from_user(turn, np.array([0, 0, 5.0]))
+    start = to_scene_frame(Hypotheses.from_poses(problem_turn[None], shift[None]), scene)
+    start = annealing.anneal_on_points(scene, start, 0.05)
+    whole = list[bool]()
+
+    def step(original: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+        clock.time += seconds
+        whole.append(options.get("steps") is None)
+        return original(*arguments, **options)
+
+    clock.wrap("search.refine.annealing.anneal_on_points", step)
+    ended = annealing.finish(scene, start)
+    assert degrees_between(to_problem_frame(ended, scene).rotation[0], problem_turn) < 1
+    assert any(whole) == fits
+    assert not whole[0]
