@@ -61,8 +61,7 @@ def main(args: Sequence[str] | None = None) -> None:
         if not {"", folder := _working_folder()} & set(sys.path):
             sys.path.append(folder)  # for the user's own classes; last, so that they hide no module
         _run(arguments)
-        if sys.stdout is not None:  # it is None where the shell closed it
-            sys.stdout.flush()
+        _flush_output()
     except Exception as error:
         if isinstance(error, BrokenPipeError) and _has_no_reader(sys.stdout):
             _discard_output()
@@ -75,13 +74,18 @@ def main(args: Sequence[str] | None = None) -> None:
         text = plain(str(error)) or "there is too little memory for this command; give it less data"
         print(f"bpnp: error: {text}".encode("utf-8", "replace").decode(), file=sys.stderr)
         try:
-            if sys.stdout is not None:
-                sys.stdout.flush()
+            _flush_output()
         except OSError:  # as on a full disk
             _discard_output()
         raise SystemExit(2) from None
     except KeyboardInterrupt:
         _end_interrupted(arguments)
+
+
+def _flush_output() -> None:
+    """Flush standard output, which is None where the shell closed it."""
+    if sys.stdout is not None:
+        sys.stdout.flush()
 
 
 def _discard_output() -> None:

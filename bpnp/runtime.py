@@ -187,7 +187,7 @@ class Deadline:
         """Return a copy that leaves some seconds, at most half of the time that is left, for the ending."""
         begun = Clock.now()
         at = max(self.at - ending, (begun + self.at) / 2) if self.at > begun else self.at
-        return replace(self, at=at, end=self.at if self.end is None else self.end)
+        return replace(self, at=at, end=self.final)
 
     def share(self, fraction: float) -> "Deadline":
         """Return a copy for the search that may take a fraction of the time that is left."""
