@@ -243,7 +243,7 @@ def test_an_annealing_on_many_points_is_begun_only_if_it_ends_in_time(
     seconds: float, fits: bool, clock: MovedClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A step takes so many seconds of 2.5; the steps after it would take more than one of them."""
-    monkeypatch.setattr(annealing, "TIME", replace(TIME, timed_pairs=0))
+    monkeypatch.setattr(annealing, "TIME", replace(TIME, timed_pairs=0.0))
     points, pixels, turn = scene_and_pixels(60)
     rays = np.column_stack([(pixels - K[:2, 2]) / K[0, 0], np.ones(60)])
     problem = Problem.of(rays / np.linalg.norm(rays, axis=1, keepdims=True), points)
