@@ -206,7 +206,7 @@ class FocalSweep(ABC):
         unknown: Camera with an unknown focal length.
         options: Options of the searches.
         constants: Constants of the sweep.
-        deadline: Deadline of the sweep; None before it.
+        deadline: Deadline of the sweep; none before it.
         ends: Final solution of each focal length so far.
     """
 

@@ -65,7 +65,7 @@ def finished(
     matched = float(found.match_count[0])
     linear = None if result.verdict == "failed" else linearised(problem, *poses[0], result.residual)
     solution = add_pose(
-        replace(failed, inlier_threshold=math.nan),
+        failed,
         result,
         replace(found, rotation=rotation, translation=translation),
         counts,

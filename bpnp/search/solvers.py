@@ -40,7 +40,7 @@ class Options(NamedTuple):
         inlier_threshold: Largest reprojection error of a match; None for the default.
         clutter: Expected outlier fraction; None if it is unknown.
         seed: Seed of the search, default 0.
-        time_limit: Seconds per problem, of which reasons speak; None for no limit.
+        time_limit: Seconds per problem, which the reasons state; None for no limit.
         device: Device of the modules; None for that of each module.
         progress: Callback with (problem index, batches of initial poses, seconds).
         settings: Settings of the search.
@@ -117,9 +117,23 @@ def solve_problems(problems: Mapping[int, Problem], options: Options) -> dict[in
     return solutions | {i: _by_search(i, problem, options) for i, problem in solvable.items()}
 
 
-def may_be_decided(result: SearchResult) -> bool:
-    """Return True if more time may change a verdict."""
-    return result.verdict != "confident" and (not result.settled or result.code in reasons.UNTESTED)
+def at_deadline(result: SearchResult, options: Options, deadline: Deadline, seconds: float) -> SearchResult:
+    """Return the result of a search, which its deadline may have cut short; the reason and the deadline then note it.
+
+    Args:
+        result: Result of the search.
+        options: Options of the search.
+        deadline: Its deadline.
+        seconds: Time that it took, which the reason states without a time limit.
+    """
+    may_be_decided = result.verdict != "confident" and (not result.settled or result.code in reasons.UNTESTED)
+    if not (may_be_decided and deadline.passed()):
+        return result
+    if not result.settled:
+        deadline.unfinished.add(reasons.Unfinished.search)
+    if options.is_part:
+        return result
+    return replace(result, reason=reasons.undecided(result.reason, options.time_limit or seconds))
 
 
 def _by_search(i: int, problem: Problem, options: Options) -> Solution:
@@ -135,11 +149,7 @@ def _by_search(i: int, problem: Problem, options: Options) -> Solution:
         progress=options.progress_of(i),
     )
     seconds = time.perf_counter() - start
-    if deadline.passed() and may_be_decided(result):
-        if not result.settled:
-            deadline.unfinished.add(reasons.Unfinished.search)
-        if not options.is_part:
-            result = replace(result, reason=reasons.undecided(result.reason, options.time_limit or seconds))
+    result = at_deadline(result, options, deadline, seconds)
     if result.verdict == "failed" and mirrored_alarms(problem, deadline) <= options.settings.evidence.false_alarms:
         result = replace(result, reason=f"{result.reason}; {reasons.MIRRORED}")
     return finished(problem, result, seconds, options.inlier_threshold, deadline)

@@ -21,11 +21,10 @@ from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.rig.cameras import Pose, Rig
 from bpnp.search.rig.search import search_rig
 from bpnp.search.solution import FOCAL_LENGTH, POSE_PARAMETERS, SCALE, Solution, add_pose
-from bpnp.search.solvers import Options, ending_seconds, may_be_decided
+from bpnp.search.solvers import Options, at_deadline, ending_seconds
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
 from bpnp.search.verdict.covariance import student_factor
 from bpnp.search.verdict.decide import SearchResult, no_pose
-from bpnp.search.verdict.reasons import Unfinished, undecided
 
 
 def prepare_rig(
@@ -165,11 +164,7 @@ def _solve(rig: Rig, options: Options) -> Solution:
             settings=options.settings,
             progress=options.progress_of(0),
         )
-        if deadline.passed() and may_be_decided(result):
-            if not result.settled:
-                deadline.unfinished.add(Unfinished.search)
-            if not options.is_part and options.time_limit is not None:
-                result = replace(result, reason=undecided(result.reason, options.time_limit))
+        result = at_deadline(result, options, deadline, Clock.now() - begun)
     solution = with_unfinished(_finished(rig, rig.problems, result, options.inlier_threshold, deadline), deadline)
     return replace(solution, seconds=Clock.now() - begun)
 
