@@ -23,7 +23,7 @@ from bpnp.report.points import ProblemPoints, points_from, write_points
 from bpnp.report.results import SUMMARY, ProblemRow, rows_from, write_results
 from bpnp.report.tables import read_runs, results_table
 from bpnp.report.terminal import console, say
-from bpnp.training.predictions import gather_objects
+from bpnp.training.predictions import folder_of_loader, gather_objects
 from bpnp.training.task import WARMUP, BlindPnPTask, number_globally
 from bpnp.types import Batch, Prediction, map_tensors
 
@@ -368,7 +368,7 @@ class ResultsWriter(Callback):
             self._write_test(trainer, [self.tested], complete=False)
 
     def _write_test(self, trainer: Trainer, gathered: Sequence[list[TestedProblems]], *, complete: bool) -> None:
-        """Write the files of each loader, of which every process has a part, and print their table."""
+        """Write the files of each loader from the parts of all processes, and print their table."""
         if not trainer.is_global_zero or trainer.fast_dev_run:  # type: ignore[attr-defined]
             return
         top, folders, count = self._folder(trainer), list[Path](), 0
@@ -378,7 +378,7 @@ class ResultsWriter(Callback):
             losses = {index: loss for part in parts for index, loss in part.losses.items()}
             mean = sum(losses[i] for i in sorted(losses)) / len(losses) if losses else None
             if rows:
-                folders.append(top / f"dataloader_idx_{loader}" if len(self.tested) > 1 else top)
+                folders.append(folder_of_loader(top, loader, len(self.tested)))
                 count += len({row.index for row in rows})
                 write_results(folders[-1], rows, correspondence_loss=mean, settings={**settings, "complete": complete})
                 write_points(folders[-1], (problem for part in parts for problem in part.points))

@@ -78,6 +78,11 @@ def pose_rows(prediction: Prediction) -> list[PoseRow]:
     return rows
 
 
+def folder_of_loader(folder: Path, loader: int, count: int) -> Path:
+    """Return the folder of the files of one of `count` loaders: with several, each has its own, named as in metrics."""
+    return folder / f"dataloader_idx_{loader}" if count > 1 else folder
+
+
 class PredictionWriter(BasePredictionWriter):
     """Write the poses of a prediction atomically when it ends, sorted by problem.
 
@@ -104,8 +109,8 @@ class PredictionWriter(BasePredictionWriter):
             trainer: Trainer of the prediction, whose default_root_dir is the default folder.
             loader: Index of the loader. Default: 0.
         """
-        part = f"dataloader_idx_{loader}" if len(trainer.num_predict_batches) > 1 else ""
-        return Path(self.folder or trainer.default_root_dir, part, f"predictions.{self.format}")
+        folder = Path(self.folder or trainer.default_root_dir)
+        return folder_of_loader(folder, loader, len(trainer.num_predict_batches)) / f"predictions.{self.format}"
 
     def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Raise ValueError if the file exists and must not be replaced."""
