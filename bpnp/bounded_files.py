@@ -1,6 +1,6 @@
 """Bounded reading of files from elsewhere: bytes, text, JSON, YAML and NumPy arrays.
 
-The readers refuse what has no end or claims more than it holds, before memory is allocated for it.
+The readers refuse what has no end or states more than it holds, before memory is allocated for it.
 """
 
 import io
@@ -37,7 +37,7 @@ def open_input(path: Path, *, pipes: bool = True) -> Iterator[io.BufferedReader]
         pipes: Accept a pipe and a terminal. Default True.
 
     Raises:
-        ValueError: The path is a folder, a device, a socket, or a pipe that nobody writes to.
+        ValueError: The path is a folder, a device, a socket, or a pipe without a writer.
         OSError: It does not exist, or cannot be read.
     """
     found = path.stat()
@@ -96,7 +96,7 @@ def _first_bytes(descriptor: int, path: Path) -> bytes:
         if first:
             return first
         if time.monotonic() > deadline:
-            raise ValueError(f"nobody writes to the pipe {path}; start the program that writes to it, or give a file")
+            raise ValueError(f"no program writes to the pipe {path}; start the one that does, or give a file")
         time.sleep(0.02)
 
 
@@ -331,8 +331,8 @@ def check_size(name: str, shape: tuple[int, ...], dtype: np.dtype[Any], most: in
         raise ValueError(f"{name} states the shape {shape}")
     if (needed := math.prod(shape) * dtype.itemsize) > most:
         raise ValueError(
-            f"{name} states {dtype} of shape {shape}, {needed} bytes, of which there are at most {max(most, 0)}; the "
-            "file is truncated or damaged"
+            f"{name} states {dtype} of shape {shape}, {needed} bytes, and there are at most {max(most, 0)}; the file "
+            "is truncated or damaged"
         )
 
 

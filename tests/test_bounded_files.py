@@ -45,7 +45,7 @@ def array_file(shape: tuple[int, ...], descr: str = "<f8", body: bytes = bytes(4
             r"states float64 of shape \(1000000000000, 3\), 24000000000000 bytes, .* at most 480",
         ),
         (array_file((5 * 10**8, 3)), "12000000000 bytes"),
-        (array_file((61, 1)), "488 bytes, of which there are at most 480"),
+        (array_file((61, 1)), "488 bytes, and there are at most 480"),
         (array_file((-1, 3)), r"states the shape \(-1, 3\)"),
         (b"\x93NUMPY\x02\x00\xff\xff\xff\xff{" + b"(" * 9000, "no .npy file"),
         (b"\x93NUMPY\x01\x00", "no .npy file"),
@@ -94,7 +94,7 @@ def test_what_has_no_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (Path("/dev/zero"), "/dev/zero is a device; give a file"),
         (tmp_path / "link.csv", "link.csv is a device"),
         (tmp_path, "is a folder; give a file"),
-        (tmp_path / "pipe", "nobody writes to the pipe .*pipe; start the program that writes to it, or give a file"),
+        (tmp_path / "pipe", "no program writes to the pipe .*pipe; start the one that does, or give a file"),
         (tmp_path / "large", "large has more than the 128 MiB that are read of such a file"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -27,7 +27,7 @@ NAME_COLUMNS = "remove it, or name the columns in the first line, such as"
 IMAGE_COLUMNS = (("x", "y", "z"), ("x", "y"), ("u", "v"))
 STANDARD_INPUT = Path("-")
 NUMPY = b"\x93NUMPY"  # first bytes of a .npy file
-FEW_ROWS = 3  # an index column has at least so many rows
+FEW_ROWS = 3  # least number of rows of an index column
 LARGEST_LABEL = 2**53  # larger integers are not exact in float64
 
 

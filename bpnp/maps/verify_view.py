@@ -30,7 +30,7 @@ def verify_pose(
         view: View with the pose.
         place: All points of the map without the view.
         regions: Returns the regions of this map, ranked for keypoints (k, 2).
-        time_limit: Seconds, of which `verify_problem` takes half at most; math.inf for no limit.
+        time_limit: Seconds, at most half of them for `verify_problem`; math.inf for no limit.
 
     Raises:
         ValueError: There are fewer than 4 keypoints, or fewer than 4 map points in view.

@@ -49,7 +49,7 @@ def test_a_binary_cloud_with_normals_and_padding_is_read(tmp_path: Path) -> None
         (header() + END.format(4, "ascii") + "1 2 3 4\n", "its header states 4 points, and it has 1 rows"),
         (header() + END.format(1, "ascii") + "1 2 3\n", "its rows have 3 numbers, and its header states 4"),
         (header() + END.format(1, "ascii") + "1 2 3 x\n", "its rows are not 4 numbers each"),
-        (header() + END.format(999999999, "binary") + "1234", "15999999984 bytes, of which there are at most 4"),
+        (header() + END.format(999999999, "binary") + "1234", "15999999984 bytes, and there are at most 4"),
         (header() + END.format(10**15, "binary") + "1234", "SIZE, TYPE, COUNT or POINTS hold something else"),
         (header() + END.format(1, "binary_compressed"), "its data are binary_compressed; write them as ascii"),
         (header("a b c label") + END.format(1, "ascii") + "1 2 3 4\n", "it needs the fields x, y, z; its fields are a"),

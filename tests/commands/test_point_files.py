@@ -342,24 +342,43 @@ def test_an_index_column_is_left_out_where_it_is_one(tmp_path: Path) -> None:
     np.testing.assert_array_equal(points_of(path), POINTS)
 
 
-def test_a_column_that_may_be_an_index_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("read", "text", "message"),
+    [
+        (  # millimetres, or a row of labelled points
+            read_points3d,
+            "1 0 0 0\n2 30 0 0\n3 0 30 5\n4 30 30 0\n",
+            "a.txt counts its rows, and may be x or an index; .* such as `x y z label` or `index x y z`",
+        ),
+        (
+            read_points2d,
+            "0 1.5 2.5 3\n1 2.5 3.5 3\n2 3.5 4.5 3\n",
+            "a.txt counts its rows; remove it, or name the columns .* `index x y`",
+        ),
+        (
+            read_points2d,
+            "7 120.5 80\n12 121 90\n33 300 7\n",
+            "has 3 columns, which are read as unit bearings, .* `index x y`",
+        ),
+        (
+            read_points3d,
+            "7 1.5 8 2.5\n12 1 2 3\n",
+            "label of .*a.txt holds 2.5; labels are integers; if a column without a name",
+        ),
+        (
+            read_points2d,
+            "photo\n1\n1 2\n2\n3 4\n",
+            "has rows of 1 and of 2 columns, such as '1' and '1 2'; .* the same, x, y$",
+        ),
+    ],
+)
+def test_columns_that_may_mean_two_things_are_named(
+    read: Callable[[Path], object], text: str, message: str, tmp_path: Path
+) -> None:
     path = tmp_path / "a.txt"
-    path.write_text("1 0 0 0\n2 30 0 0\n3 0 30 5\n4 30 30 0\n")  # millimetres, or a row of labelled points
-    message = "a.txt counts its rows, and may be x or an index; .* such as `x y z label` or `index x y z`"
+    path.write_text(text)
     with pytest.raises(ValueError, match=message):
-        read_points3d(path)
-    path.write_text("0 1.5 2.5 3\n1 2.5 3.5 3\n2 3.5 4.5 3\n")
-    with pytest.raises(ValueError, match="a.txt counts its rows; remove it, or name the columns .* `index x y`"):
-        read_points2d(path)
-    path.write_text("7 120.5 80\n12 121 90\n33 300 7\n")
-    with pytest.raises(ValueError, match="has 3 columns, which are read as unit bearings, .* `index x y`"):
-        read_points2d(path)
-    path.write_text("7 1.5 8 2.5\n12 1 2 3\n")
-    with pytest.raises(ValueError, match="label of .*a.txt holds 2.5; labels are integers; if a column without a name"):
-        read_points3d(path)
-    path.write_text("photo\n1\n1 2\n2\n3 4\n")
-    with pytest.raises(ValueError, match="has rows of 1 and of 2 columns, such as '1' and '1 2'; .* the same, x, y$"):
-        read_points2d(path)
+        read(path)
 
 
 @pytest.mark.parametrize("name", ["a.csv", "a.npy", "a.pcd", "a.ply", "a.txt"])
