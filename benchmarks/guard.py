@@ -6,9 +6,11 @@
 Kinds: shapes and meshes, photos against one view and in their maps, LEDs, near-symmetric devices, symmetric objects,
 unknown focal lengths, unrelated points, and `verify`. The file has verdict, errors, CPU seconds and pose of every
 problem. With --against, a line for each kind has the paired differences: the geometric mean of the ratios of the CPU
-seconds, the confident verdicts that were gained and lost, and the number of poses that differ by more than 2 degrees or
-a twentieth of the translation. The exit status is 1 if a kind has fewer successes, more poses that are confident and
-wrong, or more than 1.15 times the CPU seconds. --limit: problems of each kind.
+seconds, the confident verdicts that were gained and lost, the number of poses that differ by more than 2 degrees or a
+twentieth of the translation, and the number of answers that changed at all. An answer is unchanged if verdict and
+reason are equal and the pose is equal to 1e-9 of its size. The exit status is 1 if a kind has fewer successes, more
+poses that are confident and wrong, or more than 1.1 times the CPU seconds; with --exact, for code that only moves, also
+if an answer changed. --limit: problems of each kind.
 """
 
 import argparse
@@ -31,8 +33,10 @@ from view_problems import photos
 
 import bpnp
 
-MOST_CPU = 1.15
+MOST_CPU = 1.1
+EQUAL = 1e-9  # relative difference of two poses that are equal
 OTHER_DEG, OTHER_SHIFT = 2.0, 0.05  # of different poses; the shift relative to the translation
+SHOWN = 5  # names of changed problems in a line
 ANSWER = ("rotation", "translation")
 Draw = Callable[[argparse.Namespace], Iterable[Problem]]
 
@@ -116,7 +120,7 @@ KINDS: dict[str, Draw] = {
 }
 
 
-def compare(row: Row, found: Sequence[Outcome], before: Sequence[Outcome]) -> tuple[str, bool]:
+def compare(row: Row, found: Sequence[Outcome], before: Sequence[Outcome], *, exact: bool = False) -> tuple[str, bool]:
     """Return the paired comparison of a kind with an earlier run, and whether the kind is held."""
     earlier = {outcome.problem: outcome for outcome in before}
     pairs = [(outcome, earlier[outcome.problem]) for outcome in found if outcome.problem in earlier]
@@ -130,8 +134,12 @@ def compare(row: Row, found: Sequence[Outcome], before: Sequence[Outcome]) -> tu
     right = sum(map(row.is_right, new)) - sum(map(row.is_right, old))
     wrong = sum(map(row.is_confident_and_wrong, new)) - sum(map(row.is_confident_and_wrong, old))
     other = sum(differs(a, b) for a, b in pairs)
-    text = f"CPU {ratio:.2f}, right {right:+d}, wrong {wrong:+d}, confident +{gained} -{lost}, {other} other poses"
-    return text, right >= 0 and wrong <= 0 and ratio <= MOST_CPU
+    changed = [outcome.problem for outcome, earlier in pairs if is_changed(outcome, earlier)]
+    text = (
+        f"CPU {ratio:.2f}, right {right:+d}, wrong {wrong:+d}, confident +{gained} -{lost}, {other} other poses, "
+        f"{len(changed)} of {len(pairs)} answers changed{': ' * bool(changed)}{', '.join(changed[:SHOWN])}"
+    )
+    return text, right >= 0 and wrong <= 0 and ratio <= MOST_CPU and not (exact and changed)
 
 
 def differs(one: Outcome, other: Outcome) -> bool:
@@ -141,6 +149,16 @@ def differs(one: Outcome, other: Outcome) -> bool:
         return False
     moved = np.linalg.norm(translations[0] - translations[1]) / np.linalg.norm(translations[1])
     return degrees(*rotations) > OTHER_DEG or bool(moved > OTHER_SHIFT)
+
+
+def is_changed(one: Outcome, other: Outcome) -> bool:
+    """Return True if verdict or reason of two answers differ, or their poses by more than `EQUAL` of their size."""
+    poses = (np.array([getattr(each, name) for each in (one, other)]) for name in ANSWER)
+    equal = all(
+        np.array_equal(*np.isnan(pose)) and not (np.abs(pose[0] - pose[1]) > EQUAL * np.abs(pose[1]).max()).any()
+        for pose in poses
+    )
+    return (one.verdict, one.reason) != (other.verdict, other.reason) or not equal
 
 
 def read_outcomes(file: Path) -> dict[str, list[Outcome]]:
@@ -158,6 +176,7 @@ def main() -> None:
     options = parser(__doc__)
     options.set_defaults(time_limit=10.0)
     options.add_argument("--against", type=Path, help="file of an earlier run")
+    options.add_argument("--exact", action="store_true", help="a changed answer is a failure too")
     chosen = options.parse_args()
     before: dict[str, list[Outcome]] = {}
     if chosen.against:
@@ -170,7 +189,7 @@ def main() -> None:
     held = True
     for row, found in run(rows(chosen), chosen):
         if chosen.against:
-            text, good = compare(row, found, before.get(row.name, []))
+            text, good = compare(row, found, before.get(row.name, []), exact=chosen.exact)
             print(f"{row.name}: {text}{'' if good else ' NOT HELD'}")
             held &= good
     raise SystemExit(not held)

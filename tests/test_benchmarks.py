@@ -481,6 +481,25 @@ def test_the_guard_notices_a_lost_pose_a_wrong_one_and_slower_code() -> None:
     assert guard.compare(row, [one], []) == ("no problem in common", False)
 
 
+def test_the_guard_notices_any_changed_answer_if_code_only_moves() -> None:
+    row, turn = record.Row("kind", list, 3.0, right_moved=0.1), Rotation.from_rotvec([0.1, 0.2, 0.3]).as_matrix()
+    one = record.Outcome("a", 1.0, 0.0, "confident", 1.0, rotation=turn.tolist(), translation=[0.0, 3, -400])
+    failed = replace(one, problem="b", rotation=np.full((3, 3), np.nan).tolist(), translation=[np.nan] * 3)
+    nearer = replace(one, translation=[1e-7, 3, -400])
+    assert guard.compare(row, [one, failed], [nearer, failed], exact=True)[1]
+    turned = Rotation.from_rotvec([0, 0, 1e-8]).as_matrix() @ turn
+    changes = ({"translation": [0.0, 3, -400.001]}, {"rotation": turned.tolist()}, {"reason": "x"})
+    for other in (
+        replace(failed, problem="a"),
+        replace(one, verdict="ambiguous"),
+        *(replace(one, **change) for change in changes),
+    ):
+        text, held = guard.compare(row, [other], [one], exact=True)
+        assert not held
+        assert "1 of 1 answers changed: a" in text
+        assert guard.compare(row, [replace(one, **changes[0])], [one])[1]
+
+
 def test_the_guard_compares_a_file_that_it_wrote(tmp_path: Path, monkeypatch, capsys) -> None:
     """Problems of a kind have different names, as they are paired by name, and the time limit of the command."""
     options = SimpleNamespace(limit=20, seed=3, time_limit=4.0, data=tmp_path)
