@@ -125,7 +125,8 @@ def frame(device: Device, setting: Setting, rng: np.random.Generator) -> Frame |
     pointing = camera_from(camera.model)
     for _ in range(MOST_POSES):
         rotation = Rotation.random(random_state=rng.integers(2**31)).as_matrix()
-        towards = pointing.bearings(camera.size / 2 * (1 + OFF_AXIS * rng.uniform(-1, 1, (1, 2))))[0]
+        towards = np.r_[pointing.normalise(camera.size / 2 * (1 + OFF_AXIS * rng.uniform(-1, 1, (1, 2))))[0], 1]
+        towards /= np.linalg.norm(towards)
         translation = rng.uniform(*DISTANCE) * towards
         led, pixels = seen(device, setting, rotation, translation, rng)
         if len(led) < setting.least:

@@ -192,7 +192,7 @@ def beyond_bound(found: Solution, pose: Pose) -> bool:
 
 
 def sigmas(found: Solution, pose: Pose, centroid: Array) -> list[float]:
-    """Return the errors along three or six independent directions, in their standard deviations by the covariance.
+    """Return the errors along six independent directions, in their standard deviations by the covariance.
 
     The directions of the rotation come first. The shift is that of the centroid of the scene (3,), because far from it
     a rotation moves points by more than its first order. The list is empty for a solution without a covariance.
@@ -200,15 +200,13 @@ def sigmas(found: Solution, pose: Pose, centroid: Array) -> list[float]:
     (rotation, translation), rotated = pose, found.rotation @ centroid
     if not (np.isfinite(found.covariance).all() and np.isfinite(rotation).all()):
         return []
-    size = 3 if len(found.covariance) < 6 else 6  # of directions the rotation alone; a focal length is the last one
     moved = np.eye(6)
     moved[3:, :3] = np.cross(np.eye(3), rotated).T  # w x (R m)
-    moved = moved[:size, :size]
-    covariance = moved @ found.covariance[:size, :size] @ moved.T
+    covariance = moved @ found.covariance[:6, :6] @ moved.T  # an unknown focal length is the last one
     shift = rotation @ centroid + translation - rotated - found.translation
-    error = np.r_[Rotation.from_matrix(rotation @ found.rotation.T).as_rotvec(), shift][:size]
+    error = np.r_[Rotation.from_matrix(rotation @ found.rotation.T).as_rotvec(), shift]
     unit = 1 / np.sqrt(np.maximum(np.diag(covariance), 1e-300))  # radians and units of the scene differ by decades
-    scaled = covariance * np.outer(unit, unit) + 1e-12 * np.eye(size)
+    scaled = covariance * np.outer(unit, unit) + 1e-12 * np.eye(6)
     return np.linalg.solve(np.linalg.cholesky(scaled), error * unit).tolist()
 
 

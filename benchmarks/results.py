@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 import bench_rigs
-import bench_stars
 import leds
 import numpy as np
 import record
@@ -44,7 +43,7 @@ from bpnp.models.weights import checkpoint_path
 
 FILE = ROOT / "benchmarks" / "results.json"
 SEED, NETWORKS_SEED, RELIABILITY_SEED, QUICK_SEED = 1711, 506, 1811, 9
-DOCUMENTS = (ROOT / "README.md", *(ROOT / "docs" / f"{name}.md" for name in ("results", "solve", "stars", "verdict")))
+DOCUMENTS = (ROOT / "README.md", *(ROOT / "docs" / f"{name}.md" for name in ("results", "solve", "verdict")))
 COLUMNS = ("data", "problems", "rotation, deg (quartiles)", "success", "confident", "confident but wrong", "CPU s")
 # What may differ between two runs of a row, on another machine and with other libraries: problems that are right or
 # confident, and the ratio of the median errors where one exceeds FLOOR_DEG.
@@ -204,11 +203,6 @@ ROWS = (
         Row("rigs", name, partial(of_benchmark, bench_rigs.rows, name), (60, 3), bench_rigs.RIGHT_DEG)
         for name in ("LEDs, one camera", "LEDs, 2 cameras", "LEDs, 4 cameras", "LEDs, 2 cameras, scale unknown",
                      "LEDs, 4 cameras, scale unknown")
-    ),
-    *(
-        Row("stars", f"{count:,} stars, {field:.0f} deg",
-            partial(of_benchmark, bench_stars.rows, f"{count}, {field:.0f} deg"), (170, 4), bench_stars.RIGHT_DEG)
-        for count in bench_stars.CATALOGUES for field in bench_stars.FIELDS
     ),
     Row("networks", "`procedural-euler`, PSB meshes, the paper's protocol",
         pretrained("procedural-euler", {"root": "psb", "rotation": "euler"}), (100, 3), *PAPER, "psb",

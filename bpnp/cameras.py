@@ -40,7 +40,6 @@ RADIAL: dict[str, tuple[list[int], list[int]]] = {
 # Models whose image radius at the angle t from the axis is t (1 + k1 t^2 + ...), but for tangential and thin-prism
 # distortion, and which see no point at 90 degrees or beyond: indices of the parameters k1, k2, ...
 NARROW_FISHEYE = {"THIN_PRISM_FISHEYE": [4, 5, 8, 9], "RAD_TAN_THIN_PRISM_FISHEYE": [4, 5, 6, 7, 8, 9]}
-EDGES, STEPS = 1024, 5  # table of fisheye angles, and Newton steps from a table entry to full precision
 CENTRE = 0.5  # centre of the first pixel in COLMAP's coordinates; it is 0 in OpenCV's and hloc's
 SLACK, FEW_OUTSIDE = 0.01, 0.02  # margin around an image in larger sides; fraction of points allowed beyond it
 WIDEST = 10.0  # normalised image coordinates; 84 degrees off the axis
@@ -65,10 +64,6 @@ class Pinhole:
     def normalise(self, pixels: Array) -> Array:
         """Convert pixels (k, 2) to normalised image coordinates (k, 2)."""
         return np.asarray((pixels - self.matrix[:2, 2]) @ np.linalg.inv(self.matrix[:2, :2]).T, np.float64)
-
-    def bearings(self, pixels: Array) -> Array:
-        """Return the unit viewing rays (k, 3) of pixels (k, 2)."""
-        return _of_length_one(np.column_stack([self.normalise(pixels), np.ones(len(pixels))]))
 
     def project(self, points: Array) -> Array:
         """Project points (k, 3) in camera coordinates to pixels (k, 2); NaN unless z > 0."""
@@ -132,28 +127,6 @@ class Lens:
         with np.errstate(invalid="ignore"):
             good = np.linalg.norm(back - pixels, axis=-1) < ROUND_TRIP
         return np.where(good[:, None], points, np.nan)
-
-    def bearings(self, pixels: Array) -> Array:
-        """Return the unit viewing rays (k, 3) of pixels (k, 2), NaN where there are none.
-
-        Rays of a fisheye reach up to 180 degrees off its axis.
-        """
-        if (fisheye := self._fisheye) is None:
-            return _of_length_one(np.column_stack([self.normalise(pixels), np.ones(len(pixels))]))
-        distance, widest = fisheye.distance, fisheye.widest
-        slope = distance.deriv()
-        distorted = (pixels - fisheye.centre) / fisheye.focals
-        radius = np.linalg.norm(distorted, axis=-1)
-        edges = np.linspace(0, widest, EDGES)
-        rising = distance(edges)
-        k = np.clip(np.searchsorted(rising, radius) - 1, 0, EDGES - 2)
-        angle = edges[k]
-        for _ in range(STEPS):  # Newton steps, kept between two table entries
-            angle += (radius - distance(angle)) / np.maximum(slope(angle), np.finfo(float).tiny)
-            angle = np.clip(angle, edges[k], edges[k + 1])
-        angle = np.where(radius <= rising[-1], angle, np.nan)
-        transverse = distorted * (np.sin(angle) / np.maximum(radius, np.finfo(float).tiny))[:, None]
-        return np.column_stack([transverse, np.cos(angle)])
 
     def project(self, points: Array) -> Array:
         """Project points (k, 3) in camera coordinates to pixels (k, 2); NaN unless z > 0.
@@ -226,10 +199,6 @@ def _first_root(polynomial: np.polynomial.Polynomial) -> float:
     """Return the first positive root of a polynomial, infinity if it has none."""
     roots = polynomial.trim().roots()
     return float(min(roots.real[(abs(roots.imag) < 1e-9) & (roots.real > 0)], default=np.inf))
-
-
-def _of_length_one(rays: Array) -> Array:
-    return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
 
 
 def in_front(points: Array) -> Array:

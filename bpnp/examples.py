@@ -16,11 +16,10 @@ from bpnp.cameras import import_pycolmap
 from bpnp.datamodules.shapes import procedural_shape, sample_surface
 from bpnp.datamodules.synthetic_maps.maps import LONG_SIDE, MapOptions, draw_map_problem
 
-Kind = Literal["mesh", "photo", "leds", "stars"]
+Kind = Literal["mesh", "photo", "leds"]
 CAMERA = np.array([[800.0, 0.0, 640.0], [0.0, 800.0, 480.0], [0.0, 0.0, 1.0]])  # images of 1280 x 960 pixels
 NOISE_PX = 0.5
 LEDS, LIGHTS = 17, 3
-CATALOGUE, STARS, FALSE_STARS = 500, 42, 18
 PHOTO_CAMERA = ("PINHOLE", 640, 480, (560.0, 560.0, 320.0, 240.0))  # COLMAP's model, size and parameters in pixels
 HOUSES_APART, WRONG_IMAGE = 40.0, "07.jpg"  # distance of the houses of `draw_map`, metres; image with a wrong pose
 TEXELS = 80.0  # texels per metre of a texture, about the resolution of the photos
@@ -41,7 +40,7 @@ class Example:
 
     Attributes:
         points2d: Image points (m, 2), pixels.
-        points3d: Scene points (n, 3), or unit directions (n, 3).
+        points3d: Scene points (n, 3).
         camera: K (3, 3), pixels.
         rotation: True R (3, 3), camera = R p + t.
         translation: True t (3,), scene units.
@@ -84,10 +83,9 @@ def load(kind: Kind | str, *, seed: int = 0) -> Example:
     - "mesh": 200 points on a shape, all of them visible, seen from any side.
     - "photo": keypoints of a photo and points of a map; a third of them have no correspondence.
     - "leds": the LEDs that face the camera of 17 LEDs on a ring, with their normals, and 3 background lights.
-    - "stars": 42 of 500 catalogue directions and 18 false stars. `points3d` are unit vectors, for `at_infinity=True`.
 
     Args:
-        kind: Kind of problem: "mesh", "photo", "leds" or "stars".
+        kind: Kind of problem: "mesh", "photo" or "leds".
         seed: Random seed, default 0; the same seed gives the same problem.
 
     Returns:
@@ -103,7 +101,7 @@ def load(kind: Kind | str, *, seed: int = 0) -> Example:
     if kind not in get_args(Kind):
         raise ValueError(f"there is no example {kind!r}; the examples are {', '.join(get_args(Kind))}")
     rng = np.random.default_rng(seed)
-    return {"mesh": _mesh, "photo": _photo, "leds": _leds, "stars": _stars}[kind](rng)
+    return {"mesh": _mesh, "photo": _photo, "leds": _leds}[kind](rng)
 
 
 def _mesh(rng: np.random.Generator) -> Example:
@@ -137,17 +135,6 @@ def _leds(rng: np.random.Generator) -> Example:
     pixels = _pixels(points[facing], rotation, translation) + rng.normal(0, NOISE_PX, (facing.sum(), 2))
     lights = rng.uniform(pixels.min(0) - 40, pixels.max(0) + 40, (LIGHTS, 2))
     return Example(rng.permutation(np.concatenate([pixels, lights])), points, CAMERA, rotation, translation, normals)
-
-
-def _stars(rng: np.random.Generator) -> Example:
-    directions = rng.standard_normal((CATALOGUE, 3))
-    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    rotation, size = Rotation.from_quat(rng.standard_normal(4)).as_matrix(), 2 * CAMERA[:2, 2]
-    front = directions[(directions @ rotation.T)[:, 2] > 0]
-    pixels = _pixels(front, rotation, np.zeros(3))
-    stars = rng.permutation(pixels[((pixels > 1) & (pixels < size - 1)).all(-1)])[:STARS]
-    lights = np.concatenate([stars + rng.normal(0, NOISE_PX / 2, stars.shape), rng.uniform(0, size, (FALSE_STARS, 2))])
-    return Example(rng.permutation(np.clip(lights, 0, size)), directions, CAMERA, rotation, np.zeros(3))
 
 
 def _pixels(points: Any, rotation: Any, translation: Any) -> Any:

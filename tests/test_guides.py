@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 # Of the other pages, data.md has a test of its own, and maps.md needs photos.
-RUN = ("index", "layers", "model-card", "report", "solve", "stars", "train", "verdict")
+RUN = ("index", "layers", "model-card", "report", "solve", "train", "verdict")
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 
 

@@ -41,7 +41,6 @@ def solve(
     up_scene: tuple[float, float, float] | None = None,
     up_degrees: float = 2.0,
     clutter: float | None = None,
-    at_infinity: bool = False,
     solver: str = "auto",
     inlier_threshold: float | None = None,
     time_limit: float | None = None,
@@ -78,7 +77,6 @@ def solve(
         up_scene: the same direction in the scene, such as 0 0 1.
         up_degrees: standard deviation of the direction up, degrees.
         clutter: expected fraction of the image points without a correspondence, below 1; unknown by default.
-        at_infinity: points3d are unit directions, such as of stars; only the rotation is found.
         solver: auto, which also runs a packaged matcher if the search is not confident; search; or a network, packaged
             weights by name or a checkpoint.
         inlier_threshold: largest error of a match, pixels with a camera, else of x/z, y/z; three times the scale of the
@@ -136,7 +134,6 @@ def solve(
             prior=pose_prior,
             inlier_threshold=inlier_threshold,
             clutter=clutter,
-            at_infinity=at_infinity,
             seed=seed,
             time_limit=time_limit,
             device=device,

@@ -32,7 +32,7 @@ from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.focal_length import solve_with_focal_length, unknown_camera
 from bpnp.search.inputs import problem_from
 from bpnp.search.problem import Problem, UnknownFocal
-from bpnp.search.rig_and_directions import Mode, prepare_mode
+from bpnp.search.rig.arguments import RigOptions, prepare
 from bpnp.search.solution import Solution
 from bpnp.search.solvers import Options, Progress, solve_problems
 
@@ -59,7 +59,6 @@ def solve(
     prior: PriorLike | None = None,
     inlier_threshold: float | int | None = None,
     clutter: float | int | None = None,
-    at_infinity: bool = False,
     rig: Sequence[PoseLike] | None = None,
     scale: bool = False,
     seed: int = 0,
@@ -85,7 +84,7 @@ def solve(
             0.1. The focal length is then estimated too. An error without a `camera`. None if the focal length is exact.
         distortion: True to fit a radial distortion coefficient in any case. It needs an `image_size`, or a
             `focal_error` with a camera that has no distortion. Default False: a coefficient is fitted with the focal
-            length and kept only if it is significantly better; with a `rig` or `at_infinity` none is fitted.
+            length and kept only if it is significantly better; with a `rig` none is fitted.
         normals3d: (n, 3) outward unit normals. A point that faces away from the camera is not visible. None: all points
             are visible from all sides.
         labels2d: (m,) integers, such as colours, classes or identities; only points with equal labels match, and -1
@@ -112,10 +111,6 @@ def solve(
             with one other.
         clutter: Expected fraction of the image points without a correspondence, 0 or more and below 1. None if it is
             unknown: several fractions are tried.
-        at_infinity: `points3d` are unit directions, such as of stars. Only the rotation is estimated; the translation
-            is zero. Pixels of a fisheye camera may lie 90 degrees or more off its axis. Points with the largest
-            `scores2d` are tried first. The translation of a `prior` is ignored. `normals3d`, `scale`, `device`, and a
-            network as `solver` or `prior`, raise ValueError. Default False. See docs/stars.md.
         rig: Extrinsics cam_from_rig of each camera of a rig, as (R, t), (3, 4), (4, 4) or a pycolmap.Rigid3d.
             `points2d`, `labels2d` and `scores2d` are then lists with one array per camera; `camera` is one for all or a
             list without None. The returned pose is rig_from_world, in the unit of the rig and of the scene, and a
@@ -131,9 +126,8 @@ def solve(
             pose whose competing poses were not all tested is "ambiguous" at best.
         device: Device on which a copy of a module runs; None for the module's own device. The search runs on the CPU.
         progress: Callback with (problem index, batches of initial poses, seconds), called after each batch and after
-            the enumeration of a small problem (0 batches). With `at_infinity` the image points that were tried count
-            instead of batches. With an unknown focal length both numbers restart at each focal length. It is not called
-            if a module computes the poses. None for no callback.
+            the enumeration of a small problem (0 batches). With an unknown focal length both numbers restart at each
+            focal length. It is not called if a module computes the poses. None for no callback.
 
     Returns:
         Solution of the problem. Its `verdict` is "confident", "ambiguous" or "failed" (docs/verdict.md). It is also
@@ -143,7 +137,7 @@ def solve(
     Raises:
         ValueError: The input has wrong or swapped shapes, NaN, a singular camera matrix, or options that exclude each
             other. Or there are too few points: fewer than 4 in an image (each image of a `rig`) or in the scene, 3 with
-            a `GravityPrior`; `at_infinity` fewer than 3 in all images together or in the scene.
+            a `GravityPrior`.
 
     >>> import numpy as np
     >>> from bpnp import solve
@@ -164,11 +158,11 @@ def solve(
         "scores2d": scores2d,
         "scores3d": scores3d,
     }
-    if scale and rig is None and not at_infinity:
+    if scale and rig is None:
         raise ValueError(NO_RIG)
     seconds = seconds_from(time_limit, TIME.one)
-    if at_infinity or rig is not None:
-        solve_one = prepare_mode(
+    if rig is not None:
+        solve_one = prepare(
             points2d,
             points3d,
             camera,
@@ -180,8 +174,7 @@ def solve(
                 time_limit=seconds,
                 progress=progress,
             ),
-            Mode(
-                at_infinity=at_infinity,
+            RigOptions(
                 rig=rig,
                 scale=scale,
                 image_size=image_size,
@@ -230,7 +223,6 @@ def solve_many(
     prior: ManyPriors | None = None,
     inlier_threshold: float | int | None = None,
     clutter: float | int | None = None,
-    at_infinity: bool = False,
     rig: Sequence[PoseLike] | None = None,
     scale: bool = False,
     seed: int = 0,
@@ -261,7 +253,6 @@ def solve_many(
         prior: One prior for all problems, or a list of k priors. A list [R, t], or of the rows of [R | t], is one.
         inlier_threshold: Largest reprojection error of a match, for all problems; as for `solve`.
         clutter: Expected fraction of the image points without a correspondence, for all problems; as for `solve`.
-        at_infinity: `points3d` are unit directions; as for `solve`. The problems are then independent.
         rig: Extrinsics of the cameras of a rig that sees all problems; as for `solve`. The image points of a problem,
             `labels2d` and `scores2d` are then lists with one array per camera, and `camera` is one for all or a list
             with one per camera. The problems are then independent.
@@ -289,7 +280,7 @@ def solve_many(
     count = len(images)
     seconds = seconds_from(time_limit, TIME.of_many)
     options = Options(
-        solver=None if at_infinity or rig is not None else source_from(solver),
+        solver=None if rig is not None else source_from(solver),
         asks=solver == "auto",
         inlier_threshold=positive("inlier_threshold", inlier_threshold, finite=True),
         clutter=checked_clutter(clutter),
@@ -299,7 +290,7 @@ def solve_many(
         progress=progress,
         until=Deadline(begun + seconds) if count == 1 else Deadline(),
     )
-    if scale and rig is None and not at_infinity:
+    if scale and rig is None:
         raise ValueError(NO_RIG)
     point_options = {
         "normals3d": each_set("normals3d", normals3d, count),
@@ -309,9 +300,8 @@ def solve_many(
         "scores3d": each_set("scores3d", scores3d, count, 1),
     }
     scenes = each_set("points3d", points3d, count)
-    if at_infinity or rig is not None:
-        mode = Mode(
-            at_infinity=at_infinity,
+    if rig is not None:
+        chosen = RigOptions(
             rig=rig,
             scale=scale,
             image_size=image_size,
@@ -320,12 +310,11 @@ def solve_many(
             solver=solver,
             device=device,
         )
-        one_each = [camera] * count if rig is not None else each_camera(camera, count)
         ready = []
         for i, each in enumerate(each_prior(prior, count)):
             arrays = {name: values[i] for name, values in point_options.items()}
             with about(f"problem {i}" if count > 1 else None):
-                ready.append(prepare_mode(images[i], scenes[i], one_each[i], arrays, options.numbered(i), mode, each))
+                ready.append(prepare(images[i], scenes[i], camera, arrays, options.numbered(i), chosen, each))
         return [solve_one() for solve_one in ready]
     cameras = each_camera(camera, count)
     priors = [checked_prior(each) for each in each_prior(prior, count)]

@@ -868,7 +868,6 @@ class FocalSettings:
         alternations: Largest number of alternations of search and refinement from each focal length. [rounds; not
             tuned]
         promising: Largest log10 NFA of a failed search whose poses are refined. [decades; not tuned]
-        divides_time: Divide the time limit evenly among the focal lengths that are left. [yes or no; not tuned]
         rounds: Largest number of iterations of a refinement. [iterations; numerics]
         same: Change of the logarithm of the focal length below which a refinement stops. [nats; numerics]
         bends: Radial displacements at the image corner from which a fit of the distortion also starts. Started at zero
@@ -896,7 +895,6 @@ class FocalSettings:
     iterations: int = 8
     alternations: int = 3
     promising: float = -math.inf
-    divides_time: bool = True
     rounds: int = 12
     same: float = 5e-4
     bends: tuple[float, ...] = (-0.2, 0.2)
@@ -957,112 +955,6 @@ class RigSettings:
 
 
 RIG = RigSettings()
-
-
-class SkySettings(NamedTuple):
-    """Catalogue of directions (`bpnp.search.infinity.kernels`); compiled with its loops.
-
-    Attributes:
-        matched: Probability of a match under the true rotation. [probability; convention]
-        crowded: Probability of a direction in reach by chance, from which on a match is no evidence. [probability; not
-            tuned]
-        densities: Numbers of neighbours that give the density around a direction; the larger density counts.
-            [directions; not tuned]
-        catalogues: Number of catalogues that are cached: a camera sees the same sky repeatedly. [catalogues; cost]
-        stored: Number of stored neighbours of all directions, 7 megabytes. [neighbours; cost]
-    """
-
-    matched: float = 0.5
-    crowded: float = 0.45
-    densities: tuple[int, int] = (8, 32)
-    catalogues: int = 4
-    stored: int = 600_000
-
-
-SKY = SkySettings()
-
-
-@dataclass(frozen=True)
-class InfinitySettings:
-    """Search for a rotation from directions (`bpnp.search.infinity`).
-
-    Attributes:
-        noise: Standard deviations of image points that are tried one after the other. [pixels; not tuned]
-        reach: Distance within which a point is a match: 99.4 % of the errors of two normal coordinates. [standard
-            deviations; convention]
-        cell: Cell of the hash table; a point with a larger reach gets no match yet. [reaches; cost]
-        around: Number of image points around one that vote. [points; not tuned]
-        narrowest: Smallest chord to them, which limits the azimuth error to 1/10 radian. [errors of a chord; derived]
-        first: Number of the nearest of them that preselect directions. [points; cost]
-        promising: Number of preselected directions, which all of them vote on. [directions; cost]
-        refined: Number of rotations of a point that are fitted. [rotations; cost]
-        sample: Number of further points that a rotation is fitted to before it is fitted to all. [points; cost]
-        rounds: Steps of the fit to the points around one. [steps; not tuned]
-        last_rounds: Steps of the fit to the sample, and of that to all points. [steps; not tuned]
-        contests: Smallest evidence on the sample of a rotation that is fitted to all points, as a fraction of that of
-            the best one. [fraction; cost]
-        power: Fraction of the true matches that propose their rotation. [fraction; not tuned]
-        iterations: Largest number of image points that are tried. [points; cost]
-        rougher: Largest noise of the matches, in multiples of the tried one, before the next one is tried. [factor; not
-            tuned]
-        strained: Largest number of matches that are tested for an error of the camera model. [matches; cost]
-        least_share: Fraction of the image points that a rotation explains. An unsuccessful search ends when it would
-            have found such a rotation. With `clutter`, half of the expected fraction. [fraction; convention]
-        sweep: Sweep over focal lengths. Its steps are far smaller than for poses, since a rotation has no distance
-            that compensates a wrong focal length. The log10 NFA of unrelated points is mostly above 8.
-        coarse_noise: Noise of the first search at each focal length; it includes the error of the focal length near
-            the edge. If it fails, `noise` is tried, since many directions are not significant at a large noise.
-            [pixels; not tuned]
-        first_share: `least_share` of the first searches with each focal length. [fraction; not tuned]
-        bins: Binary logarithms of the smallest and largest number of azimuth bins. [bits; cost]
-        proposed_off: Largest error of a proposed rotation beyond a prior. [radians; not tuned]
-        anchor_off: Largest error of the image point that it is proposed for. [radians; not tuned]
-        fewest: Smallest number of image points and of directions; two fix a rotation and leave no evidence. [points;
-            derived]
-        scales: Number of scales of the residuals; each is half the previous one, from the largest noise on. [scales;
-            not tuned]
-        smallest_noise: Smallest noise of matches. [pixels; numerics]
-        pixel_step: Step of the difference that gives the angle per pixel. [pixels; numerics]
-        robust: Residual from which on a match counts less in a fit of the focal length. [pixels; not tuned]
-        lost: Residual of a point that leaves the view. [pixels; numerics]
-        settled: Change of the unknowns that ends this fit. [1; numerics]
-        nominal: Pixel without a camera, as a fraction of the RMS angular radius of the bearings. [fraction; convention]
-    """
-
-    noise: tuple[float, ...] = (0.35, 1.4)
-    reach: float = 3.2
-    cell: float = 4.0
-    around: int = 24
-    narrowest: float = 10.0
-    first: int = 8
-    promising: int = 384
-    refined: int = 4
-    sample: int = 200
-    rounds: int = 6
-    last_rounds: int = 3
-    contests: float = 0.7
-    power: float = 0.9
-    iterations: int = 200
-    rougher: float = 1.2
-    strained: int = 1000
-    least_share: float = 0.25
-    sweep: FocalSettings = FocalSettings(step=1.02, alternations=6, promising=5.0, same=1e-5, divides_time=False)
-    coarse_noise: float = 3.0
-    first_share: float = 0.4
-    bins: tuple[int, int] = (6, 7)
-    proposed_off: float = 0.1
-    anchor_off: float = 0.01
-    fewest: int = 3
-    scales: int = 5
-    smallest_noise: float = 1e-12
-    pixel_step: float = 0.5
-    robust: float = 1.0
-    lost: float = 1e3
-    settled: float = 1e-9
-    nominal: float = 1e-3
-
-
-INFINITY = InfinitySettings()
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from bpnp.cameras import (
 from bpnp.poses import rotation_angle, same_pose
 from bpnp.runtime import NEVER, Clock, Deadline, one_blas_thread
 from bpnp.search.arguments import Array, checked_size
-from bpnp.search.config import DEFAULT, FOCAL, FocalSettings, OtherFocal
+from bpnp.search.config import DEFAULT, FOCAL, OtherFocal
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.matching import with_unfinished
@@ -205,14 +205,12 @@ class FocalSweep(ABC):
     Attributes:
         unknown: Camera with an unknown focal length.
         options: Options of the searches.
-        constants: Constants of the sweep.
         deadline: Deadline of the sweep; none before it.
         ends: Final solution of each focal length so far.
     """
 
     unknown: UnknownCamera
     options: Options
-    constants: FocalSettings = FOCAL
     deadline: Deadline = NEVER
     ends: list[Solution] = field(default_factory=list)
 
@@ -230,10 +228,10 @@ class FocalSweep(ABC):
 
     def sweep(self, *, few: bool = False) -> Solution:
         """Return the solution with the fewest false alarms; `few` is True for points that are enumerated."""
-        most, constants, begun = self.options.settings.schedule.iterations, self.constants, Clock.now()
+        most, begun = self.options.settings.schedule.iterations, Clock.now()
         self.deadline = self.options.limit()
-        for camera in (focal_steps := self.unknown.focal_steps(constants.step_few if few else constants.step)):
-            self.search_from(self.preselect(camera), min(constants.iterations, most), len(focal_steps))
+        for camera in (focal_steps := self.unknown.focal_steps(FOCAL.step_few if few else FOCAL.step)):
+            self.search_from(self.preselect(camera), min(FOCAL.iterations, most), len(focal_steps))
             if self.best.verdict == "confident" and not few:
                 break
             if len(self.ends) < len(focal_steps) and self.deadline.passed(Unfinished.focal_lengths):
@@ -241,7 +239,7 @@ class FocalSweep(ABC):
         if (
             self.best.verdict != "confident"
             and not few
-            and most > constants.iterations
+            and most > FOCAL.iterations
             and self.best.camera is not None
             and not self.deadline.passed(Unfinished.focal_lengths)
         ):
@@ -262,8 +260,8 @@ class FocalSweep(ABC):
     def search_from(self, camera: Camera, iterations: int, steps: int) -> None:
         """Search with a camera, then with cameras that fit the found poses better."""
         found = self._search(camera, iterations, steps)
-        for _ in range(self.constants.alternations):
-            if found.verdict == "failed" and found.log10_false_alarms > self.constants.promising:
+        for _ in range(FOCAL.alternations):
+            if found.verdict == "failed" and found.log10_false_alarms > FOCAL.promising:
                 break
             better, settled = self._refined(found, camera)
             if settled:  # a better optimum may lie at a slightly different focal length
@@ -281,7 +279,7 @@ class FocalSweep(ABC):
 
     def _search(self, camera: Camera, iterations: int, steps: int) -> Solution:
         """Search with a camera, in an equal part of the time that is left for the focal lengths."""
-        waiting = max(steps - len(self.ends), 1) if self.constants.divides_time else 1
+        waiting = max(steps - len(self.ends), 1)
         settings = self.options.settings.limited(iterations)
         return self.solve_with(camera, self.options._replace(settings=settings, until=self.deadline.share(1 / waiting)))
 
@@ -292,7 +290,7 @@ class FocalSweep(ABC):
         fitted = self.refine(solution, camera, zooms)
         (zoom, radial), (before, old) = self.unknown.parts(fitted), self.unknown.parts(camera)
         bend = abs((radial or 0.0) - (old or 0.0)) * self.unknown.outermost(zoom) ** 2
-        return fitted, max(abs(math.log(zoom / before)), bend) < self.constants.same
+        return fitted, max(abs(math.log(zoom / before)), bend) < FOCAL.same
 
     def contested(self) -> Solution:
         """Return the best solution, "ambiguous" if another focal length has a different pose that fits about as well.

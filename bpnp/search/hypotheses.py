@@ -34,7 +34,6 @@ class Hypotheses:
         evidence: (c,) of a proposer, nats by which the matches exceed chance; None where it computes none.
         matches: (c, m) index of the scene point of each image point, -1 for none; None where no matches are fixed.
         residual: (c, m) angle of each match, radians, infinite for none; None likewise.
-        point_evidence: (c, m) nats by which a pose explains each image point better than chance does; None likewise.
     """
 
     rotation: NDArray[Any]
@@ -48,7 +47,6 @@ class Hypotheses:
     evidence: NDArray[np.float64] | None = None
     matches: NDArray[np.int64] | None = None
     residual: NDArray[np.float64] | None = None
-    point_evidence: NDArray[np.float64] | None = None
 
     @classmethod
     def from_poses(

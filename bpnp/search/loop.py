@@ -2,8 +2,8 @@
 
 A plan gives one step after the other, a step proposes refined poses, and a pool scores and keeps them. The loop ends
 when the verdict on the best pose is final, when the plan has no step left, or when the budget or the time is spent.
-Searches differ in their plan and pool only: one camera (`bpnp.search.plan`), a rig (`bpnp.search.rig`), directions
-(`bpnp.search.infinity`), and few points (`bpnp.search.enumeration`).
+Searches differ in their plan and pool only: one camera (`bpnp.search.plan`), a rig (`bpnp.search.rig`), and few points
+(`bpnp.search.enumeration`).
 """
 
 from collections.abc import Callable

@@ -21,7 +21,7 @@ from bpnp.search.arguments import Array, Labels
 from bpnp.search.config import MATCHES, PRECISION
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem
-from bpnp.search.refine.gauss_newton import ImageMatches, Iteration, image_equations, refine
+from bpnp.search.refine.gauss_newton import Iteration, image_equations, refine
 from bpnp.search.solution import FOCAL_LENGTH, POSE_PARAMETERS, Solution, SolutionStats, add_pose
 from bpnp.search.verdict.decide import SearchResult
 from bpnp.search.verdict.reasons import Unfinished
@@ -313,7 +313,7 @@ def fit_pose(
             or np.abs(last.gain) <= MATCHES.exact * np.asarray(last.before.cost)
         )
 
-    linearise = image_equations(model, [ImageMatches(project, points, target)], lost=1e3 * scale)
+    linearise = image_equations(model, project, points, target, lost=1e3 * scale)
     end = refine(
         model, state, linearise, [scale] * MATCHES.most_steps, settled=settled, damping=MATCHES.damping, adaptive=True
     )

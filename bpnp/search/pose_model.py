@@ -1,6 +1,6 @@
 """Pose models: the unknowns of a pose, and all that depends on which numbers are unknown.
 
-The unknowns are the rotation of the scene and, as needed, the shift of its centroid, the logarithm of the focal length,
+The unknowns are the rotation of the scene, the shift of its centroid and, as needed, the logarithm of the focal length,
 a radial coefficient and the logarithm of the scale of the scene of a rig. A model has the directions in which cameras
 see scene points, their derivatives by the unknowns, steps, the information of priors, and the number of tests of the
 NFA (`bpnp.search.verdict.false_alarms`).
@@ -19,11 +19,11 @@ is (x', 1) with
 A step (w, s, ...) gives exp([w]x) R and y + s, multiplies z by the exponential of its third part, and so on. All
 functions are pure functions of arrays, in float64.
 
-Three compiled loops of proposers have steps of their own. A search spends most of its time in them, and each fixes its
+Two compiled loops of proposers have steps of their own. A search spends most of its time in them, and each fixes its
 unknowns, its data types and its way to match: `bpnp.search.kernels.dense.move` (a pose in float32, to all points at
-once), `bpnp.search.enumeration.matching.step` (a pose of few one-to-one matches on the stereographic plane) and
-`bpnp.search.infinity.kernels.fit` (a rotation to the nearest directions). `bpnp.robust.ransac.refine_locally` is the
-refinement of RANSAC in the paper's half, in torch: a batch of samples and poses at once, on its device.
+once) and `bpnp.search.enumeration.matching.step` (a pose of few one-to-one matches on the stereographic plane).
+`bpnp.robust.ransac.refine_locally` is the refinement of RANSAC in the paper's half, in torch: a batch of samples and
+poses at once, on its device.
 """
 
 import math
@@ -43,7 +43,6 @@ from bpnp.search.starts import GravityPrior, PosePrior, Prior
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
 Extrinsics = tuple[Array, Array]
-FIXING_ROTATION = 2  # matches that fix a rotation
 
 
 class PoseState(NamedTuple):
@@ -94,7 +93,6 @@ class PoseModel:
         centre: (3,) point of the scene about which it rotates, its centroid.
         lens: Prior of an unknown focal length. A radial coefficient is unknown if its `radial_sigma` is not 0. None for
             a given camera.
-        moves: True if the shift is unknown; False for points at infinity. Default True.
         scale: True if the scale of a rig's scene is unknown. Default False.
         mounts: Extrinsics (C_k, c_k) of the cameras of a rig; None for a single camera.
         prior: Prior of the pose of the camera or the rig.
@@ -108,7 +106,6 @@ class PoseModel:
 
     centre: Array
     lens: UnknownFocal | None = None
-    moves: bool = True
     scale: bool = False
     mounts: Sequence[Extrinsics] | None = None
     prior: Prior | None = None
@@ -124,7 +121,7 @@ class PoseModel:
         bends = self.lens is not None and self.lens.radial_sigma > 0
         sizes = {
             "rotation": 3,
-            "shift": 3 * self.moves,
+            "shift": 3,
             "log_focal": int(self.lens is not None),
             "radial": int(bends),
             "log_scale": int(self.scale),
@@ -150,16 +147,14 @@ class PoseModel:
         known = "radial" in self.columns and self.lens is not None and math.isfinite(self.lens.radial_sigma)
         return -(-(self.size - self.scale - known) // 2)
 
-    def state(self, rotation: Array, translation: Array | None = None) -> PoseState:
+    def state(self, rotation: Array, translation: Array) -> PoseState:
         """Return the state of poses with the given camera.
 
         Args:
             rotation: (..., 3, 3).
-            translation: (..., 3), or homogeneous (..., 4) for a rig; None for points at infinity.
+            translation: (..., 3), or homogeneous (..., 4) for a rig.
         """
         radial = 0.0 if self.lens is None else self.lens.radial
-        if translation is None:
-            return PoseState(rotation, np.zeros(rotation.shape[:-1]), radial=radial)
         centroid = rotation @ self.centre + translation[..., :3]
         unit = 1.0 if self.mounts is None else translation[..., 3]
         return PoseState(rotation, centroid, radial=radial, unit=unit)
@@ -173,14 +168,13 @@ class PoseModel:
         return state.rotation, translation
 
     def sight(self, state: PoseState, points: Array, k: int = 0) -> Sight:
-        """Return points (n, 3) of the scene, or directions of points at infinity, as camera k sees them."""
+        """Return points (n, 3) of the scene as camera k sees them."""
         turned = (points - self.centre) @ np.swapaxes(state.rotation, -1, -2)
-        camera = turned + state.centroid[..., None, :] if self.moves else turned
+        camera = turned + state.centroid[..., None, :]
         if self.mounts is not None:
             turn, shift = self.mounts[k]
             turned, camera = turned @ turn.T, camera @ turn.T
-            if self.moves:
-                camera = camera + np.asarray(state.unit)[..., None, None] * shift
+            camera = camera + np.asarray(state.unit)[..., None, None] * shift
         stretch = self._stretch(state, camera)
         seen = (
             camera if stretch is None else np.concatenate([camera[..., :2] * stretch[..., None], camera[..., 2:]], -1)
@@ -223,12 +217,10 @@ class PoseModel:
             k: Index of the camera.
 
         Returns:
-            (..., n, d, 6), or (..., n, d, 3) of the rotation if the shift is given.
+            (..., n, d, 6).
         """
         (x, y, z), (u, v, w) = (np.moveaxis(each, -1, 0) for each in (sight.turned[..., None, :], by_point))
-        columns = [np.stack([y * w - z * v, z * u - x * w, x * v - y * u], -1)]
-        if self.moves:
-            columns.append(by_point)
+        columns = [np.stack([y * w - z * v, z * u - x * w, x * v - y * u], -1), by_point]
         if self.mounts is not None:
             columns = [each @ self.mounts[k][0] for each in columns]
         return np.concatenate(columns, -1)
@@ -236,9 +228,10 @@ class PoseModel:
     def moved(self, state: PoseState, step: Array) -> PoseState:
         """Return the state after a step (..., p)."""
         columns = self.columns
-        changed: dict[str, Any] = {"rotation": Rotation.from_rotvec(step[..., :3]).as_matrix() @ state.rotation}
-        if self.moves:
-            changed["centroid"] = state.centroid + step[..., columns["shift"]]
+        changed: dict[str, Any] = {
+            "rotation": Rotation.from_rotvec(step[..., :3]).as_matrix() @ state.rotation,
+            "centroid": state.centroid + step[..., columns["shift"]],
+        }
         if "log_focal" in columns:
             changed["zoom"] = state.zoom * np.exp(step[..., columns["log_focal"].start])
         if "radial" in columns:
@@ -259,7 +252,7 @@ class PoseModel:
             information[:3, :3] = (np.eye(3) - np.outer(up, up)) / math.radians(self.prior.sigma_deg) ** 2
         elif isinstance(self.prior, PosePrior):
             information[:3, :3] = np.eye(3) / math.radians(self.prior.rotation_sigma_deg) ** 2
-            if self.moves and self.prior.translation is not None:
+            if self.prior.translation is not None:
                 by_origin = np.concatenate([crossed(state.rotation @ self.centre), np.eye(3)], 1)
                 information[:6, :6] += by_origin.T @ by_origin / self.prior.translation_sigma**2
         return information
@@ -302,8 +295,8 @@ class PoseModel:
     def log10_choices(self, problem: Problem) -> float:
         """Return log10 of the number of states that fit as many matches as fix the unknowns, for all choices of them.
 
-        It is 2 (m)_k (n)_k / k! with k = `fixing` for poses, about two for each choice of three or four matches, and
-        half of that for rotations. Labels, if given, have to agree.
+        It is 2 (m)_k (n)_k / k! with k = `fixing`, about two for each choice of three or four matches. Labels, if
+        given, have to agree.
         """
         m, n = len(problem.bearings), len(problem.points3d)
         choices = math.prod((m - i) * (n - i) / (i + 1) for i in range(self.fixing))
@@ -311,13 +304,12 @@ class PoseModel:
             groups = label_groups(np.arange(m), problem.labels2d, problem.labels3d, n)
             agreeing = sum(len(rows) * len(columns) for rows, columns in groups)
             choices = min(choices, math.prod((agreeing - i) / (i + 1) for i in range(self.fixing)))
-        return math.log10((1 + self.moves) * max(choices, 1.0))
+        return math.log10(2 * max(choices, 1.0))
 
     def log10_cells(self, spread: float, scales: Array, solid_angle: float = 4 * math.pi) -> Array:
         """Return log10 (S,) of the number of distinguishable states, cells of width s, at each scale s of an image.
 
-        With the RMS angular radius h of the image points, the number for points at infinity is 8 pi^2 h / s^3. It is
-        the product of 4 pi / s^2 directions of an axis and 2 pi h / s rotations about it. For a pose it is that of:
+        With the RMS angular radius h of the image points, it is the number of:
 
         - 8 pi^2 (h / s)^3 rotations about the scene centroid, which move points at h from it by s,
         - A / s^2 positions of the centroid in the view,
@@ -331,9 +323,7 @@ class PoseModel:
             solid_angle: Solid angle A of the view, steradians.
         """
         relative = spread / scales
-        cells = 8 * math.pi**2 * relative / scales**2
-        if self.moves:
-            cells = 8 * math.pi**2 * relative**4 * (solid_angle / scales**2) * math.log(30)
+        cells = 8 * math.pi**2 * relative**4 * (solid_angle / scales**2) * math.log(30)
         return np.asarray(np.log10(np.maximum(cells, 1.0)) + log10_lenses(self.lens, spread, scales))
 
     def fixing_ways(self, cameras: int = 1, apart: Iterable[tuple[int, int]] = ()) -> list[list[int]]:

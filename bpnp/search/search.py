@@ -15,7 +15,6 @@ from bpnp.search.config import DEFAULT, SearchSettings
 from bpnp.search.enumeration.plan import EnumeratedPoses, EnumerationPlan
 from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
 from bpnp.search.hypotheses import Hypotheses
-from bpnp.search.infinity.search import search_rotation
 from bpnp.search.loop import Progress, run, teller
 from bpnp.search.plan import Plan, Proposals
 from bpnp.search.pool import Pool
@@ -148,7 +147,6 @@ def warm_up() -> None:
     enumerate_poses(problem)
     p3p_poses(rays[None, :3], points[None, :3])
     self_motions(points, 0.1)
-    search_rotation(Problem(rays, rays), np.full(DEFAULT.warming, 1e-3))
     scene = Scene(problem, 0, DEFAULT)
     start = Hypotheses.from_poses(*scene.enter(np.eye(3)[None], np.array([[0, 0, 6.0]])))
     run_batch(scene, start)

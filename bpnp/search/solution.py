@@ -39,8 +39,8 @@ class Candidate:
     Attributes:
         rotation: (3, 3) rotation matrix.
         translation: (3,) translation, in the unit of `Solution.translation`.
-        score: Mean log-likelihood of the bearings, nats; larger is better. For points at infinity it is the mean
-            log-likelihood ratio to unrelated points, for a rig -log10 of the false alarms.
+        score: Mean log-likelihood of the bearings, nats; larger is better. For a rig it is -log10 of the
+            false alarms.
         inlier_count: Number of one-to-one inliers (paper Eq. 1) within `Solution.inlier_threshold`, over all cameras.
         log10_false_alarms: Expected number of equally good poses for unrelated points, log10; see `Solution`.
         scale: Scale of the scene, rig = scale R p + t; 1 unless it was estimated.
@@ -64,8 +64,8 @@ class SolutionStats:
     """Statistics of the search.
 
     Attributes:
-        iterations: Number of batches of initial poses; 0 if an enumeration or known matches decided. For points at
-            infinity the number of image points that were tried, for a network as `solver` that of its poses.
+        iterations: Number of batches of initial poses; 0 if an enumeration or known matches decided. For a
+            network as `solver` the number of its poses.
         residual: Scale of the residuals, radians.
         converged: True if the verdict is "confident".
         dropped2d: Number of 2D points that could not be undistorted and were dropped.
@@ -108,8 +108,8 @@ class Solution:
             optimum without image point i, with unknown correspondences (docs/verdict.md). NaN if the verdict is
             "failed" or the points do not fix the pose.
         parameters: Names of the p estimated parameters, in the order of the covariance: "rotation_x", "rotation_y",
-            "rotation_z"; then "translation_x", "translation_y", "translation_z", except for points at infinity; then
-            "focal_length" (pixels) or "scale" if it was estimated.
+            "rotation_z"; then "translation_x", "translation_y", "translation_z"; then "focal_length" (pixels) or
+            "scale" if it was estimated.
         scale: Scale of the scene, rig = scale R p + t, with t in the unit of the rig; 1 unless `scale=True`.
         candidates: Distinct poses that the search found, best first; the first is this pose.
         verdict: "confident"; "ambiguous" if the pose is significant but another one may fit as well; "failed" if no
@@ -180,9 +180,7 @@ class Solution:
 
     @property
     def centre_std(self) -> float:
-        """Standard deviation of `centre` along its least certain axis, scene units; NaN for points at infinity."""
-        if "translation_x" not in self.parameters:
-            return math.nan
+        """Standard deviation of `centre` along its least certain axis, scene units."""
         chosen, scale = list(range(len(POSE_PARAMETERS))), None
         if SCALE in self.parameters:
             chosen, scale = [*chosen, self.parameters.index(SCALE)], self.scale

@@ -78,7 +78,7 @@ def test_options_and_columns_reach_the_search_as_they_are_written(tmp_path: Path
 
         patch.setattr("bpnp.search.api.solve", noted)
         words = "--clutter 0.25 --seed 7 --solver search --time_limit 3 --inlier_threshold 0.1 --focal_error 0.2"
-        words += f" --distortion --at_infinity --device cpu --prior {rough} --prior-degrees 6 --prior_distance 0.5"
+        words += f" --distortion --device cpu --prior {rough} --prior-degrees 6 --prior_distance 0.5"
         files = [str(tmp_path / "x.csv"), str(tmp_path / "p.csv")]
         main(["solve", *files, *words.split()])
         main(["solve", *files, *UP, "--up-degrees", "7", "--time-limit", "inf"])
@@ -93,7 +93,7 @@ def test_options_and_columns_reach_the_search_as_they_are_written(tmp_path: Path
     assert (prior.rotation_sigma_deg, prior.translation_sigma) == (6, 0.5)
     assert [np.array(known).tolist() for known in upright["prior"]] == [[0, -1, 0], [0, 0, 1], 7]
     expected = {"clutter": 0.25, "seed": 7, "solver": "search", "time_limit": 3.0, "inlier_threshold": 0.1}
-    expected |= {"focal_error": 0.2, "distortion": True, "at_infinity": True, "device": "cpu"}
+    expected |= {"focal_error": 0.2, "distortion": True, "device": "cpu"}
     assert {name: options[name] for name in expected} == expected
 
 

@@ -12,7 +12,7 @@ import pytest
 from scipy.stats import chi2
 
 from bpnp.search import config
-from bpnp.search.config import ALARMS, INFINITY, MATCHES, PRECISION, REFINER, SYMMETRIES, Repetitions
+from bpnp.search.config import ALARMS, MATCHES, PRECISION, REFINER, SYMMETRIES, Repetitions
 
 PACKAGE = Path(config.__file__).parents[1]
 FILES = [file for folder in ("search", "maps", "robust") for file in sorted((PACKAGE / folder).rglob("*.py"))]
@@ -23,12 +23,8 @@ FIXED = {
     "search/enumeration/search.py": {"ORDERS"},  # permutations
     "search/focal_length.py": {"RADIAL_PLACES", "AROUND"},  # indices of parameters; 1 and the step of `OtherFocal`
     "search/hypotheses.py": {"SIGNIFICANT"},  # above every log-likelihood
-    "search/infinity/evidence.py": {"ROTATION"},  # a model without unknowns of the translation
-    "search/infinity/kernels.py": {"TURN"},  # a circle in 16 bits
-    "search/infinity/search.py": {"NO_LABELS"},  # empty
     "search/kernels/dense.py": {"POWER"},  # eight squarings
     "search/kernels/sides.py": {"FORWARD"},  # axis of the camera
-    "search/pose_model.py": {"FIXING_ROTATION"},  # two directions fix a rotation
     "search/propose/known_matches.py": {"FIXING"},  # three points fix a pose
     "search/propose/mirror.py": {"MIRROR"},  # reflection at z = 0
     "search/rig/search.py": {"BEFORE"},  # above every evidence
@@ -109,7 +105,6 @@ def test_derived_constants_follow_from_their_laws() -> None:
     assert ALARMS.farthest**2 / 2 == pytest.approx(9)
     assert MATCHES.farthest**2 / 2 == pytest.approx(8)
     assert chi2.cdf(MATCHES.reach**2, 2) == pytest.approx(0.989, abs=5e-4)
-    assert chi2.cdf(INFINITY.reach**2, 2) == pytest.approx(0.994, abs=5e-4)
     assert (1 - 0.2**3) ** MATCHES.triples == pytest.approx(3e-4, rel=0.1)
     assert (1 - 0.5**3) ** SYMMETRIES.bases == pytest.approx(0.014, rel=0.05)
     assert (1 - 1 / 3) ** SYMMETRIES.first == pytest.approx(1 / 17, rel=0.05)

@@ -8,13 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from planted import directions
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from bpnp.search import problem as problem_module
 from bpnp.search.config import PROBLEM
-from bpnp.search.infinity.evidence import background_of, log10_false_alarms
-from bpnp.search.infinity.kernels import catalogue_of
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem
 from bpnp.search.starts import GravityPrior, PosePrior
@@ -213,36 +210,6 @@ def test_an_image_point_whose_label_no_scene_point_has_is_an_outlier(
             logs = point_evidence(problem, directions(points), np.array([1e-3]), np.array([0.75]), even=even)
         assert logs[0, 0, 0] == pytest.approx(math.log(0.25))
         assert (logs[1:] > 0).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("labels", [1, 3])
-def test_the_bound_of_markov_holds_for_rotations(labels: int) -> None:
-    """Image points and directions that have nothing to do with each other: without the number of tests, the evidence of
-    a rotation exceeds b with a probability of at most 1 / b. With labels it is that of the directions of one label."""
-    rng, exceeded, count = np.random.default_rng(0), 0, 400
-    pixel = np.full(12, 1e-3)
-    for _ in range(count):
-        rays, sky = scattered(rng, 12, 0.2), directions(rng.standard_normal((3000, 3)))
-        known = background_of(Problem(rays, sky), pixel, 8.0)
-        colours = rng.integers(0, labels, len(sky))
-        chord = cKDTree(sky[colours == 0]).query(rays)[0]
-        density = np.full(len(rays), (colours == 0).sum() / (4 * np.pi))
-        nfa, of_points = log10_false_alarms((chord / pixel) ** 2, density, known)
-        assert of_points.shape == (12,)
-        exceeded += float(known.log_tests.max()) / np.log(10) - nfa > 1
-    assert exceeded <= 0.1 * count + 3 * np.sqrt(0.09 * count)
-
-
-def test_the_density_of_a_label_is_that_of_its_directions() -> None:
-    rng = np.random.default_rng(0)
-    sky, colours = directions(rng.standard_normal((800, 3))), rng.choice([-1, 0, 1, 7], 800, p=[0.1, 0.2, 0.6, 0.1])
-    colours[colours == 7] = 7 + np.arange((colours == 7).sum())
-    every, fitting = catalogue_of(sky, colours).density
-    assert np.array_equal(every, catalogue_of(sky).density[1])
-    assert np.array_equal(every[colours < 0], fitting[colours < 0])
-    for colour, share in ((0, 0.3), (1, 0.7)):
-        assert (1 / fitting[colours == colour]).mean() == pytest.approx((1 / every).mean() / share, rel=0.1)
 
 
 def test_the_false_alarms_of_independent_cameras_multiply() -> None:

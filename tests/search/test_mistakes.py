@@ -19,12 +19,10 @@ SIZE = (640, 480)
 WITH_NAN = np.where(np.arange(20)[:, None] == 7, np.nan, P)
 EVEN = np.full((20, 4), 0.25)  # class probabilities
 SEEN: dict[str, Any] = {"points2d": X, "points3d": P}
-SKY: dict[str, Any] = {"points2d": PIXELS, "points3d": P / np.linalg.norm(P, axis=1, keepdims=True), "camera": CAMERA}
 RIG: dict[str, Any] = {"points2d": [PIXELS[:6], PIXELS[6:12]], "points3d": P}
 RIG |= {"camera": [CAMERA] * 2, "rig": [np.eye(4)] * 2}
 CALLS: dict[str, Any] = {
     "points": partial(solve, **SEEN),
-    "sky": partial(solve, at_infinity=True, **SKY),
     "rig": partial(solve, **RIG),
     "many": partial(solve_many, points2d=[X, X], points3d=P),
     "verify": partial(verify, **SEEN, rotation=np.eye(3), translation=[0, 0, 5.0]),
@@ -142,7 +140,6 @@ CALLS: dict[str, Any] = {
         ("pixels", {"camera": K * [[-1], [1], [1]]}, "focal lengths -.* and .*, which mirror the image; give positive"),
         ("pixels", {"camera": K * [[-1], [-1], [1]]}, "focal lengths -.* and -.*, which mirror the image"),
         ("pixels", {"image_size": np.array([480, 640])}, "outside the 480 x 640 pixels"),
-        ("sky", {"image_size": np.array([480, 640]), "camera": None}, "outside the 480 x 640 pixels"),
         ("pixels", {"image_size": (640.5, 480)}, "`image_size` is .640.5, 480.; it is .width, height. in whole pixels"),
         ("pixels", {"image_size": 640}, "`image_size` is 640; it is .width, height. in whole pixels"),
         (
@@ -158,21 +155,8 @@ CALLS: dict[str, Any] = {
         ),
         ("pixels", {"camera": K, "distortion": True}, "`distortion=True` needs an `image_size`"),
         # Directions.
-        ("sky", {"points3d": 2 * P}, "`points3d` is .*; unit vectors are needed: divide .* for points of a scene"),
-        ("sky", {"points3d": X}, r"`points3d` has the shape \(20, 2\), not \(k, 3\)"),
-        ("sky", {"points2d": PIXELS[:2]}, "`points2d` has 2 points; at least 3 are needed"),
-        ("sky", {"points2d": X}, "which look normalised; give pixels with a `camera`"),
-        ("sky", {"camera": None}, "`points2d` has values .*, not normalised image coordinates"),
-        ("sky", {"normals3d": P}, "`normals3d` has no meaning .* no surface"),
-        ("sky", {"scale": True}, "`scale=True` has no meaning .* no unit of length"),
-        ("sky", {"labels2d": [1], "labels3d": [1]}, r"`labels2d` has the shape \(1,\), not \(20,\)"),
-        ("sky", {"clutter": 1.2}, "`clutter`"),
-        ("sky", {"solver": "matcher-maps"}, "`solver` is 'matcher-maps', but networks are trained for .* one camera"),
-        ("sky", {"scores2d": np.zeros(20)}, "`scores2d` is 0.0 at point 0; scores are above 0"),
-        ("sky", {"inlier_threshold": -1}, "`inlier_threshold` is .*; it must be a positive number"),
         # Several cameras.
         ("rig", {"camera": [CAMERA, None]}, "`camera` is None for camera 1 of the `rig`, but not for all"),
-        ("rig", {"camera": [None, CAMERA], "at_infinity": True}, "`camera` is None for camera 0 of the `rig`"),
         ("rig", {"camera": [CAMERA]}, "`camera` has the length 1, but the `rig` has 2 cameras"),
         ("rig", {"rig": [np.eye(4)]}, "`points2d` has the length 2, but the `rig` has 1 cameras"),
         (

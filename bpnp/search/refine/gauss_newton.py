@@ -208,7 +208,7 @@ def match_equations(model: PoseModel, bearings: Array, points: Array, weight: Ar
     Args:
         model: Unknowns.
         bearings: (k, 3) of the image points.
-        points: (k, 3) scene points, or directions of points at infinity.
+        points: (k, 3) scene points.
         weight: (..., k) of the matches; None for equal ones.
     """
 
@@ -220,84 +220,32 @@ def match_equations(model: PoseModel, bearings: Array, points: Array, weight: Ar
     return linearise
 
 
-class ImageMatches(NamedTuple):
-    """k given matches of one camera of any camera model, whose residuals are those of the image.
-
-    Attributes:
-        project: Function that returns the image points (k, d) of points (k, 3) in the camera's frame; NaN outside the
-            view.
-        points: (k, 3) scene points, or directions of points at infinity.
-        target: (k, d) their image points.
-        camera: Index of the camera; default 0.
-    """
-
-    project: Callable[[Array], Array]
-    points: Array
-    target: Array
-    camera: int = 0
-
-
-def image_rows(model: PoseModel, matches: ImageMatches, state: PoseState) -> tuple[Array, Array]:
-    """Linearise given matches in the image.
+def image_equations(
+    model: PoseModel, project: Callable[[Array], Array], points: Array, target: Array, *, lost: float | int
+) -> Linearise:
+    """Return the linearisation of k given matches of one given camera of any model, whose residuals are in the image.
 
     The derivatives of the camera model are central differences by the points in the camera's frame, since there are
-    many camera models. Those by the unknowns follow from them. An unknown lens stretches the image about the principal
-    point by z (1 + k r^2) / (1 + k_0 r^2), with k_0 the radial coefficient of the camera model.
+    many camera models. Those by the pose follow from them.
 
     Args:
-        model: Unknowns.
-        matches: Matches.
-        state: State.
-
-    Returns:
-        Residuals (k, d) and derivatives (k, d, p) of the predictions; NaN outside the view.
-    """
-    sight = model.sight(state, matches.points, matches.camera)
-    h = REFINER.difference * np.maximum(np.linalg.norm(sight.camera, axis=-1), 1e-300)
-    moved = sight.camera + h[:, None] * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])[:, None]
-    seen = matches.project(moved.reshape(-1, 3)).reshape(7, *matches.target.shape)
-    if model.lens is None:
-        by_point = ((seen[1:4] - seen[4:]) / (2 * h[:, None])).transpose(1, 2, 0)
-        return matches.target - seen[0], model.by_pose(sight, by_point, matches.camera)
-    centre = matches.project(np.array([[0.0, 0.0, 1.0]]))
-    squared = np.zeros(moved.shape[:-1])
-    if model.lens.radial or state.radial or "radial" in model.columns:
-        squared = (moved[..., :2] ** 2).sum(-1) / moved[..., 2] ** 2
-    stretch = state.zoom * (1 + state.radial * squared) / (1 + model.lens.radial * squared)
-    from_centre = stretch[..., None] * (seen - centre)
-    by_point = ((from_centre[1:4] - from_centre[4:]) / (2 * h[:, None])).transpose(1, 2, 0)
-    columns = [model.by_pose(sight, by_point, matches.camera), from_centre[0][..., None]]
-    if "radial" in model.columns:
-        columns.append((from_centre[0] * (squared[0] / (1 + state.radial * squared[0]))[:, None])[..., None])
-    return matches.target - centre - from_centre[0], np.concatenate(columns, -1)
-
-
-def image_equations(
-    model: PoseModel, cameras: Sequence[ImageMatches], *, lost: float | int, robust: float | None = None
-) -> Linearise:
-    """Return the linearisation of given matches in the images of cameras of any model; see `image_rows`.
-
-    The scale of a step is the standard deviation of the residuals, which weights the prior of a focal length.
-
-    Args:
-        model: Unknowns; the scale of a rig's scene is given.
-        cameras: Matches of each camera.
+        model: Unknowns of a pose.
+        project: Function that returns the image points (k, d) of points (k, 3) in the camera's frame; NaN outside the
+            view.
+        points: (k, 3) scene points.
+        target: (k, d) their image points.
         lost: Residual of a point that leaves the view.
-        robust: Residual s from which a match counts less, 2 s^2 (sqrt(1 + r^2 / s^2) - 1) for r^2; None for r^2.
     """
 
-    def linearise(state: PoseState, scale: float) -> Equations:
-        parts = []
-        for matches in cameras:
-            residual, jacobian = image_rows(model, matches, state)
-            jacobian = np.where(np.isfinite(residual)[..., None], jacobian, 0.0)
-            residual, weight = np.nan_to_num(residual, nan=lost), np.ones(len(residual))
-            if robust is not None:
-                weight = 1 / np.sqrt(1 + (residual**2).sum(-1) / robust**2)
-            parts.append(normal_equations(np.nan_to_num(jacobian, nan=0.0), residual, weight))
-        products, gradient, cost, matched = (sum(each[1:], each[0]) for each in zip(*parts, strict=True))
-        information, pull = model.lens_prior(state)
-        return Equations(products + scale**2 * information, gradient + scale**2 * pull, cost, matched)
+    def linearise(state: PoseState, _scale: float) -> Equations:
+        sight = model.sight(state, points)
+        h = REFINER.difference * np.maximum(np.linalg.norm(sight.camera, axis=-1), 1e-300)
+        moved = sight.camera + h[:, None] * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])[:, None]
+        seen = project(moved.reshape(-1, 3)).reshape(7, *target.shape)
+        residual = target - seen[0]
+        jacobian = model.by_pose(sight, ((seen[1:4] - seen[4:]) / (2 * h[:, None])).transpose(1, 2, 0))
+        jacobian = np.nan_to_num(np.where(np.isfinite(residual)[..., None], jacobian, 0.0), nan=0.0)
+        return normal_equations(jacobian, np.nan_to_num(residual, nan=lost), np.ones(len(residual)))
 
     return linearise
 

@@ -16,7 +16,6 @@ CLAUSES = {
     "insignificant": "not significant",
     # Another pose may be the right one.
     "competing_pose": "a competing pose {away} away fits about as well (margin {margin:.1f} decades)",
-    "competing_rotation": "another rotation fits about as well (margin {margin:.1f} decades)",
     "competing_place": "a pose {distance:.3g} scene units and {degrees:.0f} deg away, elsewhere in the map, explains "
     "the image points about as well (margin {margin:.1f} decades)",
     "better_place": "a pose {distance:.3g} scene units and {degrees:.0f} deg away, elsewhere in the map, explains "
@@ -32,7 +31,6 @@ CLAUSES = {
     "{percent:.0f} % of the distance away",
     "other_focal_length": "with {zoom:.2f} times the focal length a pose {degrees:.0f} deg away fits about as well "
     "(margin {margin:.1f} decades)",
-    "other_camera_by_pixels": "a camera other than the given one, by {pixels:.2g} pixels, explains the points better",
     "other_extrinsics": "the points of camera {camera} fit another pose, {away} away: check the extrinsics",
     "camera_untested": "there was no time to try other focal lengths",
     # The points do not determine an unknown.

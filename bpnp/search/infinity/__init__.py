@@ -1,1 +1,0 @@
-"""Rotations from unmatched points at infinity, such as stars."""
