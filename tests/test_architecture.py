@@ -28,7 +28,6 @@ MAY_IMPORT = {
     "robust": {"search"},
     "layers": {"robust"},
     "models": {"robust", "layers", "search"},
-    "solving": set(),  # a deprecated place of `search`
     "datamodules": set(),
     "maps": {"search", "models", "robust", "layers", "datamodules", "report"},
     "report": set(),

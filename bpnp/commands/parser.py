@@ -19,10 +19,6 @@ from jsonargparse import ArgumentParser
 
 NEGATIVE_NUMBER = re.compile(r"-(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$", re.IGNORECASE)
 OVERRIDES = "overrides"  # name of the parameter that receives the options `--data.NAME=VALUE`
-RENAMED = {f"{part}_pairs": f"{part}_problems" for part in ("train", "val", "test")} | {
-    "pairs_factor": "matches_factor",
-    "pairs": "problems",
-}
 
 
 class OneLineParser(ArgumentParser):
@@ -49,9 +45,6 @@ class OneLineParser(ArgumentParser):
         text, of_no_class, _ = text.partition(" Expected an instantiatable class, but bpnp.models.weights.AnyModule")
         if of_no_class:
             hint = ", since there is no class; name one first, such as --model.solver bpnp.models.BPnPNet"
-        renamed = (new for old, new in RENAMED.items() if text.endswith(f"Option '{old}' is not accepted"))
-        if new := next(renamed, None):
-            hint = f"; it is now {new}"
         raise ValueError(text + hint) from ex
 
 

@@ -181,11 +181,6 @@ def find_photos(results: Results, folder: Path | None, *, side: int = SIDE) -> C
         store = open_store(roots[0], PROBLEMS, check=False)
         if {"image", "model", "camera"} <= store.columns.keys():
             images = stored_images(store)
-        elif {"min_points", "clutter"} <= store.parameters.keys():  # of COLMAP models
-            raise ValueError(
-                f"{roots[0]} was prepared by an earlier version, without the cameras of its photos; run `bpnp prepare "
-                "megadepth` again"
-            )
     elif module == "ColmapDataModule":
         if gone := [each for each in roots if not Path(each).is_dir()]:
             raise ValueError(f"the COLMAP models of the test are no longer in {', '.join(gone)}")

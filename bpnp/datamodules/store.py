@@ -98,8 +98,8 @@ def open_store(folder: str | Path, kind: str, *, check: bool = True) -> Store:
         check: Compare the files with their checksums. Default: True. False opens a large store at once.
 
     Raises:
-        StoreError: There is no manifest, the kind or the format differs, the store has no rows, or a file is missing or
-            changed. The message names the folder or the file.
+        StoreError: There is no manifest, the kind or the format differs, or a file is missing or changed.
+            The message names the folder or the file.
     """
     path = Path(folder)
     for name, (size, checksum) in _manifest(path, kind)["files"].items() if check else ():
@@ -124,8 +124,8 @@ def _manifest(folder: Path, kind: str) -> dict[str, Any]:
     """Read the manifest of a store.
 
     Raises:
-        StoreError: It is missing, truncated, edited, of another kind or format, names files other than the columns, or
-            has no rows.
+        StoreError: It is missing, truncated, edited, of another kind or format, or names files other than
+            the columns.
     """
     try:
         manifest = dict(read_json(folder / MANIFEST))
@@ -146,8 +146,6 @@ def _manifest(folder: Path, kind: str) -> dict[str, Any]:
             f"{folder / MANIFEST} names files other than the columns in its folder: {', '.join(manifest['files'])}. "
             "Prepare the data set again."
         )
-    if not manifest["rows"]:  # an earlier version could write such a store, without most columns
-        raise StoreError(f"{folder} holds no {kind}; remove it, and write or prepare it with at least one")
     return manifest
 
 

@@ -1,7 +1,5 @@
 """Map for localising photos: the points and views of a COLMAP reconstruction."""
 
-import sys
-import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -43,10 +41,6 @@ if TYPE_CHECKING:
     import torch
 
 UNKNOWN = "unknown"  # focal length
-DEFAULT_LIMIT = (
-    f"the search of a photo now ends after {TIME.photo:.0f} s by default, and this photo was not decided; "
-    "`time_limit=math.inf` is no limit"
-)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -202,8 +196,6 @@ class SceneMap(ViewedPoints):
             upright = self.match_orientation(_direction(up_camera))
             maps = [upright, self] if upright is not self else maps
         result = localize(maps, photo, None if views is None else list(views), options, limit)
-        if time_limit is None and not result.is_complete:
-            warnings.warn(DEFAULT_LIMIT, DeprecationWarning, stacklevel=_level_of_user())
         solution = result.solution
         return solution if strongest is None else among_all(solution, strongest, pixels)
 
@@ -214,7 +206,7 @@ class SceneMap(ViewedPoints):
         keypoints: PointsLike,
         *,
         seed: int = 0,
-        time_limit: float | int | None = TIME.one,
+        time_limit: float | int | None = None,
     ) -> Solution:
         """Verify the pose of a view without its own observations.
 
@@ -228,8 +220,8 @@ class SceneMap(ViewedPoints):
             keypoints: (m, 2) pixels, all that were detected in its image, in COLMAP's convention: (0.5, 0.5) is the
                 centre of the first pixel.
             seed: Seed of the perturbed copies of the pose from which it is refined, default 0.
-            time_limit: Seconds, 10 by default; math.inf for no limit. A pose whose competing poses were not all tested
-                by then is "ambiguous" at best. None is deprecated: it warns and stands for 10 seconds.
+            time_limit: Seconds; math.inf for no limit. Default: None, 10 seconds. A pose whose competing poses were not
+                all tested by then is "ambiguous" at best.
 
         Returns:
             Solution as of `bpnp.verify`. `points3d` and `point_ids` are the points in view.
@@ -238,9 +230,6 @@ class SceneMap(ViewedPoints):
             ValueError: The name is not in the map, there are fewer than 4 keypoints, or the view can see fewer than 4
                 of the remaining points.
         """
-        if time_limit is None:
-            message = "`time_limit=None` of `verify_view` is its default limit now, 10 s; math.inf is no limit"
-            warnings.warn(message, DeprecationWarning, stacklevel=2)
         limit = seconds_from(time_limit, TIME.one)
         view, rest = self.named([name])[0], self.without([name])
         pixels = np.asarray(pixels_from(keypoints, view.camera), np.float64)
@@ -386,11 +375,3 @@ def _direction(up_camera: Any) -> Array:
     if up.shape != (3,) or not np.isfinite(up).all() or not up.any():
         raise ValueError(f"`up_camera` is {up.tolist()}; three numbers that are not all zero are needed")
     return up
-
-
-def _level_of_user() -> int:
-    """Return the stack level of the innermost caller outside this package, for warnings of the calling function."""
-    frame, level = sys._getframe(1), 1
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("bpnp."):
-        frame, level = frame.f_back, level + 1
-    return level

@@ -2,7 +2,6 @@
 
 import json
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
@@ -28,8 +27,7 @@ Array = npt.NDArray[np.float64]
 ROTATION_PARAMETERS = ("rotation_x", "rotation_y", "rotation_z")  # rotation vector in the camera axes, radians
 POSE_PARAMETERS = (*ROTATION_PARAMETERS, "translation_x", "translation_y", "translation_z")
 FOCAL_LENGTH, SCALE = "focal_length", "scale"
-FORMAT = 3  # 2: with false alarms; 3: matches of a photo in a map are indices, names of the parameters
-MATCHES_ARE_IDS = 2  # format in which the matches of a photo in a map held the ids of points
+FORMAT = 3  # of the JSON file; raised when the meaning of a field changes
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,12 +159,6 @@ class Solution:
     def matched_point_ids(self) -> npt.NDArray[np.int64] | None:
         """Ids (k,) in the map of the 3D points of the matches; None without a map."""
         return None if self.point_ids is None else self.point_ids[self.matches[:, 1]]
-
-    @property
-    def match_places(self) -> npt.NDArray[np.int64]:
-        """Deprecated name of `matches`."""
-        warnings.warn("`match_places` is now `matches`, and will be removed", DeprecationWarning, stacklevel=2)
-        return self.matches
 
     @property
     def centre(self) -> Array:
@@ -319,11 +311,11 @@ class Solution:
             content = read_json(text) if isinstance(text, Path) else parse_json(text)
             if not isinstance(content, dict):
                 raise ValueError(f"it holds {short_repr(content)}")
-            if content["format"] not in (MATCHES_ARE_IDS, FORMAT):
-                raise ValueError(f"format {content['format']}, try the bpnp that wrote it")
+            if content["format"] != FORMAT:
+                raise ValueError(f"format {content['format']} in place of {FORMAT}; solve the problem again")
             if content["verdict"] not in get_args(Verdict):
                 raise ValueError(f"verdict {content['verdict']!r}")
-            solution = _read(cls, content if content["format"] == FORMAT else _converted(content))
+            solution = _read(cls, content)
             counts = [len(solution.points2d), len(solution.points3d)]
             if ((solution.matches < 0) | (solution.matches >= counts)).any():
                 most = solution.matches.max(0).tolist()
@@ -451,22 +443,9 @@ def _plain(value: Any) -> Any:
 
 
 def _read(kind: type, content: dict[str, Any]) -> Any:
-    """Build a dataclass from its JSON; fields in `LATER` and fields that default to None may be missing."""
-    missing = [field for field in fields(kind) if field.name not in content]
-    optional = [field.name for field in missing if field.default is None or field.name in LATER]
-    values = {field.name: content[field.name] for field in fields(kind) if field.name not in optional}
+    """Build a dataclass from its JSON."""
+    values = {field.name: content[field.name] for field in fields(kind)}
     return kind(**{name: READERS[name](value) if name in READERS else value for name, value in values.items()})
-
-
-def _converted(content: dict[str, Any]) -> dict[str, Any]:
-    """Return the content of a file of format `MATCHES_ARE_IDS` with matches as indices and the names of parameters."""
-    matches, size = content["matches"], len(content.get("covariance", POSE_PARAMETERS))
-    if content.get("point_ids") is not None:
-        index = {point_id: j for j, point_id in enumerate(content["point_ids"])}
-        matches = [(i, index[point_id]) for i, point_id in matches]
-    pose = ROTATION_PARAMETERS if size in (3, 4) else POSE_PARAMETERS
-    other = FOCAL_LENGTH if content.get("camera") is not None else SCALE
-    return content | {"matches": matches, "parameters": (*pose, other)[:size]}
 
 
 def _array(values: Any, *, shape: tuple[int, ...]) -> Array:
@@ -477,7 +456,6 @@ def _float(value: float | None, *, missing: float = math.nan) -> float:
     return missing if value is None else value
 
 
-LATER = {"covariance", "scale", "taken2d", "reason_code", "unfinished"}  # fields added after version 0.1.0
 READERS: dict[str, Callable[[Any], Any]] = {  # of the fields with another form in JSON
     "rotation": partial(_array, shape=(3, 3)),
     "translation": partial(_array, shape=(3,)),

@@ -122,8 +122,8 @@ class PoseLossWarmup(Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore the epoch of the switch, and print options that differ from the saved ones."""
         self.switched_at = state_dict["switched_at"]
-        for name in ("start_epoch", "weight"):  # not saved by version 0.2
-            saved, own = state_dict.get(name, getattr(self, name)), getattr(self, name)
+        for name in ("start_epoch", "weight"):
+            saved, own = state_dict[name], getattr(self, name)
             if saved != own:
                 rank_zero_info(f"The pose loss has {name}={own} (saved: {saved}).")
 

@@ -497,7 +497,7 @@ class BlindPnPTask(LightningModule):
         self._adopt(checkpoint, None if self._trainer is None else self.trainer.ckpt_path)
         self._check_pose_loss_continues(checkpoint)
         self.skipped_steps, self.consecutive_skipped_steps = checkpoint.get("skipped_steps", (0, 0))
-        self.optimizer_names = checkpoint.get("optimizer_names", ["Adam"])  # older versions only had Adam
+        self.optimizer_names = checkpoint.get("optimizer_names")
 
     def _check_pose_loss_continues(self, checkpoint: Mapping[str, Any]) -> None:
         """Raise ValueError if a training with a pose loss, now or later, is resumed without one."""

@@ -105,7 +105,6 @@ def test_options_of_the_network_and_its_parts_are_explained(
             "Expected a <class 'float'>. Got value: fast\n",
         ),
         (["fit", *MESHES, "--data.nonsense=3"], "error: Parser key \"data\": Option 'nonsense' is not accepted\n"),
-        (["fit", *MESHES, "--data.train_pairs=3"], "'train_pairs' is not accepted; it is now train_problems\n"),
         (["fit", *MESHES, "--data.num_points=many"], "\"num_points\": Expected a <class 'int'>. Got value: many\n"),
         (["fit", *MESHES, "--data.batch_size=0"], "error: `batch_size` is 0; it must be 1 or more\n"),
         (["fit", *MESHES, "--data.seed=-1"], "error: `seed` is -1; it must be 0 or more\n"),

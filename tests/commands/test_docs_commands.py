@@ -8,8 +8,8 @@ import pytest
 import torch
 import yaml
 from authors_network import Released, checkpoint
+from authors_pickles import sample, write
 from planted_model import plant_model
-from released_pickles import sample, write
 from small_data import SMALL_FEATURES, write_mesh_tree
 
 from bpnp.cli import main

@@ -21,9 +21,6 @@ from bpnp.cameras import camera_from
 from bpnp.cli import main
 from bpnp.commands.photo_files import ColmapPhotos, ModelImage, find_photos
 from bpnp.datamodules import ColmapDataModule
-from bpnp.datamodules.colmap.module import ColmapSource
-from bpnp.datamodules.colmap.reconstruction import read_reconstruction
-from bpnp.datamodules.stored import write_problems
 from bpnp.report import dashboards, figures, page, read_points, read_results, write_results
 from bpnp.report.photos import undistort_photo
 from bpnp.report.points import points_from, write_points
@@ -142,25 +139,6 @@ def test_a_store_shows_photos_without_its_models(tested: Path) -> None:
         for line in lines:
             photo = np.array(Image.open(io.BytesIO(base64.b64decode(line["photo"]["jpeg"]))))
             assert np.median(brightness(photo, line["photo"]["extent"], np.array(line["points2d"]))) > 150
-
-
-def test_a_store_without_cameras_is_read_and_named(
-    tested: Path, capsys: pytest.CaptureFixture[str], fails: Callable[..., str]
-) -> None:
-    """Of version 0.3: the same columns, but none for photos."""
-    source = ColmapSource([read_reconstruction(tested / "castle" / "sparse" / "0", name="castle")])
-    problems = [("castle", source.problem(i)) for i in range(3)]
-    write_problems(tested / "old", problems, parameters={"min_points": 4, "clutter": 0.0})
-    results, output = tested / "table" / "search", str(tested / "report.html")
-    set_root(tested / "old", results)
-    main(["report", str(results), "--html", output])
-    sentence = f"{tested / 'old'} was prepared by an earlier version, without the cameras of its photos"
-    assert capsys.readouterr().out.replace("\n", " ").count(sentence) == 1
-    assert sentence in fails("report", str(results), "--html", output, "--photos", str(tested / "castle" / "images"))
-    old = ColmapDataModule(str(tested / "old"), test_fraction=1.0, batch_size=3)
-    old.setup("test")
-    (batch,) = old.test_dataloader()
-    assert sorted(batch.ids) == [f"castle/photo {i}.jpg" for i in range(3)]
 
 
 def test_missing_photos_are_counted_once(tested: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from authors_pickles import Exploit, Sample, sample, write
 from planted import seen
-from released_pickles import Exploit, Sample, sample, write
 
 from bpnp.cli import main
 from bpnp.datamodules.augment import Outliers

@@ -175,6 +175,13 @@ def test_a_damaged_store_that_another_process_has_mended_meanwhile_is_kept(
     assert list(tmp_path.iterdir()) == [made]
 
 
+def test_a_store_of_another_format_is_refused_with_the_advice_to_prepare_it_again(tmp_path: Path) -> None:
+    manifest = {"format": 3, "kind": "problems", "rows": 0, "bulk": [], "columns": {}, "checksum": 0}
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(StoreError, match="holds problems in format 3, not problems in format 4; .*prepare it again"):
+        open_store(tmp_path, "problems")
+
+
 def test_versions_of_two_formats_share_a_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recipe, work = toy_recipe()
     folders = []

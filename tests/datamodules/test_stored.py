@@ -9,12 +9,10 @@ import pytest
 import torch
 import yaml
 from jsonargparse import ArgumentParser
-from lightning import LightningDataModule
 
-import bpnp.datamodules
 from bpnp.datamodules import Problem, ProblemSource, StoredDataModule, write_problems
-from bpnp.datamodules.store import Store, StoreError, new_store, open_store
-from bpnp.datamodules.stored import PROBLEMS, WIDTHS, StoredProblems, scene_rows, stored_problem
+from bpnp.datamodules.store import Store, StoreError, open_store
+from bpnp.datamodules.stored import PROBLEMS, StoredProblems, scene_rows, stored_problem
 
 
 def sets(i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -55,13 +53,6 @@ def test_points_with_other_coordinates_are_not_written(tmp_path: Path, side: str
     with pytest.raises(StoreError, match=rf"`{side}` of scène 0/0 has the shape \(\d+, {width}\); \(k, {side[-2]}\)"):
         write_problems(tmp_path / "store", [("a", wrong)])
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_store_without_problems_of_an_earlier_version_is_refused(tmp_path: Path) -> None:
-    with new_store(tmp_path / "empty", PROBLEMS, WIDTHS):
-        pass
-    with pytest.raises(StoreError, match=r"empty holds no problems; remove it"):
-        StoredDataModule(str(tmp_path / "empty")).setup()
 
 
 @pytest.fixture
@@ -168,16 +159,3 @@ def test_a_store_of_anyones_pairs_is_split_by_scene(store: Store) -> None:
     data = StoredDataModule(str(store.folder), test_scenes=["s1"], val_scenes=["s2"])
     data.setup()
     assert {name for batch in data.test_dataloader() for name in batch.ids} == {f"scène 1/{i}" for i in range(1, 12, 3)}
-
-
-@pytest.mark.parametrize(
-    ("earlier", "today"),
-    [("SfmSceneDataModule", "SyntheticMapDataModule"), ("PreprocessedDataModule", "AuthorsDataModule")],
-)
-def test_class_paths_of_earlier_yaml_files_load(earlier: str, today: str) -> None:
-    parser = ArgumentParser(exit_on_error=False)
-    parser.add_subclass_arguments(LightningDataModule, "data")
-    root = {} if earlier.startswith("Sfm") else {"root": "nowhere"}
-    arguments = {"data": {"class_path": f"bpnp.datamodules.{earlier}", "init_args": root | {"batch_size": 3}}}
-    data = parser.instantiate(parser.parse_object(arguments)).data
-    assert (type(data), data.batch_size) == (getattr(bpnp.datamodules, today), 3)

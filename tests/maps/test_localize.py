@@ -1,10 +1,6 @@
 """A photo's pose in a map comes from its keypoints alone."""
 
-import json
 import math
-import subprocess
-import sys
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +21,7 @@ from bpnp.maps.all_points import judge_on_all_points, refine_on_all_points
 from bpnp.maps.localize import BRIEF
 from bpnp.maps.photo_problem import Photo
 from bpnp.maps.views import View
-from bpnp.search.config import MAPS, TIME
+from bpnp.search.config import MAPS
 from bpnp.search.verdict.decide import SearchResult, judge
 from bpnp.search.verdict.false_alarms import alarms_of
 from bpnp.search.verdict.reasons import Objection, objection
@@ -84,30 +80,6 @@ def test_matches_are_indices_and_their_ids_are_those_of_the_map(planted: tuple[S
     assert again.view == "photo 0.jpg"
     np.testing.assert_array_equal(again.matches, solution.matches)
     np.testing.assert_array_equal(again.matched_point_ids, solution.matched_point_ids)
-    with pytest.warns(DeprecationWarning, match="`match_places` is now `matches`"):
-        np.testing.assert_array_equal(solution.match_places, solution.matches)
-
-
-def test_the_ids_of_an_earlier_file_become_indices(planted: tuple[SceneMap, Planted]) -> None:
-    """Format 2 had the ids of the points in `matches`, and no names of the parameters."""
-    scene, truth = planted
-    solution = scene.localize(photo_of(truth, 0)[0], PINHOLE, views=["photo 0.jpg"])
-    content = json.loads(solution.to_json())
-    ids = solution.matched_point_ids
-    assert ids is not None
-    before = content | {"format": 2, "matches": np.column_stack([solution.matches[:, 0], ids]).tolist()}
-    del before["parameters"]
-    read = Solution.from_json(json.dumps(before))
-    np.testing.assert_array_equal(read.matches, solution.matches)
-    np.testing.assert_array_equal(read.matched_point_ids, ids)
-    assert read.parameters == solution.parameters
-
-
-def test_time_limit_none_of_verify_view_is_its_default_limit_with_a_warning(planted: tuple[SceneMap, Planted]) -> None:
-    scene, truth = planted
-    pixels = 520 * seen(truth.points3d, truth.rotations[1], truth.translations[1]) + [400, 300]
-    with pytest.warns(DeprecationWarning, match="`time_limit=None` of `verify_view` is its default limit"):
-        scene.verify_view("photo 1.jpg", pixels, time_limit=None)
 
 
 def test_the_reason_has_the_number_of_views_tried_within_the_time_limit(planted: tuple[SceneMap, Planted]) -> None:
@@ -154,34 +126,6 @@ def test_a_function_ranks_the_places_of_competing_poses(planted: tuple[SceneMap,
     assert calls[0] == len(pixels)
     assert len(calls) > 1
     assert calls[1] < len(pixels)
-
-
-def test_the_default_time_limit_warns_where_there_was_none(
-    planted: tuple[SceneMap, Planted], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    scene, truth = planted
-    monkeypatch.setattr("bpnp.maps.scene_map.TIME", replace(TIME, photo=1e-9))
-    noise = np.random.default_rng(0).uniform((0, 0), (800, 600), (90, 2))
-    with pytest.warns(DeprecationWarning, match="`time_limit=math.inf` is no limit"):
-        assert "1 of 3 views" in scene.localize(noise, PINHOLE, solver="search").reason
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        scene.localize(noise, PINHOLE, solver="search", time_limit=1e-9)
-
-
-@pytest.mark.slow
-def test_the_warning_of_the_default_time_limit_reaches_a_script(tmp_path: Path) -> None:
-    """Python shows a DeprecationWarning where the line that causes it is in the script itself."""
-    plant_model(tmp_path / "map", camera=PINHOLE, images=3, points=140, seen=90)
-    script = tmp_path / "script.py"
-    script.write_text(
-        "import numpy as np\nfrom bpnp import SceneMap\nfrom bpnp.maps import scene_map\n"
-        "scene_map.TIME = type(scene_map.TIME)(photo=1e-9)\n"
-        f"scene, noise = SceneMap.from_colmap({str(tmp_path / 'map')!r}), np.random.default_rng(0).random((90, 2))\n"
-        f"scene.localize(noise * (800, 600), {PINHOLE!r}, solver='search')\n"
-    )
-    ran = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=True)
-    assert f"{script}:6: DeprecationWarning: the search of a photo now ends after" in ran.stderr
 
 
 def test_the_pose_is_fitted_to_all_points_that_its_camera_sees(planted: tuple[SceneMap, Planted]) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from authors_network import Released, checkpoint, plan
-from released_pickles import Exploit
+from authors_pickles import Exploit
 from small_data import quiet_trainer
 from torch import Tensor, nn
 

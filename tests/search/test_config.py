@@ -28,7 +28,7 @@ FIXED = {
     "search/propose/known_matches.py": {"FIXING"},  # three points fix a pose
     "search/propose/mirror.py": {"MIRROR"},  # reflection at z = 0
     "search/rig/search.py": {"BEFORE"},  # above every evidence
-    "search/solution.py": {"FORMAT", "MATCHES_ARE_IDS", "READERS"},  # versions of a file, and shapes
+    "search/solution.py": {"FORMAT", "READERS"},  # version of a file, and shapes
     "search/verdict/covariance.py": {"ONE_SIGMA"},  # normal distribution
     "search/verdict/decide.py": {"HALF_TURN"},  # the largest angle between rotations
     "search/verdict/uncertainty.py": {"MANY", "STRAINS", "POSE"},  # infinity; a basis of matrices; unknowns of a pose

@@ -16,14 +16,12 @@ from PIL import Image
 from planted import plant
 
 import bpnp
-from bpnp import report
 from bpnp.cameras import camera_from
 from bpnp.cli import main
 from bpnp.examples import load
 from bpnp.report.images import save_figure
 from bpnp.search.inputs import problem_from
 from bpnp.search.matching import failed_solution
-from bpnp.solving import solution as module
 
 EXAMPLE = load("mesh")
 PLANTED = plant(1, 40, seed=2)
@@ -64,12 +62,6 @@ def test_pycolmap_reads_a_complete_model(camera: Any, solved: bpnp.Solution, tmp
     again.mkdir()
     model.write_binary(str(again))
     assert pycolmap.Reconstruction(str(again)).num_points3D() == 200
-
-
-@pytest.mark.parametrize(("name", "successor"), [("solution_points",) * 2, ("solution_picture", "draw_solution")])
-def test_functions_that_moved_to_the_report_warn(name: str, successor: str) -> None:
-    with pytest.warns(DeprecationWarning, match=f"is now `bpnp.report.solutions.{successor}`"):
-        assert getattr(module, name) is getattr(report, successor)
 
 
 def test_a_solution_without_a_pose_cannot_be_exported(tmp_path: Path) -> None:

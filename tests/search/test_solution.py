@@ -37,9 +37,19 @@ def test_a_score_without_likelihood_is_the_same_after_its_json() -> None:
     assert Solution.from_json(changed.to_json()).candidates[0].score == -math.inf
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": 2}', "\0"])
-def test_a_text_that_is_no_solution_is_refused(text: str) -> None:
-    with pytest.raises(ValueError, match="not the JSON of a solution"):
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", ""),
+        ("[]", r"it holds \[\]"),
+        ("{}", "its field 'format' is missing"),
+        ('{"format": 2}', "format 2 in place of 3; solve the problem again"),
+        ('{"format": 3, "verdict": "failed"}', "its field 'rotation' is missing"),
+        ("\0", ""),
+    ],
+)
+def test_a_text_that_is_no_solution_is_refused(text: str, reason: str) -> None:
+    with pytest.raises(ValueError, match=f"not the JSON of a solution: {reason}"):
         Solution.from_json(text)
 
 

@@ -1,1 +1,0 @@
-"""Deprecated place of `bpnp.search`; the next minor version removes it."""
