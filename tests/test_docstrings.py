@@ -1,15 +1,27 @@
-"""Examples in docstrings: each runs when it is pasted, and gives the result that it shows."""
+"""Docstrings: examples run when they are pasted, and sections are where a user reads them."""
 
+import ast
 import doctest
 import importlib
 import inspect
+import io
+import pkgutil
 import pydoc
 import re
-from collections.abc import Iterator
+import tokenize
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import lightning
 import pytest
+import torch
+from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.loggers import Logger
+from lightning.pytorch.plugins import CheckpointIO
+
+import bpnp
+from bpnp.commands import COMMANDS
 
 pytestmark = pytest.mark.slow
 
@@ -24,6 +36,19 @@ PACKAGES = (
     "bpnp",
     *(f"bpnp.{name}" for name in ("datamodules", "layers", "models", "models.baselines", "report", "training")),
 )
+DONE = ("bpnp/maps",)  # folders whose docstrings have been read; `bpnp/*` stands for the files directly in it
+SECTION = re.compile(r"^ *(Args|Attributes|Returns|Raises|Yields):$", re.MULTILINE)
+CONFIGURABLE = (torch.nn.Module, lightning.LightningDataModule, Callback, Logger, CheckpointIO)  # by `class_path`
+# Names of other libraries and of data, which no code here uses.
+FOREIGN = {
+    "OnExceptionCheckpoint",
+    "SequentialLR",
+    "dataloader_idx_0",
+    "ddp_notebook",
+    "lu_factor",
+    "normal_resampled",
+    "setup_context",
+}
 INTERNAL = "bpnp.search."  # modules whose names are imported from `bpnp`, or are not public
 
 
@@ -95,3 +120,113 @@ def test_every_argument_of_a_public_name_is_described() -> None:
         missing += [f"{name}: no docstring"] if not text else []
         missing += [f"{name}: {each.name}" for each in parameters if not re.search(rf"^ +\**{each.name}: ", text, re.M)]
     assert missing == []
+
+
+def command_functions(commands: Mapping[str, Any]) -> Iterator[Any]:
+    for command in commands.values():
+        if isinstance(command, Mapping):
+            yield from command_functions(command)
+        else:
+            yield command
+
+
+def own_classes() -> Iterator[type]:
+    """Yield each class of the package."""
+    for info in pkgutil.walk_packages(bpnp.__path__, "bpnp."):
+        if not info.name.endswith("__main__"):
+            module = importlib.import_module(info.name)
+            classes = (each for each in vars(module).values() if inspect.isclass(each))
+            yield from (each for each in classes if each.__module__ == info.name)
+
+
+def place(each: Any) -> str:
+    """Return the name of a function or class, such as "bpnp.types.Batch.to"."""
+    each = inspect.unwrap(each)
+    return f"{each.__module__}.{each.__qualname__}"
+
+
+def places(each: type, *, is_public: bool) -> Iterator[str]:
+    """Yield the places of a class, of its constructor and `forward`, and of the methods of a public one."""
+    yield place(each)
+    for name, member in vars(each).items():
+        function = member.fget if isinstance(member, property) else getattr(member, "__func__", member)
+        if inspect.isfunction(function) and (name in ("__init__", "forward") or (is_public and name[0] != "_")):
+            yield place(function)
+
+
+def described_places() -> set[str]:
+    """Return the places of what may have sections: public names, commands, protocols, and what a YAML file can name.
+
+    The help of the command line shows the arguments of the last.
+    """
+    found = {place(command) for command in command_functions(COMMANDS)}
+    for public in public_objects():
+        if inspect.isclass(public):
+            own = (base for base in public.__mro__ if base.__module__.startswith("bpnp."))
+            found |= {each for base in own for each in places(base, is_public=True)}
+        else:
+            found.add(place(public))
+    for each in own_classes():
+        is_protocol = getattr(each, "_is_protocol", False) or inspect.isabstract(each)
+        if is_protocol or issubclass(each, CONFIGURABLE):
+            found |= set(places(each, is_public=is_protocol))
+    return found
+
+
+def documented_nodes(file: Path) -> Iterator[tuple[str, str]]:
+    """Yield place and docstring of each function and class of a file, and of the file itself."""
+
+    def visit(node: ast.AST, name: str) -> Iterator[tuple[str, str]]:
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
+            name = name if isinstance(node, ast.Module) else f"{name}.{node.name}"
+            yield name, ast.get_docstring(node) or ""
+        for child in ast.iter_child_nodes(node):
+            yield from visit(child, name)
+
+    module = ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+    yield from visit(ast.parse(file.read_text(encoding="utf-8")), module)
+
+
+def files_of(*folders: str) -> Iterator[Path]:
+    """Yield the Python files below folders, and of a folder `bpnp/*` the files directly in it."""
+    for folder in folders:
+        found = (ROOT / folder).glob("*.py") if folder.endswith("*") else (ROOT / folder).rglob("*.py")
+        yield from sorted(found)
+
+
+def test_only_what_a_user_reads_has_sections() -> None:
+    """The docstring of anything else is a sentence: an argument is described where the name and type do not."""
+    described = described_places()
+    documented = (node for file in files_of(*DONE) for node in documented_nodes(file))
+    assert [where for where, text in documented if SECTION.search(text) and where not in described] == []
+
+
+def identifiers(file: Path) -> Iterator[str]:
+    """Yield the names that the code of a file has, and those in its text constants, such as keys."""
+    yield from file.relative_to(ROOT).with_suffix("").parts
+    documentation = set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)) and ast.get_docstring(
+            node
+        ):
+            documentation.add(node.body[0].value)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in documentation:
+            yield from re.findall(r"[A-Za-z_]\w*", node.value)
+        for field in ("id", "attr", "arg", "name", "asname"):
+            if isinstance(name := getattr(node, field, None), str):
+                yield from name.split(".")
+
+
+def test_docstrings_and_comments_name_only_what_exists() -> None:
+    """A name in backticks, such as `layers.sinkhorn` or `Pose.stats`, is a name in the code of the package."""
+    known = {name for file in files_of("bpnp", "benchmarks", "tests") for name in identifiers(file)} | FOREIGN
+    wrong = []
+    for file in files_of(*DONE):
+        text = file.read_text(encoding="utf-8")
+        tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+        prose = [each.string for each in tokens if each.type == tokenize.COMMENT]
+        prose += [docstring for _, docstring in documented_nodes(file)]
+        for name in re.findall(r"`([A-Za-z_][\w.]*)`", "\n".join(prose)):
+            exists = set(name.split(".")) <= known and (not name.startswith("bpnp.") or pydoc.locate(name) is not None)
+            wrong += [] if exists else [f"{file.relative_to(ROOT)}: {name}"]
+    assert wrong == []

@@ -38,14 +38,9 @@ Pose = tuple[Array, Array]  # rotation (3, 3) and translation (3,), in the frame
 
 @dataclass(frozen=True, eq=False)
 class Competitor:
-    """The best competing pose elsewhere in a map.
+    """The best competing pose elsewhere in a map."""
 
-    Attributes:
-        margin: Decades by which it explains the image points worse than the pose; negative if better.
-        pose: The competing pose.
-    """
-
-    margin: float
+    margin: float  # decades by which it explains the image points worse than the pose; negative if better
     pose: Candidate
 
 
@@ -58,18 +53,11 @@ def best_competitor(
     regions: Iterable[Region],
     deadline: Deadline = NEVER,
 ) -> Competitor | None:
-    """Propose, refine and score the poses elsewhere in a map that explain the image points of a confident solution.
+    """Return the pose elsewhere in a map with the smallest margin to a confident solution, or None if there is none.
 
-    Args:
-        photo: The photo.
-        place: Points on which the poses are compared.
-        solution: Confident solution.
-        earlier: Significant poses that were found with the points of other views (`significant`).
-        regions: Regions of the map, ranked for the explained image points (`explained_keypoints`).
-        deadline: Deadline, after which the rest is left out; its `unfinished` then names the competing poses.
-
-    Returns:
-        The competing pose with the smallest margin; None if there is no different pose.
+    Proposals are `earlier` (significant poses of other views) and those found near `regions`, ranked for the explained
+    image points; all are compared on the points of `place`. After the deadline the rest is left out, and its
+    `unfinished` names the competing poses.
     """
     problem = replace(photo, view_count=1).problem(place, solution.camera, photo.prior)
     proposals = propose_elsewhere(photo, problem, place, solution, earlier, regions, deadline)
@@ -87,11 +75,6 @@ def margins_elsewhere(problem: Problem, solution: Solution, competing: Hypothese
     A map lacks points, and other ones of each place. Where each pose explains image points that the other one does not,
     the difference has to be significant by a sign test (`sign_margins`). A prior adds the ratio of the fractions of
     poses that are as near to it.
-
-    Args:
-        problem: Problem of the keypoints and the points on which the poses are compared, with the prior.
-        solution: The solution.
-        competing: Refined poses (c,) elsewhere.
     """
     best, scale = _pose_of(problem, solution), _scale_of(problem, solution)
     poses = competing.rotation, competing.translation
@@ -113,16 +96,10 @@ def propose_elsewhere(
     regions: Iterable[Region],
     deadline: Deadline,
 ) -> list[Pose]:
-    """Return poses elsewhere in the map that may explain the image points of a solution, unrefined.
+    """Return unrefined poses elsewhere in the map that may explain the image points of a solution.
 
-    Args:
-        photo: The photo.
-        problem: Problem of its keypoints and the points of `place`.
-        place: Points on which the poses are compared.
-        solution: The solution.
-        earlier: Significant poses that were found with the points of other views; they are proposed.
-        regions: Regions of the map, ranked for the explained image points; the first ones of other points are searched.
-        deadline: Deadline, after which no further region is searched.
+    `problem` has the points of `place`. Of the `regions`, ranked for the explained image points, the first ones with
+    other points are searched until the deadline.
     """
     scale = _scale_of(problem, solution)
     best = _pose_of(problem, solution)

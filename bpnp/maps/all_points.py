@@ -28,39 +28,24 @@ from bpnp.search.verdict.reasons import Unfinished
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """A pose refined on all map points in view.
-
-    Attributes:
-        region: Points in view.
-        problem: Problem of the keypoints and these points, with the fitted camera.
-        pose: Refined rotation (3, 3) and translation (3,), in the frame of the problem.
-        poses: The pose, its competing poses and the optima of local searches around it, in the frame of the problem.
-        scene: Normalised points of the problem.
-    """
+    """A pose refined on all map points in view."""
 
     region: Region
-    problem: Problem
-    pose: tuple[Array, Array]
+    problem: Problem  # problem of the keypoints and these points, with the fitted camera
+    pose: tuple[Array, Array]  # refined rotation (3, 3) and translation (3,), in the frame of the problem
+    # The pose, its competing poses and the optima of local searches around it, in the frame of the problem.
     poses: Hypotheses
-    scene: Scene
+    scene: Scene  # normalised points of the problem
 
 
 @one_blas_thread
 def refine_on_all_points(solution: Solution, photo: Photo, whole: Region, deadline: Deadline = NEVER) -> Refined | None:
-    """Refine a pose on all map points in view; an unknown focal length is fitted to them too.
+    """Refine a pose that was found with the points of one view on all map points in view, and an unknown focal length.
 
     The competing poses of a pose that is not confident yet are refined as well. Local searches around it propose more:
     one for a confident pose whose residuals grow, since a coarse optimum may have a finer one nearby; for others as
-    many as exclude a better pose nearby.
-
-    Args:
-        solution: Pose that was found with the points of one view.
-        photo: The photo.
-        whole: All points of the map.
-        deadline: Deadline, after which the rest is left unrefined.
-
-    Returns:
-        The refined poses; None if there is no pose, or fewer points in view than it has matches.
+    many as exclude a better pose nearby. The result is None without a pose, or if fewer points are in view than it has
+    matches.
     """
     if not solution.found:
         return None
@@ -107,15 +92,9 @@ def refine_on_all_points(solution: Solution, photo: Photo, whole: Region, deadli
 
 @one_blas_thread
 def judge_on_all_points(solution: Solution, refined: Refined | None) -> Solution:
-    """Judge a refined pose on all map points in view.
+    """Return the refined solution if its NFA is smaller, or if it is confident and the given one was not.
 
-    Args:
-        solution: Pose that was found with the points of one view.
-        refined: The pose and its competing poses on all points in view; None if it was not refined.
-
-    Returns:
-        The refined solution if its NFA is smaller, or if it is confident and the given one was not. Otherwise the given
-            solution, or a copy whose verdict is lowered by a competing pose among all points.
+    Otherwise return the given solution, whose verdict a competing pose among all points may lower.
     """
     if refined is None:
         return solution

@@ -45,13 +45,8 @@ def index_file(folder: Path) -> Path:
 def make_index(folder: Path, stamp: str, compute: Callable[[], Index]) -> Index:
     """Return the index of the model in a folder, and write it to the cache folder.
 
-    One process computes it; others that open the same model wait. Nothing is written if the model has changed since it
-    was read, or if the cache folder is not writable.
-
-    Args:
-        folder: Folder of the COLMAP model.
-        stamp: `model_stamp` of the folder from before the model was read.
-        compute: Computes the index from the model.
+    One process computes it; others that open the same model wait. Nothing is written if the model has changed since
+    `stamp`, its `model_stamp` from before it was read, or if the cache folder is not writable.
     """
     with ExitStack() as stack:
         try:

@@ -37,17 +37,11 @@ RANKS = {"failed": 0, "ambiguous": 1, "confident": 2}
 
 
 class ViewSolution(NamedTuple):
-    """The solution of a search near a view.
+    """The solution of a search near a view."""
 
-    Attributes:
-        place: View, its points and the camera of the search.
-        solution: The solution.
-        is_judged: True if it was refined and judged on all points.
-    """
-
-    place: Place
+    place: Place  # view, its points and the camera of the search
     solution: Solution
-    is_judged: bool
+    is_judged: bool  # refined and judged on all points
 
     @property
     def rank(self) -> tuple[int, float]:
@@ -57,15 +51,10 @@ class ViewSolution(NamedTuple):
 
 @dataclass(frozen=True)
 class LoopResult:
-    """Result of the loop.
-
-    Attributes:
-        solution: Solution of the photo.
-        is_complete: False if the time limit ended the loop without a confident pose.
-    """
+    """Result of the loop."""
 
     solution: Solution
-    is_complete: bool
+    is_complete: bool  # false if the time limit ended the loop without a confident pose
 
 
 def localize(
@@ -73,15 +62,9 @@ def localize(
 ) -> LoopResult:
     """Estimate the pose of a photo in a map; see `SceneMap.localize`.
 
-    Args:
-        maps: The map; before it, others with rotated views that are tried first, each in half of the time that is left.
-        photo: The photo.
-        views: Names of the views to try, best first; None for all views of the map.
-        options: Options of each search; `asks` is for longer searches only.
-        time_limit: Seconds; math.inf for no limit.
-
-    Raises:
-        ValueError: No view sees 4 or more points.
+    The last of `maps` is the map; those before it have rotated views and are tried first, each in half of the time that
+    is left. `views` are tried in their order, None stands for all. `time_limit` is in seconds. Raise ValueError if no
+    view sees 4 or more points.
     """
     start, deadline, tried = Clock.now(), Deadline.after(time_limit).before(TIME.judging), set[str]()
     results = list[LoopResult]()
@@ -106,14 +89,7 @@ def _localize_in(
     """Search near the views of a map until a pose is confident, the queue is empty, or time is over.
 
     Each view is tried briefly, then once more. A view with a likely pose, and in the end the most promising views, get
-    a longer search.
-
-    Args:
-        scene: The map.
-        photo: The photo.
-        views: Names of the views to try, best first; None for all views of the map.
-        options: Options of each search, with the deadline of all of them.
-        tried: Names of the views that were tried; those of this call are added.
+    a longer search. The names of the tried views are added to `tried`.
     """
     places = scene.places(views, photo.keypoints, photo.camera, photo.rank_views)
     if not places:
@@ -151,15 +127,7 @@ def _localize_in(
 def search_near(
     region: Region, photo: Photo, camera: Camera | UnknownCamera, options: Options, settings: SearchSettings
 ) -> Solution:
-    """Return the best pose of a photo among the points of one region.
-
-    Args:
-        region: Points, and the view to search near.
-        photo: The photo.
-        camera: Camera, or its prior.
-        options: Options of the search.
-        settings: Settings of the search.
-    """
+    """Return the best pose of a photo among the points of one region."""
     options = options._replace(settings=settings, asks=options.asks and settings is LONGER)
     prior = checked_prior(region.prior() if photo.prior is None else photo.prior)
     if isinstance(camera, UnknownCamera):
@@ -179,15 +147,8 @@ def judge_in_map(
     """Refine and judge a pose on all map points in view and, if it is confident, against poses elsewhere in the map.
 
     If a pose elsewhere is more likely by `Evidence.margin`, it is refined and judged in the same way, and used instead
-    if it is confident.
-
-    Args:
-        scene: The map.
-        photo: The photo.
-        found: The pose; returned unchanged if it was judged before.
-        earlier: Significant poses that were found with the points of other views.
-        until: Deadline, to whose end this may last; a pose whose competing poses were not all tested by then is
-            "ambiguous" at best.
+    if it is confident. A pose that was judged before is returned unchanged; one whose competing poses were not all
+    tested by the deadline is "ambiguous" at best.
     """
     if found.is_judged:
         return found
@@ -226,16 +187,7 @@ def find_competitor(
     earlier: Sequence[Candidate],
     deadline: Deadline = NEVER,
 ) -> Competitor | None:
-    """Return the best pose elsewhere in the map that explains the same image points.
-
-    Args:
-        scene: The map.
-        photo: The photo.
-        place: View near which the solution was found.
-        solution: Confident solution.
-        earlier: Significant poses that were found with the points of other views.
-        deadline: As for `best_competitor`.
-    """
+    """Return the best pose elsewhere in the map that explains the same image points as a confident solution."""
     if deadline.passed(reasons.Unfinished.competing_poses):
         return None
     explained = explained_keypoints(photo, solution)

@@ -29,16 +29,10 @@ def localized_picture(
 ) -> "Figure":
     """Draw a photo and its pose in a map.
 
-    The left part is the photo with its matches, coloured by their residuals, and the other keypoints faint. The right
-    part is the map from above with its views, and the camera with the 99.9 % ellipse of its centre. The next candidate
-    of an ambiguous solution is drawn too. A failed solution is drawn without matches and camera, since its pose is a
-    guess.
-
-    Args:
-        scene: The map.
-        solution: Pose of the photo.
-        photo: (h, w, 3) uint8, to draw under the matches.
-        title: First line, such as the name of the photo.
+    The left part is the photo (h, w, 3), uint8, with its matches, coloured by their residuals, and the other keypoints
+    faint. The right part is the map from above with its views, and the camera with the 99.9 % ellipse of its centre.
+    The next candidate of an ambiguous solution is drawn too. A failed solution is drawn without matches and camera,
+    since its pose is a guess.
     """
     from matplotlib.figure import Figure
 
@@ -58,10 +52,9 @@ def localized_picture(
 
 
 def draw_matches(axes: "Axes", solution: Solution, *, photo: Array | None = None) -> Any:
-    """Draw keypoints faint, and matches coloured by their reprojection errors.
+    """Draw keypoints faint and, unless the solution is failed, matches coloured by their reprojection errors.
 
-    Returns:
-        The coloured lines; None without matches. Matches of a failed solution are not drawn.
+    Return the coloured lines; None without matches.
     """
     from matplotlib.collections import LineCollection
 

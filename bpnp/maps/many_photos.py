@@ -45,19 +45,12 @@ Record = dict[str, Any]  # entry of a photo in results.json
 
 @dataclass(frozen=True)
 class PhotoTask:
-    """A photo to localise.
-
-    Attributes:
-        name: Name of the photo.
-        photo: Image file.
-        arguments: Arguments of `SceneMap.localize_photo`.
-        made_with: Fingerprints of all inputs of the solution.
-    """
+    """A photo to localise."""
 
     name: str
     photo: Path
-    arguments: Mapping[str, Any]
-    made_with: Mapping[str, Any]
+    arguments: Mapping[str, Any]  # arguments of `SceneMap.localize_photo`
+    made_with: Mapping[str, Any]  # fingerprints of all inputs of the solution
 
 
 Attempt = tuple[PhotoTask, Solution | str]  # a photo, and its solution or an error message
@@ -76,23 +69,10 @@ def photo_task(
     solver: str = "auto",
     **search: Any,
 ) -> PhotoTask:
-    """Build the task of a photo.
+    """Build the task of a photo from the arguments of `SceneMap.localize_photo` and the views to try, by photo name.
 
-    Args:
-        scene: The map.
-        name: Name of the photo.
-        photo: Image file.
-        map_content: Fingerprint of the files of the map.
-        camera: As for `SceneMap.localize_photo`.
-        views: Views to try, by photo name; None for the whole map.
-        keypoints: As for `SceneMap.localize_photo`.
-        leave_one_out: Remove the photo, which is a view of the map, from the map. The default camera is then that of
-            another view.
-        solver: As for `SceneMap.localize_photo`.
-        **search: focal_error, distortion, ignore_orientation, seed and time_limit.
-
-    Raises:
-        ValueError: The photo, its camera, its keypoints or its views are invalid.
+    `leave_one_out` removes the photo, a view of the map, from the map; its default camera is then that of another view.
+    Raise ValueError if the photo, its camera, its keypoints or its views are invalid.
     """
     photo_content, source = content_of(photo), "--camera"
     if camera is None or isinstance(camera, SceneMap):
@@ -142,18 +122,12 @@ def attempts(scene: SceneMap, tasks: Iterable[PhotoTask]) -> Iterator[Attempt]:
 
 @dataclass
 class Outcome:
-    """Result of a run.
+    """Result of a run."""
 
-    Attributes:
-        kept: Names of photos whose earlier solution is still valid.
-        again: Reasons why photos were solved again, by name.
-        errors: Error messages of photos that could not be tried, by name.
-        not_drawn: Error messages of pictures that could not be drawn, by the name of the photo.
-    """
-
-    kept: list[str] = field(default_factory=list)
-    again: dict[str, str] = field(default_factory=dict)
-    errors: dict[str, str] = field(default_factory=dict)
+    kept: list[str] = field(default_factory=list)  # names of photos whose earlier solution is still valid
+    again: dict[str, str] = field(default_factory=dict)  # reasons why photos were solved again, by name
+    errors: dict[str, str] = field(default_factory=dict)  # error messages of photos that could not be tried, by name
+    # Error messages of pictures that could not be drawn, by the name of the photo.
     not_drawn: dict[str, str] = field(default_factory=dict)
 
 
@@ -167,22 +141,11 @@ def localize_photos(
     done: Callable[[str], None] = lambda name: None,
     **options: Any,
 ) -> Outcome:
-    """Localise photos into a folder; solutions there with the same inputs and options are kept.
+    """Localise photos into a folder; solutions there with the same inputs and options (`photo_task`) are kept.
 
     A solution is written before its picture is drawn. A kept solution without a picture is drawn. Each task is built
-    just before it runs, since a photo may be replaced in the meantime.
-
-    Args:
-        scene: The map.
-        files: Image files by name.
-        folder: Folder of the solutions.
-        attempts: Localises the photos, on this machine or on a cluster.
-        pictures: Draw a picture of each photo. Default True.
-        done: Callback with a short message for each photo.
-        **options: As for `photo_task`.
-
-    Raises:
-        ValueError: A picture in the folder would replace a photo.
+    just before it runs, since a photo may be replaced in the meantime. `done` gets a short message for each photo.
+    Raise ValueError if a picture in the folder would replace a photo.
     """
     outcome = Outcome()
     places = {folder.picture(name).resolve() for name in files}
@@ -237,11 +200,7 @@ def localize_photos(
 
 
 def read_views(path: str | Path) -> dict[str, list[str]]:
-    """Read the views to try for each photo from a text file of lines `photo view`, as hloc writes retrieval pairs.
-
-    Raises:
-        ValueError: The file cannot be read, or a line does not have two names.
-    """
+    """Read the views to try for each photo from a text file of lines `photo view`, as hloc writes retrieval pairs."""
     try:
         lines = read_text(Path(path)).splitlines()
     except (OSError, ValueError) as error:
@@ -275,12 +234,7 @@ def content_of_map(folder: Path) -> str:
 
 
 def results_json(map_content: str, photos: Mapping[str, Record]) -> str:
-    """Return the content of results.json.
-
-    Args:
-        map_content: Fingerprint of the files of the map.
-        photos: Entries of the photos, by name.
-    """
+    """Return the content of results.json."""
     return json.dumps({"map": map_content, "photos": photos}, indent=1)
 
 
@@ -313,19 +267,13 @@ def _record(content: Any) -> Record:
 class SolutionFolder:
     """Folder with solutions/<photo>.json for each photo, and results.json and poses.txt for all.
 
-    Attributes:
-        path: The folder.
-        map_content: Fingerprint of the files of the map, whose frame the poses are in.
-        records: Entries of results.json, by photo.
-        damaged: What is wrong with each file of a solution that is not in results.json, by photo.
-
-    Raises:
-        ValueError: The folder has a results.json or poses.txt that is no result of `bpnp localize`.
+    A results.json or poses.txt that is no result of `bpnp localize` is a ValueError, so that it is not replaced.
     """
 
     path: Path
-    map_content: str
-    records: dict[str, Record] = field(default_factory=dict)
+    map_content: str  # fingerprint of the files of the map, whose frame the poses are in
+    records: dict[str, Record] = field(default_factory=dict)  # entries of results.json, by photo
+    # What is wrong with each file of a solution that is not in results.json, by photo.
     damaged: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -356,14 +304,9 @@ class SolutionFolder:
         return [key for key, value in task.made_with.items() if before.get(key) != value]
 
     def keep(self, task: PhotoTask, solution: Solution | str) -> None:
-        """Write the solution of a photo and the fingerprints of its inputs, and delete the picture of an earlier one.
+        """Write a solution and the fingerprints of its inputs, and delete the picture of an earlier one.
 
-        Args:
-            task: The photo.
-            solution: Solution, or an error message.
-
-        Raises:
-            ValueError: There is no solution; with its error message.
+        An error message in place of a solution is raised as a ValueError.
         """
         if isinstance(solution, str):
             raise ValueError(solution)
@@ -374,15 +317,7 @@ class SolutionFolder:
         self.damaged.pop(task.name, None)
 
     def draw(self, task: PhotoTask, scene: SceneMap) -> None:
-        """Draw the picture of a photo from its solution.
-
-        Args:
-            task: The photo, which has a solution.
-            scene: Map to draw the photo in.
-
-        Raises:
-            ValueError: The photo cannot be read, or its solution is damaged.
-        """
+        """Draw the picture of a photo from its solution; raise ValueError if the photo or the solution cannot be read."""
         solution = Solution.from_json(self._file("solutions", task.name, "json"))
         figure = localized_picture(scene, solution, photo=read_photo(task.photo), title=task.name)
         save_figure(figure, self.picture(task.name))

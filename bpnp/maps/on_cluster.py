@@ -25,17 +25,9 @@ class MapOfWorker(WorkerPlugin):
 def attempts_on_cluster(scene: SceneMap, tasks: Iterable[PhotoTask], cluster: str) -> Iterator[Attempt]:
     """Yield the results of photos in the order in which they finish.
 
-    The workers need bpnp, and photos and keypoints under the same paths as here. If a worker is lost, its photos are
-    reassigned.
-
-    Args:
-        scene: The map.
-        tasks: Photos to localise.
-        cluster: Address of a scheduler, such as tcp://10.0.0.1:8786, or the number of processes to start on this
-            machine.
-
-    Raises:
-        ValueError: There is no scheduler at the address.
+    `cluster` is the address of a scheduler, such as tcp://10.0.0.1:8786, or the number of processes to start on this
+    machine. The workers need bpnp, and photos and keypoints under the same paths as here. If a worker is lost, its
+    photos are reassigned.
     """
     plugin = MapOfWorker(scene)
     with connect_client(cluster) as client:

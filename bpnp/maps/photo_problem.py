@@ -15,33 +15,18 @@ from bpnp.search.solution import Solution
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """A photo to localise.
+    """A photo to localise."""
 
-    Attributes:
-        keypoints: (m, 2) pixels.
-        camera: Camera model, or its prior if the focal length is unknown.
-        prior: Prior of the pose; None for none.
-        view_count: Number of views that are tried, which the NFA counts as tests. Default 1.
-        seed: Seed of the search, default 0.
-        rank_views: Function that scores the views, as for `SceneMap.localize`; None for the density of the points.
-    """
-
-    keypoints: Array
-    camera: Camera | UnknownCamera
+    keypoints: Array  # (m, 2) pixels
+    camera: Camera | UnknownCamera  # camera model, or its prior if the focal length is unknown
     prior: Any = None
-    view_count: int = 1
+    view_count: int = 1  # number of views that are tried, which the NFA counts as tests
     seed: int = 0
+    # Function that scores the views, as for `SceneMap.localize`; None for the density of the points.
     rank_views: RankViews | None = None
 
     def problem(self, region: Region, camera: Any, prior: Any = None, focal: UnknownFocal | None = None) -> Problem:
-        """Return the problem of the keypoints and the points of one region.
-
-        Args:
-            region: Points to match.
-            camera: Camera of the photo.
-            prior: Prior of the pose; None for none.
-            focal: Prior of the focal length; None if it is known.
-        """
+        """Return the problem of the keypoints and the points of one region."""
         axes, cosines = region.cones
         arguments: dict[str, Any] = {"normals3d": axes, "cosines3d": cosines, "prior": prior, "focal": focal}
         problem = problem_from(self.keypoints, region.points3d, camera_from(camera), **arguments)

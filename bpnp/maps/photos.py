@@ -38,29 +38,19 @@ QUERY = """SELECT rows, cols, data, width, height FROM images
 
 
 class Keypoints(NamedTuple):
-    """Keypoints of a photo.
+    """Keypoints of a photo."""
 
-    Attributes:
-        pixels: (m, 2) pixels in COLMAP's convention: (0.5, 0.5) is the centre of the first pixel.
-        scores: (m,) strengths.
-        size: (width, height) of the photo, pixels; None if it is unknown.
-    """
-
-    pixels: Array
-    scores: Array
-    size: Size | None
+    pixels: Array  # (m, 2) pixels in COLMAP's convention: (0.5, 0.5) is the centre of the first pixel
+    scores: Array  # (m,) strengths
+    size: Size | None  # (width, height) of the photo, pixels; None if it is unknown
 
 
 def photo_files(paths: Iterable[Path], besides: Collection[Path] = ()) -> dict[str, Path]:
     """Return photo files by name: given files by file name, and files in given folders by their path in the folder.
 
-    Args:
-        paths: Files and folders; folders are searched recursively, also through links.
-        besides: Folders to skip in folders, such as that of the pictures of the results. Default: none.
-
-    Raises:
-        ValueError: A path does not exist, there is no photo, two photos have one name, or a name cannot begin a line of
-            a text file of poses.
+    Folders are searched recursively, also through links, without the folders `besides`, such as that of the pictures of
+    the results. Raise ValueError if a path does not exist, there is no photo, two photos have one name, or a name
+    cannot begin a line of a text file of poses.
     """
     files: dict[str, Path] = {}
     left_out = {folder.resolve() for folder in besides}
@@ -104,9 +94,6 @@ def focal_from_exif(photo: Path) -> float | None:
     millimetres is multiplied by the sensor resolution and scaled by the ratio of the stored size to the original size.
     A photo whose aspect ratio differs from the original was cropped at an unknown position, and the result is None.
     (pycolmap's `infer_camera_from_image` does not correct the sensor resolution of a scaled photo.)
-
-    Raises:
-        ValueError: The photo cannot be read.
     """
     size, tags = _read_size_and_tags(photo)
     taken = int(_number_of(tags, PIXELS_X)), int(_number_of(tags, PIXELS_Y))
@@ -123,13 +110,9 @@ def focal_from_exif(photo: Path) -> float | None:
 
 
 def up_from_exif(photo: Path) -> tuple[float, float, float] | None:
-    """Return the direction up (3,) in the camera frame of a stored photo, to a quarter turn, from the EXIF orientation.
+    """Return the direction up in the camera frame of a stored photo, to a quarter turn, from the EXIF orientation.
 
-    Returns:
-        Unit vector; None if there is no orientation, or a mirrored one.
-
-    Raises:
-        ValueError: The photo cannot be read.
+    It is a unit vector; None if there is no orientation, or a mirrored one.
     """
     return UP_OF_ORIENTATION.get(_read_size_and_tags(photo)[1].get(ORIENTATION, 0))
 
@@ -142,13 +125,7 @@ def _read_size_and_tags(photo: Path) -> tuple[Size, dict[int, Any]]:
 
 
 def _number_of(tags: dict[int, Any], tag: int, default: float = 0.0) -> float:
-    """Return the number of an EXIF tag.
-
-    Args:
-        tags: Values by tag.
-        tag: Tag.
-        default: Value if the tag is missing, or is not a number from 0.
-    """
+    """Return the number of an EXIF tag; the default if the tag is missing, or is not a number from 0."""
     try:
         value = float(tags.get(tag, default))
     except (TypeError, ValueError, OverflowError):
@@ -157,13 +134,7 @@ def _number_of(tags: dict[int, Any], tag: int, default: float = 0.0) -> float:
 
 
 def photo_keypoints(photo: Path, file: str | Path | None, name: str) -> Keypoints:
-    """Return the keypoints of a photo.
-
-    Args:
-        photo: Image file.
-        file: HDF5 file of hloc, or database of COLMAP; None to detect SIFT keypoints.
-        name: Name of the photo in that file.
-    """
+    """Return the keypoints of a photo from an HDF5 file of hloc or a database of COLMAP; None detects SIFT keypoints."""
     if file is None:
         return detected_keypoints(photo)
     path, size = Path(file), photo_size(photo)
@@ -180,13 +151,6 @@ def detected_keypoints(photo: Path, *, most: int = MAPS.most_detected) -> Keypoi
     The contrast threshold is COLMAP's. Like COLMAP, the `most` largest keypoints are kept. Large keypoints are more
     often detected from other viewpoints and triangulated. So the scale predicts better than the response if a keypoint
     has a map point.
-
-    Args:
-        photo: Image file.
-        most: Largest number of keypoints, default 8192.
-
-    Raises:
-        ValueError: The photo cannot be read, or has no keypoints.
     """
     import cv2
 
@@ -210,14 +174,9 @@ def detected_keypoints(photo: Path, *, most: int = MAPS.most_detected) -> Keypoi
 def read_features(file: Path, photo: str, size: Size | None = None) -> Keypoints:
     """Read the keypoints of a photo from an HDF5 file of hloc: `<photo>/keypoints` (m, 2) and optional `scores` (m,).
 
-    Args:
-        file: HDF5 file.
-        photo: Name of the photo in the file.
-        size: (width, height) of the photo, pixels, for a check; None for `<photo>/image_size`, if the file has it.
-
-    Raises:
-        ValueError: The photo is not in the file or has another size, or keypoints lie outside it (`outside_image`). The
-            message names file and photo.
+    `size` of the photo, for a check, is by default `<photo>/image_size`, if the file has it. Raise ValueError, which
+    names file and photo, if the photo is not in the file or has another size, or keypoints lie outside it
+    (`outside_image`).
     """
     try:
         h5py = importlib.import_module("h5py")  # optional
@@ -246,16 +205,9 @@ def read_features(file: Path, photo: str, size: Size | None = None) -> Keypoints
 def read_database(file: Path, photo: str, size: Size | None = None) -> Keypoints:
     """Read the keypoints of a photo from a COLMAP database, one per position; the score is the scale, if stored.
 
-    The database is opened read-only; `pycolmap.Database` writes to every file that it opens.
-
-    Args:
-        file: SQLite database.
-        photo: Name of the image in the database.
-        size: (width, height) of the photo, pixels, to compare with the image's camera; None for no comparison.
-
-    Raises:
-        ValueError: The photo is not in the database, has no keypoints or another size, or its keypoints are damaged or
-            outside it. The message names file and photo.
+    The database is opened read-only; `pycolmap.Database` writes to every file that it opens. Raise ValueError, which
+    names file and photo, if the photo is not in the database, has no keypoints or another size than `size` (None for no
+    check), or its keypoints are damaged or outside it.
     """
     try:
         logged = file.with_name(f"{file.name}-wal").exists()

@@ -32,13 +32,8 @@ def up_of_views(views: Sequence[View]) -> Array | None:
 def count_quarter_turns(views: Sequence[View], up_camera: Array) -> NDArray[np.int64]:
     """Return the number of quarter turns (v,), 0 to 3, that rotate each view to the orientation of a photo.
 
-    Args:
-        views: Views of a map.
-        up_camera: (3,) direction up in the camera frame of the photo.
-
-    Returns:
-        Turns about the optical axis, from x towards y. 0 for views that point steeply up or down, and for all views if
-            the direction up in the map is unknown.
+    Turns are about the optical axis, from x towards y; `up_camera` (3,) is the direction up in the photo's camera
+    frame. It is 0 for views that point steeply up or down, and for all views if the direction up in the map is unknown.
     """
     up = up_of_views(views)
     if up is None or np.hypot(*up_camera[:2]) < MAPS.in_plane * np.linalg.norm(up_camera):

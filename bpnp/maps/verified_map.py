@@ -28,31 +28,20 @@ WORST_FIRST = ("failed", "ambiguous", UNTESTED, "confident")
 
 @dataclass(frozen=True)
 class VerifiedView:
-    """Verdict on the pose of an image of a model.
-
-    Attributes:
-        name: Name of the image.
-        verdict: Verdict as of `bpnp.verify`, or "untested" if the other images see too few of its points.
-        reason: One sentence.
-        points: Number of points in view that two other images see.
-        matches: Number of keypoints that one of these points explains.
-        reprojection_error: Mean over the matches, pixels; NaN without a match.
-        log10_false_alarms: Log10 NFA; infinite if untested.
-        rotation_change_deg: Angle from the pose to the optimum of these points, degrees; NaN if untested.
-        centre_change: Distance from its camera centre to that of the optimum, scene units; NaN if untested.
-        other_centre: Camera centre of the best competing pose; None without one.
-    """
+    """Verdict on the pose of an image of a model."""
 
     name: str
-    verdict: str
+    verdict: str  # verdict as of `bpnp.verify`, or "untested" if the other images see too few of its points
     reason: str
-    points: int = 0
-    matches: int = 0
-    reprojection_error: float = math.nan
-    log10_false_alarms: float = math.inf
+    points: int = 0  # number of points in view that two other images see
+    matches: int = 0  # number of keypoints that one of these points explains
+    reprojection_error: float = math.nan  # mean over the matches, pixels; NaN without a match
+    log10_false_alarms: float = math.inf  # log10 NFA; infinite if untested
+    # Angle from the pose to the optimum of these points, degrees; NaN if untested.
     rotation_change_deg: float = math.nan
+    # Distance from its camera centre to that of the optimum, scene units; NaN if untested.
     centre_change: float = math.nan
-    other_centre: tuple[float, float, float] | None = None
+    other_centre: tuple[float, float, float] | None = None  # camera centre of the best competing pose; None without one
 
     @property
     def doubtful(self) -> bool:
@@ -71,20 +60,9 @@ def verify_map(
 
     A pose is judged on all keypoints of the image. If it is significant only on the keypoints that the model matched,
     it is "ambiguous". Thousands of other keypoints may hide a correct pose, and the matched ones alone do not exclude a
-    similar building.
-
-    Args:
-        folder: Folder of the model; the keypoints of its images are read.
-        scene: The map of the same model.
-        seed: Seed, as for `SceneMap.verify_view`. Default 0.
-        time_limit: Seconds per image, as for `SceneMap.verify_view`. Default 10; math.inf for no limit.
-        done: Callback with a short message for each image.
-
-    Returns:
-        A record for each view of the map: failed, ambiguous, untested, confident; the largest NFA first.
-
-    Raises:
-        ColmapError: The model cannot be read. It is a ValueError.
+    similar building. `time_limit` is in seconds per image, as for `SceneMap.verify_view`; `done` gets a short message
+    for each image. Views are sorted by verdict: failed, ambiguous, untested, confident; the largest NFA first. Raise
+    ColmapError, a ValueError, if the model cannot be read.
     """
     images = {image.name: image for image in read_records(folder).images}
     verified = []

@@ -20,20 +20,11 @@ from bpnp.search.verify import verify_problem
 def verify_pose(
     photo: Photo, view: View, place: Region, regions: Callable[[Array], Iterable[Region]], *, time_limit: float
 ) -> Solution:
-    """Verify the pose of a view with the points of a map that was built without it.
+    """Verify the pose of a view with the points of a map that was built without it (`place`).
 
-    The pose is judged on the points in view (`verify_problem`). It is then compared with poses elsewhere in the map
-    that explain the same image points (`bpnp.maps.aliasing`).
-
-    Args:
-        photo: Keypoints of the view and its camera.
-        view: View with the pose.
-        place: All points of the map without the view.
-        regions: Returns the regions of this map, ranked for keypoints (k, 2).
-        time_limit: Seconds, at most half of them for `verify_problem`; math.inf for no limit.
-
-    Raises:
-        ValueError: There are fewer than 4 keypoints, or fewer than 4 map points in view.
+    The pose is judged on the points in view (`verify_problem`), in at most half of the time limit in seconds. It is
+    then compared with poses elsewhere in the map, in `regions` ranked for keypoints (k, 2), that explain the same image
+    points (`bpnp.maps.aliasing`). Raise ValueError for fewer than 4 keypoints, or fewer than 4 map points in view.
     """
     deadline = Deadline.after(time_limit)
     if len(photo.keypoints) < MIN_POINTS:

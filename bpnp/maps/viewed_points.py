@@ -41,21 +41,13 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Map points that one view, or several, see, and the view to search near.
-
-    Attributes:
-        view: View to search near.
-        points3d: (k, 3) scene points.
-        point_ids: (k,) ids of the points in the COLMAP model.
-        cones: Cones of directions from which the points are visible.
-        distance: Median distance from the view to its own points, scene units; NaN if it has no points.
-    """
+    """Map points that one view, or several, see, and the view to search near."""
 
     view: View
-    points3d: Array
-    point_ids: NDArray[np.int64]
-    cones: Cones
-    distance: float
+    points3d: Array  # (k, 3) scene points
+    point_ids: NDArray[np.int64]  # (k,) ids of the points in the COLMAP model
+    cones: Cones  # cones of directions from which the points are visible
+    distance: float  # median distance from the view to its own points, scene units; NaN if it has no points
 
     def prior(self) -> PosePrior:
         """Return a prior at the view's pose, as wide as the poses of photos of one place differ."""

@@ -23,21 +23,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A registered image of the map; camera = rotation p + translation (COLMAP's cam_from_world).
-
-    Attributes:
-        name: Name of the image.
-        camera: Camera model.
-        rotation: (3, 3) rotation matrix.
-        translation: (3,) translation, scene units.
-        points: (k,) indices in `SceneMap.points3d` of the points that it sees, ascending.
-    """
+    """A registered image of the map; camera = rotation p + translation (COLMAP's cam_from_world)."""
 
     name: str
     camera: Camera
-    rotation: Array
-    translation: Array
-    points: NDArray[np.int32]
+    rotation: Array  # (3, 3) rotation matrix
+    translation: Array  # (3,) translation, scene units
+    points: NDArray[np.int32]  # (k,) indices in `SceneMap.points3d` of the points that it sees, ascending
 
     @property
     def centre(self) -> Array:
@@ -46,26 +38,17 @@ class View:
 
 
 class Cones(NamedTuple):
-    """Cones of directions from which points are visible.
+    """Cones of directions from which points are visible."""
 
-    Attributes:
-        axes: (n, 3) unit vectors.
-        cosines: (n,) cosines of the half angles.
-    """
-
-    axes: Array
-    cosines: Array
+    axes: Array  # (n, 3) unit vectors
+    cosines: Array  # (n,) cosines of the half angles
 
 
 def viewing_cones(points3d: Array, views: Iterable[tuple[Array, NDArray[np.integer]]]) -> Cones:
-    """Return the visibility cones of n points.
+    """Return the visibility cones of n points; each view is its camera centre (3,) and the visible points' indices.
 
     The axis is the mean direction to the cameras. The cone holds all of them with a margin of `MAPS.margin_deg`. A
     point that no view sees has a cone of all directions.
-
-    Args:
-        points3d: (n, 3) scene points.
-        views: Camera centre (3,) and indices of the visible points, for each view.
 
     >>> import numpy as np
     >>> from bpnp.maps.views import viewing_cones
@@ -94,15 +77,10 @@ def _directions(points: Array, centre: Array) -> Array:
 
 
 class Pictures(NamedTuple):
-    """Density images of views or of a photo.
+    """Density images of views or of a photo."""
 
-    Attributes:
-        contrasts: (k, cells^2) contrast of the point density, unit length.
-        reaches: (k,) half widths of the area of the points, normalised image coordinates.
-    """
-
-    contrasts: NDArray[np.float32]
-    reaches: Array
+    contrasts: NDArray[np.float32]  # (k, cells^2) contrast of the point density, unit length
+    reaches: Array  # (k,) half widths of the area of the points, normalised image coordinates
 
 
 def pictures_of_views(points3d: Array, views: Sequence[View], settings: RankSettings = RANK) -> Pictures:
