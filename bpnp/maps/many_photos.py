@@ -317,7 +317,7 @@ class SolutionFolder:
         self.damaged.pop(task.name, None)
 
     def draw(self, task: PhotoTask, scene: SceneMap) -> None:
-        """Draw the picture of a photo from its solution; raise ValueError if the photo or the solution cannot be read."""
+        """Draw the picture of a photo from its solution; raise ValueError if one of them cannot be read."""
         solution = Solution.from_json(self._file("solutions", task.name, "json"))
         figure = localized_picture(scene, solution, photo=read_photo(task.photo), title=task.name)
         save_figure(figure, self.picture(task.name))

@@ -134,7 +134,7 @@ def _number_of(tags: dict[int, Any], tag: int, default: float = 0.0) -> float:
 
 
 def photo_keypoints(photo: Path, file: str | Path | None, name: str) -> Keypoints:
-    """Return the keypoints of a photo from an HDF5 file of hloc or a database of COLMAP; None detects SIFT keypoints."""
+    """Return the keypoints of a photo from an HDF5 file of hloc or a COLMAP database; None detects SIFT keypoints."""
     if file is None:
         return detected_keypoints(photo)
     path, size = Path(file), photo_size(photo)
