@@ -1,6 +1,7 @@
 """Docstrings: examples run when they are pasted, and sections are where a user reads them."""
 
 import ast
+import dataclasses
 import doctest
 import importlib
 import inspect
@@ -9,6 +10,7 @@ import pkgutil
 import pydoc
 import re
 import tokenize
+import typing
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -36,9 +38,20 @@ PACKAGES = (
     "bpnp",
     *(f"bpnp.{name}" for name in ("datamodules", "layers", "models", "models.baselines", "report", "training")),
 )
-DONE = ("bpnp/maps",)  # folders whose docstrings have been read; `bpnp/*` stands for the files directly in it
+DONE = (
+    "bpnp/maps",
+    "bpnp/report",
+)  # folders whose docstrings have been read; `bpnp/*` stands for the files directly in it
 SECTION = re.compile(r"^ *(Args|Attributes|Returns|Raises|Yields):$", re.MULTILINE)
-CONFIGURABLE = (torch.nn.Module, lightning.LightningDataModule, Callback, Logger, CheckpointIO)  # by `class_path`
+# What a configuration names.
+CONFIGURABLE = (
+    torch.nn.Module,
+    lightning.LightningDataModule,
+    lightning.Trainer,
+    Callback,
+    Logger,
+    CheckpointIO,
+)
 # Names of other libraries and of data, which no code here uses.
 FOREIGN = {
     "OnExceptionCheckpoint",
@@ -154,6 +167,15 @@ def places(each: type, *, is_public: bool) -> Iterator[str]:
             yield place(function)
 
 
+def option_records(each: type) -> Iterator[type]:
+    """Yield the data classes of the package that the constructor of a class takes, at any depth."""
+    for hint in typing.get_type_hints(each.__init__).values():
+        for part in (hint, *typing.get_args(hint)):
+            if dataclasses.is_dataclass(part) and part.__module__.startswith("bpnp."):
+                yield part
+                yield from option_records(part)
+
+
 def described_places() -> set[str]:
     """Return the places of what may have sections: public names, commands, protocols, and what a YAML file can name.
 
@@ -168,8 +190,9 @@ def described_places() -> set[str]:
             found.add(place(public))
     for each in own_classes():
         is_protocol = getattr(each, "_is_protocol", False) or inspect.isabstract(each)
-        if is_protocol or issubclass(each, CONFIGURABLE):
-            found |= set(places(each, is_public=is_protocol))
+        found |= set(places(each, is_public=True)) if is_protocol else set()
+        if issubclass(each, CONFIGURABLE):
+            found |= {name for part in [each, *option_records(each)] for name in places(part, is_public=False)}
     return found
 
 

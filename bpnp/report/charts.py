@@ -50,11 +50,6 @@ def errors_of(runs: Mapping[str, Results], line: Line, error: Error) -> torch.Te
     """Return the errors of the problems that have one (not NaN).
 
     In "joint", the rotation error of a problem beyond the translation limit of `joint_limits` is infinite.
-
-    Args:
-        runs: Results by name.
-        line: Estimate of a run.
-        error: Kind of error.
     """
     errors = runs[line.run].errors(line.estimate)
     values: torch.Tensor = joint_error(errors, joint_limits(runs)[1]) if error == "joint" else getattr(errors, error)
@@ -62,28 +57,14 @@ def errors_of(runs: Mapping[str, Results], line: Line, error: Error) -> torch.Te
 
 
 def recall_of(runs: Mapping[str, Results], line: Line, error: Error, limits: Array) -> Array:
-    """Return the fraction of problems with an error up to each limit.
-
-    Args:
-        runs: Results by name.
-        line: Estimate of a run.
-        error: Kind of error.
-        limits: Limits (k,).
-    """
+    """Return the fraction (k,) of problems with an error up to each limit (k,)."""
     return recall_curve(errors_of(runs, line, error), limits.tolist()).numpy()
 
 
 def recall_chart(runs: Mapping[str, Results], error: Error, *, paper: Paper | None = None) -> "Figure | None":
     """Draw the fraction of problems with an error up to a threshold, on a logarithmic axis (paper Fig. 3).
 
-    Args:
-        runs: Results by name.
-        error: Kind of error: "rotation_deg", "translation", "joint" or "reprojection_deg".
-        paper: Table of the paper whose quartiles are drawn as rings, "modelnet40" or "megadepth". Default: None, no
-            rings.
-
-    Returns:
-        The figure, or None if no problem has an error of this kind.
+    Rings are the quartiles in the table `paper`. The result is None if no problem has an error of this kind.
     """
     from plotly.graph_objects import Figure
 

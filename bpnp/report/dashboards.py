@@ -36,28 +36,17 @@ def log_results(
     photos: PhotoFinder | None = None,
     compare_with: Path | str | None = None,
 ) -> Path:
-    """Log a results folder to W&B.
+    """Log a results folder, written by `bpnp test`, to W&B, and return the folder of the W&B run.
 
     The run has scalars "test/<estimate>/rotation_q1_deg" and so on; tables "intervals" and "groups" (medians, recall
     and paired differences with 95 % intervals, of all problems and by class or scene), "quartiles", "causes" and
     "problems"; recall curves as plotly charts and as a picture; and pictures of the worst problems. It has the
     configuration of the training. If the training was logged to W&B, the results are added to its run, under the name
-    of the folder in place of "test".
+    of the folder in place of "test"; `name` and `project` are for a new run.
 
-    Args:
-        folder: Folder that `bpnp test` wrote.
-        name: Name of the W&B run; that of a training keeps its own.
-        project: W&B project; the run of a training keeps its own.
-        directory: Parent of the folder `wandb` for the run. Default: the parent of `folder`.
-        photos: Function that finds the photos under the points of the pictures. Default: None, no photos.
-        compare_with: Results folder with whose estimates those of `folder` are compared. Default: None, the first
-            estimate of `folder`.
-
-    Returns:
-        The folder of the W&B run.
-
-    Raises:
-        ValueError: The folder cannot be read.
+    The folder `wandb` is made in `directory`, by default the parent of `folder`. `photos` finds the photos under the
+    points of the pictures. The estimates are compared with those of the results folder `compare_with`, by default with
+    the first estimate of `folder`.
     """
     import wandb
 
@@ -93,12 +82,7 @@ def log_results(
 
 
 def scalars(results: Results, part: str = "test") -> dict[str, float]:
-    """Return the numbers of `summary.json`, under the names that a test logs.
-
-    Args:
-        results: Results.
-        part: First part of the names.
-    """
+    """Return the numbers of `summary.json`, under the names that a test logs."""
     estimates = results.estimates.items()
     values = {f"{part}/{estimate}/{key}": value for estimate, numbers in estimates for key, value in numbers.items()}
     loss = results.correspondence_loss

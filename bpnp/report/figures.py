@@ -72,12 +72,9 @@ def recall_curve(runs: Sequence[Path | str] | Mapping[str, Results], *, paper: P
 
 
 def outlier_curves(frame: "DataFrame") -> "Figure":
-    """Draw the median rotation error and the recall against the outlier ratio, a curve for each method.
+    """Draw median rotation error and recall of a `table_frame` against the outlier ratio, a curve for each method.
 
     Rows without an outlier ratio, and standard deviations, are not drawn.
-
-    Args:
-        frame: Result of `bpnp.report.tables.table_frame`.
     """
     from matplotlib.figure import Figure
 
@@ -98,12 +95,7 @@ def outlier_curves(frame: "DataFrame") -> "Figure":
 
 
 def line_style(colour: int, dashes: int) -> dict[str, Any]:
-    """Return matplotlib's options of a line.
-
-    Args:
-        colour: Index of the palette.
-        dashes: Index of the dash patterns.
-    """
+    """Return matplotlib's options of a line."""
     lengths = DASHES[dashes % len(DASHES)]
     return {"color": LIGHT[colour % len(LIGHT)], "linestyle": (0, lengths) if lengths else "-"}
 
@@ -135,17 +127,10 @@ def plot_problem(problem: ProblemPoints, *, estimate: str | None = None, lines: 
 
 
 def plot_photo(problem: ProblemPoints, photo: Array, *, estimates: Sequence[str] | None = None) -> "Figure":
-    """Draw the 3D points over the photo as each pose projects them, an image per estimate (paper Fig. 4).
+    """Draw the 3D points over a photo (h, w, 3), uint8, as each pose projects them, an image per estimate (Fig. 4).
 
-    Rings are the image points. The titles have the errors of the poses, if the true pose is known.
-
-    Args:
-        problem: Problem with the camera of the photo.
-        photo: Photo (h, w, 3), uint8.
-        estimates: Names of the estimates to draw. Default: all.
-
-    Raises:
-        ValueError: The camera is missing or of another image shape, or an estimate is unknown.
+    Rings are the image points. The titles have the errors of the poses, if the true pose is known. Raise ValueError if
+    the camera is missing or of another image shape, or an estimate is unknown.
     """
     from matplotlib.figure import Figure
 
@@ -317,13 +302,9 @@ def plot_residuals(
 def plot_matches(
     problem: ProblemPoints, *, colour: str, photo: Array | None = None, competing: ProblemPoints | None = None
 ) -> "Figure":
-    """Draw the image of a problem and a close-up of its residuals, under its id.
+    """Draw the image of a problem and a close-up of its residuals, under its id in a colour.
 
-    Args:
-        problem: Problem with an estimate.
-        colour: Colour of the id.
-        photo: As in `plot_image`.
-        competing: The problem with another estimate, drawn next to it. Default: None, without.
+    `competing` is the problem with another estimate, drawn next to it.
     """
     from matplotlib.figure import Figure
 
@@ -357,11 +338,10 @@ def _estimate(problem: ProblemPoints, estimate: str | None) -> tuple[str, tuple[
 def _prepare_drawing(
     problem: ProblemPoints, estimate: str | None, lines: Lines | None
 ) -> tuple[Array, Array, Array, str]:
-    """Return what `plot_image` draws.
+    """Return image points (m, 2), projected 3D points (n, 2), links (n,) and the colour of the estimate.
 
-    Returns:
-        Image points (m, 2), projected 3D points (n, 2), NaN without a pose, both in the units of the axes; the image
-        point that each 3D point is linked to (n,), -1 for none; and the colour of the estimate.
+    Points are in the units of the axes; projected ones are NaN without a pose. A link is the index of the image point
+    that a 3D point is drawn to, -1 for none.
     """
     name, (rotation, translation) = _estimate(problem, estimate)
     image = problem.points2d

@@ -24,11 +24,7 @@ def group_of(name: str) -> str:
 def group_table(runs: Mapping[str, Results]) -> IntervalTable | None:
     """Return the table of intervals of each group of problems, the largest first.
 
-    Args:
-        runs: Results by name.
-
-    Returns:
-        The table, None if the problems of the first run do not belong to two or more groups.
+    It is None if the problems of the first run do not belong to two or more groups.
     """
     parts = {name: split_groups(results) for name, results in runs.items()}
     first = next(iter(parts.values()))
@@ -52,12 +48,7 @@ def split_groups(results: Results) -> dict[str, Results]:
 
 
 def training_configs(folders: Mapping[str, Path], runs: Mapping[str, Results]) -> dict[str, dict[str, Any]]:
-    """Return the configuration of the training of each run, empty for a run without one.
-
-    Args:
-        folders: Results folders by name.
-        runs: Their results.
-    """
+    """Return the configuration of the training of each run, empty for a run without one."""
     trainings = {name: training_of(folder, runs[name]) for name, folder in folders.items()}
     return {name: (training_config(run) if run else None) or {} for name, run in trainings.items()}
 
@@ -65,12 +56,8 @@ def training_configs(folders: Mapping[str, Path], runs: Mapping[str, Results]) -
 def differences(runs: Mapping[str, Results], trainings: Mapping[str, Mapping[str, Any]] | None = None) -> list[str]:
     """Return a line for each setting in which the runs differ, with the value of each run.
 
-    Settings of the training come first. Those of `LITTLE` are left out, and so are data and solver of the training
-    where the test differs in the same way.
-
-    Args:
-        runs: Results by name.
-        trainings: Configurations of their trainings, from `training_configs`. Default: None, without.
+    Settings of the training, from `training_configs`, come first. Those of `LITTLE` are left out, and so are data and
+    solver of the training where the test differs in the same way.
     """
     tested = {name: _test_settings(results.settings) for name, results in runs.items()}
     trained = {name: _training_settings((trainings or {}).get(name) or {}) for name in runs}

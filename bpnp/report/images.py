@@ -21,16 +21,7 @@ Array = npt.NDArray[Any]
 
 
 def save_figure(figure: "Figure", path: Path | str, *, dpi: int = 110) -> Path:
-    """Write a figure atomically and return its path.
-
-    Args:
-        figure: Matplotlib figure.
-        path: File name that ends in .png, .jpg, .svg or .pdf.
-        dpi: Resolution of .png and .jpg.
-
-    Raises:
-        ValueError: The name has another suffix.
-    """
+    """Write a figure atomically, to a name that ends in .png, .jpg, .svg or .pdf, and return its path."""
     path = Path(path)
     check_picture_name(path)
     with write_atomically(path) as temporary, delay_interrupts():  # matplotlib reports Ctrl-C as an input error
@@ -46,16 +37,9 @@ def check_picture_name(path: Path, what: str = "the file name") -> None:
 
 @contextmanager
 def open_photo(path: Path | str) -> "Iterator[Image]":
-    """Open a photo, whose pixels are read when they are used.
+    """Open a photo with Pillow; its pixels are read when they are used.
 
-    Args:
-        path: File.
-
-    Yields:
-        Image of Pillow.
-
-    Raises:
-        ValueError: The file cannot be read, or has more pixels than Pillow reads. The message names it.
+    Raise ValueError, which names the file, if it cannot be read, or has more pixels than Pillow reads.
     """
     from PIL import Image
 
@@ -69,30 +53,15 @@ def open_photo(path: Path | str) -> "Iterator[Image]":
 
 
 def read_photo(path: Path | str) -> Array:
-    """Read a photo.
-
-    Args:
-        path: File.
-
-    Returns:
-        Pixels (h, w, 3), uint8.
-
-    Raises:
-        ValueError: As `open_photo`.
-    """
+    """Read the pixels (h, w, 3) of a photo, uint8."""
     with open_photo(path) as photo:
         return np.asarray(photo.convert("RGB"))
 
 
 def size_in_camera(photo: Array, camera: Camera | None) -> tuple[int, int]:
-    """Return the width and height of a photo in pixels of its camera, which differ if the photo was resized.
+    """Return the width and height of a photo (h, w, 3) in pixels of its camera, which differ if the photo was resized.
 
-    Args:
-        photo: Photo (h, w, 3).
-        camera: Its camera.
-
-    Raises:
-        ValueError: The photo has another aspect ratio than the camera's images.
+    Raise ValueError if the photo has another aspect ratio than the camera's images.
     """
     height, width = photo.shape[:2]
     size = None if camera is None else image_size(camera)

@@ -38,17 +38,11 @@ Statistic = Callable[[NDArray[np.float64]], NDArray[np.float64]]  # reduces the 
 
 @dataclass(frozen=True)
 class Interval:
-    """Statistic and its 95 % percentile bootstrap interval.
+    """Statistic and its 95 % percentile bootstrap interval."""
 
-    Attributes:
-        value: Statistic of the problems; NaN for the difference of two infinite ones.
-        low: Lower end, which may be -infinity.
-        high: Upper end, which may be infinity.
-    """
-
-    value: float
-    low: float
-    high: float
+    value: float  # statistic of the problems; NaN for the difference of two infinite ones
+    low: float  # lower end, which may be -infinity
+    high: float  # upper end, which may be infinity
 
 
 def median(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -59,13 +53,8 @@ def median(values: NDArray[np.float64]) -> NDArray[np.float64]:
 def bootstrap(values: NDArray[np.float64], statistic: Statistic = median, *, seed: int = 0) -> Interval:
     """Return a statistic of some problems with its bootstrap interval, from draws of as many problems with replacement.
 
-    Args:
-        values: One number per problem (k,); infinity for a problem without a pose.
-        statistic: Reduces the last axis. Default: median.
-        seed: Seed of the draws.
-
-    Raises:
-        ValueError: There are no values, or one is NaN.
+    `values` has a number per problem (k,); infinity for a problem without a pose. Raise ValueError for no values, or
+    NaN.
     """
     return _interval(*_draw(values, statistic, seed))
 
@@ -73,20 +62,11 @@ def bootstrap(values: NDArray[np.float64], statistic: Statistic = median, *, see
 def paired_difference(
     first: NDArray[np.float64], second: NDArray[np.float64], statistic: Statistic = median, *, seed: int = 0
 ) -> Interval:
-    """Return statistic(second) - statistic(first) with its bootstrap interval.
+    """Return statistic(second) - statistic(first) of the same problems, as in `bootstrap`, with its bootstrap interval.
 
     Each draw takes the same problems for both. The difference is significant if the interval excludes zero. The
     difference of two infinite statistics is unknown: the value is NaN, and such a draw widens the interval on both
     sides.
-
-    Args:
-        first: One number per problem (k,); infinity for a problem without a pose.
-        second: Numbers of the same problems in the same order.
-        statistic: Reduces the last axis. Default: median.
-        seed: Seed of the draws.
-
-    Raises:
-        ValueError: The lengths differ, there are no values, or one is NaN.
     """
     if len(first) != len(second):
         raise ValueError(
@@ -97,11 +77,7 @@ def paired_difference(
 
 
 def quantile(probability: float) -> Statistic:
-    """Return the statistic that computes a quantile.
-
-    Args:
-        probability: Quantile in [0, 1].
-    """
+    """Return the statistic that computes the quantile of a probability in [0, 1]."""
     return lambda values: np.asarray(np.quantile(values, probability, axis=-1))
 
 
@@ -145,19 +121,12 @@ def _interval(value: float, drawn: NDArray[np.float64]) -> Interval:
 
 @dataclass(frozen=True)
 class IntervalRow:
-    """Statistics of an estimate, or their difference to those of another estimate, with intervals.
-
-    Attributes:
-        line: Estimate.
-        minus: Estimate that is subtracted, None for the statistics of `line` itself.
-        problems: Number of problems.
-        intervals: Interval of each column; None if no problem has its number.
-    """
+    """Statistics of an estimate, or their difference to those of another estimate, with intervals."""
 
     line: Line
-    minus: Line | None
+    minus: Line | None  # estimate that is subtracted, None for the statistics of `line` itself
     problems: int
-    intervals: tuple[Interval | None, ...]
+    intervals: tuple[Interval | None, ...]  # interval of each column; None if no problem has its number
 
     @property
     def label(self) -> str:
@@ -167,16 +136,11 @@ class IntervalRow:
 
 @dataclass(frozen=True)
 class IntervalTable:
-    """Medians, recall and seconds with intervals, for the terminal, the page and W&B.
-
-    Attributes:
-        title: Title.
-        columns: Columns. Their keys are those of `summarise`.
-        groups: Rows of all problems, or of each group of problems, by the title of the group.
-    """
+    """Medians, recall and seconds with intervals, for the terminal, the page and W&B."""
 
     title: str
-    columns: tuple[Column, ...]
+    columns: tuple[Column, ...]  # with the keys of `summarise`
+    # Rows of all problems, or of each group of problems, by the title of the group.
     groups: Mapping[str, Sequence[IntervalRow]]
 
     def cells(self, row: IntervalRow) -> list[str]:
@@ -198,10 +162,9 @@ class IntervalTable:
     def frame(self) -> "DataFrame":
         """Return the numbers, fractions from 0 to 1.
 
-        Returns:
-            Columns "group" (absent for all problems), "run", "estimate", "minus" (empty for the statistics of the
-                estimate itself) and "problems"; of each column its number, and "..._low" and "..._high", the ends of
-                its interval, NaN where there is none.
+        The columns are "group" (absent for all problems), "run", "estimate", "minus" (empty for the statistics of the
+        estimate itself) and "problems"; of each column its number, and "..._low" and "..._high", the ends of its
+        interval, NaN where there is none.
         """
         from pandas import DataFrame
 
@@ -220,11 +183,7 @@ class IntervalTable:
 
 
 def interval_table(runs: Mapping[str, Results]) -> IntervalTable:
-    """Return medians, recall and seconds of each run and estimate, and their paired differences, with intervals.
-
-    Args:
-        runs: Results by name. Each estimate is compared with that of `baseline_of`.
-    """
+    """Return medians, recall and seconds of each estimate, with intervals, and the differences to `baseline_of`."""
     title = "Medians and recall with 95 % intervals"
     return IntervalTable(title, interval_columns(runs), {"": interval_rows(runs, runs)})
 
@@ -239,9 +198,7 @@ def interval_columns(runs: Mapping[str, Results]) -> tuple[Column, ...]:
 def interval_rows(runs: Mapping[str, Results], members: Mapping[str, Results]) -> list[IntervalRow]:
     """Return the rows of each run and estimate: its statistics, then the difference to its baseline, if it has one.
 
-    Args:
-        runs: Results by name.
-        members: Some problems of the runs, such as a group; a run without any may be absent.
+    `members` are some problems of the runs, such as a group; a run without any may be absent.
     """
     lines, limits = lines_of(runs), joint_limits(runs)
     tested = {name: tested_problems(results) for name, results in members.items()}
@@ -260,17 +217,11 @@ def interval_rows(runs: Mapping[str, Results], members: Mapping[str, Results]) -
 
 @dataclass(frozen=True)
 class Sample:
-    """Statistic of the problems that have a number, and of draws of them.
+    """Statistic of the problems that have a number, and of draws of them."""
 
-    Attributes:
-        known: True for the problems that have a number (k,).
-        value: Statistic, NaN if no problem has a number.
-        drawn: Statistic of each draw (2000,).
-    """
-
-    known: NDArray[np.bool_]
-    value: float
-    drawn: NDArray[np.float64]
+    known: NDArray[np.bool_]  # (k,) the problems that have a number
+    value: float  # statistic, NaN if no problem has a number
+    drawn: NDArray[np.float64]  # (2000,) statistic of each draw
 
     def interval(self) -> Interval | None:
         """Return the statistic with its interval, None if no problem has a number."""
@@ -285,17 +236,9 @@ class Sample:
 
 
 def baseline_of(line: Line, lines: Sequence[Line]) -> Line | None:
-    """Return the line that another is compared with.
+    """Return the line that another is compared with: the same estimate of the first run, or else its first line.
 
-    It is the same estimate of the first run, or the first line where that run has no such estimate. In a single run it
-    is the first line.
-
-    Args:
-        line: Estimate of a run.
-        lines: Estimates of all runs.
-
-    Returns:
-        The line, None for the lines of the first of several runs, and for the first line.
+    In a single run it is the first line. The lines of the first of several runs, and the first line, have none.
     """
     first = lines[0]
     if line == first or (line.run == first.run and lines[-1].run != first.run):

@@ -80,17 +80,11 @@ COUNTS = ("inliers", "m", "n", "matches", "iterations")
 
 
 class TableRow(NamedTuple):
-    """Row of the table of quartiles.
-
-    Attributes:
-        name: Name.
-        line: Estimate, None for a published row.
-        cells: Text, number, and True for the best of its column.
-    """
+    """Row of the table of quartiles."""
 
     name: str
-    line: Line | None
-    cells: list[tuple[str, Any, bool]]
+    line: Line | None  # estimate, None for a published row
+    cells: list[tuple[str, Any, bool]]  # text, number, and True for the best of its column
 
 
 def write_page(

@@ -20,15 +20,10 @@ GREY = (128, 128, 128)  # outside the photo
 
 @dataclass(frozen=True)
 class ProblemPhoto:
-    """Photo of a problem, as a pinhole camera would have taken it.
+    """Photo of a problem, as a pinhole camera would have taken it."""
 
-    Attributes:
-        pixels: Pixels (h, w, 3), uint8.
-        camera: Camera of these pixels, without distortion.
-    """
-
-    pixels: Array
-    camera: Pinhole
+    pixels: Array  # pixels (h, w, 3), uint8
+    camera: Pinhole  # camera of these pixels, without distortion
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
@@ -52,16 +47,10 @@ PhotoFinder = Callable[[Results, Sequence[ProblemPoints]], PhotoSource | None]  
 
 
 def undistort_photo(photo: Array, camera: Camera, points2d: Array, *, side: int = SIDE) -> ProblemPhoto:
-    """Return the part of a photo around image points, without distortion.
+    """Return the part of a photo (h, w, 3), uint8, around image points (m, 2), normalised, without distortion.
 
-    Args:
-        photo: Photo (h, w, 3), uint8, possibly resized.
-        camera: Its camera.
-        points2d: Image points (m, 2), normalised.
-        side: Longer side of the result, pixels. Default: `SIDE`.
-
-    Raises:
-        ValueError: The photo has another aspect ratio than the camera's images, or no part of it is near the points.
+    The photo may be resized; `side` is the longer one of the result, pixels. Raise ValueError if the photo has another
+    aspect ratio than the camera's images, or no part of it is near the points.
     """
     import cv2
 

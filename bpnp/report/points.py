@@ -31,37 +31,23 @@ Array = npt.NDArray[Any]
 
 @dataclass(frozen=True)
 class ProblemPoints:
-    """Problem to draw. Conventions are those of `bpnp.types`: camera = R p + t, normalised image coordinates.
-
-    Attributes:
-        index: `Batch.index`.
-        id: Name.
-        points2d: Image points (m, 2).
-        points3d: Scene points (n, 3).
-        match3d: Index of the true 2D point of each 3D point (n,), -1 for none.
-        assigned3d: Index of the 2D point with the largest probability in the solver's assignment (n,), -1 for none.
-        pose: True R (3, 3) and t (3,), None if unknown.
-        estimates: R (3, 3) and t (3,) by the name of the estimate; NaN without a pose.
-        error: Rotation error of the first estimate, degrees.
-        ids2d: Indices of the 2D points in the whole problem, None if all points are here.
-        ids3d: Indices of the 3D points in the whole problem, None if all points are here.
-        camera: Camera in whose pixels the problem is drawn, None for normalised coordinates; not stored on disk.
-        normals3d: Outward normals (n, 3), None for points without normals; not stored on disk.
-    """
+    """Problem to draw. Conventions are those of `bpnp.types`: camera = R p + t, normalised image coordinates."""
 
     index: int
     id: str
-    points2d: Array
-    points3d: Array
-    match3d: Array
-    assigned3d: Array
-    pose: tuple[Array, Array] | None = None
+    points2d: Array  # image points (m, 2)
+    points3d: Array  # scene points (n, 3)
+    match3d: Array  # index of the true 2D point of each 3D point (n,), -1 for none
+    assigned3d: Array  # index of the 2D point with the largest probability in the solver's assignment (n,), -1 for none
+    pose: tuple[Array, Array] | None = None  # true R (3, 3) and t (3,), None if unknown
+    # R (3, 3) and t (3,) by the name of the estimate; NaN without a pose.
     estimates: dict[str, tuple[Array, Array]] = field(default_factory=dict)
-    error: float = 180.0
-    ids2d: Array | None = None
-    ids3d: Array | None = None
+    error: float = 180.0  # rotation error of the first estimate, degrees
+    ids2d: Array | None = None  # indices of the 2D points in the whole problem, None if all points are here
+    ids3d: Array | None = None  # indices of the 3D points in the whole problem, None if all points are here
+    # Camera in whose pixels the problem is drawn, None for normalised coordinates; not stored on disk.
     camera: Camera | None = None
-    normals3d: Array | None = None
+    normals3d: Array | None = None  # outward normals (n, 3), None for points without normals; not stored on disk
 
     def numbers(self) -> tuple[Array, Array]:
         """Return `ids2d` and `ids3d`, counted where they are None."""
@@ -79,10 +65,7 @@ def points_from(
 ) -> list[ProblemPoints]:
     """Return the points of each problem, at most 100 on each side, evenly spaced, matched ones first.
 
-    Args:
-        prediction: Prediction for the batch.
-        batch: Problems, with or without their true poses.
-        errors: Result of `prediction_errors`, if computed before.
+    The batch may be without true poses. `errors` are those of `prediction_errors`, if computed before.
     """
     points2d, points3d, mask2d, mask3d = map(_host, (batch.points2d, batch.points3d, batch.mask2d, batch.mask3d))
     unknown = np.full(mask3d.shape, -1)
@@ -131,16 +114,9 @@ def thin(problem: ProblemPoints, most: int = MOST) -> ProblemPoints:
 
 
 def write_points(folder: Path | str, problems: Iterable[ProblemPoints]) -> None:
-    """Write `points.npz` atomically: columns with the points of all problems one after the other.
+    """Write `points.npz` atomically: columns with the points of all problems, one after the other.
 
-    The first of several problems with one index is kept.
-
-    Args:
-        folder: Results folder.
-        problems: Problems.
-
-    Raises:
-        ValueError: The problems have different estimates.
+    The problems have the same estimates. The first of several problems with one index is kept.
     """
     first: dict[int, ProblemPoints] = {}
     for problem in problems:

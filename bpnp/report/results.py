@@ -154,16 +154,10 @@ class Results:
 def rows_from(
     prediction: Prediction, batch: Batch, seconds: float, errors: Mapping[str, PoseErrors] | None = None
 ) -> list[ProblemRow]:
-    """Return one row per problem and estimate.
+    """Return one row per problem and estimate of a batch with true poses.
 
-    Args:
-        prediction: Prediction for the batch. Its own `seconds` of an estimate, if any, are used.
-        batch: Problems with their true poses.
-        seconds: Time of the whole batch, divided equally among its problems.
-        errors: Result of `prediction_errors`, if computed before.
-
-    Raises:
-        ValueError: The batch has no true pose.
+    `seconds` of the whole batch are divided equally among its problems, unless the prediction has its own for an
+    estimate. `errors` are those of `prediction_errors`, if computed before.
     """
     matches = torch.zeros_like(batch.index) if batch.match3d is None else (batch.match3d >= 0).sum(-1)
     sizes = torch.stack([batch.count2d, batch.count3d, matches], -1).tolist()
@@ -184,15 +178,10 @@ def rows_from(
 
 
 def count_inliers(pose: Pose, batch: Batch, *, threshold: float = INLIER_THRESHOLD) -> list[int]:
-    """Count the 2D points of each problem with a projected 3D point nearer than `threshold`.
+    """Count the 2D points of each problem with a projected 3D point nearer than `threshold`, in normalised image units.
 
     No true match is needed, so a user of the pose can compute it. Points behind the camera do not count; there are no
     inliers without a pose.
-
-    Args:
-        pose: Poses.
-        batch: Problems.
-        threshold: Distance, normalised image units.
     """
     rotation, translation = pose.rotation.detach().double(), pose.translation.detach().double()
     camera = transform(rotation, translation, batch.points3d.double())
@@ -208,11 +197,7 @@ def count_inliers(pose: Pose, batch: Batch, *, threshold: float = INLIER_THRESHO
 
 
 def cause_fractions(rows: Iterable[ProblemRow]) -> dict[str, float]:
-    """Return the fraction of the rows with each cause, in the order of `CAUSES`; they sum to one.
-
-    Raises:
-        ValueError: There is no row.
-    """
+    """Return the fraction of the rows with each cause, in the order of `CAUSES`; they sum to one."""
     causes = [row.cause for row in rows]
     if not causes:
         raise ValueError("there are no rows to count causes of")

@@ -59,15 +59,7 @@ def table(runs: Sequence[Path | str] | Mapping[str, Results]) -> "DataFrame":
 
 
 class Line(NamedTuple):
-    """Estimate of a run, as tables and figures show it.
-
-    Attributes:
-        run: Name of the run.
-        estimate: Name of the estimate.
-        label: Text to show.
-        colour: Index of the palette.
-        dashes: Index of the dash patterns.
-    """
+    """Estimate of a run, as tables and figures show it."""
 
     run: str
     estimate: str
@@ -80,9 +72,6 @@ def lines_of(runs: Mapping[str, Results]) -> list[Line]:
     """Return every estimate of every run; labels have the name of the run only if there are several runs.
 
     With at most eight lines each has its own colour; with more, each run has one. Estimates of one name share dashes.
-
-    Args:
-        runs: Results by name.
     """
     keys = [(run, estimate) for run, results in runs.items() for estimate in results.estimates]
     order, names = list(runs), list(dict.fromkeys(estimate for _, estimate in keys))
@@ -97,12 +86,8 @@ def lines_of(runs: Mapping[str, Results]) -> list[Line]:
 def named_runs(paths: Sequence[Path | str]) -> dict[str, Path]:
     """Return results folders by the parts of their paths that differ; a single one by the name of its run.
 
-    Args:
-        paths: Results folders. A run's folder stands for its `test`, and a folder of several results, such as that of
-            `bpnp table`, for all of them. A folder that is given twice counts once.
-
-    Raises:
-        ValueError: There is no path.
+    A run's folder stands for its `test`, and a folder of several results, such as that of `bpnp table`, for all of
+    them. A folder that is given twice counts once.
     """
     if not paths:
         raise ValueError("no results folder is given; give one that `bpnp test` wrote")
@@ -126,37 +111,23 @@ def _results_in(folder: Path) -> list[Path]:
 
 @dataclass(frozen=True)
 class Column:
-    """Column of a table.
-
-    Attributes:
-        key: Key of its number.
-        header: Text above it.
-        percent: True for a fraction, shown in %; larger is better.
-        count: True for a count. In other columns, errors and times, smaller is better.
-    """
+    """Column of a table."""
 
     key: str
     header: str
-    percent: bool = False
-    count: bool = False
+    percent: bool = False  # a fraction, shown in %; larger is better
+    count: bool = False  # a count; in other columns, errors and times, smaller is better
 
 
 @dataclass(frozen=True)
 class MethodRow:
-    """Row of a table: an estimate of a run, or a method.
-
-    Attributes:
-        label: Name.
-        values: Numbers by column; texts for published rows.
-        source: "here", or the paper.
-        rho: Outlier ratio of the data, None if it does not apply.
-        problems: Equal for rows of the same problems, among which the best numbers are marked; None to take no part.
-    """
+    """Row of a table: an estimate of a run, or a method."""
 
     label: str
-    values: Values
-    source: str = HERE
-    rho: float | None = None
+    values: Values  # numbers by column; texts for published rows
+    source: str = HERE  # "here", or the paper
+    rho: float | None = None  # outlier ratio of the data, None if it does not apply
+    # Equal for rows of the same problems, among which the best numbers are marked; None to take no part.
     problems: Hashable = None
 
     @property
@@ -225,12 +196,7 @@ def tested_problems(results: Results) -> Hashable:
 
 
 def problem_keys(results: Results, rows: Iterable[ProblemRow]) -> list[Hashable]:
-    """Return a key of the problem of each row, equal for the same data, index, name and numbers of points and matches.
-
-    Args:
-        results: Results, whose settings have the data.
-        rows: Some of their rows.
-    """
+    """Return a key of each row's problem, equal for the same data, index, name and numbers of points and matches."""
     data = results.settings.get("data")
     if isinstance(data, Mapping) and isinstance(data.get("init_args"), Mapping):
         options = {key: value for key, value in data["init_args"].items() if key not in LOADING}
@@ -274,10 +240,7 @@ def paper_quartiles(paper: Paper | None, error: str) -> dict[str, list[float]]:
 def cell(column: Column, values: Values, *, short: bool = False) -> str:
     """Return the text of a cell: fractions in percent, counts whole, published texts unchanged, else `number`.
 
-    Args:
-        column: Column.
-        values: Numbers of the row.
-        short: Write at most four characters of a percentage and two digits of a number below 1.
+    A short one has at most four characters of a percentage and two digits of a number below 1.
     """
     value = values.get(column.key)
     if value is None or isinstance(value, str):
@@ -293,12 +256,9 @@ def cell(column: Column, values: Values, *, short: bool = False) -> str:
 def best_texts(
     columns: Sequence[Column], rows: Sequence[MethodRow], *, short: bool = False
 ) -> dict[tuple[Hashable, str], str]:
-    """Return the best number of each column among rows of the same problems, as text.
+    """Return the best number among rows of the same problems, as text, by (problems, key of the column).
 
     Comparing texts marks all cells that read the same.
-
-    Returns:
-        Texts by (problems, key of the column).
     """
     best = {}
     for problems in {row.problems for row in rows} - {None}:
@@ -316,11 +276,8 @@ def results_table(runs: Mapping[str, Results], *, paper: Paper | None = None) ->
     """Return quartiles, joint recalls, the fraction of problems with a pose and seconds, a row per run and estimate.
 
     The best number of each column is bold, among runs of the same problems. The column of the fraction is left out if
-    every problem has a pose.
-
-    Args:
-        runs: Results by name.
-        paper: Data set whose published rows are added for orientation. They are of other data and are not compared.
+    every problem has a pose. Published rows of `paper` are added for orientation: they are of other data and are not
+    compared.
     """
     sizes = " or ".join(str(size) for size in sorted({results.problems for results in runs.values()}))
     title, rows = f"Pose errors, {problems_text(sizes)}", run_rows(runs, paper)

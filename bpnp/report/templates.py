@@ -9,12 +9,9 @@ from bpnp.report.terminal import INKS
 
 
 def render_page(template: str, **values: Any) -> str:
-    """Return a self-contained page; it has the head and the style of `base.html`.
+    """Return a self-contained page of a template in `assets` for the body; `base.html` has the head and the style.
 
-    Args:
-        template: Name of the template of the body in `assets`.
-        **values: Variables of the template. Names may contain anything: all text but Markup is escaped, and bytes that
-            are not UTF-8 are replaced.
+    Values may contain anything: all text but Markup is escaped, and bytes that are not UTF-8 are replaced.
     """
     environment = Environment(
         loader=PackageLoader("bpnp.report", "assets"),

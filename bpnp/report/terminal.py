@@ -45,21 +45,12 @@ class Terminal(Console):
 
 
 def say(line: object, *, to: Console | None = None) -> None:
-    """Print a line without wrapping or colours.
-
-    Args:
-        line: Text.
-        to: Console. Default: standard output.
-    """
+    """Print a line without wrapping or colours, by default to standard output."""
     (to or Terminal()).print(str(line), markup=False, emoji=False, highlight=False, soft_wrap=True)
 
 
 def progress(*, items: bool = True, quiet: bool = False) -> Progress:
-    """Return a progress display on stderr, removed when its block ends.
-
-    Args:
-        items: Show how many items are done.
-    """
+    """Return a progress display on stderr, removed when its block ends."""
     columns = (BarColumn(), MofNCompleteColumn()) if items else ()
     console = Terminal(stderr=True, quiet=quiet, force_jupyter=False)  # a notebook's needs ipywidgets
     return Progress(
@@ -77,13 +68,7 @@ def progress(*, items: bool = True, quiet: bool = False) -> Progress:
 def count_items(what: str, total: int, *, quiet: bool = False) -> Iterator[Callable[[str], None]]:
     """Show how many items are done, on stderr: a bar on a terminal, elsewhere, such as in a pipe, a line each.
 
-    Args:
-        what: Name of the work, such as "localizing".
-        total: Number of items.
-        quiet: Show nothing.
-
-    Yields:
-        The function to call with a few words on each item that is done.
+    Yield the function to call with a few words on each item that is done. `what` names the work, such as "localizing".
     """
     with progress(quiet=quiet) as shown:
         bar = shown.add_task(what, total=total)
@@ -108,16 +93,11 @@ class SplitTable:
     """Table that is split into several, one below the other, where its columns do not fit side by side.
 
     Names are folded between words before it is split.
-
-    Attributes:
-        title: Title.
-        headers: Headers of the number columns.
-        groups: Groups of rows (name, cells), with a line between groups. Cells may have several lines.
-        caption: Text below the table.
     """
 
     title: str
-    headers: Sequence[str]
+    headers: Sequence[str]  # headers of the number columns
+    # Groups of rows (name, cells), with a line between groups. Cells may have several lines.
     groups: Sequence[Sequence[tuple[Text, Sequence[Text]]]]
     caption: str = ""
 
@@ -187,11 +167,7 @@ def format_fixed(values: Sequence[float | int]) -> list[str]:
 def number(value: float | None, *, short: bool = False) -> str:
     """Format a number with three significant digits in at most six characters.
 
-    Below 0.01 there are two digits. None gives "-".
-
-    Args:
-        value: Number.
-        short: Write two digits below 1, for a narrow column.
+    Below 0.01 there are two digits, and with `short`, for a narrow column, below 1. None gives "-".
 
     >>> from bpnp.report.terminal import number
     >>> [number(value) for value in (12.34, 0.00126, 12345.6, None)]

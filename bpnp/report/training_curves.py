@@ -26,15 +26,9 @@ SMOOTH = 0.05  # fraction of the steps in a moving average
 
 
 def read_curves(run: Path | str) -> "DataFrame":
-    """Read the log of a training, a row per step.
+    """Read the log of a training, a row per step; raise ValueError if the folder has none, or one that cannot be read.
 
     A resumed training has several logs; from the first step of each on, it replaces the earlier ones.
-
-    Args:
-        run: Folder of the run.
-
-    Raises:
-        ValueError: The folder has no log of a training, or one that cannot be read.
     """
     from pandas import DataFrame, concat, read_csv
 
@@ -64,12 +58,6 @@ def training_curves(run: Path | str) -> "Figure":
     """Draw the losses of a training and the median errors of its validation.
 
     A line marks the switch of the pose loss.
-
-    Args:
-        run: Folder of the run.
-
-    Raises:
-        ValueError: As in `read_curves`.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, NullFormatter

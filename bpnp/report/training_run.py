@@ -14,9 +14,6 @@ def training_logs(run: Path | str) -> list[Path]:
     """Return the files with the metrics of each training in a run folder, in their order.
 
     Only a training logs "train/..."; `bpnp validate` and `bpnp test` log to files of their own.
-
-    Args:
-        run: Folder of the run.
     """
     files = sorted(Path(run).glob(f"logs/version_*/{METRICS}"), key=lambda file: int(file.parent.name.split("_")[1]))
     return [file for file in files if any(name.startswith("train/") for name in _columns(file))]
@@ -37,17 +34,10 @@ def training_folder(path: Path | str) -> Path | None:
 
 
 def training_of(folder: Path | str, results: Results) -> Path | None:
-    """Return the folder of the training of the network that was tested.
+    """Return the folder of the training of the network that was tested; None without a checkpoint, or without logs.
 
     It is the run of the checkpoint, or, if that file has gone, the run with the results. The training of packaged
     weights is not recorded.
-
-    Args:
-        folder: Results folder.
-        results: Its results.
-
-    Returns:
-        The folder, None if no checkpoint was tested or no training has logs.
     """
     if "checkpoint" not in results.settings:
         return training_folder(folder)
@@ -69,13 +59,9 @@ def training_config(run: Path) -> dict[str, Any] | None:
 
 
 def wandb_run(run: Path) -> dict[str, str] | None:
-    """Read which W&B run the last training in a run folder was logged to.
+    """Read the "id", "project" and, if known, "entity" of the W&B run that the last training in a folder has.
 
-    Args:
-        run: Folder of the training.
-
-    Returns:
-        "id", "project" and, if it is known, "entity" of the W&B run; None if the training was not logged to W&B.
+    The result is None if it was not logged to W&B.
     """
     last = _last_training(run)
     if last is None or not (file := last[0] / WANDB).is_file():
