@@ -321,7 +321,7 @@ def _columns(rows: Sequence[ProblemRow]) -> dict[str, list[Any]]:
 
 
 def _shorten_number(value: float) -> float | str:
-    """Round to `DIGITS` significant digits; NaN and infinity become the names that JavaScript's `Number` reads."""
+    """Round to `DIGITS` significant digits; NaN and infinity become the names that JavaScript's `Number()` reads."""
     if math.isfinite(value):
         return float(f"{value:.{DIGITS}g}")
     return "NaN" if math.isnan(value) else "Infinity"
