@@ -21,7 +21,6 @@ from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import RansacPnP
 from bpnp.models.evaluation import Refinement
 from bpnp.models.nets import ImageFeatures, PointFeatures, SceneFeatures
-from bpnp.models.older_checkpoints import upgrade
 
 PARTS = (ImageFeatures, SceneFeatures, PointFeatures, Sinkhorn, RansacPnP, WeightedPnP, Refinement)
 WEIGHTS = resources.files("bpnp") / "weights"
@@ -141,7 +140,19 @@ def read_checkpoint(path: str | Path, *, map_location: Any = "cpu") -> dict[str,
     content = read_data(path, map_location=map_location)
     if "state_dict" not in content:
         raise ValueError(f"{path} is no checkpoint of `bpnp fit`: it has no `state_dict`")
-    return upgrade(content)
+    if unknown := next(_unknown_settings(content.get("solver")), None):
+        raise ValueError(f"{path} is of another version of bpnp: {unknown}. Train the network again")
+    return content
+
+
+def _unknown_settings(description: Any) -> Iterator[str]:
+    """Yield the settings that the classes of this package no longer have."""
+    if is_description(description) and isinstance(settings := description["settings"], Mapping):
+        cls = {class_name(cls): cls for cls in (*networks(), *PARTS)}.get(description["class"])
+        known = settings if cls is None else inspect.signature(cls).parameters
+        yield from (f"{description['class']} has no setting `{name}`" for name in settings if name not in known)
+        for setting in settings.values():
+            yield from _unknown_settings(setting)
 
 
 def read_data(path: str | Path, *, map_location: Any = "cpu") -> dict[str, Any]:
@@ -263,7 +274,7 @@ def fitting_state(
 
 
 def _with_defaults(description: Mapping[str, Any], solver: nn.Module) -> Mapping[str, Any]:
-    """Add the settings that a description of an older version lacks, with their defaults."""
+    """Add the settings that a description lacks, with their defaults: a user's class may have got new ones."""
     built = _build_without_weights(description, solver)
     return description if built is None else describe_module(built)
 

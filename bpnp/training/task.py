@@ -24,7 +24,6 @@ from bpnp.layers.pnp import WeightedPnP
 from bpnp.metrics import MeanOverProblems, PoseQuartiles, PoseRecall, prediction_errors
 from bpnp.models.bpnpnet import BPnPNet
 from bpnp.models.evaluation import REFINED, refinement_enabled
-from bpnp.models.older_checkpoints import upgrade
 from bpnp.models.weights import (
     AnyModule,
     TrainedNet,
@@ -493,7 +492,6 @@ class BlindPnPTask(LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Load the solver's weights, and restore the counts of skipped steps."""
-        checkpoint |= upgrade(checkpoint)  # not done yet by a Trainer without SafeCheckpointIO
         self._adopt(checkpoint, None if self._trainer is None else self.trainer.ckpt_path)
         self._check_pose_loss_continues(checkpoint)
         self.skipped_steps, self.consecutive_skipped_steps = checkpoint.get("skipped_steps", (0, 0))

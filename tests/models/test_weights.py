@@ -165,13 +165,18 @@ def test_a_checkpoint_that_is_cut_anywhere_is_named(tmp_path: Path, zipped: bool
     assert read_data(file)["epoch"] == 3
 
 
-OLD_FORM = {"class": "BPnPNet", "settings": {"channels": 16, "blocks": 2, "nonsense": 0.2}}
+OLDER = {"class": "BPnPNet", "settings": {"rounds": 8, "channels": 16, "blocks": 2}}
+OLDER_PART = {"class": "BPnPNet", "settings": {"ransac": {"class": "RansacPnP", "settings": {"pairs_factor": 1.5}}}}
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ({"solver": OLD_FORM, "state_dict": {}}, r"x\.ckpt: the settings do not fit BPnPNet: .*'nonsense'"),
+        ({"solver": OLDER, "state_dict": {}}, r"bpnp: BPnPNet has no setting `channels`\. Train the network again$"),
+        (
+            {"solver": OLDER_PART, "state_dict": {}},
+            r"x\.ckpt is of another version of bpnp: RansacPnP has no setting `pairs_factor`\. Train the network",
+        ),
         ({"solver": {"class": "Hungarian"}, "state_dict": {}}, r"x\.ckpt is a checkpoint of Hungarian, not of BPnPNet"),
         ({"state_dict": {}}, r"x\.ckpt is a checkpoint of another program, not of BPnPNet"),
         ([1], r"x\.ckpt is no checkpoint of `bpnp fit`: it has no `state_dict`"),
@@ -186,15 +191,3 @@ def test_a_file_that_is_no_checkpoint_is_named_and_runs_no_code(tmp_path: Path, 
     file.write_text(content) if isinstance(content, str) else torch.save(content, file)
     with pytest.raises(ValueError, match=message):
         BPnPNet.from_checkpoint(file)
-
-
-@pytest.mark.parametrize(("setting", "loads"), [(False, True), (True, False)])
-def test_a_removed_setting_is_ignored_where_it_had_no_effect(tmp_path: Path, setting: bool, loads: bool) -> None:
-    older = content(small_net())
-    older["solver"]["settings"]["features2d"]["settings"]["batch_norm"] = setting
-    torch.save(older, tmp_path / "older.ckpt")
-    if loads:
-        assert BPnPNet.from_checkpoint(tmp_path / "older.ckpt").features2d.channels == 16
-    else:
-        with pytest.raises(ValueError, match=r"older.ckpt: the settings do not fit ImageFeatures: .*batch_norm"):
-            BPnPNet.from_checkpoint(tmp_path / "older.ckpt")

@@ -1,7 +1,6 @@
 """The network of a checkpoint is the one that the checkpoint describes, whichever way it is loaded."""
 
 import json
-import lzma
 import math
 from pathlib import Path
 from typing import Any
@@ -20,10 +19,6 @@ from bpnp.models.weights import checkpoint_path, pretrained_names, read_checkpoi
 from bpnp.training import BlindPnPTask, PoseLossWarmup
 
 pytestmark = pytest.mark.slow
-
-RELEASED = Path(__file__).parents[1] / "released"
-# What the version that wrote each file gave for `asked()`.
-ASSIGNMENTS = json.loads((RELEASED / "assignments.json").read_text())
 
 
 def asked() -> Batch:
@@ -74,31 +69,22 @@ class Squares(nn.Module):
         self.power = power
 
 
-@pytest.fixture(params=[*ASSIGNMENTS, *pretrained_names()])
-def saved(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, Tensor]:
-    """A checkpoint of each version and all packaged weights, with the assignment that it should give."""
-    name = request.param
-    if name not in ASSIGNMENTS:
-        return name, assignment(TrainedNet.from_pretrained(name))
-    file = tmp_path / f"{name}.ckpt"
-    file.write_bytes(lzma.decompress((RELEASED / f"{name}.ckpt.xz").read_bytes()))
-    return str(file), torch.tensor(ASSIGNMENTS[name])[None]
-
-
-def test_every_way_of_loading_gives_the_same_assignment(saved: tuple[str, Tensor], tmp_path: Path) -> None:
-    path, expected = saved
-    task = BlindPnPTask.load_from_checkpoint(path)
-    tested = BlindPnPTask.load_from_checkpoint(path)
+@pytest.mark.parametrize("name", pretrained_names())
+def test_every_way_of_loading_gives_the_same_assignment(name: str, tmp_path: Path) -> None:
+    task = BlindPnPTask.load_from_checkpoint(name)
+    tested = BlindPnPTask.load_from_checkpoint(name)
     for parameter in tested.parameters():
         nn.init.zeros_(parameter)
-    file, run = str(checkpoint_path(path)), quiet_trainer(tmp_path, limit_test_batches=1)
+    run = quiet_trainer(tmp_path, limit_test_batches=1)
+    file = str(checkpoint_path(name))
     run.test(tested, datamodule=small_meshes(tmp_path), ckpt_path=file, verbose=False, weights_only=True)
+    expected = assignment(TrainedNet.from_pretrained(name))
     for solver in (
         task.solver,
         tested.solver,
-        TrainedNet.from_checkpoint(path),
-        BlindPnPTask(weights=path).solver,
-        BlindPnPTask(TrainedNet.from_checkpoint(path), weights=path).solver,
+        TrainedNet.from_checkpoint(name),
+        BlindPnPTask(weights=name).solver,
+        BlindPnPTask(TrainedNet.from_checkpoint(name), weights=name).solver,
     ):
         torch.testing.assert_close(assignment(solver), expected, rtol=0, atol=1e-6)
 
