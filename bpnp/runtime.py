@@ -269,8 +269,9 @@ class Loop:
 
     The machine code is kept in ``loops`` in `cache_folder`, or in NUMBA_CACHE_DIR. Each version of the source has its
     own folder there. The source includes the files of the parts that the function calls and of the named tuples that it
-    takes; numba itself only checks the function's file. One process compiles; others that need the same loop wait for
-    it. If the folder is not writable, or the disk is full, each process compiles.
+    takes, and the numbers that its module imports; numba itself only checks the function's file. One process compiles;
+    others that need the same loop wait for it. If the folder is not writable, or the disk is full, each process
+    compiles.
     """
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
@@ -324,9 +325,9 @@ def _njit_into(folder: Path, function: Callable[..., Any], options: dict[str, An
 def _folder_of(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Path:
     """Return the folder for this version of a function's source."""
     types = {type(value) for value in _flatten(arguments) if hasattr(value, "_fields")}
-    files = sorted({__file__, *_files_of(function), *map(inspect.getfile, types)})
-    content = hashlib.blake2b(numba.__version__.encode(), digest_size=8)
-    for file in files:
+    files, numbers = _sources_of(function)
+    content = hashlib.blake2b(repr((numba.__version__, sorted(numbers))).encode(), digest_size=8)
+    for file in sorted({__file__, *files, *map(inspect.getfile, types)}):
         content.update(_digest(file))
     root = Path(_SETTINGS.CACHE_DIR) if _SETTINGS.CACHE_DIR else cache_folder() / "loops"
     return root / f"{function.__module__}.{function.__name__}-{content.hexdigest()}"
@@ -341,21 +342,23 @@ def _flatten(values: tuple[Any, ...]) -> Iterator[Any]:
 
 
 @cache
-def _files_of(function: Callable[..., Any]) -> frozenset[str]:
-    """Return the files of a function and, recursively, of the parts and named tuples in its module."""
-    files, modules, waiting = set[str](), set[str](), [function]
+def _sources_of(function: Callable[..., Any]) -> tuple[frozenset[str], frozenset[tuple[str, float]]]:
+    """Return the files, and the numbers by name, of a function and, recursively, of the parts in its module."""
+    files, modules, waiting, numbers = set[str](), set[str](), [function], set[tuple[str, float]]()
     while waiting:
         part = waiting.pop()
         files.add(inspect.getfile(part))
         if part.__module__ in modules:
             continue
         modules.add(part.__module__)
-        for value in part.__globals__.values():
+        for name, value in part.__globals__.items():
             if hasattr(value, "py_func"):  # numba's
                 waiting.append(value.py_func)
             elif isinstance(value, tuple) and hasattr(value, "_fields"):
                 files.add(inspect.getfile(type(value)))
-    return frozenset(files)
+            elif isinstance(value, int | float):
+                numbers.add((f"{part.__module__}.{name}", value))
+    return frozenset(files), frozenset(numbers)
 
 
 @cache

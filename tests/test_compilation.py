@@ -12,6 +12,9 @@ import bpnp.runtime
 
 pytestmark = pytest.mark.nightly
 
+CONSTANTS = """
+OFFSET = 0
+"""
 FACTOR = """
 from typing import NamedTuple
 from bpnp.runtime import compiler
@@ -27,13 +30,14 @@ def factor():
     return 2
 """
 LOOP = """
+from bpnp.constants import OFFSET
 from bpnp.runtime import compiler
 from bpnp.factor import factor
 
 
 @compiler()
 def double(x):
-    return factor() * x.value
+    return factor() * x.value + OFFSET
 """
 CALL = """
 import numba
@@ -53,6 +57,7 @@ def package(tmp_path: Path) -> Path:
     for name in ("runtime.py", "files.py", "bounded_files.py"):
         shutil.copy(source / name, folder)
     (folder / "__init__.py").touch()
+    (folder / "constants.py").write_text(CONSTANTS)
     (folder / "factor.py").write_text(FACTOR)
     (folder / "loop.py").write_text(LOOP)
     (folder / "__pycache__").touch()  # a file where the folder would be
@@ -85,7 +90,7 @@ def test_a_loop_is_compiled_once_into_the_users_cache(package: Path, tmp_path: P
     assert not list(package.rglob("*.nbc"))
 
 
-def test_a_loop_is_compiled_again_after_a_change_of_a_part_or_of_a_tuple_that_it_takes(
+def test_a_loop_is_compiled_again_after_a_change_of_a_part_a_tuple_or_a_number_of_another_file(
     package: Path, tmp_path: Path
 ) -> None:
     cache = tmp_path / "cache"
@@ -96,6 +101,9 @@ def test_a_loop_is_compiled_again_after_a_change_of_a_part_or_of_a_tuple_that_it
     (package / "bpnp" / "factor.py").write_text(swapped)  # the types of the fields are as before
     assert called(package, cache)[0] == "2 2 True \n"
     (package / "bpnp" / "factor.py").write_text(FACTOR)
+    (package / "bpnp" / "constants.py").write_text(CONSTANTS.replace("0", "7"))
+    assert called(package, cache)[0] == "15 17 True \n"
+    (package / "bpnp" / "constants.py").write_text(CONSTANTS)
     out, log = called(package, cache)
     assert (out, log) == ("8 10 True \n", "")  # the first version is still there
 

@@ -16,7 +16,7 @@ from bpnp.files import cache_folder, file_states, fingerprint, lock_folder, writ
 from bpnp.maps.views import Array, Cones, Pictures, View
 from bpnp.search.config import MAPS, RANK
 
-FORMAT = 1
+FORMAT = 1  # version of the file [1; convention]
 
 
 class Index(NamedTuple):

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from bpnp.maps.views import View
 
 Array = npt.NDArray[Any]
-BOUND = 3.72  # standard deviations that hold 99.9 % of a plane's normal distribution
+BOUND = 3.72  # bound of 99.9 % of a plane's normal distribution [standard deviations; derived]
 
 
 def localized_picture(

@@ -21,18 +21,19 @@ Array = NDArray[np.float64]
 Size = tuple[int, int]  # width and height, pixels
 # Pillow may not read the last four; they are listed so that the error names the photo.
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".avif", ".dng"}
-IFD_EXIF = 0x8769
-FOCAL_LENGTH, FOCAL_LENGTH_35MM = 0x920A, 0xA405
-RESOLUTION_X, RESOLUTION_UNIT = 0xA20E, 0xA210
-ORIENTATION = 0x0112
+IFD_EXIF = 0x8769  # [EXIF; convention]
+FOCAL_LENGTH, FOCAL_LENGTH_35MM = 0x920A, 0xA405  # [EXIF; convention]
+RESOLUTION_X, RESOLUTION_UNIT = 0xA20E, 0xA210  # [EXIF; convention]
+ORIENTATION = 0x0112  # [EXIF; convention]
 # Direction up in the camera (x right, y down) of a photo with this orientation; the others are mirrored.
 UP_OF_ORIENTATION = {1: (0.0, -1.0, 0.0), 3: (0.0, 1.0, 0.0), 6: (-1.0, 0.0, 0.0), 8: (1.0, 0.0, 0.0)}
-PIXELS_X, PIXELS_Y = 0xA002, 0xA003
-DIAGONAL_35MM = 43.2666  # of a frame of 36 x 24 mm; equivalent focal lengths are by the diagonal (CIPA DCG-001)
+PIXELS_X, PIXELS_Y = 0xA002, 0xA003  # [EXIF; convention]
+# Equivalent focal lengths are by the diagonal (CIPA DCG-001).
+DIAGONAL_35MM = 43.2666  # of a frame of 36 x 24 mm [mm; convention]
 MILLIMETRES = {2: 25.4, 3: 10.0}  # per unit of the resolution, by EXIF number: inch, centimetre
 SQLITE = b"SQLite format 3\0"
 # x, y; and scale, orientation; or and a 2x2 matrix of the local shape. https://colmap.github.io/database.html
-COLUMNS = (2, 4, 6)
+COLUMNS = (2, 4, 6)  # [numbers; convention]
 QUERY = """SELECT rows, cols, data, width, height FROM images
     LEFT JOIN keypoints USING (image_id) LEFT JOIN cameras USING (camera_id) WHERE name = ?"""
 

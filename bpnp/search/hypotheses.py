@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bpnp.poses import close_poses, distinct
 from bpnp.search.search_frame import Scene
 
-SIGNIFICANT = 1e3  # nats per bearing, more than any log-likelihood
+SIGNIFICANT = 1e3  # more than any log-likelihood per bearing [nats; derived]
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,7 @@ Array = npt.NDArray[np.float64]
 ROTATION_PARAMETERS = ("rotation_x", "rotation_y", "rotation_z")  # rotation vector in the camera axes, radians
 POSE_PARAMETERS = (*ROTATION_PARAMETERS, "translation_x", "translation_y", "translation_z")
 FOCAL_LENGTH, SCALE = "focal_length", "scale"
-FORMAT = 3  # of the JSON file; raised when the meaning of a field changes
+FORMAT = 3  # version of the JSON file; raised when the meaning of a field changes [1; convention]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,5 @@
 import itertools
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,10 +12,10 @@ from scipy.spatial.transform import Rotation
 import bpnp
 from bpnp.robust.minimal_solvers import p3p
 from bpnp.runtime import Clock
-from bpnp.search.config import ENUMERATION, RULES, Stage
 from bpnp.search.enumeration import search
+from bpnp.search.enumeration.hypotheses import VISITED_PAIRS
 from bpnp.search.enumeration.points import ImageSide
-from bpnp.search.enumeration.search import Enumerated, Enumeration, enumerate_poses
+from bpnp.search.enumeration.search import Enumerated, Enumeration, Stage, enumerate_poses
 from bpnp.search.problem import Problem
 from bpnp.search.starts import PosePrior
 
@@ -106,6 +105,13 @@ def test_a_camera_that_sees_all_around_has_chance_matches_in_the_whole_sphere(co
     assert ratio.max() < 2 * most
 
 
+@pytest.fixture
+def short_sweeps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten hypotheses between checks of the best pose."""
+    monkeypatch.setattr(search, "HYPOTHESES_A_SWEEP", 10)
+    monkeypatch.setattr(search, "HYPOTHESES_A_LOOK", 10)
+
+
 class Sweeps:
     """Calls of the compiled loop: its arguments and what it returns."""
 
@@ -126,9 +132,10 @@ def labelled(count: int, first: int) -> Enumeration:
     labels = first + rng.permutation(count)
     problem = Problem.of(rays, rng.uniform(-1, 1, (count, 3)), labels2d=np.arange(count), labels3d=labels)
     stage = Stage(3, count - 1, count - 1, 0.5)
-    return Enumeration(problem, RADIUS, replace(ENUMERATION, stages=(stage,), chunk=10, look=10))
+    return Enumeration(problem, RADIUS, stages=[stage])
 
 
+@pytest.mark.usefixtures("short_sweeps")
 def test_pairs_whose_labels_differ_end_a_sweep_too(monkeypatch: pytest.MonkeyPatch) -> None:
     """One hypothesis fits each of the C(14, 3) sets of image points.
 
@@ -140,10 +147,11 @@ def test_pairs_whose_labels_differ_end_a_sweep_too(monkeypatch: pytest.MonkeyPat
     assert run.ended == "exhausted"
     ends = [end for arguments, end in sweeps.calls if arguments[2] > 0]
     assert sum(visited for *_, visited in ends) == 6 * sets**2 // 14
-    assert max(visited for *_, visited in ends) <= 10 * RULES.visited
+    assert max(visited for *_, visited in ends) <= 10 * VISITED_PAIRS
     assert sum(solved for _, _, solved, _ in ends) == run.solved == sets
 
 
+@pytest.mark.usefixtures("short_sweeps")
 @pytest.mark.parametrize(("any2d", "any3d"), [(0, 0), (2, 0), (0, 2), (2, 2)])
 def test_every_hypothesis_whose_labels_fit_is_solved_once(any2d: int, any3d: int) -> None:
     """Two labels on each side, and points that fit any; two stages, of which the second adds the sets of the rest."""
@@ -153,7 +161,7 @@ def test_every_hypothesis_whose_labels_fit_is_solved_once(any2d: int, any3d: int
     labels2d[:any2d], labels3d[:any3d] = -1, -1
     problem = Problem.of(rays, rng.uniform(-1, 1, (count, 3)), labels2d=labels2d, labels3d=labels3d)
     stages = Stage(3, 4, 4, 0.5), Stage(3, count - 1, count - 1, 0.5)
-    run = Enumeration(problem, RADIUS, replace(ENUMERATION, stages=stages, chunk=10, look=10))
+    run = Enumeration(problem, RADIUS, stages=stages)
     while run.advance(math.inf):
         pass
     fitting = (labels2d[:, None] == labels3d) | (labels2d[:, None] < 0) | (labels3d < 0)
@@ -166,6 +174,7 @@ def test_every_hypothesis_whose_labels_fit_is_solved_once(any2d: int, any3d: int
     assert run.solved == expected
 
 
+@pytest.mark.usefixtures("short_sweeps")
 def test_image_points_without_a_fitting_label_take_part_in_no_hypothesis(monkeypatch: pytest.MonkeyPatch) -> None:
     """Three image points have labels of the scene: one set, in 6 orders, each of them first in two."""
     for fitting in (0, 3):
@@ -187,10 +196,11 @@ def test_no_pose_beyond_four_standard_deviations_of_a_prior_rotation_is_tried(si
     assert any(degrees_between(each, rotation) < 0.2 for each in poses.rotation) == is_found
 
 
+@pytest.mark.usefixtures("short_sweeps")
 def test_a_clock_that_stands_still_ends_no_enumeration(monkeypatch: pytest.MonkeyPatch) -> None:
     rays, points, rotation, _, _ = planted(np.random.default_rng(0), 8, noise=0.0)
     monkeypatch.setattr(Clock, "now", classmethod(lambda cls: 0.0))
-    run = Enumeration(Problem.of(rays, points), RADIUS, replace(ENUMERATION, chunk=10, look=10))
+    run = Enumeration(Problem.of(rays, points), RADIUS)
     while run.advance(1e3):
         pass
     assert degrees_between(run.poses().rotation[0], rotation) < 0.1

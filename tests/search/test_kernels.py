@@ -10,10 +10,9 @@ import torch
 from scipy.spatial.distance import cdist
 
 from bpnp.geometry import random_rotations, retract
-from bpnp.search.config import KERNELS
 from bpnp.search.kernels.dense import POWER, assign, dense_scratch, normal_equations
 from bpnp.search.kernels.sides import WeightedBearings, WeightedPoints
-from bpnp.search.kernels.sparse import assign_sparse, build_tiles, sparse_scratch
+from bpnp.search.kernels.sparse import KERNEL_REACH, assign_sparse, build_tiles, sparse_scratch
 
 FORWARD = np.array([0.0, 0.0, 1.0])
 
@@ -90,7 +89,7 @@ def test_the_likelihood_on_tiles_is_the_mixture_and_close_to_that_on_clusters(sp
     at = *view.pose(), np.float32(scale), np.float32(outlier)
     likelihood, matched, _ = entry(assign_sparse)(tiles, sides[1], *at, sparse)
     squared = cdist(view.bearings, view.directions(), "sqeuclidean")
-    k = np.where(squared < (KERNELS.reach * scale) ** 2, np.exp(-squared / (2 * scale**2)), 0)
+    k = np.where(squared < (KERNEL_REACH * scale) ** 2, np.exp(-squared / (2 * scale**2)), 0)
     assert likelihood == pytest.approx(np.log((k.mean(1) + outlier) / scale**2).mean(), abs=2e-3)
     assert 0.5 < matched < 50 / 60 + 0.05
     assert entry(assign)(*sides, *at, dense) == pytest.approx(likelihood, abs=0.1)

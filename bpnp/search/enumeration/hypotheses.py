@@ -3,11 +3,35 @@
 import math
 from typing import Any, NamedTuple
 
-from bpnp.search.config import RULES
-from bpnp.search.enumeration.matching import Matches, cell_of, evidence, fits, match, nearest, sight, step
+from bpnp.poses import SAME
+from bpnp.search.enumeration.matching import (
+    MATCHED_COSINE,
+    Matches,
+    cell_of,
+    evidence,
+    fits,
+    match,
+    nearest,
+    sight,
+    step,
+)
 from bpnp.search.enumeration.points import Array, Places
 from bpnp.search.kernels.vectors import copy_pose, rotated
 from bpnp.search.propose.minimal_solvers import Triangles, chords_between, compiled, part, solve_p2p, solve_p3p
+
+LACKING = 0.25  # matches subtracted from a hypothesis for each expected but missing point [matches; calibration]
+# Pairs of an image set and a scene set that a sweep may visit per hypothesis of its budget. Those whose labels differ
+# are no hypothesis; this many take about as long as one.
+VISITED_PAIRS = 256  # [pairs; cost]
+# Matches that a hypothesis may lack against the best one of its stage and still be refined.
+BEHIND = 1.0  # [matches; calibration]
+SKIPPED_MATCHES = 5  # matches of the best pose from which its own triples are not solved again [matches; calibration]
+SKIPPED_BASIN_COUNT = 12  # basin count of the best pose that this requires too [hypotheses; calibration]
+TIGHTER = 0.55  # factor of the radius from one step of a refinement to the next [factor; calibration]
+FINAL_STEPS = 3  # steps of a refinement at its last radius [steps; calibration]
+# Smallest trace of the rotation between two poses that are the same (`Tolerance`).
+SAME_TRACE = 1 + 2 * math.cos(math.radians(SAME.degrees))  # [1; derived]
+SAME_SHIFT = SAME.shift  # largest shift between them, as a fraction of the scene's distance [fraction; derived]
 
 
 class Block(NamedTuple):
@@ -67,7 +91,7 @@ def sweep(row: int, first: int, budget: int, stop: float, block: Any, problem: A
     """Solve up to `budget` hypotheses, and keep the refined poses.
 
     A row is an image set in one order, paired with the triangles whose first point fits the label of its first point.
-    The sweep also ends after an image set once the best evidence reaches `stop`, and after `RULES.visited` pairs of a
+    The sweep also ends after an image set once the best evidence reaches `stop`, and after `VISITED_PAIRS` pairs of a
     row and a triangle per hypothesis: labels may exclude most pairs.
 
     Args:
@@ -101,7 +125,7 @@ def sweep(row: int, first: int, budget: int, stop: float, block: Any, problem: A
         if block.size == 3:
             hand = 1 if _determinant(rays[i], rays[j], rays[k]) > 0 else 2
         while at < last:
-            if solved >= budget or visited >= RULES.visited * budget:
+            if solved >= budget or visited >= VISITED_PAIRS * budget:
                 return row, at, solved, visited
             t = by_label[at if at < free else offset + at]
             at, visited = at + 1, visited + 1
@@ -114,7 +138,7 @@ def sweep(row: int, first: int, budget: int, stop: float, block: Any, problem: A
                 continue
             its_points = kept.point[best[0]]
             own = its_points[i] == a and its_points[j] == b and its_points[k] == c
-            if own and kept.counts[best[0]] >= RULES.skipped and kept.basin_count[best[0]] >= RULES.counted:
+            if own and kept.counts[best[0]] >= SKIPPED_MATCHES and kept.basin_count[best[0]] >= SKIPPED_BASIN_COUNT:
                 continue
             solved += 1
             if block.size == 2:
@@ -147,7 +171,7 @@ def facing(pose: Any, normals: Any, a: int, rays: Any, i: int) -> bool:
     if not len(normals):
         return True
     x, y, z = rotated(pose, normals[a, 0], normals[a, 1], normals[a, 2])
-    return -(x * rays[i, 0] + y * rays[i, 1] + z * rays[i, 2]) > RULES.matched_cosine
+    return -(x * rays[i, 0] + y * rays[i, 1] + z * rays[i, 2]) > MATCHED_COSINE
 
 
 @part
@@ -173,7 +197,7 @@ def witnessed(pose: Any, points: Any, seen: Any, block: Any, problem: Any) -> bo
         if p == points[1] or p == points[2]:
             continue
         u, v, cosine = sight(pose, scene, p)
-        if cosine < RULES.matched_cosine:
+        if cosine < MATCHED_COSINE:
             continue
         q, _ = nearest(u, v, cell_of(u, v, grid), scene.labels[p], reach * reach, grid)
         if q >= 0 and q != seen[0] and q != seen[1] and q != seen[2]:
@@ -193,7 +217,7 @@ class Kept(NamedTuple):
         point: (c, m) scene point of each image point, or -1.
         distance2: (c, m) squared distances, in match radii.
         best: (1,) index of the best pose.
-        most: (1,) largest number of matches of a hypothesis in this stage, less `RULES.lacking` for each missing point.
+        most: (1,) largest number of matches of a hypothesis in this stage, less `LACKING` for each missing point.
         basin_count: (c,) number of image sets with a hypothesis that ended at the pose.
         last: (c,) image set that was counted last.
         at: (1,) current image set; -1 for a pose from elsewhere.
@@ -230,9 +254,9 @@ def copy(values: Any, to: Any) -> None:
 def consider(pose: Any, reach: float, problem: Any, kept: Any, work: Any) -> None:
     """Refine a pose with about as many matches as the best hypothesis of the stage."""
     count, _, expected = match(pose, reach, problem.scene, problem.image.grid, work.matches)
-    value = count - RULES.lacking * (expected - count if expected > count else 0)
+    value = count - LACKING * (expected - count if expected > count else 0)
     kept.most[0] = max(kept.most[0], value)
-    if count > problem.fixing and value >= kept.most[0] - RULES.behind:
+    if count > problem.fixing and value >= kept.most[0] - BEHIND:
         settle(pose, reach, problem, kept, work)
 
 
@@ -268,12 +292,12 @@ def settle(pose: Any, reach: float, problem: Any, kept: Any, work: Any) -> None:
 def tightened(pose: Any, reach: float, last: float, problem: Any, matches: Any, system: Any) -> bool:
     """Refine a pose in place by Gauss-Newton steps on matches within a shrinking radius.
 
-    The radius shrinks from `reach` to `last`, in match radii; `RULES.final` steps follow there.
+    The radius shrinks from `reach` to `last`, in match radii; `FINAL_STEPS` steps follow there.
 
     Returns:
         False for too few matches, a singular step, or a pose that the prior excludes.
     """
-    left, directions = RULES.final, len(problem.prior.in_scene)
+    left, directions = FINAL_STEPS, len(problem.prior.in_scene)
     while left > 0:
         count, _, _ = match(pose, reach, problem.scene, problem.image.grid, matches)
         if count < 3 and count + directions < 3:
@@ -281,7 +305,7 @@ def tightened(pose: Any, reach: float, last: float, problem: Any, matches: Any, 
         if not step(pose, matches.point, problem, system):
             return False
         left -= reach <= last
-        reach = max(last, RULES.tighter * reach)
+        reach = max(last, TIGHTER * reach)
     return allowed(pose, problem.prior)
 
 
@@ -335,12 +359,12 @@ def keep(pose: Any, value: float, count: int, matches: Any, kept: Any) -> None:
 
 @part
 def _same(pose: Any, other: Any) -> bool:
-    """Return whether two poses (4, 3) are the same within the tolerances of `Rules`."""
+    """Return whether two poses (4, 3) are the same within the tolerances of `SAME`."""
     shift2 = depth2 = trace = 0.0  # trace of the rotation between them: 1 + 2 cos
     for k in range(3):
         shift2 += (pose[3, k] - other[3, k]) ** 2
         depth2 += other[3, k] ** 2
         for c in range(3):
             trace += pose[k, c] * other[k, c]
-    near = shift2 < RULES.same_shift**2 * depth2
-    return near and trace > RULES.same_trace
+    near = shift2 < SAME_SHIFT**2 * depth2
+    return near and trace > SAME_TRACE

@@ -9,11 +9,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bpnp.search.config import RULES
-from bpnp.search.enumeration.points import Array, Heading, ImageArrays, Places, PriorArrays, SceneArrays
+from bpnp.search.enumeration.points import IMAGE_CELLS, Array, Heading, ImageArrays, Places, PriorArrays, SceneArrays
 from bpnp.search.kernels.dense import solve_normal_equations
 from bpnp.search.kernels.vectors import rotated, turn
 from bpnp.search.propose.minimal_solvers import part
+
+# Smallest cosine between a normal and the line of sight at which a point can have a match.
+MATCHED_COSINE = math.cos(math.radians(87.0))  # [1; calibration]
+# Smallest cosine at which a point with a normal is expected to be seen.
+EXPECTED_COSINE = math.cos(math.radians(72.0))  # [1; calibration]
+TESTED_RADII = 5  # number of radii 1, 1/2, 1/4 ... at which matches are counted [radii; calibration]
+MISSED_NATS = 1.5  # nats subtracted for each expected but missing point; one in five is missed [nats; calibration]
 
 
 class EnumerationTables(NamedTuple):
@@ -77,7 +83,7 @@ def fits(label: int, other: int) -> bool:
 def cell_of(u: float, v: float, grid: Any) -> Any:
     """Return the cell of the grid that contains (u, v), or -1 outside."""
     a, b = (u - grid.low_u) * grid.per_cell, (v - grid.low_v) * grid.per_cell
-    return np.int64(a) * RULES.cells + np.int64(b) if a >= 0 and b >= 0 and a < RULES.cells and b < RULES.cells else -1
+    return np.int64(a) * IMAGE_CELLS + np.int64(b) if a >= 0 and b >= 0 and a < IMAGE_CELLS and b < IMAGE_CELLS else -1
 
 
 @part
@@ -118,11 +124,11 @@ def match(pose: Any, reach: float, scene: Any, grid: Any, matches: Any) -> tuple
     visible = expected = count = 0
     for j in range(len(scene.points)):
         u, v, cosine = sight(pose, scene, j)
-        if cosine < RULES.matched_cosine:
+        if cosine < MATCHED_COSINE:
             continue
         cell = cell_of(u, v, grid)
         visible += cell >= 0
-        expected += len(scene.normals) > 0 and cosine > RULES.expected_cosine
+        expected += len(scene.normals) > 0 and cosine > EXPECTED_COSINE
         i, d2 = nearest(u, v, cell, scene.labels[j], reach * reach, grid)
         if i >= 0 and d2 < matches.distance2[i]:
             count += matches.point[i] < 0
@@ -149,7 +155,7 @@ def evidence(count: int, visible: int, expected: int, matches: Any, fixing: int,
         Evidence in nats, and the radius in match radii.
     """
     best, radius, radius2 = -math.inf, 1.0, 1.0
-    for _ in range(RULES.ladder):
+    for _ in range(TESTED_RADII):
         k = 0
         for i in range(len(matches.point)):
             k += matches.point[i] >= 0 and matches.distance2[i] <= radius2
@@ -158,7 +164,7 @@ def evidence(count: int, visible: int, expected: int, matches: Any, fixing: int,
         if value > best:
             best, radius = value, math.sqrt(radius2)
         radius2 *= 0.25
-    return best - RULES.missed * (expected - count if expected > count else 0), radius
+    return best - MISSED_NATS * (expected - count if expected > count else 0), radius
 
 
 @part

@@ -13,9 +13,9 @@ import numpy as np
 
 from bpnp.runtime import Deadline
 from bpnp.search.competing_poses import SceneOf, judge_with_competitors
-from bpnp.search.config import ENUMERATION, SearchSettings
+from bpnp.search.config import SearchSettings
 from bpnp.search.enumeration.points import predicted_pose
-from bpnp.search.enumeration.search import Enumeration, enumerate_poses, margin
+from bpnp.search.enumeration.search import PATIENCE, STAGES, Enumeration, enumerate_poses, margin
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.loop import Step
 from bpnp.search.possible_matches import score_pose
@@ -23,6 +23,9 @@ from bpnp.search.problem import Problem
 from bpnp.search.propose.repetitions import competing_poses
 from bpnp.search.starts import GravityPrior
 from bpnp.search.verdict.decide import REFINED, SearchResult, add_false_alarms, is_certain, judge, rank_poses
+
+NEAR_NATS = 25.0  # evidence in nats by which a competing pose may be behind the best [nats; calibration]
+SMALLEST_SCALE = 1e-5  # smallest scale of the residuals if the pixel size is unknown [radians; numerics]
 
 
 class EnumeratedPoses:
@@ -53,8 +56,7 @@ class EnumeratedPoses:
 
     def begin(self, problem: Problem, *, predicted_only: bool = False) -> None:
         """Begin an enumeration of a problem; with `predicted_only` of the predicted pose alone."""
-        settings = replace(ENUMERATION, stages=()) if predicted_only else ENUMERATION
-        self.run = Enumeration(problem, problem.match_radius, settings)
+        self.run = Enumeration(problem, problem.match_radius, stages=() if predicted_only else STAGES)
         self._leaders: list[Hypotheses] = []  # poses (1,) whose competing poses were proposed
 
     def add(self, step: Step, found: Hypotheses) -> None:
@@ -77,7 +79,7 @@ class EnumeratedPoses:
         leader = self.found[:1]
         self._leaders.append(leader)
         pose, verdict_settings = leader.pose(), self.settings.evidence
-        scale = max(float(leader.scale[0]), self.problem.floor or ENUMERATION.smallest_scale)
+        scale = max(float(leader.scale[0]), self.problem.floor or SMALLEST_SCALE)
         rotations, translations, *_ = competing_poses(self.problem, *pose, scale, verdict_settings)
         rest = self._poses_of_rest(leader, deadline)
         rotations = np.concatenate([rotations, rest.rotation])
@@ -96,9 +98,8 @@ class EnumeratedPoses:
         scene = np.setdiff1d(np.arange(len(problem.points3d)), matches)
         if min(len(image), len(scene)) < leader.match_count[0]:
             return Hypotheses.empty()
-        settings = replace(ENUMERATION, most=ENUMERATION.patience)
         rest = problem.choose(image, scene)
-        return enumerate_poses(rest, radius=problem.match_radius, deadline=deadline, settings=settings).poses
+        return enumerate_poses(rest, radius=problem.match_radius, deadline=deadline, most=PATIENCE).poses
 
     def may_be_decided(self) -> bool:
         """Return True if the best pose leads by a safe margin and passes the cheap tests of the verdict."""
@@ -134,8 +135,8 @@ class EnumeratedPoses:
         poses = self.found
         if poses.evidence is None or not len(poses):
             return poses
-        poses = poses[poses.evidence >= poses.evidence.max() - ENUMERATION.near_nats][: self.settings.kept]
-        scale = np.maximum(poses.scale, self.problem.floor or ENUMERATION.smallest_scale)
+        poses = poses[poses.evidence >= poses.evidence.max() - NEAR_NATS][: self.settings.kept]
+        scale = np.maximum(poses.scale, self.problem.floor or SMALLEST_SCALE)
         each = zip(poses.rotation, poses.translation, scale, strict=True)
         likelihood = np.array([score_pose(self.problem, *one)[0] for one in each])
         return replace(poses, scale=scale, log_likelihood=likelihood)

@@ -8,10 +8,24 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.search.config import ENUMERATION, RULES, EnumerationSettings
 from bpnp.search.problem import Problem
 from bpnp.search.propose.minimal_solvers import Triangles, triangles_of
 from bpnp.search.starts import GravityPrior, PosePrior, Prior, turned_to
+
+IMAGE_CELLS = 48  # cells along a side of the grid of the image points [cells; cost]
+PRIOR_SIGMAS = 4.0  # standard deviations of a prior beyond which no pose is tried [standard deviations; convention]
+# Noise is a tenth to a third of a radius.
+PRIOR_WEIGHT = 0.1  # match radii that weigh as much as one standard deviation of a prior [match radii; calibration]
+# Cosine from the mean bearing; a camera with a bearing below it sees all around.
+ALL_AROUND_COSINE = -0.5  # [1; not tuned]
+RANKED_NEIGHBOURS = 64  # points up to which all neighbours are ranked; beyond, only this many of each [points; cost]
+CACHED_SCENES = 8  # number of scenes whose tables stay in the cache [scenes; cost]
+OPPOSITE_COSINE = -0.8  # cosine of two normals below which no camera faces both [1; not tuned]
+# Cosine below which a point of a triple faces away; the lines of sight to three points are not quite parallel, so it is
+# that of 95 degrees.
+AWAY_COSINE = math.cos(math.radians(95.0))  # [1; not tuned]
+EDGE_ON_SINE = 0.15  # sine of an angle to a triangle's plane below which either orientation is possible [1; not tuned]
+TESTED_DIRECTIONS = 192  # number of directions with which the orientations of a triangle are tested [directions; cost]
 
 Array = NDArray[np.float64]
 Places = NDArray[np.int64]
@@ -195,7 +209,7 @@ def axis_of(bearings: Array) -> Array:
     """
     mean = bearings.mean(0)
     length = float(np.linalg.norm(mean))
-    if float((bearings @ mean).min()) > ENUMERATION.all_around * length:
+    if float((bearings @ mean).min()) > ALL_AROUND_COSINE * length:
         return np.asarray(mean)
     return np.asarray(DIRECTIONS[(bearings @ DIRECTIONS.T).min(0).argmax()])
 
@@ -207,7 +221,7 @@ def scene_side(points3d: Array, normals3d: Array | None, labels3d: Places | None
     )
 
 
-@functools.lru_cache(maxsize=ENUMERATION.scenes)
+@functools.lru_cache(maxsize=CACHED_SCENES)
 def _remembered(points3d: bytes, normals3d: bytes | None, labels3d: bytes | None) -> SceneSide:
     """Build a scene from the bytes of its arrays, which are the key of the cache."""
     return SceneSide(
@@ -227,14 +241,14 @@ def nearest_of(points: Array, normals: Array) -> Places:
         normals: (n, 3), or (0, 3) for none.
     """
     n = len(points)
-    if n > ENUMERATION.ranked:
-        order = cKDTree(points).query(points, ENUMERATION.ranked)[1]
+    if n > RANKED_NEIGHBOURS:
+        order = cKDTree(points).query(points, RANKED_NEIGHBOURS)[1]
         itself_last = np.argsort(order == np.arange(n)[:, None], axis=1, kind="stable")
         order = np.take_along_axis(order, itself_last, 1)[:, :-1]
     else:
         distance2 = ((points[:, None] - points[None]) ** 2).sum(-1)
         if len(normals):
-            distance2 += np.where(normals @ normals.T < ENUMERATION.opposite, 1e6 * (distance2.max() + 1e-300), 0.0)
+            distance2 += np.where(normals @ normals.T < OPPOSITE_COSINE, 1e6 * (distance2.max() + 1e-300), 0.0)
         np.fill_diagonal(distance2, np.inf)
         order = np.argsort(distance2, axis=1, kind="stable")[:, :-1]
     return np.ascontiguousarray(order, np.int64)
@@ -265,9 +279,9 @@ def visible_triangles(points: Array, normals: Array, triples: Places) -> Triangl
     triangles = triangles_of(points, triples)
     orientation = triangles.orientation
     if len(normals):
-        facing = (normals @ DIRECTIONS.T > ENUMERATION.parallel)[triangles.triples].all(1)
+        facing = (normals @ DIRECTIONS.T > AWAY_COSINE)[triangles.triples].all(1)
         above = triangles.frames[:, 2] @ DIRECTIONS.T
-        seen = [(facing & (side * above < ENUMERATION.edge_on)).any(1) for side in (-1, 1)]
+        seen = [(facing & (side * above < EDGE_ON_SINE)).any(1) for side in (-1, 1)]
         orientation &= np.stack(seen, -1) @ (1, 2)
     tables: Any = (np.ascontiguousarray(table[orientation > 0]) for table in triangles)
     return Triangles(*tables)
@@ -289,12 +303,12 @@ def sphere(count: int) -> Array:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], -1)
 
 
-DIRECTIONS = sphere(ENUMERATION.directions)
+DIRECTIONS = sphere(TESTED_DIRECTIONS)
 
 
 def grid_of(flat: Array, gain: Array, labels: Places, reach: float) -> Grid:
     """Build the grid of image points (m, 2), each in all cells within `reach` radii."""
-    cells, around = RULES.cells, reach / gain[:, None]
+    cells, around = IMAGE_CELLS, reach / gain[:, None]
     low, high = (flat - around).min(0), (flat + around).max(0)
     per_cell = cells / (float((high - low).max()) * (1 + 1e-9) + 1e-12)
     first, last = (
@@ -325,9 +339,7 @@ def predicted_pose(prior: Prior | None) -> tuple[Array, Array] | None:
     return np.asarray(prior.rotation, np.float64), np.asarray(prior.translation, np.float64)
 
 
-def prior_arrays(
-    problem: Problem, scene: SceneSide, image: ImageSide, settings: EnumerationSettings
-) -> tuple[PriorArrays, Heading, float]:
+def prior_arrays(problem: Problem, scene: SceneSide, image: ImageSide) -> tuple[PriorArrays, Heading, float]:
     """Convert the prior to the frames of the loops.
 
     Where two matches fix a pose, one direction is taken as exact. It is the vertical, or the direction of the view: the
@@ -337,7 +349,6 @@ def prior_arrays(
         problem: Points and prior.
         scene: Scene of the problem.
         image: Image of the problem.
-        settings: Constants.
 
     Returns:
         The prior as arrays, the input of P2P, and the logarithm of the fraction of rotations that the prior allows.
@@ -359,15 +370,15 @@ def prior_arrays(
         in_scene, in_camera = np.eye(3), np.ascontiguousarray(rotation.T)
         if (predicted := predicted_pose(prior)) is not None:
             translation = image.turn @ predicted[1]
-            farthest_shift2 = (settings.sigmas * prior.translation_sigma) ** 2
-        most = min(settings.sigmas * sigma, math.pi)
+            farthest_shift2 = (PRIOR_SIGMAS * prior.translation_sigma) ** 2
+        most = min(PRIOR_SIGMAS * sigma, math.pi)
         log_share, sine2 = math.log((most - math.sin(most)) / math.pi), math.sin(min(most, math.pi / 2)) ** 2
     about = np.array([np.diag([0.0, 0, 1]), np.diag([1.0, 1, 0]), [[0, -1, 0], [1, 0, 0], [0, 0, 0]]])
     rays = np.ascontiguousarray(image.arrays.rays @ from_camera.T)
     points = np.ascontiguousarray(scene.arrays.points @ from_scene.T)
     heading = Heading(rays, points, from_camera.T @ about @ from_scene, sine2)
     # A rotation by v about an axis across `moved` directions moves each of them by 2 sin(v / 2).
-    weight = settings.prior_weight / (math.sqrt(moved) * sigma)
-    farthest2 = moved * (2 * math.sin(min(settings.sigmas * sigma, math.pi) / 2)) ** 2
+    weight = PRIOR_WEIGHT / (math.sqrt(moved) * sigma)
+    farthest2 = moved * (2 * math.sin(min(PRIOR_SIGMAS * sigma, math.pi) / 2)) ** 2
     arrays = PriorArrays(in_scene, in_camera, float(weight), float(farthest2), translation, float(farthest_shift2))
     return arrays, heading, log_share

@@ -6,15 +6,16 @@ one-to-one. The neighbourhoods grow until the verdict is safe, every triple was 
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from bpnp.runtime import Clock
-from bpnp.search.config import ENUMERATION, RULES, TIME, EnumerationSettings, Stage
-from bpnp.search.enumeration.hypotheses import Block, Kept, Work, explore
-from bpnp.search.enumeration.matching import EnumerationTables, Matches
+from bpnp.search.config import TIME
+from bpnp.search.enumeration.hypotheses import VISITED_PAIRS, Block, Kept, Work, explore
+from bpnp.search.enumeration.matching import TESTED_RADII, EnumerationTables, Matches
 from bpnp.search.enumeration.points import (
     Array,
     ImageSide,
@@ -29,6 +30,41 @@ from bpnp.search.kernels.sides import fit_any
 from bpnp.search.problem import Problem
 from bpnp.search.starts import PosePrior
 
+MOST_PRODUCTS = 4000  # largest number of image points times scene points that are enumerated: 63 x 63 [products; cost]
+MOST_PRODUCTS_KNOWN = 250_000  # the limit where a prior lets two matches fix a pose [products; cost]
+KEPT_POSES = 16  # distinct poses that are kept [poses; cost]
+# Margin in nats, over chance and over any other pose, at which the search ends at once.
+SAFE_NATS = math.log(1e6)  # [nats; calibration]
+# After twice as many the search ends with any significant pose.
+PATIENCE = 25_000  # hypotheses after which the required margin has fallen linearly to 0 [hypotheses; calibration]
+HYPOTHESES_A_LOOK = 3_000  # hypotheses between checks of the best pose once it is significant [hypotheses; cost]
+HYPOTHESES_A_SWEEP = 20_000  # hypotheses between checks before [hypotheses; cost]
+MOST_HYPOTHESES = 200_000  # largest number of hypotheses [hypotheses; cost]
+# Largest radius within which points are matched to a predicted pose, in match radii.
+WIDEST_REACH = 12.0  # [match radii; calibration]
+# Preverification points that are seen, if the image points are spread evenly over the scene.
+SEEN_WITNESSES = 3.0  # [points; calibration]
+FEWEST_WITNESSES = 10  # fewest preverification points of a hypothesis [points; calibration]
+MOST_WITNESSES = 32  # most preverification points of a hypothesis [points; cost]
+# Expected chance matches of these points from which two, and three, matches are required.
+WITNESS_CHANCES = (0.05, 0.3)  # [matches; calibration]
+
+
+class Stage(NamedTuple):
+    """Block of hypotheses: the `near2d` nearest of an image point with the `near3d` nearest of a scene point."""
+
+    matches: int  # of a hypothesis: 3, or 2 where a prior lets two matches fix a pose
+    near2d: int  # neighbours of an image point
+    near3d: int  # neighbours of a scene point
+    reach: float  # largest residual of a match before the pose is refined, in match radii
+
+
+# Blocks of hypotheses, in their order; those of two matches need a prior that lets two fix a pose.
+STAGES = (  # [`Stage`; calibration]
+    *(Stage(2, *near, 0.6) for near in ((5, 9), (9, 16), (63, 63))),
+    *(Stage(2, 63, 63, 2.0), Stage(3, 3, 5, 0.5), Stage(3, 4, 7, 0.5), Stage(3, 3, 5, 2.0)),
+    *(Stage(3, *near, reach) for near in ((5, 9), (8, 13), (24, 32), (63, 63)) for reach in (0.5, 2.0)),
+)
 ORDERS = {
     2: np.array([[0, 1, 1], [1, 0, 0]]),
     3: np.array([[0, 1, 2], [1, 2, 0], [2, 0, 1], [0, 2, 1], [1, 0, 2], [2, 1, 0]]),
@@ -59,7 +95,7 @@ class Enumeration:
         problem: Points.
         scene: Scene of the problem.
         image: Image of the problem.
-        settings: Constants.
+        most: Largest number of hypotheses.
         reach: Largest radius of a match, in match radii.
         fixing: Number of matches that fix a pose.
         solved: Number of minimal problems solved so far.
@@ -70,19 +106,28 @@ class Enumeration:
         work: Buffers of the compiled loops.
     """
 
-    def __init__(self, problem: Problem, radius: float, settings: EnumerationSettings = ENUMERATION) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        radius: float,
+        *,
+        stages: Sequence[Stage] = STAGES,
+        most: int = MOST_HYPOTHESES,
+        kept: int = KEPT_POSES,
+    ) -> None:
         scene = scene_side(problem.points3d, problem.normals3d, problem.labels3d)
-        self.reach = _reach(problem, radius, settings)
+        self.reach = _reach(problem, radius, stages)
         image = ImageSide(problem.bearings, radius, problem.labels2d, self.reach)
-        (prior, heading, log_share), fixing = prior_arrays(problem, scene, image, settings), problem.fixing_matches
-        self.problem, self.scene, self.image, self.settings = problem, scene, image, settings
+        (prior, heading, log_share), fixing = prior_arrays(problem, scene, image), problem.fixing_matches
+        self.problem, self.scene, self.image, self.most = problem, scene, image, most
         self.fixing, self.solved, self._pace = fixing, 0, TIME.hypothesis
         self.ended: Ended | None = None
         self._predicted, self._safe = predicted_pose(problem.prior), 0.0
-        self._stages = [stage for stage in settings.stages if stage.matches >= fixing]
+        self._last_reach = stages[-1].reach if stages else 0.0
+        self._stages = [stage for stage in stages if stage.matches >= fixing]
         self._stage: Stage | None = None
         self._is_checked = self._is_complete = True
-        m, n, kept = len(image.arrays.rays), len(scene.arrays.points), settings.kept
+        m, n = len(image.arrays.rays), len(scene.arrays.points)
         self.tables = EnumerationTables(scene.arrays, image.arrays, prior, heading, fixing, image.density)
         self.kept = Kept(
             poses=np.zeros((kept, 4, 3)),
@@ -99,11 +144,11 @@ class Enumeration:
         self._may_match = fit_any(image.arrays.grid.labels, scene.arrays.labels)
         matches = Matches(np.empty(m, np.int64), np.empty(m))
         self.work = Work(np.empty((4, 4, 3)), matches, np.empty((8, 6)))
-        seen = settings.seen_witnesses * n / max(m - fixing, 1)
-        near = int(np.clip(seen, settings.fewest_witnesses, settings.most_witnesses))
+        seen = SEEN_WITNESSES * n / max(m - fixing, 1)
+        near = int(np.clip(seen, FEWEST_WITNESSES, MOST_WITNESSES))
         self._witnesses = np.ascontiguousarray(scene.nearest[:, :near])
         problems = _log_choose(m, fixing) + _log_choose(n, fixing) + math.lgamma(fixing + 1) + log_share
-        self.tests = math.log(RULES.ladder) + max(problems, 0.0)
+        self.tests = math.log(TESTED_RADII) + max(problems, 0.0)
         self._done: dict[tuple[int, float], tuple[int, int]] = {}
         none = np.empty((0, fixing), np.int64)
         empty = np.zeros(m, np.int64)
@@ -131,12 +176,12 @@ class Enumeration:
     @property
     def safe_margin(self) -> float:
         """Margin in nats above which the best pose ends the enumeration; it falls with the hypotheses solved."""
-        return self._safe * (1 - self.solved / self.settings.patience)
+        return self._safe * (1 - self.solved / PATIENCE)
 
     @property
     def is_long(self) -> bool:
         """True if enough hypotheses are solved for a significant pose to end the enumeration."""
-        return self.solved >= 2 * self.settings.patience
+        return self.solved >= 2 * PATIENCE
 
     @property
     def best(self) -> float:
@@ -163,7 +208,7 @@ class Enumeration:
         self._done[stage.matches, stage.reach] = len(sets), len(triangles.triples)
         # The required number of preverification points depends on the expected number of chance matches.
         chance = self._witnesses.shape[1] * m * self.image.density * stage.reach**2
-        one, two = self.settings.witness_chances
+        one, two = WITNESS_CHANCES
         need = (1 if chance < one else 2 if chance < two else 3) + (stage.matches == 2)
         need = min(need, m - stage.matches, n - stage.matches)
         size, orders = stage.matches, ORDERS[stage.matches]
@@ -182,7 +227,7 @@ class Enumeration:
         """Continue until the best pose is significant, or to the end.
 
         The predicted pose of the prior is tried first, then the hypotheses stage by stage. Once a pose is significant,
-        the function returns after every `EnumerationSettings.look` hypotheses.
+        the function returns after every `HYPOTHESES_A_LOOK` hypotheses.
 
         Args:
             deadline: When to stop (`Clock.now`).
@@ -195,7 +240,7 @@ class Enumeration:
             self.propose(*predicted, self.reach)
             if self.is_significant:
                 return True
-        self._safe = self.settings.safe
+        self._safe = SAFE_NATS
         while self.ended is None:
             self._advance(deadline)
             if not self._is_checked and self.is_significant:
@@ -204,20 +249,20 @@ class Enumeration:
 
     def _advance(self, deadline: float) -> None:
         """Solve some hypotheses of the current stage, begin the next stage, or end."""
-        settings, stage = self.settings, self._stage
+        stage = self._stage
         late = not self._is_checked and deadline - Clock.now() < TIME.shortest
-        if not self._is_checked and (late or self.solved > settings.most):
+        if not self._is_checked and (late or self.solved > self.most):
             self.ended = "interrupted" if late else "most"
             return
         self._is_checked = True
         if stage is not None and self._row < len(self._block.sets) * len(self._block.orders):
-            self.sweep(settings.look if self.is_significant else settings.chunk, deadline)
+            self.sweep(HYPOTHESES_A_LOOK if self.is_significant else HYPOTHESES_A_SWEEP, deadline)
             self._is_checked = False
             return
         m, n = len(self.problem.bearings), len(self.problem.points3d)
         if stage is not None:
             self._is_complete = stage.near2d >= m - 1 and stage.near3d >= n - 1
-            if self._is_complete and stage.matches == 3 and stage.reach == settings.stages[-1].reach:
+            if self._is_complete and stage.matches == 3 and stage.reach == self._last_reach:
                 self._stages = []
         if not self._stages:
             self.ended = "exhausted" if stage is not None and self._is_complete else "most"
@@ -239,7 +284,7 @@ class Enumeration:
         most = int(min(most, max(0.5 * (deadline - start) / self._pace, 1)))
         self._row, self._triangle, solved, visited = self._explored(self._row, self._triangle, most, stop, 1.0)
         self.solved += solved
-        if (done := max(solved, visited // RULES.visited)) >= most:
+        if (done := max(solved, visited // VISITED_PAIRS)) >= most:
             self._pace = max((Clock.now() - start) / done, TIME.least_pace)
 
     def propose(self, rotation: Array, translation: Array, reach: float) -> None:
@@ -287,7 +332,8 @@ def enumerate_poses(
     radius: float | None = None,
     deadline: float = math.inf,
     to_the_end: bool = False,
-    settings: EnumerationSettings = ENUMERATION,
+    most: int = MOST_HYPOTHESES,
+    kept: int = KEPT_POSES,
 ) -> Enumerated:
     """Enumerate poses under which image points see scene points, one-to-one within a radius.
 
@@ -299,7 +345,8 @@ def enumerate_poses(
         deadline: When to stop (`Clock.now`).
         to_the_end: True to try every hypothesis; False to stop once the best pose is significant and leads every other
             pose by a safe margin.
-        settings: Constants.
+        most: Largest number of hypotheses.
+        kept: Number of distinct poses that are kept.
 
     Returns:
         The poses, and why the enumeration ended.
@@ -313,7 +360,7 @@ def enumerate_poses(
     >>> np.allclose(found.rotation[0], np.eye(3)), found.matches[0].tolist()
     (True, [0, 1, 2, 3, 4, 5])
     """
-    run = Enumeration(problem, problem.match_radius if radius is None else radius, settings)
+    run = Enumeration(problem, problem.match_radius if radius is None else radius, most=most, kept=kept)
     while run.advance(deadline):
         if not to_the_end and margin(poses := run.poses(), problem) >= run.safe_margin:
             return Enumerated(poses, "safe")
@@ -324,17 +371,17 @@ def enumerate_poses(
     return Enumerated(run.poses(), run.ended)
 
 
-def _reach(problem: Problem, radius: float, settings: EnumerationSettings) -> float:
+def _reach(problem: Problem, radius: float, stages: Sequence[Stage]) -> float:
     """Return the largest radius of a match, in match radii.
 
-    It covers the uncertainty of a predicted pose, up to `settings.widest`.
+    It covers the uncertainty of a predicted pose, up to `WIDEST_REACH`.
     """
-    needed = max([1.0, *(stage.reach for stage in settings.stages)])
+    needed = max([1.0, *(stage.reach for stage in stages)])
     if (predicted := predicted_pose(problem.prior)) is not None and isinstance(problem.prior, PosePrior):
         distance = max(float(np.linalg.norm(predicted[1])), 1e-12)
         turn = math.radians(problem.prior.rotation_sigma_deg) * min(1 / distance, 1.0)
         off = 2 * math.hypot(turn, problem.prior.translation_sigma / distance)
-        needed = max(needed, min(off / radius, settings.widest))
+        needed = max(needed, min(off / radius, WIDEST_REACH))
     return needed
 
 
@@ -355,7 +402,7 @@ def _log_choose(n: int, k: int) -> float:
 def is_enumerable(problem: Problem) -> bool:
     """Return whether the points are few enough to be enumerated."""
     products = len(problem.bearings) * len(problem.points3d)
-    return products <= (ENUMERATION.most_products if problem.fixing_matches == 3 else ENUMERATION.most_products_known)
+    return products <= (MOST_PRODUCTS if problem.fixing_matches == 3 else MOST_PRODUCTS_KNOWN)
 
 
 def exceeds_enumeration(problem: Problem) -> bool:

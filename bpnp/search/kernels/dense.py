@@ -20,11 +20,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bpnp.search.config import KERNELS
 from bpnp.search.kernels.sides import Array, visible_weights
 from bpnp.search.kernels.vectors import F, compiled, cross, direction, part, rotated, sum_of, turn
 
-POWER = 256  # of the kernel: eight squarings
+# Alternating expectation and maximisation takes short steps.
+RELAXATION = 1.7  # factor on a Gauss-Newton step on clusters [factor; not tuned]
+# Fraction by which each diagonal entry of the Hessian grows, so that a direction that the points do not fix is left
+# unchanged.
+STEP_DAMPING = 1e-3  # [fraction; not tuned]
+# Smallest base of the kernel on clusters: a kernel of 1e-18, whose square is not denormal. Denormal numbers are 2.5
+# times as slow.
+LEAST_BASE = 0.85  # [1; numerics]
+
+POWER = 256  # power of the kernel: eight squarings [1; derived]
 
 
 @part
@@ -104,7 +112,7 @@ def move(q: Any, p: Any, rotation: Any, translation: Any, length: Any, system: A
     """
     normal_equations(q, p, rotation, translation, system)
     for k in range(6):
-        system[k, k] *= F(1 + KERNELS.damping)
+        system[k, k] *= F(1 + STEP_DAMPING)
     if not solve_normal_equations(system):
         return False
     step = system[7]
@@ -182,7 +190,7 @@ def assign(bearings: Any, points: Any, rotation: Any, translation: Any, scale: A
             x, y, z = sharp * x, sharp * y, sharp * z
             total, b, line = F(0), weight[j], kernel[j]
             for i in range(first, last):
-                v = max(base[i] + shift + f[0, i] * x + f[1, i] * y + f[2, i] * z, F(KERNELS.least_base))
+                v = max(base[i] + shift + f[0, i] * x + f[1, i] * y + f[2, i] * z, F(LEAST_BASE))
                 v = v * v
                 v = v * v
                 v = v * v
@@ -239,7 +247,7 @@ def descend(
             scale = scales[step]
             visible_weights(points, rotation[k], translation[k], scratch.weight)
             score[k] = assign(bearings, points, rotation[k], translation[k], scale, outlier * scale * scale, scratch)
-            fixed = move(scratch.q, points.p, rotation[k], translation[k], F(KERNELS.relaxation), scratch.system)
+            fixed = move(scratch.q, points.p, rotation[k], translation[k], F(RELAXATION), scratch.system)
             if not (fixed and math.isfinite(score[k])):
                 score[k] = -np.inf
                 break

@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.config import KERNELS
 from bpnp.search.kernels.vectors import compiled, part
+
+NEIGHBOUR_CELLS = 64  # largest number of cells along a side of the grid of neighbours [cells; cost]
 
 Array = NDArray[np.float64]
 
@@ -30,7 +31,7 @@ def sums_near(
     """
     at = bearings @ axes
     low, extent = at.min(0), float(np.ptp(at, 0).max())
-    cell = max(float(radii[-1]), extent / KERNELS.neighbour_cells)
+    cell = max(float(radii[-1]), extent / NEIGHBOUR_CELLS)
     side = int(extent / cell) + 1
     key = ((at - low) / cell).astype(np.int64) @ [side, 1]
     order = np.argsort(key, kind="stable")

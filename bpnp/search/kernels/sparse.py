@@ -13,14 +13,23 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.config import KERNELS
 from bpnp.search.kernels.dense import move, see
 from bpnp.search.kernels.sides import Array, WeightedBearings, visible_weights
 from bpnp.search.kernels.vectors import F, compiled, copy_pose, part, sum_of
 
+SWEEPS = 2  # alternating normalisations of the assignment on all points, of rows and columns [sweeps; not tuned]
+# Mean number of tiles near a point that the first buffer holds; a larger one is made where needed.
+FIRST_TILES = 12  # [tiles; cost]
+# Smallest weight of the points that face the camera, as a fraction of all weights.
+LEAST_SEEN = 0.25  # [fraction; not tuned]
+# Distance beyond which the kernel on all points is 0; it is below 0.012 there.
+KERNEL_REACH = 3.0  # [scales of the annealing; cost]
+LANES = 16  # bearings of a tile [bearings; cost]
+SCENE_CELLS = 64  # cells along the longer side of the grid of scene points [cells; cost]
+
 
 class Tiles(NamedTuple):
-    """Bearings in c tiles of `KERNELS.lanes`, and a grid across the view.
+    """Bearings in c tiles of `LANES`, and a grid across the view.
 
     Cell (i, j) of the grid is number 1 + i * shape[1] + j; number 0 is outside.
 
@@ -46,9 +55,9 @@ class Tiles(NamedTuple):
 
     def with_margin(self, scale: float) -> "Tiles":
         """Return the tiles with a grid that covers the bearings and the reach of a kernel of this scale, radians."""
-        margin = F(KERNELS.reach * scale)
+        margin = F(KERNEL_REACH * scale)
         low, high = self.box[:, :2].min(0) - margin, self.box[:, 2:].max(0) + margin
-        cell = F((high - low).max() / KERNELS.cells)
+        cell = F((high - low).max() / SCENE_CELLS)
         return self._replace(low=low, cell=cell, shape=np.floor((high - low) / cell).astype(np.int32) + 1)
 
 
@@ -71,14 +80,14 @@ def build_tiles(bearings: WeightedBearings) -> Tiles:
     x, y = bearings.f[:2]
     m = len(x)
     stripe = np.empty(m, np.int64)
-    stripe[np.argsort(x, kind="stable")] = np.arange(m) // (KERNELS.lanes * math.ceil(math.sqrt(m / KERNELS.lanes)))
+    stripe[np.argsort(x, kind="stable")] = np.arange(m) // (LANES * math.ceil(math.sqrt(m / LANES)))
     order = np.lexsort((y, stripe))
-    order = np.append(order, np.repeat(order[-1:], -m % KERNELS.lanes))
-    a, odds = (values[order].reshape(-1, KERNELS.lanes) for values in (bearings.a, bearings.odds))
+    order = np.append(order, np.repeat(order[-1:], -m % LANES))
+    a, odds = (values[order].reshape(-1, LANES) for values in (bearings.a, bearings.odds))
     a.flat[m:] = 0
-    f = np.ascontiguousarray(bearings.f[:, order].reshape(3, -1, KERNELS.lanes).transpose(1, 0, 2))
+    f = np.ascontiguousarray(bearings.f[:, order].reshape(3, -1, LANES).transpose(1, 0, 2))
     box = np.concatenate([f[:, :2].min(2), f[:, :2].max(2)], 1)
-    label = bearings.label[order].reshape(-1, KERNELS.lanes)
+    label = bearings.label[order].reshape(-1, LANES)
     return Tiles(f, a, odds, label, box, box[0, :2], F(1), np.ones(2, np.int32))
 
 
@@ -133,7 +142,7 @@ def meet(tiles: Any, labels: Any, u: Any, scale: Any, start: Any, order: Any, ne
     """
     f, label, box, low, cell, shape = tiles.f, tiles.label, tiles.box, tiles.low, tiles.cell, tiles.shape
     point, kernel, end = near
-    radius = F(KERNELS.reach) * scale
+    radius = F(KERNEL_REACH) * scale
     bound, sharp = radius * radius, F(-1 / 128) / (scale * scale)
     place = end[0]
     for t in range(len(f)):
@@ -145,7 +154,7 @@ def meet(tiles: Any, labels: Any, u: Any, scale: Any, start: Any, order: Any, ne
                     return False
                 j = order[e]
                 x, y, z, wanted, total = u[0, j], u[1, j], u[2, j], labels[j], F(0)
-                for k in range(KERNELS.lanes):
+                for k in range(LANES):
                     dx, dy, dz = f[t, 0, k] - x, f[t, 1, k] - y, f[t, 2, k] - z
                     squared = dx * dx + dy * dy + dz * dz
                     partners = (wanted < 0) | (label[t, k] < 0) | (label[t, k] == wanted)
@@ -171,11 +180,11 @@ def add_to_bearings(values: Any, near: Any, sums: Any) -> None:
     """Fill sums (c, lanes) with sum_j K_ij values_j."""
     point, kernel, end = near
     for t in range(len(sums)):
-        for k in range(KERNELS.lanes):
+        for k in range(LANES):
             sums[t, k] = 0
         for e in range(end[t], end[t + 1]):
             value = values[point[e]]
-            for k in range(KERNELS.lanes):
+            for k in range(LANES):
                 sums[t, k] += kernel[e, k] * value
 
 
@@ -188,7 +197,7 @@ def add_to_points(values: Any, near: Any, sums: Any) -> None:
     for t in range(len(values)):
         for e in range(end[t], end[t + 1]):
             total = F(0)
-            for k in range(KERNELS.lanes):
+            for k in range(LANES):
                 total += kernel[e, k] * values[t, k]
             sums[point[e]] += total
 
@@ -204,7 +213,7 @@ def add_moments(f: Any, u: Any, row: Any, column: Any, near: Any, q: Any) -> Non
             j = point[e]
             x, y, z = u[0, j], u[1, j], u[2, j]
             q0, q1, q2, q3 = F(0), F(0), F(0), F(0)
-            for k in range(KERNELS.lanes):
+            for k in range(LANES):
                 mass = kernel[e, k] * row[t, k]
                 q0 += mass * (f[t, 0, k] - x)
                 q1 += mass * (f[t, 1, k] - y)
@@ -253,10 +262,10 @@ class SparseScratch(NamedTuple):
 
 def sparse_scratch(tiles: Tiles, n: int, pairs: int = 0) -> SparseScratch:
     """Allocate the buffers of `descend_sparse`, for n points and at least `pairs` pairs of a tile and a point."""
-    most, c = max(pairs, n * KERNELS.first_tiles) + 1, len(tiles.f)
+    most, c = max(pairs, n * FIRST_TILES) + 1, len(tiles.f)
     cells, order, start, point = (np.empty(k, np.int32) for k in (n, n, tiles.shape.prod() + 1, most))
-    near = Near(point, np.empty((most, KERNELS.lanes), F), np.zeros(c + 1, np.int32))
-    shapes = (3, n), (c, KERNELS.lanes), (c, KERNELS.lanes), n, n, (4, n), (8, 6), (4, 3), (4, 3)
+    near = Near(point, np.empty((most, LANES), F), np.zeros(c + 1, np.int32))
+    shapes = (3, n), (c, LANES), (c, LANES), n, n, (4, n), (8, 6), (4, 3), (4, 3)
     u, *rest = (np.empty(shape, F) for shape in shapes)
     return SparseScratch(u, cells, start, order, near, *rest)
 
@@ -294,24 +303,24 @@ def assign_sparse(
     add_to_bearings(weight, near, sums)
     total_a, total_b, likelihood = F(0), sum_of(weight) + F(1e-20), F(0)
     for t in range(len(a)):
-        for k in range(KERNELS.lanes):
+        for k in range(LANES):
             total_a += a[t, k]
     slack = math.sqrt(outlier * math.sqrt(total_a * total_b))
     for t in range(len(a)):
-        for k in range(KERNELS.lanes):
+        for k in range(LANES):
             density = (sums[t, k] / total_b + outlier * odds2d[t, k]) / (scale * scale)
             likelihood += a[t, k] * math.log(density)
             row[t, k] = a[t, k] / math.sqrt(slack * odds2d[t, k] + sums[t, k])
-    for _ in range(KERNELS.sweeps):
+    for _ in range(SWEEPS):
         add_to_points(row, near, column)
         for j in range(n):
             column[j] = weight[j] / (slack * odds3d[j] + column[j])
         add_to_bearings(column, near, sums)
         for t in range(len(a)):
-            for k in range(KERNELS.lanes):
+            for k in range(LANES):
                 row[t, k] = a[t, k] / (slack * odds2d[t, k] + sums[t, k])
     add_moments(tiles.f, u, row, column, near, scratch.q)
-    most = min(total_a, max(total_b, F(KERNELS.least_seen) * sum_of(points.b)))
+    most = min(total_a, max(total_b, F(LEAST_SEEN) * sum_of(points.b)))
     return likelihood / total_a, sum_of(scratch.q[3]) / most, True
 
 

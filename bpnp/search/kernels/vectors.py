@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 
 from bpnp.runtime import FAST, compiler
-from bpnp.search.config import KERNELS
+
+LARGEST_TURN = 0.5  # largest rotation of one step [radians; not tuned]
 
 F = np.float32
 compiled = compiler(fastmath=FAST | {"afn"})
@@ -62,7 +63,7 @@ def turn(rotation: Any, vector: Any) -> None:
     """Apply R <- exp([w]x) R in place through a unit quaternion; w = vector[:3], clipped to length `largest_turn`."""
     x, y, z = vector[0], vector[1], vector[2]
     angle: Any = math.sqrt(x * x + y * y + z * z)
-    shrink = F(KERNELS.largest_turn) / angle if angle > F(KERNELS.largest_turn) else F(1)
+    shrink = F(LARGEST_TURN) / angle if angle > F(LARGEST_TURN) else F(1)
     angle *= shrink
     half = F(0.5) * angle
     factor = shrink * (F(0.5) if angle < F(1e-4) else math.sin(half) / angle)

@@ -21,7 +21,7 @@ from bpnp.search.refine.gauss_newton import match_equations, refine
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
-FIXING = 3  # matches that fix a pose
+FIXING = 3  # matches that fix a pose [matches; derived]
 
 
 def known_matches(problem: Problem) -> tuple[Labels, Labels] | None:

@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 
 from bpnp.runtime import Deadline
-from bpnp.search.config import ENUMERATION
 from bpnp.search.enumeration.search import enumerate_poses, is_enumerable
 from bpnp.search.problem import Problem
 from bpnp.search.verdict.false_alarms import alarms_of
+
+# Number of hypotheses of a mirrored scene, some 10 ms: a correct pose of clean points is among the first thousands.
+MIRRORED_HYPOTHESES = 20_000  # [hypotheses; cost]
 
 MIRROR = np.array([1.0, 1.0, -1.0])
 
@@ -34,8 +36,7 @@ def mirrored_alarms(problem: Problem, deadline: Deadline) -> float:
         return np.inf
     normals = None if problem.normals3d is None or problem.cosines3d is not None else problem.normals3d * MIRROR
     mirrored = replace(problem, points3d=problem.points3d * MIRROR, normals3d=normals, cosines3d=None)
-    settings = replace(ENUMERATION, most=ENUMERATION.mirrored)
-    found = enumerate_poses(mirrored, deadline=deadline.at, settings=settings).poses
+    found = enumerate_poses(mirrored, deadline=deadline.at, most=MIRRORED_HYPOTHESES).poses
     if not len(found):
         return np.inf
     return float(alarms_of(mirrored, found.rotation[:1], found.translation[:1]).own[0])

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from bpnp.poses import distinct, polar_coordinates
 from bpnp.runtime import NEVER, Clock, Deadline, one_blas_thread
 from bpnp.search.competing_poses import fitted_lens
-from bpnp.search.config import DEFAULT, ENUMERATION, RIG, SearchSettings
+from bpnp.search.config import DEFAULT, RIG, SearchSettings
 from bpnp.search.enumeration.points import predicted_pose
 from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame, to_scene_frame
@@ -37,8 +37,7 @@ from bpnp.search.verdict.false_alarms import alarms_of
 from bpnp.search.verdict.reasons import Objection, Unfinished, focal_length_not_fixed, objection
 from bpnp.search.verdict.uncertainty import linearised, share_bound
 
-PROPOSING = replace(ENUMERATION, kept=RIG.proposing)
-BEFORE = 1e9  # score of the poses that were refined before, nats: above the evidence of any pose
+BEFORE = 1e9  # score of the poses that were refined before: above the evidence of any pose [nats; derived]
 
 
 @one_blas_thread
@@ -96,7 +95,7 @@ def _of_few_points(
             few[k] = poses_of_matches(problem, *matches, seed + k)
         elif is_enumerable(problem):
             until = (Clock.now() * (len(problems) - k - 1) + deadline.at) / (len(problems) - k)
-            found = enumerate_poses(problem, deadline=until, to_the_end=True, settings=PROPOSING)
+            found = enumerate_poses(problem, deadline=until, to_the_end=True, kept=RIG.proposing)
             few[k] = Hypotheses.from_poses(found.poses.rotation, found.poses.translation)
             poses.exhaustive &= found.ended == "exhausted"
         else:

@@ -15,7 +15,7 @@ from bpnp.search.config import PRECISION
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
-ONE_SIGMA = 0.8413447460685429  # probability of a normal variable below one standard deviation
+ONE_SIGMA = 0.8413447460685429  # of a normal variable below one standard deviation [probability; derived]
 
 
 class Linearisation(NamedTuple):

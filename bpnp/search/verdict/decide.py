@@ -38,7 +38,7 @@ from bpnp.search.verdict.reasons import CLAUSES, CONFIDENT, Objection, focal_len
 from bpnp.search.verdict.uncertainty import error_bounds, is_redundant, linearised, systematic_misfit
 
 Verdict = Literal["confident", "ambiguous", "failed"]
-HALF_TURN = 180.0  # degrees; a larger bound does not constrain a rotation
+HALF_TURN = 180.0  # a larger bound does not constrain a rotation [degrees; derived]
 REFINED = math.inf  # number of local searches that the exact refinement of an enumeration replaces
 
 

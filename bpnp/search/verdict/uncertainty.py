@@ -18,7 +18,7 @@ from bpnp.search.verdict.covariance import Linearisation, covariance_of, student
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
-MANY = 1e9  # degrees of freedom of a number that does not vary
+MANY = 1e9  # degrees of freedom of a number that does not vary [1; numerics]
 
 # Basis of the strains that preserve the volume; the sixth is the unit of length, which no image shows.
 STRAINS = np.array(
@@ -31,7 +31,7 @@ STRAINS = np.array(
     ],
     np.float64,
 )
-POSE = 6  # parameters of a pose
+POSE = 6  # parameters of a pose [parameters; derived]
 
 
 def error_bounds(problem: Problem, linear: "Linearised | None", count: float) -> tuple[float, float]:

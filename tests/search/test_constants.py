@@ -1,0 +1,82 @@
+"""Constants of the search, of maps and of RANSAC: each has a unit and an origin where it stands."""
+
+import ast
+import dataclasses
+import inspect
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from bpnp.search import config
+from bpnp.search.config import ALARMS, MATCHES, PRECISION, REFINER, SYMMETRIES, Repetitions
+
+PACKAGE = Path(config.__file__).parents[1]
+FILES = [file for folder in ("search", "maps", "robust") for file in sorted((PACKAGE / folder).rglob("*.py"))]
+GROUPS = [each for each in vars(config).values() if inspect.isclass(each) and each.__module__ == config.__name__]
+ORIGINS = ("calibration", "chosen on ", "measured, ", "derived", "convention", "cost", "numerics", "not tuned")
+
+
+def constants(source: str) -> dict[str, str]:
+    """Return the comments of the names in capitals to which a module assigns numbers; tables are no constants."""
+    found, lines = dict[str, str](), source.splitlines()
+    for node in ast.parse(source).body:
+        if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            parts = list(ast.walk(node.value))
+            is_table = any(isinstance(part, ast.Dict) or getattr(part, "attr", "") == "array" for part in parts)
+            values = [part.value for part in parts if isinstance(part, ast.Constant)]
+            if any(type(value) in (int, float) for value in values) and not is_table and str not in map(type, values):
+                names = [part.id for target in targets for part in ast.walk(target) if isinstance(part, ast.Name)]
+                comments = [line.partition("  # ")[2] for line in lines[node.lineno - 1 : node.end_lineno]]
+                found |= {name: "\n".join(filter(None, comments)) for name in names if name.strip("_").isupper()}
+    return found
+
+
+def test_constants_are_found_in_every_form() -> None:
+    source = "A, B = 1, 2.0  # a\nC: int = 3\nD = {1: 2}\nE = f(4)\nG = True\n_H = 1 << 2\nn = 1\nK = (  # k\n 1,\n)"
+    assert constants(source) == {"A": "a", "B": "a", "C": "", "E": "", "_H": "", "K": "k"}
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(PACKAGE)))
+def test_constants_have_a_unit_and_an_origin(file: Path) -> None:
+    for name, comment in constants(file.read_text()).items():
+        tag = re.search(r"\[([^\[\];]+); ([^\[\];]+)\]$", comment, re.MULTILINE)
+        assert tag is not None, f"{name} has no [unit; origin]"
+        assert tag[2].startswith(ORIGINS), f"{name} has the origin {tag[2]!r}"
+
+
+def fields_of(group: Any) -> list[str]:
+    return [one.name for one in dataclasses.fields(group)] if dataclasses.is_dataclass(group) else list(group._fields)
+
+
+def is_group(value: Any) -> bool:
+    return isinstance(value, tuple(group for group in GROUPS))
+
+
+@pytest.mark.parametrize("group", GROUPS, ids=lambda group: group.__name__)
+def test_groups_have_units_and_origins(group: Any) -> None:
+    text = inspect.getdoc(group) or ""
+    entries = re.findall(r"^    (\w+): ((?:.*\n?)(?:        .*\n?)*)", text.partition("Attributes:\n")[2], re.MULTILINE)
+    assert [name for name, _ in entries] == fields_of(group)
+    for name, entry in entries:
+        if not is_group(getattr(group, name, None)):
+            tag = re.search(r"\. \[([^\[\];]+); ([^\[\];]+)\]$", " ".join(entry.split()))
+            assert tag is not None, f"{group.__name__}.{name} ends without [unit; origin]"
+            assert tag[2].startswith(ORIGINS), f"{group.__name__}.{name} has the origin {tag[2]!r}"
+
+
+def test_derived_constants_follow_from_their_laws() -> None:
+    """The numbers that the documentation derives: quantiles, probabilities of a miss, tails of a normal density."""
+    assert chi2.ppf(1 - PRECISION.exceeded, 6) == pytest.approx(PRECISION.far, abs=0.1)
+    assert ALARMS.farthest**2 / 2 == pytest.approx(9)
+    assert MATCHES.farthest**2 / 2 == pytest.approx(8)
+    assert chi2.cdf(MATCHES.reach**2, 2) == pytest.approx(0.989, abs=5e-4)
+    assert (1 - 0.2**3) ** MATCHES.triples == pytest.approx(3e-4, rel=0.1)
+    assert (1 - 0.5**3) ** SYMMETRIES.bases == pytest.approx(0.014, rel=0.05)
+    assert (1 - 1 / 3) ** SYMMETRIES.first == pytest.approx(1 / 17, rel=0.05)
+    assert (1 - 1 / 27) ** Repetitions.bases_of_scene == pytest.approx(0.008, rel=0.05)
+    assert REFINER.difference == pytest.approx(np.cbrt(np.finfo(float).eps), rel=0.02)
