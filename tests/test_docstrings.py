@@ -41,6 +41,8 @@ PACKAGES = (
 DONE = (
     "bpnp/maps",
     "bpnp/report",
+    "bpnp/commands",
+    "bpnp/datamodules",
 )  # folders whose docstrings have been read; `bpnp/*` stands for the files directly in it
 SECTION = re.compile(r"^ *(Args|Attributes|Returns|Raises|Yields):$", re.MULTILINE)
 # What a configuration names.

@@ -24,17 +24,11 @@ def is_calibration(text: str) -> bool:
 
 
 def parse_calibration(text: str, *, centre: float = 0.0) -> Calibrated:
-    """Parse ROS's camera_info or OpenCV's calibration.
+    """Parse ROS's camera_info or OpenCV's calibration, YAML or JSON: the camera of the raw image, with its distortion.
 
-    Args:
-        text: YAML or JSON; of several documents, such as the messages of a topic, the first.
-        centre: Coordinate of the centre of the first pixel in the image points; it is 0 in these files.
-
-    Returns:
-        The camera of the raw image, distortion included.
-
-    Raises:
-        ValueError: The text has no calibrated camera, or a distortion that is not known.
+    Of several documents, such as the messages of a topic, the first is read. `centre` is the coordinate of the centre
+    of the first pixel in the image points; it is 0 in these files. Raise ValueError for no calibrated camera, or an
+    unknown distortion.
     """
     lines = [line for line in text.splitlines() if not line.startswith("%")]
     starts = [i for i, line in enumerate(lines) if re.fullmatch(r"(---|\.\.\.)\s*", line)]

@@ -189,12 +189,7 @@ def _attempts(cluster: str | None) -> Callable[..., Any]:
 
 
 def _table(records: Mapping[str, Mapping[str, Any]], width: int) -> Table:
-    """Return a table with a row for each photo; long names of photos and views are shortened.
-
-    Args:
-        records: Records of the solutions, by the name of the photo.
-        width: Width of the terminal, columns.
-    """
+    """Return a table with a row for each photo; long names of photos and views are shortened to the `width`."""
     from bpnp.maps.many_photos import ERROR
     from bpnp.report.terminal import VERDICTS, number, shorten
 

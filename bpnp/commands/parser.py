@@ -99,20 +99,9 @@ def plain(message: str) -> str:
 
 
 def parse_arguments(name: str, command: Callable[..., None], arguments: Sequence[str]) -> dict[str, Any]:
-    """Parse the arguments of a command.
+    """Parse the arguments of a command into values by parameter; raise ValueError if it does not take them.
 
     A hyphen in the name of an option is read as an underscore, and the value `inf` as YAML's `.inf`.
-
-    Args:
-        name: Name of the command.
-        command: Function of the command.
-        arguments: Words of the command line.
-
-    Returns:
-        Values by the name of the parameter.
-
-    Raises:
-        ValueError: The command does not take these arguments.
     """
     words = [re.sub(r"^--[\w-]+", lambda name: f"--{name[0][2:].replace('-', '_')}", text) for text in arguments]
     hints = typing.get_type_hints(command)
@@ -147,10 +136,6 @@ def command_parser(name: str, command: Callable[..., None]) -> OneLineParser:
 
     A list takes several words and a tuple as many as it has. A bool is a flag without a value. Anything else is parsed
     as its annotation says.
-
-    Args:
-        name: Name of the command.
-        command: Function of the command.
     """
     docstring = parse_docstring(inspect.getdoc(command) or "")
     help_of = {parameter.arg_name: parameter.description for parameter in docstring.params}
@@ -180,12 +165,7 @@ def command_parser(name: str, command: Callable[..., None]) -> OneLineParser:
 
 
 def at_least(least: int, **options: float | int | None) -> None:
-    """Raise ValueError for an option below `least` or not finite; None is ignored.
-
-    Args:
-        least: Least value.
-        **options: Values by the name of the option.
-    """
+    """Raise ValueError for an option below `least` or not finite; None is ignored."""
     for name, value in options.items():
         if value is not None and not least <= value < math.inf:
             raise ValueError(f"--{name} is {value}; it must be {least:g} or more")

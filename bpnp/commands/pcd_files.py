@@ -15,17 +15,9 @@ REQUIRED = ("FIELDS", "SIZE", "TYPE", "POINTS")
 
 
 def parse_pcd(content: bytes) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
-    """Parse a point cloud, ASCII or binary.
+    """Parse a point cloud, ASCII or binary, into points (n, 3) in the order of the file and other columns (n,) by name.
 
-    Args:
-        content: Bytes of the file.
-
-    Returns:
-        The points (n, 3) in the order of the file, and the other columns (n,) with one number a point, by name; normals
-        are nx, ny, nz.
-
-    Raises:
-        ValueError: The file is something else, is truncated or compressed.
+    These have one number a point; normals are nx, ny, nz. Raise ValueError for something else, truncated or compressed.
     """
     if (found := DATA.search(content)) is None:
         raise ValueError("its header has no line DATA ascii or DATA binary")

@@ -23,30 +23,19 @@ MODULES = ("ColmapDataModule", "StoredDataModule")  # data modules of problems t
 
 
 class ModelImage(NamedTuple):
-    """Image that a problem may be of.
+    """Image that a problem may be of."""
 
-    Attributes:
-        name: Name of the image in its model.
-        model: Name of the model.
-        folder: Folder of the model, which a store may outlive.
-        camera: Function that returns the camera, None if the model has no such image.
-    """
-
-    name: str
+    name: str  # name of the image in its model
     model: str
-    folder: Path
-    camera: Callable[[], Camera | None]
+    folder: Path  # folder of the model, which a store may outlive
+    camera: Callable[[], Camera | None]  # function that returns the camera, None if the model has no such image
 
 
 ImagesOf = Callable[[str], Iterator[ModelImage]]  # images that a problem may be of, by its name
 
 
 def model_images(models: Mapping[str, Path]) -> ImagesOf:
-    """Return the images of problems that are named <model>/<image>; a model is read when its first camera is used.
-
-    Args:
-        models: Folders of the models by name.
-    """
+    """Return the images of problems that are named <model>/<image>; a model is read when its first camera is used."""
 
     @cache
     def cameras(model: str) -> dict[str, Camera]:
@@ -66,11 +55,7 @@ def model_images(models: Mapping[str, Path]) -> ImagesOf:
 
 
 def stored_images(store: Store) -> ImagesOf:
-    """Return the images of problems in a store of COLMAP models.
-
-    Args:
-        store: Store with the columns "image", "model" and "camera".
-    """
+    """Return the images of problems in a store of COLMAP models, which has columns "image", "model" and "camera"."""
     rows = {store.name(row): row for row in range(len(store))}
 
     def images(problem: str) -> Iterator[ModelImage]:
@@ -86,11 +71,8 @@ def stored_images(store: Store) -> ImagesOf:
 class ColmapPhotos:
     """Source of the photos of problems from COLMAP models.
 
-    Args:
-        images: Images of the problems.
-        folder: Folder of the photos: <image> or <model>/<image> in it. None for the folder `images` of each model's
-            scene, next to `sparse`.
-        side: Longer side of the photos, pixels.
+    Photos are <image> or <model>/<image> in `folder`; for None in the folder `images` of each model's scene, next to
+    `sparse`. Their longer side is reduced to `side` pixels.
     """
 
     def __init__(self, images: ImagesOf, folder: Path | None = None, *, side: int = SIDE) -> None:
@@ -125,13 +107,7 @@ class ColmapPhotos:
 def photo_finder(folder: Path | None, *, side: int = SIDE) -> PhotoFinder:
     """Return a function that finds the source of the photos of a test, and prints once what is missing.
 
-    Args:
-        folder: Folder of the photos, as in `ColmapPhotos`.
-        side: Longer side of the photos, pixels.
-
-    Returns:
-        Function of the results and the problems of a test. It raises ValueError if `folder` is given and has no photo
-        of the problems.
+    It raises ValueError if a folder is given, as in `ColmapPhotos`, and has no photo of the problems.
     """
     printed: set[str] = set()
 
@@ -158,19 +134,10 @@ def photo_finder(folder: Path | None, *, side: int = SIDE) -> PhotoFinder:
 
 
 def find_photos(results: Results, folder: Path | None, *, side: int = SIDE) -> ColmapPhotos | None:
-    """Return the source of the photos of tested problems.
+    """Return the source of the photos of tested problems; None if the test was not of photos and no folder is given.
 
-    Args:
-        results: Results of a test.
-        folder: Folder of the photos, as in `ColmapPhotos`.
-        side: Longer side of the photos, pixels.
-
-    Returns:
-        The source, None if the test was not of photos and no folder is given.
-
-    Raises:
-        ValueError: The COLMAP models of the test, or the cameras in a store made of them, are not there; or a folder is
-            given, and the test was not of photos.
+    Raise ValueError if the COLMAP models of the test, or the cameras in a store made of them, are not there; or if a
+    folder is given, as in `ColmapPhotos`, and the test was not of photos.
     """
     data = results.settings.get("data")
     module = str(data.get("class_path")).rpartition(".")[2] if isinstance(data, Mapping) else ""

@@ -32,18 +32,11 @@ LARGEST_LABEL = 2**53  # larger integers are not exact in float64
 
 
 def read_points2d(path: Path) -> tuple[Array, Labels | None]:
-    """Read image points.
+    """Read image points (m, 2) or unit bearings (m, 3), and labels (m,) of a column named label, else None.
 
-    Args:
-        path: .npy or text as for `read_points3d`. Named columns x and y are read, and z if there is one, or u and v; of
-            unnamed columns the first two, since a detector's rows continue with scale and angle; or three, unit
-            bearings, or a count of the rows before x and y.
-
-    Returns:
-        Points (m, 2) or unit bearings (m, 3), and labels (m,) of a column named label, else None.
-
-    Raises:
-        ValueError: As `read_points3d`.
+    The file is .npy or text as for `read_points3d`. Named columns x and y are read, and z if there is one, or u and v;
+    of unnamed columns the first two, since a detector's rows continue with scale and angle; or three, unit bearings, or
+    a count of the rows before x and y.
     """
     _check_suffix(path, ARRAYS)
     values, names = _columns(path, {name for columns in IMAGE_COLUMNS for name in columns} | {LABEL}, needs="x, y")
@@ -68,26 +61,20 @@ def read_points2d(path: Path) -> tuple[Array, Labels | None]:
 def read_points3d(
     path: Path, *, surface: int | None = None, seed: int = 0
 ) -> tuple[Array, Array | None, Labels | None]:
-    """Read scene points.
+    """Read scene points (n, 3), their outward normals (n, 3) and labels (n,), None if the file has none.
 
-    Args:
-        path: One of:
-            .npy; .csv, .txt or .xyz with columns of numbers separated by commas, semicolons, tabs or spaces (a comma is
-            a decimal mark if the separator is a semicolon or a tab). The first line may name the columns; otherwise
-            they are x, y, z, then nx, ny, nz or label or both. # starts a comment.
-            .pcd, ASCII or binary.
-            .ply or a mesh (.obj, .off, .stl, .glb): its distinct vertices, or `surface` points drawn from its
-            triangles. A COLMAP model: its folder, or its points3D.bin or points3D.txt.
-            `-` or a pipe with the content of a .npy or of a text.
-        surface: Number of points to draw from a mesh. Default: its vertices.
-        seed: Random seed of these.
+    The path is one of:
 
-    Returns:
-        Points (n, 3); their outward normals (n, 3) and labels (n,), None if the file has none. The normals of a .ply
-        without faces are read unless all of them are zero.
+    - .npy; .csv, .txt or .xyz with columns of numbers separated by commas, semicolons, tabs or spaces (a comma is a
+      decimal mark if the separator is a semicolon or a tab). The first line may name the columns; otherwise they are
+      x, y, z, then nx, ny, nz or label or both. # starts a comment.
+    - .pcd, ASCII or binary.
+    - .ply or a mesh (.obj, .off, .stl, .glb): its distinct vertices, or `surface` points drawn from its triangles. The
+      normals of a .ply without faces are read unless all of them are zero.
+    - A COLMAP model: its folder, or its points3D.bin or points3D.txt.
+    - `-` or a pipe with the content of a .npy or of a text.
 
-    Raises:
-        ValueError: The file cannot be read. The message names it and what is wrong in it.
+    Raise ValueError, which names the file and what is wrong in it.
     """
     if path.is_dir() or path.name in COLMAP_POINTS:
         from bpnp.datamodules.colmap.model_files import read_records
@@ -120,17 +107,11 @@ def read_points3d(
 def read_camera(text: str, image: str | None = None, *, centre: float = 0.0) -> Any:
     """Read the camera that `--camera` names.
 
-    Args:
-        text: A file with a 3x3 matrix; a YAML file of ROS (camera_info) or OpenCV, see
-            `parse_calibration`; a COLMAP camera model with its parameters, "PINHOLE 500 500 320 240" or
-            "PINHOLE,640,480,500,500,320,240" (with width and height, as in cameras.txt); or a COLMAP model, its folder
-            or its cameras.bin or cameras.txt.
-        image: Name of the image of the COLMAP model whose camera is read. Default: the only camera of the model.
-        centre: Coordinate of the centre of the first pixel in the image points, for the camera of a YAML file: 0 as in
-            OpenCV and ROS, the default, or 0.5 as in COLMAP.
-
-    Raises:
-        ValueError: The text is something else.
+    It is a file with a 3x3 matrix; a YAML file of ROS (camera_info) or OpenCV, see `parse_calibration`; a COLMAP camera
+    model with its parameters, "PINHOLE 500 500 320 240" or "PINHOLE,640,480,500,500,320,240" (with width and height, as
+    in cameras.txt); or a COLMAP model, its folder or its cameras.bin or cameras.txt. `image` names the image of the
+    COLMAP model whose camera is read, by default its only camera. `centre` is the coordinate of the centre of the first
+    pixel in the image points, for the camera of a YAML file: 0 as in OpenCV and ROS, or 0.5 as in COLMAP.
     """
     path = Path(text)
     if (text and path.is_dir()) or (path.name in COLMAP_CAMERAS and path.is_file()):
@@ -154,16 +135,10 @@ def read_camera(text: str, image: str | None = None, *, centre: float = 0.0) -> 
 
 
 def read_prior(path: Path, degrees: float, distance: float | None) -> Any:
-    """Read a rough pose as a prior.
+    """Read a rough pose from JSON with `rotation` and `translation`, or a pipe with it, as a prior.
 
-    Args:
-        path: JSON with `rotation` and `translation`, or a pipe with it. Any other path is returned unchanged, as a
-            checkpoint.
-        degrees: Standard deviation of the rotation, degrees.
-        distance: Standard deviation of the translation, scene units; None if unknown.
-
-    Raises:
-        ValueError: The JSON has no pose.
+    Standard deviations are in degrees and scene units, None if unknown. Another path, of a checkpoint, is returned
+    unchanged.
     """
     from bpnp.search.starts import PosePrior
 
@@ -174,14 +149,7 @@ def read_prior(path: Path, degrees: float, distance: float | None) -> Any:
 
 
 def read_pose(path: Path) -> tuple[Array, Array]:
-    """Read rotation and translation from a JSON file, such as that of a solution.
-
-    Args:
-        path: File.
-
-    Raises:
-        ValueError: The file has no pose.
-    """
+    """Read rotation and translation from a JSON file, such as that of a solution."""
     try:
         content = parse_json(_content(path))
         if not isinstance(content, dict):
@@ -236,14 +204,9 @@ def _check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
 def _read_annotation(
     path: Path, values: Array, names: list[str], coordinates: tuple[str, ...], *, hint: str = ""
 ) -> tuple[Array, Array | None, Labels | None]:
-    """Take points, normals and labels from columns.
+    """Take points, normals and labels from columns (k, c), whose names are empty if the file has none.
 
-    Args:
-        path: File, for messages.
-        values: Columns (k, c).
-        names: Names of the columns; empty if the file has none.
-        coordinates: Names of the coordinates.
-        hint: Text after the coordinates in the message that they are missing.
+    `hint` follows the coordinates in the message that they are missing.
     """
     swapped = " (are the two files swapped?)" if values.shape[1] == 2 else ""
     if not names and values.shape[1] not in COLUMNS:
@@ -311,8 +274,7 @@ def _counts_rows(column: Array) -> bool:
 def _without_index(path: Path, values: Array) -> Array:
     """Return columns without names, of scene points, without a first one that counts the rows.
 
-    Raises:
-        ValueError: The first column may also be x.
+    Raise ValueError if the first column may also be x.
     """
     count = values.shape[1]
     if count - 1 not in COLUMNS or not _counts_rows(values[:, 0]):
@@ -339,22 +301,12 @@ def _columns(path: Path, wanted: Set[str] = frozenset(), *, needs: str) -> tuple
 def _parse_columns(
     path: Path, content: bytes, wanted: Set[str] = frozenset(), *, needs: str
 ) -> tuple[Array, list[str]]:
-    """Parse columns of numbers of a .npy or a text.
+    """Parse columns of numbers (k, c) of a .npy or a text, and their names; no name if the first line has none.
 
-    Args:
-        path: File, pipe or standard input, for messages.
-        content: Its bytes.
-        wanted: Names of the columns that have to be numbers, where the first line names them; all by default. A column
-            of another name is NaN. Rows may have one more word than the first line, before the others, as R writes
-            their names.
-        needs: What a row has to hold, for messages.
-
-    Returns:
-        Numbers (k, c), and the names of the c columns; no name if the first line has none.
-
-    Raises:
-        ValueError: The file cannot be read, or its first line names another number of columns than its rows have,
-            or two wanted columns alike.
+    `wanted` columns have to be numbers, where the first line names them; all by default. A column of another name is
+    NaN. Rows may have one more word than the first line, before the others, as R writes their names. Raise ValueError
+    if the file cannot be read, or its first line names another number of columns than its rows have, or two wanted
+    columns alike. `needs`, what a row has to hold, is for messages.
     """
     try:
         if path.suffix.lower() == ".npy" or content.startswith(NUMPY):

@@ -172,9 +172,7 @@ def view(
 def merge_estimates(problems: "Sequence[ProblemPoints]", folders: Mapping[str, Path]) -> "list[ProblemPoints]":
     """Return problems with the poses of several tests, by the names of the tests and estimates.
 
-    Args:
-        problems: Problems of the first test.
-        folders: Results folders by name; those of other problems are left out.
+    Results of other problems than those of the first test are left out.
     """
     from bpnp.report.points import read_points
 
@@ -220,9 +218,6 @@ def picture_names(problems: "Sequence[ProblemPoints]") -> dict[int, str]:
 
     It is the name of the problem with underscores for what a file name cannot hold, and with the index if several
     problems would have the same file name.
-
-    Args:
-        problems: All problems of the test.
     """
     plain = {problem.index: re.sub(r"[^\w.-]+", "_", problem.id) for problem in problems}
     counts = Counter(plain.values())
@@ -230,15 +225,9 @@ def picture_names(problems: "Sequence[ProblemPoints]") -> dict[int, str]:
 
 
 def choose_problems(problems: "Sequence[ProblemPoints]", names: Sequence[str], folder: Path) -> "list[ProblemPoints]":
-    """Return the problems with these names, or parts of names.
+    """Return the problems with these names, or parts of names; without names, the worst problem.
 
-    Args:
-        problems: Problems of a test.
-        names: Names. Empty: the worst problem.
-        folder: Results folder, for messages.
-
-    Raises:
-        ValueError: There are no problems, or a name is that of no problem, or part of several names.
+    Raise ValueError if there are no problems, or a name is that of no problem, or part of several names.
     """
     if not problems:
         raise ValueError(f"{folder} has no points.npz; run `bpnp test` again, which writes it")

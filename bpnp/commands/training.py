@@ -141,9 +141,7 @@ class Bar(RichProgressBar):
 class BpnpCLI(LightningCLI):
     """Lightning's CLI with the run folder of this project: checkpoints, logs and results in trainer.default_root_dir.
 
-    Args:
-        command: Command to parse and run.
-        held: Context managers that end after the run.
+    The context managers `held` end after the run.
     """
 
     def __init__(self, command: str, held: ExitStack, *args: Any, **kwargs: Any) -> None:
@@ -229,8 +227,7 @@ class BpnpCLI(LightningCLI):
     def before_instantiate_classes(self) -> None:
         """Merge `--pose_loss` into the `PoseLossWarmup` of the configuration, or add one.
 
-        Raises:
-            ValueError: A weight is set without an epoch, or a schedule without an optimizer.
+        Raise ValueError for a weight without an epoch, or a schedule without an optimizer.
         """
         given = self.config[self.command]
         if given.get("lr_scheduler") is not None and given.get("optimizer") is None:
@@ -301,11 +298,7 @@ class BpnpCLI(LightningCLI):
         self.held.enter_context(raise_on_interrupt(self.trainer))
 
     def before_fit(self) -> None:
-        """Lock the run folder.
-
-        Raises:
-            ValueError: Another process has locked it, or a training would be overwritten.
-        """
+        """Lock the run folder; raise ValueError if another process has, or a training would be overwritten."""
         root = Path(self.trainer.default_root_dir)
         if self.trainer.fast_dev_run or self.trainer.global_rank != 0:  # type: ignore[attr-defined]
             return
@@ -406,12 +399,8 @@ def _log_in(logger: Any, root: str) -> None:
 def join_training(logger: Any, checkpoint: str, command: str) -> None:
     """Let a WandbLogger log into the W&B run of the training of a checkpoint, and print that.
 
-    A logger that names another id, project or entity has a run of its own.
-
-    Args:
-        logger: Configuration of a logger, changed in place.
-        checkpoint: Checkpoint file.
-        command: `fit` to continue the training, or `test`.
+    The configuration of the logger is changed in place; one that names another id, project or entity has a run of its
+    own. The command is `fit`, to continue the training, or `test`.
     """
     if not isinstance(logger, Namespace) or _find_class(logger.class_path) is not WandbLogger:
         return
@@ -443,13 +432,9 @@ def _is_in(path: str | None, folder: Path) -> bool:
 
 
 def run_training(arguments: Sequence[str]) -> None:
-    """Parse the arguments of fit, validate, test or predict, and run the command.
+    """Parse the arguments of fit, validate, test or predict, the command first, and run it.
 
-    Args:
-        arguments: Words of the command line, the command first.
-
-    Raises:
-        ValueError: The options are wrong, or the training diverged.
+    Raise ValueError if the options are wrong, or the training diverged.
     """
     set_loader("yaml", _load_bounded, (YAMLError,))
     for name in dir(bpnp.datamodules):  # import them all, so that --help lists them and short names are accepted

@@ -60,25 +60,16 @@ class Outliers:
 
 @dataclass(frozen=True)
 class Augmentation:
-    """Options of `augment`.
+    """Options of `augment`; a value out of range is a ValueError."""
 
-    Args:
-        max_points: Largest number of matches; of more, a random subset is taken. Default: None, all matches.
-        clutter: Number of points without a correspondence to keep, as a ratio to the matches kept, or all if there are
-            fewer; inf for all.
-        clutter_side: Side that keeps them, "both", "2d" or "3d".
-        rotate: Rotate the 3D points about their origin by a uniformly random rotation.
-        outliers: Synthetic outliers and occlusion.
-
-    Raises:
-        ValueError: A value is out of range.
-    """
-
+    # Largest number of matches; of more, a random subset is taken. Default: None, all matches.
     max_points: int | None = None
+    # Number of points without a correspondence to keep, as a ratio to the matches kept, or all if there are fewer; inf
+    # for all.
     clutter: float = math.inf
-    clutter_side: Side = "both"
-    rotate: bool = False
-    outliers: Outliers = field(default_factory=Outliers)
+    clutter_side: Side = "both"  # side that keeps them, "both", "2d" or "3d"
+    rotate: bool = False  # rotate the 3D points about their origin by a uniformly random rotation
+    outliers: Outliers = field(default_factory=Outliers)  # synthetic outliers and occlusion
 
     def __post_init__(self) -> None:
         if self.max_points is not None and self.max_points < MIN_POINTS:
@@ -104,33 +95,19 @@ class Augmentation:
 
 
 class SideCounts(NamedTuple):
-    """Numbers of points on one side of each augmented problem, (b, 1) each.
+    """Numbers of points on one side of each augmented problem, (b, 1) each."""
 
-    Attributes:
-        matched: Points of the chosen matches that remain on this side.
-        hidden: Chosen matches whose point on this side is hidden.
-        extra: Clutter.
-        outliers: Synthetic outliers.
-    """
-
-    matched: Tensor
-    hidden: Tensor
+    matched: Tensor  # points of the chosen matches that remain on this side
+    hidden: Tensor  # chosen matches whose point on this side is hidden
     extra: Tensor
     outliers: Tensor
 
 
 def augment(batch: Batch, how: Augmentation, keys: Sequence[Key]) -> Batch:
-    """Choose the points of each problem, add outliers, and shuffle both sides.
+    """Choose the points of each problem of `stack_problems`, on the CPU, add outliers, and shuffle both sides.
 
-    Rotations and translations keep their dtype.
-
-    Args:
-        batch: Problems from `stack_problems`, on the CPU.
-        how: Options.
-        keys: Key of each problem. The result depends only on the problem and its key, not on its batch or its padding.
-
-    Raises:
-        ValueError: The problems have no `match3d` or no pose.
+    A result depends only on the problem and its key, not on its batch or its padding. Rotations and translations keep
+    their dtype. Raise ValueError if the problems have no `match3d` or no pose.
     """
     if batch.match3d is None or batch.rotation is None:
         raise ValueError("the problems have no `match3d` or no pose, which the augmentation needs")
@@ -181,14 +158,7 @@ def bounds(value: NumberOrRange) -> tuple[float, float]:
 def _amounts(
     how: Augmentation, total: Tensor, batch: Batch, random: Generators
 ) -> tuple[Tensor, SideCounts, SideCounts]:
-    """Return the number of matches that remain (b, 1), and the numbers of points of both sides.
-
-    Args:
-        how: Options.
-        total: Number of matches before (b, 1).
-        batch: Problems.
-        random: Random generator of each problem.
-    """
+    """Return the number of matches that remain of `total`, and the numbers of points of both sides."""
     ratio, side, occlusion, occluded = uniform(random, 4).unsqueeze(-1).unbind(1)
     chosen = total if how.max_points is None else total.clamp(max=how.max_points)
     hidden = (_draw_amount(how.outliers.occlusion, occlusion) * chosen).round().long()
@@ -251,11 +221,6 @@ def _shuffle_points(points: Tensor, side: SideCounts, random: Generators) -> tup
 
 
 def gather_points(points: Float[Tensor, "b n d"], order: Int[Tensor, "b k"]) -> Float[Tensor, "b k d"]:
-    """Return the points at the given indices of each row.
-
-    Args:
-        points: Points (b, n, d).
-        order: Indices (b, k).
-    """
+    """Return the points at the given indices of each row."""
     rows = torch.arange(len(points), device=points.device)[:, None] * points.shape[1]
     return points.flatten(0, 1).index_select(0, (order + rows).flatten()).view(*order.shape, points.shape[2])

@@ -83,14 +83,8 @@ class AuthorsDataModule(StoredDataModule):
 def authors_recipe(source: Path, dataset: str | None) -> Recipe:
     """Return the recipe of the store of the authors' files, with the scenes train and test.
 
-    `prepare` raises PickleError for a bad file.
-
-    Args:
-        source: Folder of the files.
-        dataset: Name of the data set, None for the only one.
-
-    Raises:
-        ValueError: There is nothing to convert, or there are several data sets.
+    Without a name, the folder has one data set; else, or without data, raise ValueError. `prepare` raises PickleError
+    for a bad file.
     """
     name, parts = _find_parts(source, dataset)
     files = [file for _, part in parts for file in part]
@@ -148,9 +142,6 @@ def _convert(scene: str, files: Sequence[Path], focal: float) -> JobResult:
     Copies that pad small sets to 1000 points are dropped. W_gt may hold the 2D point of each 3D point or, as for
     Data61/2D3D, the 3D point of each 2D point; the reading that agrees with the poses is taken. -1, or an index one
     past the end, means no point.
-
-    Raises:
-        PickleError: A file is broken.
     """
     columns = {file.stem: _column(file) for file in files}
     keys = list(next(iter(columns.values())))
@@ -206,11 +197,7 @@ def _error(sample: Mapping[str, Any], by_2d: bool) -> float:
 
 
 def _problem(name: str, sample: Mapping[str, Any], *, by_2d: bool, focal: float) -> Problem:
-    """Convert one sample.
-
-    Raises:
-        ValueError: The sample cannot be used.
-    """
+    """Convert one sample; raise ValueError if it cannot be used."""
     if "matches" in sample:
         matches = _numbers(sample["matches"], "matches", 5)
         points2d, points3d, match3d = matches[:, :2], matches[:, 2:], np.arange(len(matches))
@@ -263,16 +250,9 @@ class PickleError(ValueError):
 
 
 def load_pickle(path: Path) -> Any:
-    """Read a dict, list, tuple or array from a pickle of Python 2 or 3.
+    """Read a dict, list, tuple or array from a pickle of Python 2 or 3; raise PickleError for other content.
 
     Nothing else in the pickle is imported or called.
-
-    Args:
-        path: File.
-
-    Raises:
-        PickleError: The content is something else.
-        OSError: The file cannot be read.
     """
     with open_input(path, pipes=False) as file:
         try:

@@ -32,12 +32,9 @@ SPLITS = ("train", "test")
 def read_cloud(path: Path) -> NDArray[np.float64]:
     """Read the points (k, 3) of a point cloud file.
 
-    Args:
-        path: .ply without faces; .npy with an array (k, 3) or wider; .xyz or .txt with numbers separated by spaces,
-            tabs or commas. Columns after the third (normals, colours) are ignored, `#` starts a comment.
-
-    Raises:
-        MeshError: The file is empty, truncated or holds something else. The message names the file.
+    It is .ply without faces; .npy with an array (k, 3) or wider; .xyz or .txt with numbers separated by spaces, tabs or
+    commas. Columns after the third (normals, colours) are ignored, `#` starts a comment. Raise MeshError, which names
+    the file, if it is empty, truncated or holds something else.
     """
     if path.suffix.lower() == ".ply":
         with open_mesh(path) as (content, suffix):
@@ -83,20 +80,13 @@ def draw_points(points: NDArray[np.float64], count: int, name: str) -> NDArray[n
 
 
 def open_shapes(source: Path) -> Shapes:
-    """Find the shapes of a folder.
+    """Find the shapes of a folder, named ``<class>/<split>/<stem>``, training shapes first.
 
-    Args:
-        source: Folder of meshes or point clouds in ModelNet40's layout, <class>/{train,test}/*, or a folder of such
-            folders; or one of the two archives of ModelNet40's point clouds: `modelnet40_ply_hdf5_2048` (HDF5) and
-            `modelnet40_normal_resampled` (text).
-
-    Returns:
-        The shapes, named ``<class>/<split>/<stem>``, training shapes first. The name has the suffix of the file where
-        several files of a folder have one stem, and begins with the folder where several folders have shapes.
-
-    Raises:
-        ValueError: The folder is missing or has no shape. The message names it.
-        ImportError: The folder has HDF5 files and h5py is not installed.
+    It has meshes or point clouds in ModelNet40's layout, <class>/{train,test}/*, or is a folder of such folders; or one
+    of the two archives of ModelNet40's point clouds: `modelnet40_ply_hdf5_2048` (HDF5) and
+    `modelnet40_normal_resampled` (text). A name has the suffix of the file where several files of a folder have one
+    stem, and begins with the folder where several folders have shapes. Raise ValueError if the folder is missing or has
+    no shape, and ImportError if it has HDF5 files and h5py is not installed.
     """
     if not source.is_dir():
         raise ValueError(f"{source} is not a folder; a folder with {LAYOUT} is needed (unpack the archive first)")

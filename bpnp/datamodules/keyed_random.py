@@ -51,15 +51,10 @@ def normal(generators: Generators, count: int) -> Float[Tensor, "b count"]:
 def permutations(
     generators: Generators, count: int, group: Int[Tensor, "b count"] | None = None
 ) -> Int[Tensor, "b count"]:
-    """Draw a permutation of range(count) from each generator.
+    """Draw a permutation of range(count) from each generator; all indices of group 0 come first, and so on.
 
     The order within a group does not depend on the indices of later groups, so padding in the last group changes
-    nothing.
-
-    Args:
-        generators: One for each row.
-        count: Length of the permutation.
-        group: Group number of each index (b, count); all of group 0 come first, and so on. Default: one group.
+    nothing. By default there is one group.
     """
     numbers = _uniform(generators, count)
     return torch.from_numpy(np.argsort(numbers if group is None else numbers + group.numpy(), axis=-1))

@@ -26,11 +26,7 @@ POOL_BATCHES = 50  # number of training batches in a pool that is sorted by size
 class ProblemDataset(Dataset[Batch]):
     """Data set that maps a list of (epoch, index) keys to a batch, whatever the worker or the order.
 
-    Args:
-        source: Source of the problems.
-        augmentation: Augmentation of the problems. Default: None, without.
-        seed: A problem is a function of (seed, index).
-        fresh: Make a problem a function of the epoch too.
+    A problem is a function of (seed, index), and of the epoch too if it is `fresh`.
     """
 
     def __init__(
@@ -69,18 +65,9 @@ class BucketSampler(DistributedSampler[list[Key]]):
     The order of the batches is random, so that the first few, all that a limited run has, are a fair sample. Problems
     are repeated if the processes do not divide the last batch.
 
-    Args:
-        dataset: Problems.
-        batch_size: Problems in a step, over all processes.
-        shuffle: True for training.
-        seed: Random seed.
-        num_replicas: Number of processes.
-        rank: Number of this process.
-        max_cells: Limit of problems x size^2 of a step in evaluation. Default: no limit.
-
-    Raises:
-        ValueError: The data set is empty, the processes do not divide `batch_size`, or `max_cells` is set in training,
-            where a step keeps its number of problems.
+    `max_cells` limits problems x size^2 of a step in evaluation; None is no limit. Raise ValueError if the data set is
+    empty, the processes do not divide `batch_size`, or `max_cells` is set in training, where a step keeps its number of
+    problems.
     """
 
     def __init__(
@@ -170,9 +157,6 @@ class FixedSampler(DistributedSampler[int], SequentialSampler):
 
     With `overfit_batches`, Lightning replaces a sampler that is not sequential, and in several processes one that is
     not distributed, by another that drops batches.
-
-    Args:
-        batches: Batches of this process.
     """
 
     def __init__(self, batches: Dataset[Batch]) -> None:
@@ -322,13 +306,7 @@ class ProblemDataModule(LightningDataModule):
 def hold_out(count: int, fraction: float, *, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Split range(count) at random into training rows and validation rows, at least one of each, both sorted.
 
-    Args:
-        count: Number of rows, at least two.
-        fraction: Fraction of validation rows, in (0, 1).
-        seed: Random seed.
-
-    Raises:
-        ValueError: `fraction` is out of range, or there are fewer than two rows.
+    Raise ValueError if the fraction of validation rows is not in (0, 1), or there are fewer than two rows.
     """
     if not 0 < fraction < 1:
         raise ValueError(f"`val_fraction` is {fraction}; it must be between 0 and 1")

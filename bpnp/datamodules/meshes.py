@@ -52,31 +52,20 @@ MIN_DEPTH = 0.1  # least depth of a visible point, scene units
 
 @dataclass(frozen=True)
 class RandomCameras:
-    """Distribution of the cameras of `MeshDataModule`.
+    """Distribution of the cameras of `MeshDataModule`; an option out of range is a ValueError.
 
-    The translation is t = (x, y, distance + z), each of x, y, z uniform in +-translation_range.
-
-    The defaults are those of Campbell et al. (ECCV 2020) for ModelNet40. As in the paper, points beyond the border of
-    the 640 x 480 image are kept.
-
-    Args:
-        rotation: "euler" for R = Rz Ry Rx with angles uniform in euler_range, "so3" for uniform rotations.
-        euler_range: Smallest and largest Euler angle, degrees.
-        translation_range: Half width of the uniform distribution of each coordinate, scene units.
-        distance: Added to the translation along the optical axis, scene units.
-        focal: Focal length, pixels.
-        noise_px: Standard deviation of the noise of 2D points, pixels.
-
-    Raises:
-        ValueError: An option is out of range.
+    The translation is t = (x, y, distance + z), each of x, y, z uniform in +-translation_range. The defaults are those
+    of Campbell et al. (ECCV 2020) for ModelNet40. As in the paper, points beyond the border of the 640 x 480 image are
+    kept.
     """
 
+    # "euler" for R = Rz Ry Rx with angles uniform in euler_range, "so3" for uniform rotations.
     rotation: Literal["euler", "so3"] = "euler"
-    euler_range: tuple[float, float] = (0.0, 45.0)
-    translation_range: float = 0.5
-    distance: float = 4.5
-    focal: float = 800.0
-    noise_px: float = 2.0
+    euler_range: tuple[float, float] = (0.0, 45.0)  # smallest and largest Euler angle, degrees
+    translation_range: float = 0.5  # half width of the uniform distribution of each coordinate, scene units
+    distance: float = 4.5  # added to the translation along the optical axis, scene units
+    focal: float = 800.0  # focal length, pixels
+    noise_px: float = 2.0  # standard deviation of the noise of 2D points, pixels
 
     def __post_init__(self) -> None:
         if self.rotation not in ("euler", "so3"):
@@ -87,14 +76,7 @@ class RandomCameras:
         check_positive(focal=self.focal)
 
     def poses(self, random: Generators) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"]]:
-        """Draw a pose camera = R p + t from each generator.
-
-        Args:
-            random: One random generator per pose.
-
-        Returns:
-            Rotations (b, 3, 3) and translations (b, 3), float64.
-        """
+        """Draw a pose camera = R p + t, float64, from each generator."""
         numbers = uniform(random, 6)
         if self.rotation == "so3":
             rotation = rotations(random)
@@ -109,22 +91,9 @@ class RandomCameras:
 class MeshSource:
     """Source of problems: problem i is view i // k of mesh rows[i % k] of a store of surface samples, with k meshes.
 
-    Fewer problems than meshes use a random choice of the meshes. A problem draws its points from the first `pool_size`
-    samples of its mesh. It is a function of (seed, epoch, index). A warning is issued if some points may lie behind a
-    camera.
-
-    Args:
-        store: Store of surface samples.
-        rows: Rows of the meshes.
-        count: Number of problems, None for one per mesh.
-        num_points: Number of 3D points of a problem.
-        pool_size: Number of samples of a mesh to draw from.
-        cameras: Distribution of the cameras.
-        seed: Seeds.
-        label: Name of the split, for messages.
-
-    Raises:
-        ValueError: There are no problems.
+    Fewer problems than meshes use a random choice of the meshes; `count` is None for one per mesh. A problem draws its
+    points from the first `pool_size` samples of its mesh. It is a function of (seed, epoch, index). A warning is issued
+    if some points may lie behind a camera. `label` is the name of the split, for messages.
     """
 
     def __init__(
@@ -164,17 +133,8 @@ class MeshSource:
         """Return random camera views of `num_points` samples of each mesh, drawn without replacement.
 
         2D points are x/z and y/z plus noise, computed in float64. A point with a depth below 0.1 has no 2D point and -1
-        in match3d. All other points have one, on the far side of the mesh too.
-
-        Args:
-            index: Indices of the problems (b,).
-            epoch: Epoch, which is part of the seed.
-
-        Returns:
-            The problems with their true poses and matches.
-
-        Raises:
-            ValueError: A problem has fewer than 4 points in front of its camera.
+        in match3d. All other points have one, on the far side of the mesh too. Raise ValueError if a problem has fewer
+        than 4 points in front of its camera.
         """
         count, size = self.num_points, len(index)
         keys = row_keys(index, *self.seed, epoch)
@@ -322,11 +282,7 @@ class MeshDataModule(ProblemDataModule):
         )
 
     def _rows(self, store: Store, split: str, root: Path) -> NDArray[np.int64]:
-        """Return the rows of the shapes of a split.
-
-        Raises:
-            StoreError: There are none, or one has too few points.
-        """
+        """Return the rows of the shapes of a split; raise StoreError if there are none, or one has too few points."""
         folder = "test" if split == "test" else "train"
         rows = np.array([row for row in range(len(store)) if store.name(row).split("/")[-2] == folder])
         if not len(rows):
@@ -374,14 +330,7 @@ class MeshDataModule(ProblemDataModule):
 
 
 def surfaces_recipe(shapes: Shapes, *, points: int, normalisation: Normalisation, label: str) -> Recipe:
-    """Return the recipe of a store of surface samples.
-
-    Args:
-        shapes: Shapes.
-        points: Number of samples of each shape.
-        normalisation: Frame of each shape.
-        label: Name of the shapes, for messages.
-    """
+    """Return the recipe of a store of surface samples in a normalised frame."""
     samplers = list(shapes.samplers.items())
     starts = range(0, len(samplers), MESHES_A_PART)
     return Recipe(

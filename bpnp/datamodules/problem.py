@@ -97,17 +97,11 @@ class Problem:
 
 
 class Counts(NamedTuple):
-    """Numbers of points of the problems of a source.
+    """Numbers of points of the problems of a source."""
 
-    Attributes:
-        matched: Matches (k,).
-        points2d: 2D points (k,).
-        points3d: 3D points (k,).
-    """
-
-    matched: NDArray[np.int64]
-    points2d: NDArray[np.int64]
-    points3d: NDArray[np.int64]
+    matched: NDArray[np.int64]  # matches (k,)
+    points2d: NDArray[np.int64]  # 2D points (k,)
+    points3d: NDArray[np.int64]  # 3D points (k,)
 
 
 @runtime_checkable
@@ -131,10 +125,6 @@ def stack_problems(problems: Sequence[Problem], index: Int[Tensor, " b"]) -> Bat
     """Pad and mask problems. 3D point j of the batch corresponds to 2D point j, or to none (match3d -1).
 
     Points are float32, poses float64.
-
-    Args:
-        problems: Problems.
-        index: Their `Batch.index` (b,).
     """
     indices = [np.arange(len(problem.points3d)) for problem in problems]
     batch = Batch.from_arrays(

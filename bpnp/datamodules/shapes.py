@@ -35,18 +35,10 @@ class MeshError(ValueError):
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangle mesh.
+    """Triangle mesh; triangles that are no surface are a MeshError."""
 
-    Attributes:
-        vertices: Vertices (v, 3).
-        faces: Vertex indices of the triangles (f, 3).
-
-    Raises:
-        MeshError: The triangles are no surface.
-    """
-
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int64]
+    vertices: NDArray[np.float64]  # (v, 3)
+    faces: NDArray[np.int64]  # vertex indices of the triangles (f, 3)
 
     def __post_init__(self) -> None:
         if len(self.faces) == 0:
@@ -71,14 +63,8 @@ def read_mesh(path: Path) -> Mesh:
     """Read an .off, .ply, .obj, .stl or .glb file.
 
     The parts of a scene become one mesh; polygons become fans of triangles. An .obj file does not declare its number of
-    faces, so that a truncated one is read as far as it goes.
-
-    Args:
-        path: File.
-
-    Raises:
-        MeshError: The file is truncated, foreign or empty, or the mesh has no faces, no area, NaN, or a face of missing
-            vertices.
+    faces, so that a truncated one is read as far as it goes. Raise MeshError if the file is truncated, foreign or
+    empty, or the mesh has no faces, no area, NaN, or a face of missing vertices.
     """
     with open_mesh(path) as (content, suffix):
         if suffix == ".off":
@@ -100,16 +86,10 @@ def open_mesh(path: Path) -> Iterator[tuple[bytes, str]]:
 
 
 def read_vertices(path: Path) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
-    """Read the points of a cloud in the order of the file, or the distinct vertices of a mesh.
+    """Read the points (v, 3) of a cloud in the order of the file, or the distinct vertices of a mesh (`read_mesh`).
 
-    Args:
-        path: File as for `read_mesh`.
-
-    Returns:
-        The points (v, 3), and the properties of the points of a .ply cloud (v,) by name, empty for other files.
-
-    Raises:
-        MeshError: The file is truncated, foreign or empty.
+    The properties of the points of a .ply cloud (v,) are returned by name. Raise MeshError if the file is truncated,
+    foreign or empty.
     """
     with open_mesh(path) as (content, suffix):
         mesh = _parse_off(content) if suffix == ".off" else _load(content, suffix)
@@ -120,17 +100,9 @@ def read_vertices(path: Path) -> tuple[NDArray[np.float64], dict[str, NDArray[np
 
 
 def parse_cloud(content: bytes, suffix: str) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
-    """Parse a file of points without faces.
+    """Parse a file of points without faces: points (v, 3) in its order and, of a .ply, their properties (v,) by name.
 
-    Args:
-        content: Bytes of the file.
-        suffix: Suffix of the file, such as ".ply".
-
-    Returns:
-        The points (v, 3) in the order of the file, and the properties of the points of a .ply file (v,) by name.
-
-    Raises:
-        MeshError: The file is truncated, foreign or empty.
+    Raise MeshError if the file is truncated, foreign or empty.
     """
     cloud = _load(content, suffix, force=None)
     vertices = np.asarray(getattr(cloud, "vertices", ()), np.float64).reshape(-1, 3)
@@ -234,18 +206,10 @@ def _is_whole(row: Sequence[bytes], lists: Sequence[bool]) -> bool:
 
 
 def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw points uniformly by area from the triangles of a mesh.
+    """Draw points (count, 3) uniformly by area from the triangles of a mesh.
 
-    A triangle is drawn with probability proportional to its area, a point in it as a + u (b - a) + v (c - a) with
-    (u, v) uniform in the unit square, folded over its diagonal.
-
-    Args:
-        mesh: Mesh.
-        count: Number of points.
-        rng: Random generator.
-
-    Returns:
-        Points (count, 3).
+    A triangle is drawn with probability proportional to its area, a point in it as a + u (b - a) + v (c - a) with (u,
+    v) uniform in the unit square, folded over its diagonal.
     """
     cumulative = mesh.areas.cumsum()
     # side="right" never draws a triangle without area
@@ -258,19 +222,10 @@ def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> NDArray[
 
 
 def normalise(points: NDArray[np.float64], mode: Normalisation) -> NDArray[np.float64]:
-    """Transform the surface samples of a mesh to a frame that does not depend on its units.
+    """Transform the surface samples (k, 3) of a mesh to a frame that does not depend on its units.
 
-    Args:
-        points: Samples (k, 3).
-        mode: "unit_sphere": mean at the origin, farthest sample at distance 1. "unit_cube": bounding box centred,
-            longest side 1. "none": unchanged.
-
-    Returns:
-        Samples (k, 3) in that frame.
-
-    Raises:
-        ValueError: The mode is unknown.
-        MeshError: All samples coincide.
+    "unit_sphere": mean at the origin, farthest sample at distance 1. "unit_cube": bounding box centred, longest side 1.
+    "none": unchanged. Raise MeshError if all samples coincide.
     """
     if mode not in get_args(Normalisation):
         raise ValueError(f"`normalisation` is {mode!r}; it is one of {', '.join(get_args(Normalisation))}")
@@ -287,32 +242,19 @@ def normalise(points: NDArray[np.float64], mode: Normalisation) -> NDArray[np.fl
 
 @dataclass(frozen=True)
 class Shapes:
-    """Shapes to sample.
+    """Shapes to sample."""
 
-    Attributes:
-        samplers: By the name of each shape, a function from a number to that many points (k, 3) of its surface; fewer
-            if the shape is a point cloud of fewer points. The points depend only on the shape and its name. It raises
-            MeshError for a file that cannot be used.
-        identity: Fingerprint that changes with any shape.
-    """
-
+    # By the name of each shape, a function from a number to that many points (k, 3) of its surface; fewer if the shape
+    # is a point cloud of fewer points. The points depend only on the shape and its name. It raises MeshError for a file
+    # that cannot be used.
     samplers: Mapping[str, Sampler]
-    identity: str
+    identity: str  # fingerprint that changes with any shape
 
 
 def procedural_shapes(split: str, count: int, *, seed: int, kind: ProceduralKind = "turned") -> Shapes:
-    """Return the shapes of a split.
+    """Return the shapes of a split: `procedural_shape` for "turned", `aligned_shape` for "aligned".
 
-    No shape belongs to two splits or two seeds, and shape i does not depend on `count`.
-
-    Args:
-        split: train, val or test.
-        count: Number of shapes, at least 1.
-        seed: Random seed.
-        kind: "turned" for `procedural_shape`, "aligned" for `aligned_shape`.
-
-    Raises:
-        ValueError: The kind is unknown.
+    No shape belongs to two splits or two seeds, and shape i does not depend on `count`, which is at least 1.
     """
     check_within(1, math.inf, **{f"{split}_shapes": count})
     if kind not in DRAWN:
@@ -447,10 +389,8 @@ NAMES: dict[ProceduralKind, str] = {"turned": "procedural", "aligned": "aligned"
 def shape_files(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> dict[str, Path]:
     """Find <class>/{train,test}/<stem><suffix> in a folder, by ``<class>/<split>/<stem>``, training shapes first.
 
-    Files of one folder with the same stem are named with their suffix.
-
-    Raises:
-        ValueError: A class has two folders of one split, such as `train` and `Train`.
+    Files of one folder with the same stem are named with their suffix. Raise ValueError if a class has two folders of
+    one split, such as `train` and `Train`.
     """
     named: dict[str, list[Path]] = defaultdict(list)
     split_folders: dict[str, Path] = {}

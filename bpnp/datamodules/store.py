@@ -50,25 +50,15 @@ def is_store(folder: str | Path) -> bool:
 
 @dataclass(frozen=True)
 class Store:
-    """Open store, from `open_store`.
-
-    Attributes:
-        folder: Folder of the files.
-        kind: Kind of the rows.
-        bulk: Columns of points (total, width), float32.
-        starts: First index of each row of a bulk column, and its length, (k + 1,).
-        columns: Columns with one entry a row.
-        parameters: Parameters that the store was made with.
-        skipped: Reason for each item that is not in the store.
-    """
+    """Open store, from `open_store`."""
 
     folder: Path
     kind: str
-    bulk: dict[str, NDArray[np.float32]]
-    starts: dict[str, NDArray[np.int64]]
-    columns: dict[str, NDArray[Any]]
-    parameters: dict[str, Any]
-    skipped: dict[str, str]
+    bulk: dict[str, NDArray[np.float32]]  # columns of points (total, width), float32
+    starts: dict[str, NDArray[np.int64]]  # first index of each row of a bulk column, and its length, (k + 1,)
+    columns: dict[str, NDArray[Any]]  # columns with one entry a row
+    parameters: dict[str, Any]  # parameters that the store was made with
+    skipped: dict[str, str]  # reason for each item that is not in the store
 
     def __len__(self) -> int:
         return len(self.columns["name"])
@@ -90,16 +80,10 @@ class Store:
 
 
 def open_store(folder: str | Path, kind: str, *, check: bool = True) -> Store:
-    """Open a store, and read it once to compare it with its checksums.
+    """Open a store, and read it once to compare it with its checksums; without this check a large store opens at once.
 
-    Args:
-        folder: Folder of the store.
-        kind: Required kind of its rows.
-        check: Compare the files with their checksums. Default: True. False opens a large store at once.
-
-    Raises:
-        StoreError: There is no manifest, the kind or the format differs, or a file is missing or changed.
-            The message names the folder or the file.
+    Raise StoreError, which names the folder or the file, if there is no manifest, the kind or the format differs, the
+    store has no rows, or a file is missing or changed.
     """
     path = Path(folder)
     for name, (size, checksum) in _manifest(path, kind)["files"].items() if check else ():
@@ -123,9 +107,8 @@ def _map_file(folder: Path, kind: str) -> Store:
 def _manifest(folder: Path, kind: str) -> dict[str, Any]:
     """Read the manifest of a store.
 
-    Raises:
-        StoreError: It is missing, truncated, edited, of another kind or format, or names files other than
-            the columns.
+    Raise StoreError if it is missing, truncated, edited, of another kind or format, names files other than the columns,
+    or has no rows.
     """
     try:
         manifest = dict(read_json(folder / MANIFEST))
@@ -154,12 +137,7 @@ def _checksum(file: Path) -> int:
 
 
 class StoreWriter:
-    """Writer that appends rows to the columns of a new store; made by `new_store`.
-
-    Attributes:
-        parameters: JSON content for the manifest.
-        skipped: Reason for each item that is left out.
-    """
+    """Writer that appends rows to the columns of a new store; made by `new_store`."""
 
     def __init__(self, files: Mapping[str, BinaryIO], widths: Mapping[str, int]) -> None:
         self._files, self._widths = files, widths
@@ -173,16 +151,7 @@ class StoreWriter:
         return len(self._columns["name"])
 
     def add(self, name: str, points: Mapping[str, NDArray[Any]], columns: Mapping[str, Any]) -> None:
-        """Append one row.
-
-        Args:
-            name: Name of the row.
-            points: Points by bulk column.
-            columns: Entries of the other columns.
-
-        Raises:
-            StoreError: Points do not have the width of their column.
-        """
+        """Append one row; raise StoreError if points do not have the width of their column."""
         for key, width in self._widths.items():
             part = np.ascontiguousarray(points[key], BULK)
             if part.ndim != 2 or part.shape[1] != width:
@@ -215,16 +184,8 @@ class StoreWriter:
 def new_store(folder: Path, kind: str, widths: Mapping[str, int]) -> Iterator[StoreWriter]:
     """Yield a writer of a new folder, which appears, complete, when the block ends without an error.
 
-    Points are written at once; memory holds the other columns.
-
-    Args:
-        folder: Folder of the store.
-        kind: Kind of its rows.
-        widths: Number of coordinates of a point in each bulk column.
-
-    Raises:
-        StoreError: The folder exists.
-        OSError: The disk is full; the message names the folder.
+    `widths` are the numbers of coordinates of a point in the bulk columns. Points are written at once; memory holds the
+    other columns. Raise StoreError if the folder exists, and OSError, which names it, if the disk is full.
     """
     if folder.exists():
         raise StoreError(f"{folder} exists; remove it, or give a new folder")
@@ -244,25 +205,15 @@ def _write_header(file: BinaryIO, dtype: np.dtype[Any], shape: tuple[int, ...]) 
 
 @dataclass(frozen=True)
 class Recipe(Dataset[JobResult]):
-    """Jobs that make a store; `work(*job)` returns rows.
-
-    Attributes:
-        kind: As in `new_store`.
-        widths: As in `new_store`.
-        parameters: Saved in the store; other parameters make another store.
-        jobs: Arguments of `work`; picklable for several processes.
-        work: Function that does a job; picklable for several processes.
-        what: Name of an item, for messages.
-        source: Source of the items, for messages.
-    """
+    """Jobs that make a store; `work(*job)` returns rows."""
 
     kind: str
     widths: Mapping[str, int]
-    parameters: Mapping[str, Any]
-    jobs: Sequence[tuple[Any, ...]]
-    work: Callable[..., JobResult]
-    what: str
-    source: str
+    parameters: Mapping[str, Any]  # saved in the store; other parameters make another store
+    jobs: Sequence[tuple[Any, ...]]  # arguments of `work`; picklable for several processes
+    work: Callable[..., JobResult]  # function that does a job; picklable for several processes
+    what: str  # name of an item, for messages
+    source: str  # source of the items, for messages
 
     def __len__(self) -> int:
         return len(self.jobs)
@@ -277,18 +228,9 @@ def prepare(
     """Open the store `output`, or make it; an interrupted run leaves no store.
 
     The store is made in the folder `.<output>.unfinished` of the same parent, which only this function writes to. Files
-    that a killed process has left there are removed.
-
-    Args:
-        recipe: Recipe of the store.
-        output: Folder of the store.
-        processes: Number of processes that read the source.
-        wait_for_others: Wait for another process that is making the store, instead of raising.
-        replace_damaged: Make a store that cannot be used again, with a warning, instead of raising.
-
-    Raises:
-        StoreError: `output` is something else, is damaged or was made with other parameters, or no job gives a row.
-        ValueError: Another process is making the store, and `wait_for_others` is False.
+    that a killed process has left there are removed. It waits for another process that is making the store, or raises
+    ValueError; it makes a damaged store again with a warning, or raises. Raise StoreError if `output` is something
+    else, is damaged or was made with other parameters, or no job gives a row.
     """
     try:
         if is_store(output):
@@ -333,14 +275,9 @@ def _remove_damaged(recipe: Recipe, output: Path, aside: Path) -> None:
 
 
 def open_or_prepare(recipe: Recipe, label: str, cache_dir: str | None) -> Store:
-    """Return the store of a recipe in the cache folder; make it if it is missing or damaged.
+    """Return the store of a recipe in the cache folder (`cache_folder()`); make it if it is missing or damaged.
 
-    A warning names items that are left out. Errors are those of `prepare`.
-
-    Args:
-        recipe: Recipe of the store.
-        label: Beginning of the folder's name.
-        cache_dir: Folder for stores, None for `cache_folder()`.
+    `label` begins the folder's name. A warning names items that are left out. Errors are those of `prepare`.
     """
     folder = Path(cache_dir) if cache_dir is not None else cache_folder()
     # Versions with other formats have stores of their own, and do not replace each other's.

@@ -70,16 +70,7 @@ def scene_rows(store: Store) -> dict[str, NDArray[np.int64]]:
 
 
 class StoredProblems:
-    """Source of problems in rows of a store.
-
-    Args:
-        store: Store of problems.
-        rows: Rows to use.
-        min_points: Least number of matches.
-
-    Raises:
-        StoreError: No problem has that many matches.
-    """
+    """Source of problems in rows of a store; StoreError if none has `min_points` matches."""
 
     def __init__(self, store: Store, rows: NDArray[np.int64], *, min_points: int) -> None:
         self.store = store
@@ -208,19 +199,8 @@ def split_scenes(
 
     Lists that are given are taken unchanged. The remaining scenes are shuffled by `seed`, and where a list is None it
     gets its fraction of all scenes: first test, then val, at least one unless the fraction is 0 (val only if one is
-    left to train); train gets the rest.
-
-    Args:
-        scenes: All scenes.
-        train: Training scenes.
-        val: Validation scenes.
-        test: Test scenes.
-        val_fraction: Fraction of validation scenes.
-        test_fraction: Fraction of test scenes.
-        seed: Random seed.
-
-    Raises:
-        ValueError: A name is not in `scenes`, a scene is in two lists, or a fraction is outside [0, 1].
+    left to train); train gets the rest. Raise ValueError if a name is not in `scenes`, a scene is in two lists, or a
+    fraction is outside [0, 1].
     """
     split = {part: list(names) for part, names in (("train", train), ("val", val), ("test", test)) if names is not None}
     fractions = {"test": test_fraction, "val": val_fraction}
@@ -241,15 +221,9 @@ def split_scenes(
 
 
 def has_enough_matches(matched: NDArray[np.int64], min_points: int, where: str) -> NDArray[np.int64]:
-    """Return the indices of problems with `min_points` matches or more, and warn of the others.
+    """Return the indices of problems with `min_points` matches or more of their numbers (k,), and warn of the others.
 
-    Args:
-        matched: Number of matches of each problem (k,).
-        min_points: Least number of matches.
-        where: Source of the problems, for messages.
-
-    Raises:
-        StoreError: No problem has that many matches.
+    Raise StoreError if there is none.
     """
     large = np.flatnonzero(matched >= min_points)
     if not len(large):
@@ -266,8 +240,7 @@ def has_enough_matches(matched: NDArray[np.int64], min_points: int, where: str) 
 def _scene_list(name: str, scenes: list[str] | list[int] | str | None) -> list[str] | None:
     """Return the scenes of a list, or of the lines of a text file.
 
-    Raises:
-        ValueError: A name is a number, as YAML reads digits without quotes; or the file is missing or empty.
+    Raise ValueError if a name is a number, as YAML reads digits without quotes; or the file is missing or empty.
     """
     if scenes is None:
         return None

@@ -22,7 +22,7 @@ GREY = (128, 128, 128)  # outside the photo
 class ProblemPhoto:
     """Photo of a problem, as a pinhole camera would have taken it."""
 
-    pixels: Array  # pixels (h, w, 3), uint8
+    pixels: Array  # (h, w, 3), uint8
     camera: Pinhole  # camera of these pixels, without distortion
 
     @property

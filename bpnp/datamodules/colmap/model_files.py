@@ -42,57 +42,34 @@ class ColmapError(ValueError):
 
 
 class CameraRecord(NamedTuple):
-    """Record of a camera.
-
-    Attributes:
-        model: Name of the camera model.
-        params: Parameters in COLMAP's order.
-        size: Width and height of the image, pixels.
-    """
+    """Record of a camera."""
 
     model: str
-    params: NDArray[np.float64]
-    size: tuple[int, int]
+    params: NDArray[np.float64]  # parameters in COLMAP's order
+    size: tuple[int, int]  # width and height of the image, pixels
 
 
 @dataclass(frozen=True)
 class ImageRecord:
-    """Record of an image; the pose is cam_from_world.
-
-    Attributes:
-        name: Name.
-        image_id: Id.
-        camera_id: Id of the camera.
-        quaternion: (w, x, y, z).
-        translation: t (3,).
-        keypoints: Keypoints (k, 2), pixels.
-        point_ids: Id of the 3D point of each keypoint (k,), -1 for none.
-    """
+    """Record of an image; the pose is cam_from_world."""
 
     name: str
     image_id: int
     camera_id: int
-    quaternion: NDArray[np.float64]
-    translation: NDArray[np.float64]
-    keypoints: NDArray[np.float64]
-    point_ids: NDArray[np.int64]
+    quaternion: NDArray[np.float64]  # (w, x, y, z)
+    translation: NDArray[np.float64]  # t (3,)
+    keypoints: NDArray[np.float64]  # (k, 2), pixels
+    point_ids: NDArray[np.int64]  # id of the 3D point of each keypoint (k,), -1 for none
 
 
 @dataclass(frozen=True)
 class ModelRecords:
-    """Content of the three files.
-
-    Attributes:
-        cameras: Cameras by id.
-        images: Images.
-        point_ids: Ids of the points (n,).
-        points3d: Points (n, 3).
-    """
+    """Content of the three files."""
 
     cameras: dict[int, CameraRecord]
     images: list[ImageRecord]
-    point_ids: NDArray[np.int64]
-    points3d: NDArray[np.float64]
+    point_ids: NDArray[np.int64]  # ids of the points (n,)
+    points3d: NDArray[np.float64]  # points (n, 3)
 
 
 def model_format(folder: Path) -> str | None:
@@ -104,12 +81,8 @@ def model_format(folder: Path) -> str | None:
 def read_records(folder: Path) -> ModelRecords:
     """Read the model in a folder.
 
-    Args:
-        folder: Folder.
-
-    Raises:
-        ColmapError: A file is missing, empty, truncated or too long, holds no record, or is not a COLMAP file. The
-            message names the file, and the byte or line.
+    Raise ColmapError, which names the file, and the byte or line, if a file is missing, empty, truncated or too long,
+    holds no record, or is not a COLMAP file.
     """
     suffix = model_format(folder)
     if suffix is None:
@@ -291,21 +264,12 @@ def _points(cursor: _Cursor) -> NDArray[Any]:
 
 
 def find_scenes(roots: str | Path | Sequence[str | Path]) -> dict[str, dict[str, Path]]:
-    """Find every COLMAP model at or below some folders.
+    """Return every COLMAP model at or below some folders as {scene: {name of the model: folder}}, sorted.
 
     A scene is named by its path below the root, up to `sparse` or `dense`. All models below it (`sparse/0`, `sparse/1`,
     `sparse/manhattan/0`) belong to it. The only model of a scene has the scene's name; of several, each has its path
-    added.
-
-    Args:
-        roots: Folder or folders.
-
-    Returns:
-        {scene: {name of the model: folder}}, sorted.
-
-    Raises:
-        ColmapError: A root is not a folder, holds no model, two scenes have one name, or a model is in two scenes. A
-            folder that lacks one of the three files is skipped with a warning if there are complete ones.
+    added. A folder that lacks one of the three files is skipped with a warning if there are complete ones. Raise
+    ColmapError if a root is not a folder, holds no model, two scenes have one name, or a model is in two scenes.
     """
     scenes: dict[str, dict[str, Path]] = {}
     homes: dict[str, Path] = {}

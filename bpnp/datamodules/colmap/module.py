@@ -78,16 +78,12 @@ class ColmapSource:
     """Source of problems from the images of COLMAP models.
 
     A problem has the keypoints of an image with a 3D point, these points, and clutter without correspondence. Units are
-    the scene's. An image whose points lie more than 100 times their extent from the origin, as in a geo-referenced
-    scene, gets their median as its origin, because float32 has 7 digits; a warning logs the number of such images.
+    the scene's. An image with fewer matches than `min_points` is skipped, with a warning. An image whose points lie
+    more than 100 times their extent from the origin, as in a geo-referenced scene, gets their median as its origin,
+    because float32 has 7 digits; a warning logs the number of such images.
 
-    Args:
-        reconstructions: Models, from `read_reconstruction`.
-        min_points: An image with fewer matches is skipped, with a warning.
-        clutter: Points without correspondence, as a ratio to the matches, or all if there are fewer: keypoints without
-            a 3D point, and points of the scene that the image does not see. They are drawn uniformly, by (seed, epoch,
-            index).
-        seed: Seeds.
+    `clutter` is a ratio to the matches: keypoints without a 3D point, and points of the scene that the image does not
+    see, or all if there are fewer. They are drawn uniformly, by (seed, epoch, index).
     """
 
     def __init__(
@@ -126,12 +122,7 @@ class ColmapSource:
         return stack_problems([self.problem(i, epoch) for i in index.tolist()], index)
 
     def problem(self, index: int, epoch: int = 0) -> Problem:
-        """Return the problem of one image.
-
-        Args:
-            index: Index of the image.
-            epoch: Epoch, for the choice of the clutter.
-        """
+        """Return the problem of one image."""
         scene, image = self.images[index]
         rng = np.random.default_rng([*self.seed, epoch, index])
         free2d, free3d = self._free(scene, image)
@@ -168,11 +159,7 @@ def colmap_recipe(source: Path, *, min_points: int, clutter: float) -> Recipe:
     """Return the recipe of the store of all images of all COLMAP models in a folder.
 
     Images with fewer than `min_points` matches, and models that cannot be read, are left out and listed in the store.
-
-    Args:
-        source: Folder.
-        min_points: Least number of matches of an image.
-        clutter: Natural clutter to keep on both sides, as a ratio to the matches.
+    Natural clutter is kept on both sides, as a ratio to the matches.
     """
     models = [(scene, *model) for scene, models in find_scenes(source).items() for model in models.items()]
     files = (folder / f"{file}.{suffix}" for _, _, folder in models for file in FILES for suffix in ("bin", "txt"))

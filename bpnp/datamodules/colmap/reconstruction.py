@@ -25,47 +25,28 @@ class ImagePoints:
     """Registered image with its points; camera = rotation p + translation (cam_from_world).
 
     The last three attributes are empty if keypoints were not read.
-
-    Attributes:
-        name: Name of the image.
-        image_id: COLMAP's id.
-        camera: Camera model.
-        rotation: R (3, 3).
-        translation: t (3,), scene units.
-        observed: Indices of all 3D points that have a keypoint in the image, ascending.
-        points2d: Normalised, undistorted keypoints (k, 2) of the scene's points3d[seen].
-        seen: Indices (k,) of the observed points that were not dropped, without repetition.
-        clutter2d: Normalised, undistorted keypoints without a 3D point (c, 2).
     """
 
     name: str
     image_id: int
     camera: Camera
-    rotation: NDArray[np.float64]
-    translation: NDArray[np.float64]
-    observed: NDArray[np.int64]
-    points2d: NDArray[np.float32]
-    seen: NDArray[np.int64]
-    clutter2d: NDArray[np.float32]
+    rotation: NDArray[np.float64]  # R (3, 3)
+    translation: NDArray[np.float64]  # t (3,), scene units
+    observed: NDArray[np.int64]  # indices of all 3D points that have a keypoint in the image, ascending
+    points2d: NDArray[np.float32]  # normalised, undistorted keypoints (k, 2) of the scene's points3d[seen]
+    seen: NDArray[np.int64]  # indices (k,) of the observed points that were not dropped, without repetition
+    clutter2d: NDArray[np.float32]  # normalised, undistorted keypoints without a 3D point (c, 2)
 
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """COLMAP model.
-
-    Attributes:
-        name: Name.
-        points3d: Points (n, 3), scene units, in the order of their ids.
-        images: Images in the order of their names.
-        lost: Numbers of keypoints, points and images that could not be used, by reason.
-        point_ids: Ids of the points (n,).
-    """
+    """COLMAP model."""
 
     name: str
-    points3d: NDArray[np.float64]
-    images: tuple[ImagePoints, ...]
-    lost: Mapping[str, int]
-    point_ids: NDArray[np.int64]
+    points3d: NDArray[np.float64]  # points (n, 3), scene units, in the order of their ids
+    images: tuple[ImagePoints, ...]  # images in the order of their names
+    lost: Mapping[str, int]  # numbers of keypoints, points and images that could not be used, by reason
+    point_ids: NDArray[np.int64]  # ids of the points (n,)
 
     @property
     def notable(self) -> str:
@@ -82,17 +63,8 @@ def read_reconstruction(folder: str | Path, *, name: str | None = None, keypoint
     (the one of smaller reprojection error is kept); images with a broken pose. All but the repeated keypoints are
     logged as a warning.
 
-    Args:
-        folder: Folder of the model.
-        name: Name of the model. Default: that of the folder.
-        keypoints: Read the keypoints, the default. Without them images only have the points that they observe, in a
-            tenth of the time.
-
-    Returns:
-        The model, with its points in the order of their ids and its images in the order of their names.
-
-    Raises:
-        ColmapError: A file cannot be read, no image is left, or a camera is missing or broken.
+    The default name is that of the folder. Without keypoints, images only have the points that they observe, in a tenth
+    of the time. Raise ColmapError if a file cannot be read, no image is left, or a camera is missing or broken.
     """
     path = Path(folder)
     records = read_records(path)
@@ -176,23 +148,11 @@ def write_image(
     name: str,
     size: tuple[int, int] | None,
 ) -> Path:
-    """Write a COLMAP model of one image in text files.
+    """Write a COLMAP model of one image in text files into a new or empty folder, and return the folder.
 
-    Args:
-        folder: New or empty folder.
-        points2d: Normalised image points (m, 2).
-        points3d: Scene points (n, 3).
-        matches: Indices (k, 2) of matching 2D and 3D points.
-        pose: R (3, 3) and t (3,), camera = R p + t.
-        camera: As in `Solution.to_colmap`.
-        name: File name of the image, without spaces.
-        size: Width and height of the image, pixels, None if unknown.
-
-    Returns:
-        The folder.
-
-    Raises:
-        ValueError: The name contains spaces, the camera has skew, or the folder has files.
+    Image points (m, 2) are normalised, `matches` (k, 2) are their indices and those of scene points (n, 3); the pose is
+    R (3, 3) and t (3,), camera = R p + t; `camera` is as in `Solution.to_colmap`; the size is in pixels, None if
+    unknown. Raise ValueError if the name contains spaces, the camera has skew, or the folder has files.
     """
     if not name or name.split() != [name]:
         raise ValueError(f"`name` is {name!r}; names in COLMAP's text files have no spaces")

@@ -45,14 +45,9 @@ def alike_walls(
 
 
 def box_walls(centre: Array, half: Array, yaw: Array, height: Array, **alike: float) -> Walls:
-    """Return the four walls of each of b boxes.
+    """Return the four walls of each of b boxes, whose centres and half widths are (b, 2), angles and heights (b,).
 
-    Args:
-        centre: Centres (b, 2), metres.
-        half: Half widths (b, 2), metres.
-        yaw: Angles (b,), radians.
-        height: Heights (b,), metres.
-        alike: Options of `alike_walls`.
+    Lengths are in metres, angles in radians; `alike` are options of `alike_walls`.
     """
     along = directions((yaw[:, None] + np.pi / 2 * np.arange(4)).ravel())  # counter-clockwise
     ahead, right = half[:, [0, 1, 0, 1]].ravel(), half[:, [1, 0, 1, 0]].ravel()
@@ -224,10 +219,7 @@ EYE = (1.2, 2.0)  # smallest and largest height of the camera, metres
 def facades(count: int, half: float, rng: np.random.Generator) -> tuple[DrawnScene, Viewpoint]:
     """Draw a scene of one to three walls in a line with corners, mostly at right angles; columns, trees and boxes.
 
-    Args:
-        count: Number of points.
-        half: Half of the longer side of the image over the focal length.
-        rng: Random generator.
+    `half` is half of the longer side of the image over the focal length.
     """
     main = _corner_walls(int(rng.integers(1, 4)), rng)
     boxes = int(rng.integers(0, 5))
@@ -254,12 +246,7 @@ def facades(count: int, half: float, rng: np.random.Generator) -> tuple[DrawnSce
 def street(count: int, half: float, rng: np.random.Generator) -> tuple[DrawnScene, Viewpoint]:
     """Draw a scene of houses on both sides of a street, some of them identical; cars, trees and poles.
 
-    The camera is within the scene: depths vary strongly, and other photos are near.
-
-    Args:
-        count: Number of points.
-        half: Not used.
-        rng: Random generator.
+    The camera is within the scene: depths vary strongly, and other photos are near. `half` is not used.
     """
     del half
     houses = int(rng.integers(3, 9))
@@ -297,10 +284,7 @@ def street(count: int, half: float, rng: np.random.Generator) -> tuple[DrawnScen
 def statue(count: int, half: float, rng: np.random.Generator) -> tuple[DrawnScene, Viewpoint]:
     """Draw a figure of stacked parts, often on a pedestal, before distant houses; 1 to 40 metres high.
 
-    Args:
-        count: Number of points.
-        half: Half of the longer side of the image over the focal length.
-        rng: Random generator.
+    `half` is half of the longer side of the image over the focal length.
     """
     tall, parts = 40 ** rng.random(), int(rng.integers(4, 13))
     foot = tall * (rng.uniform(0.1, 0.7) if rng.random() < 0.7 else 0.02)

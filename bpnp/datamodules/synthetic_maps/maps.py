@@ -47,24 +47,21 @@ WITHIN = "street"  # kind whose camera is within the scene, with a field of view
 
 @dataclass(frozen=True, kw_only=True)
 class MapOptions:
-    """Options of `draw_map_problem`; see `SyntheticMapDataModule` for those not listed.
-
-    Args:
-        frame: Frame of the map: "upright" for the third axis upwards, "y_down" for the second axis downwards, "view"
-            for the coordinates of the first of the cameras whose map points are taken.
-        tilt_deg: Standard deviation of the rotation about each horizontal axis of a frame "upright" or "y_down",
-            degrees, as where the vertical is known roughly.
-        heading_deg: Standard deviation of the heading of a frame "upright" or "y_down", degrees; at 0 the first of the
-            cameras looks along the second axis ("upright") or the third ("y_down"). None for any heading.
-    """
+    """Options of `draw_map_problem`; see `SyntheticMapDataModule` for those not listed."""
 
     num_points: int = 256
     min_points: int = 16
     outliers: NumberOrRange = (0.25, 1.0)
     views: tuple[int, int] = (1, 3)
     kinds: Mapping[str, float] = field(default_factory=WEIGHTS.copy)
+    # Frame of the map: "upright" for the third axis upwards, "y_down" for the second axis downwards, "view" for the
+    # coordinates of the first of the cameras whose map points are taken.
     frame: Frame = "upright"
+    # Standard deviation of the rotation about each horizontal axis of a frame "upright" or "y_down", degrees, as where
+    # the vertical is known roughly.
     tilt_deg: float = 0.0
+    # Standard deviation of the heading of a frame "upright" or "y_down", degrees; at 0 the first of the cameras looks
+    # along the second axis ("upright") or the third ("y_down"). None for any heading.
     heading_deg: float | None = None
     scale_range: tuple[float, float] = (0.1, 10.0)
     field_of_view: NumberOrRange = (24.0, 115.0)
@@ -90,15 +87,7 @@ class MapOptions:
 def draw_map_problem(name: str, options: MapOptions, rng: np.random.Generator) -> Problem:
     """Draw a scene, a map of it by some photos, and the keypoints of one more photo.
 
-    If the photo shares fewer than `min_points` points with the map, another scene is drawn.
-
-    Args:
-        name: Name of the problem.
-        options: Options.
-        rng: Random generator.
-
-    Raises:
-        ValueError: 50 scenes shared too few points.
+    If the photo shares fewer than `min_points` points with the map, another scene is drawn; ValueError after 50 scenes.
     """
     kinds = list(options.kinds)
     weights = np.array([options.kinds[kind] for kind in kinds])
@@ -168,22 +157,12 @@ def _draw(name: str, kind: str, half: float, options: MapOptions, rng: np.random
 def triangulate(
     scene: DrawnScene, view: Viewpoint, cameras: list[DrawnCamera], reach: Array, noise: float, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], Array]:
-    """Return the scene points in the map, and their map positions.
+    """Return the indices (k,) of the scene points in the map, ascending, and their map positions (k, 3).
 
     A point is in the map if one of the cameras and enough other photos have a keypoint of it. Its position is off along
     the ray of the camera by a normal error of its inverse depth, noise / (baseline sqrt(photos)): with few photos from
-    almost one position, far points are anywhere along the ray.
-
-    Args:
-        scene: Scene.
-        view: Viewpoint.
-        cameras: Cameras whose points are taken.
-        reach: As in `find_visible`.
-        noise: Standard deviation of a keypoint, radians.
-        rng: Random generator.
-
-    Returns:
-        Indices of the points (k,), ascending, and their map positions (k, 3).
+    almost one position, far points are anywhere along the ray. `noise` is the standard deviation of a keypoint in
+    radians, `reach` is as in `find_visible`.
     """
     photos = int(2 ** rng.uniform(1, 4))  # number of other photos that may see a point
     least = int(rng.integers(1, 3))  # number of them that have to see it
@@ -247,14 +226,7 @@ def _log_uniform(value: NumberOrRange, rng: np.random.Generator) -> float:
 
 
 class MapSource:
-    """Source of problems with one scene each, drawn on demand as a function of (seed, epoch, index).
-
-    Args:
-        options: Options.
-        count: Number of problems, at least 1.
-        seed: Seeds.
-        label: Name of the split.
-    """
+    """Source of problems with one scene each, drawn on demand as a function of (seed, epoch, index), at least one."""
 
     def __init__(self, options: MapOptions, *, count: int, seed: Sequence[int], label: str) -> None:
         check_within(1, math.inf, **{f"{label}_problems": count})

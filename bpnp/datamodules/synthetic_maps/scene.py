@@ -15,93 +15,55 @@ REACHED = 0.985  # fraction of the segment to a point; a blob entered later is t
 
 
 class Walls(NamedTuple):
-    """Upright rectangles on the ground.
+    """Upright rectangles on the ground."""
 
-    Attributes:
-        start: Lower corners (k, 2), metres.
-        along: Unit directions (k, 2).
-        normal: Outward normals (k, 2).
-        width: Widths (k,), metres.
-        height: Heights (k,), metres.
-        weight: Relative density of points (k,).
-        cell: Size of the repeated pattern (k,), metres.
-        relief: Depth of the relief (k,), metres; a wall does not hide points nearer to its plane.
-    """
-
-    start: Array
-    along: Array
-    normal: Array
-    width: Array
-    height: Array
-    weight: Array
-    cell: Array
-    relief: Array
+    start: Array  # lower corners (k, 2), metres
+    along: Array  # unit directions (k, 2)
+    normal: Array  # outward normals (k, 2)
+    width: Array  # (k,), metres
+    height: Array  # (k,), metres
+    weight: Array  # relative density of points (k,)
+    cell: Array  # size of the repeated pattern (k,), metres
+    relief: Array  # depth of the relief (k,), metres; a wall does not hide points nearer to its plane
 
 
 class Blobs(NamedTuple):
-    """Ellipsoids; p is on the surface where ||to_sphere (p - centre)|| = 1.
+    """Ellipsoids; p is on the surface where ||to_sphere (p - centre)|| = 1."""
 
-    Attributes:
-        centre: Centres (k, 3), metres.
-        to_sphere: Maps to the unit sphere (k, 3, 3).
-    """
-
-    centre: Array
-    to_sphere: Array
+    centre: Array  # (k, 3), metres
+    to_sphere: Array  # maps to the unit sphere (k, 3, 3)
 
 
 class DrawnScene(NamedTuple):
-    """Feature points of a scene, metres, third axis upwards.
+    """Feature points of a scene, metres, third axis upwards."""
 
-    Attributes:
-        points: Points (n, 3).
-        normals: Normals (n, 3), 0 for points visible from every side.
-        repeatability: Probability (n,) that a photo in which the point is visible has a keypoint there; 0 for points
-            that only one photo has a keypoint of.
-        walls: Walls.
-        blobs: Blobs.
-    """
-
-    points: Array
-    normals: Array
+    points: Array  # (n, 3)
+    normals: Array  # (n, 3), 0 for points visible from every side
+    # Probability (n,) that a photo in which the point is visible has a keypoint there; 0 for points that only one photo
+    # has a keypoint of.
     repeatability: Array
     walls: Walls
     blobs: Blobs
 
 
 class Viewpoint(NamedTuple):
-    """Position of a photo of a scene, and how other photos of the same part differ from it.
+    """Position of a photo of a scene, and how other photos of the same part differ from it."""
 
-    Attributes:
-        centre: Camera centre (3,), metres.
-        target: Point that the camera looks at (3,), metres.
-        orbit: Standard deviation of the angle by which other photos go around the target, radians.
-        shift: Standard deviation of their distance from there, as a fraction of the distance to the target.
-        heading: Standard deviation of their viewing direction, radians.
-        parallax: Smallest and largest baseline between the photos that saw a point, as a fraction of the distance to
-            the target.
-    """
-
-    centre: Array
-    target: Array
-    orbit: float
-    shift: float
-    heading: float
+    centre: Array  # camera centre (3,), metres
+    target: Array  # point that the camera looks at (3,), metres
+    orbit: float  # standard deviation of the angle by which other photos go around the target, radians
+    shift: float  # standard deviation of their distance from there, as a fraction of the distance to the target
+    heading: float  # standard deviation of their viewing direction, radians
+    # Smallest and largest baseline between the photos that saw a point, as a fraction of the distance to the target.
     parallax: tuple[float, float]
 
 
 class Surface(NamedTuple):
-    """Points of a surface.
+    """Points of a surface."""
 
-    Attributes:
-        points: Points (n, 3).
-        normals: Normals (n, 3).
-        repeatable: Fraction of the points that are detected in other photos too.
-    """
-
-    points: Array
-    normals: Array
-    repeatable: float
+    points: Array  # (n, 3)
+    normals: Array  # (n, 3)
+    repeatable: float  # fraction of the points that are detected in other photos too
 
 
 NO_BLOBS = Blobs(np.zeros((0, 3)), np.zeros((0, 3, 3)))
@@ -165,41 +127,26 @@ def hidden_by_blobs(blobs: Blobs, centre: Array, points: Array) -> NDArray[np.bo
 
 
 class DrawnCamera(NamedTuple):
-    """Pinhole camera; camera = rotation p + translation, metres.
+    """Pinhole camera; camera = rotation p + translation, metres."""
 
-    Attributes:
-        rotation: R (3, 3).
-        translation: t (3,).
-        centre: Camera centre (3,).
-        half: Half of the image's width and height over the focal length (2,).
-    """
-
-    rotation: Array
-    translation: Array
-    centre: Array
-    half: Array
+    rotation: Array  # R (3, 3)
+    translation: Array  # t (3,)
+    centre: Array  # camera centre (3,)
+    half: Array  # half of the image's width and height over the focal length (2,)
 
 
 class VisiblePoints(NamedTuple):
-    """Keypoints of a photo.
+    """Keypoints of a photo."""
 
-    Attributes:
-        of: Index of the scene point of each keypoint (k,).
-        image: Projections (k, 2).
-        depth: Depths (k,), metres.
-    """
-
-    of: NDArray[np.int64]
-    image: Array
-    depth: Array
+    of: NDArray[np.int64]  # index of the scene point of each keypoint (k,)
+    image: Array  # projections (k, 2)
+    depth: Array  # (k,), metres
 
 
 def image_shape(half: float, rng: np.random.Generator) -> Array:
     """Draw half of the image's width and height over the focal length: 4:3, 3:2 or 16:9, upright or not.
 
-    Args:
-        half: Half of the longer side over the focal length.
-        rng: Random generator.
+    `half` is half of the longer side over the focal length.
     """
     shape = half * np.array([1.0, rng.choice([3 / 4, 2 / 3, 9 / 16])])
     return shape if rng.random() < 0.75 else shape[::-1]
@@ -234,12 +181,8 @@ def find_visible(
 ) -> VisiblePoints:
     """Draw the keypoints of a photo, among points in the image, in front of their surface and not hidden.
 
-    Args:
-        scene: Scene.
-        camera: Camera of the photo.
-        reach: Largest distance from which a camera of unit `half` resolves the details at each point (n,), metres.
-        rng: Random generator.
-        alone: Include points that no other photo has a keypoint of.
+    A camera of unit `half` resolves the details at a point from at most its `reach` (n,), metres. With `alone`, points
+    that no other photo has a keypoint of are included.
     """
     x, y, depth = camera.rotation @ scene.points.T + camera.translation[:, None]
     inside = (np.abs(x) < camera.half[0] * depth) & (np.abs(y) < camera.half[1] * depth)
