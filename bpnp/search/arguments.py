@@ -13,8 +13,17 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.argument_types import PoseObject, check_unmasked, short_repr
 from bpnp.cameras import CENTRE, Camera, check_normalised, is_opencv, outside_image
-from bpnp.search.config import INPUTS
 from bpnp.search.starts import GravityPrior, PosePrior
+
+ROTATION_ROUNDING = 1e-12  # largest error of R R^T of a rotation; others are made orthonormal [1; numerics, float64]
+UNIT_TOLERANCE = 1e-3  # largest error of a unit length, of a rotation, and of a sum of probabilities [1; convention]
+SURE_CLASS = 0.97  # probability of a class from which on points match only within the class [probability; not tuned]
+PRIOR_DEG = 10.0  # default standard deviation of a given rotation about each axis [degrees; convention]
+LEAST_SIGMA_DEG = 1e-6  # least standard deviation of an angle of a prior [degrees; numerics, float64]
+# Largest coordinate of image points that are refused as normalised coordinates if a camera in pixels is given.
+ONE_PIXEL = 3.0  # [pixels; convention]
+# Largest number of columns of an array of keypoints whose first two columns are positions.
+WIDEST_ROW = 8  # [columns; convention]
 
 if TYPE_CHECKING:
     import torch
@@ -195,7 +204,7 @@ def checked_prior(prior: Any) -> Prior | None:
     if prior is None:
         return None
     if not isinstance(prior, (PosePrior, GravityPrior)) and (pose := pose_of(prior)) is not None:
-        prior = PosePrior(*pose, INPUTS.prior_deg)
+        prior = PosePrior(*pose, PRIOR_DEG)
     if isinstance(prior, PosePrior):
         rotation, shift = checked_pose("prior.", prior.rotation, prior.translation)
         return PosePrior(rotation, shift, _sigma(prior, "rotation_sigma_deg"), _sigma(prior, "translation_sigma"))
@@ -223,8 +232,8 @@ def _sigma(prior: PosePrior | GravityPrior, name: str) -> float:
         raise ValueError(f"`prior.{name}` is None; it must be a positive number")
     if name == "translation_sigma":  # in the unit of the scene, whose size is not known here
         return sigma
-    if sigma < INPUTS.least_sigma_deg:
-        least = f"{INPUTS.least_sigma_deg:g}"
+    if sigma < LEAST_SIGMA_DEG:
+        least = f"{LEAST_SIGMA_DEG:g}"
         raise ValueError(f"`prior.{name}` is {sigma:g} degrees; give {least} or more, even where it is known exactly")
     return min(sigma, 180.0)
 
@@ -233,10 +242,10 @@ def checked_pose(prefix: str, rotation: Any, translation: Any) -> tuple[Array, A
     """Return an orthonormal rotation (3, 3) and a translation (3,) or None; messages name them with `prefix`."""
     matrix = _finite(f"{prefix}rotation", rotation, (3, 3))
     off = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
-    if off > INPUTS.unit or np.linalg.det(matrix) < 0:
+    if off > UNIT_TOLERANCE or np.linalg.det(matrix) < 0:
         raise ValueError(f"`{prefix}rotation` is no rotation matrix, R R^T = I and det R = 1: {matrix.tolist()}")
     shift = None if translation is None else _finite(f"{prefix}translation", translation, (3,))
-    return Rotation.from_matrix(matrix).as_matrix() if off > INPUTS.rounding else matrix, shift
+    return Rotation.from_matrix(matrix).as_matrix() if off > ROTATION_ROUNDING else matrix, shift
 
 
 def numbers(name: str, values: Any) -> Array:
@@ -323,7 +332,7 @@ def image_points(values: Any) -> Array:
     orientation, strength).
     """
     points = scene_points(values, "points2d")
-    return points[:, :2] if points.ndim == 2 and 3 < points.shape[1] <= INPUTS.widest_row else points
+    return points[:, :2] if points.ndim == 2 and 3 < points.shape[1] <= WIDEST_ROW else points
 
 
 def scene_points(values: Any, name: str = "points3d") -> Array:
@@ -354,9 +363,9 @@ def _check_rows(name: str, rows: Array, good: Any, requirement: str) -> None:
 
 
 def unit_bearings(rays: Array) -> Array:
-    """Return bearings (m, 3), normalised; raise ValueError if a length differs from one by more than `INPUTS.unit`."""
+    """Return bearings (m, 3), normalised; raise ValueError if a length is off by more than `UNIT_TOLERANCE`."""
     length = np.linalg.norm(rays, axis=-1, keepdims=True)
-    if np.abs(length - 1).max() > INPUTS.unit:
+    if np.abs(length - 1).max() > UNIT_TOLERANCE:
         worst = float(length[np.abs(length - 1).argmax(), 0])
         raise ValueError(
             f"`points2d` of shape (m, 3) are unit bearings, but one has the length {worst:g} (are points2d and "
@@ -370,7 +379,7 @@ def check_unit(points2d: Array, camera: Camera | None) -> None:
     largest = np.abs(points2d).max()
     if camera is None:
         check_normalised(points2d, "camera=K")
-    if camera is not None and largest < INPUTS.one_pixel and camera.focal > 100:
+    if camera is not None and largest < ONE_PIXEL and camera.focal > 100:
         raise ValueError(
             f"`points2d` has values up to {largest:g}, which look normalised; give pixels with a `camera`, or leave "
             "the camera out"
@@ -378,9 +387,9 @@ def check_unit(points2d: Array, camera: Camera | None) -> None:
 
 
 def unit_vectors(name: str, vectors: Array, hint: str = "divide by the lengths") -> Array:
-    """Return vectors (n, 3), normalised; raise ValueError if a length differs from one by more than `INPUTS.unit`."""
+    """Return vectors (n, 3), normalised; raise ValueError if a length is off by more than `UNIT_TOLERANCE`."""
     length = np.linalg.norm(vectors, axis=-1)
-    _check_rows(name, vectors, np.abs(length - 1) <= INPUTS.unit, f"unit vectors are needed: {hint}")
+    _check_rows(name, vectors, np.abs(length - 1) <= UNIT_TOLERANCE, f"unit vectors are needed: {hint}")
     return np.asarray(vectors / length[:, None])
 
 
@@ -414,7 +423,7 @@ def checked_labels(labels2d: Any, labels3d: Any, counts: tuple[int, int]) -> dic
         )
     odds = image / np.maximum(image.mean(0), 1e-12)
     odds /= np.maximum(odds @ scene.mean(0), 1e-12)[:, None]
-    sure = [np.where(shares.max(1) >= INPUTS.sure, shares.argmax(1), -1) for shares in (image, scene)]
+    sure = [np.where(shares.max(1) >= SURE_CLASS, shares.argmax(1), -1) for shares in (image, scene)]
     return {"labels2d": sure[0], "labels3d": sure[1], "odds2d": odds, "classes3d": scene}
 
 
@@ -447,7 +456,7 @@ def _classes(name: str, values: Any, count: int) -> Array:
             f"`{name}` has the shape {shares.shape}; it needs class probabilities of shape ({count}, c), as the other "
             "labels"
         )
-    good = (shares >= 0).all(1) & (np.abs(shares.sum(1) - 1) <= INPUTS.unit)
+    good = (shares >= 0).all(1) & (np.abs(shares.sum(1) - 1) <= UNIT_TOLERANCE)
     _check_rows(name, shares, good, "probabilities are 0 or more and add up to 1: use softmax, or divide by the sums")
     return np.asarray(shares / shares.sum(1, keepdims=True))
 

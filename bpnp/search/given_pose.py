@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from bpnp.poses import rotation_angle
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
 from bpnp.search.competing_poses import judge_with_competitors
-from bpnp.search.config import DEFAULT, PRECISION, PROBLEM, Evidence
+from bpnp.search.config import DEFAULT, PRECISION, Evidence
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.possible_matches import score_pose
-from bpnp.search.problem import Problem, in_bulk
+from bpnp.search.problem import EQUALLY_NEAR_SIGMAS, Problem, in_bulk
 from bpnp.search.propose.density_map import perturb_each
 from bpnp.search.propose.repetitions import competing_poses
 from bpnp.search.propose.symmetries import mirror_pose
@@ -85,7 +85,7 @@ def judge_given_pose(
         scale = float(optimum.scale[0])
         distance = float(np.linalg.norm(rotation @ problem.centre3d + translation))
         prior = PosePrior(
-            rotation, translation, math.degrees(scale) / PROBLEM.sigmas, scale * distance / PROBLEM.sigmas
+            rotation, translation, math.degrees(scale) / EQUALLY_NEAR_SIGMAS, scale * distance / EQUALLY_NEAR_SIGMAS
         )
         near = replace(problem, prior=prior).log10_prior_fraction(*optimum.pose())
         one = replace(problem, log10_tried=max(PoseModel.of(problem).log10_tests([problem]) + near, 0.0))

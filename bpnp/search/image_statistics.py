@@ -5,11 +5,21 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.config import ImageSettings
 from bpnp.search.kernels.neighbours import sums_near
 
+# Factor from one scale of the residuals to the next.
+SCALE_STEP = 2.0  # [factor; measured, coarser steps give the same evidence in half the time]
+# Largest scale, in spacings sqrt(A / m) of the points; beyond it only the outline fits.
+COARSEST_SCALE = 0.5  # [spacings of the points; not tuned]
+# Smallest scale, in RMS angular radii of the bearings: some hundredths of a pixel of an ordinary camera.
+FLOOR_SCALE = 2e-4  # [RMS angular radii; convention]
+TOGETHER_SCALES = 2.0  # distance, in scales, below which points count as one observation [scales; convention]
+# Standard deviations above the count of an even spread from which neighbours form a clump.
+CROWDED_SIGMAS = 2.0  # [standard deviations; not tuned]
+# Largest number of image points that are used, evenly spaced among the given ones.
+MOST_IMAGE_POINTS = 2000  # [points; cost]
+
 Array = NDArray[np.float64]
-IMAGE = ImageSettings()
 
 
 class ImageStatistics:
@@ -23,12 +33,12 @@ class ImageStatistics:
         solid_angle: Area of this rectangle, steradians, at most 4 pi.
         scales: (S,) scales of residuals, radians, from the noise floor to a fraction of the mean distance of the
             points.
-        chosen: (k,) indices of the image points that are used, at most `settings.most`.
-        together: (k, S) number of used points within `settings.together` scales of each.
+        chosen: (k,) indices of the image points that are used, at most MOST_IMAGE_POINTS.
+        together: (k, S) number of used points within TOGETHER_SCALES scales of each.
         weights: (k, S, S) weights of the evidence, see `_weights`.
     """
 
-    def __init__(self, bearings: Array, floor: float | None, settings: ImageSettings = IMAGE) -> None:
+    def __init__(self, bearings: Array, floor: float | None) -> None:
         m = len(bearings)
         self.centre = bearings.mean(0)
         centred = bearings - self.centre
@@ -37,17 +47,19 @@ class ImageStatistics:
         self.half_widths, self.axes = np.sqrt(3 * np.maximum(variance[1:], 1e-24)), axes[:, 1:]
         area = 12 * math.sqrt(max(float(variance[1:].prod()), 0.0))
         self.solid_angle = float(np.clip(area, 1e-24, 4 * math.pi))
-        smallest = max(floor or 0.0, settings.floor * self.spread)
-        largest = max(settings.coarsest * math.sqrt(self.solid_angle / m), 2 * smallest)
-        steps = max(3, 1 + math.ceil(math.log(largest / smallest) / math.log(settings.scale_step)))
+        smallest = max(floor or 0.0, FLOOR_SCALE * self.spread)
+        largest = max(COARSEST_SCALE * math.sqrt(self.solid_angle / m), 2 * smallest)
+        steps = max(3, 1 + math.ceil(math.log(largest / smallest) / math.log(SCALE_STEP)))
         self.scales = np.geomspace(smallest, largest, steps)
-        self.chosen = np.arange(m) if m <= settings.most else np.linspace(0, m - 1, settings.most).astype(np.int64)
-        within = settings.together * self.scales
+        self.chosen = (
+            np.arange(m) if m <= MOST_IMAGE_POINTS else np.linspace(0, m - 1, MOST_IMAGE_POINTS).astype(np.int64)
+        )
+        within = TOGETHER_SCALES * self.scales
         looked_at = bearings[self.chosen]
         together = sums_near(looked_at, looked_at, self.axes, within, np.zeros(steps))
         self.together = together.astype(np.int64)
         expected = 1 + (len(looked_at) - 1) * math.pi * within**2 / self.solid_angle
-        self.weights = _weights(self.together, expected, settings.crowded)
+        self.weights = _weights(self.together, expected, CROWDED_SIGMAS)
 
 
 def _weights(together: NDArray[np.int64], expected: Array, crowded_sigmas: float) -> Array:
@@ -59,7 +71,7 @@ def _weights(together: NDArray[np.int64], expected: Array, crowded_sigmas: float
     position of each of its points within it is one more.
 
     Args:
-        together: (k, S) number n_i of image points within `ImageSettings.together` scales of each.
+        together: (k, S) number n_i of image points within TOGETHER_SCALES scales of each.
         expected: (S,) number for points spread evenly over the view.
         crowded_sigmas: Standard deviations above `expected` from which points are a clump.
 

@@ -20,9 +20,14 @@ from bpnp.search.arguments import (
     scene_points,
     unit_bearings,
 )
-from bpnp.search.config import INPUTS
 from bpnp.search.problem import Problem, Unit, UnknownFocal, units_per_radian
 from bpnp.search.starts import GravityPrior, PosePrior
+
+FLOOR_PIXELS = 0.1  # smallest noise of an image point; no point detector is more accurate [pixels; convention]
+# With a smaller one, such as that of an identity matrix, the unit of the image points is no pixel, and the smallest
+# noise is unknown.
+LEAST_FOCAL = 10.0  # smallest focal length in pixels [pixels; convention]
+OFF_AXIS_DEG = 80.0  # largest median angle of image points from the axis of a pinhole camera [degrees; convention]
 
 
 def problem_from(
@@ -64,7 +69,7 @@ def problem_from(
     image = bearings if unit == "rad" else image
     usable = np.flatnonzero(np.isfinite(bearings).all(-1))
     check_seen(usable, image, fewest)
-    in_pixels = camera if camera is not None and camera.focal >= INPUTS.least_focal else None
+    in_pixels = camera if camera is not None and camera.focal >= LEAST_FOCAL else None
     per_radian = units_per_radian(plane[usable], unit, camera)
     pose_prior = prior if isinstance(prior, (PosePrior, GravityPrior)) else None
     problem = Problem.of(
@@ -76,7 +81,7 @@ def problem_from(
         cosines3d=cosines3d,
         scores2d=checked_scores("scores2d", scores2d, len(image)),
         scores3d=checked_scores("scores3d", scores3d, len(scene)),
-        floor=None if in_pixels is None else INPUTS.floor_pixels / per_radian,
+        floor=None if in_pixels is None else FLOOR_PIXELS / per_radian,
         radius=None if inlier_threshold is None else inlier_threshold / per_radian,
         focal=focal,
         points2d=None if unit == "rad" else image,
@@ -113,7 +118,7 @@ def check_view(plane: Array, camera: Camera | None) -> None:
     if camera is None or not is_pinhole(camera):
         return
     off = math.degrees(math.atan(float(np.median(np.linalg.norm(plane, axis=-1)))))
-    if off > INPUTS.off_axis_deg:
+    if off > OFF_AXIS_DEG:
         raise ValueError(
             f"`points2d` lie {off:.0f} degrees from the axis of the `camera` (median), whose focal length is "
             f"{camera.focal:.4g} pixels; give the focal length and the points in the same unit"

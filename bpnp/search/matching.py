@@ -18,14 +18,25 @@ from scipy.spatial import cKDTree
 from bpnp.poses import MIN_POINTS
 from bpnp.runtime import NEVER, Clock, Deadline
 from bpnp.search.arguments import Array, Labels
-from bpnp.search.config import MATCHES, PRECISION
+from bpnp.search.config import PRECISION
 from bpnp.search.pose_model import PoseModel
+from bpnp.search.possible_matches import DENSE_MATCHES, FEW_NEIGHBOURS, MATCH_REACH
 from bpnp.search.problem import Problem
-from bpnp.search.refine.gauss_newton import Iteration, image_equations, refine
+from bpnp.search.refine.gauss_newton import FIRST_DAMPING, Iteration, image_equations, refine
 from bpnp.search.solution import FOCAL_LENGTH, POSE_PARAMETERS, Solution, SolutionStats, add_pose
 from bpnp.search.verdict.decide import SearchResult
 from bpnp.search.verdict.reasons import Unfinished
 from bpnp.search.verdict.uncertainty import linearised, pose_covariance
+
+# Number of points whose neighbours are looked up, or that are assigned, between two checks of the deadline.
+POINTS_A_CHECK = 5000  # [points; cost]
+# Time of an optimal assignment, over the product of its numbers of points and of possible matches. With less time left,
+# points get their mutual nearest neighbours.
+ASSIGNMENT_SECONDS = 1e-9  # [seconds; cost]
+COUNTING_SECONDS = 2e-6  # time of a maximum matching, over its number of possible matches [seconds; cost]
+FIT_ROUNDS = 5  # rounds of the last fit, each with new matches [rounds; not tuned]
+MOST_STEPS = 50  # largest number of steps of Levenberg and Marquardt [steps; numerics]
+EXACT_CHANGE = 1e-12  # relative change of a pose, and of the sum of squares, that ends the steps [ratio; numerics]
 
 Allowed = Callable[[Labels, Labels], NDArray[np.bool_]]
 
@@ -51,7 +62,7 @@ def finished(
     failed = failed_solution(problem, _note_duplicates(problem, result), inlier_threshold, seconds, code=result.code)
     if not len(found):
         return with_unfinished(failed, deadline)
-    threshold = inlier_threshold or MATCHES.reach * result.residual * problem.per_radian
+    threshold = inlier_threshold or MATCH_REACH * result.residual * problem.per_radian
     poses = list(zip(found.rotation, found.translation, strict=True))
     if result.batches:  # an enumerated pose is a least-squares fit in float64 already
         poses[0] = _fitted(problem, *poses[0], threshold, deadline)
@@ -88,7 +99,7 @@ def with_unfinished(solution: Solution, deadline: Deadline) -> Solution:
 
 def _note_duplicates(problem: Problem, result: SearchResult) -> str:
     """Return the reason of a verdict, with the number of duplicate points unless the verdict is "confident"."""
-    if result.verdict == "confident" or len(problem.points3d) > MATCHES.dense:
+    if result.verdict == "confident" or len(problem.points3d) > DENSE_MATCHES:
         return result.reason
     sides = {"image": problem.image_points, "scene": problem.points3d}
     counts = {side: len(points) - len(np.unique(points, axis=0)) for side, points in sides.items()}
@@ -147,7 +158,7 @@ def _fitted(
     sum of n squared residuals, is distributed as chi-squared with 6 degrees of freedom.
     """
     image = problem.image_points
-    for _ in range(MATCHES.fit_rounds):
+    for _ in range(FIT_ROUNDS):
         if deadline.ended(Unfinished.refinement):
             break
         projected = problem.project_scene(rotation, translation)
@@ -172,7 +183,7 @@ def one_to_one(
     The matches (i, j) satisfy |image_i - projected_j| <= radius, and no point is in two of them. Among the maximum
     matchings it has the least sum of squared distances. It is a minimum-weight matching in which an unmatched image
     point costs more than all distances together. Points that share no possible match are assigned separately. With many
-    points only the `MATCHES.few_neighbours` nearest neighbours of each are edges.
+    points only the `FEW_NEIGHBOURS` nearest neighbours of each are edges.
 
     Args:
         image: (m, 2) image points.
@@ -201,7 +212,7 @@ def count_one_to_one(
     matches, distance = _near(image, projected, radius, allowed, deadline)
     if all(np.bincount(side).max(initial=0) <= 1 for side in matches.T):
         return len(matches)  # no point has several candidates
-    if _is_too_long(MATCHES.counting * len(matches), deadline):
+    if _is_too_long(COUNTING_SECONDS * len(matches), deadline):
         return len(_mutual(matches, distance))
     graph = csr_array((np.ones(len(matches)), tuple(matches.T)), shape=(len(image), len(projected)))
     return int((maximum_bipartite_matching(graph, perm_type="column") >= 0).sum())
@@ -210,13 +221,13 @@ def count_one_to_one(
 def _components(matches: Labels, count: int) -> Iterator[Labels | slice]:
     """Yield the indices of the possible matches (e, 2) of points that share none with others, in groups.
 
-    A group has one component, or several with together at most `MATCHES.asked` matches.
+    A group has one component, or several with together at most `POINTS_A_CHECK` matches.
 
     Args:
         matches: Indices of `count` image points and of scene points.
         count: Number of image points.
     """
-    if len(matches) <= MATCHES.asked:
+    if len(matches) <= POINTS_A_CHECK:
         yield slice(None)
         return
     size = count + int(matches[:, 1].max()) + 1
@@ -228,7 +239,7 @@ def _components(matches: Labels, count: int) -> Iterator[Labels | slice]:
     first = 0
     while first < len(order):
         last = int(
-            ends[max(np.searchsorted(ends, first + MATCHES.asked, "right") - 1, np.searchsorted(ends, first + 1))]
+            ends[max(np.searchsorted(ends, first + POINTS_A_CHECK, "right") - 1, np.searchsorted(ends, first + 1))]
         )
         yield order[first:last]
         first = last
@@ -244,7 +255,7 @@ def _assigned(matches: Labels, distance: Array, radius: float, deadline: Deadlin
     rows, row = np.unique(matches[:, 0], return_inverse=True)
     columns, column = np.unique(matches[:, 1], return_inverse=True)
     count, every = len(columns), np.arange(len(rows))
-    if _is_too_long(MATCHES.assignment * len(matches) * len(rows), deadline):
+    if _is_too_long(ASSIGNMENT_SECONDS * len(matches) * len(rows), deadline):
         return np.concatenate([sure, _mutual(matches, distance)])
     cost = (distance / radius) ** 2 + 1e-9  # a zero would be no edge
     out = np.full(len(rows), float(min(len(rows), count) + 2))
@@ -309,14 +320,12 @@ def fit_pose(
 
     def settled(last: Iteration) -> bool:
         return bool(
-            (np.abs(last.step) <= MATCHES.exact * relative).all()
-            or np.abs(last.gain) <= MATCHES.exact * np.asarray(last.before.cost)
+            (np.abs(last.step) <= EXACT_CHANGE * relative).all()
+            or np.abs(last.gain) <= EXACT_CHANGE * np.asarray(last.before.cost)
         )
 
     linearise = image_equations(model, project, points, target, lost=1e3 * scale)
-    end = refine(
-        model, state, linearise, [scale] * MATCHES.most_steps, settled=settled, damping=MATCHES.damping, adaptive=True
-    )
+    end = refine(model, state, linearise, [scale] * MOST_STEPS, settled=settled, damping=FIRST_DAMPING, adaptive=True)
     return model.pose(end.state)
 
 
@@ -325,12 +334,12 @@ def _near(
 ) -> tuple[Labels, Array]:
     """Return the allowed matches (e, 2) within `radius`, ordered, and their distances; nearest neighbours if many."""
     seen = np.flatnonzero(np.isfinite(projected).all(-1))
-    if len(image) * len(seen) <= MATCHES.dense:
+    if len(image) * len(seen) <= DENSE_MATCHES:
         distance = np.sqrt(((image[:, None] - projected[seen]) ** 2).sum(-1))
         matches = np.argwhere(distance <= radius)
     else:
         both = _neighbours(image, projected[seen], radius, deadline)
-        if np.bincount(both[:, 0]).max(initial=0) == MATCHES.few_neighbours:  # there may be more
+        if np.bincount(both[:, 0]).max(initial=0) == FEW_NEIGHBOURS:  # there may be more
             both = np.concatenate([both, _neighbours(projected[seen], image, radius, deadline)[:, ::-1]])
         # One number per match: sorting unique rows as records takes ten times as long.
         matches = np.stack(np.divmod(np.unique(both[:, 0] * len(seen) + both[:, 1]), len(seen)), -1)
@@ -344,8 +353,8 @@ def _neighbours(points: Array, others: Array, radius: float, deadline: Deadline)
 
     Points that are not looked up before the end of a deadline have none.
     """
-    count, tree, found = min(MATCHES.few_neighbours, len(others)), cKDTree(others), list[Labels]()
-    step = len(points) if math.isinf(deadline.final) else MATCHES.asked
+    count, tree, found = min(FEW_NEIGHBOURS, len(others)), cKDTree(others), list[Labels]()
+    step = len(points) if math.isinf(deadline.final) else POINTS_A_CHECK
     for first in range(0, len(points), step):
         if first and deadline.ended(Unfinished.matches):
             break

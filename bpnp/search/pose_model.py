@@ -36,9 +36,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.search.config import REFINER
 from bpnp.search.problem import Problem, UnknownFocal, label_groups
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
+
+# Smallest derivative of the distorted by the undistorted radius at which a point is visible.
+LEAST_SLOPE = 0.2  # [1; not tuned]
+UNDISTORTING_STEPS = 20  # Newton steps that undistort a radius [steps; numerics]
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
@@ -349,7 +352,7 @@ class PoseModel:
             return np.broadcast_to(zoom, camera.shape[:-1])
         ahead = camera[..., 2] > 0
         squared = (camera[..., :2] ** 2).sum(-1) / np.where(ahead, camera[..., 2], np.inf) ** 2
-        visible = ahead & (1 + 3 * state.radial * squared > REFINER.least_slope)
+        visible = ahead & (1 + 3 * state.radial * squared > LEAST_SLOPE)
         stretch = np.where(visible, zoom * (1 + state.radial * squared), np.nan)
         if lens.radial:
             radius = stretch * np.sqrt(squared)
@@ -442,10 +445,10 @@ def true_radius(radius: Array, radial: float) -> Array:
     Returns:
         (...) r, at most the largest radius of the camera model.
     """
-    most = math.sqrt((1 - REFINER.least_slope) / (-3 * radial)) if radial < 0 else math.inf
+    most = math.sqrt((1 - LEAST_SLOPE) / (-3 * radial)) if radial < 0 else math.inf
     true = np.minimum(radius, most)
-    for _ in range(REFINER.undistorted):
-        slope = np.maximum(1 + 3 * radial * true**2, REFINER.least_slope)
+    for _ in range(UNDISTORTING_STEPS):
+        slope = np.maximum(1 + 3 * radial * true**2, LEAST_SLOPE)
         true = np.clip(true - (true * (1 + radial * true**2) - radius) / slope, 0.0, most)
     return np.asarray(true)
 
@@ -454,7 +457,7 @@ def _radii(seen: Array, radial: float) -> tuple[Array, Array]:
     """Return |x'|^2 (...) of directions (..., 3), 0 behind the camera, and the derivative of the image radius."""
     ahead = seen[..., 2] > 0
     squared = (seen[..., :2] ** 2).sum(-1) / np.where(ahead, seen[..., 2], 1.0) ** 2 * ahead
-    return squared, np.maximum(1 + 3 * radial * squared, REFINER.least_slope)
+    return squared, np.maximum(1 + 3 * radial * squared, LEAST_SLOPE)
 
 
 def _outwards(seen: Array) -> Array:

@@ -7,8 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.search.config import DEFAULT, MATCHES
+from bpnp.search.config import DEFAULT
 from bpnp.search.problem import Problem, faces
+
+# Distance within which an image point has a match, and default inlier threshold; 98.9 % of the errors of two normal
+# coordinates are within it.
+MATCH_REACH = 3.0  # [scales of the residuals; convention]
+# Distance within which a scene point counts as a possible correspondence in a weighted fit, where each counts by its
+# likelihood; beyond, it is below e^-8.
+FARTHEST_MATCH = 4.0  # [scales of the residuals; derived]
+FEW_NEIGHBOURS = 8  # number of nearest scene points of an image point that are tried first [points; cost]
+MOST_NEIGHBOURS = 64  # number that is tried if all of the few are in reach [points; cost]
+DENSE_MATCHES = 4096  # number of possible matches up to which all distances are computed [matches; cost]
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
@@ -29,7 +39,7 @@ def facing(problem: Problem, camera: Array, rotation: Array) -> Labels:
 
 
 def possible_matches(
-    problem: Problem, directions: Array, indices: Labels, chosen: Labels, scale: float, most: int = MATCHES.neighbours
+    problem: Problem, directions: Array, indices: Labels, chosen: Labels, scale: float, most: int = MOST_NEIGHBOURS
 ) -> tuple[Any, Any, Array, Array]:
     """Return the possible matches of chosen image points and scene points near them.
 
@@ -47,14 +57,14 @@ def possible_matches(
         Index (k,) into `chosen`, index (k,) into `directions` and density (k,) of each match; and the total density
         (m,) of each image point, which includes that of no correspondence.
     """
-    bearings, reach = problem.bearings[chosen], MATCHES.farthest * scale
-    if len(bearings) * len(directions) <= MATCHES.dense:
+    bearings, reach = problem.bearings[chosen], FARTHEST_MATCH * scale
+    if len(bearings) * len(directions) <= DENSE_MATCHES:
         squared = ((bearings[:, None] - directions) ** 2).sum(-1)
         i, j = np.nonzero(squared < reach**2)
         squared = squared[i, j]
     else:
         tree, counts = cKDTree(directions), range(1, min(most, len(directions)) + 1)
-        for count in (counts[: MATCHES.few_neighbours][-1], counts[-1]):  # few are enough unless all of them are near
+        for count in (counts[:FEW_NEIGHBOURS][-1], counts[-1]):  # few are enough unless all of them are near
             distance, nearest = tree.query(bearings, counts[:count], distance_upper_bound=reach)
             if count == len(counts) or not np.isfinite(distance[:, -1]).any():
                 break

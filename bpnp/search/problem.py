@@ -14,10 +14,28 @@ from numpy.typing import NDArray
 
 from bpnp.cameras import Camera, in_front
 from bpnp.poses import MIN_POINTS, SAME, Tolerance, rotation_angle, same_pose
-from bpnp.search.config import INPUTS, PROBLEM
 from bpnp.search.image_statistics import ImageStatistics
 from bpnp.search.propose.symmetries import Motions
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
+
+# Distance from the median beyond which scene points do not affect the origin and the unit.
+BULK = 20.0  # [median distances; not tuned]
+# Largest standard deviation of a rotation prior with which two matches fix a pose.
+TWO_MATCH_DEG = 5.0  # [degrees; not tuned]
+# Largest motion of the image points by the tilt with which two matches fix a pose.
+TWO_MATCH_TILT = 2.0  # [match radii; not tuned]
+MATCH_RADIUS = 3e-3  # radius of a match if the pixel size is unknown [radians; not tuned]
+# Radius of a match if it is known: 3 pixels if the floor is a tenth of a pixel.
+MATCH_FLOORS = 30.0  # [noise floors; convention]
+# Width of a prior within which all poses count as equally near.
+EQUALLY_NEAR_SIGMAS = 2.0  # [standard deviations; convention]
+# Logarithm of the farthest over the nearest possible distance of a scene.
+LOG_DEPTHS = math.log(30.0)  # [nats; convention]
+PAIRS_A_POINT = 32  # largest number of pairs per point for which every pair is computed [pairs; cost]
+LIKELY_CLASS = 0.1  # least likelihood of a possible match by its classes, relative to a mean match [ratio; not tuned]
+LINE_RATIO = 1e-6  # second extent of points over the first, below which they lie on a line [ratio; numerics, float32]
+LEAST_SIGMA = 1e-6  # least standard deviation of a translation of a prior [size of the scene; numerics, float64]
+WIDEST_SIGMA = 1e9  # standard deviation of a translation above which it is unknown [size of the scene; numerics]
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
@@ -170,13 +188,13 @@ class Problem:
             return prior
         rotation, translation = self.from_user(np.asarray(prior.rotation), np.asarray(prior.translation))
         sigma = prior.translation_sigma / self.size
-        if sigma < INPUTS.least_sigma:
-            least = 10.0 ** math.ceil(math.log10(INPUTS.least_sigma * self.size))
+        if sigma < LEAST_SIGMA:
+            least = 10.0 ** math.ceil(math.log10(LEAST_SIGMA * self.size))
             raise ValueError(
                 f"`prior.translation_sigma` is {prior.translation_sigma:g}, for a scene of size {self.size:.2g}; give "
                 f"{least:g} or more, even where the translation is known exactly"
             )
-        sigma = sigma if sigma <= INPUTS.widest_sigma else math.inf
+        sigma = sigma if sigma <= WIDEST_SIGMA else math.inf
         return prior._replace(rotation=rotation, translation=translation, translation_sigma=sigma)
 
     def choose(self, image: Labels | slice = slice(None), scene: Labels | slice = slice(None)) -> "Problem":
@@ -258,7 +276,7 @@ class Problem:
     def may_match(self, i: Labels, j: Labels) -> NDArray[np.bool_]:
         """Return a mask (k,) of pairs i, j (k,) of image and scene points that their labels or classes admit."""
         if self.odds2d is not None and self.classes3d is not None:
-            return np.asarray((self.odds2d[i] * self.classes3d[j]).sum(-1) > PROBLEM.likely)
+            return np.asarray((self.odds2d[i] * self.classes3d[j]).sum(-1) > LIKELY_CLASS)
         if self.labels2d is None or self.labels3d is None:
             return np.ones(len(i), np.bool_)
         label2d, label3d = self.labels2d[i], self.labels3d[j]
@@ -289,7 +307,7 @@ class Problem:
             return None
         chosen, n = self.image.chosen, len(self.points3d)
         groups = label_groups(chosen, self.labels2d, self.labels3d, n)
-        if sum(len(rows) * len(columns) for rows, columns in groups) > PROBLEM.pairs_a_point * (len(chosen) + n):
+        if sum(len(rows) * len(columns) for rows, columns in groups) > PAIRS_A_POINT * (len(chosen) + n):
             return None
         i = [np.repeat(rows, len(columns)) for rows, columns in groups]
         j = [np.tile(columns, len(rows)) for rows, columns in groups]
@@ -339,14 +357,14 @@ class Problem:
     @property
     def has_known_rotation(self) -> bool:
         """True if a prior has the rotation to 5 degrees: a half turn then has 10^3.5 times the false alarms."""
-        return isinstance(self.prior, PosePrior) and self.prior.rotation_sigma_deg <= PROBLEM.turned_deg
+        return isinstance(self.prior, PosePrior) and self.prior.rotation_sigma_deg <= TWO_MATCH_DEG
 
     @property
     def match_radius(self) -> float:
         """Largest residual of a match in an enumeration, radians: `radius`, or 3 pixels if the pixel size is known."""
         if self.radius is not None:
             return self.radius
-        return PROBLEM.radius if self.floor is None else PROBLEM.floors * self.floor
+        return MATCH_RADIUS if self.floor is None else MATCH_FLOORS * self.floor
 
     @property
     def has_known_vertical(self) -> bool:
@@ -358,7 +376,7 @@ class Problem:
             return False
         if min(len(self.bearings), len(self.points3d)) == 3:
             return True
-        return math.radians(self.prior.sigma_deg) * self.image.spread <= PROBLEM.tilted * self.match_radius
+        return math.radians(self.prior.sigma_deg) * self.image.spread <= TWO_MATCH_TILT * self.match_radius
 
     @property
     def fixing_matches(self) -> int:
@@ -375,10 +393,11 @@ class Problem:
         """Return log10 of the fraction F of all poses that are at least as near to the prior as this one.
 
         The nearness is the larger of the deviations of rotation and position from the prior, in standard deviations.
-        Poses within `PROBLEM.sigmas` of them are equally near. The poses are those that fit matches of these points:
-        their rotations fill SO(3) evenly, the directions to the median scene point fill the view, and the logarithms of
-        its distance a factor of 30. For poses of unrelated points, F exceeds a uniform variable in [0, 1]: it is a
-        p-value of the prior, and the NFA is the number of tests times F over the likelihood ratio of the points.
+        Poses within `EQUALLY_NEAR_SIGMAS` of them are equally near. The poses are those that fit matches of these
+        points: their rotations fill SO(3) evenly, the directions to the median scene point fill the view, and the
+        logarithms of its distance a factor of 30. For poses of unrelated points, F exceeds a uniform variable in
+        [0, 1]: it is a p-value of the prior, and the NFA is the number of tests times F over the likelihood ratio of
+        the points.
 
         Args:
             rotation: (3, 3) of the pose.
@@ -387,7 +406,7 @@ class Problem:
         Returns:
             log10 F; 0 without a prior.
         """
-        prior, sigmas = self.prior, PROBLEM.sigmas
+        prior, sigmas = self.prior, EQUALLY_NEAR_SIGMAS
         if prior is None:
             return 0.0
         if isinstance(prior, GravityPrior):
@@ -407,7 +426,7 @@ class Problem:
         if has_position:
             relative = far * prior.translation_sigma / max(float(np.linalg.norm(expected)), 1e-12)
             fraction *= min(1.0, math.pi * relative**2 / self.image.solid_angle)
-            fraction *= min(1.0, 2 * math.atanh(relative) / PROBLEM.log_depths) if relative < 1 else 1.0
+            fraction *= min(1.0, 2 * math.atanh(relative) / LOG_DEPTHS) if relative < 1 else 1.0
         return math.log10(fraction)
 
 
@@ -455,9 +474,9 @@ def label_groups(
 
 
 def in_bulk(points3d: Array) -> NDArray[np.bool_]:
-    """Return a mask of the points (n, 3) that are within `PROBLEM.bulk` median distances of the median."""
+    """Return a mask of the points (n, 3) that are within `BULK` median distances of the median."""
     distance = np.linalg.norm(points3d - np.median(points3d, 0), axis=-1)
-    return np.asarray(distance <= PROBLEM.bulk * float(np.median(distance)))
+    return np.asarray(distance <= BULK * float(np.median(distance)))
 
 
 def units_per_radian(points2d: Array, unit: Unit, camera: Camera | None) -> float:
@@ -489,6 +508,6 @@ def why_degenerate(bearings: Array, points3d: Array, fewest: int = MIN_POINTS) -
         if count < fewest:
             return f"only {count} different {name} point{'' if count == 1 else 's'}: {fewest} or more fix a pose"
     extents = np.linalg.svd(points3d - points3d.mean(0), compute_uv=False)
-    if extents[1] <= PROBLEM.line * extents[0]:
+    if extents[1] <= LINE_RATIO * extents[0]:
         return "the 3D points lie on one line: the camera can turn about it"
     return None

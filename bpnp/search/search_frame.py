@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.poses import MIN_POINTS
 from bpnp.runtime import NEVER, Deadline
-from bpnp.search.config import PROBLEM, DensityShape, SearchSettings
+from bpnp.search.config import DensityShape, SearchSettings
 from bpnp.search.kernels.density_map import DensityMap
 from bpnp.search.kernels.sides import (
     FORWARD,
@@ -22,8 +22,11 @@ from bpnp.search.kernels.sides import (
     with_partners,
 )
 from bpnp.search.kernels.sparse import Tiles, build_tiles
-from bpnp.search.problem import Problem, in_bulk
+from bpnp.search.problem import LINE_RATIO, Problem, in_bulk
 from bpnp.search.starts import Array, GravityPrior, Prior, turned_to
+
+# Weight of a shift along the view over one across it, for an RMS angular radius of one radian; at most 1.
+SHIFT_ALONG = 5.0  # [per radian; not tuned]
 
 Sides = tuple[WeightedBearings, WeightedPoints]
 
@@ -83,7 +86,7 @@ class Scene:
         self.seen = side_of(self.points3d, problem.scores3d, problem.labels3d, problem.cones3d, order)
         self.image, self.seen = with_partners(self.image, self.seen), with_partners(self.seen, self.image)
         self.spread, self.solid_angle = problem.image.spread, problem.image.solid_angle
-        self.shift_weight = np.array([1, 1, min(1, PROBLEM.shift_along * self.spread)], np.float32)
+        self.shift_weight = np.array([1, 1, min(1, SHIFT_ALONG * self.spread)], np.float32)
         fine = settings.fine
         floor = math.inf if problem.floor is None else problem.floor
         self.smallest_scale = min(fine.smallest_scale, fine.relative_smallest * self.spread, floor)
@@ -172,4 +175,4 @@ def degenerate(points: NDArray[np.float64]) -> bool:
         return True
     values = np.linalg.svd(points - points.mean(0), compute_uv=False)
     extent = max(float(np.abs(points).max()), float(values[0]))
-    return bool(values[0] <= 1e-9 * extent or values[1] <= PROBLEM.line * values[0])
+    return bool(values[0] <= 1e-9 * extent or values[1] <= LINE_RATIO * values[0])

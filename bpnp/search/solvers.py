@@ -12,7 +12,7 @@ import numpy as np
 
 from bpnp.runtime import Clock, Deadline
 from bpnp.search.arguments import Array
-from bpnp.search.config import DEFAULT, NETWORKS, TIME, SearchSettings
+from bpnp.search.config import DEFAULT, TIME, SearchSettings
 from bpnp.search.enumeration.search import exceeds_enumeration
 from bpnp.search.matching import failed_solution, finished
 from bpnp.search.plan import Proposals
@@ -23,6 +23,13 @@ from bpnp.search.solution import Solution
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import reasons
 from bpnp.search.verdict.decide import SearchResult
+
+BATCH_ENTRIES = 2**26  # largest assignment matrix of a batch on a GPU, 2D points times 3D points [entries; cost]
+MATCHER_ENTRIES = 2**22  # largest assignment matrix of a packaged matcher; larger ones take seconds [entries; cost]
+# Time of a packaged matcher, over the sum of the squared numbers of 2D and of 3D points; it is not asked with less time
+# left.
+MATCHER_SECONDS = 2e-7  # [seconds; cost]
+LOADING_SECONDS = 2.0  # time to import torch and to load the weights [seconds; cost]
 
 if TYPE_CHECKING:
     import torch
@@ -169,7 +176,7 @@ def _proposals_of_matcher(problem: Problem, seed: int, deadline: Deadline) -> Pr
     undecided and there is time for them.
     """
     weights = VIEW_MATCHER if isinstance(problem.prior, PosePrior) else SCENE_MATCHER
-    too_many = len(problem.bearings) * len(problem.points3d) > NETWORKS.most_cells
+    too_many = len(problem.bearings) * len(problem.points3d) > MATCHER_ENTRIES
     if weights == SCENE_MATCHER and (too_many or problem.prior is not None or problem.network is not None):
         return None
 
@@ -187,7 +194,7 @@ def _proposals_of_matcher(problem: Problem, seed: int, deadline: Deadline) -> Pr
 def _seconds_of_matcher(problem: Problem) -> float:
     """Return the expected time of a packaged matcher, which cannot be interrupted."""
     squares = len(problem.bearings) ** 2 + len(problem.points3d) ** 2
-    return NETWORKS.seconds_a_square * squares + (0.0 if "torch" in sys.modules else NETWORKS.loading)
+    return MATCHER_SECONDS * squares + (0.0 if "torch" in sys.modules else LOADING_SECONDS)
 
 
 def _by_module(
@@ -218,7 +225,7 @@ def _by_module(
                 progress=options.progress_of(i),
             )
             yield i, finished(problem, result, time.perf_counter() - start, options.inlier_threshold, deadline)
-        elif groups and device_of(net).type != "cpu" and cells[i] * (len(groups[-1]) + 1) <= NETWORKS.together:
+        elif groups and device_of(net).type != "cpu" and cells[i] * (len(groups[-1]) + 1) <= BATCH_ENTRIES:
             groups[-1].append(i)
         else:
             groups.append([i])

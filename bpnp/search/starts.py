@@ -7,7 +7,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.search.config import PROBLEM, StartSampling
+from bpnp.search.config import StartSampling
+
+# RMS angular radius above which bearings fill about 220 degrees or more, so that the camera is among the points.
+ALL_AROUND_SPREAD = 0.95  # [radians; derived]
+# Step of the spiral of positions at which searches aim, with radii of `aim_step` times the square root of the number;
+# it leaves no gaps.
+AIM_STEP = 0.16  # [RMS angular radii; not tuned]
 
 Array = NDArray[np.float32]
 
@@ -126,7 +132,7 @@ def draw_poses(
         recipe: Sampling of the point and of the depth.
         prior: Prior of the rotation; None for all rotations.
         rng: Generator.
-        aim: (2,) position in the view, in units of `spread`; the scene point is seen within `PROBLEM.aim_step` of it.
+        aim: (2,) position in the view, in units of `spread`; the scene point is seen within `AIM_STEP` of it.
             None for the axis.
 
     Returns:
@@ -138,14 +144,14 @@ def draw_poses(
     along = np.einsum("si,ij,sj->s", rotation[:, 2], covariance, rotation[:, 2])  # variance along the view
     extent = np.sqrt(np.maximum(np.trace(covariance) - along, 0))
     depth = extent / spread * np.exp(recipe.log_depth * rng.uniform(-1, 1, count))
-    if spread > PROBLEM.all_around:  # the camera is among the points
+    if spread > ALL_AROUND_SPREAD:  # the camera is among the points
         depth *= rng.random(count)
     seen = centroid + recipe.off_centre * rng.random((count, 1)) * (
         points3d[rng.integers(len(points3d), size=count)] - centroid
     )
     towards = np.tile((0.0, 0.0, 1.0), (count, 1))
     if aim is not None:
-        angle, away = 2 * math.pi * rng.random(count), PROBLEM.aim_step * np.sqrt(rng.random(count))
+        angle, away = 2 * math.pi * rng.random(count), AIM_STEP * np.sqrt(rng.random(count))
         towards[:, :2] = spread * (aim + (away * np.stack([np.cos(angle), np.sin(angle)])).T)
         towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
     translation = depth[:, None] * towards - np.einsum("sij,sj->si", rotation, seen)
@@ -168,7 +174,7 @@ def aim_of(number: int) -> NDArray[np.float64]:
     while place >= places:
         place, places = place - places, min(4 * places, 64)
     place, angle = (place + 1) * (number % 2), place * math.pi * (3 - math.sqrt(5))
-    return PROBLEM.aim_step * math.sqrt(place) * np.array([math.cos(angle), math.sin(angle)])
+    return AIM_STEP * math.sqrt(place) * np.array([math.cos(angle), math.sin(angle)])
 
 
 def turned_to(axis: NDArray[np.float64]) -> NDArray[np.float64]:

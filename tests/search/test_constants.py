@@ -12,7 +12,11 @@ import pytest
 from scipy.stats import chi2
 
 from bpnp.search import config
-from bpnp.search.config import ALARMS, MATCHES, PRECISION, REFINER, SYMMETRIES, Repetitions
+from bpnp.search.config import ALARMS, PRECISION, Repetitions
+from bpnp.search.possible_matches import FARTHEST_MATCH, MATCH_REACH
+from bpnp.search.propose.known_matches import MOST_TRIPLES
+from bpnp.search.propose.symmetries import BASES, FIRST_SAMPLED
+from bpnp.search.refine.gauss_newton import DIFFERENCE_STEP
 
 PACKAGE = Path(config.__file__).parents[1]
 FILES = [file for folder in ("search", "maps", "robust") for file in sorted((PACKAGE / folder).rglob("*.py"))]
@@ -73,10 +77,10 @@ def test_derived_constants_follow_from_their_laws() -> None:
     """The numbers that the documentation derives: quantiles, probabilities of a miss, tails of a normal density."""
     assert chi2.ppf(1 - PRECISION.exceeded, 6) == pytest.approx(PRECISION.far, abs=0.1)
     assert ALARMS.farthest**2 / 2 == pytest.approx(9)
-    assert MATCHES.farthest**2 / 2 == pytest.approx(8)
-    assert chi2.cdf(MATCHES.reach**2, 2) == pytest.approx(0.989, abs=5e-4)
-    assert (1 - 0.2**3) ** MATCHES.triples == pytest.approx(3e-4, rel=0.1)
-    assert (1 - 0.5**3) ** SYMMETRIES.bases == pytest.approx(0.014, rel=0.05)
-    assert (1 - 1 / 3) ** SYMMETRIES.first == pytest.approx(1 / 17, rel=0.05)
+    assert pytest.approx(8) == FARTHEST_MATCH**2 / 2
+    assert chi2.cdf(MATCH_REACH**2, 2) == pytest.approx(0.989, abs=5e-4)
+    assert pytest.approx(3e-4, rel=0.1) == (1 - 0.2**3) ** MOST_TRIPLES
+    assert pytest.approx(0.014, rel=0.05) == (1 - 0.5**3) ** BASES
+    assert pytest.approx(1 / 17, rel=0.05) == (1 - 1 / 3) ** FIRST_SAMPLED
     assert (1 - 1 / 27) ** Repetitions.bases_of_scene == pytest.approx(0.008, rel=0.05)
-    assert REFINER.difference == pytest.approx(np.cbrt(np.finfo(float).eps), rel=0.02)
+    assert pytest.approx(np.cbrt(np.finfo(float).eps), rel=0.02) == DIFFERENCE_STEP

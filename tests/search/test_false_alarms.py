@@ -11,7 +11,6 @@ from planted import directions
 from scipy.spatial.transform import Rotation
 
 from bpnp.search import problem as problem_module
-from bpnp.search.config import PROBLEM
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem
 from bpnp.search.starts import GravityPrior, PosePrior
@@ -201,7 +200,7 @@ def test_an_image_point_whose_label_no_scene_point_has_is_an_outlier(
     pairs: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its evidence is that of a point without a near correspondence, log(1 - w), however the density is measured."""
-    monkeypatch.setattr(problem_module, "PROBLEM", replace(PROBLEM, pairs_a_point=pairs))
+    monkeypatch.setattr(problem_module, "PAIRS_A_POINT", pairs)
     points = np.random.default_rng(3).uniform(-1, 1, (12, 3)) + [0, 0, 6]
     labels = np.arange(12)
     problem = Problem(directions(points), points, labels2d=np.r_[99, labels[1:]], labels3d=labels)

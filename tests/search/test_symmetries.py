@@ -325,7 +325,7 @@ def test_no_shift_of_a_repetition_maps_more_than_what_was_left_out_unless_it_is_
 def test_motions_may_be_missing_if_the_registration_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
     points = parts(2, 25, 0, 4)
     assert self_motions(points, 0.02).left_out == 0
-    monkeypatch.setattr(symmetries, "SYMMETRIES", symmetries.SYMMETRIES._replace(most_work=32))
+    monkeypatch.setattr(symmetries, "MOST_WORK", 32)
     assert self_motions(points, 0.02).left_out == 1
 
 

@@ -2,7 +2,6 @@
 compare. The clock is that of the test; work is counted, not timed."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,10 +15,10 @@ from scipy.spatial.transform import Rotation
 from bpnp import Solution, solve, solve_many, verify
 from bpnp.runtime import Clock, Deadline
 from bpnp.search import matching
-from bpnp.search.config import DEFAULT, MATCHES, TIME
+from bpnp.search.config import DEFAULT
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.inputs import problem_from
-from bpnp.search.matching import count_one_to_one, one_to_one
+from bpnp.search.matching import POINTS_A_CHECK, count_one_to_one, one_to_one
 from bpnp.search.problem import Problem
 from bpnp.search.refine import annealing
 from bpnp.search.search_frame import Scene
@@ -56,7 +55,8 @@ def scene_and_pixels(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray,
 
 
 def test_matches_by_components_are_those_of_the_dense_assignment(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(matching, "MATCHES", type(MATCHES)(asked=5, dense=0))
+    monkeypatch.setattr(matching, "POINTS_A_CHECK", 5)
+    monkeypatch.setattr(matching, "DENSE_MATCHES", 0)
     for seed in range(20):
         rng = np.random.default_rng(seed)
         projected, image = rng.uniform(0, 20, (120, 2)), rng.uniform(0, 20, (100, 2))
@@ -85,7 +85,7 @@ def test_matching_stops_at_the_limit(clock: MovedClock, monkeypatch: pytest.Monk
     assert not assignments
     assert not maxima
     assert not fits
-    assert CountedTree.looked_up <= 2 * MATCHES.asked
+    assert CountedTree.looked_up <= 2 * POINTS_A_CHECK
     assert "matches" in solution.stats.unfinished
     assert "search" in solution.stats.unfinished
     assert "not decided in 5 s" in solution.reason
@@ -243,7 +243,7 @@ def test_an_annealing_on_many_points_is_begun_only_if_it_ends_in_time(
     seconds: float, fits: bool, clock: MovedClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A step takes so many seconds of 2.5; the steps after it would take more than one of them."""
-    monkeypatch.setattr(annealing, "TIME", replace(TIME, timed_pairs=0.0))
+    monkeypatch.setattr(annealing, "TIMED_PAIRS", 0.0)
     points, pixels, turn = scene_and_pixels(60)
     rays = np.column_stack([(pixels - K[:2, 2]) / K[0, 0], np.ones(60)])
     problem = Problem.of(rays / np.linalg.norm(rays, axis=1, keepdims=True), points)

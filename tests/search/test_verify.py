@@ -1,7 +1,6 @@
 """`bpnp.verify`: planted poses that are right, a little off, far off, mirrored, or of points that have none."""
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,6 @@ from planted import degrees_between, seen, view_with_outliers
 from scipy.spatial.transform import Rotation
 
 import bpnp
-from bpnp.search.config import PROBLEM
 
 
 @pytest.fixture(scope="module")
@@ -248,6 +246,6 @@ def test_thousands_of_matches_are_judged_as_labels_of_one_pair_each(monkeypatch:
     labels2d, labels3d = np.arange(60) % 7 - 1, np.arange(60) % 9 - 1
     poses = rotation[None], translation[None]
     together = alarms_of(Problem(bearings, points, labels2d=labels2d, labels3d=labels3d), *poses).own
-    monkeypatch.setattr(problem, "PROBLEM", replace(PROBLEM, pairs_a_point=0))
+    monkeypatch.setattr(problem, "PAIRS_A_POINT", 0)
     one_by_one = alarms_of(Problem(bearings, points, labels2d=labels2d, labels3d=labels3d), *poses).own
     assert together == pytest.approx(one_by_one, rel=1e-6)

@@ -26,7 +26,7 @@ VISITED_PAIRS = 256  # [pairs; cost]
 # Matches that a hypothesis may lack against the best one of its stage and still be refined.
 BEHIND = 1.0  # [matches; calibration]
 SKIPPED_MATCHES = 5  # matches of the best pose from which its own triples are not solved again [matches; calibration]
-SKIPPED_BASIN_COUNT = 12  # basin count of the best pose that this requires too [hypotheses; calibration]
+SKIPPED_BASIN_COUNT = 12  # basin count of the best pose that skipping requires too [hypotheses; calibration]
 TIGHTER = 0.55  # factor of the radius from one step of a refinement to the next [factor; calibration]
 FINAL_STEPS = 3  # steps of a refinement at its last radius [steps; calibration]
 # Smallest trace of the rotation between two poses that are the same (`Tolerance`).

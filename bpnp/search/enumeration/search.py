@@ -13,7 +13,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from bpnp.runtime import Clock
-from bpnp.search.config import TIME
 from bpnp.search.enumeration.hypotheses import VISITED_PAIRS, Block, Kept, Work, explore
 from bpnp.search.enumeration.matching import TESTED_RADII, EnumerationTables, Matches
 from bpnp.search.enumeration.points import (
@@ -65,6 +64,11 @@ STAGES = (  # [`Stage`; calibration]
     *(Stage(2, 63, 63, 2.0), Stage(3, 3, 5, 0.5), Stage(3, 4, 7, 0.5), Stage(3, 3, 5, 2.0)),
     *(Stage(3, *near, reach) for near in ((5, 9), (8, 13), (24, 32), (63, 63)) for reach in (0.5, 2.0)),
 )
+HYPOTHESIS_SECONDS = 2e-6  # time of a hypothesis of the enumeration before it is measured [seconds; cost]
+LEAST_PACE = 1e-9  # least measured time of a hypothesis; a coarse clock may measure 0 [seconds; numerics]
+SET_SECONDS = 5e-7  # time of a set of points when a stage of the enumeration begins [seconds; cost]
+FACING_SET_SECONDS = 5e-6  # the same for a set of points with normals [seconds; cost]
+SHORTEST_SECONDS = 5e-5  # time before the deadline in which no hypothesis is begun [seconds; cost]
 ORDERS = {
     2: np.array([[0, 1, 1], [1, 0, 0]]),
     3: np.array([[0, 1, 2], [1, 2, 0], [2, 0, 1], [0, 2, 1], [1, 0, 2], [2, 1, 0]]),
@@ -120,7 +124,7 @@ class Enumeration:
         image = ImageSide(problem.bearings, radius, problem.labels2d, self.reach)
         (prior, heading, log_share), fixing = prior_arrays(problem, scene, image), problem.fixing_matches
         self.problem, self.scene, self.image, self.most = problem, scene, image, most
-        self.fixing, self.solved, self._pace = fixing, 0, TIME.hypothesis
+        self.fixing, self.solved, self._pace = fixing, 0, HYPOTHESIS_SECONDS
         self.ended: Ended | None = None
         self._predicted, self._safe = predicted_pose(problem.prior), 0.0
         self._last_reach = stages[-1].reach if stages else 0.0
@@ -196,7 +200,7 @@ class Enumeration:
         )
         if (stage.matches, min(stage.near3d, self.scene.nearest.shape[1])) in self.scene.tables:
             scene = 0
-        return TIME.built * image + (TIME.built_facing if len(self.scene.arrays.normals) else TIME.built) * scene
+        return SET_SECONDS * image + (FACING_SET_SECONDS if len(self.scene.arrays.normals) else SET_SECONDS) * scene
 
     def begin(self, stage: Stage) -> None:
         """Continue with the hypotheses of a stage, without those solved before."""
@@ -250,7 +254,7 @@ class Enumeration:
     def _advance(self, deadline: float) -> None:
         """Solve some hypotheses of the current stage, begin the next stage, or end."""
         stage = self._stage
-        late = not self._is_checked and deadline - Clock.now() < TIME.shortest
+        late = not self._is_checked and deadline - Clock.now() < SHORTEST_SECONDS
         if not self._is_checked and (late or self.solved > self.most):
             self.ended = "interrupted" if late else "most"
             return
@@ -285,7 +289,7 @@ class Enumeration:
         self._row, self._triangle, solved, visited = self._explored(self._row, self._triangle, most, stop, 1.0)
         self.solved += solved
         if (done := max(solved, visited // VISITED_PAIRS)) >= most:
-            self._pace = max((Clock.now() - start) / done, TIME.least_pace)
+            self._pace = max((Clock.now() - start) / done, LEAST_PACE)
 
     def propose(self, rotation: Array, translation: Array, reach: float) -> None:
         """Refine a pose (3, 3), (3,) from matches within `reach` radii, and keep it."""

@@ -13,8 +13,20 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from bpnp.search.config import COLLINEAR, MATCHES
+from bpnp.search.possible_matches import MATCH_REACH
 from bpnp.search.problem import Problem
+
+FEWEST_ON_LINE = 5  # smallest number of matched points on the line [points; not tuned]
+# A wrong pose explains at least half of its matches by independent coincidences, unless this fraction lies on a line.
+LEAST_ON_LINE = 0.5  # smallest fraction of the matched points on the line [fraction; derived]
+# Largest distance from the line through two points of a point that lies on it, in distances between the two.
+THIN_LINE = 0.05  # [1; not tuned]
+# All pairs miss a line of half of the points with a probability of (1 - 1/4)^256.
+LINE_PAIRS = 256  # number of pairs of points whose lines are tried [pairs; derived]
+ANGLES = 360  # number of angles of a full turn [angles; cost]
+APART_STEPS = 2  # two angles within this many steps are one, since poses are refined [steps; not tuned]
+MOST_OTHERS = 500  # largest number of points off the line that are rotated, the nearest ones [points; cost]
+KEPT_ANGLES = 6  # largest number of competing poses, those that explain the most points [poses; cost]
 
 Array = NDArray[np.float64]
 
@@ -41,10 +53,10 @@ def find_line(points: Array) -> Line | None:
     """Return the line through most of the points, of those through two of them.
 
     Args:
-        points: (n, 3) points; of more than `COLLINEAR.pairs` a sample of this size is used.
+        points: (n, 3) points; of more than `LINE_PAIRS` a sample of this size is used.
 
     Returns:
-        The line, or None if fewer than `COLLINEAR.fewest` points or less than `COLLINEAR.least` of them lie on it.
+        The line, or None if fewer than `FEWEST_ON_LINE` points or less than `LEAST_ON_LINE` of them lie on it.
 
     >>> points = np.concatenate([np.outer(np.linspace(-1, 1, 9), [1, 0, 0]), np.eye(3)])
     >>> line = find_line(points)
@@ -52,13 +64,13 @@ def find_line(points: Array) -> Line | None:
     10
     """
     rng, count = np.random.default_rng(0), len(points)
-    if count < COLLINEAR.fewest:
+    if count < FEWEST_ON_LINE:
         return None
-    if count > COLLINEAR.pairs:
-        points, count = points[rng.choice(count, COLLINEAR.pairs, replace=False)], COLLINEAR.pairs
+    if count > LINE_PAIRS:
+        points, count = points[rng.choice(count, LINE_PAIRS, replace=False)], LINE_PAIRS
     pairs = np.stack(np.triu_indices(count, 1), -1)
-    if len(pairs) > COLLINEAR.pairs:
-        pairs = pairs[rng.choice(len(pairs), COLLINEAR.pairs, replace=False)]
+    if len(pairs) > LINE_PAIRS:
+        pairs = pairs[rng.choice(len(pairs), LINE_PAIRS, replace=False)]
     edges = points[pairs[:, 1]] - points[pairs[:, 0]]
     lengths = np.linalg.norm(edges, axis=-1)
     pairs, axes = pairs[lengths > 0], edges[lengths > 0] / lengths[lengths > 0, None]
@@ -66,10 +78,10 @@ def find_line(points: Array) -> Line | None:
         return None
     offsets = points - points[pairs[:, :1]]
     away = np.linalg.norm(np.cross(offsets, axes[:, None]), axis=-1)
-    radius = COLLINEAR.thin * np.linalg.norm(edges[lengths > 0], axis=-1)
+    radius = THIN_LINE * np.linalg.norm(edges[lengths > 0], axis=-1)
     held = (away <= radius[:, None]).sum(-1)
     best = int(held.argmax())
-    if held[best] < max(COLLINEAR.fewest, COLLINEAR.least * count):
+    if held[best] < max(FEWEST_ON_LINE, LEAST_ON_LINE * count):
         return None
     return Line(points[pairs[best, 0]], axes[best], float(radius[best]))
 
@@ -87,7 +99,7 @@ def rotations_about(
         scale: Standard deviation of its residuals, radians.
 
     Returns:
-        Rotations (c, 3, 3) and translations (c, 3) of at most `COLLINEAR.kept` poses.
+        Rotations (c, 3, 3) and translations (c, 3) of at most `KEPT_ANGLES` poses.
 
     >>> line = np.outer(np.linspace(-1, 1, 9), [1, 0, 0])
     >>> points = np.concatenate([line, [[0.1, 1, 0], [-0.4, 0, 0.9], [0.7, 0.2, -0.6]]])
@@ -100,25 +112,25 @@ def rotations_about(
     """
     origin, axis = rotation @ line.point + translation, rotation @ line.axis
     others = problem.points3d[line.distances(problem.points3d) > line.radius] - line.point
-    others = others[np.argsort(np.linalg.norm(others, axis=-1), kind="stable")[: COLLINEAR.others]] @ rotation.T
+    others = others[np.argsort(np.linalg.norm(others, axis=-1), kind="stable")[:MOST_OTHERS]] @ rotation.T
     if not len(others):
         return np.empty((0, 3, 3)), np.empty((0, 3))
-    step = 2 * math.pi / COLLINEAR.angles
-    angles = step * np.arange(1, COLLINEAR.angles)
+    step = 2 * math.pi / ANGLES
+    angles = step * np.arange(1, ANGLES)
     along = others @ axis
     radial = others - along[:, None] * axis
     cosines, sines = np.cos(angles)[:, None, None], np.sin(angles)[:, None, None]
     moved = origin + along[:, None] * axis + cosines * radial + sines * np.cross(axis, radial)
     depths = np.linalg.norm(moved, axis=-1)
     # From one angle to the next a point moves by its distance from the line times the step.
-    reach = MATCHES.reach * scale + 0.5 * step * np.linalg.norm(radial, axis=-1) / depths
+    reach = MATCH_REACH * scale + 0.5 * step * np.linalg.norm(radial, axis=-1) / depths
     away, _ = cKDTree(problem.bearings).query(moved / depths[..., None])
     votes = (away < reach).sum(-1)
     kept: list[int] = []
     for k in np.argsort(-votes, kind="stable")[: (votes > 0).sum()].tolist():
-        if all(abs(k - other) > COLLINEAR.apart for other in kept):
+        if all(abs(k - other) > APART_STEPS for other in kept):
             kept.append(k)
-        if len(kept) == COLLINEAR.kept:
+        if len(kept) == KEPT_ANGLES:
             break
     turns = Rotation.from_rotvec(angles[kept, None] * axis).as_matrix().reshape(-1, 3, 3)
     return turns @ rotation, turns @ (translation - origin) + origin

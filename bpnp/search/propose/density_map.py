@@ -25,12 +25,17 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr, ndtri
 
 from bpnp.runtime import in_time
-from bpnp.search.config import SMOOTHING, DensitySearch, DensityShape
+from bpnp.search.config import DensitySearch, DensityShape
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.kernels.density_map import DensityMap, add_up
 from bpnp.search.refine.annealing import anneal_on_points, perturb_about_centroid
 from bpnp.search.search_frame import Scene
 from bpnp.search.starts import PosePrior, Prior, aim_of, draw_poses
+
+KERNEL_SIGMAS = 5.0  # distance beyond which a smoothing kernel is 0 [standard deviations; numerics]
+# Half side of the largest density map: 120 degrees off the axis.
+WIDEST_MAP = 2 * math.tan(math.radians(60))  # [stereographic coordinate; convention]
+NARROW_CELLS = 4.0  # standard deviation below which a smoothing is computed cell by cell [cells; cost]
 
 
 def search_near(scene: Scene, prior: PosePrior, density: DensitySearch | None = None) -> Hypotheses:
@@ -286,7 +291,7 @@ def _draw_density_map(scene: Scene, shape: DensityShape, scale: float) -> Densit
     d = scene.offsets.astype(np.float64)
     at = 2 * d[:, :2] / np.maximum(2 + d[:, 2:], 1e-9)
     scale *= scene.spread
-    half = min(float(np.abs(at).max()) + 3 * scale, SMOOTHING.widest)
+    half = min(float(np.abs(at).max()) + 3 * scale, WIDEST_MAP)
     cells = min(math.ceil(2 * half * shape.cells / scale), shape.most_cells)
     per_cell = cells / (2 * half)
     within = (np.abs(at) < half).all(1)
@@ -315,10 +320,10 @@ def _smoothed(values: NDArray[np.float32], cells: float) -> NDArray[np.float32]:
     A wide filter has two steps of half the variance, the first one to a coarser grid, as products of matrices. Sums at
     a spacing of 0.6 standard deviations are exact to 3e-6, and cost a tenth.
     """
-    if cells < SMOOTHING.narrow:
+    if cells < NARROW_CELLS:
         return np.asarray(gaussian_filter(values, cells, mode="constant"))
     step = 0.6 * cells
     away = (np.arange(len(values))[:, None] - np.arange(-3 * cells, len(values) + 3 * cells, step)) / cells
     weights = math.sqrt(step / math.pi) / cells * np.exp(-(away**2))
-    kernel = np.where(np.abs(away) < SMOOTHING.wide, weights, 0).astype(np.float32)
+    kernel = np.where(np.abs(away) < KERNEL_SIGMAS, weights, 0).astype(np.float32)
     return np.asarray(kernel @ (kernel.T @ values @ kernel) @ kernel.T)

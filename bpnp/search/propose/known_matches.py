@@ -11,17 +11,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.poses import SAME, distinct, polar_coordinates
-from bpnp.search.config import MATCHES
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.possible_matches import score_pose
 from bpnp.search.problem import Problem
 from bpnp.search.propose.minimal_solvers import p3p_poses
-from bpnp.search.refine.gauss_newton import match_equations, refine
+from bpnp.search.refine.gauss_newton import FIRST_DAMPING, match_equations, refine
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
 FIXING = 3  # matches that fix a pose [matches; derived]
+# With a fifth of the matches correct, all of them miss a correct triple 3 times in 10,000.
+MOST_TRIPLES = 1000  # largest number of triples of given matches [triples; derived]
+SCORED_MATCHES = 500  # number of given matches on which the poses of the triples are compared [matches; cost]
+REFINED_TRIPLES = 6  # number of poses of triples that are refined [poses; not tuned]
+REFINEMENT_STEPS = 10  # steps of a refinement to given matches [steps; numerics]
+REWEIGHTINGS = 3  # number of reweightings of the given matches [rounds; not tuned]
+WRONG_FRACTION = 0.1  # expected fraction of wrong given matches [fraction; not tuned]
+# Difference within which refined poses are one optimum, in tolerances of equal poses.
+SAME_OPTIMUM = 0.05  # [fraction; not tuned]
+SETTLED_CHANGE = 1e-6  # relative change of a sum of squares that ends the steps [ratio; numerics]
+NEGLIGIBLE_SUM = 1e-24  # sum of squares that ends the steps [radians squared; numerics]
 
 
 def known_matches(problem: Problem) -> tuple[Labels, Labels] | None:
@@ -51,7 +61,7 @@ def poses_of_matches(problem: Problem, i: Labels, j: Labels, seed: int = 0) -> H
         problem: Points of the problem.
         i: (k,) indices of image points, more than three.
         j: (k,) indices of their scene points.
-        seed: Of the triples that are drawn where there are more than `MATCHES.triples`.
+        seed: Of the triples that are drawn where there are more than `MOST_TRIPLES`.
 
     Returns:
         The least-squares poses of all matches, then those of the matches that agree, each with the fewest residuals
@@ -66,17 +76,17 @@ def poses_of_matches(problem: Problem, i: Labels, j: Labels, seed: int = 0) -> H
     poses = poses[np.isfinite(poses).all((1, 2))]
     if not len(poses):
         return Hypotheses.empty()
-    some = np.arange(len(i)) if len(i) <= MATCHES.scored else rng.choice(len(i), MATCHES.scored, replace=False)
+    some = np.arange(len(i)) if len(i) <= SCORED_MATCHES else rng.choice(len(i), SCORED_MATCHES, replace=False)
     squared = _squared(rays[some], points[some], poses)
     scales = _scales(problem)
     density = 1 / problem.image.solid_angle
     agreeing, scale_of = _agreement(squared, scales, density)
     cost = np.sort(np.minimum(squared, 1.0), 1)[:, : -(len(some) // 4) or None].sum(1)
-    every = poses[np.argsort(cost)[: MATCHES.refined]]
+    every = poses[np.argsort(cost)[:REFINED_TRIPLES]]
     every = _refined(rays, points, every, np.ones((len(every), len(i))))
-    best = np.argsort(-agreeing, kind="stable")[: MATCHES.refined]
+    best = np.argsort(-agreeing, kind="stable")[:REFINED_TRIPLES]
     fitted, scale = poses[best], scales[scale_of[best]]
-    for _ in range(MATCHES.reweighted):
+    for _ in range(REWEIGHTINGS):
         squared = _squared(rays, points, fitted)
         weight = _inlier_probability(squared, scale[:, None], density)
         count = weight.sum(1)
@@ -84,7 +94,7 @@ def poses_of_matches(problem: Problem, i: Labels, j: Labels, seed: int = 0) -> H
         scale = np.clip(np.sqrt((weight * squared).sum(1) / np.maximum(free, 1e-3)), scales[0], scales[-1])
         enough = count > FIXING + 0.5
         fitted, scale, weight = fitted[enough], scale[enough], weight[enough]
-        fitted = _refined(rays, points, fitted, weight, MATCHES.steps // 2)
+        fitted = _refined(rays, points, fitted, weight, REFINEMENT_STEPS // 2)
     ends = []
     for group in (every, fitted):
         if len(group):
@@ -97,13 +107,13 @@ def poses_of_matches(problem: Problem, i: Labels, j: Labels, seed: int = 0) -> H
 
 
 def _triples(count: int, rng: np.random.Generator) -> Labels:
-    """Return all triples (t, 3) of `count` matches, or `MATCHES.triples` of them."""
-    if math.comb(count, 3) <= MATCHES.triples:
+    """Return all triples (t, 3) of `count` matches, or `MOST_TRIPLES` of them."""
+    if math.comb(count, 3) <= MOST_TRIPLES:
         a, b, c = np.meshgrid(*[np.arange(count)] * 3, indexing="ij")
         return np.argwhere((a < b) & (b < c))
     if count < 64:
-        return np.argsort(rng.random((MATCHES.triples, count)), 1)[:, :3]
-    return rng.integers(count, size=(MATCHES.triples, 3))
+        return np.argsort(rng.random((MOST_TRIPLES, count)), 1)[:, :3]
+    return rng.integers(count, size=(MOST_TRIPLES, 3))
 
 
 def _scales(problem: Problem) -> Array:
@@ -121,8 +131,8 @@ def _squared(rays: Array, points: Array, poses: Array) -> Array:
 
 def _inlier_probability(squared: Array, scale: Array, density: float) -> Array:
     """Return the probability that a residual belongs to an inlier, not to a point anywhere in view."""
-    inlier = (1 - MATCHES.wrong) * np.exp(-0.5 * squared / scale**2) / (2 * math.pi * scale**2)
-    return np.asarray(inlier / (inlier + MATCHES.wrong * density))
+    inlier = (1 - WRONG_FRACTION) * np.exp(-0.5 * squared / scale**2) / (2 * math.pi * scale**2)
+    return np.asarray(inlier / (inlier + WRONG_FRACTION * density))
 
 
 def _agreement(squared: Array, scales: Array, density: float) -> tuple[Array, Labels]:
@@ -133,12 +143,12 @@ def _agreement(squared: Array, scales: Array, density: float) -> tuple[Array, La
     evidence = np.empty((len(squared), len(scales)))
     for s, scale in enumerate(scales.tolist()):
         kernel = np.exp(-0.5 * squared / scale**2) / (2 * math.pi * scale**2)
-        terms = np.log(MATCHES.wrong + (1 - MATCHES.wrong) * kernel / density)
+        terms = np.log(WRONG_FRACTION + (1 - WRONG_FRACTION) * kernel / density)
         evidence[:, s] = np.sort(terms, 1)[:, :-FIXING].sum(1)
     return evidence.max(1), evidence.argmax(1)
 
 
-def _refined(rays: Array, points: Array, poses: Array, weights: Array, most: int = MATCHES.steps) -> Array:
+def _refined(rays: Array, points: Array, poses: Array, weights: Array, most: int = REFINEMENT_STEPS) -> Array:
     """Return poses (h, 4, 3) after Levenberg-Marquardt steps on weighted residuals of unit rays (k, 3)."""
     if not len(poses):
         return poses
@@ -148,8 +158,8 @@ def _refined(rays: Array, points: Array, poses: Array, weights: Array, most: int
         model.state(poses[:, :3], poses[:, 3]),
         match_equations(model, rays, points, weights),
         [1.0] * most,
-        settled=lambda last: bool((np.abs(last.gain) <= MATCHES.settled * last.before.cost + MATCHES.negligible).all()),
-        damping=MATCHES.damping,
+        settled=lambda last: bool((np.abs(last.gain) <= SETTLED_CHANGE * last.before.cost + NEGLIGIBLE_SUM).all()),
+        damping=FIRST_DAMPING,
         adaptive=True,
     )
     return np.concatenate([end.state.rotation, end.state.centroid[:, None]], 1)
@@ -167,4 +177,4 @@ def _scored(problem: Problem, i: Labels, j: Labels, rotation: Array, translation
     score, count = (np.array([one[k] for one in found]) for k in (0, 1))
     hypotheses = Hypotheses.from_poses(rotation, translation, log_likelihood=score, match_count=count, scale=scale)
     seen, order = polar_coordinates(rotation @ problem.centre3d + translation), -np.arange(float(len(score)))
-    return hypotheses[distinct(rotation, seen, order, len(score), *SAME.times(MATCHES.converged))]
+    return hypotheses[distinct(rotation, seen, order, len(score), *SAME.times(SAME_OPTIMUM))]

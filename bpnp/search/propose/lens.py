@@ -9,10 +9,23 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.config import LENS, OtherFocal
+from bpnp.search.config import OtherFocal
 from bpnp.search.pose_model import PoseModel, PoseState
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.refine.gauss_newton import refine, soft_equations
+
+CORRESPONDENCES = 2  # number of scene points that may correspond to each image point [points; not tuned]
+MOST_ZOOM_STEP = 0.2  # largest step of the logarithm of the scale factor [nats; not tuned]
+MOST_BEND_STEP = 0.1  # largest step of the relative shift of the outermost point [fraction; not tuned]
+# Change of the logarithm of the scale factor below which no other round of steps is taken.
+SAME_ZOOM = 0.01  # [nats; not tuned]
+MOST_ROUNDS = 4  # largest number of rounds [rounds; not tuned]
+# Change of the logarithm of the scale factor that ends the last steps, with all points.
+SETTLED_ZOOM = 2e-5  # [nats; numerics]
+MOST_LAST_STEPS = 40  # largest number of last steps [steps; numerics]
+FIRST_WIDTHS = (4.0,)  # scales of the steps before the first round [scales of the residuals; not tuned]
+ROUND_WIDTHS = (4.0, 2.0, 2.0, 1.0, 1.0)  # scales of the steps of each round [scales of the residuals; not tuned]
+LENS_DAMPING = 1e-6  # damping, a fraction of the diagonal of the normal equations [fraction; numerics]
 
 Array = NDArray[np.float64]
 
@@ -74,30 +87,30 @@ def fit_lens(
     model = lens_model(problem, bends=radial is not None)
     zoom = model.columns["log_focal"].start
     largest = np.full(model.size, math.inf)
-    largest[zoom] = LENS.most_zoom
+    largest[zoom] = MOST_ZOOM_STEP
     if radial is not None:
         outermost = float(((problem.bearings[:, :2] / problem.bearings[:, 2:]) ** 2).sum(-1).max())
-        largest[model.columns["radial"]] = LENS.most_bend / outermost
+        largest[model.columns["radial"]] = MOST_BEND_STEP / outermost
     chosen = problem.image.chosen
     some = chosen[:: max(math.ceil(len(chosen) / OtherFocal.bearings), 1)]
-    linearise = soft_equations(model, [problem], chosen=some, most=LENS.correspondences)
+    linearise = soft_equations(model, [problem], chosen=some, most=CORRESPONDENCES)
     state = PoseState(rotation, centre3d, radial=radial or 0.0)
-    for widths in (LENS.first + LENS.widths, *[LENS.widths] * (LENS.most_rounds - 1)):
+    for widths in (FIRST_WIDTHS + ROUND_WIDTHS, *[ROUND_WIDTHS] * (MOST_ROUNDS - 1)):
         scales = [width * scale for width in widths]
-        end = refine(model, state, linearise, scales, damping=LENS.damping, largest=largest)
+        end = refine(model, state, linearise, scales, damping=LENS_DAMPING, largest=largest)
         if end.lost:
             return None
         moved = math.log(end.state.zoom / state.zoom)
         state = end.state
-        if abs(moved) < LENS.same_zoom:
+        if abs(moved) < SAME_ZOOM:
             break
     end = refine(
         model,
         state,
-        soft_equations(model, [problem], most=LENS.correspondences),
-        [scale] * LENS.most_steps,
-        settled=lambda last: bool(abs(last.step[zoom]) < LENS.settled_zoom),
-        damping=LENS.damping,
+        soft_equations(model, [problem], most=CORRESPONDENCES),
+        [scale] * MOST_LAST_STEPS,
+        settled=lambda last: bool(abs(last.step[zoom]) < SETTLED_ZOOM),
+        damping=LENS_DAMPING,
         largest=largest,
     )
     if end.lost:

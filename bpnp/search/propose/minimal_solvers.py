@@ -11,8 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.runtime import compiler, in_threads
-from bpnp.search.config import TRIANGLES
 from bpnp.search.kernels.vectors import cross, rotated
+
+# Squared height of a triangle over its squared longest side, at which it is a line.
+FLAT_TRIANGLE = 1e-12  # [ratio; numerics]
+SIDE_TOLERANCE = 1e-6  # largest error of the squared sides, in units of the longest [ratio; numerics]
+ROUNDING = 1e-12  # relative size of a discriminant that counts as zero [ratio; numerics]
+# Sine of both rays' height below which a prior vertical does not determine their depths.
+LEVEL_SINE = 1e-6  # [1; numerics]
+# Horizontal fraction of the vector between two points below which it does not determine the heading.
+UPRIGHT_FRACTION = 1e-3  # [fraction; numerics]
 
 compiled = compiler()
 part = compiler(part=True, forceinline=True)  # called by compiled functions alone
@@ -51,7 +59,7 @@ def triangles_of(points: Array, triples: NDArray[np.int64]) -> Triangles:
     normal /= np.sqrt(np.maximum(height2, 1e-300))[:, None]
     a, b = (((p[:, 0] - p[:, k]) ** 2).sum(-1) / length2 for k in (1, 2))
     sides, frames = np.stack([a, b, np.sqrt(length2)], -1), np.stack([along, np.cross(normal, along), normal], 1)
-    return Triangles(triples, sides, frames, p.mean(1), np.where(height2 > TRIANGLES.flat * length2, 3, 0))
+    return Triangles(triples, sides, frames, p.mean(1), np.where(height2 > FLAT_TRIANGLE * length2, 3, 0))
 
 
 def p3p_poses(rays: Array, points: Array) -> Array:
@@ -125,7 +133,7 @@ def solve_p3p(rays: Any, seen: Any, chords: Any, triangles: Any, t: int, poses: 
         ax, ay, az = x1 - x2, y1 - y2, z1 - z2
         nx, ny, nz = cross(ax, ay, az, x0 - x2, y0 - y2, z0 - z2)
         length2, area2 = ax * ax + ay * ay + az * az, nx * nx + ny * ny + nz * nz
-        if not area2 > TRIANGLES.flat * length2 * length2:
+        if not area2 > FLAT_TRIANGLE * length2 * length2:
             continue
         scale, across = 1 / math.sqrt(length2), 1 / math.sqrt(area2)
         ax, ay, az, nx, ny, nz = ax * scale, ay * scale, az * scale, nx * across, ny * across, nz * across
@@ -267,7 +275,7 @@ def _meet(line: Any, conics: Any, chords: Any, a: float, b: float, poses: Any, c
     if _size(other) > _size((q, h, k)):
         q, h, k = other
     discriminant = h * h - q * k
-    if not discriminant > -TRIANGLES.rounding * (h * h + abs(q * k)):
+    if not discriminant > -ROUNDING * (h * h + abs(q * k)):
         return count
     larger = -(h + math.copysign(math.sqrt(max(discriminant, 0.0)), h))
     for root in range(2):
@@ -319,7 +327,7 @@ def anneal_to_end(d0: float, d1: float, d2: float, chords: Any, a: float, b: flo
         d0 -= scale * (a2 * (e0 * a1 - b0 * e1) + b0 * b1 * e2)
         d1 -= scale * (a0 * (e1 * a2 - b1 * e2) + b1 * b2 * e0)
         d2 -= scale * (a1 * (e2 * a0 - b2 * e0) + b2 * b0 * e1)
-    return bool(worst < TRIANGLES.tolerance and depths[0] > 0 and depths[1] > 0 and depths[2] > 0)
+    return bool(worst < SIDE_TOLERANCE and depths[0] > 0 and depths[1] > 0 and depths[2] > 0)
 
 
 @part
@@ -344,11 +352,11 @@ def solve_p2p(i: int, j: int, a: int, b: int, heading: Any, rays: Any, points: A
         The number of poses, up to two.
     """
     f, g, p, q = heading.rays[i], heading.rays[j], heading.points[a], heading.points[b]
-    if max(abs(f[2]), abs(g[2])) < TRIANGLES.level:
+    if max(abs(f[2]), abs(g[2])) < LEVEL_SINE:
         return 0
     rise, along0, along1 = q[2] - p[2], q[0] - p[0], q[1] - p[1]
     length2 = along0 * along0 + along1 * along1
-    if length2 < TRIANGLES.upright * TRIANGLES.upright * (length2 + rise * rise):
+    if length2 < UPRIGHT_FRACTION * UPRIGHT_FRACTION * (length2 + rise * rise):
         return 0
     # R (q - p) lies in the plane of the rays; the prior rotation must bring it there within its largest error.
     n0, n1, n2 = cross(f[0], f[1], f[2], g[0], g[1], g[2])

@@ -11,13 +11,20 @@ from torch import Tensor, nn
 from bpnp.runtime import Deadline
 from bpnp.search.arguments import Array
 from bpnp.search.competing_poses import judge_with_competitors
-from bpnp.search.config import DEFAULT, NETWORKS
+from bpnp.search.config import DEFAULT
 from bpnp.search.problem import Problem
 from bpnp.search.propose.given import score_given
 from bpnp.search.search_frame import Scene
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict.decide import SearchResult, judge, no_pose
 from bpnp.types import Batch
+
+# Largest distance from the origin at which float32 is precise enough.
+FARTHEST_ORIGIN = 100.0  # [sizes of the scene; numerics]
+# With 2 % correct matches one in 10^5 is correct, and more nearly so.
+DRAWN_TRIPLES = 80_000  # match triples per assignment [triples; derived]
+NETWORK_SIGMA_DEG = 10.0  # standard deviation of the rotation of a network's pose [degrees; not tuned]
+NETWORK_SIGMA_SHIFT = 0.1  # standard deviation of its translation, as a fraction of the distance [fraction; not tuned]
 
 if TYPE_CHECKING:
     from bpnp.models.matcher import Matcher
@@ -53,8 +60,8 @@ def pose_prior(net: nn.Module, problem: Problem, deadline: Deadline) -> PosePrio
         return None
     rotation, translation = asked.best
     centre = rotation @ problem.points3d.mean(0) + translation
-    sigma = NETWORKS.sigma_shift * float(np.linalg.norm(centre)) + 1e-12
-    return PosePrior(rotation, translation, NETWORKS.sigma_deg, sigma)
+    sigma = NETWORK_SIGMA_SHIFT * float(np.linalg.norm(centre)) + 1e-12
+    return PosePrior(rotation, translation, NETWORK_SIGMA_DEG, sigma)
 
 
 def predicted(net: nn.Module, members: list[Problem], deadline: Deadline) -> list[SearchResult]:
@@ -96,7 +103,7 @@ def proposed(net: "Matcher", problem: Problem, seed: int) -> tuple[Array, Array]
         assignment.sqrt(),
         batch.points2d,
         batch.points3d,
-        triples=NETWORKS.drawn,
+        triples=DRAWN_TRIPLES,
         seed=seed,
         aligned=net.frame == "view",
     )
@@ -156,7 +163,7 @@ def view_for(net: nn.Module, problem: Problem) -> NetworkFrame:
 
 def _near_origin(problem: Problem) -> Array:
     """Return the origin of a problem in the user's coordinates; 0 if it is too far away for float32."""
-    is_far = problem.origin is None or np.linalg.norm(problem.origin) > NETWORKS.far * problem.size
+    is_far = problem.origin is None or np.linalg.norm(problem.origin) > FARTHEST_ORIGIN * problem.size
     return np.zeros(3) if is_far else np.asarray(problem.origin)
 
 

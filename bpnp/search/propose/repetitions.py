@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from bpnp.runtime import NEVER, Deadline
-from bpnp.search.config import MATCHES, Evidence, Repetitions
+from bpnp.search.config import Evidence, Repetitions
 from bpnp.search.hypotheses import Hypotheses
+from bpnp.search.possible_matches import MATCH_REACH
 from bpnp.search.problem import Problem
 from bpnp.search.propose.collinear import find_line, rotations_about
 from bpnp.search.propose.symmetries import Motions, matching_tolerance, mirror_pose, reflection, self_motions
@@ -110,7 +111,7 @@ def matched_points(problem: Problem, rotation: Array, translation: Array, scale:
     camera = problem.points3d @ rotation.T + translation
     depth = np.linalg.norm(camera, axis=-1)
     away, nearest = cKDTree(camera / np.maximum(depth, 1e-300)[:, None]).query(problem.bearings)
-    return np.unique(nearest[away < MATCHES.reach * scale])
+    return np.unique(nearest[away < MATCH_REACH * scale])
 
 
 Frozen = tuple[bytes, str, tuple[int, ...]] | None
@@ -188,7 +189,7 @@ def _is_far(
     seen = camera.mean(0)
     mirrored = seen + (camera - seen) @ reflection(seen)
     one, other = (x / np.maximum(np.linalg.norm(x, axis=-1, keepdims=True), 1e-300) for x in (camera, mirrored))
-    near = np.linalg.norm(one - other, axis=-1) < MATCHES.reach * scale
+    near = np.linalg.norm(one - other, axis=-1) < MATCH_REACH * scale
     return float(near.mean()) >= settings.repetitions.symmetric
 
 
@@ -280,7 +281,7 @@ def repetition_margins(
     missing = min((int((logs[0] < 0).sum()) + 1) / (count + 2), (count * (1 - fraction) + 1) / (count + 2))
     missing = min(missing, limits.most_missing)
     most = math.log((1 - missing) / missing)
-    is_repeated = _is_repeated(problem, best, repeated, MATCHES.reach * scale)
+    is_repeated = _is_repeated(problem, best, repeated, MATCH_REACH * scale)
     counted = np.stack([_among(problem, one) for one in seen[1:]]) | ~is_repeated
     return np.asarray(np.where(counted, np.clip(logs[0] - logs[1:], -most, most), 0).sum(-1) / math.log(10))
 

@@ -27,9 +27,40 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bpnp.poses import distinct
-from bpnp.search.config import SYMMETRIES
 from bpnp.search.kernels.neighbours import HashedPoints, hashed, lies_on
 from bpnp.search.kernels.vectors import compiled, part
+
+NEIGHBOURS = 96  # number of neighbours of a point that a base and its matches come from [points; not tuned]
+NEIGHBOURS_OF_MANY = 48  # the same for scenes of more than `MANY_POINTS` [points; cost]
+MANY_POINTS = 500  # number of points from which a scene has many [points; cost]
+# At most (1 - 1/8)^32 = 1.4 % of the registrations miss a motion of half of the points.
+BASES = 32  # number of bases [bases; derived]
+COMPACT = 4  # every other base is drawn from this fraction (1 / `COMPACT`) of a neighbourhood [1; not tuned]
+DRAWN_TRIANGLES = 4  # number of triangles drawn for a base; the largest is taken [triangles; not tuned]
+# Three fix a motion and are no evidence of it.
+FEWEST_MOVED = 5  # smallest number of moved points that lie on others [points; derived]
+# Smallest number of moved points that lie on others, for motions of another scale.
+FEWEST_MOVED_SCALED = 8  # [points; calibration]
+# One of 17 motions of a third of the points fails.
+FIRST_SAMPLED = 7  # number of sampled points; at least one must confirm a motion [points; derived]
+BASES_SCALED = 16  # largest number of bases that are matched at other scales, at most a third of all [bases; cost]
+MOST_SCALED_WORK = 2000  # largest number of these bases times points [bases * points; cost]
+CHECKED_POINTS = 32  # number of sampled points that confirm a motion before all points do [points; cost]
+# Largest number of pairs of points that are compared for all bases together, some 0.1 s; the rest is left out.
+MOST_WORK = 30_000_000  # [pairs; cost]
+PAIRS_A_SAMPLE = 8  # number of pairs that take as long as a sampled point [pairs; cost]
+MOST_FOUND = 4096  # number of motions of all bases together that are ranked [motions; cost]
+REFINED_MOTIONS = 48  # number of motions, those of the largest fraction first, that are refined [motions; cost]
+REFINED_MOTIONS_SCALED = 8  # number of motions of another scale that are refined [motions; cost]
+# Largest error of a point under a near symmetry, as a fraction of the extent.
+NEAR_SYMMETRY = 0.02  # [fraction; convention]
+# Largest error in spacings of the points: at a quarter of the spacing 1 to 6 % of the points lie on others by chance.
+TOLERANCE_SPACINGS = 0.25  # [spacings; derived]
+FLAT_SCENE = 0.1  # largest third extent of a flat scene, as a fraction of its second extent [fraction; not tuned]
+REFINEMENT_ROUNDS = 3  # rounds of the refinement: nearest points, rigid fit [rounds; not tuned]
+# Angle between the rotations of two motions below which they can be one; their shifts must be within four tolerances
+# too.
+SAME_MOTION_DEG = 3.0  # [degrees; not tuned]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -127,7 +158,7 @@ class Motions(NamedTuple):
         moved, reach = self.apply(points3d[sources]), tolerance * np.minimum(self.scale, 1)[:, None]
         near, _ = _mapped(cKDTree(points3d), moved, self.rotation, sources, reach, labels3d, normals3d)
         fraction = near.mean(-1) if len(sources) else np.zeros(len(near))
-        fewest = np.where(self.scale == 1, SYMMETRIES.fewest, SYMMETRIES.fewest_scaled)
+        fewest = np.where(self.scale == 1, FEWEST_MOVED, FEWEST_MOVED_SCALED)
         order = np.argsort(-fraction, kind="stable")
         order = order[(fraction >= np.maximum(least, fewest / max(len(sources), 1)))[order]]
         # As if all points that they map were sources.
@@ -149,13 +180,13 @@ def mirror_pose(points3d: Array, rotation: Array, translation: Array) -> tuple[A
         rotation: (3, 3), translation: (3,) of a pose.
 
     Returns:
-        Rotation (3, 3) and translation (3,), or None where the scene is not flat (`SYMMETRIES.flat`).
+        Rotation (3, 3) and translation (3,), or None where the scene is not flat (`FLAT_SCENE`).
 
     Source: D. Oberkampf, D. DeMenthon, L. Davis, Iterative pose estimation using coplanar feature points, CVIU 1996.
     """
     centroid = points3d.mean(0)
     _, extents, axes = np.linalg.svd(points3d - centroid, full_matrices=False)
-    if len(points3d) < 3 or extents[2] > SYMMETRIES.flat * extents[1]:
+    if len(points3d) < 3 or extents[2] > FLAT_SCENE * extents[1]:
         return None
     flipped = reflection(axes[2])
     motions = Motions(flipped[None], (centroid - flipped @ centroid)[None], np.ones(1), np.ones(1), 0.0)
@@ -171,7 +202,7 @@ def self_motions(
     labels3d: Indices | None = None,
     normals3d: Array | None = None,
     least: float = 0.3,
-    bases: int = SYMMETRIES.bases,
+    bases: int = BASES,
     factor: float | int = 1,
     reflected: bool = False,
 ) -> Motions:
@@ -219,7 +250,7 @@ def self_motions(
     rigid = _motions(scene, tree, moved, chosen, tolerance, least, 1.0, hand, features)
     if factor == 1 or reflected:
         return rigid
-    several = min(bases // 3, SYMMETRIES.bases_scaled, SYMMETRIES.most_scaled // len(points))
+    several = min(bases // 3, BASES_SCALED, MOST_SCALED_WORK // len(points))
     chosen = _longer_first(points, chosen[:several])
     scaled = _motions(scene, tree, moved, chosen, tolerance, least, float(factor), hand, features)
     both = Motions.concatenate([rigid, scaled])
@@ -242,13 +273,13 @@ def _motions(
     With the hand -1 they are reflections.
     """
     rigid, own = factor == 1, scene.points[moved]
-    fewest, count = SYMMETRIES.fewest, SYMMETRIES.refined
+    fewest, count = FEWEST_MOVED, REFINED_MOTIONS
     if not rigid:
-        fewest, count = SYMMETRIES.fewest_scaled, SYMMETRIES.refined_scaled
+        fewest, count = FEWEST_MOVED_SCALED, REFINED_MOTIONS_SCALED
     least = max(least, fewest / len(moved))
-    sample, room = _sample(moved), SYMMETRIES.most_found
+    sample, room = _sample(moved), MOST_FOUND
     found = Found(np.zeros((room, 3, 3)), np.zeros((room, 3)), np.zeros(room))
-    confirming, most = math.ceil(0.7 * least * len(sample)), SYMMETRIES.most_work // max(len(bases), 1)
+    confirming, most = math.ceil(0.7 * least * len(sample)), MOST_WORK // max(len(bases), 1)
     total, complete = _register(
         scene, bases, sample, tolerance, confirming, factor, hand, most, found, np.empty((4, 3, 3))
     )
@@ -278,7 +309,7 @@ def _distinct(motions: Motions, own: Array, tolerance: float, count: int) -> Ind
     size = extent(own)
     offsets = motions.apply(np.median(own, 0)[None])[:, 0] / size
     places = np.column_stack([offsets, motions.scale])
-    limits = SYMMETRIES.same_deg, max(4 * tolerance / size, 1e-6)
+    limits = SAME_MOTION_DEG, max(4 * tolerance / size, 1e-6)
     return distinct(motions.rotation, places, motions.fraction, count, *limits)
 
 
@@ -300,13 +331,13 @@ def matching_tolerance(points3d: Array, sources: Indices, noise: float) -> float
         the latter; at most `spacing` of the median distance of a source from its nearest neighbour, beyond which points
         lie on others by chance.
     """
-    least = SYMMETRIES.near_symmetry * extent(points3d[sources])
+    least = NEAR_SYMMETRY * extent(points3d[sources])
     if not least > 0:
         return 0.0
     steps = math.ceil(math.log2(max(3 * noise / least, 1.0)))
     nearest = cKDTree(points3d).query(points3d[sources], 2)[0][:, 1]
     spacing = float(np.median(nearest[nearest > 0])) if nearest.any() else 0.0
-    return min(2.0**steps * least, SYMMETRIES.spacing * spacing)
+    return min(2.0**steps * least, TOLERANCE_SPACINGS * spacing)
 
 
 class SceneIndex(NamedTuple):
@@ -352,8 +383,8 @@ def _bases(points: Array, moved: Indices, count: int) -> Indices:
     around = around.reshape(count, -1)
     # The widest of several triangles determines the motion best. Every other base is compact, for small parts.
     size = around.shape[1]
-    last = np.where(np.arange(count) % 2, size, max(size // SYMMETRIES.compact, min(size, 4)))
-    drawn = 1 + (rng.random((count, SYMMETRIES.widest, 2)) * (last - 1)[:, None, None]).astype(np.int64)
+    last = np.where(np.arange(count) % 2, size, max(size // COMPACT, min(size, 4)))
+    drawn = 1 + (rng.random((count, DRAWN_TRIANGLES, 2)) * (last - 1)[:, None, None]).astype(np.int64)
     draws = moved[np.take_along_axis(around[:, None], drawn.reshape(count, 1, -1), 2).reshape(drawn.shape)]
     u, v = np.moveaxis(points[draws] - points[first][:, None, None], 2, 0)
     # Twice the area, squared: |u|^2 |v|^2 - (u v)^2.
@@ -370,13 +401,13 @@ def _longer_first(points: Array, bases: Indices) -> Indices:
 
 def _neighbours(points: Array) -> int:
     """Return the number of neighbours of a point that bases and matches come from."""
-    return SYMMETRIES.neighbours if len(points) <= SYMMETRIES.many else SYMMETRIES.many_neighbours
+    return NEIGHBOURS if len(points) <= MANY_POINTS else NEIGHBOURS_OF_MANY
 
 
 def _sample(moved: Indices) -> Indices:
-    """Return at most `SYMMETRIES.checked` sources, drawn at random."""
+    """Return at most `CHECKED_POINTS` sources, drawn at random."""
     order = np.random.default_rng(1).permutation(len(moved))
-    return np.ascontiguousarray(moved[order[: SYMMETRIES.checked]])
+    return np.ascontiguousarray(moved[order[:CHECKED_POINTS]])
 
 
 def _refine(
@@ -393,10 +424,10 @@ def _refine(
     Source: S. Umeyama, Least-squares estimation of transformation parameters between two point patterns, PAMI 1991.
     """
     own, near, reach, rigid = points[moved], np.zeros(len(moved), bool), 2 * tolerance, motion.scale[0] == 1
-    for step in range(SYMMETRIES.rounds + 1):
+    for step in range(REFINEMENT_ROUNDS + 1):
         bound = reach * min(float(motion.scale[0]), 1.0)
         near, target = _mapped(tree, motion.apply(own)[0], motion.rotation[0], moved, bound, labels3d, normals3d)
-        if step == SYMMETRIES.rounds or near.sum() < 3:
+        if step == REFINEMENT_ROUNDS or near.sum() < 3:
             break
         one, other = own[near], points[target[near]]
         centre, onto = one.mean(0), other.mean(0)
@@ -543,10 +574,10 @@ def _register(
                         )
                     score, left = 0, len(sample)
                     for s in range(len(sample)):
-                        if score + left < least or (score == 0 and s == SYMMETRIES.first):
+                        if score + left < least or (score == 0 and s == FIRST_SAMPLED):
                             break
                         left -= 1
-                        work_done += SYMMETRIES.confirming
+                        work_done += PAIRS_A_SAMPLE
                         score += _on(scene, linear, shift, sample[s], 2 * near)
                     if score >= least:
                         _keep(found, count, score, linear, shift)

@@ -8,12 +8,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bpnp.runtime import Clock, in_time, thread_count
-from bpnp.search.config import TIME, Stages
+from bpnp.search.config import Stages
 from bpnp.search.hypotheses import Hypotheses, select_distinct, to_problem_frame
 from bpnp.search.kernels.dense import dense_scratch, descend
 from bpnp.search.kernels.sparse import descend_sparse, sparse_scratch
 from bpnp.search.search_frame import Scene, Sides
 from bpnp.search.starts import Array, Prior, draw_poses
+
+# Pairs of bearings and points from which the first step of an annealing on all of them is timed.
+TIMED_PAIRS = 3e8  # [count; cost]
 
 
 def multistart(scene: Scene, number: int, prior: Prior | None) -> Hypotheses:
@@ -207,7 +210,7 @@ def _outlasts_deadline(scene: Scene, pose: Hypotheses, first_scale: float) -> bo
 
     The time is that of one step at the first scale, and of further ones whose close points become fewer.
     """
-    if math.isinf(scene.deadline.at) or len(scene.offsets) * len(scene.points3d) < TIME.timed_pairs:
+    if math.isinf(scene.deadline.at) or len(scene.offsets) * len(scene.points3d) < TIMED_PAIRS:
         return False
     begun = Clock.now()
     anneal_on_points(scene, pose, first_scale, every=True, steps=1)

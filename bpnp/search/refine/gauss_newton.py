@@ -16,10 +16,15 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.config import MATCHES, REFINER
 from bpnp.search.pose_model import PoseModel, PoseState, Sight
-from bpnp.search.possible_matches import facing, possible_matches
+from bpnp.search.possible_matches import MOST_NEIGHBOURS, facing, possible_matches
 from bpnp.search.problem import Problem
+
+RIDGE = 1e-12  # least damping, a fraction of the diagonal: unknowns that nothing fixes do not move [fraction; numerics]
+DIFFERENCE_STEP = 6e-6  # step of central differences, the cube root of the machine precision [fraction; derived]
+DAMPING_IF_TAKEN = 0.1  # factor on the damping after a step that is taken [factor; convention]
+DAMPING_IF_NOT = 10.0  # factor on the damping after a step that is not [factor; convention]
+FIRST_DAMPING = 1e-3  # first damping of Levenberg and Marquardt, a fraction of the diagonal [fraction; convention]
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
@@ -43,7 +48,7 @@ class Equations(NamedTuple):
     def step(self, damping: Array | float | int = 0) -> Array:
         """Return the step (..., p), damped by a fraction of the diagonal."""
         diagonal = np.einsum("...ii->...i", self.products)
-        damped = np.where(diagonal > 0, (np.asarray(damping)[..., None] + REFINER.ridge) * diagonal, 1.0)
+        damped = np.where(diagonal > 0, (np.asarray(damping)[..., None] + RIDGE) * diagonal, 1.0)
         products = self.products + damped[..., None] * np.eye(diagonal.shape[-1])
         return np.asarray(np.linalg.solve(products, self.gradient[..., None])[..., 0])
 
@@ -131,7 +136,7 @@ def steps(
         gain = np.asarray(here.cost) - there.cost
         before, better = here, np.asarray(gain > 0)
         state, here = _select(better, trial, state), _select(better, there, here)
-        factor = factor * np.where(better, REFINER.longer, REFINER.shorter)
+        factor = factor * np.where(better, DAMPING_IF_TAKEN, DAMPING_IF_NOT)
         yield Iteration(state, scale, step, before, gain)
 
 
@@ -239,7 +244,7 @@ def image_equations(
 
     def linearise(state: PoseState, _scale: float) -> Equations:
         sight = model.sight(state, points)
-        h = REFINER.difference * np.maximum(np.linalg.norm(sight.camera, axis=-1), 1e-300)
+        h = DIFFERENCE_STEP * np.maximum(np.linalg.norm(sight.camera, axis=-1), 1e-300)
         moved = sight.camera + h[:, None] * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])[:, None]
         seen = project(moved.reshape(-1, 3)).reshape(7, *target.shape)
         residual = target - seen[0]
@@ -274,7 +279,7 @@ def soft_matches(
     *,
     camera: int = 0,
     chosen: Labels | None = None,
-    most: int = MATCHES.neighbours,
+    most: int = MOST_NEIGHBOURS,
 ) -> SoftMatches | None:
     """Return the possible matches of one camera under a state, or None if there are none.
 
@@ -305,7 +310,7 @@ def soft_equations(
     problems: Sequence[Problem],
     *,
     chosen: Labels | None = None,
-    most: int = MATCHES.neighbours,
+    most: int = MOST_NEIGHBOURS,
     fewest: float | int = 0,
 ) -> Linearise:
     """Return the linearisation of the possible matches of all cameras, weighted with their probabilities.

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from bpnp.runtime import NEVER, Deadline
-from bpnp.search.config import ALARMS, RIG
+from bpnp.search.config import ALARMS
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem, UnknownFocal
@@ -34,6 +34,17 @@ from bpnp.search.starts import GravityPrior, PosePrior, Prior
 from bpnp.search.verdict.covariance import covariance_of, join
 from bpnp.search.verdict.false_alarms import Terms, camera_terms, directions_of, log10_nfa, match_shares
 from bpnp.search.verdict.uncertainty import linearise, matches_of
+
+# Scale at which proposals are compared: a pose of one camera is inaccurate in another.
+WIDE_SCALES = 60.0  # [smallest scales; not tuned]
+REFINEMENT_SCALES = 9  # number of decreasing scales of a refinement [scales; not tuned]
+STEPS_A_SCALE = 2  # number of Gauss-Newton steps at each scale [steps; not tuned]
+MOST_SCALE_STEP = 1.0  # largest step of the logarithm of the scale of the scene [nats; not tuned]
+LENS_FIRST_SCALE = 8.0  # first scale of a fit of the lens [scales of the residuals; not tuned]
+MOST_LENS_STEP = 0.1  # largest step of a lens, of its focal length or its distortion [nats; not tuned]
+WEIGHED_SCALES = 7  # number of the last scales at which the false alarms of poses are computed [scales; cost]
+# Distance below which camera centres coincide, as a fraction of their largest coordinate in the rig.
+SAME_CENTRE = 1e-6  # [fraction; numerics]
 
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]
@@ -66,7 +77,7 @@ class Rig:
         if isinstance(prior, PosePrior) and not is_metric:
             prior = prior._replace(translation=None)
         centres = np.array([-turn.T @ shift for turn, shift in mounts])
-        least = RIG.same_centre * np.abs(centres).max()
+        least = SAME_CENTRE * np.abs(centres).max()
         pairs = combinations(range(len(mounts)), 2)
         self.apart = [(k, other) for k, other in pairs if np.linalg.norm(centres[k] - centres[other]) > least]
         self.mounts = [(turn, shift / problem.size) for problem, (turn, shift) in zip(problems, mounts, strict=True)]
@@ -121,11 +132,11 @@ class Rig:
         Yields:
             Rotation, translation, scale (radians) and expected number of matches after each step.
         """
-        scales = (np.geomspace(RIG.wide, 1.0, RIG.steps).repeat(RIG.again) * self.floor).tolist()
+        scales = (np.geomspace(WIDE_SCALES, 1.0, REFINEMENT_SCALES).repeat(STEPS_A_SCALE) * self.floor).tolist()
         model = replace(self.model, lens=None)
         linearise = soft_equations(model, self.problems, fewest=model.size - 3)
         largest = np.full(model.size, math.inf)
-        largest[6:] = RIG.most_scale
+        largest[6:] = MOST_SCALE_STEP
         for last in steps(model, model.state(rotation, translation), linearise, scales, largest=largest):
             yield (*model.pose(last.state), last.scale, float(last.before.matched))
 
@@ -141,8 +152,10 @@ class Rig:
             Factor of the focal length, and the radial coefficient.
         """
         linearise = soft_equations(self.model, self.problems, fewest=self.model.size - 3)
-        scales = (max(scale, self.floor) * np.geomspace(RIG.lens_wide, 1.0, RIG.steps).repeat(RIG.again)).tolist()
-        largest = np.where(np.arange(self.model.size) < 6, math.inf, RIG.most_lens)
+        scales = (
+            max(scale, self.floor) * np.geomspace(LENS_FIRST_SCALE, 1.0, REFINEMENT_SCALES).repeat(STEPS_A_SCALE)
+        ).tolist()
+        largest = np.where(np.arange(self.model.size) < 6, math.inf, MOST_LENS_STEP)
         end = refine(self.model, self.model.state(rotation, translation), linearise, scales, largest=largest)
         return float(end.state.zoom), float(end.state.radial)
 
@@ -290,7 +303,7 @@ class Rig:
         for k, (rotation, translation) in enumerate(zip(rotations, translations, strict=True)):
             if k and deadline.passed(stage):
                 break
-            last = list(self.refined(rotation, translation))[RIG.again - 1 :: RIG.again][-RIG.weighed :]
+            last = list(self.refined(rotation, translation))[STEPS_A_SCALE - 1 :: STEPS_A_SCALE][-WEIGHED_SCALES:]
             if last:
                 ends.append(min(((*self.alarms(*end[:3]), *end) for end in last), key=lambda scored: scored[0]))
         if not ends:

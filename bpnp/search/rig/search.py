@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from bpnp.poses import distinct, polar_coordinates
 from bpnp.runtime import NEVER, Clock, Deadline, one_blas_thread
 from bpnp.search.competing_poses import fitted_lens
-from bpnp.search.config import DEFAULT, RIG, SearchSettings
+from bpnp.search.config import DEFAULT, SearchSettings
 from bpnp.search.enumeration.points import predicted_pose
 from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame, to_scene_frame
@@ -28,7 +28,7 @@ from bpnp.search.problem import Problem
 from bpnp.search.propose.density_map import search_around
 from bpnp.search.propose.known_matches import known_matches, poses_of_matches
 from bpnp.search.propose.repetitions import repeated_poses
-from bpnp.search.rig.cameras import Array, Pose, Rig
+from bpnp.search.rig.cameras import WIDE_SCALES, Array, Pose, Rig
 from bpnp.search.search import lacks_partners
 from bpnp.search.search_frame import Scene
 from bpnp.search.verdict.competitors import distance_between
@@ -38,6 +38,15 @@ from bpnp.search.verdict.reasons import Objection, Unfinished, focal_length_not_
 from bpnp.search.verdict.uncertainty import linearised, share_bound
 
 BEFORE = 1e9  # score of the poses that were refined before: above the evidence of any pose [nats; derived]
+PROPOSED_POSES = 4000  # number of poses that a camera with few points proposes [poses; cost]
+REFINED_RIG_POSES = 16  # number of enumerated poses that are refined, and of distinct poses that are kept [poses; cost]
+REFINED_EACH_ITERATION = 2  # number of poses of an iteration that are refined [poses; cost]
+COMPARED_POSES = 64  # largest number of proposals whose evidence is computed [poses; cost]
+AGREE_DEG = 6.0  # angle between the poses of two cameras below which they agree [degrees; not tuned]
+AGREE_SHIFT = 0.2  # distance below which they agree, in distances of the scene [fraction; not tuned]
+COMPARED_PAIRS = 50_000  # largest number of pairs of poses that are compared [pairs; cost]
+# Smallest baseline of two cameras that determines the scale, in distances of the scene.
+LEAST_BASELINE = 0.01  # [fraction; not tuned]
 
 
 @one_blas_thread
@@ -74,10 +83,10 @@ def search_rig(
     rig.join({k: pool.scene for k, pool in poses.pools.items()})
     if (predicted := predicted_pose(rig.model.prior)) is not None:
         poses.add_refined(rig.candidates(predicted[0][None], np.r_[predicted[1], 1.0][None]))
-    poses.take(_of_few_points(poses, rig.problems, seed, deadline), RIG.refined)
+    poses.take(_of_few_points(poses, rig.problems, seed, deadline), REFINED_RIG_POSES)
     if rig.model.prior is not None and not poses.is_significant():
         without = [replace(problem, prior=None) for problem in rig.problems]
-        poses.take(_of_few_points(poses, without, seed, deadline), RIG.refined)
+        poses.take(_of_few_points(poses, without, seed, deadline), REFINED_RIG_POSES)
     tell(0)
     if poses.may_be_decided() and (result := poses.result(ended=False)).verdict == "confident":
         return result
@@ -95,7 +104,7 @@ def _of_few_points(
             few[k] = poses_of_matches(problem, *matches, seed + k)
         elif is_enumerable(problem):
             until = (Clock.now() * (len(problems) - k - 1) + deadline.at) / (len(problems) - k)
-            found = enumerate_poses(problem, deadline=until, to_the_end=True, kept=RIG.proposing)
+            found = enumerate_poses(problem, deadline=until, to_the_end=True, kept=PROPOSED_POSES)
             few[k] = Hypotheses.from_poses(found.poses.rotation, found.poses.translation)
             poses.exhaustive &= found.ended == "exhausted"
         else:
@@ -157,7 +166,7 @@ class RigPoses:
         """Add the poses of one camera, in the frame of its scene."""
         if step.counts:
             self.pools[step.camera].add(step, found)
-        self.take({step.camera: to_problem_frame(found, self.pools[step.camera].scene)}, RIG.each_iteration)
+        self.take({step.camera: to_problem_frame(found, self.pools[step.camera].scene)}, REFINED_EACH_ITERATION)
 
     def take(self, new: Mapping[int, Hypotheses], most: int) -> None:
         """Refine those proposals of the cameras that have the most evidence in all cameras.
@@ -169,8 +178,8 @@ class RigPoses:
         rotation, translation = _proposals(self.rig, new, self.found)
         for k, poses in new.items():
             self.found[k] = Hypotheses.concatenate([self.found[k], poses])
-        if len(rotation) > RIG.compared:
-            best = np.argsort(-_agreement(self.rig, rotation, translation), kind="stable")[: RIG.compared]
+        if len(rotation) > COMPARED_POSES:
+            best = np.argsort(-_agreement(self.rig, rotation, translation), kind="stable")[:COMPARED_POSES]
             rotation, translation = rotation[best], translation[best]
         score = np.array([self.rig.evidence(*pose).sum() for pose in zip(rotation, translation, strict=True)])
         poses, earlier = Hypotheses.from_poses(rotation, translation, log_likelihood=score), len(self.starts)
@@ -200,7 +209,7 @@ class RigPoses:
     def add_refined(self, refined: Hypotheses) -> None:
         """Add refined poses; the basin count of the best one is the sum over all cameras."""
         every = Hypotheses.concatenate([self.best, refined])
-        self.best = every[self._distinct(every, -every.log10_false_alarms, RIG.refined)]
+        self.best = every[self._distinct(every, -every.log10_false_alarms, REFINED_RIG_POSES)]
         if len(self.best):
             self.best.basin_count[0] = sum(
                 int(poses.basin_count[self._as_best(k, poses)].sum()) for k, poses in enumerate(self.found)
@@ -305,7 +314,7 @@ class RigPoses:
             here = float(self._alarms_alone(k, seen)[0])
             if not fits_by_chance(here) or not len(found):
                 continue
-            own = self._alarms_alone(k, found[: RIG.refined])  # those of an enumeration begin with the likeliest
+            own = self._alarms_alone(k, found[:REFINED_RIG_POSES])  # those of an enumeration begin with the likeliest
             if own.min() <= min(settings.false_alarms, here - settings.margin):
                 away = distance_between(self.rig.problems[k], seen.pose(), found.pose(int(own.argmin())))
                 return objection("other_extrinsics", camera=k, away=away)
@@ -368,24 +377,24 @@ def _agreeing_poses(rig: Rig, pair: tuple[int, int], first: Hypotheses, second: 
     centre = rig.problems[0].centre3d
     first_rotations, others = (turn.T @ first.rotation).reshape(-1, 9), (other.T @ second.rotation).reshape(-1, 9)
     traces = first_rotations.astype(np.float32) @ others.T.astype(np.float32)
-    near = np.flatnonzero(traces.ravel() > 1 + 2 * math.cos(math.radians(RIG.agree_deg)))
-    i, j = np.divmod(near[np.argsort(-traces.ravel()[near], kind="stable")[: RIG.pairs]], max(len(others), 1))
+    near = np.flatnonzero(traces.ravel() > 1 + 2 * math.cos(math.radians(AGREE_DEG)))
+    i, j = np.divmod(near[np.argsort(-traces.ravel()[near], kind="stable")[:COMPARED_PAIRS]], max(len(others), 1))
     rotation = turn.T @ first.rotation[i]
     seen = (first.rotation[i] @ centre + first.translation[i]) @ turn  # from the first camera, in the rig's axes
     way = seen - (second.rotation[j] @ centre + second.translation[j]) @ other
     apart = shift @ turn - moved @ other
     distance, length = np.linalg.norm(seen, axis=-1), float(np.linalg.norm(apart))
-    unit = np.maximum(way @ apart / length, RIG.least_apart * distance)[:, None] / length
+    unit = np.maximum(way @ apart / length, LEAST_BASELINE * distance)[:, None] / length
     translation = np.concatenate(
         [seen - unit * (shift @ turn) - (way - unit * apart) / 2 - rotation @ centre, unit], -1
     )
-    agree = np.linalg.norm(way - unit * apart, axis=-1) < RIG.agree_shift * distance
+    agree = np.linalg.norm(way - unit * apart, axis=-1) < AGREE_SHIFT * distance
     return rotation[agree], translation[agree]
 
 
 def _agreement(rig: Rig, rotations: Array, translations: Array) -> Array:
     """Score poses (p, 3, 3), (p, 4) cheaply: robust log-likelihood (p,) of all bearings at a wide scale, nats."""
-    total, scale = np.zeros(len(rotations)), RIG.wide * rig.floor
+    total, scale = np.zeros(len(rotations)), WIDE_SCALES * rig.floor
     for k, problem in enumerate(rig.problems):
         rotations_of_camera, shifts = rig.pose_of(k, rotations, translations)
         seen = problem.points3d @ rotations_of_camera.transpose(0, 2, 1) + shifts[:, None]

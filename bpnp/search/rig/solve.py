@@ -11,12 +11,12 @@ import numpy as np
 from bpnp.cameras import Camera, camera_from
 from bpnp.runtime import NEVER, Clock, Deadline
 from bpnp.search.arguments import Array, about, checked_pose, pose_of
-from bpnp.search.config import MATCHES
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.focal_length import FocalSweep, UnknownCamera
 from bpnp.search.inputs import problem_from
 from bpnp.search.matching import count_one_to_one, failed_solution, one_to_one, with_unfinished
 from bpnp.search.pose_model import crossed
+from bpnp.search.possible_matches import MATCH_REACH
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.rig.cameras import Pose, Rig
 from bpnp.search.rig.search import search_rig
@@ -210,7 +210,7 @@ def _finished(
     matches, errors, angles, count = [], [], [], 0
     counts = np.zeros(len(found), np.int64)  # inliers of each pose in all cameras
     for k, problem in enumerate(problems):
-        threshold = inlier_threshold or MATCHES.reach * result.residual * problem.per_radian
+        threshold = inlier_threshold or MATCH_REACH * result.residual * problem.per_radian
         image, may_match = problem.image_points, problem.may_match
         seen, *others = map(problem.project_scene, *rig.pose_of(k, found.rotation, found.translation))
         i, j = one_to_one(image, seen, threshold, may_match, deadline).T
@@ -236,7 +236,7 @@ def _finished(
         np.concatenate(errors),
         np.concatenate(angles),
         most=sum(min(len(problem.all2d), len(problem.points3d)) for problem in problems),
-        threshold=inlier_threshold or MATCHES.reach * result.residual * first.per_radian,
+        threshold=inlier_threshold or MATCH_REACH * result.residual * first.per_radian,
         residual=result.residual,
         covariance=covariance,
     )

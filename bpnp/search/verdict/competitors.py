@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bpnp.poses import rotation_angle
-from bpnp.search.config import MATCHES, REASONS, Evidence
+from bpnp.search.config import REASONS, Evidence
 from bpnp.search.hypotheses import Hypotheses
+from bpnp.search.possible_matches import MATCH_REACH
 from bpnp.search.problem import Problem, label_groups
 from bpnp.search.verdict.false_alarms import directions_of, own_evidence
 from bpnp.search.verdict.reasons import Objection, objection
@@ -164,14 +165,14 @@ def sign_margins(cameras: CandidatesOfCameras, settings: Evidence) -> Array:
     if not len(others):
         return margins
     scales = np.maximum(candidates.scale, problem.image.scales[0])
-    best, first = _explained(cameras, 0, scales[0], MATCHES.reach)
+    best, first = _explained(cameras, 0, scales[0], MATCH_REACH)
     for k in others.tolist():
-        evidence, other = _explained(cameras, k, scales[k], MATCHES.reach)
+        evidence, other = _explained(cameras, k, scales[k], MATCH_REACH)
         gap = best - evidence
         squared = float((gap**2).sum())
         if float(np.abs(gap).sum()) ** 2 < least * squared:
             continue
-        reach = MATCHES.reach * max(scales[0], scales[k]) * np.linalg.norm(first.places, axis=-1)
+        reach = MATCH_REACH * max(scales[0], scales[k]) * np.linalg.norm(first.places, axis=-1)
         same = (first.points == other.points) | (np.linalg.norm(first.places - other.places, axis=-1) < reach)
         same |= _with_reversed_depths(first, other, reach)
         alone, others_alone = int((first.near & ~other.near).sum()), int((other.near & ~first.near).sum())
