@@ -89,12 +89,7 @@ else:
 
 
 def check_unmasked(name: str, values: object) -> None:
-    """Raise ValueError for a masked array with masked values, whose mask NumPy drops in a conversion.
-
-    Args:
-        name: Name of the argument, for the message.
-        values: Its value.
-    """
+    """Raise ValueError for a masked array with masked values, whose mask NumPy drops in a conversion."""
     if isinstance(values, np.ma.MaskedArray) and (count := int(np.ma.count_masked(values))):
         raise ValueError(
             f"`{name}` is a masked array with {count} masked values; give only the rows to use, such as "

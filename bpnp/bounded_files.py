@@ -30,15 +30,10 @@ PIPE_SECONDS = 5.0  # how long a named pipe without a writer is waited for
 
 @contextmanager
 def open_input(path: Path, *, pipes: bool = True) -> Iterator[io.BufferedReader]:
-    """Open a file, or a pipe, for reading.
+    """Open a file or, unless excluded, a pipe or a terminal for reading.
 
-    Args:
-        path: File.
-        pipes: Accept a pipe and a terminal. Default True.
-
-    Raises:
-        ValueError: The path is a folder, a device, a socket, or a pipe without a writer.
-        OSError: It does not exist, or cannot be read.
+    Raise ValueError for a folder, a device, a socket, or a pipe without a writer, and OSError if it does not exist, or
+    cannot be read.
     """
     found = path.stat()
     if stat.S_ISREG(found.st_mode):
@@ -101,30 +96,15 @@ def _first_bytes(descriptor: int, path: Path) -> bytes:
 
 
 def read_bytes(path: Path, most: int = MOST_TEXT) -> bytes:
-    """Return the bytes of a file or of a pipe.
-
-    Args:
-        path: File.
-        most: Largest number of bytes. Default: that of a text.
-
-    Raises:
-        ValueError: As `open_input`, or there are more bytes.
-        OSError: As `open_input`.
-    """
+    """Return the bytes of a file or of a pipe (`open_input`); raise ValueError if there are more than `most`."""
     with open_input(path) as file:
         return read_stream(file, str(path), most)
 
 
 def read_stream(file: Any, name: str, most: int = MOST_TEXT) -> bytes:
-    """Return the bytes of an open file up to its end.
+    """Return the bytes of an open file, pipe or standard input up to its end.
 
-    Args:
-        file: File, pipe or standard input.
-        name: Its name, for messages.
-        most: Largest number of bytes.
-
-    Raises:
-        ValueError: There are more bytes, or it is a device other than a terminal.
+    Raise ValueError if there are more than `most`, or it is a device other than a terminal.
     """
     found = _status(file)
     if found is not None and not stat.S_ISFIFO(found.st_mode):
@@ -153,10 +133,9 @@ def _too_large(name: str, most: int) -> str:
 
 
 def read_text(path: Path, most: int = MOST_TEXT) -> str:
-    """Return a UTF-8 text, without a byte order mark; as `read_bytes`.
+    """Return a UTF-8 text, without a byte order mark, as `read_bytes`.
 
-    Raises:
-        ValueError: As `read_bytes`, or the file is no UTF-8. The message names it.
+    Raise ValueError, which names the file, if it is not UTF-8.
     """
     try:
         return read_bytes(path, most).decode("utf-8-sig")
@@ -165,11 +144,7 @@ def read_text(path: Path, most: int = MOST_TEXT) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """Return the content of a JSON file.
-
-    Raises:
-        ValueError: As `read_bytes`, or the file is no JSON.
-    """
+    """Return the content of a JSON file, read by `read_bytes`; raise ValueError if it is no JSON."""
     return parse_json(read_bytes(path))
 
 
@@ -182,10 +157,9 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def read_yaml(path: Path) -> Any:
-    """Return the content of a YAML file.
+    """Return the content of a YAML file, read by `read_bytes`.
 
-    Raises:
-        ValueError: As `read_bytes`, or the file is not YAML, or its aliases stand for too many values.
+    Raise ValueError if it is not YAML, or its aliases stand for too many values.
     """
     text = read_text(path, MOST_YAML)
     try:
@@ -208,12 +182,8 @@ def parse_yaml(text: str) -> Any:
 def check_yaml(text: str) -> None:
     """Check the size of a YAML text with its aliases written out, and its depth, before anything walks through it.
 
-    Args:
-        text: YAML.
-
-    Raises:
-        yaml.YAMLError: The text is not YAML, refers to itself, is nested more than `MOST_DEPTH` deep, or has more than
-            `MOST_NODES` values.
+    Raise yaml.YAMLError if the text is not YAML, refers to itself, is nested more than `MOST_DEPTH` deep, or has more
+    than `MOST_NODES` values.
     """
     import yaml
 
@@ -244,15 +214,7 @@ def _yaml_loader() -> Any:
 
 
 def read_npy(path: Path, most: int = MOST_BINARY) -> NDArray[Any]:
-    """Return the array of a .npy file.
-
-    Args:
-        path: File.
-        most: Largest number of bytes.
-
-    Raises:
-        ValueError: As `parse_npy`. The message names the file.
-    """
+    """Return the array of a .npy file of at most `most` bytes, as `parse_npy`; the message of an error names it."""
     content = read_bytes(path, most)
     try:
         return parse_npy(content)
@@ -263,12 +225,8 @@ def read_npy(path: Path, most: int = MOST_BINARY) -> NDArray[Any]:
 def parse_npy(content: bytes) -> NDArray[Any]:
     """Return the array in the bytes of a .npy file.
 
-    Args:
-        content: Bytes.
-
-    Raises:
-        ValueError: The bytes are something else, have fewer values than the header says, or hold Python objects or
-            named fields.
+    Raise ValueError for bytes of something else, with fewer values than the header says, Python objects or named
+    fields.
     """
     _check_header(io.BytesIO(content), len(content))
     return np.asarray(npy.read_array(io.BytesIO(content), allow_pickle=False))
@@ -277,12 +235,8 @@ def parse_npy(content: bytes) -> NDArray[Any]:
 def read_npz(path: Path) -> dict[str, NDArray[Any]]:
     """Return the arrays of a .npz file that `numpy.savez` wrote, without compression, by name.
 
-    Args:
-        path: File.
-
-    Raises:
-        ValueError: As `parse_npy`, or the arrays are larger than the file.
-        OSError, zipfile.BadZipFile: The file cannot be read, or is no archive.
+    Raise ValueError as `parse_npy`, or if the arrays are larger than the file, and OSError or zipfile.BadZipFile if the
+    file cannot be read, or is no archive.
     """
     arrays = {}
     with open_input(path, pipes=False) as file, zipfile.ZipFile(file) as archive:
@@ -316,16 +270,9 @@ def _check_header(file: Any, size: int) -> None:
 
 
 def check_size(name: str, shape: tuple[int, ...], dtype: np.dtype[Any], most: int) -> None:
-    """Check the size of an array before it is made.
+    """Check the size of an array that a file states before it is made.
 
-    Args:
-        name: Where its size is stated, for messages.
-        shape: Shape that a file states.
-        dtype: Type of its values.
-        most: Number of bytes that it may have.
-
-    Raises:
-        ValueError: A side is negative, or the array has more bytes.
+    `name` tells where it is stated. Raise ValueError if a side is negative, or the array has more than `most` bytes.
     """
     if any(side < 0 for side in shape):
         raise ValueError(f"{name} states the shape {shape}")
@@ -337,14 +284,7 @@ def check_size(name: str, shape: tuple[int, ...], dtype: np.dtype[Any], most: in
 
 
 def file_inside(folder: Path, name: str) -> Path | None:
-    """Return the path of a file that another file names, in a folder.
-
-    Args:
-        folder: Folder.
-        name: Path in the folder, with slashes.
-
-    Returns:
-        The path; None for a name that is absolute or leads out of the folder.
+    """Return the path of a file that another file names with slashes, in a folder; None if it is absolute or leads out.
 
     >>> from pathlib import Path
     >>> from bpnp.bounded_files import file_inside

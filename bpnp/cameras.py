@@ -48,13 +48,9 @@ MOST_PIXELS = 2**31  # largest side of an image, pixels; a larger one means a co
 
 @dataclass(frozen=True, eq=False)
 class Pinhole:
-    """Camera without distortion, pixels ~ K (x, y, 1).
+    """Camera without distortion, pixels ~ K (x, y, 1)."""
 
-    Attributes:
-        matrix: K (3, 3), pixels.
-    """
-
-    matrix: Array
+    matrix: Array  # K (3, 3), pixels
 
     @property
     def focal(self) -> float:
@@ -71,28 +67,17 @@ class Pinhole:
 
 
 class _Fisheye(NamedTuple):
-    """A fisheye, which sees the angle t from its axis at the radius t (1 + k1 t^2 + ...), in focal lengths.
+    """A fisheye, which sees the angle t from its axis at the radius t (1 + k1 t^2 + ...), in focal lengths."""
 
-    Attributes:
-        focals: (1,) or (2,) focal lengths, pixels.
-        centre: (2,) principal point, pixels.
-        distance: Radius as a polynomial of the angle.
-        widest: Angle up to which the radius rises, the first root of its derivative; at most 180 degrees. Radians.
-    """
-
-    focals: Array
-    centre: Array
-    distance: np.polynomial.Polynomial
-    widest: float
+    focals: Array  # (1,) or (2,) focal lengths, pixels
+    centre: Array  # (2,) principal point, pixels
+    distance: np.polynomial.Polynomial  # radius as a polynomial of the angle
+    widest: float  # angle up to which the radius rises (root of its derivative), radians; at most 180 degrees
 
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """Camera of any COLMAP model, with its distortion.
-
-    Attributes:
-        camera: A `pycolmap.Camera`.
-    """
+    """Camera of any COLMAP model, with its distortion."""
 
     camera: Any
 
@@ -209,19 +194,12 @@ def in_front(points: Array) -> Array:
 
 
 def camera_from(camera: Any) -> Camera:
-    """Convert a description of a camera to a `Camera`.
+    """Convert a description of a camera to a `Pinhole` for K without distortion, else to a `Lens`.
 
-    Args:
-        camera: One of: a 3x3 matrix K; OpenCV's (K, distortion); (COLMAP model name, parameters); (name, width, height,
-            parameters); a mapping with `model` and `params`, and optionally `width` and `height`; a `pycolmap.Camera`;
-            a `Camera`, which is returned unchanged.
-
-    Returns:
-        A `Pinhole` for K without distortion, else a `Lens`.
-
-    Raises:
-        ValueError: K is singular or not finite, the model is unknown, the number of parameters is wrong, or the focal
-            length is not positive.
+    It is one of: a 3x3 matrix K; OpenCV's (K, distortion); (COLMAP model name, parameters); (name, width, height,
+    parameters); a mapping with `model` and `params`, and optionally `width` and `height`; a `pycolmap.Camera`; a
+    `Camera`, which is returned unchanged. Raise ValueError if K is singular or not finite, the model is unknown, the
+    number of parameters is wrong, or the focal length is not positive.
 
     >>> from bpnp.cameras import camera_from
     >>> camera_from(("PINHOLE", 640, 480, [800, 800, 320, 240])).focal
@@ -245,43 +223,25 @@ def camera_from(camera: Any) -> Camera:
 
 
 def is_opencv(camera: Any) -> bool:
-    """Return True for OpenCV's (K, distortion), whose pixel (0, 0) is the centre of the first pixel.
-
-    Args:
-        camera: Description of a camera, as for `camera_from`.
-    """
+    """Return True for OpenCV's (K, distortion), whose pixel (0, 0) is the centre of the first pixel."""
     return isinstance(camera, tuple) and len(camera) == 2 and np.shape(camera[0]) == (3, 3)
 
 
 def image_size(camera: Camera) -> tuple[int, int] | None:
-    """Return the width and height of a camera's images in pixels, or None if they are unknown.
-
-    Args:
-        camera: Camera; only one of a COLMAP model has a size.
-    """
+    """Return the width and height of a camera's images in pixels, or None; only one of a COLMAP model has a size."""
     size = (camera.camera.width, camera.camera.height) if isinstance(camera, Lens) else (0, 0)
     return size if all(size) else None
 
 
 def same_aspect_ratio(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Return True if two image sizes have the same aspect ratio, up to a pixel of rounding a side.
-
-    Args:
-        size: Width and height, pixels.
-        other: Width and height, pixels.
-    """
+    """Return True if two image sizes have the same aspect ratio, up to a pixel of rounding a side."""
     return abs(size[0] * other[1] - size[1] * other[0]) <= max(*size, *other)
 
 
 def check_normalised(points2d: Any, remedy: str) -> None:
-    """Raise ValueError if the image points are pixels: half of them lie more than 84 degrees off the axis.
+    """Raise ValueError if finite image points (m, 2) are pixels: half of them lie more than 84 degrees off the axis.
 
-    Args:
-        points2d: Image points (m, 2), array or tensor, finite.
-        remedy: Proposal of the message, after "try".
-
-    Raises:
-        ValueError: The points are pixels.
+    `remedy` is the proposal of the message, after "try".
     """
     points = np.asarray(points2d)
     if np.median(np.linalg.norm(points, axis=-1)) > WIDEST:
@@ -292,17 +252,11 @@ def check_normalised(points2d: Any, remedy: str) -> None:
 
 
 def outside_image(pixels: Array, sides: Any) -> npt.NDArray[np.bool_]:
-    """Return which pixels show that an image has another size.
+    """Return which pixels (m, 2) show that an image has another size; none if they are no more than 2 %.
 
     Detectors place some keypoints slightly outside of an image. Allowed are all points within a hundredth of the larger
-    side (at least one pixel) of the image, and up to 2 % of the points farther away.
-
-    Args:
-        pixels: Image points (m, 2), pixels. NaN counts as inside.
-        sides: Width and height, pixels.
-
-    Returns:
-        Mask (m,) of the points farther outside; all False if they are no more than 2 %.
+    side (at least one pixel) of the image, and up to 2 % of the points farther away. NaN counts as inside. `sides` are
+    width and height in pixels.
 
     >>> import numpy as np
     >>> from bpnp.cameras import outside_image
@@ -316,14 +270,9 @@ def outside_image(pixels: Array, sides: Any) -> npt.NDArray[np.bool_]:
 
 
 def resize_camera(camera: Camera, size: tuple[int, int]) -> Camera:
-    """Return the camera of resized images.
+    """Return the camera of resized images, whose width and height are in pixels.
 
-    Args:
-        camera: Camera with a known image size.
-        size: Width and height of the resized images, pixels, with the same aspect ratio.
-
-    Raises:
-        ValueError: The image size of the camera is unknown, or the aspect ratios differ.
+    Raise ValueError if the image size of the camera is unknown, or the aspect ratios differ.
 
     >>> from bpnp.cameras import camera_from, resize_camera
     >>> resize_camera(camera_from(("PINHOLE", 1000, 800, [900, 880, 500, 400])), (500, 400)).matrix.tolist()
@@ -345,10 +294,6 @@ def resize_camera(camera: Camera, size: tuple[int, int]) -> Camera:
 
 def scale_focal_length(camera: Camera, zoom: float) -> Camera:
     """Return the camera with its focal length multiplied by a factor.
-
-    Args:
-        camera: Any camera.
-        zoom: Factor.
 
     >>> from bpnp.cameras import camera_from, scale_focal_length
     >>> scale_focal_length(camera_from(("SIMPLE_RADIAL", 1000, 800, [900, 500, 400, 0.1])), 2.0).focal
@@ -372,14 +317,9 @@ def is_pinhole(camera: Camera) -> bool:
 
 
 def with_radial_distortion(camera: Camera, radial: float) -> Lens:
-    """Add a radial distortion coefficient to a pinhole camera.
+    """Add the coefficient k1 of the squared radius to a pinhole camera without skew.
 
-    Args:
-        camera: Pinhole camera without skew.
-        radial: Coefficient k1 of the squared radius.
-
-    Returns:
-        A SIMPLE_RADIAL camera, or an OPENCV camera for two different focal lengths.
+    The result is a SIMPLE_RADIAL camera, or an OPENCV camera for two different focal lengths.
 
     >>> from bpnp.cameras import camera_from, with_radial_distortion
     >>> with_radial_distortion(camera_from(("SIMPLE_PINHOLE", 1000, 800, [900, 500, 400])), 0.1).camera.params.tolist()
@@ -401,15 +341,9 @@ def camera_to_json(camera: Camera) -> list[list[float]] | dict[str, Any]:
 
 
 def colmap_camera(model: str, params: Any, size: Any = (0, 0)) -> Lens:
-    """Return the camera of a COLMAP model.
+    """Return the camera of a COLMAP model, such as "PINHOLE", for parameters in COLMAP's order.
 
-    Args:
-        model: COLMAP's name of the model, such as "PINHOLE".
-        params: Parameters in COLMAP's order.
-        size: Width and height of the images, pixels; 0 if unknown.
-
-    Raises:
-        ValueError: As in `camera_from`.
+    The size is the width and height of the images in pixels, 0 if unknown. Errors are those of `camera_from`.
     """
     counts = dict(camera_models().values())
     if model not in counts:
@@ -433,16 +367,9 @@ def colmap_camera(model: str, params: Any, size: Any = (0, 0)) -> Lens:
 
 
 def read_text_model(folder: Path) -> Any:
-    """Read a COLMAP model in text files.
+    """Read a folder with cameras.txt, images.txt and points3D.txt as a `pycolmap.Reconstruction`.
 
-    Args:
-        folder: Folder with cameras.txt, images.txt and points3D.txt.
-
-    Returns:
-        A `pycolmap.Reconstruction`.
-
-    Raises:
-        ValueError: pycolmap cannot read the files; the message has its reason.
+    Raise ValueError, with its reason, if pycolmap cannot read the files.
     """
     model = import_pycolmap().Reconstruction()
     try:
@@ -491,12 +418,7 @@ def _opencv(matrix: Any, distortion: Any) -> Camera:
 def opencv_model(matrix: Any, distortion: Any) -> tuple[str, list[float]]:
     """Return the COLMAP model of an OpenCV camera and its parameters; PINHOLE, without the skew, if all are 0.
 
-    Args:
-        matrix: K (3, 3).
-        distortion: k1, k2, p1, p2[, k3[, k4, k5, k6]]; None for none.
-
-    Raises:
-        ValueError: As `camera_from`.
+    The distortion is k1, k2, p1, p2[, k3[, k4, k5, k6]], or None. Errors are those of `camera_from`.
     """
     pinhole = _pinhole(matrix)
     (fx, skew, cx), (_, fy, cy), _ = pinhole.matrix.tolist()
@@ -540,14 +462,9 @@ def _pinhole(values: Any) -> Pinhole:
 
 
 def check_single_camera(points_per_camera: Sequence[int] | None, what: str) -> None:
-    """Refuse the solution of a rig.
+    """Raise ValueError for the solution of a rig, whose points are counted by camera; None is a single camera.
 
-    Args:
-        points_per_camera: Number of 2D points of each camera of a rig; None for a single camera.
-        what: What would be made of the solution, for the message.
-
-    Raises:
-        ValueError: The solution is that of a rig.
+    `what` would be made of the solution, for the message.
     """
     if points_per_camera is not None:
         raise ValueError(

@@ -20,11 +20,8 @@ def check_shapes(function: _F) -> _F:
 
     An annotation such as `Float[Tensor, "b m 2"]` requires three non-empty axes, the last of size 2, and floating-point
     numbers. An axis name stands for one size in all arguments. Not checked are other annotations, those with a variable
-    number of axes, and None where it is the default.
-
-    Raises:
-        ValueError: From the decorated function, for an argument that does not fit, or within a transform of
-            `torch.func`.
+    number of axes, and None where it is the default. The decorated function raises ValueError for an argument that does
+    not fit, and within a transform of `torch.func`.
 
     >>> import torch
     >>> from jaxtyping import Float
@@ -63,11 +60,7 @@ class _Probe(torch.autograd.Function):
 
 
 def refuse_transforms(name: str) -> None:
-    """Raise ValueError within a transform of `torch.func`, such as `torch.vmap`.
-
-    Args:
-        name: Name of the calling function, for the message.
-    """
+    """Raise ValueError, which names the calling function, within a transform of `torch.func`, such as `torch.vmap`."""
     if torch.compiler.is_compiling():
         return
     try:
@@ -80,23 +73,16 @@ def refuse_transforms(name: str) -> None:
 
 
 def check_positive(**options: int | float) -> None:
-    """Raise ValueError for the first option that is not above zero (NaN included).
-
-    Args:
-        **options: Values by the name of the option.
-    """
+    """Raise ValueError for the first option that is not above zero (NaN included)."""
     for name, value in options.items():
         if not value > 0:
             raise ValueError(f"`{name}` is {value}; it must be above 0")
 
 
 def check_within(least: float | int, most: float | int, **options: Any) -> None:
-    """Raise ValueError for the first option that is not finite or not within limits.
+    """Raise ValueError for the first option that is not finite or not within limits, which are included.
 
-    Args:
-        least: Lower limit, included.
-        most: Upper limit, included.
-        **options: A number, or a pair (low, high) with low <= high, by the name of the option.
+    An option is a number, or a pair (low, high) with low <= high.
 
     >>> from bpnp.checks import check_within
     >>> check_within(0, 1, share=(0.2, 0.5))
@@ -122,13 +108,9 @@ def _tensor_type(hint: Any) -> Any:
 
 
 def _check(name: str, value: Any, kind: Any, sizes: dict[str, tuple[int, str]]) -> None:
-    """Check one argument against its annotation.
+    """Check one argument against its jaxtyping annotation.
 
-    Args:
-        name: Name of the argument.
-        value: Its value.
-        kind: Its jaxtyping annotation.
-        sizes: Size of each axis name found so far, and the argument that set it; extended.
+    `sizes`, of each axis name found so far with the argument that set it, is extended.
     """
     axes = kind.dim_str.split()
     shape = f"({', '.join(axes)}{',' * (len(axes) == 1)})"
@@ -151,16 +133,7 @@ def _check(name: str, value: Any, kind: Any, sizes: dict[str, tuple[int, str]]) 
 
 
 def as_tensor_list(name: str, values: ManyArrays | float, ndim: int) -> list[Tensor]:
-    """Convert one array, a stack of arrays, or a sequence of arrays to a list of CPU tensors.
-
-    Args:
-        name: Name of the argument, for messages.
-        values: Array or arrays.
-        ndim: Number of axes of one array.
-
-    Returns:
-        One tensor for each problem.
-    """
+    """Convert one array, a stack of arrays, or a sequence of arrays to a list of CPU tensors, one for each problem."""
     if isinstance(values, (list, tuple)) and values and np.ndim(values[0]) == ndim:
         return [as_tensor(name, v) for v in values]
     array = as_tensor(name, values)
@@ -184,17 +157,7 @@ def as_tensor(name: str, values: ManyArrays | float) -> Tensor:
 
 
 def check_points(name: str, i: int | str, points: Tensor, dim: int) -> Tensor:
-    """Check the points of one problem and return them.
-
-    Args:
-        name: Name of the argument, for messages.
-        i: Index or name of the problem, for messages.
-        points: Points (k, dim).
-        dim: Number of coordinates.
-
-    Raises:
-        ValueError: Another shape, no points, NaN or infinity.
-    """
+    """Return the points (k, dim) of one problem; raise ValueError for another shape, no points, NaN or infinity."""
     if points.ndim != 2 or points.shape[1] != dim:
         hint = " (are points2d and points3d swapped?)" if points.ndim == 2 and points.shape[1] in (2, 3) else ""
         raise ValueError(f"`{name}` has the shape {tuple(points.shape)} in problem {i}, not (k, {dim}){hint}")
@@ -216,16 +179,9 @@ def _check_numbers(name: str, i: int | str, values: Tensor) -> None:
 
 
 def check_match3d(i: int | str, match: Tensor, m: int, n: int) -> Tensor:
-    """Check the `match3d` of one problem and return it as int64.
+    """Return the `match3d` of one problem as int64: the index of the 2D point of each 3D point (n,), -1 for none.
 
-    Args:
-        i: Index or name of the problem, for messages.
-        match: Index of the 2D point of each 3D point (n,), -1 for none.
-        m: Number of 2D points.
-        n: Number of 3D points.
-
-    Raises:
-        ValueError: Another shape, no integers, or an index that is no 2D point.
+    Raise ValueError for another shape, no integers, or an index that is not one of the m 2D points.
     """
     if match.shape != (n,):
         raise ValueError(
@@ -244,17 +200,7 @@ def check_match3d(i: int | str, match: Tensor, m: int, n: int) -> Tensor:
 
 
 def stack_values(name: str, values: list[Tensor], shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-    """Stack the values of all problems.
-
-    Args:
-        name: Name of the argument, for messages.
-        values: One tensor for each problem.
-        shape: Required shape of each.
-        dtype: Dtype of the result.
-
-    Raises:
-        ValueError: Another shape, NaN or infinity.
-    """
+    """Stack the values of all problems; raise ValueError for another shape, NaN or infinity."""
     for i, value in enumerate(values):
         if value.shape != shape:
             raise ValueError(f"`{name}` has the shape {tuple(value.shape)} in problem {i}, not {shape}")

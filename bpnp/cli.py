@@ -44,9 +44,6 @@ def main(args: Sequence[str] | None = None) -> None:
 
     A user's mistake ends in one line on stderr and exit status 2, without a traceback. If the reader of standard output
     closes it, as `head` does, the command ends silently.
-
-    Args:
-        args: Arguments. Default: those of the process.
     """
     arguments = list(sys.argv[1:] if args is None else args)
     _quieten()
@@ -231,11 +228,7 @@ def _row(head: str, text: str) -> str:
 
 
 def _with_packaged_configs(arguments: Sequence[str]) -> list[str]:
-    """Replace names of packaged configurations by their files.
-
-    Raises:
-        ValueError: There is no such file or configuration.
-    """
+    """Replace names of packaged configurations by their files; raise ValueError if there is no such one."""
     words = [part for text in arguments for part in (text.split("=", 1) if text.startswith("--config=") else [text])]
     for i, before in enumerate(words[:-1], 1):
         if before in ("-c", "--config"):

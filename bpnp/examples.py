@@ -36,36 +36,23 @@ Face = tuple[Array, Array, Array, Image.Image]  # corner, edges a and b (metres,
 
 @dataclass(frozen=True)
 class Example:
-    """Problem with its true pose.
+    """Problem with its true pose."""
 
-    Attributes:
-        points2d: Image points (m, 2), pixels.
-        points3d: Scene points (n, 3).
-        camera: K (3, 3), pixels.
-        rotation: True R (3, 3), camera = R p + t.
-        translation: True t (3,), scene units.
-        normals3d: Outward normals (n, 3), None for points without normals.
-    """
-
-    points2d: Array
-    points3d: Array
-    camera: Array
-    rotation: Array
-    translation: Array
-    normals3d: Array | None = None
+    points2d: Array  # image points (m, 2), pixels
+    points3d: Array  # scene points (n, 3)
+    camera: Array  # K (3, 3), pixels
+    rotation: Array  # true R (3, 3), camera = R p + t
+    translation: Array  # true t (3,), scene units
+    normals3d: Array | None = None  # outward normals (n, 3), None for points without normals
 
     def __repr__(self) -> str:
         normals = "" if self.normals3d is None else " with normals"
         return f"Example({len(self.points2d)} image points, {len(self.points3d)} scene points{normals})"
 
     def rotation_error_deg(self, rotation: Any) -> float:
-        """Return the angle between a rotation and the true one, degrees.
+        """Return the angle in [0, 180] degrees between an estimated rotation (3, 3) and the true one.
 
-        Args:
-            rotation: Estimated R (3, 3).
-
-        Returns:
-            The angle in [0, 180], or NaN for a rotation that is not finite, such as that of a failed solution.
+        It is NaN for a rotation that is not finite, such as that of a failed solution.
 
         >>> import numpy as np
         >>> from bpnp.examples import load
@@ -250,15 +237,9 @@ def _build_scene(rng: np.random.Generator) -> list[Face]:
 
 
 def _texture(width: Any, height: Any, colours: str, rng: np.random.Generator) -> Image.Image:
-    """Draw overlapping rectangles of all sizes: detail at every scale, as in natural images.
+    """Draw overlapping rectangles of all sizes: detail at every scale, as in natural images. Sides are in metres.
 
     Source: Lee, Mumford, Huang, Occlusion models for natural images (dead leaves), IJCV 2001.
-
-    Args:
-        width: Width, metres.
-        height: Height, metres.
-        colours: Key of `COLOURS`.
-        rng: Random generator.
     """
     w, h = round(TEXELS * width), round(TEXELS * height)
     picture = Image.new("RGB", (w, h), tuple(COLOURS[colours].mean(0).astype(int)))

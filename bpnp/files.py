@@ -22,13 +22,10 @@ REMOVALS = 100  # times that a folder to lock may have been removed by another p
 
 @contextmanager
 def write_atomically(path: Path) -> Iterator[Path]:
-    """Yield a temporary path next to `path`, renamed to `path` on success and deleted on error.
+    """Yield a temporary path next to a file or folder, renamed to it on success and deleted on error.
 
     Parent folders are created. An OSError without a file name gets `path`. A device or a pipe, such as /dev/stdout, is
     yielded itself: it is written to, not replaced.
-
-    Args:
-        path: File or folder to write.
     """
     if _is_device(path):
         yield path
@@ -55,12 +52,9 @@ def _is_device(path: Path) -> bool:
 
 
 def write_text(path: Path, text: str, *, errors: str = "strict") -> Path:
-    """Write a text file atomically, with its line ends unchanged, and return its path.
+    """Write a text file as UTF-8 atomically, with its line ends unchanged, and return its path.
 
-    Args:
-        path: File.
-        text: Content, written as UTF-8.
-        errors: Python's handler for what is not UTF-8: "surrogateescape" writes the bytes of file names unchanged.
+    The handler of errors "surrogateescape" writes the bytes of file names unchanged.
     """
     with write_atomically(path) as temporary:
         temporary.write_text(text, encoding="utf-8", errors=errors, newline="")
@@ -68,15 +62,10 @@ def write_text(path: Path, text: str, *, errors: str = "strict") -> Path:
 
 
 def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path | None] = ()) -> None:
-    """Check that files can be written, before the work whose results they get, and create their folders.
+    """Check that files, or None, can be written, before the work whose results they get, and create their folders.
 
-    Args:
-        outputs: Files to write; None is ignored.
-        inputs: Files that are read, or folders; None is ignored. Default: none.
-
-    Raises:
-        ValueError: An output is a folder, a file that is also an input or another output, or in a folder that cannot be
-            created or written to.
+    Raise ValueError if an output is a folder, a file that is also an input or another output, or in a folder that
+    cannot be created or written to. An input may be a folder.
     """
     input_files = {path.resolve() for path in inputs if path is not None and path.is_file()}
     output_files: set[Path] = set()
@@ -109,14 +98,8 @@ def require_new_folder(folder: Path) -> None:
 def lock_folder(folder: Path, *, wait: bool = False) -> Iterator[None]:
     """Lock a folder for this process until the block ends; create it if it does not exist.
 
-    The operating system releases the lock when the process ends, however it ends.
-
-    Args:
-        folder: Folder to lock.
-        wait: Wait for another process that holds the lock, instead of raising.
-
-    Raises:
-        ValueError: `folder` is or lies in a file, cannot be created, or another process holds the lock.
+    The operating system releases the lock when the process ends, however it ends. It waits for another process that
+    holds the lock, or raises ValueError, as for a folder that is or lies in a file, or cannot be created.
     """
     lock = FileLock(folder / ".lock", timeout=-1 if wait else 0)
     tries = 0
@@ -161,11 +144,7 @@ def delay_interrupts() -> Iterator[None]:
 
 
 def read_lines(path: Path) -> list[str]:
-    """Return the lines of a text file without white space around them; empty ones are left out.
-
-    Args:
-        path: UTF-8 file.
-    """
+    """Return the lines of a UTF-8 file without white space around them; empty ones are left out."""
     return [line for text in read_text(path).splitlines() if (line := text.strip())]
 
 
@@ -185,11 +164,7 @@ def fingerprint(content: Any) -> str:
 
 
 def file_states(files: Iterable[Path]) -> list[tuple[str, int, int]]:
-    """Return the name, size and modification time of each file, for a `fingerprint` that changes with any of them.
-
-    Args:
-        files: Existing files.
-    """
+    """Return the name, size and modification time of each file, for a `fingerprint` that changes with any of them."""
     return [(file.name, (stat := file.stat()).st_size, stat.st_mtime_ns) for file in files]
 
 
@@ -199,11 +174,7 @@ def cache_folder() -> Path:
 
 
 def packaged_config(name: str) -> str:
-    """Return the file of a configuration.
-
-    Args:
-        name: Path of a file, which is returned unchanged, or the name of a packaged configuration, such as
-            `quickstart`.
+    """Return the file of a packaged configuration, such as `quickstart`; the path of a file is returned unchanged.
 
     >>> from pathlib import Path
     >>> from bpnp.files import packaged_config
@@ -221,14 +192,7 @@ def config_names() -> list[str]:
 
 
 def config_content(file: Path) -> dict[str, Any]:
-    """Read the options of a configuration file.
-
-    Args:
-        file: YAML file.
-
-    Raises:
-        ValueError: The file is not YAML, or holds no options.
-    """
+    """Read the options of a configuration file; raise ValueError if it is not YAML, or holds no options."""
     content = read_yaml(file)
     if not isinstance(content, dict):
         raise ValueError(f"{file} has no options such as `model:` and `data:`; its content is {content!r:.60}")

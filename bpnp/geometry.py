@@ -10,13 +10,7 @@ from torch import Tensor
 
 
 def bearings(points2d: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 3"]:
-    """Return the unit viewing rays f = (x, y, 1) / |(x, y, 1)| of image points.
-
-    Args:
-        points2d: Normalised image coordinates (..., 2).
-
-    Returns:
-        Unit vectors (..., 3) in camera coordinates.
+    """Return the unit viewing rays f = (x, y, 1) / |(x, y, 1)| of normalised image points, in camera coordinates.
 
     >>> import torch
     >>> from bpnp.geometry import bearings
@@ -30,27 +24,12 @@ def bearings(points2d: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 3"]:
 def transform(
     rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"], points3d: Float[Tensor, "*b n 3"]
 ) -> Float[Tensor, "*b n 3"]:
-    """Transform scene points to camera coordinates, R p + t.
-
-    Args:
-        rotation: R (..., 3, 3).
-        translation: t (..., 3), scene units.
-        points3d: p (..., n, 3), scene units.
-
-    Returns:
-        Camera coordinates (..., n, 3), scene units.
-    """
+    """Transform scene points to camera coordinates, R p + t."""
     return points3d @ rotation.mT + translation.unsqueeze(-2)
 
 
 def project(points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 2"]:
-    """Project points in camera coordinates to the normalised image plane.
-
-    Args:
-        points: Camera coordinates (..., 3).
-
-    Returns:
-        (x/z, y/z), (..., 2); infinite at z = 0.
+    """Project points in camera coordinates to the normalised image plane, (x/z, y/z); infinite at z = 0.
 
     >>> import torch
     >>> from bpnp.geometry import project
@@ -61,41 +40,17 @@ def project(points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 2"]:
 
 
 def camera_centre(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-    """Return the camera centre in scene coordinates, -R^T t.
-
-    Args:
-        rotation: R (..., 3, 3).
-        translation: t (..., 3), scene units.
-
-    Returns:
-        Centre (..., 3), scene units.
-    """
+    """Return the camera centre in scene coordinates, -R^T t."""
     return -(rotation.mT @ translation.unsqueeze(-1)).squeeze(-1)
 
 
 def choose(chosen: Bool[Tensor, " b"], first: Tensor, second: Tensor) -> Tensor:
-    """Choose between two tensors sample by sample.
-
-    Args:
-        chosen: Mask (b,).
-        first: Values (b, ...) where the mask is True.
-        second: Values (b, ...) where the mask is False.
-
-    Returns:
-        Values (b, ...).
-    """
+    """Choose `first` (b, ...) for the samples of the mask and `second` (b, ...) for the others."""
     return torch.where(chosen.view(-1, *(1 for _ in first.shape[1:])), first, second)
 
 
 def hat(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Return the skew-symmetric matrix [v]x with [v]x w = v x w.
-
-    Args:
-        vector: v (..., 3).
-
-    Returns:
-        Matrices (..., 3, 3).
-    """
+    """Return the skew-symmetric matrix [v]x with [v]x w = v x w."""
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
@@ -104,17 +59,9 @@ def hat(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 def retract(
     step: Float[Tensor, "*b 6"], rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]
 ) -> tuple[Float[Tensor, "*b 3 3"], Float[Tensor, "*b 3"]]:
-    """Move a pose by a step: (R, t) becomes (exp([w]x) R, t + s).
+    """Move a pose by a step (w, s): (R, t) becomes (exp([w]x) R, t + s), with w in radians.
 
     The exponential acts on the left, so that camera coordinates y = R p + t change by w x (R p) + s to first order.
-
-    Args:
-        step: (w, s), (..., 6); w in radians, s in the units of t.
-        rotation: R (..., 3, 3).
-        translation: t (..., 3).
-
-    Returns:
-        The new rotation (..., 3, 3) and translation (..., 3).
 
     >>> import torch
     >>> from bpnp.geometry import retract
@@ -128,15 +75,9 @@ def retract(
 
 
 def quaternion_rotation(quaternion: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3 3"]:
-    """Convert quaternions of any length to rotation matrices.
+    """Convert quaternions (x, y, z, w) of any length but zero to rotation matrices.
 
     A quaternion of four normal numbers gives a uniformly random rotation.
-
-    Args:
-        quaternion: (x, y, z, w), (..., 4), not zero.
-
-    Returns:
-        Rotations (..., 3, 3).
     """
     import roma  # as in `retract`
 
@@ -146,14 +87,9 @@ def quaternion_rotation(quaternion: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 
 def random_rotations(
     count: int, generator: torch.Generator | np.random.Generator | None = None
 ) -> Float[Tensor, "count 3 3"]:
-    """Draw rotations uniformly over SO(3).
+    """Draw rotations uniformly over SO(3), float64, on the CPU, from 4 normal numbers each.
 
-    Args:
-        count: Number of rotations.
-        generator: Source of 4 normal numbers a rotation. Default: torch's global generator.
-
-    Returns:
-        Rotations (count, 3, 3), float64, on the CPU.
+    By default they come from torch's global generator.
     """
     if isinstance(generator, np.random.Generator):
         return quaternion_rotation(torch.from_numpy(generator.standard_normal((count, 4))))
@@ -161,45 +97,23 @@ def random_rotations(
 
 
 def angle_between(a: Float[Tensor, "*#b 3"], b: Float[Tensor, "*#b 3"]) -> Float[Tensor, "*#b"]:
-    """Return the angle between vectors, atan2(|a x b|, a.b).
+    """Return the angle between vectors of any length, atan2(|a x b|, a.b), in [0, pi] radians.
 
     This form is exact near 0 and pi, where arccos loses half of the digits.
-
-    Args:
-        a: Vectors (..., 3) of any length.
-        b: Vectors (..., 3); their leading axes broadcast with those of `a`.
-
-    Returns:
-        Angles (...) in [0, pi], radians.
     """
     a, b = torch.broadcast_tensors(a, b)
     return torch.atan2(torch.linalg.vector_norm(torch.linalg.cross(a, b), dim=-1), (a * b).sum(-1))
 
 
 def is_finite(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
-    """Return which poses are finite.
-
-    A pose that was not found holds NaN or infinity.
-
-    Args:
-        rotation: R (..., 3, 3).
-        translation: t (..., 3).
-
-    Returns:
-        Mask (...).
-    """
+    """Return which poses are finite: one that was not found holds NaN or infinity."""
     return rotation.isfinite().all((-2, -1)) & translation.isfinite().all(-1)
 
 
 def masked_median(values: Float[Tensor, "*b k"], mask: Bool[Tensor, "*#b k"]) -> Float[Tensor, "*b"]:
-    """Return the lower median of the masked values, as `torch.nanmedian`, which is not deterministic on a GPU.
+    """Return the lower median of the values where the mask is True, NaN without one.
 
-    Args:
-        values: Values (..., k).
-        mask: True at the values that count (..., k), broadcast.
-
-    Returns:
-        Median (...); NaN where no value counts.
+    It is that of `torch.nanmedian`, which is not deterministic on a GPU.
     """
     mask = mask.expand_as(values)
     ordered = values.masked_fill(~mask, torch.inf).sort(-1).values
@@ -214,34 +128,18 @@ def chords(
     rotation: Float[Tensor, "b 3 3"],
     translation: Float[Tensor, "b 3"],
 ) -> Float[Tensor, "b m n"]:
-    """Return the distance between each bearing and each point's direction, |f_i - u_j| = 2 sin(angle / 2).
+    """Return the distance between each bearing and each point's direction, |f_i - u_j| = 2 sin(angle / 2), in [0, 2].
 
     u_j is the unit direction of R p_j + t. The chord keeps its digits at small angles and needs no cross products.
-
-    Args:
-        bearings: Unit vectors f_i (b, m, 3).
-        points3d: Scene points p_j (b, n, 3), scene units.
-        rotation: R (b, 3, 3).
-        translation: t (b, 3), scene units.
-
-    Returns:
-        Chords (b, m, n) in [0, 2].
     """
     directions = torch.nn.functional.normalize(transform(rotation, translation, points3d), dim=-1)
     return torch.cdist(bearings, directions, compute_mode="donot_use_mm_for_euclid_dist")
 
 
 def rotation_angle(a: Float[Tensor, "*b 3 3"], b: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
-    """Return the angle of the relative rotation a^T b (paper Eq. 13).
+    """Return the angle of the relative rotation a^T b in [0, pi] radians (paper Eq. 13).
 
     It is atan2 of twice the sine and twice the cosine. The gradient is undefined at 0 and pi; zero is returned there.
-
-    Args:
-        a: Rotations (..., 3, 3).
-        b: Rotations (..., 3, 3).
-
-    Returns:
-        Angles (...) in [0, pi], radians.
     """
     relative = a.mT @ b
     skew = relative - relative.mT

@@ -25,21 +25,13 @@ from bpnp.types import Batch, Pose, Prediction
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """Errors of one estimate for b problems, float64.
+    """Errors of one estimate for b problems, float64."""
 
-    Attributes:
-        rotation_deg: `rotation_error` (b,), degrees.
-        translation: `translation_error` (b,), scene units.
-        centre: `centre_error` (b,), scene units.
-        reprojection_deg: `reprojection_error` (b,), degrees.
-        index: `Batch.index` of the problems (b,), None if they have none.
-    """
-
-    rotation_deg: Float[Tensor, " b"]
-    translation: Float[Tensor, " b"]
-    centre: Float[Tensor, " b"]
-    reprojection_deg: Float[Tensor, " b"]
-    index: Int[Tensor, " b"] | None = None
+    rotation_deg: Float[Tensor, " b"]  # `rotation_error`, degrees
+    translation: Float[Tensor, " b"]  # `translation_error`, scene units
+    centre: Float[Tensor, " b"]  # `centre_error`, scene units
+    reprojection_deg: Float[Tensor, " b"]  # `reprojection_error`, degrees
+    index: Int[Tensor, " b"] | None = None  # `Batch.index` of the problems, None if they have none
 
 
 def rotation_error(rotation: Float[Tensor, "b 3 3"], rotation_gt: Float[Tensor, "b 3 3"]) -> Float[Tensor, " b"]:
@@ -87,18 +79,9 @@ def centre_error(
     rotation_gt: Float[Tensor, "b 3 3"],
     translation_gt: Float[Tensor, "b 3"],
 ) -> Float[Tensor, " b"]:
-    """Return the distance of the camera centres, |R^T t - R_gt^T t_gt|.
+    """Return the distance of the camera centres, |R^T t - R_gt^T t_gt|, float64; infinite where the pose is not finite.
 
     Unlike |t - t_gt|, it does not depend on the origin of the scene.
-
-    Args:
-        rotation: Estimated R (b, 3, 3).
-        translation: Estimated t (b, 3), scene units.
-        rotation_gt: True R (b, 3, 3).
-        translation_gt: True t (b, 3), scene units.
-
-    Returns:
-        Distances (b,), scene units, float64; infinity where the pose is not finite.
     """
     centre = camera_centre(rotation.double(), translation.double())
     error = torch.linalg.vector_norm(centre - camera_centre(rotation_gt.double(), translation_gt.double()), dim=-1)
@@ -138,15 +121,8 @@ def reprojection_error(
 def pose_errors(pose: Pose, batch: Batch) -> PoseErrors:
     """Return all four errors of a pose against the true pose of the batch.
 
-    Args:
-        pose: Estimated poses.
-        batch: Problems with their true pose.
-
-    Returns:
-        The errors. `reprojection_deg` is NaN if the batch has no `match3d`.
-
-    Raises:
-        ValueError: The batch has no true pose, or one that is not finite.
+    `reprojection_deg` is NaN if the batch has no `match3d`. Raise ValueError if it has no true pose, or one that is not
+    finite.
     """
     if batch.rotation is None or batch.translation is None:
         raise ValueError("the batch has no true `rotation` and `translation`, which pose errors need")
@@ -168,18 +144,7 @@ def pose_errors(pose: Pose, batch: Batch) -> PoseErrors:
 
 
 def prediction_errors(prediction: Prediction, batch: Batch) -> dict[str, PoseErrors]:
-    """Return the `pose_errors` of each estimate of a prediction.
-
-    Args:
-        prediction: Prediction with any number of poses.
-        batch: Problems with their true pose.
-
-    Returns:
-        The errors by the name of the estimate.
-
-    Raises:
-        ValueError: The batch has no true pose, or one that is not finite.
-    """
+    """Return the `pose_errors` of each estimate of a prediction, by its name."""
     return {name: pose_errors(pose, batch) for name, pose in prediction.poses.items()}
 
 
@@ -215,22 +180,15 @@ class RecallThresholds:
 
 
 def pose_quartiles(errors: PoseErrors) -> dict[str, Tensor]:
-    """Return the three quartiles of each error.
+    """Return the three quartiles of each error of at least one problem as float64 scalars, and two counts.
+
+    The names are "rotation_q1_deg", "translation_q2", "centre_q3", "reprojection_q1_deg" and so on, where q2 is the
+    median; "found", the fraction of problems with a pose; "without_matches", the number of problems without a
+    reprojection error. Quartiles of the reprojection error leave these problems out, and are absent if no problem has
+    that error.
 
     Quartiles interpolate linearly between order statistics (numpy's default). A quartile next to an infinite error is
     infinite.
-
-    Args:
-        errors: Errors of at least one problem.
-
-    Returns:
-        Float64 scalars by name: "rotation_q1_deg", "translation_q2", "centre_q3", "reprojection_q1_deg" and so on,
-            where q2 is the median; "found", the fraction of problems with a pose; "without_matches", the number of
-            problems without a reprojection error. Quartiles of the reprojection error leave these problems out, and are
-            absent if no problem has that error.
-
-    Raises:
-        ValueError: There are no problems.
     """
     values: dict[str, Tensor] = {}
     for name, unit, error in known_errors(errors):
@@ -247,21 +205,11 @@ def pose_quartiles(errors: PoseErrors) -> dict[str, Tensor]:
 
 
 def pose_recalls(errors: PoseErrors, thresholds: RecallThresholds | None = None) -> dict[str, Tensor]:
-    """Return the fraction of problems with an error up to each threshold.
+    """Return the fraction of at least one problem with an error up to each threshold, float64 scalars in [0, 1].
 
-    The fractions of the reprojection error are of the problems that have one.
-
-    Args:
-        errors: Errors of at least one problem.
-        thresholds: Thresholds. Default: `RecallThresholds()`.
-
-    Returns:
-        Float64 scalars in [0, 1] by name: "recall_rotation_5deg", "recall_translation_0.5", "recall_centre_0.5",
-            "recall_reprojection_1deg" and so on, and "recall_joint_15deg_0.5" for rotation and translation together.
-            Those of the reprojection error are absent if no problem has that error.
-
-    Raises:
-        ValueError: There are no problems.
+    The names are "recall_rotation_5deg", "recall_translation_0.5", "recall_centre_0.5", "recall_reprojection_1deg" and
+    so on, and "recall_joint_15deg_0.5" for rotation and translation together. Fractions of the reprojection error are
+    of the problems that have one, and are absent if none has.
     """
     thresholds = thresholds or RecallThresholds()
     values: dict[str, Tensor] = {}
@@ -275,14 +223,7 @@ def pose_recalls(errors: PoseErrors, thresholds: RecallThresholds | None = None)
 
 
 def recall_curve(error: Float[Tensor, " b"], limits: Limits) -> Float[Tensor, " k"]:
-    """Return the fraction of errors up to each limit.
-
-    Args:
-        error: Errors (b,).
-        limits: Limits (k,), in the unit of the errors.
-
-    Returns:
-        Fractions (k,), float64.
+    """Return the fraction of errors up to each limit, float64.
 
     >>> import torch
     >>> from bpnp.metrics import recall_curve
@@ -295,20 +236,14 @@ def recall_curve(error: Float[Tensor, " b"], limits: Limits) -> Float[Tensor, " 
 
 
 def joint_error(errors: PoseErrors, translation: float | int) -> Float[Tensor, " b"]:
-    """Return the rotation errors in degrees, infinite where the translation error exceeds a limit.
-
-    Args:
-        errors: Errors of b problems.
-        translation: Largest translation error, scene units.
-    """
+    """Return the rotation errors in degrees, infinite where the translation error exceeds a limit in scene units."""
     return errors.rotation_deg.where(errors.translation <= translation, math.inf)
 
 
 def known_errors(errors: PoseErrors) -> Iterator[tuple[str, str, Tensor]]:
     """Yield the name, the unit and the finite or infinite values of each error that at least one problem has.
 
-    Raises:
-        ValueError: There are no problems, or an error other than the reprojection error is NaN.
+    Raise ValueError if there are no problems, or an error other than the reprojection error is NaN.
     """
     if len(errors.rotation_deg) == 0:
         raise ValueError(NO_PROBLEM)
@@ -385,12 +320,7 @@ class MeanOverProblems(ProblemMetric):
     width = 1
 
     def update(self, values: Float[Tensor, " b"], index: Int[Tensor, " b"]) -> None:
-        """Add the values of a batch.
-
-        Args:
-            values: One value per problem (b,).
-            index: `Batch.index` of the problems (b,).
-        """
+        """Add one value per problem of a batch; `index` is its `Batch.index`."""
         self._append(values, index=index)
 
     def compute(self) -> Float[Tensor, ""]:

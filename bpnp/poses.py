@@ -18,15 +18,10 @@ def rotation_angle(one: Array, other: Array) -> float:
 
 
 class Tolerance(NamedTuple):
-    """Largest difference between two poses that count as the same one.
+    """Largest difference between two poses that count as the same one."""
 
-    Attributes:
-        degrees: Angle between the rotations.
-        shift: Motion of the centroid of the scene in the camera's frame, a fraction of its distance.
-    """
-
-    degrees: float = 2.0
-    shift: float = 0.05
+    degrees: float = 2.0  # angle between the rotations
+    shift: float = 0.05  # motion of the centroid of the scene in the camera's frame, a fraction of its distance
 
     def times(self, factor: float | int) -> "Tolerance":
         """Return a tolerance that is larger by a factor."""
@@ -39,23 +34,15 @@ SAME = Tolerance()
 def same_pose(
     rotation: Array, centroid: Array, i: int | NDArray[np.int64] = 0, tolerance: Tolerance = SAME
 ) -> NDArray[np.bool_]:
-    """Find the poses that are the same as pose i.
+    """Find the poses that are the same as pose i, or as several indices (k,): a mask (c,) or (k, c).
 
-    Args:
-        rotation: Rotations (c, 3, 3).
-        centroid: (c, 3) the centroid of the scene in the camera's frame; (c, k, 3) in the frames of several cameras.
-        i: Index of the reference pose, or several indices (k,).
-        tolerance: Largest differences.
+    `centroid` (c, 3) is that of the scene in the camera's frame, or (c, k, 3) in the frames of several cameras.
 
-    Returns:
-        Mask (c,), or (k, c) for several indices.
-
-    Examples:
-        >>> import numpy as np
-        >>> from bpnp.poses import same_pose
-        >>> middle = np.array([[0, 0, 10], [0.4, 0, 10], [0, 0, 10.6]])
-        >>> same_pose(np.stack([np.eye(3)] * 3), middle)
-        array([ True,  True, False])
+    >>> import numpy as np
+    >>> from bpnp.poses import same_pose
+    >>> middle = np.array([[0, 0, 10], [0.4, 0, 10], [0, 0, 10.6]])
+    >>> same_pose(np.stack([np.eye(3)] * 3), middle)
+    array([ True,  True, False])
     """
     return close_poses(rotation, polar_coordinates(centroid), i, *tolerance)
 
@@ -70,18 +57,10 @@ def polar_coordinates(points: Array) -> Array:
 def close_poses(
     rotation: Array, translation: Array, i: int | NDArray[np.int64], degrees: float, shift: float
 ) -> NDArray[np.bool_]:
-    """Find the poses that are close to pose i.
+    """Find the poses that are close to pose i, or to several indices (k,): a mask (c,) or (k, c).
 
-    Args:
-        rotation: Rotations (c, 3, 3).
-        translation: Translations (c, 3), or whatever else `shift` limits.
-        i: Index of the reference pose, or several indices (k,).
-        degrees: Largest rotation angle between two equal poses, degrees.
-        shift: Largest distance of their translations, in the units of `translation`. `math.inf` ignores the
-            translations.
-
-    Returns:
-        Mask (c,), or (k, c) for several indices. Pose i is close to itself; NaN is close to nothing.
+    `shift` is the largest distance of the translations (c, 3), or of whatever else is given for them; `math.inf`
+    ignores them. Pose i is close to itself; NaN is close to nothing.
     """
     flat = rotation.reshape(-1, 9)
     alike = flat[i] @ flat.T >= 1 + 2 * math.cos(math.radians(degrees))
@@ -93,18 +72,10 @@ def close_poses(
 def distinct(
     rotation: Array, translation: Array, score: Array, count: int, degrees: float, shift: float
 ) -> NDArray[np.int64]:
-    """Select the best poses such that no two are closer than both limits.
+    """Return the indices of at most `count` poses, best first, of which no two are closer than both limits.
 
-    Args:
-        rotation: Rotations (c, 3, 3).
-        translation: Translations (c, 3).
-        score: Score (c,), larger is better. Poses with NaN or an infinite score are left out.
-        count: Largest number of poses.
-        degrees: Angle limit, as in `close_poses`, degrees.
-        shift: Distance limit, as in `close_poses`.
-
-    Returns:
-        Indices of at most `count` poses, best first.
+    The limits are those of `close_poses`, the score (c,) is larger for a better pose. Poses with NaN or an infinite
+    score are left out.
     """
     kept: list[int] = []
     free = np.isfinite(score)

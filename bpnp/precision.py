@@ -42,9 +42,6 @@ def exact_products(device: torch.device) -> Iterator[None]:
 
     Autocast is a setting of the thread. The precision of products is one of the process, so other threads compute exact
     products meanwhile. The user's setting returns when the last of nested or concurrent blocks ends.
-
-    Args:
-        device: Device whose autocast is switched off.
     """
     with _LOCK:
         _RESTORE.append(_raise_precision())

@@ -23,13 +23,10 @@ _T = TypeVar("_T")
 
 
 def has_no_padding(mask: Bool[Tensor, "b k"]) -> bool:
-    """Return True if every point is known to be real, so that the mask need not be applied.
+    """Return True if every point is known to be real (True in the mask), so that the mask need not be applied.
 
     The result is False for a mask on a GPU, where reading the values would make the host wait, and while a graph is
     compiled, which has to serve any mask.
-
-    Args:
-        mask: True at real points (b, k).
     """
     return mask.is_cpu and not torch.compiler.is_compiling() and bool(mask.all())
 
@@ -269,14 +266,9 @@ class Batch(Tensors):
 
 
 def map_tensors(value: _T, function: Callable[[Tensor], Tensor]) -> _T:
-    """Apply a function to every tensor of a dataclass or dict, recursively.
+    """Return a copy of a dataclass or dict with a function applied to every tensor, recursively.
 
-    Args:
-        value: Tensor, dict or dataclass; any other value is returned unchanged.
-        function: Function of one tensor.
-
-    Returns:
-        A copy with the results.
+    Any other value is returned unchanged.
     """
     if isinstance(value, Tensor):
         return cast(_T, function(value))

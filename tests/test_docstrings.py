@@ -38,12 +38,18 @@ PACKAGES = (
     "bpnp",
     *(f"bpnp.{name}" for name in ("datamodules", "layers", "models", "models.baselines", "report", "training")),
 )
-DONE = (
-    "bpnp/maps",
-    "bpnp/report",
-    "bpnp/commands",
-    "bpnp/datamodules",
-)  # folders whose docstrings have been read; `bpnp/*` stands for the files directly in it
+# Folders and files whose docstrings have not been read yet.
+NOT_YET = {
+    "bpnp/layers",
+    "bpnp/models",
+    "bpnp/robust",
+    "bpnp/runtime.py",
+    "bpnp/search",
+    "bpnp/solving",
+    "bpnp/training",
+    "benchmarks",
+    "tests",
+}
 SECTION = re.compile(r"^ *(Args|Attributes|Returns|Raises|Yields):$", re.MULTILINE)
 # What a configuration names.
 CONFIGURABLE = (
@@ -212,17 +218,24 @@ def documented_nodes(file: Path) -> Iterator[tuple[str, str]]:
     yield from visit(ast.parse(file.read_text(encoding="utf-8")), module)
 
 
-def files_of(*folders: str) -> Iterator[Path]:
-    """Yield the Python files below folders, and of a folder `bpnp/*` the files directly in it."""
-    for folder in folders:
-        found = (ROOT / folder).glob("*.py") if folder.endswith("*") else (ROOT / folder).rglob("*.py")
-        yield from sorted(found)
+def sources() -> Iterator[Path]:
+    """Yield the Python files of the package, the benchmarks and the tests."""
+    for folder in ("bpnp", "benchmarks", "tests"):
+        yield from sorted((ROOT / folder).rglob("*.py"))
+
+
+def read_sources() -> Iterator[Path]:
+    """Yield the files that are not in `NOT_YET`."""
+    for file in sources():
+        path = file.relative_to(ROOT)
+        if not {str(each) for each in (path, *path.parents)} & NOT_YET:
+            yield file
 
 
 def test_only_what_a_user_reads_has_sections() -> None:
     """The docstring of anything else is a sentence: an argument is described where the name and type do not."""
     described = described_places()
-    documented = (node for file in files_of(*DONE) for node in documented_nodes(file))
+    documented = (node for file in read_sources() for node in documented_nodes(file))
     assert [where for where, text in documented if SECTION.search(text) and where not in described] == []
 
 
@@ -244,9 +257,9 @@ def identifiers(file: Path) -> Iterator[str]:
 
 def test_docstrings_and_comments_name_only_what_exists() -> None:
     """A name in backticks, such as `layers.sinkhorn` or `Pose.stats`, is a name in the code of the package."""
-    known = {name for file in files_of("bpnp", "benchmarks", "tests") for name in identifiers(file)} | FOREIGN
+    known = {name for file in sources() for name in identifiers(file)} | FOREIGN
     wrong = []
-    for file in files_of(*DONE):
+    for file in read_sources():
         text = file.read_text(encoding="utf-8")
         tokens = tokenize.generate_tokens(io.StringIO(text).readline)
         prose = [each.string for each in tokens if each.type == tokenize.COMMENT]
