@@ -30,7 +30,7 @@ from bpnp.search.plan import Plan
 from bpnp.search.pool import Pool
 from bpnp.search.propose.repetitions import competing_poses
 from bpnp.search.search_frame import Scene
-from bpnp.search.verdict.decide import count_starts, no_pose
+from bpnp.search.verdict.decide import Case
 
 FILE, PAGES = ROOT / "benchmarks" / "completeness.json", (ROOT / "docs" / "verdict.md",)
 TURNS = 8
@@ -47,7 +47,7 @@ def reached(problem: Problem) -> dict[int, bool]:
     """Return, for each basin count that a best pose reached, whether the first pose that did was correct."""
     points2d, points3d = problem.solve.args  # type: ignore[attr-defined]
     points, settings = problem_from(points2d, points3d, None), replace(DEFAULT, evidence=BLIND)
-    pool = Pool(Scene(points, 0, settings), points, no_pose())
+    pool = Pool(Scene(points, 0, settings), points, Case.without_pose(points))
     found: dict[int, bool] = {}
     plan = Plan.of(pool)
     for _ in range(TURNS):
@@ -57,7 +57,7 @@ def reached(problem: Problem) -> dict[int, bool]:
         leaders = pool.leaders()
         if not len(leaders) or leaders.log10_false_alarms[0] > BLIND.false_alarms:
             continue
-        hits = count_starts(leaders, points, BLIND)
+        hits = pool.symmetry.basin_count(leaders)
         turn = leaders.rotation[0].T @ problem.poses[0][0]
         right = np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))) < RIGHT_DEG
         for least in BASIN_COUNTS:

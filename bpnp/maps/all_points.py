@@ -11,7 +11,6 @@ from bpnp.maps.viewed_points import Region
 from bpnp.maps.views import Array
 from bpnp.poses import MIN_POINTS
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
-from bpnp.search.competing_poses import judge_with_competitors, other_lens
 from bpnp.search.config import DEFAULT, MAPS, Evidence
 from bpnp.search.focal_length import AROUND, UnknownCamera, fit_camera
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
@@ -22,8 +21,10 @@ from bpnp.search.refine.annealing import anneal_to_end, finish
 from bpnp.search.search_frame import Scene
 from bpnp.search.solution import Solution, add_objection, change_verdict
 from bpnp.search.verdict.competitors import competing_pose
-from bpnp.search.verdict.decide import judge
+from bpnp.search.verdict.contest import contest, rivals_of
+from bpnp.search.verdict.decide import Case, decide
 from bpnp.search.verdict.reasons import Unfinished
+from bpnp.search.verdict.rivals.lens import lens
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,9 +101,9 @@ def judge_on_all_points(solution: Solution, refined: Refined | None) -> Solution
         return solution
     problem, settings, confident = refined.problem, DEFAULT.evidence, solution.verdict == "confident"
 
-    alone = judge(refined.poses, problem, batches=1, exhaustive=True, settings=settings)
+    alone = Case.of(refined.poses, problem, exhaustive=True, iterations=1)
     deadline = refined.scene.deadline
-    result = judge_with_competitors(alone, problem, lambda: refined.scene, settings, exhaustive=True, deadline=deadline)
+    result = decide(contest(alone, rivals_of(lambda: refined.scene, deadline)))
     rotation, translation = result.best
     behind = result.log10_false_alarms - solution.log10_false_alarms
     if confident and not problem.same_as(refined.pose, rotation[None], translation[None], settings.same)[0]:
@@ -115,9 +116,9 @@ def judge_on_all_points(solution: Solution, refined: Refined | None) -> Solution
         return with_ids(replace(found, stats=stats, candidates=candidates), refined.region)
     if not confident:
         return solution
-    if alone.verdict != "confident":  # other cameras have not been tested for it
-        lens_objection = other_lens(alone, problem, lambda: refined.scene, settings, deadline)
-        return solution if lens_objection is None else add_objection(solution, lens_objection)
+    if alone.objection is not None:  # other cameras have not been tested for it
+        objections = lens(alone, scene_of=lambda: refined.scene, deadline=deadline).objections
+        return add_objection(solution, objections[-1]) if objections else solution
     if result.verdict == "confident":
         return solution
     return change_verdict(solution, result.verdict, result.reason, result.code)

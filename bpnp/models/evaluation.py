@@ -24,9 +24,9 @@ from bpnp.runtime import Deadline, default_float_errors
 from bpnp.search.config import DEFAULT, SearchSettings
 from bpnp.search.problem import Problem
 from bpnp.search.propose.given import anneal_given
-from bpnp.search.search import search_poses
+from bpnp.search.search import fixing_no_pose, search_poses
 from bpnp.search.search_frame import Scene, degenerate
-from bpnp.search.verdict.decide import SearchResult, degenerate_points, judge
+from bpnp.search.verdict.decide import Case, SearchResult, decide
 from bpnp.types import Batch, Pose, Prediction, SolveStats
 
 
@@ -100,9 +100,9 @@ def refine(batch: Batch, rotation: Float[Tensor, "b s 3 3"], translation: Float[
 def _refine(problem: Problem, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> SearchResult:
     """Return the annealed poses of one problem, the best one first."""
     if degenerate(problem.bearings) or degenerate(problem.points3d):
-        return degenerate_points("too few points, or all on one line")
+        return decide(fixing_no_pose(problem, "too few points, or all on one line"))
     poses = anneal_given(Scene(problem, 0, DEFAULT), rotation, translation)
-    return judge(poses, problem, batches=int(np.isfinite(rotation).all((-2, -1)).sum()), settings=DEFAULT.evidence)
+    return decide(Case.of(poses, problem, iterations=int(np.isfinite(rotation).all((-2, -1)).sum())))
 
 
 def problems_of(batch: Batch) -> list[Problem]:
@@ -132,7 +132,7 @@ def best_poses(results: Iterable[tuple[Problem, SearchResult]], like: Tensor) ->
     rotation = torch.from_numpy(np.array([pose[0] for pose in poses]).reshape(-1, 3, 3)).to(like)
     translation = torch.from_numpy(np.array([pose[1] for pose in poses]).reshape(-1, 3)).to(like)
     stats = SolveStats(
-        torch.tensor([result.batches for _, result in solved], device=like.device, dtype=torch.int64),
+        torch.tensor([result.iterations for _, result in solved], device=like.device, dtype=torch.int64),
         like.new_tensor([result.residual for _, result in solved]),
         torch.tensor([result.verdict == "confident" for _, result in solved], device=like.device, dtype=torch.bool),
     )

@@ -79,7 +79,7 @@ class Repetitions:
 
 @dataclass(frozen=True)
 class OtherFocal:
-    """Search for another focal length near a confident pose (`bpnp.search.competing_poses`).
+    """Search for another focal length near a confident pose (`bpnp.search.verdict.rivals.lens`).
 
     Attributes:
         step: Factor from one focal length to the next. [factor; calibration]

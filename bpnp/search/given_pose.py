@@ -6,18 +6,18 @@ poses that are as near to the given one as this optimum.
 The competing poses are proposed from the pose and from the scene; no search is run. Some are the optima that annealing
 reaches from the pose, from perturbed copies, and from its mirror image in front of a flat scene. Others come from the
 motions and reflections that map the scene onto itself, and from other focal lengths
-(`bpnp.search.competing_poses`). A better pose elsewhere is not searched for.
+(`bpnp.search.verdict.contest`). A better pose elsewhere is not searched for.
 """
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.poses import rotation_angle
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
-from bpnp.search.competing_poses import judge_with_competitors
 from bpnp.search.config import DEFAULT, PRECISION, Evidence
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
@@ -30,8 +30,8 @@ from bpnp.search.propose.symmetries import mirror_pose
 from bpnp.search.refine.annealing import anneal_on_points, anneal_to_end, finish
 from bpnp.search.search_frame import Scene
 from bpnp.search.starts import PosePrior
-from bpnp.search.verdict.competitors import distance_between
-from bpnp.search.verdict.decide import SearchResult, Verdict, add_false_alarms, fits_by_chance, judge
+from bpnp.search.verdict.contest import contest, rivals_of
+from bpnp.search.verdict.decide import Case, add_false_alarms
 from bpnp.search.verdict.false_alarms import likeliest_scale
 from bpnp.search.verdict.reasons import Unfinished, objection
 from bpnp.search.verdict.uncertainty import linearised, local_covariance
@@ -41,7 +41,7 @@ ONE_POSE = "only this pose and its competitors were tested, no better one was se
 
 
 @one_blas_thread
-def judge_given_pose(
+def given_pose(
     problem: Problem,
     rotation: Array,
     translation: Array,
@@ -49,8 +49,8 @@ def judge_given_pose(
     refine: bool = True,
     seed: int = 0,
     deadline: Deadline = NEVER,
-) -> tuple[SearchResult, Hypotheses]:
-    """Judge a given pose, or the optimum near it.
+) -> tuple[Case, Hypotheses]:
+    """Return what is known of a given pose, or of the optimum near it.
 
     Args:
         problem: Points of the problem.
@@ -92,19 +92,23 @@ def judge_given_pose(
         claim = optimum
     competing = others[~same & (others.log10_false_alarms < 0)]  # insignificant poses do not compete
     candidates = _with_new_false_alarms(Hypotheses.concatenate([claim, competing]), one)
-    result = judge(candidates, one, batches=0, exhaustive=True, settings=settings)
-    result = judge_with_competitors(
-        result, one, lambda: scene, settings, exhaustive=True, enumerated=few, deadline=deadline
-    )
-    result = _of_claim(result, candidates[:1], one)
-    if result.verdict == "confident":
-        result = replace(result, reason=f"{result.reason}; {ONE_POSE}")
-    margin = float(claim.log10_false_alarms[0] - optimum.log10_false_alarms[0]) if better else 0.0
-    if not refine and result.verdict == "confident" and 2 * math.log(10) * margin > PRECISION.far:  # see Wilks 1938
-        off = math.degrees(rotation_angle(rotation, optimum.rotation[0]))
-        result = result.add_objection(objection("better_nearby", margin, degrees=off))
-    refined = refine and result.verdict == "confident"
-    return replace(result, batches=int(refined)), optimum  # 0 batches: no last fit to the matches
+    case = Case.of(candidates, one, exhaustive=True, is_fitted=not refine, claim=candidates[:1], note=ONE_POSE)
+    rivals = rivals_of(lambda: scene, deadline, enumerated=few)
+    if better and not refine:
+        rivals.append(partial(_nearby, claim=claim, optimum=optimum))
+    return contest(case, rivals), optimum
+
+
+def _nearby(case: Case, *, claim: Hypotheses, optimum: Hypotheses) -> Case:
+    """Return the case against a given pose if the optimum near it fits significantly better.
+
+    Source: S. S. Wilks, The large-sample distribution of the likelihood ratio, Ann. Math. Statist. 1938.
+    """
+    margin = float(claim.log10_false_alarms[0] - optimum.log10_false_alarms[0])
+    if 2 * math.log(10) * margin <= PRECISION.far:
+        return case
+    off = math.degrees(rotation_angle(claim.rotation[0], optimum.rotation[0]))
+    return case.against(objection("better_nearby", margin, degrees=off))
 
 
 def _proposed(problem: Problem, claim: Hypotheses, scene: Scene) -> Hypotheses:
@@ -159,20 +163,3 @@ def _is_same(problem: Problem, claim: Hypotheses, pose: Hypotheses, settings: Ev
     centre, other = (one.rotation[0] @ problem.centre3d + one.translation[0] for one in (claim, pose))
     step = np.r_[vector, centre - other]
     return bool(step @ np.linalg.solve(covariance, step) < PRECISION.far)
-
-
-def _of_claim(result: SearchResult, claim: Hypotheses, problem: Problem) -> SearchResult:
-    """Convert a verdict on several poses into one on the given pose (1,), which becomes the first candidate."""
-    candidates = result.candidates
-    place = int(np.flatnonzero((candidates.translation == claim.translation[0]).all(-1))[0])
-    ordered = replace(result, candidates=candidates[np.r_[place, np.delete(np.arange(len(candidates)), place)]])
-    alarms = float(claim.log10_false_alarms[0])
-    if fits_by_chance(alarms):
-        return ordered.add_objection(objection("chance", what="the pose fits no"), "failed")
-    if place:
-        away = distance_between(problem, claim.pose(), candidates.pose())
-        margin = alarms - float(candidates.log10_false_alarms[0])
-        refuted = result.verdict == "confident"  # the other pose is confident and refutes the given one
-        verdict: Verdict = "failed" if refuted else "ambiguous"
-        return ordered.add_objection(objection("better_pose", margin, away=away), verdict)
-    return ordered

@@ -1,17 +1,20 @@
-"""The loop of every search: propose, refine, score, judge.
+"""The loop of every search: propose, refine, score, contest.
 
-A plan gives one step after the other, a step proposes refined poses, and a pool scores and keeps them. The loop ends
-when the verdict on the best pose is final, when the plan has no step left, or when the budget or the time is spent.
+A plan gives one step after the other, a step proposes refined poses, and a pool scores and keeps them. Once the best
+pose may be confident, its rivals are asked (`bpnp.search.verdict.contest`). The loop ends when nothing speaks against
+it, when more search would not help, when the plan has no step left, or when the budget or the time is spent.
 Searches differ in their plan and pool only: one camera (`bpnp.search.plan`), a rig (`bpnp.search.rig`), and few points
 (`bpnp.search.enumeration`).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
 
 from bpnp.runtime import Clock, Deadline
 from bpnp.search.hypotheses import Hypotheses
-from bpnp.search.verdict.decide import SearchResult
+from bpnp.search.verdict.contest import contest
+from bpnp.search.verdict.decide import Case
+from bpnp.search.verdict.rivals import Rival
 
 Progress = Callable[[int, float], None]  # iterations so far, seconds
 
@@ -51,11 +54,15 @@ class Poses(Protocol):
     def add(self, step: Step, found: Hypotheses) -> None:
         """Score the poses that a step found, and keep the best of all."""
 
-    def may_be_decided(self) -> bool:
-        """Return True if the verdict may be final; it is cheap, and `result` is computed only then."""
+    @property
+    def rivals(self) -> Sequence[Rival]:
+        """What to ask about the best pose."""
 
-    def result(self, *, ended: bool = True) -> SearchResult:
-        """Compute the verdict; `ended` is False while the search may go on."""
+    def may_be_decided(self) -> bool:
+        """Return True if the best pose may be confident; it is cheap, and `case` is called only then."""
+
+    def case(self, *, ended: bool = True) -> Case:
+        """Return what is known of the best pose; `ended` is False while the search may go on."""
 
 
 def teller(progress: Progress | None) -> Callable[[int], None]:
@@ -80,8 +87,8 @@ def run(
     most: int,
     deadline: Deadline,
     tell: Callable[[int], None] = lambda iterations: None,
-) -> SearchResult:
-    """Run the steps of a plan until the verdict is final or the budget is spent.
+) -> Case:
+    """Run the steps of a plan until its best pose is decided or the budget is spent.
 
     Args:
         plan: Steps of the search.
@@ -91,13 +98,13 @@ def run(
         tell: Called with the number of iterations after each step.
 
     Returns:
-        Distinct poses with the verdict.
+        What is known of the best pose, after its rivals were asked.
     """
     while poses.iterations < most and not deadline.passed() and (step := plan.next_step()) is not None:
         poses.add(step, step.propose())
         tell(poses.iterations)
         if poses.may_be_decided():
-            result = poses.result(ended=False)
-            if result.verdict == "confident" or result.settled:
-                return result
-    return poses.result()
+            case = contest(poses.case(ended=False), poses.rivals)
+            if case.is_settled:
+                return case
+    return contest(poses.case(), poses.rivals)

@@ -64,7 +64,7 @@ def finished(
         return with_unfinished(failed, deadline)
     threshold = inlier_threshold or MATCH_REACH * result.residual * problem.per_radian
     poses = list(zip(found.rotation, found.translation, strict=True))
-    if result.batches:  # an enumerated pose is a least-squares fit in float64 already
+    if not result.is_fitted:
         poses[0] = _fitted(problem, *poses[0], threshold, deadline)
     projected, image, may_match = problem.project_scene(*poses[0]), problem.image_points, problem.may_match
     matches = one_to_one(image, projected, threshold, may_match, deadline)

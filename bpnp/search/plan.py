@@ -35,7 +35,6 @@ from bpnp.search.propose.given import enter_given
 from bpnp.search.refine.annealing import multistart
 from bpnp.search.starts import PosePrior, Prior
 from bpnp.search.verdict.completeness import far_missed, near_missed
-from bpnp.search.verdict.decide import count_starts, is_symmetric
 
 Proposals = Callable[[], tuple[NDArray[np.float64], NDArray[np.float64]]]  # rotations (s, 3, 3), translations (s, 3)
 
@@ -241,8 +240,8 @@ class Plan:
         pool = self.pool
         leaders, settings = pool.leaders(), pool.scene.settings
         local_searches, verdict_settings = pool.local_searches(leaders), settings.evidence
-        symmetric = bool(pool.problem.registered) and is_symmetric(leaders, pool.problem, verdict_settings)
-        basin_count = count_starts(leaders, pool.problem, verdict_settings, symmetric=symmetric)
+        symmetric = pool.symmetry.is_known(leaders) and pool.symmetry.is_symmetric(leaders)
+        basin_count = pool.symmetry.basin_count(leaders, with_copies=symmetric)
         far = far_missed(basin_count, verdict_settings, symmetric=symmetric)
         if (
             local_searches < settings.schedule.local_searches

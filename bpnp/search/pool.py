@@ -1,20 +1,23 @@
-"""Poses that a search has found so far, and the verdict on them."""
+"""Poses that a search has found so far."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.poses import close_poses
-from bpnp.search.competing_poses import judge_with_competitors
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.loop import Step
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem
 from bpnp.search.refine.annealing import finish
 from bpnp.search.search_frame import Scene
-from bpnp.search.verdict.decide import SearchResult, add_false_alarms, judge, missed, rank_poses
+from bpnp.search.verdict.completeness import Symmetry
+from bpnp.search.verdict.contest import rivals_of
+from bpnp.search.verdict.decide import Case, add_false_alarms, rank_poses
+from bpnp.search.verdict.rivals import Rival
 
 
 class Pool:
@@ -23,19 +26,21 @@ class Pool:
     Attributes:
         scene: Points in the frame of the search.
         problem: Points in the frame of the problem.
-        enumerated: Result of the enumeration of few points, whose poses are the first candidates.
+        enumerated: Case of the enumeration of few points, whose poses are the first candidates.
         candidates: Best poses in the frame of the scene, at most `settings.kept`.
         iterations: Number of iterations so far.
         missed: log10 of the probability that the search missed a better optimum.
         surrounded: Significant poses whose local search found nothing better.
         searched: Other poses whose surroundings were searched.
+        symmetry: Motions of the scene that were registered with matched points.
     """
 
-    def __init__(self, scene: Scene, problem: Problem, enumerated: SearchResult) -> None:
+    def __init__(self, scene: Scene, problem: Problem, enumerated: Case) -> None:
         self.scene, self.problem, self.enumerated = scene, problem, enumerated
         self.iterations, self._judged_alarms = 0, 0.0
         self._is_thinned = len(problem.bearings) > scene.settings.fine.bearings
         self._tests = PoseModel.of(problem).log10_tests([problem])
+        self.symmetry = Symmetry(problem, scene.settings.evidence)
         self.forget()
         if len(enumerated.candidates):
             self.candidates = to_scene_frame(enumerated.candidates, scene)
@@ -68,13 +73,13 @@ class Pool:
         ):
             self.surrounded = Hypotheses.concatenate([self.surrounded, step.around])
         self.missed = self._missed()
-        if self.missed > verdict_settings.missed:  # otherwise `result` computes the NFA of the others
+        if self.missed > verdict_settings.missed:  # otherwise `case` computes the NFA of the others
             self.candidates = self._with_false_alarms(self.candidates)
             self.candidates = self.candidates[np.argsort(-self.candidates.sort_key, kind="stable")]
             self.missed = self._missed()
 
     def may_be_decided(self) -> bool:
-        """Return True if the verdict on the best pose may be final, or more points may be matched by it."""
+        """Return True if the best pose may be confident, or match more points than before."""
         bettered = self._is_thinned and self.alarms < self._judged_alarms - self.scene.settings.evidence.margin
         return bettered or self.missed <= self.scene.settings.evidence.missed
 
@@ -135,35 +140,38 @@ class Pool:
 
     def _missed(self) -> float:
         """Compute `missed` from the current candidates."""
-        leaders = self.leaders()
-        return missed(leaders, self.problem, self.local_searches(leaders), self.scene.settings.evidence)
+        return self._case_of(self.leaders()).missed
 
-    def result(self, *, ended: bool = True) -> SearchResult:
-        """Compute the verdict on the best candidates.
+    def _case_of(self, leaders: Hypotheses) -> Case:
+        return Case(
+            leaders,
+            self.problem,
+            local_searches=self.local_searches(leaders),
+            iterations=self.iterations,
+            limits=self.scene.settings.evidence,
+            motions=self.symmetry,
+        )
+
+    @property
+    def rivals(self) -> Sequence[Rival]:
+        """Poses that the scene's motions confuse with the best one, and other lenses."""
+        return rivals_of(lambda: self.scene, self.scene.deadline)
+
+    def case(self, *, ended: bool = True) -> Case:
+        """Return what is known of the best candidates, or the case of the enumeration if it has fewer false alarms.
 
         Args:
             ended: True after the last iteration, where the `settings.finished` best candidates are annealed on all
                 points; False to anneal only the best one.
         """
-        scene, problem, verdict_settings = self.scene, self.problem, self.scene.settings.evidence
+        scene, problem = self.scene, self.problem
         self._judged_alarms = min(self._judged_alarms, self.alarms)
         annealed = scene.settings.finished if ended else 1
         ends = finish(scene, self.candidates, annealed) if len(self.candidates) else self.candidates
         if len(ends) and problem.prior is not None:  # keep the version of each pose with the smaller NFA
             ends = self._with_false_alarms(ends)
             ends = merge_hypotheses([ends, self.candidates.as_dependent()], scene)
-        leaders = rank_poses(to_problem_frame(ends, scene), problem, verdict_settings)
-        local_searches = self.local_searches(leaders)
-        result = judge(
-            leaders, problem, batches=self.iterations, local_searches=local_searches, settings=verdict_settings
-        )
-        if self.enumerated.log10_false_alarms < result.log10_false_alarms:
-            return replace(self.enumerated, batches=self.iterations)
-        return judge_with_competitors(
-            result,
-            problem,
-            lambda: scene,
-            verdict_settings,
-            local_searches=local_searches,
-            deadline=scene.deadline,
-        )
+        case = self._case_of(rank_poses(to_problem_frame(ends, scene), problem, scene.settings.evidence))
+        if self.enumerated.log10_false_alarms < case.log10_false_alarms:
+            return replace(self.enumerated, iterations=self.iterations)
+        return case

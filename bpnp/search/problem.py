@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from bpnp.cameras import Camera, in_front
 from bpnp.poses import MIN_POINTS, SAME, Tolerance, rotation_angle, same_pose
 from bpnp.search.image_statistics import ImageStatistics
-from bpnp.search.propose.symmetries import Motions
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
 
 # Distance from the median beyond which scene points do not affect the origin and the unit.
@@ -326,11 +325,6 @@ class Problem:
             if len(columns):
                 scores[rows] = self.scores3d[columns].mean() / self.scores3d.mean()
         return scores
-
-    @cached_property
-    def registered(self) -> list[tuple[Array, Array, Motions]]:
-        """Poses (3, 3), (3,) with the motions of the scene that were computed from their matched points."""
-        return []
 
     @cached_property
     def centre3d(self) -> Array:

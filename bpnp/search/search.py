@@ -5,12 +5,12 @@
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
-from bpnp.search.competing_poses import SceneOf, judge_with_competitors
 from bpnp.search.config import DEFAULT, SearchSettings
 from bpnp.search.enumeration.plan import EnumeratedPoses, EnumerationPlan
 from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
@@ -26,11 +26,19 @@ from bpnp.search.propose.symmetries import self_motions
 from bpnp.search.refine.annealing import run_batch
 from bpnp.search.search_frame import Scene, degenerate
 from bpnp.search.starts import Prior
-from bpnp.search.verdict.decide import SearchResult, degenerate_points, fits_by_chance, judge, no_pose
+from bpnp.search.verdict.contest import contest, rivals_of
+from bpnp.search.verdict.decide import Case, SearchResult, decide, fits_by_chance
+from bpnp.search.verdict.reasons import objection
+from bpnp.search.verdict.rivals import SceneOf
+
+
+def search_poses(problem: Problem, **options: Any) -> SearchResult:
+    """Search for the pose of a problem, and decide; options as for `find_case`."""
+    return decide(find_case(problem, **options))
 
 
 @one_blas_thread
-def search_poses(
+def find_case(
     problem: Problem,
     *,
     around: Prior | None = None,
@@ -41,7 +49,7 @@ def search_poses(
     deadline: Deadline = NEVER,
     settings: SearchSettings = DEFAULT,
     progress: Progress | None = None,
-) -> SearchResult:
+) -> Case:
     """Search for distinct poses (R, t) that explain the bearings f_i by the points p_j, in no known order.
 
     Maximises the likelihood of the bearings under the mixture
@@ -69,15 +77,15 @@ def search_poses(
             of few points. None for no callback.
 
     Returns:
-        Distinct poses with the verdict. There are no candidates with fewer than 4 points of a side, or if all bearings
-        or all points coincide or lie on one line.
+        What is known of the best of distinct poses. There are no candidates with fewer than 4 points of a side, or if
+        all bearings or all points coincide or lie on one line.
 
     Raises:
         ValueError: If `clutter` is out of range.
     """
     if clutter is not None:
         settings, problem = settings.expecting(clutter), replace(problem, clutter=clutter)
-    tell, enumerated = teller(progress), no_pose()
+    tell, enumerated = teller(progress), Case.without_pose(problem)
 
     @cache
     def scene_of() -> Scene:
@@ -99,14 +107,14 @@ def search_poses(
         # More search helps only if no pose is significant yet, and there are enough points to anneal.
         small = min(len(problem.bearings), len(problem.points3d)) < settings.least_annealed
         settled = poses.is_exhausted or not by_chance
-        if enumerated.verdict == "confident" or small or (settled and not many):
+        if enumerated.objection is None or small or (settled and not many):
             return enumerated
     if degenerate(problem.bearings) or degenerate(problem.points3d):
         counts = f"{len(problem.bearings)} 2D and {len(problem.points3d)} 3D points"
-        return degenerate_points(f"{counts}, too few or all on one line")
+        return fixing_no_pose(problem, f"{counts}, too few or all on one line")
     scene = scene_of()
     if lacks_partners(scene):
-        return degenerate_points("too few points with a label of the other side, or all on one line")
+        return fixing_no_pose(problem, "too few points with a label of the other side, or all on one line")
     pool = Pool(scene, problem, enumerated)
     is_asked = many or only_proposals
     plan = Plan.of(pool, around, proposals if is_asked else None, only_proposals=only_proposals)
@@ -121,11 +129,16 @@ def _of_known_matches(
     seed: int,
     settings: SearchSettings,
     deadline: Deadline,
-) -> SearchResult:
-    """Compute the verdict on the poses that known matches, indices (k,) of image and of scene points, fit best."""
-    found, verdict_settings = poses_of_matches(problem, i, j, seed), settings.evidence
-    result = judge(found, problem, batches=0, exhaustive=True, settings=verdict_settings)
-    return judge_with_competitors(result, problem, scene_of, verdict_settings, exhaustive=True, deadline=deadline)
+) -> Case:
+    """Return the case of the poses that known matches, indices (k,) of image and of scene points, fit best."""
+    poses, limits = poses_of_matches(problem, i, j, seed), settings.evidence
+    case = Case.of(poses, problem, exhaustive=True, is_fitted=True, limits=limits)
+    return contest(case, rivals_of(scene_of, deadline))
+
+
+def fixing_no_pose(problem: Problem, why: str) -> Case:
+    """Return a case without a pose, since the points fix none."""
+    return Case.without_pose(problem, objection("degenerate", why=f"no pose fits: {why}"), exhaustive=True)
 
 
 def lacks_partners(scene: Scene) -> bool:

@@ -415,7 +415,7 @@ def add_pose(
         log10_false_alarms=candidates[0].log10_false_alarms,
         stats=replace(
             solution.stats,
-            iterations=result.batches,
+            iterations=result.iterations,
             residual=residual,
             converged=result.verdict == "confident",
         ),

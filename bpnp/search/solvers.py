@@ -22,7 +22,7 @@ from bpnp.search.search import search_poses
 from bpnp.search.solution import Solution
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import reasons
-from bpnp.search.verdict.decide import SearchResult
+from bpnp.search.verdict.decide import SearchResult, decide
 
 BATCH_ENTRIES = 2**26  # largest assignment matrix of a batch on a GPU, 2D points times 3D points [entries; cost]
 MATCHER_ENTRIES = 2**22  # largest assignment matrix of a packaged matcher; larger ones take seconds [entries; cost]
@@ -133,10 +133,10 @@ def at_deadline(result: SearchResult, options: Options, deadline: Deadline, seco
         deadline: Its deadline.
         seconds: Time that it took, which the reason states without a time limit.
     """
-    may_be_decided = result.verdict != "confident" and (not result.settled or result.code in reasons.UNTESTED)
+    may_be_decided = result.verdict != "confident" and (not result.is_settled or result.code in reasons.UNTESTED)
     if not (may_be_decided and deadline.passed()):
         return result
-    if not result.settled:
+    if not result.is_settled:
         deadline.unfinished.add(reasons.Unfinished.search)
     if options.is_part:
         return result
@@ -232,7 +232,7 @@ def _by_module(
     for group in groups:
         start, members = time.perf_counter(), [problems[i] for i in group]
         deadline = options.deadline(members[-1])
-        results = predicted(net, members, deadline)
+        cases = predicted(net, members, deadline)
         seconds = (time.perf_counter() - start) / len(group)
-        for i, result in zip(group, results, strict=True):
-            yield i, finished(problems[i], result, seconds, options.inlier_threshold, deadline)
+        for i, case in zip(group, cases, strict=True):
+            yield i, finished(problems[i], decide(case), seconds, options.inlier_threshold, deadline)

@@ -13,15 +13,14 @@ from bpnp.cameras import CameraLike, camera_from
 from bpnp.runtime import NEVER, Deadline, default_float_errors
 from bpnp.search.arguments import Array, Labels, checked_pose, checked_seed, numbers, positive, seconds_from
 from bpnp.search.config import TIME
-from bpnp.search.given_pose import judge_given_pose
+from bpnp.search.given_pose import given_pose
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.inputs import problem_from
 from bpnp.search.matching import failed_solution, finished
 from bpnp.search.problem import Problem
 from bpnp.search.solution import Solution
-from bpnp.search.solvers import Options
-from bpnp.search.verdict.decide import match_count
-from bpnp.search.verdict.reasons import UNTESTED, Unfinished, objection, undecided
+from bpnp.search.solvers import Options, at_deadline
+from bpnp.search.verdict.decide import decide, match_count
 from bpnp.search.verdict.uncertainty import linearised, pose_covariance
 
 
@@ -151,15 +150,13 @@ def verify_problem(
         Solution with this pose, as of `verify`.
     """
     begun = time.perf_counter()
-    deadline = Options(time_limit=time_limit, until=until).deadline(problem)
+    options = Options(time_limit=time_limit, until=until)
+    deadline = options.deadline(problem)
     if problem.degenerate is not None:
         return failed_solution(problem, problem.degenerate, inlier_threshold, code="degenerate")
     claim = problem.from_user(rotation, translation)
-    result, optimum = judge_given_pose(problem, *claim, refine=refine, seed=seed, deadline=deadline)
-    if result.verdict == "confident" and Unfinished.competing_poses in deadline.unfinished:
-        result = result.add_objection(objection("untested"))
-    if result.code in UNTESTED:
-        result = replace(result, reason=undecided(result.reason, time_limit))
+    case, optimum = given_pose(problem, *claim, refine=refine, seed=seed, deadline=deadline)
+    result = at_deadline(decide(case), options, deadline, time_limit)
     solution = finished(problem, result, time.perf_counter() - begun, inlier_threshold, deadline)
     if not refine and solution.found:  # to the last digit
         first = replace(solution.candidates[0], translation=translation)

@@ -22,9 +22,9 @@ from bpnp.maps.localize import BRIEF
 from bpnp.maps.photo_problem import Photo
 from bpnp.maps.views import View
 from bpnp.search.config import MAPS
-from bpnp.search.verdict.decide import SearchResult, judge
+from bpnp.search.verdict.decide import Case
 from bpnp.search.verdict.false_alarms import alarms_of
-from bpnp.search.verdict.reasons import Objection, objection
+from bpnp.search.verdict.reasons import objection
 
 
 @pytest.fixture(scope="module")
@@ -141,32 +141,36 @@ def test_the_pose_is_fitted_to_all_points_that_its_camera_sees(planted: tuple[Sc
     assert solution.log10_false_alarms < of_view.log10_false_alarms
 
 
-def another(result: SearchResult, *_: object, **__: object) -> SearchResult:
-    return replace(result, verdict="ambiguous", reason="another")
+def another(case: Case, *_: object) -> Case:
+    return case.against(objection("competing_pose", 2.0, away="another"))
 
 
-def elsewhere(result: SearchResult, *_: object, **__: object) -> SearchResult:
+def elsewhere(case: Case, *_: object) -> Case:
     """With the best pose turned by 10 degrees and far from chance."""
-    turn, poses = Rotation.from_euler("z", 10, degrees=True).as_matrix(), result.candidates
+    turn, poses = Rotation.from_euler("z", 10, degrees=True).as_matrix(), case.candidates
     alarms = np.full(len(poses), -500.0)
-    return replace(result, candidates=replace(poses, rotation=turn @ poses.rotation, log10_false_alarms=alarms))
+    return replace(case, candidates=replace(poses, rotation=turn @ poses.rotation, log10_false_alarms=alarms))
 
 
-def of_another_lens(*_: object, **__: object) -> Objection:
-    return objection("other_camera", camera="1.30 times the focal length", degrees=2.0, percent=30.0)
+def of_another_lens(case: Case, **_: object) -> Case:
+    return case.against(objection("other_camera", camera="1.30 times the focal length", degrees=2.0, percent=30.0))
 
 
-def not_sure(*known: Any, **options: Any) -> SearchResult:
-    return replace(judge(*known, **options), verdict="ambiguous")
+class NotSure:
+    """A case that is ambiguous by itself."""
+
+    @staticmethod
+    def of(*known: Any, **options: Any) -> Case:
+        return Case.of(*known, **options).against(objection("incomplete", what="pose", probability="0.1"))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("stages", "reason"),
     [
-        ({"judge_with_competitors": another}, "another"),
-        ({"judge_with_competitors": elsewhere}, "A competing pose 10 deg away fits about as well"),
-        ({"judge": not_sure, "other_lens": of_another_lens}, "With 1.30 times the focal length"),
+        ({"contest": another}, "another"),
+        ({"contest": elsewhere}, "A competing pose 10 deg away fits about as well"),
+        ({"Case": NotSure, "lens": of_another_lens}, "With 1.30 times the focal length"),
     ],
     ids=["competing pose", "other pose", "other camera of an ambiguous pose"],
 )

@@ -41,7 +41,7 @@ def test_a_pose_that_was_not_compared_in_the_map_is_ambiguous(
     scene, truth = planted
     clock.stop_at(f"maps.localize.{stage}", after=stage == "solve_problems")
     kernels = ("maps.all_points.search_around", "maps.aliasing.search_near", "maps.aliasing.search_around")
-    late = [clock.count_late(kernel) for kernel in (*kernels, "search.competing_poses.repeated_poses")]
+    late = [clock.count_late(kernel) for kernel in (*kernels, "search.verdict.rivals.symmetries.repeated_poses")]
     solution = scene.localize(pixels_of(truth), camera_from(PINHOLE), time_limit=30)
     assert not any(late)
     assert degrees_between(solution.rotation, TURN @ truth.rotations[1]) < 1

@@ -40,7 +40,7 @@ def test_a_guess_from_the_same_points_is_tried_first_and_is_no_prior(problem, of
     result = search_poses(points, around=points.prior_from_user(PosePrior(rotation, translation, 4.0, 0.1)))
     assert result.verdict == "confident"
     assert rotation_error(torch.as_tensor(result.best[0])[None], problem.rotation[:1]) < 0.5
-    assert (result.batches <= DEFAULT.schedule.around) == (off < 0.1)
+    assert (result.iterations <= DEFAULT.schedule.around) == (off < 0.1)
 
 
 @pytest.mark.parametrize(
@@ -99,7 +99,7 @@ def test_points_on_a_line_or_without_a_common_label_have_no_pose():
     labelled = replace(problem, labels2d=np.ones(300, np.int64), labels3d=np.full(280, 2))
     for lacking in (labelled, Problem.of(problem.bearings, problem.points3d[:, :1] * [1.0, 2, 3])):
         result = search_poses(lacking)
-        assert (result.verdict, result.batches, len(result.candidates)) == ("failed", 0, 0)
+        assert (result.verdict, result.iterations, len(result.candidates)) == ("failed", 0, 0)
 
 
 def planted_points(count: int) -> tuple[Problem, np.ndarray, np.ndarray]:  # type: ignore[type-arg]

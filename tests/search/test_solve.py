@@ -267,7 +267,7 @@ def test_the_reason_names_the_time_limit_that_left_a_pose_undecided(monkeypatch:
     """The search returns an open verdict, with its deadline passed or not."""
     planted = plant(2, 40)
     points = planted.points2d[0].numpy(), planted.points3d[0].numpy()
-    result = replace(search_poses(problem_from(*points, None)), verdict="ambiguous", settled=False)
+    result = replace(search_poses(problem_from(*points, None)), verdict="ambiguous", is_settled=False)
     monkeypatch.setattr(solvers, "search_poses", lambda *_, **__: result)
     assert "not decided" not in solve(*points, time_limit=60).reason
     monkeypatch.setattr(solvers.Options, "deadline", lambda *_: Deadline.after(-1.0))

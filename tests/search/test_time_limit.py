@@ -153,9 +153,9 @@ def test_a_part_of_the_time_is_not_the_limit_of_the_sentence(clock: MovedClock) 
 
 def test_no_competing_pose_is_proposed_after_the_limit(clock: MovedClock) -> None:
     points, pixels, turn = scene_and_pixels(150)
-    clock.stop_at("search.pool.judge", after=True)
-    proposals = clock.count_late("search.competing_poses.repeated_poses")
-    lenses = clock.count_late("search.competing_poses.fit_lens")
+    clock.stop_at("search.loop.contest")
+    proposals = clock.count_late("search.verdict.rivals.symmetries.repeated_poses")
+    lenses = clock.count_late("search.verdict.rivals.lens.fit_lens")
     solution = solve(pixels, points, K, solver="search", time_limit=10)
     assert degrees_between(solution.rotation, turn) < 1
     assert not proposals
@@ -168,9 +168,9 @@ def test_no_competing_pose_is_proposed_after_the_limit(clock: MovedClock) -> Non
 def test_no_other_focal_length_is_searched_after_the_limit(clock: MovedClock) -> None:
     """Seventy points leave a chance that another focal length fits, for which the search runs again."""
     points, pixels, turn = scene_and_pixels(70)
-    clock.stop_at("search.competing_poses.repeated_competitors", after=True)
-    searches = clock.count_late("search.competing_poses.search_around")
-    fits = clock.count_late("search.competing_poses.fit_lens")
+    clock.stop_at("search.verdict.rivals.symmetries._repeated", after=True)
+    searches = clock.count_late("search.verdict.rivals.lens.search_around")
+    fits = clock.count_late("search.verdict.rivals.lens.fit_lens")
     solution = verify(pixels, points, turn, [0, 0, 5], K)
     assert not searches
     assert not fits
@@ -198,7 +198,7 @@ def test_a_rig_compares_no_pose_after_the_limit(clock: MovedClock) -> None:
     aside = (points @ turn.T + [0.5, 0, 5])[:, :2] / (points @ turn.T + [0.5, 0, 5])[:, 2:]
     second = aside @ K[:2, :2].T + K[:2, 2]
     rig = [(np.eye(3), np.zeros(3)), (np.eye(3), np.array([0.5, 0, 0]))]
-    clock.stop_at("search.rig.search.judge", after=True)
+    clock.stop_at("search.loop.contest")
     proposals = clock.count_late("search.rig.search.repeated_poses")
     assignments = clock.count_late("search.matching.min_weight_full_bipartite_matching")
     solution = solve([pixels, second], points, K, rig=rig)
@@ -212,7 +212,7 @@ def test_a_rig_compares_no_pose_after_the_limit(clock: MovedClock) -> None:
 def test_each_of_many_problems_has_its_own_limit(clock: MovedClock) -> None:
     """The limit of the first problem cuts nothing of the second, whose clock starts when it begins."""
     points, pixels, turn = scene_and_pixels(150)
-    clock.stop_at("search.pool.judge", after=True)
+    clock.stop_at("search.loop.contest")
     first, second = solve_many([pixels, pixels], points, K, solver="search")
     assert first.verdict == "ambiguous"
     assert second.verdict == "confident"

@@ -4,6 +4,7 @@ import math
 import re
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,19 +15,20 @@ from scipy.spatial.transform import Rotation
 from scipy.special import stdtrit
 
 from bpnp.runtime import NEVER, Deadline
-from bpnp.search.competing_poses import AtZoom, judge_with_competitors, likeliest_zoom, other_lens
 from bpnp.search.config import DEFAULT
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.propose.known_matches import poses_of_matches
 from bpnp.search.search_frame import Scene
-from bpnp.search.verdict.decide import SearchResult, judge
+from bpnp.search.verdict.contest import contest, rivals_of
+from bpnp.search.verdict.decide import Case, SearchResult, decide
+from bpnp.search.verdict.rivals.lens import AtZoom, lens, likeliest_zoom
 
 Array = NDArray[np.float64]
 SHIFT = np.array([0.0, 0.0, 6.0])
 
 
-def verdict_on(problem: Problem, rotations: Array, translations: Array, scale: float, matched: float) -> SearchResult:
+def case_of(problem: Problem, rotations: Array, translations: Array, scale: float, matched: float) -> Case:
     c = len(rotations)
     poses = Hypotheses.from_poses(
         rotations,
@@ -35,7 +37,11 @@ def verdict_on(problem: Problem, rotations: Array, translations: Array, scale: f
         match_count=np.full(c, matched * min(len(problem.bearings), len(problem.points3d))),
         scale=np.full(c, scale),
     )
-    return judge(poses, problem, batches=0, exhaustive=True)
+    return Case.of(poses, problem, exhaustive=True)
+
+
+def verdict_on(problem: Problem, *known: Any) -> SearchResult:
+    return decide(case_of(problem, *known))
 
 
 def test_a_few_exact_matches_do_not_make_a_rough_alignment_precise() -> None:
@@ -115,7 +121,7 @@ def test_weak_matches_need_repeated_basins_or_a_local_search(
     rays = directions(directions(points + SHIFT) + 5e-3 * rng.standard_normal((400, 3)))
     columns = {"match_count": np.array([320.0]), "scale": np.array([5e-3])}
     pose = Hypotheses.from_poses(np.eye(3)[None], SHIFT[None], basin_count=basin_count, **columns)
-    found = judge(pose, Problem(rays, points), batches=1, local_searches=local_searches)
+    found = decide(Case.of(pose, Problem(rays, points), local_searches=local_searches))
     assert -10 > found.log10_false_alarms > -60
     assert found.verdict == verdict
     assert ("miss probability" in found.reason) == (verdict == "ambiguous")
@@ -131,7 +137,7 @@ def test_initial_poses_that_end_near_a_pose_count_for_its_basin(degrees: float, 
     columns = {"match_count": np.array([320.0, 200.0]), "scale": np.array([5e-3, 5e-3])}
     poses = Hypotheses.from_poses(rotations, np.stack([SHIFT, SHIFT]), **columns)
     poses = replace(poses, basin_count=np.array([0, 10]))
-    found = judge(poses, Problem(rays, points), batches=1, local_searches=1)
+    found = decide(Case.of(poses, Problem(rays, points), local_searches=1))
     assert found.verdict == verdict
     assert ("miss probability" in found.reason) == (verdict == "ambiguous")
 
@@ -167,14 +173,13 @@ def test_a_focal_length_sweep_reaches_the_true_focal_length(factor: float) -> No
     climbed = likeliest_zoom(met, Scene(problem, 0, DEFAULT), DEFAULT.evidence.other_focal)
     assert climbed.zoom == pytest.approx(1 / factor, rel=0.09 if factor == 1 else 0.045)  # half a step; never none
     assert np.degrees(Rotation.from_matrix(climbed.pose.rotation[0]).magnitude()) < 0.5
-    seen = verdict_on(problem, np.eye(3)[None], met.centre3d[None], 4e-3, 0.6)
+    seen = case_of(problem, np.eye(3)[None], met.centre3d[None], 4e-3, 0.6)
     scenes = [Scene(problem, 0, DEFAULT, end) for end in (NEVER, Deadline(0.0))]
-    other, untried = (other_lens(seen, problem, lambda one=one: one, DEFAULT.evidence, one.deadline) for one in scenes)
-    assert untried is not None
-    if other is None:
+    other, (untried,) = (lens(seen, scene_of=lambda one=one: one, deadline=one.deadline).objections for one in scenes)
+    if not other:
         assert (factor, untried.clause) == (1.0, "there was no time to try other focal lengths")
     else:
-        zoom = float(re.search(r"with (\S+) times the focal length", other.clause)[1])
+        zoom = float(re.search(r"with (\S+) times the focal length", other[0].clause)[1])
         assert zoom == pytest.approx(1 / factor, rel=0.03)
 
 
@@ -186,12 +191,10 @@ def test_a_pose_is_not_confident_if_there_was_no_time_to_refine_its_competing_po
     rays = points + [0, 0, 6] + 0.006 * rng.standard_normal(points.shape)
     problem = Problem.of(rays / np.linalg.norm(rays, axis=1, keepdims=True), points)
     found = poses_of_matches(problem, np.arange(80), np.arange(80), 0)
-    alone = judge(found, problem, batches=0, exhaustive=True)
-    assert (alone.verdict, len(alone.candidates)) == ("confident", 1)
+    alone = Case.of(found, problem, exhaustive=True)
+    assert (alone.objection, len(alone.candidates)) == (None, 1)
     in_time, late = (
-        judge_with_competitors(
-            alone, problem, partial(Scene, problem, 0, DEFAULT, end), DEFAULT.evidence, exhaustive=True, deadline=end
-        )
+        decide(contest(alone, rivals_of(partial(Scene, problem, 0, DEFAULT, end), end)))
         for end in (NEVER, Deadline(0.0))
     )
     assert degrees_between(in_time.best[0], np.eye(3)) < 1

@@ -6,13 +6,13 @@ significant, the search is repeated without it: a hypothesis of two matches has 
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from bpnp.runtime import Deadline
-from bpnp.search.competing_poses import SceneOf, judge_with_competitors
 from bpnp.search.config import SearchSettings
 from bpnp.search.enumeration.points import predicted_pose
 from bpnp.search.enumeration.search import PATIENCE, STAGES, Enumeration, enumerate_poses, margin
@@ -22,7 +22,10 @@ from bpnp.search.possible_matches import score_pose
 from bpnp.search.problem import Problem
 from bpnp.search.propose.repetitions import competing_poses
 from bpnp.search.starts import GravityPrior
-from bpnp.search.verdict.decide import REFINED, SearchResult, add_false_alarms, is_certain, judge, rank_poses
+from bpnp.search.verdict.completeness import Symmetry
+from bpnp.search.verdict.contest import rivals_of
+from bpnp.search.verdict.decide import REFINED, Case, add_false_alarms
+from bpnp.search.verdict.rivals import Rival, SceneOf
 
 NEAR_NATS = 25.0  # evidence in nats by which a competing pose may be behind the best [nats; calibration]
 SMALLEST_SCALE = 1e-5  # smallest scale of the residuals if the pixel size is unknown [radians; numerics]
@@ -50,7 +53,8 @@ class EnumeratedPoses:
         # Without viewing cones, which an enumeration ignores.
         has_cones = problem.cosines3d is not None
         self.enumerated = replace(problem, normals3d=None, cosines3d=None) if has_cones else problem
-        self._result: SearchResult | None = None
+        self._symmetry = Symmetry(self.enumerated, settings.evidence)
+        self._case: Case | None = None
         is_tracked = predicted_pose(problem.prior) is not None
         self.begin(self.enumerated, predicted_only=is_tracked and problem.fixing_matches == 2)
 
@@ -103,13 +107,14 @@ class EnumeratedPoses:
 
     def may_be_decided(self) -> bool:
         """Return True if the best pose leads by a safe margin and passes the cheap tests of the verdict."""
-        run, verdict_settings = self.run, self.settings.evidence
+        run = self.run
         if not (run.is_significant and self.has_competitors and margin(self.found, run.problem) >= run.safe_margin):
             return False
-        candidates = rank_poses(self._candidates(), self.enumerated, verdict_settings)
-        self.is_certain = is_certain(candidates, self.enumerated, verdict_settings)
+        known = {"local_searches": REFINED, "limits": self.settings.evidence, "motions": self._symmetry}
+        case = Case.of(self._candidates(), self.enumerated, **known)
+        self.is_certain = case.is_certain
         if self.is_certain:
-            self._keep(candidates)
+            self._keep(case.candidates)
         return self.is_certain
 
     def end(self) -> None:
@@ -151,29 +156,24 @@ class EnumeratedPoses:
             return False
         return self.problem.fixing_matches == 2 or margin(self.found, self.enumerated) < 0
 
-    def result(self, *, ended: bool = True) -> SearchResult:
-        """Compute the verdict on the best pose and its competing poses."""
-        if self._result is None:
-            problem, verdict_settings, exhaustive = self.problem, self.settings.evidence, self.is_exhausted
-            scene_of, count = self._scene_of, REFINED
-            result = judge(
+    @property
+    def rivals(self) -> Sequence[Rival]:
+        """Poses that the scene's motions confuse with the best one, and other lenses."""
+        return rivals_of(self._scene_of, enumerated=True)
+
+    def case(self, *, ended: bool = True) -> Case:
+        """Return what is known of the best pose."""
+        if self._case is None:
+            self._case = Case.of(
                 self.candidates,
-                problem,
-                batches=0,
-                local_searches=count,
-                exhaustive=exhaustive,
-                settings=verdict_settings,
+                self.problem,
+                local_searches=REFINED,
+                exhaustive=self.is_exhausted,
+                is_fitted=True,
+                limits=self.settings.evidence,
+                motions=self._symmetry if self.problem is self.enumerated else None,
             )
-            self._result = judge_with_competitors(
-                result,
-                problem,
-                scene_of,
-                verdict_settings,
-                local_searches=count,
-                exhaustive=exhaustive,
-                enumerated=True,
-            )
-        return self._result
+        return self._case
 
 
 class EnumerationPlan:

@@ -10,13 +10,14 @@ from torch import Tensor, nn
 
 from bpnp.runtime import Deadline
 from bpnp.search.arguments import Array
-from bpnp.search.competing_poses import judge_with_competitors
 from bpnp.search.config import DEFAULT
 from bpnp.search.problem import Problem
 from bpnp.search.propose.given import score_given
 from bpnp.search.search_frame import Scene
 from bpnp.search.starts import PosePrior
-from bpnp.search.verdict.decide import SearchResult, judge, no_pose
+from bpnp.search.verdict.contest import contest, rivals_of
+from bpnp.search.verdict.decide import Case
+from bpnp.search.verdict.reasons import objection
 from bpnp.types import Batch
 
 # Largest distance from the origin at which float32 is precise enough.
@@ -58,14 +59,14 @@ def pose_prior(net: nn.Module, problem: Problem, deadline: Deadline) -> PosePrio
     (asked,) = predicted(net, [problem], deadline)
     if not len(asked.candidates):
         return None
-    rotation, translation = asked.best
+    rotation, translation = asked.pose
     centre = rotation @ problem.points3d.mean(0) + translation
     sigma = NETWORK_SIGMA_SHIFT * float(np.linalg.norm(centre)) + 1e-12
     return PosePrior(rotation, translation, NETWORK_SIGMA_DEG, sigma)
 
 
-def predicted(net: nn.Module, members: list[Problem], deadline: Deadline) -> list[SearchResult]:
-    """Return the scored poses of a module's prediction for each problem."""
+def predicted(net: nn.Module, members: list[Problem], deadline: Deadline) -> list[Case]:
+    """Return the scored poses of a module's prediction for each problem, and what their rivals found."""
     views, batch = _given(net, members)
     with torch.no_grad():
         poses = net(batch).poses
@@ -75,17 +76,16 @@ def predicted(net: nn.Module, members: list[Problem], deadline: Deadline) -> lis
     rotation = _host(torch.stack([poses[name].rotation for name in order], 1))
     translation = _host(torch.stack([poses[name].translation for name in order], 1))
     given = zip(members, views, rotation, translation, strict=True)
-    return [_judge(problem, *view.before(r, t), deadline) for problem, view, r, t in given]
+    return [_case_of(problem, *view.before(r, t), deadline) for problem, view, r, t in given]
 
 
-def _judge(problem: Problem, rotation: Array, translation: Array, deadline: Deadline) -> SearchResult:
-    """Compute the verdict on poses of a network and their competing poses."""
+def _case_of(problem: Problem, rotation: Array, translation: Array, deadline: Deadline) -> Case:
     scene = Scene(problem, 0, DEFAULT, deadline)
     poses = score_given(scene, rotation, translation)
     if not len(poses):
-        return no_pose("the module found no pose")
-    result = judge(poses, problem, batches=len(rotation), settings=DEFAULT.evidence)
-    return judge_with_competitors(result, problem, lambda: scene, DEFAULT.evidence, deadline=deadline)
+        return Case.without_pose(problem, objection("no_pose")._replace(clause="the module found no pose"))
+    case = Case.of(poses, problem, iterations=len(rotation))
+    return contest(case, rivals_of(lambda: scene, deadline))
 
 
 def proposed(net: "Matcher", problem: Problem, seed: int) -> tuple[Array, Array]:

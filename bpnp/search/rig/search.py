@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from bpnp.poses import distinct, polar_coordinates
 from bpnp.runtime import NEVER, Clock, Deadline, one_blas_thread
-from bpnp.search.competing_poses import fitted_lens
 from bpnp.search.config import DEFAULT, SearchSettings
 from bpnp.search.enumeration.points import predicted_pose
 from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
@@ -32,9 +31,12 @@ from bpnp.search.rig.cameras import WIDE_SCALES, Array, Pose, Rig
 from bpnp.search.search import lacks_partners
 from bpnp.search.search_frame import Scene
 from bpnp.search.verdict.competitors import distance_between
-from bpnp.search.verdict.decide import SearchResult, fits_by_chance, is_object, judge, match_count, missed, no_pose
+from bpnp.search.verdict.completeness import Symmetry
+from bpnp.search.verdict.contest import Rival, contest
+from bpnp.search.verdict.decide import Case, fits_by_chance, is_object
 from bpnp.search.verdict.false_alarms import alarms_of
 from bpnp.search.verdict.reasons import Objection, Unfinished, focal_length_not_fixed, objection
+from bpnp.search.verdict.rivals.lens import fitted_lens
 from bpnp.search.verdict.uncertainty import linearised, share_bound
 
 BEFORE = 1e9  # score of the poses that were refined before: above the evidence of any pose [nats; derived]
@@ -58,7 +60,7 @@ def search_rig(
     deadline: Deadline = NEVER,
     settings: SearchSettings = DEFAULT,
     progress: Progress | None = None,
-) -> SearchResult:
+) -> Case:
     """Search for the pose of a rig.
 
     Args:
@@ -71,7 +73,7 @@ def search_rig(
             after each iteration. None for no callback.
 
     Returns:
-        Distinct poses of the rig, best first, and the verdict on the first one.
+        What is known of the best of distinct poses of the rig.
     """
     settings = settings if clutter is None else settings.expecting(clutter)
     poses, tell = RigPoses(rig, deadline), teller(progress)
@@ -79,7 +81,7 @@ def search_rig(
         if exceeds_enumeration(problem):
             scene = Scene(problem, seed + k, settings, deadline)
             if not lacks_partners(scene):
-                poses.pools[k] = Pool(scene, problem, no_pose("no pose was found"))
+                poses.pools[k] = Pool(scene, problem, Case.without_pose(problem))
     rig.join({k: pool.scene for k, pool in poses.pools.items()})
     if (predicted := predicted_pose(rig.model.prior)) is not None:
         poses.add_refined(rig.candidates(predicted[0][None], np.r_[predicted[1], 1.0][None]))
@@ -88,8 +90,8 @@ def search_rig(
         without = [replace(problem, prior=None) for problem in rig.problems]
         poses.take(_of_few_points(poses, without, seed, deadline), REFINED_RIG_POSES)
     tell(0)
-    if poses.may_be_decided() and (result := poses.result(ended=False)).verdict == "confident":
-        return result
+    if poses.may_be_decided() and (case := contest(poses.case(ended=False), poses.rivals)).objection is None:
+        return case
     return run(RigPlan(poses), poses, most=settings.schedule.iterations, deadline=deadline, tell=tell)
 
 
@@ -156,6 +158,7 @@ class RigPoses:
         self.found = [Hypotheses.empty() for _ in rig.problems]
         self.starts = Hypotheses.empty(4)
         self.best, self.searched, self.pools = self.starts, self.starts, dict[int, Pool]()
+        self._symmetries = [Symmetry(problem, self.verdict_settings) for problem in rig.problems]
 
     @property
     def iterations(self) -> int:
@@ -242,64 +245,85 @@ class RigPoses:
         """Return whether the best pose is significant and its miss probability is low enough."""
         if not self.is_significant():
             return False
-        strongest, seen = self._strongest()
-        problem, searches = self.rig.problems[strongest], self._local_searches()
-        unseen = missed(seen, problem, searches, self.verdict_settings, distinct=self._distinct_fraction())
-        return unseen <= self.verdict_settings.missed
+        return self._case().missed <= self.verdict_settings.missed
 
     def _strongest(self) -> tuple[int, Hypotheses]:
         """Return the index of the camera with the most evidence for the best pose, and the poses in that camera."""
         k = int(self.rig.evidence(self.best.rotation[0], self.best.translation[0], float(self.best.scale[0])).argmax())
         return k, self.rig.seen(k, self.best)
 
-    def result(self, *, ended: bool = True) -> SearchResult:
-        """Judge the best poses; a confident one also against the competing poses of a repeated structure."""
-        if not len(self.best):
-            return no_pose()
-        result = self._judge()
-        if result.verdict == "confident" and self.deadline.ended(Unfinished.competing_poses):
-            result = result.add_objection(objection("untested"))
-        if result.verdict == "confident":
-            strongest, seen = self._strongest()
-            pose_and_scale = *seen.pose(), float(seen.scale[0])
-            problem = self.rig.problems[strongest]
-            repeated, sizes, _ = repeated_poses(problem, *pose_and_scale, self.verdict_settings, deadline=self.deadline)
-            unit = self.best.translation[0, 3]
-            if self.rig.model.scale:  # a copy of another size looks the same if the rig is larger as well
-                unit = unit * sizes[:, None]
-            copies = self.rig.rig_of(strongest, repeated.rotation, repeated.translation, unit)
-            end = replace(self.deadline, at=self.deadline.final)
-            self.add_refined(self.rig.candidates(*copies, end, Unfinished.competing_poses))
-            result = self._judge()
-        if result.verdict == "confident" and Unfinished.competing_poses in self.deadline.unfinished:
-            result = result.add_objection(objection("untested"))
-        if result.verdict == "confident" and (other := self._other_extrinsics()) is not None:
-            result = result.add_objection(other)
-        if result.verdict == "confident" and self.rig.model.lens is None:
-            strongest, seen = self._strongest()
-            pose = *seen.pose(), float(seen.scale[0])
-            linear = linearised(self.rig.problems[strongest], *pose)
-            other = fitted_lens(linear, match_count(seen), self.verdict_settings)
-            result = result if other is None else result.add_objection(other)
-        if result.verdict == "confident" and self.rig.unknowns > 6:
-            best = self.best.rotation[0], self.best.translation[0], float(self.best.scale[0])
-            covariance = self.rig.covariance(*best)
-            free = 2 * float(self.best.match_count[0]) - self.rig.unknowns
-            few = is_object(self.rig.problems[0], self.verdict_settings)
-            limits = (
-                {"focal": self.verdict_settings.focal_few if few else self.verdict_settings.focal}
-                if self.rig.model.lens
-                else {}
-            )
-            limits |= {"scale": self.verdict_settings.scale} if self.rig.model.scale else {}
-            for k, (name, limit) in enumerate(limits.items(), 6):
-                bound = math.inf if covariance is None else share_bound(covariance[k : k + 1, k : k + 1], free)
-                if bound > limit and name == "scale":
-                    result = result.add_objection(objection("scale_not_fixed", percent=100 * limit))
-                elif bound > limit:
-                    result = result.add_objection(focal_length_not_fixed(bound))
-        poses = replace(result.candidates, rotation=self.best.rotation, translation=self.best.translation)
-        return replace(result, candidates=poses)
+    @property
+    def rivals(self) -> Sequence[Rival]:
+        """What may contradict the best pose, the cheapest last."""
+        return self._copies, self._extrinsics, self._lens, self._unknowns
+
+    def case(self, *, ended: bool = True) -> Case:
+        """Return what is known of the best pose, as seen by the camera with the most evidence for it."""
+        return self._case() if len(self.best) else Case.without_pose(self.rig.problems[0])
+
+    def _case(self) -> Case:
+        strongest, seen = self._strongest()
+        cameras = [(self.rig.seen(k, self.best), problem) for k, problem in enumerate(self.rig.problems)]
+        return Case.of(
+            seen,
+            self.rig.problems[strongest],
+            local_searches=self._local_searches(),
+            exhaustive=self.exhaustive,
+            iterations=self.iterations,
+            cameras=cameras,
+            distinct=self._distinct_fraction(),
+            of_rig=self.best,
+            limits=self.verdict_settings,
+            motions=self._symmetries[strongest],
+        )
+
+    def _copies(self, case: Case) -> Case:
+        """Return the case after the competing poses of a repeated structure were refined on all cameras."""
+        if self.deadline.ended(Unfinished.competing_poses):
+            return case.against(objection("untested"))
+        strongest, seen = self._strongest()
+        problem, pose_and_scale = self.rig.problems[strongest], (*seen.pose(), float(seen.scale[0]))
+        repeated, sizes, _ = repeated_poses(problem, *pose_and_scale, self.verdict_settings, deadline=self.deadline)
+        unit = self.best.translation[0, 3]
+        if self.rig.model.scale:  # a copy of another size looks the same if the rig is larger as well
+            unit = unit * sizes[:, None]
+        copies = self.rig.rig_of(strongest, repeated.rotation, repeated.translation, unit)
+        end = replace(self.deadline, at=self.deadline.final)
+        self.add_refined(self.rig.candidates(*copies, end, Unfinished.competing_poses))
+        late = Unfinished.competing_poses in self.deadline.unfinished
+        return self._case().against(objection("untested") if late else None)
+
+    def _extrinsics(self, case: Case) -> Case:
+        return case.against(self._other_extrinsics())
+
+    def _lens(self, case: Case) -> Case:
+        """Return the case against another focal length that the residuals in one camera support."""
+        if self.rig.model.lens is not None:
+            return case
+        linear = linearised(case.problem, *case.pose, case.residual)
+        return case.against(fitted_lens(linear, case.match_count, self.verdict_settings))
+
+    def _unknowns(self, case: Case) -> Case:
+        """Return the case against a focal length or a scale that the points do not fix."""
+        limits = self.verdict_settings
+        most: dict[str, float] = {}
+        if self.rig.model.lens:
+            most["focal"] = limits.focal_few if is_object(self.rig.problems[0], limits) else limits.focal
+        if self.rig.model.scale:
+            most["scale"] = limits.scale
+        if not most:
+            return case
+        best = self.best.rotation[0], self.best.translation[0], float(self.best.scale[0])
+        covariance, free = self.rig.covariance(*best), 2 * float(self.best.match_count[0]) - self.rig.unknowns
+        bounds = [
+            math.inf if covariance is None else share_bound(covariance[k : k + 1, k : k + 1], free)
+            for k in range(6, 6 + len(most))
+        ]
+        for (name, limit), bound in reversed([*zip(most.items(), bounds, strict=True)]):
+            if bound > limit:
+                scale = objection("scale_not_fixed", percent=100 * limit)
+                return case.against(scale if name == "scale" else focal_length_not_fixed(bound))
+        return case
 
     def _other_extrinsics(self) -> Objection | None:
         """Return an objection if one camera contradicts the best pose, else None.
@@ -324,19 +348,6 @@ class RigPoses:
         """Return log10 NFA (c,) of poses of camera k, in this camera alone, at the residual scale of the best pose."""
         problem = replace(self.rig.problems[k], prior=None)
         return alarms_of(problem, poses.rotation, poses.translation, np.repeat(self.best.scale[:1], len(poses))).own
-
-    def _judge(self) -> SearchResult:
-        strongest, seen = self._strongest()
-        return judge(
-            seen,
-            self.rig.problems[strongest],
-            batches=self.iterations,
-            local_searches=self._local_searches(),
-            exhaustive=self.exhaustive,
-            settings=self.verdict_settings,
-            rig=[(self.rig.seen(k, self.best), problem) for k, problem in enumerate(self.rig.problems)],
-            distinct=self._distinct_fraction(),
-        )
 
     def _distinct_fraction(self) -> float:
         """Return the number of matched scene points of the best pose over that of its matches."""

@@ -24,7 +24,8 @@ from bpnp.search.solution import FOCAL_LENGTH, POSE_PARAMETERS, SCALE, Solution,
 from bpnp.search.solvers import Options, at_deadline, ending_seconds
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
 from bpnp.search.verdict.covariance import student_factor
-from bpnp.search.verdict.decide import SearchResult, no_pose
+from bpnp.search.verdict.decide import Case, SearchResult, decide
+from bpnp.search.verdict.reasons import objection
 
 
 def prepare_rig(
@@ -153,10 +154,11 @@ def _solve(rig: Rig, options: Options) -> Solution:
     begun, deadline = Clock.now(), NEVER
     reasons = [problem.degenerate for problem in rig.problems if problem.degenerate is not None]
     if reasons:
-        result = no_pose(reasons[0], code="degenerate", settled=True)
+        case = Case.without_pose(rig.problems[0], objection("degenerate", why=reasons[0]), exhaustive=True)
+        result = decide(case)
     else:
         deadline = options.limit().before(ending_seconds(*rig.problems))
-        result = search_rig(
+        case = search_rig(
             rig,
             clutter=options.clutter,
             seed=options.seed,
@@ -164,7 +166,7 @@ def _solve(rig: Rig, options: Options) -> Solution:
             settings=options.settings,
             progress=options.progress_of(0),
         )
-        result = at_deadline(result, options, deadline, Clock.now() - begun)
+        result = at_deadline(decide(case), options, deadline, Clock.now() - begun)
     solution = with_unfinished(_finished(rig, rig.problems, result, options.inlier_threshold, deadline), deadline)
     return replace(solution, seconds=Clock.now() - begun)
 

@@ -1,8 +1,17 @@
 """Completeness of a search: the probability that a better pose exists and was not visited."""
 
 import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
 
 from bpnp.search.config import Evidence
+from bpnp.search.hypotheses import Hypotheses
+from bpnp.search.problem import Problem
+from bpnp.search.propose.collinear import find_line
+from bpnp.search.propose.repetitions import matched_points, registered
+from bpnp.search.propose.symmetries import Motions
 
 
 def log10_missed(
@@ -62,3 +71,96 @@ def far_missed(basin_count: int, settings: Evidence, *, symmetric: bool = False)
     The prior probability is `settings.uncompared` in a symmetric scene, else `settings.another`.
     """
     return (settings.uncompared if symmetric else settings.another) * 0.5**basin_count
+
+
+class Symmetry:
+    """Motions that map the matched points of a pose onto other scene points, registered once for equal poses.
+
+    A motion that maps a large part of them could by itself explain a better pose.
+    """
+
+    def __init__(self, problem: Problem, limits: Evidence) -> None:
+        self._problem, self._limits = problem, limits
+        self._known: list[tuple[NDArray[np.float64], NDArray[np.float64], Motions]] = []
+
+    def of(self, poses: Hypotheses) -> Motions:
+        """Return the motions of the first pose."""
+        if (motions := self._find(poses)) is None:
+            pose, least = poses.pose(), float(self._problem.image.scales[0])
+            motions = registered(self._problem, *pose, max(float(poses.scale[0]), least), self._limits)
+            self._known.append((*pose, motions))
+        return motions
+
+    def is_known(self, poses: Hypotheses) -> bool:
+        """Return True if the motions of the first pose were registered before."""
+        return len(poses) > 0 and self._find(poses) is not None
+
+    def is_symmetric(self, poses: Hypotheses) -> bool:
+        """Return True if a motion maps `Repetitions.symmetric` of the matched points of the first pose.
+
+        Motions of another scale are left out if there is a baseline.
+        """
+        motions = self.of(poses)
+        fraction = motions.fraction[motions.scale == 1] if self._problem.baseline else motions.fraction
+        return float(fraction.max(initial=0)) >= self._limits.repetitions.symmetric
+
+    def basin_count(self, poses: Hypotheses, *, with_copies: bool = False) -> int:
+        """Return the basin count of the first pose and of all poses equal to it.
+
+        With copies, the poses that the motions of the scene confuse with the first one count too. Each is compared
+        with it separately, and a better pose elsewhere has the same number of copies.
+        """
+        first = poses.rotation[:1], poses.translation[:1]
+        if with_copies:
+            copies = self.of(poses).competitors(first[0][0], first[1][0])
+            first = np.concatenate([first[0], copies[0]]), np.concatenate([first[1], copies[1]])
+        counted, tolerance = np.zeros(len(poses), bool), self._limits.same
+        for pose in zip(*first, strict=True):
+            counted |= self._problem.same_as(pose, poses.rotation, poses.translation, tolerance)
+        return int(poses.basin_count[counted].sum())
+
+    def _find(self, poses: Hypotheses) -> Motions | None:
+        for rotation, translation, motions in self._known:
+            if self._problem.same_as(poses.pose(), rotation[None], translation[None], self._limits.same)[0]:
+                return motions
+        return None
+
+
+def missed(
+    poses: Hypotheses,
+    problem: Problem,
+    symmetry: Symmetry,
+    local_searches: float | int,
+    limits: Evidence,
+    *,
+    decades_a_match: float,
+) -> float:
+    """Return log10 of the probability that the search missed a better optimum than the first of its poses.
+
+    If a motion maps the matched points onto others, matches of a wrong pose are not independent coincidences, and only
+    basin counts reduce the value. A prior then reduces the probability of a better pose elsewhere.
+    """
+    count = symmetry.basin_count(poses)
+    value = log10_missed(count, decades_a_match, local_searches, limits)
+    if value <= limits.missed and decades_a_match:
+        fewer = replace(limits, independent=independent_matches(poses, problem, limits))
+        value = log10_missed(count, decades_a_match, local_searches, fewer)
+    if value > limits.missed or not symmetry.is_symmetric(poses):
+        return value
+    count = symmetry.basin_count(poses, with_copies=True)
+    fraction = problem.log10_prior_fraction(*poses.pose())
+    return min(log10_missed(count, 0.0, local_searches, limits, symmetric=True) + fraction, 0.0)
+
+
+def independent_matches(poses: Hypotheses, problem: Problem, limits: Evidence) -> int:
+    """Return the number of matches that must be independent coincidences if the first pose is wrong.
+
+    It is `Evidence.independent`, unless most matched points lie on a line of the scene. Wrong poses then share these
+    matches, one of the other points fixes the rotation about the line, and only the rest are coincidences.
+    """
+    scale = max(float(poses.scale[0]), float(problem.image.scales[0]))
+    points = problem.points3d[matched_points(problem, *poses.pose(), scale)]
+    line = find_line(points)
+    if line is None:
+        return limits.independent
+    return int(np.clip((line.distances(points) > line.radius).sum() - 1, 0, limits.independent))

@@ -1,18 +1,19 @@
-"""Verdict on the best pose of a search.
+"""Verdict on the best pose of a search; nothing else makes or changes one.
 
 The criterion is the number of false alarms (NFA, `bpnp.search.verdict.false_alarms`): the expected number of poses
 that fit as well if image and scene are unrelated.
 
 - "confident": log10 NFA is at most `Evidence.false_alarms`. The margin to every competing pose is at least
   `Evidence.margin` decades. log10 of the probability that the search missed a better optimum is at most
-  `Evidence.missed` (`bpnp.search.verdict.completeness`).
-- "ambiguous": The best pose fits better than chance (log10 NFA below 0), but one of the three conditions does not
-  hold. Points that do not fix the rotation or the focal length give this verdict too.
-- "failed": No pose was found, or none fits better than chance.
+  `Evidence.missed` (`bpnp.search.verdict.completeness`). No rival objects (`bpnp.search.verdict.contest`).
+- "ambiguous": The best pose fits better than chance (log10 NFA below 0), but one of these conditions does not hold.
+  Points that do not fix the rotation or the focal length give this verdict too.
+- "failed": No pose was found, or none fits better than chance, or a given pose is refuted by a confident one.
 """
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -21,21 +22,19 @@ from numpy.typing import NDArray
 from bpnp.search.config import DEFAULT, Evidence
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem
-from bpnp.search.propose.collinear import find_line
-from bpnp.search.propose.repetitions import matched_points, registered
-from bpnp.search.propose.symmetries import Motions
 from bpnp.search.verdict import reasons
 from bpnp.search.verdict.competitors import (
     CandidatesOfCameras,
+    distance_between,
     other_camera,
     other_pose,
     rough_residuals,
     unrelated_competitor,
 )
-from bpnp.search.verdict.completeness import log10_missed
+from bpnp.search.verdict.completeness import Symmetry, missed
 from bpnp.search.verdict.false_alarms import alarms_of
-from bpnp.search.verdict.reasons import CLAUSES, CONFIDENT, Objection, focal_length_not_fixed, objection
-from bpnp.search.verdict.uncertainty import error_bounds, is_redundant, linearised, systematic_misfit
+from bpnp.search.verdict.reasons import CONFIDENT, NO_POSE, Objection, focal_length_not_fixed, objection
+from bpnp.search.verdict.uncertainty import Linearised, error_bounds, is_redundant, linearised, systematic_misfit
 
 Verdict = Literal["confident", "ambiguous", "failed"]
 HALF_TURN = 180.0  # a larger bound does not constrain a rotation [degrees; derived]
@@ -43,34 +42,172 @@ REFINED = math.inf  # number of local searches that the exact refinement of an e
 
 
 @dataclass(frozen=True, eq=False)
+class Case:
+    """What is known of the best pose of a search, the leader: its rivals, and how complete the search was."""
+
+    candidates: Hypotheses  # in the frame of the problem; `Case.of` moves the leader to the front
+    problem: Problem  # of a rig, that of the camera with the most evidence
+    failure: Objection = NO_POSE  # why there are no candidates, if there are none
+    local_searches: float | int = 0  # around the leader, that found nothing better; `REFINED` for an enumeration
+    exhaustive: bool = False  # every pose that fits some points was examined: the miss probability is 0
+    iterations: int = 0  # of the search
+    is_fitted: bool = False  # the leader is a least-squares fit to its matches
+    cameras: CandidatesOfCameras = ()  # candidates and points of every camera of a rig
+    distinct: float = 1.0  # matched scene points over matches, below 1 if several cameras see some
+    objections: tuple[Objection, ...] = ()  # what rivals found that are no poses of this camera
+    claim: Hypotheses | None = None  # (1,) pose in question, if it was given
+    note: str = ""  # added to the reason of a confident pose
+    of_rig: Hypotheses | None = None  # the candidates as poses of a rig
+    limits: Evidence = DEFAULT.evidence
+    motions: Symmetry | None = None  # those of the scene that other cases of the problem have registered
+
+    @classmethod
+    def of(cls, candidates: Hypotheses, problem: Problem, **known: object) -> "Case":
+        """Return a case with the candidates ranked by `rank_poses`."""
+        limits = known.get("limits", DEFAULT.evidence)
+        assert isinstance(limits, Evidence)
+        return cls(rank_poses(candidates, problem, limits), problem, **known)  # type: ignore[arg-type]
+
+    @classmethod
+    def without_pose(cls, problem: Problem, failure: Objection = NO_POSE, *, exhaustive: bool = False) -> "Case":
+        """Return a case without candidates."""
+        return cls(Hypotheses.empty(), problem, failure, exhaustive=exhaustive)
+
+    def among(self, rivals: Hypotheses) -> "Case":
+        """Return the case with rivals among the candidates; objections to another leader do not count."""
+        ranked = rank_poses(Hypotheses.concatenate([self.candidates, rivals]), self.problem, self.limits)
+        case = replace(self, candidates=ranked)
+        return case if case.has_leader_of(self) else replace(case, objections=())
+
+    def against(self, one: Objection | None) -> "Case":
+        """Return the case with an objection to the leader; the same one for None."""
+        return self if one is None else replace(self, objections=(*self.objections, one))
+
+    def has_leader_of(self, other: "Case") -> bool:
+        """Return True if another case has the same leader."""
+        return bool(np.array_equal(self.candidates.translation[:1], other.candidates.translation[:1]))
+
+    @property
+    def pose(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Rotation (3, 3) and translation (3,) of the leader."""
+        return self.candidates.pose()
+
+    @property
+    def residual(self) -> float:
+        """Scale of the residuals of the leader, radians; infinite without one."""
+        return float(self.candidates.scale[0]) if len(self.candidates) else math.inf
+
+    @property
+    def log10_false_alarms(self) -> float:
+        """log10 NFA of the leader; infinite without one."""
+        return float(self.candidates.log10_false_alarms[0]) if len(self.candidates) else math.inf
+
+    @property
+    def match_count(self) -> float:
+        """Expected number of matches of the leader."""
+        return match_count(self.candidates)
+
+    @cached_property
+    def symmetry(self) -> Symmetry:
+        """Motions of the scene that map matched points."""
+        return self.motions or Symmetry(self.problem, self.limits)
+
+    @cached_property
+    def missed(self) -> float:
+        """log10 of the probability that the search missed a better optimum than the leader."""
+        return -math.inf if self.exhaustive else self._missed(with_matches=True)
+
+    @cached_property
+    def is_settled(self) -> bool:
+        """True if more search would not help: no test fails, or nothing was missed even if matches are no evidence."""
+        if self.exhaustive or not len(self.candidates):
+            return self.exhaustive
+        return self._shortcoming is None or self._missed(with_matches=False) <= self.limits.missed
+
+    @cached_property
+    def is_certain(self) -> bool:
+        """True if the leader passes the cheap tests: the NFA, the miss probability, other poses, rough residuals."""
+        if self.log10_false_alarms > self.limits.false_alarms:
+            return False
+        return all(one.margin >= self.limits.margin for one in self._rivals) and self.missed <= self.limits.missed
+
+    @property
+    def objection(self) -> Objection | None:
+        """Reason against the leader; None if it is confident."""
+        return self._shortcoming or next(iter(self.objections), None)
+
+    @cached_property
+    def bounds(self) -> tuple[float, float]:
+        """99.9 % bounds of the rotation, degrees, and of the focal length, a fraction; the latter is 0 if given."""
+        turned, share = error_bounds(self.problem, self._linear, self.match_count)
+        return math.degrees(turned), share
+
+    @cached_property
+    def _shortcoming(self) -> Objection | None:
+        """Test that the leader fails; costly ones run only if the verdict depends on them."""
+        limits, alarms = self.limits, self.log10_false_alarms
+        if not len(self.candidates):
+            return self.failure
+        if fits_by_chance(alarms):
+            return objection("chance", what="no pose fits")
+        if self.is_certain:
+            return self._not_fixed or min(self._doubts, default=None)
+        if near := [one for one in self._rivals if one.margin < limits.margin]:
+            return min(near)
+        if alarms > limits.false_alarms:
+            return objection("insignificant", alarms=reasons.nfa(alarms), most=limits.false_alarms)
+        return objection("incomplete", what="pose", probability=reasons.miss_probability(self.missed))
+
+    def _missed(self, *, with_matches: bool) -> float:
+        """Compute `missed`, with or without the evidence of the matches."""
+        if fits_by_chance(self.log10_false_alarms):
+            return 0.0
+        decades = -self.log10_false_alarms / max(self.distinct * self.match_count, 1.0) if with_matches else 0.0
+        known = self.problem, self.symmetry, self.local_searches, self.limits
+        return missed(self.candidates, *known, decades_a_match=decades)
+
+    @cached_property
+    def _linear(self) -> Linearised | None:
+        return linearised(self.problem, *self.pose, self.residual)
+
+    @cached_property
+    def _rivals(self) -> list[Objection]:
+        """Best other pose in each camera, and the pose itself at rough residuals."""
+        others = [other_pose(*each, self.limits) for each in self._cameras]
+        return [one for one in (*others, rough_residuals(self.candidates)) if one is not None]
+
+    @property
+    def _cameras(self) -> CandidatesOfCameras:
+        return self.cameras or [(self.candidates, self.problem)]
+
+    @property
+    def _not_fixed(self) -> Objection | None:
+        """Unknown that the points do not determine."""
+        (off, share), count = self.bounds, self.match_count
+        if off >= HALF_TURN or not (self.cameras or is_redundant(self.problem, count)):
+            return objection("rotation_not_fixed", count=count, what="the rotation")
+        most = self.limits.focal_few if is_object(self.problem, self.limits) else self.limits.focal
+        return focal_length_not_fixed(share) if share > most else None
+
+    @property
+    def _doubts(self) -> list[Objection]:
+        """Other cameras that the residuals support, and far poses that explain other points."""
+        misfit = systematic_misfit(self._linear, self.match_count, self.limits)
+        doubts = other_camera(misfit, self.limits), unrelated_competitor(self._cameras, self.limits)
+        return [one for one in doubts if one is not None and one.margin < self.limits.margin]
+
+
+@dataclass(frozen=True, eq=False)
 class SearchResult:
-    """Result of the search for the pose of one problem.
+    """Result of the search for the pose of one problem."""
 
-    Attributes:
-        candidates: Distinct poses in the frame of the problem, float64, best first.
-        verdict: Confident, ambiguous or failed, as defined at the head of this file.
-        reason: Reason of the verdict, a plain sentence.
-        batches: Number of iterations of the search.
-        code: Kind of the reason, "confident" or a key of `bpnp.search.verdict.reasons.CLAUSES`.
-        settled: True if more search would not change the verdict. A better optimum is then excluded without the
-            evidence of the matches.
-    """
-
-    candidates: Hypotheses
+    candidates: Hypotheses  # distinct poses, best first, in the frame of the problem, or of the rig
     verdict: Verdict
-    reason: str
-    batches: int
-    code: str
-    settled: bool = False
-
-    def add_objection(self, one: Objection, verdict: Verdict = "ambiguous") -> "SearchResult":
-        """Return a copy that is ambiguous, or failed, for a reason."""
-        return replace(self, verdict=verdict, reason=one.sentence(self.log10_false_alarms), code=one.code)
-
-    def as_insignificant(self, most: float) -> "SearchResult":
-        """Return a copy that is ambiguous, since its log10 NFA is above `most`."""
-        reason = reasons.insignificant(self.log10_false_alarms, most)
-        return replace(self, verdict="ambiguous", reason=reason, code="insignificant")
+    reason: str  # a plain sentence
+    code: str  # kind of the reason: "confident" or a key of `reasons.CLAUSES`
+    iterations: int  # of the search
+    is_settled: bool = False  # more search would not change the verdict
+    is_fitted: bool = False  # the best pose is a least-squares fit to its matches
 
     @property
     def best(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -90,6 +227,35 @@ class SearchResult:
         return float(self.candidates.log10_false_alarms[0]) if len(self.candidates) else math.inf
 
 
+def decide(case: Case) -> SearchResult:
+    """Return the verdict on the leader of a case, or on the pose that it claims.
+
+    A claim is "failed" if the leader is another pose without an objection, and "ambiguous" if it is another one.
+    """
+    candidates, one, refuted = case.candidates, case.objection, False
+    if case.claim is not None:
+        place = int(np.flatnonzero((candidates.translation == case.claim.translation[0]).all(-1))[0])
+        alarms = float(case.claim.log10_false_alarms[0])
+        if place and not fits_by_chance(alarms):
+            away = distance_between(case.problem, case.claim.pose(), case.pose)
+            refuted, margin = one is None, alarms - case.log10_false_alarms
+            one = objection("better_pose", margin, away=away)
+        elif fits_by_chance(alarms):
+            one = objection("chance", what="the pose fits no")
+        candidates = candidates[np.r_[place, np.delete(np.arange(len(candidates)), place)]]
+    verdict: Verdict = "confident"
+    if one is None:
+        code = CONFIDENT
+        reason = reasons.confident(case.log10_false_alarms, case.limits.margin, *case.bounds)
+        reason = "; ".join([reason, case.note] if case.note else [reason])
+    else:
+        verdict, code = "failed" if refuted or one.code in reasons.FAILURES else "ambiguous", one.code
+        reason = one.sentence(float(candidates.log10_false_alarms[0])) if len(candidates) else one.clause
+    if case.of_rig is not None:
+        candidates = replace(candidates, rotation=case.of_rig.rotation, translation=case.of_rig.translation)
+    return SearchResult(candidates, verdict, reason, code, case.iterations, case.is_settled, case.is_fitted)
+
+
 def fits_by_chance(log10_false_alarms: float) -> bool:
     """Return True if a pose fits no better than chance: its NFA is at least 1.
 
@@ -99,15 +265,7 @@ def fits_by_chance(log10_false_alarms: float) -> bool:
 
 
 def add_false_alarms(candidates: Hypotheses, problem: Problem) -> Hypotheses:
-    """Compute the NFA of the candidates that lack it.
-
-    Args:
-        candidates: Poses in the frame of the problem.
-        problem: Points of the problem.
-
-    Returns:
-        Candidates in the same order.
-    """
+    """Compute the NFA of the candidates that lack it; the order stays."""
     alarms, rough = candidates.log10_false_alarms.copy(), candidates.log10_rough.copy()
     new = np.isnan(alarms)
     if not new.any():
@@ -117,25 +275,17 @@ def add_false_alarms(candidates: Hypotheses, problem: Problem) -> Hypotheses:
     return replace(candidates, log10_false_alarms=alarms, log10_rough=rough)
 
 
-def rank_poses(candidates: Hypotheses, problem: Problem, settings: Evidence = DEFAULT.evidence) -> Hypotheses:
-    """Compute the NFA of the candidates and move the best one to the front.
+def rank_poses(candidates: Hypotheses, problem: Problem, limits: Evidence = DEFAULT.evidence) -> Hypotheses:
+    """Compute the NFA of the candidates and move the best one to the front; the others keep their order.
 
     The best is the first one in the order of the search whose log10 NFA is within `Evidence.margin` of the smallest.
     The order of the search is that of the likelihood. It decides among poses that the NFA cannot separate.
-
-    Args:
-        candidates: Poses in the frame of the problem, best first.
-        problem: Points of the problem.
-        settings: Constants of the verdict.
-
-    Returns:
-        Candidates with their NFA; the others keep their order.
     """
     if not len(candidates):
         return candidates
     candidates = add_false_alarms(candidates, problem)
     alarms = candidates.log10_false_alarms
-    first = int(np.flatnonzero(alarms <= alarms.min() + settings.margin)[0])
+    first = int(np.flatnonzero(alarms <= alarms.min() + limits.margin)[0])
     order = np.r_[first, np.delete(np.arange(len(alarms)), first)]
     return candidates[order]
 
@@ -145,205 +295,6 @@ def match_count(candidates: Hypotheses) -> float:
     return float(candidates.match_count[0])
 
 
-def missed(
-    candidates: Hypotheses,
-    problem: Problem,
-    local_searches: float | int,
-    settings: Evidence,
-    *,
-    independent: bool = True,
-    distinct: float = 1.0,
-) -> float:
-    """Return log10 of the probability that the search missed a better optimum.
-
-    Args:
-        candidates: Poses in the frame of the problem with their NFA, best first.
-        problem: Points of the problem.
-        local_searches: Number of local searches around the first candidate that found nothing better. `REFINED` for an
-            enumeration, whose exact refinement leaves no better pose nearby.
-        settings: Constants of the verdict.
-        independent: False to leave out the evidence of the matches.
-        distinct: Number of matched scene points over that of matches, below 1 if several cameras of a rig see some.
-
-    Returns:
-        The logarithm; 0 if the first candidate is not significant. If a motion maps the matched points onto others,
-        matches of a wrong pose are not independent coincidences. Only basin counts reduce the value then.
-    """
-    alarms = float(candidates.log10_false_alarms[0]) if len(candidates) else math.inf
-    if fits_by_chance(alarms):
-        return 0.0
-    decades = -alarms / max(distinct * match_count(candidates), 1.0) if independent else 0.0
-    basin_count = count_starts(candidates, problem, settings)
-    value = log10_missed(basin_count, decades, local_searches, settings)
-    if value <= settings.missed and decades:
-        fewer = replace(settings, independent=independent_matches(candidates, problem, settings))
-        value = log10_missed(basin_count, decades, local_searches, fewer)
-    if value > settings.missed or not is_symmetric(candidates, problem, settings):
-        return value
-    basin_count = count_starts(candidates, problem, settings, symmetric=True)
-    # A prior reduces the probability of a better pose elsewhere.
-    fraction = problem.log10_prior_fraction(*candidates.pose())
-    return min(log10_missed(basin_count, 0.0, local_searches, settings, symmetric=True) + fraction, 0.0)
-
-
-def cached_motions(candidates: Hypotheses, problem: Problem, settings: Evidence) -> Motions:
-    """Return the motions that map the matched points of the first candidate onto other scene points.
-
-    The result is stored in `Problem.registered` and reused for equal poses.
-    """
-    pose = candidates.pose()
-    for rotation, translation, motions in problem.registered:
-        if problem.same_as(pose, rotation[None], translation[None], settings.same)[0]:
-            return motions
-    scale = max(float(candidates.scale[0]), float(problem.image.scales[0]))
-    motions = registered(problem, *pose, scale, settings)
-    problem.registered.append((*pose, motions))
-    return motions
-
-
-def is_symmetric(candidates: Hypotheses, problem: Problem, settings: Evidence) -> bool:
-    """Return True if a motion maps a large part of the matched points onto other scene points.
-
-    The motion could by itself explain a better pose. The fraction is compared with `Evidence.repetitions`. Motions of
-    another scale could not if there is a baseline.
-    """
-    motions = cached_motions(candidates, problem, settings)
-    fraction = motions.fraction[motions.scale == 1] if problem.baseline else motions.fraction
-    return float(fraction.max(initial=0)) >= settings.repetitions.symmetric
-
-
-def independent_matches(candidates: Hypotheses, problem: Problem, settings: Evidence) -> int:
-    """Return the number of matches that must be independent coincidences if the first candidate is wrong.
-
-    It is `Evidence.independent`, unless most matched points lie on a line of the scene. Wrong poses then share these
-    matches, one of the other points fixes the rotation about the line, and only the rest are coincidences.
-    """
-    scale = max(float(candidates.scale[0]), float(problem.image.scales[0]))
-    points = problem.points3d[matched_points(problem, *candidates.pose(), scale)]
-    line = find_line(points)
-    if line is None:
-        return settings.independent
-    return int(np.clip((line.distances(points) > line.radius).sum() - 1, 0, settings.independent))
-
-
-def count_starts(candidates: Hypotheses, problem: Problem, settings: Evidence, *, symmetric: bool = False) -> int:
-    """Return the basin count of the first candidate and of all poses equal to it.
-
-    Args:
-        candidates: Poses in the frame of the problem, best first.
-        problem: Points of the problem.
-        settings: Constants of the verdict.
-        symmetric: Also count the poses that the motions of the scene confuse with the first one. Each is compared with
-            it separately; a better pose elsewhere has the same number of copies.
-    """
-    first = candidates.rotation[:1], candidates.translation[:1]
-    if symmetric:
-        copies = cached_motions(candidates, problem, settings).competitors(first[0][0], first[1][0])
-        first = np.concatenate([first[0], copies[0]]), np.concatenate([first[1], copies[1]])
-    counted = np.zeros(len(candidates), bool)
-    for rotation, translation in zip(*first, strict=True):
-        counted |= problem.same_as((rotation, translation), candidates.rotation, candidates.translation, settings.same)
-    return int(candidates.basin_count[counted].sum())
-
-
-def judge(
-    candidates: Hypotheses,
-    problem: Problem,
-    *,
-    batches: int,
-    local_searches: float | int = 0,
-    exhaustive: bool = False,
-    settings: Evidence = DEFAULT.evidence,
-    rig: CandidatesOfCameras = (),
-    distinct: float = 1.0,
-) -> SearchResult:
-    """Compute the verdict on the candidates.
-
-    Args:
-        candidates: Poses in the frame of the problem, best first.
-        problem: Points of the problem.
-        batches: Number of iterations of the search.
-        local_searches: Number of local searches around the best pose that found nothing better.
-        exhaustive: True if every pose that fits some points was examined; the miss probability is then 0.
-        settings: Constants of the verdict.
-        rig: Candidates, best first, and points of every camera of a rig; empty for a single camera.
-        distinct: As for `missed`.
-
-    Returns:
-        Candidates, best first, with the verdict and its reason.
-    """
-    if not len(candidates):
-        return no_pose(batches=batches, settled=exhaustive)
-    candidates = rank_poses(candidates, problem, settings)
-    alarms = float(candidates.log10_false_alarms[0])
-    settled = exhaustive or missed(candidates, problem, local_searches, settings, independent=False) <= settings.missed
-    result = SearchResult(candidates, "confident", "", batches, CONFIDENT, settled)
-    if fits_by_chance(alarms):
-        return result.add_objection(objection("chance", what="no pose fits"), "failed")
-    unseen = -math.inf if exhaustive else missed(candidates, problem, local_searches, settings, distinct=distinct)
-    # Costly tests run only if the verdict depends on them.
-    per_camera = rig or [(candidates, problem)]
-    against = [*(other_pose(*each, settings) for each in per_camera), rough_residuals(candidates)]
-    certain = alarms <= settings.false_alarms and unseen <= settings.missed
-    off = share = math.nan
-    if certain and all(one is None or one.margin >= settings.margin for one in against):
-        count = match_count(candidates)
-        linear = linearised(problem, *candidates.pose(), float(candidates.scale[0]))
-        turned, share = error_bounds(problem, linear, count)
-        off = math.degrees(turned)
-        if off >= HALF_TURN or not (rig or is_redundant(problem, count)):
-            return result.add_objection(objection("rotation_not_fixed", count=count, what="the rotation"))
-        if share > (settings.focal_few if is_object(problem, settings) else settings.focal):
-            return result.add_objection(focal_length_not_fixed(share))
-        against += [
-            other_camera(systematic_misfit(linear, count, settings), settings),
-            unrelated_competitor(per_camera, settings),
-        ]
-    objections = [one for one in against if one is not None and one.margin < settings.margin]
-    if certain and not objections:
-        return replace(result, reason=reasons.confident(alarms, settings.margin, off, share), settled=True)
-    if objections:
-        return result.add_objection(min(objections))
-    if alarms > settings.false_alarms:
-        return result.as_insignificant(settings.false_alarms)
-    return result.add_objection(objection("incomplete", what="pose", probability=reasons.miss_probability(unseen)))
-
-
-def is_object(problem: Problem, settings: Evidence) -> bool:
-    """Return True if the scene points are those of an object.
-
-    An object has few points, and they have no viewing cones, unlike those of a map.
-    """
-    return problem.cosines3d is None and len(problem.points3d) <= settings.repetitions.whole
-
-
-def is_certain(candidates: Hypotheses, problem: Problem, settings: Evidence = DEFAULT.evidence) -> bool:
-    """Return True if the first candidate of an enumeration passes the cheap tests of the verdict.
-
-    The tests are the NFA, the margin to the best different pose, rough residuals and the miss probability.
-    """
-    if not len(candidates) or float(candidates.log10_false_alarms[0]) > settings.false_alarms:
-        return False
-    other = other_pose(candidates, problem, settings)
-    if (other is not None and other.margin < settings.margin) or rough_residuals(candidates) is not None:
-        return False
-    return missed(candidates, problem, REFINED, settings) <= settings.missed
-
-
-def no_pose(
-    reason: str = CLAUSES["no_pose"], batches: int = 0, *, code: str = "no_pose", settled: bool = False
-) -> SearchResult:
-    """Return a failed result without candidates.
-
-    Args:
-        reason: Reason, a sentence.
-        batches: Number of iterations of the search.
-        code: Kind of the reason, a key of `CLAUSES`.
-        settled: True if more search would not find a pose. Default False.
-    """
-    return SearchResult(Hypotheses.empty(), "failed", reason, batches, code, settled)
-
-
-def degenerate_points(why: str) -> SearchResult:
-    """Return a failed result for points that fix no pose."""
-    return no_pose(objection("degenerate", why=why).clause, code="degenerate", settled=True)
+def is_object(problem: Problem, limits: Evidence) -> bool:
+    """Return True if the scene is an object: few points without the viewing cones of a map."""
+    return problem.cosines3d is None and len(problem.points3d) <= limits.repetitions.whole

@@ -7,13 +7,14 @@ from bpnp.search.config import REASONS
 
 MIRRORED = "the mirror image of the scene has a significant pose: check the directions of its axes"
 CONFIDENT = "confident"  # code of a pose without an objection
+FAILURES = {"no_pose", "degenerate", "chance"}  # codes of a problem without a pose, or with one that is not significant
 UNTESTED = {"untested", "camera_untested"}  # codes of poses for whose competitors there was no time
 CLAUSES = {
     # There is no pose, or it is not significant.
     "no_pose": "no pose was found",
-    "degenerate": "no pose fits: {why}",
+    "degenerate": "{why}",
     "chance": "{what} better than chance",
-    "insignificant": "not significant",
+    "insignificant": "not significant: {alarms}, and at most {most:g} is needed",
     # Another pose may be the right one.
     "competing_pose": "a competing pose {away} away fits about as well (margin {margin:.1f} decades)",
     "competing_place": "a pose {distance:.3g} scene units and {degrees:.0f} deg away, elsewhere in the map, explains "
@@ -71,7 +72,8 @@ class Objection(NamedTuple):
 
     def sentence(self, log10_false_alarms: float) -> str:
         """Return the reason of a pose with this log10 NFA."""
-        return f"{self.clause[0].upper()}{self.clause[1:]}; {nfa(log10_false_alarms)}"
+        clause = f"{self.clause[0].upper()}{self.clause[1:]}"
+        return clause if self.code == "insignificant" else f"{clause}; {nfa(log10_false_alarms)}"
 
 
 def objection(code: str, margin: float = -math.inf, **values: object) -> Objection:
@@ -87,6 +89,9 @@ def objection(code: str, margin: float = -math.inf, **values: object) -> Objecti
         'Its 4 matches do not fix the rotation; log10 NFA -5.0'
     """
     return Objection(margin, code, CLAUSES[code].format(margin=margin, **values))
+
+
+NO_POSE = objection("no_pose")
 
 
 def focal_length_not_fixed(bound: float) -> Objection:
@@ -113,11 +118,6 @@ def confident(log10_false_alarms: float, margin: float, bound_deg: float, focal:
     if focal:
         precision += f", focal length to {rounded(100 * focal)} %"
     return f"No competing pose within {margin:g} decades; {nfa(log10_false_alarms)}; {precision} (99.9 %)"
-
-
-def insignificant(log10_false_alarms: float, most: float) -> str:
-    """Return the reason of a pose that is not significant; `most` is the largest significant log10 NFA."""
-    return f"Not significant: {nfa(log10_false_alarms)}, and at most {most:g} is needed"
 
 
 def miss_probability(log10_missed: float) -> str:

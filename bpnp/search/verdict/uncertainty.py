@@ -353,7 +353,7 @@ def systematic_misfit(linear: Linearised | None, count: float, settings: Evidenc
       their probabilities. The pose is eliminated, and the principal directions of the strains with a significant F
       statistic count (level 0.001).
     - The log of the focal length is fitted and tested likewise (level `settings.focal_chance`, 0.01). The
-      correspondences of the pose bias it towards the given one; `bpnp.search.competing_poses` fits a
+      correspondences of the pose bias it towards the given one; `bpnp.search.verdict.rivals.lens` fits a
       significant one with new ones.
 
     Args:

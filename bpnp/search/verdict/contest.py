@@ -1,0 +1,33 @@
+"""Rivals of the best pose: each is asked while nothing else speaks against it; all are asked about a better one too."""
+
+from collections.abc import Sequence
+from functools import partial
+
+from bpnp.runtime import NEVER, Deadline
+from bpnp.search.verdict.decide import Case
+from bpnp.search.verdict.rivals import Rival, SceneOf
+from bpnp.search.verdict.rivals.lens import lens
+from bpnp.search.verdict.rivals.symmetries import symmetries
+
+
+def rivals_of(scene_of: SceneOf, deadline: Deadline = NEVER, *, enumerated: bool = False) -> list[Rival]:
+    """Return the rivals of a pose of one camera, in the order in which they are asked.
+
+    Args:
+        scene_of: Function that returns the scene for refinements; it is called only if one is needed.
+        deadline: Deadline of the scene, after whose end nothing more is tested.
+        enumerated: True if the candidates are those of an enumeration.
+    """
+    return [
+        partial(symmetries, scene_of=scene_of, deadline=deadline, enumerated=enumerated),
+        partial(lens, scene_of=scene_of, deadline=deadline),
+    ]
+
+
+def contest(case: Case, rivals: Sequence[Rival]) -> Case:
+    """Return a case after its rivals were asked."""
+    asked = 0
+    while asked < len(rivals) and case.objection is None:
+        answer = rivals[asked](case)
+        asked, case = asked + 1 if answer.has_leader_of(case) else 0, answer
+    return case

@@ -1,0 +1,9 @@
+"""Rivals of the best pose: each file proposes competing poses, or objects to it, in one way."""
+
+from collections.abc import Callable
+
+from bpnp.search.search_frame import Scene
+from bpnp.search.verdict.decide import Case
+
+SceneOf = Callable[[], Scene]
+Rival = Callable[[Case], Case]  # the case with competing poses or an objection; the same one if there is none
