@@ -83,10 +83,7 @@ def leads_back(kind: symmetric.Kind, problem: Problem) -> bool:
 def measure(seed: int, limit: int, trials: int) -> dict[str, Any]:
     """Return the settings, how many best poses reached each basin count and were wrong, and the trials of motions.
 
-    Args:
-        seed: seed of the objects and of the searches.
-        limit: objects of each kind that are searched.
-        trials: objects of each kind whose true pose is rotated by a symmetry.
+    Of each kind, `limit` objects are searched, and the true pose of `trials` ones is rotated by a symmetry.
     """
     counts: Counter[tuple[int, bool]] = Counter()
     searched = 0

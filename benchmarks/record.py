@@ -56,12 +56,7 @@ class Similarity:
 
 
 def parser(doc: str | None, *, without: Collection[str] = ()) -> argparse.ArgumentParser:
-    """Return a parser with the options that most benchmarks have.
-
-    Args:
-        doc: docstring of the benchmark, which is its help.
-        without: names of the options that this benchmark does not have.
-    """
+    """Return a parser with the options that most benchmarks have, whose help is `doc`."""
     result = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     options: dict[str, dict[str, Any]] = {
         "data": {"type": Path, "default": DATA, "help": "folder with colmap, photos and psb"},
@@ -269,11 +264,7 @@ def measure_rows(rows: Iterable[Row]) -> Iterator[tuple[Row, dict[str, Any], lis
 
 
 def run(rows: Iterable[Row], options: argparse.Namespace) -> list[tuple[Row, list[Outcome]]]:
-    """Measure the rows that `--only` selects, and write each with its outcomes to `--output` at once.
-
-    Returns:
-        The rows that were measured, with their outcomes.
-    """
+    """Measure and return the rows that `--only` selects, and write each with its outcomes to `--output` at once."""
     measured, results = [], {}
     for row, result, found in measure_rows(select(rows, options.only, lambda row: row.name)):
         measured.append((row, found))

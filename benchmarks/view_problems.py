@@ -158,20 +158,12 @@ def photos(
     apart: bool = False,
     time_limit: float | None = None,
 ) -> Iterator[Problem]:
-    """Yield at most `limit` photos of the reported scenes, without a prior.
+    """Yield at most `limit` photos of the reported scenes, without a prior, from a folder with colmap.
 
-    Args:
-        against: as for `view_problem`.
-        outliers: as for `view_problem`.
-        limit: largest number of photos.
-        seed: seed of the problems and of the search.
-        data: folder with colmap.
-        in_map: localise the photo in the map of these points, with the name of the view if there is one; otherwise
-            `solve` gets the points alone.
-        apart: each photo is put into the map of another problem, half a list away.
-        time_limit: seconds; None for the default of `localize` or `solve`.
-
-    The error of a centre is in median distances of the points.
+    With `in_map` the photo is localised in the map of these points, with the name of the view if there is one;
+    otherwise `solve` gets the points alone. With `apart` each photo is put into the map of another problem, half a list
+    away. The time limit in seconds is that of `localize` or `solve` by default. The error of a centre is in median
+    distances of the points.
     """
     each = -(-limit // len(REPORTED))
     drawn = list(scene_problems(data, REPORTED, each, against=against, outliers=outliers, seed=seed))
