@@ -46,8 +46,8 @@ from bpnp.datamodules.colmap.module import ColmapSource
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
 from bpnp.datamodules.stored import write_problems
 from bpnp.models.weights import checkpoint_path
+from bpnp.report.figure_files import save_figure
 from bpnp.report.figures import line_style
-from bpnp.report.images import save_figure
 from bpnp.report.results import ProblemRow
 
 if TYPE_CHECKING:

@@ -35,8 +35,8 @@ from bpnp.layers import RansacPnP, WeightedPnP
 from bpnp.models import BPnPNet, Search, TrainedNet
 from bpnp.models.evaluation import round_widths
 from bpnp.models.weights import read_checkpoint
+from bpnp.report.figure_files import save_figure
 from bpnp.report.figures import line_style
-from bpnp.report.images import save_figure
 from bpnp.report.intervals import Interval, bootstrap, fraction, paired_difference, quantile
 from bpnp.report.results import ProblemRow, rows_from
 from bpnp.report.tables import PRINTED

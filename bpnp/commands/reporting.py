@@ -47,9 +47,9 @@ def report(
         photos: folder of the photos of COLMAP models, for the page; `images` of each scene by default.
         groups: print the intervals of each class, scene or landmark too, as on the page.
     """
+    from bpnp.report.figure_files import check_picture_name, save_figure
     from bpnp.report.figures import recall_curve
     from bpnp.report.groups import differences, group_table, training_configs
-    from bpnp.report.images import check_picture_name, save_figure
     from bpnp.report.intervals import interval_table
     from bpnp.report.page import write_page
     from bpnp.report.results import SUMMARY
@@ -119,8 +119,9 @@ def view(
             that has the photo.
         photos: folder of the photos of the COLMAP models that were tested, in place of --photo and --camera.
     """
+    from bpnp.report.figure_files import save_figure
     from bpnp.report.figures import plot_photo, plot_problem
-    from bpnp.report.images import read_photo, save_figure
+    from bpnp.report.images import read_photo
     from bpnp.report.points import read_points
     from bpnp.report.tables import named_runs
 
@@ -299,8 +300,8 @@ def table(
         paper: published rows to add.
     """
     from bpnp.datamodules import Outliers
+    from bpnp.report.figure_files import save_figure
     from bpnp.report.figures import outlier_curves
-    from bpnp.report.images import save_figure
     from bpnp.report.tables import (
         CAPTION,
         FILE_COLUMNS,

@@ -96,7 +96,8 @@ def solve(
     if photo is not None and (picture is None or camera is None):
         raise ValueError("--photo needs --picture and --camera")
     if picture is not None:
-        from bpnp.report.images import check_picture_name, read_photo, save_figure, size_in_camera
+        from bpnp.report.figure_files import check_picture_name, save_figure
+        from bpnp.report.images import read_photo, size_in_camera
 
         check_picture_name(picture, "--picture")
     image_points, scene_points, annotations = _read_sides(points2d, points3d, surface, seed)

@@ -23,7 +23,8 @@ from bpnp.files import delay_interrupts, fingerprint, write_text
 from bpnp.maps.localized_picture import localized_picture
 from bpnp.maps.photos import photo_keypoints
 from bpnp.maps.scene_map import UNKNOWN, SceneMap
-from bpnp.report.images import read_photo, save_figure
+from bpnp.report.figure_files import save_figure
+from bpnp.report.images import read_photo
 from bpnp.search.arguments import seconds_from
 from bpnp.search.config import TIME
 from bpnp.search.solution import Solution

@@ -1,4 +1,4 @@
-"""Photos that are read and figures that are written."""
+"""Photos: their pixels, and their size in the pixels of their camera."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,29 +10,11 @@ import numpy.typing as npt
 
 from bpnp.bounded_files import open_input
 from bpnp.cameras import Camera, image_size, same_aspect_ratio
-from bpnp.files import delay_interrupts, write_atomically
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from PIL.Image import Image
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".svg", ".pdf")
 Array = npt.NDArray[Any]
-
-
-def save_figure(figure: "Figure", path: Path | str, *, dpi: int = 110) -> Path:
-    """Write a figure atomically, to a name that ends in .png, .jpg, .svg or .pdf, and return its path."""
-    path = Path(path)
-    check_picture_name(path)
-    with write_atomically(path) as temporary, delay_interrupts():  # matplotlib reports Ctrl-C as an input error
-        figure.savefig(temporary, format=path.suffix[1:].lower(), dpi=dpi)
-    return path
-
-
-def check_picture_name(path: Path, what: str = "the file name") -> None:
-    """Raise ValueError, which begins with `what`, if `save_figure` does not write files of this suffix."""
-    if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"{what} {path.name!r} has to end in {', '.join(SUFFIXES)}")
 
 
 @contextmanager

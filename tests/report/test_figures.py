@@ -13,8 +13,8 @@ from bpnp import Pose, Prediction, SolveStats
 from bpnp.cameras import camera_from
 from bpnp.cli import main
 from bpnp.report import write_results
+from bpnp.report.figure_files import save_figure
 from bpnp.report.figures import plot_photo, plot_problem, recall_curve
-from bpnp.report.images import save_figure
 from bpnp.report.points import points_from, write_points
 from bpnp.report.results import rows_from
 from bpnp.report.terminal import DARK, INKS, LIGHT

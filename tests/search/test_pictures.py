@@ -19,7 +19,7 @@ import bpnp
 from bpnp.cameras import camera_from
 from bpnp.cli import main
 from bpnp.examples import load
-from bpnp.report.images import save_figure
+from bpnp.report.figure_files import save_figure
 from bpnp.search.inputs import problem_from
 from bpnp.search.matching import failed_solution
 
