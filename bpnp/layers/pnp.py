@@ -3,12 +3,13 @@
 The objective is f(R, t) = sum_ij P_ij (1 - f_i . g(R p_j + t)) with g(y) = y / |y|. It is linear in the bearings: with
 q_j = sum_i P_ij f_i, f = sum P - sum_j q_j . g(R p_j + t). After one product, an evaluation costs O(n), not O(m n).
 
-A step (w, s) acts on the left: y = exp([w]x) R p + t + s. The q_j and p_j are columns of (b, 3, n) tensors, because
-torch sums three rows of n numbers faster than n rows of three.
+A step (w, s) moves the points in the frame of the scene: y = R (exp([w]x) p + s) + t. In this frame the q_j turn and
+the p_j stay. Both are columns of (b, 3, n) tensors, because torch sums three rows of n numbers faster than n rows of
+three.
 """
 
-import math
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -16,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from bpnp.checks import check_shapes
-from bpnp.geometry import choose, hat, is_finite, retract
+from bpnp.geometry import choose, hat, is_finite
 from bpnp.layers.implicit import first_derivative, refuse_second_derivative
 from bpnp.layers.lbfgs import lbfgs
 from bpnp.precision import full_precision
@@ -52,42 +53,43 @@ class ClippedColumns:
         self.columns = self.clipped = 0
 
 
+@dataclass
+class _ColumnLimit:
+    """Limit of the norm of the columns of the pose's derivative, for the backward pass of `_Aggregate`."""
+
+    largest: float
+    count: ClippedColumns | None
+    grams: Float[Tensor, "b n 3 3"] | None = None  # f_i^T grams_j f_i is the squared norm of column ij; set when solved
+
+
 class _Aggregate(torch.autograd.Function):
     """F^T P (b, 3, n): q_j = sum_i P_ij f_i, the mean bearing of each 3D point times the point's weight.
 
-    Its gradients are exact products too. With `grams` (b, n, 3, 3) and `limit`, f_i^T grams_j f_i is the squared norm
-    of column ij, and the gradient of P_ij is that of the column scaled down to the norm `limit`.
+    Its gradients are exact products too. With a limit, the gradient of P_ij is that of the shortened column.
     """
 
     @staticmethod
-    def forward(
-        ctx: Any,
-        assignment: Tensor,
-        bearings: Tensor,
-        grams: Tensor | None = None,
-        limit: float = math.inf,
-        count: ClippedColumns | None = None,
-    ) -> Tensor:
-        ctx.save_for_backward(assignment, bearings, grams)
-        ctx.limit, ctx.count = limit, count
+    def forward(ctx: Any, assignment: Tensor, bearings: Tensor, limit: _ColumnLimit | None) -> Tensor:
+        ctx.save_for_backward(assignment, bearings)
+        ctx.limit = limit
         return bearings.mT @ assignment
 
     @staticmethod
     @first_derivative
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        assignment, bearings, grams = ctx.saved_tensors
+        assignment, bearings = ctx.saved_tensors
         to_assignment, to_bearings = ctx.needs_input_grad[:2]
         of_assignment = bearings @ gradient if to_assignment else None
-        if of_assignment is not None and grams is not None:
+        if of_assignment is not None and ctx.limit is not None:
             outer = (bearings.unsqueeze(-1) * bearings.unsqueeze(-2)).flatten(-2)
-            norms = (outer.to(grams) @ grams.flatten(-2).mT).clamp_min(0).sqrt()
-            if ctx.count is not None:
+            norms = (outer.to(ctx.limit.grams) @ ctx.limit.grams.flatten(-2).mT).clamp_min(0).sqrt()
+            if ctx.limit.count is not None:
                 real = assignment > 0
-                ctx.count.columns += int(real.sum())
-                ctx.count.clipped += int((real & (norms > ctx.limit)).sum())
-            of_assignment = of_assignment * (ctx.limit / norms).clamp_max(1).to(of_assignment)
+                ctx.limit.count.columns += int(real.sum())
+                ctx.limit.count.clipped += int((real & (norms > ctx.limit.largest)).sum())
+            of_assignment = of_assignment * (ctx.limit.largest / norms).clamp_max(1).to(of_assignment)
         of_bearings = assignment @ gradient.mT if to_bearings else None
-        return of_assignment, of_bearings, None, None, None
+        return of_assignment, of_bearings, None
 
 
 class Derivatives(NamedTuple):
@@ -98,53 +100,80 @@ class Derivatives(NamedTuple):
     hessian: Float[Tensor, "b 6 6"]
 
 
-def derivatives(q: Columns, points: Columns, rotation: Rotations, translation: Translations) -> Derivatives:
-    """Compute the value, gradient and Hessian of the objective together.
+class Objective:
+    """The aggregated objective of a batch of problems, and its derivatives in the step (w, s).
 
-    With x = R p, y = x + t, d = |y|, u = y/d, the derivative of a term in y is h = ((q.u) u - q)/d, and its second
-    derivative G = [(q.u)(I - 3 u u^T) + q u^T + u q^T]/d^2. Since dy = D (w, s) with D = [-[x]x, I], the Hessian is
-    sum D^T G D, plus sym(x h^T) - (x.h) I in its rotation block, the second derivative of exp([w]x) x.
-    G is written as (q.u)/d^2 I + v k^T + k v^T with v = u/d, k = (q - 1.5 (q.u) u)/d.
-
-    Args:
-        q: Weighted bearings (b, 3, n).
-        points: Scene points (b, 3, n).
-        rotation: R (b, 3, 3).
-        translation: t (b, 3).
+    With y = p + R^T t, d = |y|, u = y/d and R^T q for q, the derivative of a term in y is h = ((q.u) u - q)/d, and its
+    second derivative G = [(q.u)(I - 3 u u^T) + q u^T + u q^T]/d^2 = c I + v k^T + k v^T, where c = (q.u)/d^2, v = u/d
+    and k = (q - 1.5 (q.u) u)/d. The derivatives by a step are linear in h, c and v k^T, and polynomials of degree 2 in
+    p. One product thus gives all sums over the points, and a constant matrix makes derivatives of them.
     """
-    x = rotation @ points
-    y = x + translation.unsqueeze(-1)
-    u, inverse, h = _point_gradient(q, y)
-    along = (q * u).sum(-2, keepdim=True)
-    v = inverse * u
-    k = inverse * q - 1.5 * along * v
-    # D^T v = (x cross v, v), and x cross y = x cross t.
-    dv = torch.cat([hat(translation).mT @ v, v], -2)
-    dk = torch.cat([torch.linalg.cross(x, k, dim=-2), k], -2)
-    low_rank = dv @ dk.mT
-    curvature = along * inverse.square()
-    weighted = curvature * x
-    second, bend = x @ weighted.mT, x @ h.mT
-    eye = torch.eye(3, dtype=q.dtype, device=q.device)
-    # sum c D^T D = [[c (|x|^2 I - x x^T), c [x]x], [.., c I]]
-    trace = (second - bend).diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-    rotation_block = trace * eye - second + 0.5 * (bend + bend.mT)
-    mixed = hat(weighted.sum(-1))
-    top = torch.cat([rotation_block, mixed], -1)
-    bottom = torch.cat([mixed.mT, curvature.sum(-1, keepdim=True) * eye], -1)
-    hessian = low_rank + low_rank.mT + torch.cat([top, bottom], -2)
-    return Derivatives(-along.sum((-2, -1)), _gradient(bend, h), hessian)
+
+    def __init__(self, q: Columns, points: Columns) -> None:
+        """Set the weighted bearings q_j and the scene points p_j of each sample."""
+        self.q, self.points = q, points
+        homogeneous = torch.cat([torch.ones_like(points[:, :1]), points], 1)
+        self.monomials = homogeneous[:, FIRST] * homogeneous[:, SECOND]
+
+    def packed(self, rotation: Rotations, translation: Translations) -> Float[Tensor, "b 43"]:
+        """Return value, gradient and Hessian in one row a sample, which `unpack` separates."""
+        back = rotation.mT
+        q, y = back @ self.q, self.points + back @ translation.unsqueeze(-1)
+        inverse = y.square().sum(1, keepdim=True).clamp_min(NEAR**2).rsqrt()
+        u = y * inverse
+        along = (q * u).sum(1, keepdim=True)
+        v, q = u * inverse, q * inverse
+        k = torch.addcmul(q, along, v, value=-1.5)
+        h = torch.addcmul(-q, along, v)
+        products = (v.unsqueeze(2) * k.unsqueeze(1)).flatten(1, 2)
+        moments = self.monomials @ torch.cat([products, h, along * inverse.square(), along], 1).mT
+        return moments.flatten(1) @ _from_moments(q.dtype, q.device)
+
+    def derivatives(self, rotation: Rotations, translation: Translations) -> Derivatives:
+        """Return value, gradient and Hessian."""
+        return unpack(self.packed(rotation, translation))
 
 
-def _point_gradient(q: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return u = y/d (b, 3, n), 1/d (b, 1, n) with d = |y|, and h = ((q.u) u - q)/d (b, 3, n)."""
-    inverse = y.square().sum(-2, keepdim=True).clamp_min(NEAR**2).rsqrt()
-    u = inverse * y
-    return u, inverse, ((q * u).sum(-2, keepdim=True) * u - q) * inverse
+FIRST, SECOND = (list(index) for index in zip(*((a, b) for a in range(4) for b in range(a, 4)), strict=True))
 
 
-def _gradient(outer: Tensor, h: Tensor) -> Float[Tensor, "b 6"]:
-    """Return (sum x cross h, sum h) of columns x, h, given outer = sum x h^T."""
+def unpack(packed: Float[Tensor, "b 43"]) -> Derivatives:
+    """Separate value, gradient and Hessian."""
+    return Derivatives(packed[:, 0], packed[:, 1:7], packed[:, 7:].unflatten(1, (6, 6)))
+
+
+@cache
+def _from_moments(dtype: torch.dtype, device: torch.device) -> Float[Tensor, "140 43"]:
+    """Return the matrix from the moments of `Objective` to value, gradient and Hessian.
+
+    For the homogeneous point (1, p) the derivative of y in the step is sum_a p_a L_a, with L_0 = [0, I] and
+    L_a = [-[e_a]x, 0]. The gradient is thus sum_a L_a^T sum p_a h, and the Hessian sum_ab L_a^T (sum p_a p_b G) L_b,
+    plus sym(sum p h^T) - (sum p.h) I in its rotation block, the second derivative of exp([w]x) p.
+    """
+    eye = torch.eye(3, dtype=torch.float64, device="cpu")
+    zero = torch.zeros_like(eye)
+    by_step = torch.stack([torch.cat([zero, eye], 1), *(torch.cat([-hat(e), zero], 1) for e in eye)])
+    basis = torch.eye(10 * 14, dtype=torch.float64, device="cpu").view(-1, 10, 14)
+    moments = basis.new_zeros(len(basis), 4, 4, 14)
+    moments[:, FIRST, SECOND] = moments[:, SECOND, FIRST] = basis
+    products, h, c, along = moments.split([9, 3, 1, 1], -1)
+    products, h = products.unflatten(-1, (3, 3)), h[:, 0]
+    second = products + products.mT + c.unsqueeze(-1) * eye
+    hessian = torch.einsum("aki, zabkl, blj -> zij", by_step, second, by_step)
+    bend = h[:, 1:]
+    trace = bend.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None]
+    hessian[:, :3, :3] += (bend + bend.mT) / 2 - trace * eye
+    gradient = torch.einsum("aki, zak -> zi", by_step, h)
+    return torch.cat([-along[:, 0, 0], gradient, hessian.flatten(1)], 1).to(device, dtype)
+
+
+def _optimality(q: Columns, points: Columns, rotation: Rotations, translation: Translations) -> Float[Tensor, "b 6"]:
+    """Return the gradient of `Objective` alone, which autograd can follow to q and to the points."""
+    q, y = rotation.mT @ q, points + rotation.mT @ translation.unsqueeze(-1)
+    inverse = y.square().sum(1, keepdim=True).clamp_min(NEAR**2).rsqrt()
+    u = y * inverse
+    h = ((q * u).sum(1, keepdim=True) * u - q) * inverse
+    outer = points @ h.mT
     twist = outer - outer.mT
     return torch.stack([twist[:, 1, 2], twist[:, 2, 0], twist[:, 0, 1], *h.sum(-1).unbind(-1)], -1)
 
@@ -153,56 +182,71 @@ EQUAL = 1e-13  # a smaller difference of two objective values (weights sum to on
 
 
 def newton(
-    q: Columns,
-    points: Columns,
+    objective: Objective,
     rotation: Rotations,
     translation: Translations,
     *,
     tolerance: float,
     max_iterations: int,
-) -> tuple[Rotations, Translations, Int[Tensor, " b"]]:
+) -> tuple[Rotations, Translations, Int[Tensor, " b"], Derivatives]:
     """Minimise the aggregated objective by Newton's method with Levenberg damping, for the whole batch at once.
 
     Each sample has its own damping, zero until a step fails, and stops by itself.
 
     Args:
-        q: Weighted bearings (b, 3, n), the weights of a sample summing to one.
-        points: Scene points of unit size (b, 3, n).
+        objective: Objective, the weights |q_j| of a sample summing to one and the points of unit size.
         rotation: Initial R (b, 3, 3).
         translation: Initial t (b, 3).
         tolerance: Largest gradient norm at the result.
         max_iterations: Largest number of iterations of a sample.
 
     Returns:
-        Rotation (b, 3, 3), translation (b, 3) and the iterations of each sample (b,).
+        Rotation (b, 3, 3), translation (b, 3), the iterations of each sample (b,), and the derivatives at the end.
     """
-    current = derivatives(q, points, rotation, translation)
-    damping = torch.zeros_like(current.value)
-    iterations = torch.zeros(len(q), dtype=torch.long, device=q.device)
-    eye = torch.eye(6, dtype=q.dtype, device=q.device)
+    eye = torch.eye(6, dtype=rotation.dtype, device=rotation.device)
+    current = objective.packed(rotation, translation)
+    value, gradient, hessian = unpack(current)
+    slope = torch.linalg.vector_norm(gradient, dim=-1)
+    damping, iterations = torch.zeros_like(slope), torch.zeros_like(slope, dtype=torch.long)
     for _ in range(max_iterations):
-        active = current.gradient.norm(dim=-1) > tolerance
+        active = slope > tolerance
         if not bool(active.any()):
             break
         iterations += active
-        factor, info = torch.linalg.cholesky_ex(current.hessian + damping[:, None, None] * eye)
-        step = -torch.cholesky_solve(current.gradient.unsqueeze(-1), factor).squeeze(-1)
-        usable = active & (info == 0) & step.isfinite().all(-1)
-        new_rotation, new_translation = retract(torch.where(usable[:, None], step, 0), rotation, translation)
-        trial = derivatives(q, points, new_rotation, new_translation)
-        # Near the optimum the values agree to rounding; there the smaller gradient decides.
-        flat = (trial.value - current.value).abs() <= EQUAL
-        lower = (trial.value < current.value) | (flat & (trial.gradient.norm(dim=-1) < current.gradient.norm(dim=-1)))
-        accept = usable & lower
+        factor, info = torch.linalg.cholesky_ex(torch.addcmul(hessian, damping[:, None, None], eye))
+        step = torch.cholesky_solve(gradient.unsqueeze(-1), factor)
+        new_rotation = rotation @ _rotation_of(-step[:, :3, 0])
+        new_translation = torch.baddbmm(translation.unsqueeze(-1), rotation, step[:, 3:], alpha=-1).squeeze(-1)
+        trial = objective.packed(new_rotation, new_translation)
+        new_value, new_gradient, _ = unpack(trial)
+        new_slope = torch.linalg.vector_norm(new_gradient, dim=-1)
+        # Near the optimum the values agree to rounding; there the smaller gradient decides. NaN is not accepted.
+        flat = (new_value - value).abs() <= EQUAL
+        accept = active & (info == 0) & ((new_value < value) | (flat & (new_slope < slope)))
         rotation, translation = choose(accept, new_rotation, rotation), choose(accept, new_translation, translation)
-        current = Derivatives(*(choose(accept, *both) for both in zip(trial, current, strict=True)))
-        raised = (10 * damping).clamp_min(1e-3)
-        lowered = torch.where(damping > 1e-6, damping / 10, 0)
-        damping = torch.where(active, torch.where(accept, lowered, raised), damping)
-    return rotation, translation, iterations
+        current, slope = choose(accept, trial, current), torch.where(accept, new_slope, slope)
+        value, gradient, hessian = unpack(current)
+        lowered, raised = torch.threshold(damping / 10, 1e-7, 0), (10 * damping).clamp_min(1e-3)
+        damping = torch.where(accept, lowered, raised)
+    return rotation, translation, iterations, unpack(current)
 
 
-SOLVERS = {"newton": newton, "lbfgs": lbfgs}
+def _lbfgs(
+    objective: Objective, rotation: Rotations, translation: Translations, **stops: Any
+) -> tuple[Rotations, Translations, Int[Tensor, " b"], Derivatives]:
+    """Minimise the objective by L-BFGS, with the arguments and results of `newton`."""
+    r, t, iterations = lbfgs(objective.q, objective.points, rotation, translation, **stops)
+    return r, t, iterations, objective.derivatives(r, t)
+
+
+def _rotation_of(w: Float[Tensor, "b 3"]) -> Rotations:
+    """Return a rotation that equals exp([w]x) up to the third order in w, by the Cayley transform."""
+    k, eye = hat(w), torch.eye(3, dtype=w.dtype, device=w.device)
+    factor = 4 / (4 + w.square().sum(-1))[:, None, None]
+    return torch.addcmul(eye, factor, torch.baddbmm(k, k, k, alpha=0.5))
+
+
+SOLVERS = {"newton": newton, "lbfgs": _lbfgs}
 
 
 @check_shapes
@@ -260,68 +304,61 @@ def weighted_pnp(
     >>> bool(stats.converged), (t - torch.tensor([0, 0, 4])).abs().max().item() < 1e-5
     (True, True)
     """
-    import roma  # as in `bpnp.geometry.retract`
-
     if solver not in SOLVERS:
         raise ValueError(f"`solver` is {solver!r}; it is one of {', '.join(SOLVERS)}")
     if clip_columns is not None and not clip_columns > 0:
         raise ValueError(f"`clip_columns` is {clip_columns}; it is a norm above 0, or None for no limit")
     bearings = bearings.to(assignment.dtype)
-    with torch.no_grad():
-        q: Columns = _Aggregate.apply(assignment, bearings).double()
-        usable = q.isfinite().all((-2, -1)) & points3d.isfinite().all((-2, -1))
+    limit = None if clip_columns is None else _ColumnLimit(clip_columns, clipped)
+    weighted: Columns = _Aggregate.apply(assignment, bearings, limit).double()
+    usable = weighted.isfinite().all((-2, -1)) & points3d.isfinite().all((-2, -1))
     if not bool(usable.all()):
         # Zeros have a zero gradient; that of NaN would be NaN, and that of the network with it.
         assignment, bearings, points3d = (
             torch.where(usable[:, None, None], values, 0) for values in (assignment, bearings, points3d)
         )
-        q = choose(usable, q, torch.zeros_like(q))
+        weighted = _Aggregate.apply(assignment, bearings, limit).double()
     with torch.no_grad():
         # The optimum does not depend on a factor of the weights |q_j|; here they sum to one.
-        total = _lengths(q).sum(-1, keepdim=True).clamp_min(torch.finfo(q.dtype).tiny)
-        q = q / total
-        weight = _lengths(q)
-    points, centre, scale = _normalise(points3d.double().mT.contiguous(), weight)
+        lengths = _lengths(weighted)
+        total = lengths.sum(-1, keepdim=True).clamp_min(torch.finfo(lengths.dtype).tiny)
+    q = weighted / total
+    points, centre, scale = _normalise(points3d.double().mT.contiguous(), lengths / total)
     with torch.no_grad():
         found = usable & is_finite(rotation, translation)
-        # Project a rounded rotation onto SO(3); samples without a pose get an arbitrary one.
+        # Make a rounded rotation orthonormal; samples without a pose get an arbitrary one.
         r = torch.where(found[:, None, None], rotation.double(), torch.eye(3, dtype=q.dtype, device=q.device))
-        r = roma.special_procrustes(r)
+        r = _orthonormalise(r)
         t = (torch.where(found[:, None], translation.double(), 1) + _rotate(r, centre)) / scale
-        r, t, iterations = SOLVERS[solver](q, points.detach(), r, t, tolerance=tolerance, max_iterations=max_iterations)
-        residual, well_posed, factor = _judge(derivatives(q, points, r, t))
+        objective = Objective(q.detach(), points.detach())
+        r, t, iterations, end = SOLVERS[solver](objective, r, t, tolerance=tolerance, max_iterations=max_iterations)
+        residual, well_posed, factor = _judge(end)
         converged = found & (residual <= tolerance) & well_posed & (t.norm(dim=-1) < FARTHEST)
-        grams = None
-        if clip_columns is not None:
+        if limit is not None:
             to_scene = _scene_step(r, centre, scale)
             # The columns are those for a P that sums to one, as in the paper.
             unit = (assignment.sum((-2, -1)).double() / total[:, 0, 0])[:, None, None]
-            grams = _column_grams(points, r, t, factor, unit * to_scene)
+            limit.grams = _column_grams(objective.points, r, t, factor, unit * to_scene)
 
-    limit = math.inf if clip_columns is None else clip_columns
-    q = _Aggregate.apply(assignment, bearings, grams, limit, clipped).double() / total
-    # One more Newton step y - H^-1 F(y, x), H held fixed, has the derivative -H^-1 dF/dx of the optimum y(x).
-    rotated = r @ points
-    *_, h = _point_gradient(q, rotated + t.unsqueeze(-1))
-    optimality = _gradient(rotated @ h.mT, h)
-    step = -torch.cholesky_solve(optimality.unsqueeze(-1), factor).squeeze(-1)
-    step = torch.where(converged[:, None], step - step.detach(), 0)
-    if step.requires_grad:
+    if q.requires_grad or points.requires_grad:
+        # One more Newton step y - H^-1 F(y, x), H held fixed, has the derivative -H^-1 dF/dx of the optimum y(x).
+        step = -torch.cholesky_solve(_optimality(q, points, r, t).unsqueeze(-1), factor).squeeze(-1)
+        step = torch.where(converged[:, None], step - step.detach(), 0)
         step.register_hook(refuse_second_derivative)
-    # The step is zero: exp([w]x) R = R + [w]x R is exact, in the derivative too.
-    moved_r = r + hat(step[:, :3]) @ r
-    moved_t = (t + step[:, 3:]) * scale - _rotate(moved_r, centre)
-    moved_r = torch.where(found[:, None, None], moved_r, torch.nan).to(assignment.dtype)
-    moved_t = torch.where(found[:, None], moved_t, torch.nan).to(assignment.dtype)
-    return moved_r, moved_t, SolveStats(iterations, torch.where(found, residual, torch.inf), converged)
+        # The step is zero: R exp([w]x) = R + R [w]x is exact, in the derivative too.
+        r, t = r + r @ hat(step[:, :3]), t + _rotate(r, step[:, 3:])
+    t = t * scale - _rotate(r, centre)
+    r = torch.where(found[:, None, None], r, torch.nan).to(assignment.dtype)
+    t = torch.where(found[:, None], t, torch.nan).to(assignment.dtype)
+    return r, t, SolveStats(iterations, torch.where(found, residual, torch.inf), converged)
 
 
 def _scene_step(rotation: Rotations, centre: Translations, scale: Float[Tensor, "b 1"]) -> Float[Tensor, "b 6 6"]:
     """Return the matrix from a step (w, s) in the solver's frame to one of (angle-axis r, t in scene units).
 
-    t = scale t' - R c, so dt = scale s + (R c) x w; dr = J^-1 w with the left Jacobian J of exp at r.
+    t = scale t' - R c, so dt = R (scale s + c x w); dr = J^-1 R w with the left Jacobian J of exp at r.
     """
-    import roma  # as in `bpnp.geometry.retract`
+    import roma  # here, not at the top: it imports all of torch's compiler
 
     r = roma.rotmat_to_rotvec(rotation)
     angle = r.norm(dim=-1).clamp_min(1e-6)[:, None, None]
@@ -330,8 +367,8 @@ def _scene_step(rotation: Rotations, centre: Translations, scale: Float[Tensor, 
     bend = 1 / angle**2 - 1 / (2 * angle * torch.tan(angle / 2))
     inverse = eye - turn / 2 + torch.where(angle > 1e-3, bend, 1 / 12) * (turn @ turn)
     zero = torch.zeros_like(inverse)
-    top = torch.cat([inverse, zero], -1)
-    bottom = torch.cat([hat(_rotate(rotation, centre)), scale[:, :, None] * eye], -1)
+    top = torch.cat([inverse @ rotation, zero], -1)
+    bottom = rotation @ torch.cat([hat(centre), scale[:, :, None] * eye], -1)
     return torch.cat([top, bottom], -2)
 
 
@@ -344,15 +381,16 @@ def _column_grams(
 ) -> Float[Tensor, "b n 3 3"]:
     """Return A_j^T A_j (b, n, 3, 3) for the columns dy / dP_ij = A_j f_i of the pose's derivative.
 
-    With u = g(y_j) and D = [-[x]x, I], the optimality condition has d/dP_ij = -D^T (I - u u^T) f_i / d; dy is minus the
-    inverse Hessian times it. `factor` is the Cholesky factor of the Hessian.
+    With u = g(p_j + R^T t) and D = [-[p]x, I], the optimality condition has d/dP_ij = -D^T (I - u u^T) R^T f_i / d; dy
+    is minus the inverse Hessian times it. `factor` is the Cholesky factor of the Hessian.
     """
-    x = rotation @ points
-    u, inverse, _ = _point_gradient(torch.zeros_like(x), x + translation.unsqueeze(-1))
-    x, u, inverse = x.mT, u.mT, inverse.mT.unsqueeze(-1)
-    eye = torch.eye(3, dtype=x.dtype, device=x.device)
-    project = inverse * (eye - u.unsqueeze(-1) * u.unsqueeze(-2))
-    rows = torch.cat([hat(x) @ project, project], -2)  # D^T (I - u u^T) / d, D^T = [[x]x; I]
+    p = points.mT
+    y = p + _rotate(rotation.mT, translation).unsqueeze(-2)
+    inverse = y.square().sum(-1, keepdim=True).clamp_min(NEAR**2).rsqrt()
+    u = (y * inverse).unsqueeze(-1)
+    eye = torch.eye(3, dtype=p.dtype, device=p.device)
+    project = inverse.unsqueeze(-1) * (eye - u * u.mT) @ rotation.mT.unsqueeze(1)
+    rows = torch.cat([hat(p) @ project, project], -2)  # D^T (I - u u^T) R^T / d, D^T = [[p]x; I]
     b, n = rows.shape[:2]
     solved = torch.cholesky_solve(rows.permute(0, 2, 1, 3).reshape(b, 6, 3 * n), factor)
     columns = (to_scene @ solved).reshape(b, 6, n, 3).permute(0, 2, 1, 3)
@@ -361,6 +399,14 @@ def _column_grams(
 
 def _lengths(columns: Columns) -> Float[Tensor, "b 1 n"]:
     return columns.square().sum(-2, keepdim=True).sqrt()
+
+
+def _orthonormalise(rotation: Rotations) -> Rotations:
+    """Return the rotations with the directions of the first column and of the plane of the first two."""
+    first, second, _ = rotation.unbind(-1)
+    first = nn.functional.normalize(first, dim=-1)
+    third = nn.functional.normalize(torch.linalg.cross(first, second), dim=-1)
+    return torch.stack([first, torch.linalg.cross(third, first), third], -1)
 
 
 def _rotate(rotation: Rotations, vector: Translations) -> Translations:

@@ -4,6 +4,7 @@ import pytest
 import torch
 from planted import Planted, plant
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from bpnp.geometry import camera_centre, rotation_angle, transform
 from bpnp.layers import weighted_pnp
@@ -142,6 +143,28 @@ def test_a_camera_beyond_ten_thousand_radii_is_flagged(radii: float, near: bool)
     assignment = torch.eye(30, dtype=torch.float64).expand(4, 30, 30) / 30
     stats = weighted_pnp(assignment, bearings, points3d, planted.rotation, translation)[2]
     assert stats.converged.tolist() == [near] * 4
+
+
+class Products(TorchDispatchMode):
+    """Count the matrix products with a factor of a shape."""
+
+    def __init__(self, shape: torch.Size) -> None:
+        super().__init__()
+        self.shape, self.count = shape, 0
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None) -> Any:
+        if function is torch.ops.aten.bmm.default:
+            self.count += any(factor.shape == self.shape for factor in args)
+        return function(*args, **kwargs or {})
+
+
+@pytest.mark.parametrize("trained", [False, True])
+def test_the_assignment_is_reduced_once_a_forward_pass(trained: bool) -> None:
+    planted = plant(2, 40, outliers2d=5, seed=14)
+    assignment = planted.permutation().requires_grad_(trained)
+    with Products(assignment.shape) as products:
+        solve(planted, assignment, planted.near(0.05))
+    assert products.count == 1
 
 
 def test_an_initial_pose_behind_the_points_ends_in_front_or_is_flagged() -> None:
