@@ -122,7 +122,7 @@ def with_cones(photo: ViewProblem, factor: float, **arguments: Any) -> Solution:
     camera = camera_from(np.diag([factor * photo.focal, factor * photo.focal, 1.0]))
     cones: dict[str, Any] = {"normals3d": photo.scene.cones.axes, "cosines3d": photo.scene.cones.cosines}
     points = problem_from(photo.focal * photo.points2d, photo.points3d, camera, **cones)
-    return solve_problems({0: points}, Options(asks=False, **arguments))[0]
+    return solve_problems({0: points}, Options(asks=False, **arguments))[0].solution
 
 
 def limits(options: argparse.Namespace) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from bpnp.maps.viewed_points import Region
 from bpnp.maps.views import Array
 from bpnp.poses import rotation_angle, same_pose
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
+from bpnp.search.assemble import Solved, candidates_of
 from bpnp.search.config import ALIASING, DEFAULT, DensityShape
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
 from bpnp.search.kernels.density_map import DensityMap
@@ -27,7 +28,7 @@ from bpnp.search.propose.density_map import search_around, search_near
 from bpnp.search.propose.repetitions import repeated_poses, repetition_margins
 from bpnp.search.refine.annealing import anneal_to_end, finish
 from bpnp.search.search_frame import Scene
-from bpnp.search.solution import Candidate, Solution, add_objection, candidates_of
+from bpnp.search.solution import Candidate, Solution
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict.competitors import sign_margins
 from bpnp.search.verdict.decide import add_false_alarms, rank_poses
@@ -133,14 +134,14 @@ def refine_elsewhere(
     return refined[differ(refined.rotation, refined.translation)]
 
 
-def judge_against(solution: Solution, competitor: Competitor | None) -> Solution:
-    """Return a confident solution, or an ambiguous one if a competing pose elsewhere is within the margin.
+def judge_against(own: Solved, competitor: Competitor | None) -> Solved:
+    """Return a solution, against a competing pose elsewhere that is within the margin.
 
-    An ambiguous solution has both poses as its first candidates.
+    It then has both poses as its first candidates.
     """
-    least_margin = DEFAULT.evidence.margin
+    least_margin, solution = DEFAULT.evidence.margin, own.solution
     if competitor is None or competitor.margin >= least_margin:
-        return solution
+        return own
     other, margin = competitor.pose, competitor.margin
     values = {
         "distance": float(np.linalg.norm(other.centre - solution.centre)),
@@ -148,8 +149,8 @@ def judge_against(solution: Solution, competitor: Competitor | None) -> Solution
         "better": -margin,
     }
     code = "better_place" if margin <= -least_margin else "competing_place"
-    doubtful = add_objection(solution, objection(code, margin, **values))
-    return replace(doubtful, candidates=(solution.candidates[0], other, *solution.candidates[1:]))
+    case, doubtful = own.against(objection(code, margin, **values))
+    return Solved(case, replace(doubtful, candidates=(solution.candidates[0], other, *solution.candidates[1:])))
 
 
 def significant(solution: Solution) -> list[Candidate]:

@@ -11,15 +11,15 @@ from bpnp.maps.viewed_points import Region
 from bpnp.maps.views import Array
 from bpnp.poses import MIN_POINTS
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
+from bpnp.search.assemble import OneCamera, Solved, assembled
 from bpnp.search.config import DEFAULT, MAPS, Evidence
 from bpnp.search.focal_length import AROUND, UnknownCamera, fit_camera
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
-from bpnp.search.matching import finished
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.propose.density_map import search_around
 from bpnp.search.refine.annealing import anneal_to_end, finish
 from bpnp.search.search_frame import Scene
-from bpnp.search.solution import Solution, add_objection, change_verdict
+from bpnp.search.solution import Solution
 from bpnp.search.verdict.competitors import competing_pose
 from bpnp.search.verdict.contest import contest, rivals_of
 from bpnp.search.verdict.decide import Case, decide
@@ -92,36 +92,38 @@ def refine_on_all_points(solution: Solution, photo: Photo, whole: Region, deadli
 
 
 @one_blas_thread
-def judge_on_all_points(solution: Solution, refined: Refined | None) -> Solution:
-    """Return the refined solution if its NFA is smaller, or if it is confident and the given one was not.
+def judge_on_all_points(own: Solved, refined: Refined | None) -> Solved:
+    """Judge a refined pose on all map points in view.
 
-    Otherwise return the given solution, whose verdict a competing pose among all points may lower.
+    Args:
+        own: Pose that was found with the points of one view.
+        refined: The pose and its competing poses on all points in view; None if it was not refined.
+
+    Returns:
+        The refined solution if its NFA is smaller, or if it is confident and the given one was not. Otherwise the given
+            solution, against a competing pose among all points.
     """
     if refined is None:
-        return solution
-    problem, settings, confident = refined.problem, DEFAULT.evidence, solution.verdict == "confident"
-
-    alone = Case.of(refined.poses, problem, exhaustive=True, iterations=1)
+        return own
+    problem, limits, solution, confident = refined.problem, DEFAULT.evidence, own.solution, own.case.objection is None
     deadline = refined.scene.deadline
-    result = decide(contest(alone, rivals_of(lambda: refined.scene, deadline)))
-    rotation, translation = result.best
-    behind = result.log10_false_alarms - solution.log10_false_alarms
-    if confident and not problem.same_as(refined.pose, rotation[None], translation[None], settings.same)[0]:
-        other = competing_pose(problem, refined.pose, result.best, behind)
-        return solution if behind >= settings.margin else add_objection(solution, other)
-    if behind < 0 or (not confident and result.verdict == "confident"):
-        found = finished(problem, result, solution.seconds, None, deadline)
+    alone = Case.of(refined.poses, problem, exhaustive=True, iterations=1)
+    case = contest(alone, rivals_of(lambda: refined.scene, deadline))
+    behind = case.log10_false_alarms - solution.log10_false_alarms
+    rotation, translation = case.pose
+    if confident and not problem.same_as(refined.pose, rotation[None], translation[None], limits.same)[0]:
+        return own if behind >= limits.margin else own.against(competing_pose(problem, refined.pose, case.pose, behind))
+    if behind < 0 or (not confident and case.objection is None):
+        found = assembled(OneCamera(problem), decide(case), seconds=solution.seconds, deadline=deadline)
         stats = replace(found.stats, iterations=solution.stats.iterations)
         candidates = (*found.candidates, *solution.candidates[1:])
-        return with_ids(replace(found, stats=stats, candidates=candidates), refined.region)
+        return Solved(case, with_ids(replace(found, stats=stats, candidates=candidates), refined.region))
     if not confident:
-        return solution
+        return own
     if alone.objection is not None:  # other cameras have not been tested for it
-        objections = lens(alone, scene_of=lambda: refined.scene, deadline=deadline).objections
-        return add_objection(solution, objections[-1]) if objections else solution
-    if result.verdict == "confident":
-        return solution
-    return change_verdict(solution, result.verdict, result.reason, result.code)
+        case = lens(alone, scene_of=lambda: refined.scene, deadline=deadline)
+        return own.against(next(iter(case.objections), None))
+    return own.against(case.objection)
 
 
 def local_searches_for_certainty(settings: Evidence) -> int:

@@ -20,13 +20,14 @@ from bpnp.maps.photo_problem import Photo, with_ids
 from bpnp.maps.viewed_points import Place, Region, ViewedPoints
 from bpnp.runtime import NEVER, Clock, Deadline
 from bpnp.search.arguments import checked_prior
+from bpnp.search.assemble import Solved, with_unfinished
 from bpnp.search.config import DEFAULT, MAPS, TIME, SearchSettings
 from bpnp.search.focal_length import UnknownCamera, solve_with_focal_length
-from bpnp.search.matching import with_unfinished
 from bpnp.search.problem import Problem, UnknownFocal
-from bpnp.search.solution import Candidate, Solution, add_objection
+from bpnp.search.solution import Candidate, Solution
 from bpnp.search.solvers import Options, solve_problems
 from bpnp.search.verdict import reasons
+from bpnp.search.verdict.decide import Case
 from bpnp.search.verdict.reasons import objection
 
 # The search stays near the view's pose, not near the best pose of an unsuccessful earlier search.
@@ -40,8 +41,12 @@ class ViewSolution(NamedTuple):
     """The solution of a search near a view."""
 
     place: Place  # view, its points and the camera of the search
-    solution: Solution
+    solved: Solved
     is_judged: bool  # refined and judged on all points
+
+    @property
+    def solution(self) -> Solution:
+        return self.solved.solution
 
     @property
     def rank(self) -> tuple[int, float]:
@@ -102,9 +107,9 @@ def _localize_in(
         tried.add(place.view.name)
         own = search_near(scene.region(place.view, place.points), photo, place.camera, options, settings)
         found = ViewSolution(place, own, False)
-        if own.verdict == "confident" or own.log10_false_alarms < 0:
+        if own.case.objection is None or own.solution.log10_false_alarms < 0:
             found = judge_in_map(scene, photo, found, earlier, options.until)
-        if "confident" in (own.verdict, found.solution.verdict):
+        if None in (own.case.objection, found.solved.case.objection):
             return LoopResult(found.solution, found.solution.reason_code not in reasons.UNTESTED)
         earlier += significant(found.solution)
         best = sorted([*best, found], key=lambda one: one.rank, reverse=True)[: MAPS.promising]
@@ -126,7 +131,7 @@ def _localize_in(
 
 def search_near(
     region: Region, photo: Photo, camera: Camera | UnknownCamera, options: Options, settings: SearchSettings
-) -> Solution:
+) -> Solved:
     """Return the best pose of a photo among the points of one region."""
     options = options._replace(settings=settings, asks=options.asks and settings is LONGER)
     prior = checked_prior(region.prior() if photo.prior is None else photo.prior)
@@ -135,10 +140,10 @@ def search_near(
         def problem_at(known: Any, focal: UnknownFocal) -> Problem:
             return photo.problem(region, known, prior, focal)
 
-        solution = solve_with_focal_length(problem_at, camera, options)
+        case, solution = solve_with_focal_length(problem_at, camera, options)
     else:
-        solution = solve_problems({0: photo.problem(region, camera, prior)}, options)[0]
-    return with_ids(solution, region)
+        case, solution = solve_problems({0: photo.problem(region, camera, prior)}, options)[0]
+    return Solved(case, with_ids(solution, region))
 
 
 def judge_in_map(
@@ -152,31 +157,31 @@ def judge_in_map(
     """
     if found.is_judged:
         return found
-    place, own = found.place, found.solution
+    place, own = found.place, found.solved
     deadline = Deadline(until.final)
     if deadline.passed(reasons.Unfinished.competing_poses):
         return ViewSolution(place, _if_tested(own, deadline, until), False)
     whole = scene.region(place.view)
-    solution = judge_on_all_points(own, refine_on_all_points(own, photo, whole, deadline))
-    if solution.verdict == "confident":
-        earlier = [*earlier, *significant(own)]
-        competitor = find_competitor(scene, photo, place, solution, earlier, deadline)
+    on_all = judge_on_all_points(own, refine_on_all_points(own.solution, photo, whole, deadline))
+    if on_all.case.objection is None:
+        earlier = [*earlier, *significant(own.solution)]
+        competitor = find_competitor(scene, photo, place, on_all.solution, earlier, deadline)
         if competitor is not None and competitor.margin <= -DEFAULT.evidence.margin:
-            better = _judge_competitor(scene, photo, solution, competitor.pose, deadline)
-            if better.verdict == "confident":
-                earlier = [*earlier, *significant(solution)]
-                competitor = find_competitor(scene, photo, place, better, earlier, deadline)
-                solution = better
-        solution = judge_against(solution, competitor)
-    return ViewSolution(place, _if_tested(solution, deadline, until), True)
+            better = _judge_competitor(scene, photo, on_all.solution, competitor.pose, deadline)
+            if better.case.objection is None:
+                earlier = [*earlier, *significant(on_all.solution)]
+                competitor = find_competitor(scene, photo, place, better.solution, earlier, deadline)
+                on_all = better
+        on_all = judge_against(on_all, competitor)
+    return ViewSolution(place, _if_tested(on_all, deadline, until), True)
 
 
-def _if_tested(solution: Solution, deadline: Deadline, until: Deadline) -> Solution:
+def _if_tested(solved: Solved, deadline: Deadline, until: Deadline) -> Solved:
     """Return a solution, ambiguous if the deadline of its verdict cut off a test; a longer one takes note of it."""
     until.unfinished.update(deadline.unfinished)
-    if solution.verdict == "confident" and deadline.unfinished & reasons.TESTS:
-        solution = add_objection(solution, objection("untested"))
-    return with_unfinished(solution, deadline)
+    if solved.case.objection is None and deadline.unfinished & reasons.TESTS:
+        solved = solved.against(objection("untested"))
+    return solved._replace(solution=with_unfinished(solved.solution, deadline))
 
 
 def find_competitor(
@@ -197,7 +202,7 @@ def find_competitor(
 
 def _judge_competitor(
     scene: ViewedPoints, photo: Photo, solution: Solution, pose: Candidate, deadline: Deadline
-) -> Solution:
+) -> Solved:
     """Return the solution of a competing pose of a solution, refined and judged on all map points in view."""
     whole, camera = scene.region(scene.views[0]), camera_from(solution.camera)
     seen = np.zeros(len(scene.points3d), bool)
@@ -212,7 +217,8 @@ def _judge_competitor(
         verdict="failed",
         log10_false_alarms=np.inf,
     )
-    return judge_on_all_points(proposed, refine_on_all_points(proposed, photo, whole, deadline))
+    refined = refine_on_all_points(proposed, photo, whole, deadline)
+    return judge_on_all_points(Solved(Case.without_pose(photo.problem(whole, camera)), proposed), refined)
 
 
 def rank(solution: Solution) -> tuple[int, float]:

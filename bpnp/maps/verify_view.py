@@ -10,9 +10,8 @@ from bpnp.maps.viewed_points import Region
 from bpnp.maps.views import Array, View
 from bpnp.poses import MIN_POINTS
 from bpnp.runtime import Deadline
-from bpnp.search.config import DEFAULT
-from bpnp.search.matching import with_unfinished
-from bpnp.search.solution import Solution, add_objection, change_verdict
+from bpnp.search.assemble import Solved, with_unfinished
+from bpnp.search.solution import Solution
 from bpnp.search.verdict.reasons import Unfinished, objection, undecided
 from bpnp.search.verify import verify_problem
 
@@ -37,7 +36,7 @@ def verify_pose(
     region = place.part(seen)
     problem = photo.problem(region, photo.camera)
     until = deadline.share(1 / 2)
-    solution = verify_problem(
+    case, solution = verify_problem(
         problem, view.rotation, view.translation, seed=photo.seed, time_limit=time_limit, until=until
     )
     solution = with_ids(solution, region)
@@ -45,10 +44,8 @@ def verify_pose(
         return solution
     explained = regions(explained_keypoints(photo, solution))
     competitor = None if deadline.passed() else best_competitor(photo, place, solution, [], explained, deadline)
-    compared = judge_against(solution, competitor)
-    if compared.verdict == "confident" and deadline.passed(Unfinished.competing_poses):
-        compared = add_objection(compared, objection("untested"))
-        compared = replace(compared, reason=undecided(compared.reason, time_limit))
-    compared = with_unfinished(compared, deadline)
-    refuted = competitor is not None and competitor.margin <= -DEFAULT.evidence.margin
-    return change_verdict(compared, "failed", compared.reason, compared.reason_code) if refuted else compared
+    compared = judge_against(Solved(case, solution), competitor)
+    if compared.solution.verdict != "confident" or not deadline.passed(Unfinished.competing_poses):
+        return with_unfinished(compared.solution, deadline)
+    untested = compared.against(objection("untested")).solution
+    return with_unfinished(replace(untested, reason=undecided(untested.reason, time_limit)), deadline)

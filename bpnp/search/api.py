@@ -39,7 +39,8 @@ from bpnp.search.solvers import Options, Progress, solve_problems
 if TYPE_CHECKING:
     import torch
 
-NO_RIG = "`scale=True` needs a `rig`: one camera does not determine the unit of a scene"
+# Arguments of `solve_many` with one value per problem, besides the camera, which may be one for all.
+PER_PROBLEM = ("points2d", "points3d", "normals3d", "labels2d", "labels3d", "scores2d", "scores3d", "prior")
 
 
 def solve(
@@ -151,58 +152,10 @@ def solve(
     >>> bool(np.allclose(solution.translation, [0, 0, 6], atol=1e-6))
     True
     """
-    point_options: dict[str, Any] = {
-        "normals3d": normals3d,
-        "labels2d": labels2d,
-        "labels3d": labels3d,
-        "scores2d": scores2d,
-        "scores3d": scores3d,
-    }
-    if scale and rig is None:
-        raise ValueError(NO_RIG)
-    seconds = seconds_from(time_limit, TIME.one)
-    if rig is not None:
-        solve_one = prepare(
-            points2d,
-            points3d,
-            camera,
-            point_options,
-            Options(
-                inlier_threshold=positive("inlier_threshold", inlier_threshold, finite=True),
-                clutter=checked_clutter(clutter),
-                seed=checked_seed(seed),
-                time_limit=seconds,
-                progress=progress,
-            ),
-            RigOptions(
-                rig=rig,
-                scale=scale,
-                image_size=image_size,
-                focal_error=focal_error,
-                distortion=distortion,
-                solver=solver,
-                device=device,
-            ),
-            prior,
-        )
-        return solve_one()
-    points: dict[str, Any] = {"points2d": points2d, "points3d": points3d}
-    arrays: dict[str, Any] = {name: [values] for name, values in (points | point_options).items()}
-    return solve_many(
-        camera=camera,
-        image_size=image_size,
-        focal_error=focal_error,
-        distortion=distortion,
-        solver=solver,
-        prior=[prior],
-        inlier_threshold=inlier_threshold,
-        clutter=clutter,
-        seed=seed,
-        time_limit=seconds,
-        device=device,
-        progress=progress,
-        **arrays,
-    )[0]
+    options = dict(locals())
+    options |= {name: [options[name]] for name in PER_PROBLEM}
+    options["time_limit"] = seconds_from(time_limit, TIME.one)
+    return solve_many(**options)[0]
 
 
 @default_float_errors
@@ -291,7 +244,7 @@ def solve_many(
         until=Deadline(begun + seconds) if count == 1 else Deadline(),
     )
     if scale and rig is None:
-        raise ValueError(NO_RIG)
+        raise ValueError("`scale=True` needs a `rig`: one camera does not determine the unit of a scene")
     point_options = {
         "normals3d": each_set("normals3d", normals3d, count),
         "labels2d": each_set("labels2d", labels2d, count, _axes_of_labels(labels2d)),
@@ -315,7 +268,7 @@ def solve_many(
             arrays = {name: values[i] for name, values in point_options.items()}
             with about(f"problem {i}" if count > 1 else None):
                 ready.append(prepare(images[i], scenes[i], camera, arrays, options.numbered(i), chosen, each))
-        return [solve_one() for solve_one in ready]
+        return [solve_one().solution for solve_one in ready]
     cameras = each_camera(camera, count)
     priors = [checked_prior(each) for each in each_prior(prior, count)]
     pixels = [pixels_from(points, one, image_size) for points, one in zip(images, cameras, strict=True)]
@@ -344,16 +297,17 @@ def solve_many(
                 whole = problem(i, lens, focal)
                 return whole if taken is None else whole.without(taken)
 
-            return solve_with_focal_length(at, unknown[i], options.numbered(i))
+            return solve_with_focal_length(at, unknown[i], options.numbered(i)).solution
 
         solutions = {i: again(i) for i in problems}
     else:
         problems = {i: problem(i, None if one is None else camera_from(one)) for i, one in enumerate(cameras)}
 
         def again(i: int, taken: Labels | None = None) -> Solution:
-            return solve_problems({i: problems[i] if taken is None else problems[i].without(taken)}, options)[i]
+            problem = problems[i] if taken is None else problems[i].without(taken)
+            return solve_problems({i: problem}, options)[i].solution
 
-        solutions = solve_problems(problems, options)
+        solutions = {i: one.solution for i, one in solve_problems(problems, options).items()}
     share_points(problems, solutions, again)
     return [solutions[i] for i in range(count)]
 

@@ -29,18 +29,18 @@ from bpnp.cameras import (
 from bpnp.poses import rotation_angle, same_pose
 from bpnp.runtime import NEVER, Clock, Deadline, one_blas_thread
 from bpnp.search.arguments import Array, checked_size
+from bpnp.search.assemble import Solved, with_unfinished
 from bpnp.search.config import DEFAULT, FOCAL, OtherFocal
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.hypotheses import Hypotheses
-from bpnp.search.matching import with_unfinished
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.propose.lens import fit_lens
 from bpnp.search.refine.annealing import anneal_to_end
 from bpnp.search.search_frame import Scene
-from bpnp.search.solution import FOCAL_LENGTH, ROTATION_PARAMETERS, Solution, add_objection
+from bpnp.search.solution import FOCAL_LENGTH, ROTATION_PARAMETERS, Solution
 from bpnp.search.solvers import Options, solve_problems
 from bpnp.search.verdict.decide import match_count, rank_poses
-from bpnp.search.verdict.reasons import TESTS, Unfinished, objection, undecided
+from bpnp.search.verdict.reasons import TESTS, Objection, Unfinished, objection, undecided
 from bpnp.search.verdict.uncertainty import is_within
 
 ProblemAt = Callable[[Camera, UnknownFocal], Problem]
@@ -184,7 +184,7 @@ def unknown_camera(
 
 
 @one_blas_thread
-def solve_with_focal_length(problem_at: ProblemAt, unknown: UnknownCamera, options: Options) -> Solution:
+def solve_with_focal_length(problem_at: ProblemAt, unknown: UnknownCamera, options: Options) -> Solved:
     """Return the solution with the fewest false alarms over pose and focal length.
 
     Args:
@@ -212,10 +212,10 @@ class FocalSweep(ABC):
     unknown: UnknownCamera
     options: Options
     deadline: Deadline = NEVER
-    ends: list[Solution] = field(default_factory=list)
+    ends: list[Solved] = field(default_factory=list)
 
     @abstractmethod
-    def solve_with(self, camera: Camera, options: Options) -> Solution:
+    def solve_with(self, camera: Camera, options: Options) -> Solved:
         """Return the solution with a given camera."""
 
     @abstractmethod
@@ -226,58 +226,62 @@ class FocalSweep(ABC):
         """Return the camera to search with at a focal length of the sweep; a cheap search may find a better one."""
         return camera
 
-    def sweep(self, *, few: bool = False) -> Solution:
+    def sweep(self, *, few: bool = False) -> Solved:
         """Return the solution with the fewest false alarms; `few` is True for points that are enumerated."""
         most, begun = self.options.settings.schedule.iterations, Clock.now()
         self.deadline = self.options.limit()
         for camera in (focal_steps := self.unknown.focal_steps(FOCAL.step_few if few else FOCAL.step)):
             self.search_from(self.preselect(camera), min(FOCAL.iterations, most), len(focal_steps))
-            if self.best.verdict == "confident" and not few:
+            if self.best.case.objection is None and not few:
                 break
             if len(self.ends) < len(focal_steps) and self.deadline.passed(Unfinished.focal_lengths):
                 break
         if (
-            self.best.verdict != "confident"
+            self.best.case.objection is not None
             and not few
             and most > FOCAL.iterations
-            and self.best.camera is not None
+            and self.best.solution.camera is not None
             and not self.deadline.passed(Unfinished.focal_lengths)
         ):
-            self.search_from(self.best.camera, most, 1)
-        best = self.contested()
-        if best.verdict == "confident" and few and Unfinished.focal_lengths in self.deadline.unfinished:
-            best = add_objection(best, objection("camera_untested"))
+            self.search_from(self.best.solution.camera, most, 1)
+        best = self.best
+        if best.case.objection is None:
+            best = best.against(self.other_focal_length())
+        if best.case.objection is None and few and Unfinished.focal_lengths in self.deadline.unfinished:
+            best = best.against(objection("camera_untested"))
         unfinished = self.deadline.unfinished & {Unfinished.search, *TESTS}
-        is_open = best.verdict != "confident" and bool(unfinished)
+        solution = replace(with_unfinished(best.solution, self.deadline), seconds=Clock.now() - begun)
+        is_open = best.case.objection is not None and bool(unfinished)
         if is_open and not self.options.is_part and self.options.time_limit is not None:
-            best = replace(best, reason=undecided(best.reason, self.options.time_limit))
-        return replace(with_unfinished(best, self.deadline), seconds=Clock.now() - begun)
+            solution = replace(solution, reason=undecided(solution.reason, self.options.time_limit))
+        return Solved(best.case, solution)
 
     @property
-    def best(self) -> Solution:
-        return min(self.ends, key=lambda end: end.log10_false_alarms)
+    def best(self) -> Solved:
+        return min(self.ends, key=lambda end: end.solution.log10_false_alarms)
 
     def search_from(self, camera: Camera, iterations: int, steps: int) -> None:
         """Search with a camera, then with cameras that fit the found poses better."""
         found = self._search(camera, iterations, steps)
         for _ in range(FOCAL.alternations):
-            if found.verdict == "failed" and found.log10_false_alarms > FOCAL.promising:
+            solution = found.solution
+            if solution.verdict == "failed" and solution.log10_false_alarms > FOCAL.promising:
                 break
-            better, settled = self._refined(found, camera)
+            better, settled = self._refined(solution, camera)
             if settled:  # a better optimum may lie at a slightly different focal length
-                better, settled = self._refined(found, camera, AROUND)
+                better, settled = self._refined(solution, camera, AROUND)
             if self.deadline.passed(Unfinished.focal_lengths):
-                found = add_objection(found, objection("camera_untested")) if found.verdict == "confident" else found
+                found = found.against(objection("camera_untested")) if found.case.objection is None else found
                 break
             if settled:
                 break
             again = self._search(better, iterations, steps)
-            if again.log10_false_alarms >= found.log10_false_alarms:
+            if again.solution.log10_false_alarms >= solution.log10_false_alarms:
                 break
             found, camera = again, better
         self.ends.append(found)
 
-    def _search(self, camera: Camera, iterations: int, steps: int) -> Solution:
+    def _search(self, camera: Camera, iterations: int, steps: int) -> Solved:
         """Search with a camera, in an equal part of the time that is left for the focal lengths."""
         waiting = max(steps - len(self.ends), 1)
         settings = self.options.settings.limited(iterations)
@@ -292,16 +296,14 @@ class FocalSweep(ABC):
         bend = abs((radial or 0.0) - (old or 0.0)) * self.unknown.outermost(zoom) ** 2
         return fitted, max(abs(math.log(zoom / before)), bend) < FOCAL.same
 
-    def contested(self) -> Solution:
-        """Return the best solution, "ambiguous" if another focal length has a different pose that fits about as well.
+    def other_focal_length(self) -> Objection | None:
+        """Return another focal length with a different pose that fits about as well as the best solution, or None.
 
         A pose within the uncertainty of the best solution does not count as different.
         """
-        best, settings = self.best, DEFAULT.evidence
-        if best.verdict != "confident":
-            return best
+        best, settings = self.best.solution, DEFAULT.evidence
         centre = np.median(best.points3d, 0)
-        for end in self.ends:
+        for end in (each.solution for each in self.ends):
             for other in end.candidates if end is not best else ():
                 behind = other.log10_false_alarms - best.log10_false_alarms
                 rotations = np.stack([best.rotation, other.rotation])
@@ -314,8 +316,8 @@ class FocalSweep(ABC):
                     and not is_within_bound(best, other.rotation, zoom)
                 ):
                     away = math.degrees(rotation_angle(best.rotation, other.rotation))
-                    return add_objection(best, objection("other_focal_length", behind, zoom=zoom, degrees=away))
-        return best
+                    return objection("other_focal_length", behind, zoom=zoom, degrees=away)
+        return None
 
 
 @dataclass
@@ -324,7 +326,7 @@ class _OneCamera(FocalSweep):
 
     problem_at: ProblemAt = field(kw_only=True)
 
-    def solve_with(self, camera: Camera, options: Options) -> Solution:
+    def solve_with(self, camera: Camera, options: Options) -> Solved:
         return solve_problems({0: self.problem_at(camera, self.unknown.focal(camera))}, options)[0]
 
     def refine(self, solution: Solution, camera: Camera, zooms: Sequence[float] = (1.0,)) -> Camera:

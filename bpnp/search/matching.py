@@ -1,9 +1,7 @@
-"""One-to-one matches of two point sets in the image, the pose that fits them best, and the `Solution` of both."""
+"""One-to-one matches of two point sets in the image, and the pose that fits them best."""
 
 import math
-import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +18,10 @@ from bpnp.runtime import NEVER, Clock, Deadline
 from bpnp.search.arguments import Array, Labels
 from bpnp.search.config import PRECISION
 from bpnp.search.pose_model import PoseModel
-from bpnp.search.possible_matches import DENSE_MATCHES, FEW_NEIGHBOURS, MATCH_REACH
+from bpnp.search.possible_matches import DENSE_MATCHES, FEW_NEIGHBOURS
 from bpnp.search.problem import Problem
 from bpnp.search.refine.gauss_newton import FIRST_DAMPING, Iteration, image_equations, refine
-from bpnp.search.solution import FOCAL_LENGTH, POSE_PARAMETERS, Solution, SolutionStats, add_pose
-from bpnp.search.verdict.decide import SearchResult
 from bpnp.search.verdict.reasons import Unfinished
-from bpnp.search.verdict.uncertainty import linearised, pose_covariance
 
 # Number of points whose neighbours are looked up, or that are assigned, between two checks of the deadline.
 POINTS_A_CHECK = 5000  # [points; cost]
@@ -41,114 +36,7 @@ EXACT_CHANGE = 1e-12  # relative change of a pose, and of the sum of squares, th
 Allowed = Callable[[Labels, Labels], NDArray[np.bool_]]
 
 
-def finished(
-    problem: Problem,
-    result: SearchResult,
-    seconds: float,
-    inlier_threshold: float | None,
-    deadline: Deadline = NEVER,
-) -> Solution:
-    """Build a `Solution` of a search result: refine the best pose, match points, count the inliers of each candidate.
-
-    Args:
-        problem: The problem.
-        result: Result of the search.
-        seconds: Run time of the search; the run time of this function is added.
-        inlier_threshold: Largest error of an inlier, in the unit of the problem; None for three times the residual
-            scale.
-        deadline: Deadline; after its end, points get their mutual nearest neighbours, and candidates no inliers.
-    """
-    start, found = time.perf_counter(), result.candidates
-    failed = failed_solution(problem, _note_duplicates(problem, result), inlier_threshold, seconds, code=result.code)
-    if not len(found):
-        return with_unfinished(failed, deadline)
-    threshold = inlier_threshold or MATCH_REACH * result.residual * problem.per_radian
-    poses = list(zip(found.rotation, found.translation, strict=True))
-    if not result.is_fitted:
-        poses[0] = _fitted(problem, *poses[0], threshold, deadline)
-    projected, image, may_match = problem.project_scene(*poses[0]), problem.image_points, problem.may_match
-    matches = one_to_one(image, projected, threshold, may_match, deadline)
-    others = (problem.project_scene(*pose) for pose in poses[1:])
-    counts = [len(matches), *(count_one_to_one(image, seen, threshold, may_match, deadline) for seen in others)]
-    rotation, translation = problem.to_user(*map(np.stack, zip(*poses, strict=True)))
-    i, j = matches.T
-    camera = problem.points3d[j] @ poses[0][0].T + poses[0][1]
-    matched = float(found.match_count[0])
-    linear = None if result.verdict == "failed" else linearised(problem, *poses[0], result.residual)
-    solution = add_pose(
-        failed,
-        result,
-        replace(found, rotation=rotation, translation=translation),
-        counts,
-        np.stack([problem.usable[i], j], -1),
-        np.linalg.norm(image[i] - projected[j], axis=-1),
-        angles_between(problem.bearings[i], camera),
-        most=min(len(problem.all2d), len(problem.points3d)),
-        threshold=threshold,
-        residual=result.residual,
-        covariance=_of_pixels(problem, pose_covariance(problem, linear, matched)),
-    )
-    return with_unfinished(replace(solution, seconds=seconds + time.perf_counter() - start), deadline)
-
-
-def with_unfinished(solution: Solution, deadline: Deadline) -> Solution:
-    """Return a solution whose statistics name the stages that a deadline cut short, besides those that they have."""
-    unfinished = tuple(sorted({*solution.stats.unfinished, *deadline.unfinished}))
-    return replace(solution, stats=replace(solution.stats, unfinished=unfinished))
-
-
-def _note_duplicates(problem: Problem, result: SearchResult) -> str:
-    """Return the reason of a verdict, with the number of duplicate points unless the verdict is "confident"."""
-    if result.verdict == "confident" or len(problem.points3d) > DENSE_MATCHES:
-        return result.reason
-    sides = {"image": problem.image_points, "scene": problem.points3d}
-    counts = {side: len(points) - len(np.unique(points, axis=0)) for side, points in sides.items()}
-    notes = [f"{count} of the {side} points are duplicates" for side, count in counts.items() if count]
-    return "; ".join([result.reason, *notes])
-
-
-def angles_between(bearings: Array, directions: Array) -> Array:
-    """Return the angles (k,) between vectors (k, 3), radians, accurate also for small angles."""
-    sine = np.linalg.norm(np.cross(bearings, directions), axis=-1)
-    return np.arctan2(sine, (bearings * directions).sum(-1))
-
-
-def failed_solution(
-    problem: Problem,
-    reason: str,
-    inlier_threshold: float | None,
-    seconds: float = 0.0,
-    *,
-    code: str = "no_pose",
-) -> Solution:
-    """Return a failed solution of a problem, without a pose."""
-    return Solution(
-        inlier_threshold=math.nan if inlier_threshold is None else inlier_threshold,
-        unit=problem.unit,
-        covariance=_of_pixels(problem, None),
-        parameters=POSE_PARAMETERS if problem.focal is None else (*POSE_PARAMETERS, FOCAL_LENGTH),
-        verdict="failed",
-        reason=reason,
-        reason_code=code,
-        stats=SolutionStats(dropped2d=problem.dropped2d, taken2d=problem.taken2d),
-        seconds=seconds,
-        points2d=problem.all2d,
-        points3d=problem.all3d,
-        normals3d=problem.normals3d if problem.cosines3d is None else None,
-        camera=problem.camera,
-    )
-
-
-def _of_pixels(problem: Problem, covariance: Array | None) -> Array:
-    """Return a covariance with the focal length in pixels instead of its logarithm; NaN for None."""
-    size = 6 if problem.focal is None else 7
-    if covariance is None or problem.camera is None:
-        return np.full((size, size), math.nan) if covariance is None else covariance
-    unit = np.where(np.arange(size) < 6, 1.0, problem.camera.focal)
-    return np.asarray(covariance * np.outer(unit, unit))
-
-
-def _fitted(
+def fit_to_matches(
     problem: Problem, rotation: Array, translation: Array, threshold: float, deadline: Deadline
 ) -> tuple[Array, Array]:
     """Fit the pose to mutual nearest neighbours by least squares; keep the search's pose unless the fit is better.

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
@@ -14,10 +14,8 @@ import numpy.typing as npt
 from bpnp.argument_types import short_repr
 from bpnp.bounded_files import parse_json, read_json
 from bpnp.cameras import Camera, CameraLike, camera_from, camera_to_json, check_single_camera
-from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Unit
-from bpnp.search.verdict.decide import SearchResult, Verdict
-from bpnp.search.verdict.reasons import Objection
+from bpnp.search.verdict.decide import Verdict
 from bpnp.search.verdict.uncertainty import centre_covariance
 
 if TYPE_CHECKING:
@@ -324,102 +322,6 @@ class Solution:
         except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
             reason = f"its field {error} is missing" if isinstance(error, KeyError) else error
             raise ValueError(f"this is not the JSON of a solution{name}: {reason}") from error
-
-
-def add_objection(solution: Solution, one: Objection) -> Solution:
-    """Return a copy of a solution that is ambiguous for a reason."""
-    return change_verdict(solution, "ambiguous", one.sentence(solution.log10_false_alarms), one.code)
-
-
-def change_verdict(solution: Solution, verdict: Verdict, reason: str, code: str) -> Solution:
-    """Return a copy of a solution with another verdict, and with the values that depend on the verdict.
-
-    Args:
-        solution: Solution with a pose.
-        verdict: New verdict. "failed" sets the covariance to NaN.
-        reason: Reason of the verdict, a sentence.
-        code: Kind of the reason.
-    """
-    covariance = np.full_like(solution.covariance, math.nan) if verdict == "failed" else solution.covariance
-    stats = replace(solution.stats, converged=verdict == "confident")
-    return replace(solution, verdict=verdict, reason=reason, reason_code=code, covariance=covariance, stats=stats)
-
-
-def candidates_of(poses: Hypotheses, counts: Sequence[int]) -> tuple[Candidate, ...]:
-    """Return hypotheses as `Candidate` objects.
-
-    Args:
-        poses: Poses in the user's frame; translations (c, 3), or homogeneous (c, 4) with the unit of the scene last.
-        counts: Number of inliers of each pose.
-    """
-    unit = poses.translation[:, 3:] if poses.translation.shape[1] == 4 else np.ones((len(poses), 1))
-    return tuple(
-        Candidate(rotation, translation, score, count, alarms, scale)
-        for rotation, translation, score, count, alarms, scale in zip(
-            poses.rotation,
-            poses.translation[:, :3] / unit,
-            poses.log_likelihood.tolist(),
-            counts,
-            poses.log10_false_alarms.tolist(),
-            (1 / unit[:, 0]).tolist(),
-            strict=True,
-        )
-    )
-
-
-def add_pose(
-    solution: Solution,
-    result: SearchResult,
-    poses: Hypotheses,
-    counts: Sequence[int],
-    matches: npt.NDArray[np.int64],
-    errors: Array,
-    angles: Array,
-    *,
-    most: int,
-    threshold: float,
-    residual: float,
-    covariance: Array | None,
-) -> Solution:
-    """Return a solution with the pose, the verdict and the candidates of a search.
-
-    Args:
-        solution: Solution without a pose.
-        result: Search result with the verdict.
-        poses: Hypotheses in the user's frame, best first; see `candidates_of`.
-        counts: Number of inliers of each hypothesis.
-        matches: (k, 2) matches of the first pose.
-        errors: (k,) reprojection errors of the matches, in the unit of the solution.
-        angles: (k,) angular errors of the matches, radians.
-        most: Largest possible number of matches.
-        threshold: Largest error of an inlier, in the unit of the solution.
-        residual: Scale of the residuals, radians.
-        covariance: Covariance of the first pose; None keeps that of the solution.
-    """
-    candidates = candidates_of(poses, counts)
-    return replace(
-        solution,
-        rotation=candidates[0].rotation,
-        translation=candidates[0].translation,
-        scale=candidates[0].scale,
-        matches=matches,
-        inlier_count=len(matches),
-        inlier_ratio=len(matches) / most,
-        inlier_threshold=threshold,
-        reprojection_error=float(errors.mean()) if len(matches) else math.nan,
-        reprojection_error_deg=float(np.degrees(angles).mean()) if len(matches) else math.nan,
-        covariance=solution.covariance if covariance is None else covariance,
-        candidates=candidates,
-        verdict=result.verdict,
-        reason_code=result.code,
-        log10_false_alarms=candidates[0].log10_false_alarms,
-        stats=replace(
-            solution.stats,
-            iterations=result.iterations,
-            residual=residual,
-            converged=result.verdict == "confident",
-        ),
-    )
 
 
 def _largest(covariance: Array) -> float:

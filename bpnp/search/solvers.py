@@ -12,17 +12,16 @@ import numpy as np
 
 from bpnp.runtime import Clock, Deadline
 from bpnp.search.arguments import Array
+from bpnp.search.assemble import OneCamera, Solved, assembled
 from bpnp.search.config import DEFAULT, TIME, SearchSettings
 from bpnp.search.enumeration.search import exceeds_enumeration
-from bpnp.search.matching import failed_solution, finished
 from bpnp.search.plan import Proposals
 from bpnp.search.problem import Problem
 from bpnp.search.propose.mirror import mirrored_alarms
-from bpnp.search.search import search_poses
-from bpnp.search.solution import Solution
+from bpnp.search.search import find_case
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import reasons
-from bpnp.search.verdict.decide import SearchResult, decide
+from bpnp.search.verdict.decide import Case, SearchResult, decide
 
 BATCH_ENTRIES = 2**26  # largest assignment matrix of a batch on a GPU, 2D points times 3D points [entries; cost]
 MATCHER_ENTRIES = 2**22  # largest assignment matrix of a packaged matcher; larger ones take seconds [entries; cost]
@@ -98,15 +97,14 @@ def ending_seconds(*problems: Problem) -> float:
     return TIME.ending + TIME.ending_a_point * points
 
 
-def solve_problems(problems: Mapping[int, Problem], options: Options) -> dict[int, Solution]:
+def solve_problems(problems: Mapping[int, Problem], options: Options) -> dict[int, Solved]:
     """Return the solution of each problem, by the index of the problem."""
-    solutions: dict[int, Solution] = {}
+    solutions: dict[int, Solved] = {}
     solvable: dict[int, Problem] = {}
     copies: dict[int, torch.nn.Module] = {}
     for i, problem in problems.items():
         if problem.degenerate is not None:
-            threshold = options.inlier_threshold
-            solutions[i] = failed_solution(problem, problem.degenerate, threshold, code="degenerate")
+            solutions[i] = without_pose(problem, problem.degenerate, options.inlier_threshold)
             continue
         net = problem.network
         if net is not None or options.solver is not None:
@@ -143,9 +141,23 @@ def at_deadline(result: SearchResult, options: Options, deadline: Deadline, seco
     return replace(result, reason=reasons.undecided(result.reason, options.time_limit or seconds))
 
 
-def _by_search(i: int, problem: Problem, options: Options) -> Solution:
+def without_pose(problem: Problem, why: str, inlier_threshold: float | None) -> Solved:
+    """Return the solution of a problem whose points fix no pose."""
+    case = Case.without_pose(problem, reasons.objection("degenerate", why=why), exhaustive=True)
+    return Solved(case, assembled(OneCamera(problem), decide(case), inlier_threshold=inlier_threshold))
+
+
+def _solved(
+    problem: Problem, case: Case, result: SearchResult, options: Options, deadline: Deadline, seconds: float
+) -> Solved:
+    threshold = options.inlier_threshold
+    solution = assembled(OneCamera(problem), result, seconds=seconds, inlier_threshold=threshold, deadline=deadline)
+    return Solved(case, solution)
+
+
+def _by_search(i: int, problem: Problem, options: Options) -> Solved:
     start, deadline = time.perf_counter(), options.deadline(problem)
-    result = search_poses(
+    case = find_case(
         problem,
         around=None if problem.network is None else _pose_of_network(problem.network, problem, deadline),
         clutter=options.clutter,
@@ -156,10 +168,10 @@ def _by_search(i: int, problem: Problem, options: Options) -> Solution:
         progress=options.progress_of(i),
     )
     seconds = time.perf_counter() - start
-    result = at_deadline(result, options, deadline, seconds)
+    result = at_deadline(decide(case), options, deadline, seconds)
     if result.verdict == "failed" and mirrored_alarms(problem, deadline) <= options.settings.evidence.false_alarms:
         result = replace(result, reason=f"{result.reason}; {reasons.MIRRORED}")
-    return finished(problem, result, seconds, options.inlier_threshold, deadline)
+    return _solved(problem, case, result, options, deadline, seconds)
 
 
 def _pose_of_network(net: "torch.nn.Module", problem: Problem, deadline: Deadline) -> PosePrior | None:
@@ -199,7 +211,7 @@ def _seconds_of_matcher(problem: Problem) -> float:
 
 def _by_module(
     net: "torch.nn.Module", problems: Mapping[int, Problem], options: Options
-) -> Iterator[tuple[int, Solution]]:
+) -> Iterator[tuple[int, Solved]]:
     """Yield the solutions of a module, by the index of the problem.
 
     With a Matcher and too many points to enumerate, a search starts from poses sampled from its assignment. Otherwise
@@ -214,7 +226,7 @@ def _by_module(
         start, problem = time.perf_counter(), problems[i]
         if isinstance(net, Matcher) and exceeds_enumeration(problem):
             deadline = options.deadline(problem)
-            result = search_poses(
+            case = find_case(
                 problem,
                 proposals=partial(proposed, net, problem, options.seed),
                 only_proposals=True,
@@ -224,7 +236,7 @@ def _by_module(
                 settings=options.settings,
                 progress=options.progress_of(i),
             )
-            yield i, finished(problem, result, time.perf_counter() - start, options.inlier_threshold, deadline)
+            yield i, _solved(problem, case, decide(case), options, deadline, time.perf_counter() - start)
         elif groups and device_of(net).type != "cpu" and cells[i] * (len(groups[-1]) + 1) <= BATCH_ENTRIES:
             groups[-1].append(i)
         else:
@@ -235,4 +247,4 @@ def _by_module(
         cases = predicted(net, members, deadline)
         seconds = (time.perf_counter() - start) / len(group)
         for i, case in zip(group, cases, strict=True):
-            yield i, finished(problems[i], decide(case), seconds, options.inlier_threshold, deadline)
+            yield i, _solved(problems[i], case, decide(case), options, deadline, seconds)

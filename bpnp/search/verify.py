@@ -12,14 +12,14 @@ from bpnp.argument_types import ArrayLike, PointsLike
 from bpnp.cameras import CameraLike, camera_from
 from bpnp.runtime import NEVER, Deadline, default_float_errors
 from bpnp.search.arguments import Array, Labels, checked_pose, checked_seed, numbers, positive, seconds_from
+from bpnp.search.assemble import OneCamera, Solved, assembled
 from bpnp.search.config import TIME
 from bpnp.search.given_pose import given_pose
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.inputs import problem_from
-from bpnp.search.matching import failed_solution, finished
 from bpnp.search.problem import Problem
 from bpnp.search.solution import Solution
-from bpnp.search.solvers import Options, at_deadline
+from bpnp.search.solvers import Options, at_deadline, without_pose
 from bpnp.search.verdict.decide import decide, match_count
 from bpnp.search.verdict.uncertainty import linearised, pose_covariance
 
@@ -109,7 +109,7 @@ def verify(
     given = None if matches is None else _checked_matches(matches, problem)
     judged = problem if given is None else _of_matches(problem, given)
     limits: dict[str, Any] = {"inlier_threshold": threshold, "seed": checked_seed(seed), "time_limit": limit}
-    solution = verify_problem(judged, *pose, refine=refine, **limits)
+    solution = verify_problem(judged, *pose, refine=refine, **limits).solution
     if given is None:
         return solution
     return replace(
@@ -133,7 +133,7 @@ def verify_problem(
     seed: int = 0,
     time_limit: float = TIME.one,
     until: Deadline = NEVER,
-) -> Solution:
+) -> Solved:
     """Verify a pose of a problem whose points have been checked; see `verify`.
 
     Args:
@@ -153,17 +153,19 @@ def verify_problem(
     options = Options(time_limit=time_limit, until=until)
     deadline = options.deadline(problem)
     if problem.degenerate is not None:
-        return failed_solution(problem, problem.degenerate, inlier_threshold, code="degenerate")
+        return without_pose(problem, problem.degenerate, inlier_threshold)
     claim = problem.from_user(rotation, translation)
     case, optimum = given_pose(problem, *claim, refine=refine, seed=seed, deadline=deadline)
     result = at_deadline(decide(case), options, deadline, time_limit)
-    solution = finished(problem, result, time.perf_counter() - begun, inlier_threshold, deadline)
+    seconds = time.perf_counter() - begun
+    camera = OneCamera(problem)
+    solution = assembled(camera, result, seconds=seconds, inlier_threshold=inlier_threshold, deadline=deadline)
     if not refine and solution.found:  # to the last digit
         first = replace(solution.candidates[0], translation=translation)
         solution = replace(solution, translation=translation, candidates=(first, *solution.candidates[1:]))
     if not refine and solution.verdict != "failed" and len(optimum):
         solution = replace(solution, covariance=_of_unrefined(problem, optimum, rotation, translation))
-    return solution
+    return Solved(case, solution)
 
 
 def _checked_matches(values: Any, problem: Problem) -> Labels:

@@ -16,7 +16,9 @@ from bpnp.maps.localize import ONCE, ViewSolution, judge_in_map, search_near
 from bpnp.maps.photo_problem import Photo
 from bpnp.maps.viewed_points import Place
 from bpnp.maps.views import View
+from bpnp.search.assemble import Solved
 from bpnp.search.solvers import Options
+from bpnp.search.verdict.decide import Case
 
 pytestmark = pytest.mark.slow
 
@@ -191,8 +193,11 @@ def test_a_better_pose_elsewhere_takes_the_place_of_a_confident_one() -> None:
     opposite = PosePrior(pose[0] @ about_y(180.0).T, pose[1], 2.0, 0.1)
     view, photo = scene.views[4], Photo(keypoints, camera_from(CAMERA))
     wrong = search_near(scene.region(view, view.points), replace(photo, prior=opposite), photo.camera, Options(), ONCE)
-    assert degrees_between(wrong.rotation, opposite.rotation) < 1
-    attempt = ViewSolution(Place(view, view.points, photo.camera), replace(wrong, verdict="confident"), is_judged=False)
+    assert degrees_between(wrong.solution.rotation, opposite.rotation) < 1
+    alone = Case.of(wrong.case.candidates[:1], wrong.case.problem, exhaustive=True)
+    assert alone.objection is None
+    unopposed = Solved(alone, replace(wrong.solution, verdict="confident"))
+    attempt = ViewSolution(Place(view, view.points, photo.camera), unopposed, is_judged=False)
     solution = judge_in_map(scene, photo, attempt, []).solution
     assert solution.verdict == "confident"
     assert degrees_between(solution.rotation, pose[0]) < 1

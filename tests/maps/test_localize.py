@@ -21,8 +21,10 @@ from bpnp.maps.all_points import judge_on_all_points, refine_on_all_points
 from bpnp.maps.localize import BRIEF
 from bpnp.maps.photo_problem import Photo
 from bpnp.maps.views import View
+from bpnp.search.assemble import Solved, with_verdict
 from bpnp.search.config import MAPS
-from bpnp.search.verdict.decide import Case
+from bpnp.search.solvers import Options
+from bpnp.search.verdict.decide import Case, decide
 from bpnp.search.verdict.false_alarms import alarms_of
 from bpnp.search.verdict.reasons import objection
 
@@ -278,9 +280,11 @@ def test_bad_input_is_one_clear_error(planted: tuple[SceneMap, Planted]) -> None
         scene.localize(keypoints, PINHOLE, time_limit=0)
 
 
-def found_with_few_points(found: Solution) -> Solution:
+def found_with_few_points(found: Solved) -> Solved:
     """Return the solution as not significant, although its pose is right."""
-    return replace(found, verdict="failed", reason="no pose fits better than chance", log10_false_alarms=3.0)
+    poses = replace(found.case.candidates, log10_false_alarms=np.full(len(found.case.candidates), 3.0))
+    case = replace(found.case, candidates=poses)
+    return Solved(case, replace(with_verdict(found.solution, decide(case)), log10_false_alarms=3.0))
 
 
 @pytest.mark.nightly
@@ -319,12 +323,14 @@ def test_an_unknown_lens_is_fitted_to_all_points(planted: tuple[SceneMap, Plante
 def test_each_view_that_is_tried_counts_once(planted: tuple[SceneMap, Planted]) -> None:
     scene, truth = planted
     keypoints, _ = photo_of(truth, 1)
-    alone = scene.localize(keypoints, PINHOLE, views=["photo 1.jpg"], solver="search")
     region = scene.region(scene.views[1])
     one, hundred = (Photo(keypoints, camera_from(PINHOLE), view_count=views) for views in (1, 100))
-    counts = [judge_on_all_points(alone, refine_on_all_points(alone, photo, region)) for photo in (one, hundred)]
+    of_view = localize.search_near(region, one, one.camera, Options(asks=False), localize.ONCE)
+    solved = judge_on_all_points(of_view, refine_on_all_points(of_view.solution, one, region))
+    alone = solved.solution
     # With 100 views the NFA of the refined pose is not smaller than that of the given one, which counts one.
-    assert counts[1].log10_false_alarms == alone.log10_false_alarms
+    counted = judge_on_all_points(solved, refine_on_all_points(alone, hundred, region)).solution
+    assert counted.log10_false_alarms == alone.log10_false_alarms
     first, other = (photo.problem(region, PINHOLE) for photo in (one, hundred))
     pose = alone.rotation[None], alone.translation[None]
     assert alarms_of(other, *pose).own[0] - alarms_of(first, *pose).own[0] == pytest.approx(2)
@@ -343,7 +349,9 @@ def test_a_competing_pose_of_one_view_competes_on_all_points(planted: tuple[Scen
     )  # fmt: skip
     few_matches = replace(few_matches, matches=few_matches.matches[:4])
     photo = Photo(keypoints, camera_from(PINHOLE))
-    solution = judge_on_all_points(few_matches, refine_on_all_points(few_matches, photo, scene.region(scene.views[1])))
+    refined = refine_on_all_points(few_matches, photo, scene.region(scene.views[1]))
+    assert refined is not None
+    solution = judge_on_all_points(Solved(Case.without_pose(refined.problem), few_matches), refined).solution
     assert degrees_between(solution.rotation, right.rotation) < 0.5
     assert solution.verdict == "confident"
 

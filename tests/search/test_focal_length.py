@@ -14,11 +14,13 @@ from scipy.spatial.transform import Rotation
 
 from bpnp import Solution, solve
 from bpnp.cameras import Camera, camera_from, camera_to_json
+from bpnp.search.assemble import Solved
 from bpnp.search.focal_length import FocalSweep, fit_camera, is_within_bound, unknown_camera
 from bpnp.search.inputs import problem_from
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.solution import FOCAL_LENGTH, POSE_PARAMETERS, SCALE, Candidate, SolutionStats
 from bpnp.search.solvers import Options
+from bpnp.search.verdict.decide import Case
 
 Array = NDArray[np.float64]
 SIZE = (640, 480)
@@ -195,7 +197,7 @@ def test_a_given_camera_is_kept_and_a_better_camera_model_makes_the_pose_ambiguo
 class PlantedSweep(FocalSweep):
     """A sweep whose solutions are given."""
 
-    def solve_with(self, camera: Camera, options: Options) -> Solution:
+    def solve_with(self, camera: Camera, options: Options) -> Solved:
         raise NotImplementedError
 
     def refine(self, solution: Solution, camera: Camera, zooms: Sequence[float] = (1.0,)) -> Camera:
@@ -207,9 +209,9 @@ def test_the_unit_of_a_scene_hides_no_pose_at_another_focal_length(unit: float) 
     """A rig in metres, 5 and 10 m from a scene in metres or millimetres: two poses that fit equally well."""
     points = np.random.default_rng(0).uniform(-1, 1, (20, 3)) + [0, 0, 5]
 
-    def end(distance: float, focal: float, log10_nfa: float) -> Solution:
+    def end(distance: float, focal: float, log10_nfa: float) -> Solved:
         pose = Candidate(np.eye(3), np.array([0, 0, distance - 5]), 0.0, 20, log10_nfa, scale=unit)
-        return Solution(
+        solution = Solution(
             rotation=pose.rotation,
             translation=pose.translation,
             scale=unit,
@@ -226,7 +228,9 @@ def test_the_unit_of_a_scene_hides_no_pose_at_another_focal_length(unit: float) 
             points2d=np.zeros((20, 2)),
             points3d=points / unit,
         )
+        return Solved(Case.without_pose(Problem(np.eye(3), np.eye(3))), solution)
 
     ends = [end(5.0, 800.0, -20.0), end(10.0, 1000.0, -19.0)]
-    best = PlantedSweep(unknown_camera(None, SIZE, None), Options(), ends=ends).contested()
-    assert (best.verdict, best.reason_code) == ("ambiguous", "other_focal_length")
+    other = PlantedSweep(unknown_camera(None, SIZE, None), Options(), ends=ends).other_focal_length()
+    assert other is not None
+    assert (other.code, other.margin) == ("other_focal_length", pytest.approx(1.0))

@@ -126,7 +126,7 @@ def test_an_undecided_search_asks_the_matcher_and_a_confident_one_does_not(
     problem = problem_from(noise2d, noise3d, None, prior=prior)
     brief = replace(DEFAULT, schedule=replace(DEFAULT.schedule, iterations=24, unaided=4))
     alone, helped = (
-        solve_problems({0: problem}, Options(asks=asks, seed=3, settings=brief))[0] for asks in (False, True)
+        solve_problems({0: problem}, Options(asks=asks, seed=3, settings=brief))[0].solution for asks in (False, True)
     )
     assert asked == ([] if name is None else [(3, name)])
     assert alone.verdict == helped.verdict != "confident"

@@ -21,7 +21,7 @@ from bpnp.cli import main
 from bpnp.examples import load
 from bpnp.report.figure_files import save_figure
 from bpnp.search.inputs import problem_from
-from bpnp.search.matching import failed_solution
+from bpnp.search.solvers import without_pose
 
 EXAMPLE = load("mesh")
 PLANTED = plant(1, 40, seed=2)
@@ -67,7 +67,7 @@ def test_pycolmap_reads_a_complete_model(camera: Any, solved: bpnp.Solution, tmp
 def test_a_solution_without_a_pose_cannot_be_exported(tmp_path: Path) -> None:
     problem = problem_from(np.random.default_rng(0).normal(size=(8, 2)), EXAMPLE.points3d, None)
     with pytest.raises(ValueError, match="a solution without a pose cannot be exported: a reason"):
-        failed_solution(problem, "a reason", None).to_colmap(tmp_path / "model")
+        without_pose(problem, "a reason", None).solution.to_colmap(tmp_path / "model")
     assert not (tmp_path / "model").exists()
 
 

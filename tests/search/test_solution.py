@@ -9,7 +9,9 @@ import pytest
 from planted import plant
 
 from bpnp import Solution, solve
-from bpnp.search.solution import add_objection, change_verdict
+from bpnp.search.assemble import Solved
+from bpnp.search.inputs import problem_from
+from bpnp.search.solvers import Options, solve_problems
 from bpnp.search.verdict.reasons import objection
 
 
@@ -56,12 +58,17 @@ def test_a_text_that_is_no_solution_is_refused(text: str, reason: str) -> None:
 def test_values_that_depend_on_the_verdict_change_with_it() -> None:
     """`converged` is true for confident solutions only, and failed ones have no uncertainty."""
     planted = plant(1, 30, noise=0.001)
-    solution = solve(planted.points2d[0], planted.points3d[0])
+    problem = problem_from(planted.points2d[0].numpy(), planted.points3d[0].numpy(), None)
+    solved = solve_problems({0: problem}, Options())[0]
+    solution = solved.solution
     assert (solution.verdict, solution.stats.converged) == ("confident", True)
-    doubtful = add_objection(solution, objection("incomplete", what="pose", probability="0.1"))
+    case, doubtful = solved.against(objection("incomplete", what="pose", probability="0.1"))
     assert (doubtful.verdict, doubtful.reason_code, doubtful.stats.converged) == ("ambiguous", "incomplete", False)
     assert doubtful.rotation_std_deg == solution.rotation_std_deg
-    failed = change_verdict(solution, "failed", "another pose is better", "better_place")
+    claim = replace(case, claim=case.candidates[:1])
+    better = objection("better_place", -3.5, distance=2.0, degrees=90.0, better=3.5)
+    failed = Solved(claim, solution).against(better).solution
+    assert failed.reason_code == "better_place"
     assert (failed.verdict, failed.stats.converged) == ("failed", False)
     assert np.isnan([failed.rotation_std_deg, failed.centre_std]).all()
     assert failed.stats.iterations == solution.stats.iterations

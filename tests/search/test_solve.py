@@ -1,7 +1,6 @@
 """`solve` and `solve_many` on planted problems."""
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -17,7 +16,9 @@ from bpnp.models import Search
 from bpnp.runtime import Deadline
 from bpnp.search import solvers
 from bpnp.search.inputs import problem_from
-from bpnp.search.search import search_poses
+from bpnp.search.search import find_case
+from bpnp.search.verdict.decide import Case
+from bpnp.search.verdict.reasons import objection
 
 FISHEYE = ("OPENCV_FISHEYE", [300.0, 310.0, 400.0, 300.0, 0.05, -0.02, 0.01, 0.001])
 K = np.array([[520.0, 1.5, 405.0], [0.0, 500.0, 290.0], [0.0, 0.0, 1.0]])
@@ -267,8 +268,9 @@ def test_the_reason_names_the_time_limit_that_left_a_pose_undecided(monkeypatch:
     """The search returns an open verdict, with its deadline passed or not."""
     planted = plant(2, 40)
     points = planted.points2d[0].numpy(), planted.points3d[0].numpy()
-    result = replace(search_poses(problem_from(*points, None)), verdict="ambiguous", is_settled=False)
-    monkeypatch.setattr(solvers, "search_poses", lambda *_, **__: result)
+    case = find_case(problem_from(*points, None)).against(objection("incomplete", what="pose", probability="0.1"))
+    monkeypatch.setattr(solvers, "find_case", lambda *_, **__: case)
+    monkeypatch.setattr(Case, "is_settled", False)
     assert "not decided" not in solve(*points, time_limit=60).reason
     monkeypatch.setattr(solvers.Options, "deadline", lambda *_: Deadline.after(-1.0))
     assert "not decided in 7 s" in solve(*points, time_limit=7).reason

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from bpnp.search.arguments import check_inside, checked_prior, each_camera, each_set, is_network, pixels_from
+from bpnp.search.assemble import Solved
 from bpnp.search.focal_length import unknown_camera
 from bpnp.search.rig.solve import mount_from, prepare_rig
-from bpnp.search.solution import Solution
 from bpnp.search.solvers import Options
 from bpnp.search.starts import GravityPrior, PosePrior
 
@@ -34,7 +34,7 @@ def prepare(
     options: Options,
     chosen: RigOptions,
     prior: Any,
-) -> Callable[[], Solution]:
+) -> Callable[[], Solved]:
     """Check the arguments of one problem with a rig, and return the function that solves it.
 
     Args:

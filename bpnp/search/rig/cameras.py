@@ -26,12 +26,13 @@ from scipy.spatial import KDTree
 from bpnp.runtime import NEVER, Deadline
 from bpnp.search.config import ALARMS
 from bpnp.search.hypotheses import Hypotheses
-from bpnp.search.pose_model import PoseModel
+from bpnp.search.pose_model import PoseModel, crossed
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.refine.gauss_newton import refine, soft_equations, steps
 from bpnp.search.search_frame import Scene
+from bpnp.search.solution import FOCAL_LENGTH, POSE_PARAMETERS, SCALE
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
-from bpnp.search.verdict.covariance import covariance_of, join
+from bpnp.search.verdict.covariance import covariance_of, join, student_factor
 from bpnp.search.verdict.false_alarms import Terms, camera_terms, directions_of, log10_nfa, match_shares
 from bpnp.search.verdict.uncertainty import linearise, matches_of
 
@@ -65,6 +66,8 @@ class Rig:
             refined with the given cameras; the number of tests and the covariance count the unknowns.
     """
 
+    is_rig = True
+
     def __init__(
         self,
         problems: Sequence[Problem],
@@ -82,7 +85,7 @@ class Rig:
         self.apart = [(k, other) for k, other in pairs if np.linalg.norm(centres[k] - centres[other]) > least]
         self.mounts = [(turn, shift / problem.size) for problem, (turn, shift) in zip(problems, mounts, strict=True)]
         baseline = is_metric and bool(self.apart)
-        self.problems = [
+        self.problems: Sequence[Problem] = [
             replace(each, prior=_prior_of(mount, prior), baseline=baseline)
             for each, mount in zip(problems, self.mounts, strict=True)
         ]
@@ -291,6 +294,39 @@ class Rig:
                 kept = np.concatenate([np.arange(self.model.size)[self.model.columns[name]] for name in names])
                 return np.asarray(covariance[np.ix_(kept, kept)] / sharper**2)
         return None
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the estimated parameters."""
+        names = POSE_PARAMETERS if self.model.lens is None else (*POSE_PARAMETERS, FOCAL_LENGTH)
+        return (*names, SCALE) if self.model.scale else names
+
+    def to_user(self, poses: Hypotheses) -> Hypotheses:
+        """Return poses in the user's frame, with homogeneous translations."""
+        _, moved = self.problems[0].to_user(poses.rotation, poses.translation[:, :3])
+        return replace(poses, translation=np.column_stack([moved, poses.translation[:, 3]]))
+
+    def covariance_of(self, poses: Hypotheses, residual: float, inliers: int) -> Array | None:
+        """Return the covariance of the user's parameters of the first pose.
+
+        They are the rotation, the translation in units of the rig, the focal length in pixels and the scale.
+        """
+        (rotation, translation), first = poses.pose(), self.problems[0]
+        covariance = self.covariance(rotation, translation, residual)
+        if covariance is None:
+            return None
+        scale, (_, shift) = 1 / translation[3], first.to_user(rotation, translation[:3])
+        has_focal, camera = self.model.lens is not None, first.camera
+        moved = np.eye(6 + has_focal + self.model.scale)  # from an error about the centroid, in unit size
+        moved[3:6, 3:6] *= scale * first.size
+        moved[3:6, :3] = scale * crossed(rotation @ first.centre3d_of_user)
+        if has_focal and camera is not None:
+            moved[6, 6] = camera.focal
+        if self.model.scale:
+            moved[-1, -1] = scale
+            moved[3:6, -1] = scale * shift
+        free = max(2 * inliers - self.unknowns, 1)
+        return np.asarray(student_factor(free) * moved @ covariance @ moved.T)
 
     def candidates(
         self, rotations: Array, translations: Array, deadline: Deadline = NEVER, stage: str | None = None

@@ -270,6 +270,7 @@ class RigPoses:
             local_searches=self._local_searches(),
             exhaustive=self.exhaustive,
             iterations=self.iterations,
+            is_fitted=True,
             cameras=cameras,
             distinct=self._distinct_fraction(),
             of_rig=self.best,

@@ -9,22 +9,19 @@ from typing import Any
 import numpy as np
 
 from bpnp.cameras import Camera, camera_from
-from bpnp.runtime import NEVER, Clock, Deadline
-from bpnp.search.arguments import Array, about, checked_pose, pose_of
+from bpnp.runtime import NEVER, Clock
+from bpnp.search.arguments import about, checked_pose, pose_of
+from bpnp.search.assemble import Solved, assembled
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.focal_length import FocalSweep, UnknownCamera
 from bpnp.search.inputs import problem_from
-from bpnp.search.matching import count_one_to_one, failed_solution, one_to_one, with_unfinished
-from bpnp.search.pose_model import crossed
-from bpnp.search.possible_matches import MATCH_REACH
-from bpnp.search.problem import Problem, UnknownFocal
+from bpnp.search.problem import UnknownFocal
 from bpnp.search.rig.cameras import Pose, Rig
 from bpnp.search.rig.search import search_rig
-from bpnp.search.solution import FOCAL_LENGTH, POSE_PARAMETERS, SCALE, Solution, add_pose
+from bpnp.search.solution import Solution
 from bpnp.search.solvers import Options, at_deadline, ending_seconds
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
-from bpnp.search.verdict.covariance import student_factor
-from bpnp.search.verdict.decide import Case, SearchResult, decide
+from bpnp.search.verdict.decide import Case, decide
 from bpnp.search.verdict.reasons import objection
 
 
@@ -39,7 +36,7 @@ def prepare_rig(
     *,
     prior: Prior | None = None,
     scale: bool = False,
-) -> Callable[[], Solution]:
+) -> Callable[[], Solved]:
     """Check the problem of a rig, and return the function that estimates its pose rig_from_world; see `bpnp.solve`.
 
     Args:
@@ -137,8 +134,9 @@ class _RigSweep(FocalSweep):
         zoom, radial = self.unknown.parts(camera)
         return self.points.rig([one.at(zoom, radial) for one in self.every], self.unknown.focal(camera))
 
-    def solve_with(self, camera: Camera, options: Options) -> Solution:
-        return replace(_solve(self.rig(camera), options), camera=camera)
+    def solve_with(self, camera: Camera, options: Options) -> Solved:
+        case, solution = _solve(self.rig(camera), options)
+        return Solved(case, replace(solution, camera=camera))
 
     def refine(self, solution: Solution, camera: Camera, zooms: Sequence[float] = (1.0,)) -> Camera:
         if zooms != (1.0,):  # the fit of the lens has started at wide scales
@@ -150,12 +148,11 @@ class _RigSweep(FocalSweep):
         return self.unknown.at(first[0] * zoom, radial if self.unknown.bends else None)
 
 
-def _solve(rig: Rig, options: Options) -> Solution:
+def _solve(rig: Rig, options: Options) -> Solved:
     begun, deadline = Clock.now(), NEVER
     reasons = [problem.degenerate for problem in rig.problems if problem.degenerate is not None]
     if reasons:
         case = Case.without_pose(rig.problems[0], objection("degenerate", why=reasons[0]), exhaustive=True)
-        result = decide(case)
     else:
         deadline = options.limit().before(ending_seconds(*rig.problems))
         case = search_rig(
@@ -166,9 +163,9 @@ def _solve(rig: Rig, options: Options) -> Solution:
             settings=options.settings,
             progress=options.progress_of(0),
         )
-        result = at_deadline(decide(case), options, deadline, Clock.now() - begun)
-    solution = with_unfinished(_finished(rig, rig.problems, result, options.inlier_threshold, deadline), deadline)
-    return replace(solution, seconds=Clock.now() - begun)
+    result = at_deadline(decide(case), options, deadline, Clock.now() - begun)
+    solution = assembled(rig, result, inlier_threshold=options.inlier_threshold, deadline=deadline)
+    return Solved(case, replace(solution, seconds=Clock.now() - begun))
 
 
 def mount_from(name: str, value: Any) -> Pose:
@@ -180,89 +177,3 @@ def mount_from(name: str, value: Any) -> Pose:
             f"`{name}` {wrong}; give cam_from_rig as (R, t), a matrix (3, 4) or (4, 4), or a pycolmap.Rigid3d"
         )
     return checked_pose(f"{name}.", *pose)
-
-
-def _finished(
-    rig: Rig,
-    problems: Sequence[Problem],
-    result: SearchResult,
-    inlier_threshold: float | None,
-    deadline: Deadline,
-) -> Solution:
-    """Build the solution with the matches of all cameras; 2D points are indexed over all cameras, concatenated."""
-    found, first = result.candidates, problems[0]
-    solution = replace(failed_solution(first, result.reason, inlier_threshold, code=result.code), camera=None)
-    parameters: tuple[str, ...] = POSE_PARAMETERS
-    if rig.model.lens is not None:
-        parameters = (*parameters, FOCAL_LENGTH)
-    if rig.model.scale:
-        parameters = (*parameters, SCALE)
-        solution = replace(solution, scale=math.nan)
-    solution = replace(
-        solution,
-        covariance=np.full((len(parameters),) * 2, math.nan),
-        parameters=parameters,
-        points2d=np.concatenate([problem.all2d for problem in problems]),
-        points_per_camera=tuple(len(problem.all2d) for problem in problems),
-        stats=replace(solution.stats, dropped2d=sum(problem.dropped2d for problem in problems)),
-    )
-    if not len(found):
-        return solution
-    rotation, translation = found.pose()
-    matches, errors, angles, count = [], [], [], 0
-    counts = np.zeros(len(found), np.int64)  # inliers of each pose in all cameras
-    for k, problem in enumerate(problems):
-        threshold = inlier_threshold or MATCH_REACH * result.residual * problem.per_radian
-        image, may_match = problem.image_points, problem.may_match
-        seen, *others = map(problem.project_scene, *rig.pose_of(k, found.rotation, found.translation))
-        i, j = one_to_one(image, seen, threshold, may_match, deadline).T
-        counts += [len(i), *(count_one_to_one(image, other, threshold, may_match, deadline) for other in others)]
-        errors.append(np.linalg.norm(image[i] - seen[j], axis=-1))
-        angles.append(errors[-1] / problem.per_radian)
-        matches.append(np.stack([problem.usable[i] + count, j], -1))
-        count += len(problem.all2d)
-    covariance = None if result.verdict == "failed" else rig.covariance(rotation, translation, result.residual)
-    if covariance is not None:
-        centre = rotation @ first.centre3d_of_user
-        _, shift = first.to_user(rotation, translation[:3])
-        free = max(2 * int(counts[0]) - rig.unknowns, 1)
-        moved_by = _about_origin(rig, first.size, centre, shift, 1 / translation[3])
-        covariance = student_factor(free) * moved_by @ covariance @ moved_by.T
-    _, moved = first.to_user(found.rotation, found.translation[:, :3])
-    return add_pose(
-        solution,
-        result,
-        replace(found, translation=np.column_stack([moved, found.translation[:, 3]])),
-        counts.tolist(),
-        np.concatenate(matches),
-        np.concatenate(errors),
-        np.concatenate(angles),
-        most=sum(min(len(problem.all2d), len(problem.points3d)) for problem in problems),
-        threshold=inlier_threshold or MATCH_REACH * result.residual * first.per_radian,
-        residual=result.residual,
-        covariance=covariance,
-    )
-
-
-def _about_origin(rig: Rig, size: float, centre: Array, shift: Array, scale: float) -> Array:
-    """Return the matrix that converts an error about the centroid, in unit size, to one of the user's parameters.
-
-    These are the rotation, the translation in units of the rig, the focal length in pixels and the scale.
-
-    Args:
-        rig: Cameras; the covariance is that of `Rig.covariance`.
-        size: Size of the scene, user's unit.
-        centre: (3,) centroid of the scene from its origin, in the axes of the rig, user's unit.
-        shift: (3,) translation, unit of the scene.
-        scale: Units of the rig in one unit of the scene.
-    """
-    has_focal, camera = rig.model.lens is not None, rig.problems[0].camera
-    moved = np.eye(6 + has_focal + rig.model.scale)
-    moved[3:6, 3:6] *= scale * size
-    moved[3:6, :3] = scale * crossed(centre)
-    if has_focal and camera is not None:
-        moved[6, 6] = camera.focal
-    if rig.model.scale:
-        moved[-1, -1] = scale
-        moved[3:6, -1] = scale * shift
-    return moved

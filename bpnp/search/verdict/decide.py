@@ -230,7 +230,8 @@ class SearchResult:
 def decide(case: Case) -> SearchResult:
     """Return the verdict on the leader of a case, or on the pose that it claims.
 
-    A claim is "failed" if the leader is another pose without an objection, and "ambiguous" if it is another one.
+    A claim is "failed" if the leader is another pose without an objection, or if an objection is a pose that is more
+    likely by `Evidence.margin`; it is "ambiguous" if the leader is another pose.
     """
     candidates, one, refuted = case.candidates, case.objection, False
     if case.claim is not None:
@@ -242,6 +243,8 @@ def decide(case: Case) -> SearchResult:
             one = objection("better_pose", margin, away=away)
         elif fits_by_chance(alarms):
             one = objection("chance", what="the pose fits no")
+        elif refuting := [each for each in case.objections if -math.inf < each.margin <= -case.limits.margin]:
+            refuted, one = True, min(refuting)
         candidates = candidates[np.r_[place, np.delete(np.arange(len(candidates)), place)]]
     verdict: Verdict = "confident"
     if one is None:
