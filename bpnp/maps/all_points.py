@@ -122,7 +122,7 @@ def judge_on_all_points(own: Solved, refined: Refined | None) -> Solved:
         return own
     if alone.objection is not None:  # other cameras have not been tested for it
         case = lens(alone, scene_of=lambda: refined.scene, deadline=deadline)
-        return own.against(next(iter(case.objections), None))
+        return own if case is alone else own.against(case.objections[-1])
     return own.against(case.objection)
 
 
