@@ -174,7 +174,7 @@ def _scale_of(problem: Problem, solution: Solution) -> float:
 def _candidate(problem: Problem, solution: Solution, pose: Hypotheses, margin: float) -> Candidate:
     """Return a competing pose (1,) as a candidate in the user's frame."""
     seen = problem.project_scene(*pose.pose())
-    inliers = count_one_to_one(problem.image_points, seen, solution.inlier_threshold)
+    inliers = count_one_to_one(problem.measured.points, seen, solution.inlier_threshold)
     rotation, translation = problem.to_user(pose.rotation, pose.translation)
     alarms = np.array([solution.log10_false_alarms + margin])
     return candidates_of(
@@ -186,9 +186,9 @@ def _other_regions(regions: Iterable[Region], place: Region, problem: Problem, s
     """Yield the first regions with mostly points that are not visible from the pose of a solution."""
     if len(solution.matches) < ALIASING.fewest:
         return
-    assert problem.camera is not None
+    assert problem.measured.camera is not None
     pose = solution.rotation, solution.translation
-    seen, count = place.point_ids[place.in_view(*pose, problem.camera, problem.image_points)], 0
+    seen, count = place.point_ids[place.in_view(*pose, problem.measured.camera, problem.measured.points)], 0
     for region in regions:
         other = ~np.isin(region.point_ids, seen)
         if other.sum() >= ALIASING.fewest and other.mean() >= ALIASING.least_other:

@@ -333,7 +333,7 @@ def share_points(
     groups: dict[bytes, list[int]] = {}
     for i, problem in problems.items():
         if len(problems) > 1 and problem.degenerate is None and is_enumerable(problem):
-            groups.setdefault(problem.image_points.tobytes() + repr(problem.camera).encode(), []).append(i)
+            groups.setdefault(problem.measured.points.tobytes() + repr(problem.measured.camera).encode(), []).append(i)
     for members in groups.values():
         taken: set[int] = set()
         for i in sorted(members, key=lambda i: (solutions[i].log10_false_alarms, i)):

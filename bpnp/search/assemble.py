@@ -76,9 +76,9 @@ class OneCamera:
     def covariance_of(self, poses: Hypotheses, residual: float, inliers: int) -> Array | None:
         linear = linearised(self.problem, *poses.pose(), residual)
         covariance = pose_covariance(self.problem, linear, float(poses.match_count[0]))
-        if covariance is None or self.problem.camera is None:
+        if covariance is None or self.problem.measured.camera is None:
             return covariance
-        unit = np.where(np.arange(len(covariance)) < len(POSE_PARAMETERS), 1.0, self.problem.camera.focal)
+        unit = np.where(np.arange(len(covariance)) < len(POSE_PARAMETERS), 1.0, self.problem.measured.camera.focal)
         return np.asarray(covariance * np.outer(unit, unit))  # of the focal length instead of its logarithm
 
 
@@ -117,7 +117,9 @@ def assembled(
     start, found, problems = time.perf_counter(), result.candidates, cameras.problems
     solution = _without_pose(cameras, result, inlier_threshold)
     if len(found):
-        thresholds = [inlier_threshold or MATCH_REACH * result.residual * problem.per_radian for problem in problems]
+        thresholds = [
+            inlier_threshold or MATCH_REACH * result.residual * problem.measured.per_radian for problem in problems
+        ]
         if not result.is_fitted:
             found = _with_best(found, *fit_to_matches(problems[0], *found.pose(), thresholds[0], deadline))
         matches, errors, angles, counts = _match(cameras, found, thresholds, deadline)
@@ -132,7 +134,7 @@ def assembled(
             scale=candidates[0].scale,
             matches=matches,
             inlier_count=len(matches),
-            inlier_ratio=len(matches) / sum(min(len(one.all2d), len(one.points3d)) for one in problems),
+            inlier_ratio=len(matches) / sum(min(len(one.measured.plane), len(one.points3d)) for one in problems),
             inlier_threshold=thresholds[0],
             reprojection_error=float(errors.mean()) if len(matches) else math.nan,
             reprojection_error_deg=float(np.degrees(angles).mean()) if len(matches) else math.nan,
@@ -181,21 +183,21 @@ def candidates_of(poses: Hypotheses, counts: Sequence[int]) -> tuple[Candidate, 
 def _without_pose(cameras: Cameras, result: SearchResult, inlier_threshold: float | None) -> Solution:
     """Return the solution of points for which there is no pose."""
     problems, first = cameras.problems, cameras.problems[0]
-    dropped, taken = (sum(getattr(one, name) for one in problems) for name in ("dropped2d", "taken2d"))
+    dropped, taken = (sum(getattr(one.measured, name) for one in problems) for name in ("dropped", "taken"))
     return Solution(
         inlier_threshold=math.nan if inlier_threshold is None else inlier_threshold,
-        unit=first.unit,
+        unit=first.measured.unit,
         covariance=np.full((len(cameras.parameters),) * 2, math.nan),
         parameters=cameras.parameters,
         scale=math.nan if "scale" in cameras.parameters else 1.0,
         verdict=result.verdict,
         reason=result.reason,
         stats=SolutionStats(dropped2d=dropped, taken2d=taken),
-        points2d=np.concatenate([one.all2d for one in problems]),
-        points_per_camera=tuple(len(one.all2d) for one in problems) if cameras.is_rig else None,
+        points2d=np.concatenate([one.measured.plane for one in problems]),
+        points_per_camera=tuple(len(one.measured.plane) for one in problems) if cameras.is_rig else None,
         points3d=first.all3d,
         normals3d=first.normals3d if first.cosines3d is None else None,
-        camera=None if cameras.is_rig else first.camera,
+        camera=None if cameras.is_rig else first.measured.camera,
     )
 
 
@@ -221,12 +223,12 @@ def _match(
         rotations, translations = cameras.pose_of(k, found.rotation, found.translation)
         seen, *others = map(problem.project_scene, rotations, translations)
         known = threshold, problem.may_match, deadline
-        i, j = one_to_one(problem.image_points, seen, *known).T
-        counts += [len(i), *(count_one_to_one(problem.image_points, other, *known) for other in others)]
-        errors.append(np.linalg.norm(problem.image_points[i] - seen[j], axis=-1))
+        i, j = one_to_one(problem.measured.points, seen, *known).T
+        counts += [len(i), *(count_one_to_one(problem.measured.points, other, *known) for other in others)]
+        errors.append(np.linalg.norm(problem.measured.points[i] - seen[j], axis=-1))
         angles.append(_angles(problem.bearings[i], problem.points3d[j] @ rotations[0].T + translations[0]))
-        matches.append(np.stack([problem.usable[i] + before, j], -1))
-        before += len(problem.all2d)
+        matches.append(np.stack([problem.measured.indices[i] + before, j], -1))
+        before += len(problem.measured.plane)
     return np.concatenate(matches), np.concatenate(errors), np.concatenate(angles), counts
 
 
@@ -238,7 +240,7 @@ def _angles(bearings: Array, directions: Array) -> Array:
 
 def _duplicates(problems: Sequence[Problem]) -> list[str]:
     """Return sentences with the number of duplicate points of each side, for not too many points."""
-    sides = {"image": [one.image_points for one in problems], "scene": [problems[0].points3d]}
+    sides = {"image": [one.measured.points for one in problems], "scene": [problems[0].points3d]}
     if len(problems[0].points3d) > DENSE_MATCHES:
         return []
     counts = {side: sum(len(each) - len(np.unique(each, axis=0)) for each in points) for side, points in sides.items()}

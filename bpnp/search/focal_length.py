@@ -121,7 +121,7 @@ class UnknownCamera(NamedTuple):
 
     def seen_by(self, problem: Problem) -> "UnknownCamera":
         """Return a copy with the reach of the image points of a problem whose camera is the reference."""
-        outermost = float(np.linalg.norm(problem.all2d[problem.usable], axis=-1).max())
+        outermost = float(np.linalg.norm(problem.measured.plane[problem.measured.indices], axis=-1).max())
         return self._replace(reach=max(self.reach, outermost))
 
 

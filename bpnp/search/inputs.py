@@ -20,7 +20,8 @@ from bpnp.search.arguments import (
     scene_points,
     unit_bearings,
 )
-from bpnp.search.problem import Problem, Unit, UnknownFocal, units_per_radian
+from bpnp.search.measured import Measured, Unit
+from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.starts import GravityPrior, PosePrior
 
 FLOOR_PIXELS = 0.1  # smallest noise of an image point; no point detector is more accurate [pixels; convention]
@@ -66,11 +67,11 @@ def problem_from(
     check_points("points2d", image, (2, 3) if camera is None else (2,), fewest)
     check_points("points3d", scene, (3,), fewest)
     unit, (bearings, plane) = unit_of(image, camera), bearings_of(image, camera)
-    image = bearings if unit == "rad" else image
     usable = np.flatnonzero(np.isfinite(bearings).all(-1))
     check_seen(usable, image, fewest)
     in_pixels = camera if camera is not None and camera.focal >= LEAST_FOCAL else None
-    per_radian = units_per_radian(plane[usable], unit, camera)
+    measured = Measured.of(bearings if unit == "rad" else image, camera, plane)
+    per_radian = measured.choose(usable).per_radian
     pose_prior = prior if isinstance(prior, (PosePrior, GravityPrior)) else None
     problem = Problem.of(
         bearings,
@@ -84,9 +85,7 @@ def problem_from(
         floor=None if in_pixels is None else FLOOR_PIXELS / per_radian,
         radius=None if inlier_threshold is None else inlier_threshold / per_radian,
         focal=focal,
-        points2d=None if unit == "rad" else image,
-        camera=camera,
-        given2d=plane,
+        measured=measured,
         **checked_labels(labels2d, labels3d, (len(image), len(scene))),
     )
     return problem.choose(usable)

@@ -45,7 +45,7 @@ def fit_to_matches(
     unless its float32 steps were too coarse for the data. At an optimum of the same precision n log(S / S_min), S the
     sum of n squared residuals, is distributed as chi-squared with 6 degrees of freedom.
     """
-    image = problem.image_points
+    image = problem.measured.points
     for _ in range(FIT_ROUNDS):
         if deadline.ended(Unfinished.refinement):
             break
@@ -54,8 +54,8 @@ def fit_to_matches(
         if len(i) < MIN_POINTS:
             break
         target, points = image[i], problem.points3d[j]
-        trial = fit_pose(problem.project, points, target, rotation, translation, scale=threshold)
-        after = problem.project(points @ trial[0].T + trial[1])
+        trial = fit_pose(problem.measured.project, points, target, rotation, translation, scale=threshold)
+        after = problem.measured.project(points @ trial[0].T + trial[1])
         squares = [float(((each - target) ** 2).sum()) for each in (projected[j], after)]
         if not squares[0] > squares[1] * math.exp(PRECISION.far / target.size):
             break

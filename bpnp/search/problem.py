@@ -7,14 +7,14 @@ the scene; `to_user` converts a pose to the user's coordinates.
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.cameras import Camera, in_front
 from bpnp.poses import MIN_POINTS, SAME, Tolerance, rotation_angle, same_pose
 from bpnp.search.image_statistics import ImageStatistics
+from bpnp.search.measured import UNMEASURED, Array, Labels, Measured
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
 
 # Distance from the median beyond which scene points do not affect the origin and the unit.
@@ -36,10 +36,7 @@ LINE_RATIO = 1e-6  # second extent of points over the first, below which they li
 LEAST_SIGMA = 1e-6  # least standard deviation of a translation of a prior [size of the scene; numerics, float64]
 WIDEST_SIGMA = 1e9  # standard deviation of a translation above which it is unknown [size of the scene; numerics]
 
-Array = NDArray[np.float64]
-Labels = NDArray[np.int64]
-Unit = Literal["px", "normalised", "rad"]
-OF_IMAGE = "bearings", "labels2d", "scores2d", "odds2d", "points2d"  # fields with one row per image point
+OF_IMAGE = "bearings", "labels2d", "scores2d", "odds2d"  # fields with one row per image point
 OF_SCENE = "points3d", "normals3d", "labels3d", "cosines3d", "scores3d", "classes3d"  # one row per scene point
 
 
@@ -99,13 +96,8 @@ class Problem:
             these bearings.
         origin: (3,) of the user's coordinates that is the origin here.
         size: RMS distance of the scene points from it, user's unit.
-        points2d: (m, 2) image points in which residuals are measured: pixels with a camera, normalised without; None
-            for bearings.
-        camera: Camera of the pixels.
-        indices2d: (m,) index of each image point among the user's; None if all are used.
-        given2d: All image points of the user, normalised, NaN for one without such coordinates; None for `bearings`.
+        measured: The image points as the user measured them; the bearings by default.
         given3d: The scene points in the user's coordinates; None if they are these.
-        taken2d: Number of image points that were left to another problem.
         network: Trained network whose pose is tried first.
         baseline: True if other cameras at known distances see the scene too: a copy of another size looks different.
 
@@ -140,14 +132,14 @@ class Problem:
     log10_views: float = 0.0
     origin: Array | None = None
     size: float = 1.0
-    points2d: Array | None = None
-    camera: Camera | None = None
-    indices2d: Labels | None = None
-    given2d: Array | None = None
+    measured: Measured = UNMEASURED
     given3d: Array | None = None
-    taken2d: int = 0
     network: Any = None
     baseline: bool = False
+
+    def __post_init__(self) -> None:
+        if self.measured is UNMEASURED:
+            object.__setattr__(self, "measured", Measured.of(self.bearings))
 
     @classmethod
     def of(cls, bearings: Array, points3d: Array, *, prior: Prior | None = None, **attributes: Any) -> "Problem":
@@ -206,68 +198,32 @@ class Problem:
         rows = dict.fromkeys(OF_IMAGE, image) | dict.fromkeys(OF_SCENE, scene)
         selected = {name: values[rows[name]] for name in rows if (values := getattr(self, name)) is not None}
         given3d = None if self.given3d is None else self.given3d[scene]
-        return replace(self, indices2d=self.usable[image], given3d=given3d, given2d=self.all2d, **selected)
+        return replace(self, measured=self.measured.choose(image), given3d=given3d, **selected)
 
     def without(self, taken: Labels) -> "Problem":
         """Return the problem without the image points that have these indices among the user's."""
-        stay = np.flatnonzero(~np.isin(self.usable, taken))
-        return replace(self.choose(stay), taken2d=self.taken2d + len(self.bearings) - len(stay))
-
-    @property
-    def usable(self) -> Labels:
-        """(m,) index of each image point among the user's."""
-        return np.arange(len(self.bearings)) if self.indices2d is None else self.indices2d
-
-    @property
-    def all2d(self) -> Array:
-        """(k, 2) all image points of the user, normalised; NaN for one without such coordinates."""
-        return in_front(self.bearings)[:, :2] if self.given2d is None else self.given2d
+        stay = np.flatnonzero(~np.isin(self.measured.indices, taken))
+        left = self.choose(stay)
+        return replace(
+            left, measured=replace(left.measured, taken=left.measured.taken + len(self.bearings) - len(stay))
+        )
 
     @property
     def all3d(self) -> Array:
         """(n, 3) scene points in the user's coordinates."""
         return self.points3d if self.given3d is None else self.given3d
 
-    @property
-    def dropped2d(self) -> int:
-        """Number of image points of the user that could not be undistorted."""
-        return len(self.all2d) - len(self.usable) - self.taken2d
-
-    @property
-    def unit(self) -> Unit:
-        """Unit in which residuals are measured."""
-        return "rad" if self.points2d is None else "normalised" if self.camera is None else "px"
-
-    @property
-    def image_points(self) -> Array:
-        """(m, d) image points in which residuals are measured, in `unit`."""
-        return self.bearings if self.points2d is None else self.points2d
-
-    @cached_property
-    def per_radian(self) -> float:
-        """Units of `image_points` per radian, at the median image point."""
-        return units_per_radian(self.all2d[self.usable], self.unit, self.camera)
-
     @cached_property
     def degenerate(self) -> str | None:
         """Reason why these points fix no pose; None if they may."""
         fewest = MIN_POINTS - isinstance(self.prior, GravityPrior)
         reason = why_degenerate(self.bearings, self.points3d, fewest)
-        return f"of the 2D points that no other problem has, {reason}" if reason and self.taken2d else reason
-
-    def project(self, in_camera: Array) -> Array:
-        """Project points (p, 3) in the camera's frame to `image_points`; NaN for points without an image."""
-        if self.camera is not None:
-            return self.camera.project(in_camera)
-        if self.points2d is not None:
-            return in_front(in_camera)[:, :2]
-        length = np.linalg.norm(in_camera, axis=-1, keepdims=True)
-        return np.divide(in_camera, length, out=np.full_like(in_camera, np.nan), where=length > 0)
+        return f"of the 2D points that no other problem has, {reason}" if reason and self.measured.taken else reason
 
     def project_scene(self, rotation: Array, translation: Array) -> Array:
         """Project the scene points, (n, d); NaN for those without an image or that face away."""
         in_camera = self.points3d @ rotation.T + translation
-        seen = self.project(in_camera)
+        seen = self.measured.project(in_camera)
         if self.normals3d is not None:
             seen[~faces(self.normals3d, self.cosines3d, in_camera, rotation)] = np.nan
         return seen
@@ -471,20 +427,6 @@ def in_bulk(points3d: Array) -> NDArray[np.bool_]:
     """Return a mask of the points (n, 3) that are within `BULK` median distances of the median."""
     distance = np.linalg.norm(points3d - np.median(points3d, 0), axis=-1)
     return np.asarray(distance <= BULK * float(np.median(distance)))
-
-
-def units_per_radian(points2d: Array, unit: Unit, camera: Camera | None) -> float:
-    """Return image units per radian at the median point: a plane stretches by (1 + r^2)^(3/4) at the distance r.
-
-    Args:
-        points2d: (m, 2) normalised image points.
-        unit: Unit in which residuals are measured.
-        camera: Camera of the pixels; None for normalised points.
-    """
-    if unit == "rad":
-        return 1.0
-    stretch = (1 + (points2d**2).sum(-1)) ** 0.75
-    return float(np.median(stretch) * (1.0 if camera is None else camera.focal))
 
 
 def why_degenerate(bearings: Array, points3d: Array, fewest: int = MIN_POINTS) -> str | None:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from bpnp.argument_types import short_repr
 from bpnp.bounded_files import parse_json, read_json
 from bpnp.cameras import Camera, CameraLike, camera_from, camera_to_json, check_single_camera
-from bpnp.search.problem import Unit
+from bpnp.search.measured import Unit
 from bpnp.search.verdict.decide import Verdict
 from bpnp.search.verdict.uncertainty import centre_covariance
 

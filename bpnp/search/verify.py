@@ -17,6 +17,7 @@ from bpnp.search.config import TIME
 from bpnp.search.given_pose import given_pose
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.inputs import problem_from
+from bpnp.search.measured import Measured
 from bpnp.search.problem import Problem
 from bpnp.search.solution import Solution
 from bpnp.search.solvers import Options, at_deadline, without_pose
@@ -116,8 +117,8 @@ def verify(
         solution,
         matches=given[solution.matches[:, 0]],
         inlier_ratio=solution.inlier_count / max(len(given), 1),
-        stats=replace(solution.stats, dropped2d=problem.dropped2d),
-        points2d=problem.all2d,
+        stats=replace(solution.stats, dropped2d=problem.measured.dropped),
+        points2d=problem.measured.plane,
         points3d=problem.all3d,
         normals3d=problem.normals3d,
     )
@@ -170,7 +171,7 @@ def verify_problem(
 
 def _checked_matches(values: Any, problem: Problem) -> Labels:
     """Return the (k, 2) indices of matches whose 2D point is usable; raise ValueError if a point is in two matches."""
-    matches, counts = numbers("matches", values), (len(problem.all2d), len(problem.points3d))
+    matches, counts = numbers("matches", values), (len(problem.measured.plane), len(problem.points3d))
     if matches.ndim != 2 or matches.shape[1] != 2 or (matches != np.round(matches)).any():
         raise ValueError(
             f"`matches` has the shape {matches.shape}; pairs of indices are needed, integers of shape (k, 2)"
@@ -187,21 +188,20 @@ def _checked_matches(values: Any, problem: Problem) -> Labels:
                 f"{name} point {times.argmax()} is in {times.max()} of the `matches`; a point has one at most"
             )
     places = matches.astype(np.int64)
-    return np.asarray(places[np.isin(places[:, 0], problem.usable)])
+    return np.asarray(places[np.isin(places[:, 0], problem.measured.indices)])
 
 
 def _of_matches(problem: Problem, matches: Labels) -> Problem:
     """Return a problem of the matched points alone, with a unique label for each match."""
     (i, j), own = matches.T, np.arange(len(matches))
-    matched = problem.choose(np.searchsorted(problem.usable, i), j)
+    matched = problem.choose(np.searchsorted(problem.measured.indices, i), j)
     return replace(
         matched,
         labels2d=own,
         labels3d=own,
         odds2d=None,
         classes3d=None,
-        indices2d=None,
-        given2d=problem.all2d[i],
+        measured=Measured(matched.measured.points, own, problem.measured.plane[i], problem.measured.camera),
     )
 
 

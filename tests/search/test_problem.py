@@ -112,13 +112,13 @@ def test_some_points_keep_their_annotations_and_indices() -> None:
     some = problem.choose(np.array([3, 5, 8]), np.array([5, 6])).choose(np.array([0, 2]))
     assert some.labels2d is not None
     assert some.labels3d is not None
-    assert (some.labels2d.tolist(), some.labels3d.tolist(), some.usable.tolist()) == ([3, 8], [5, 6], [3, 8])
+    assert (some.labels2d.tolist(), some.labels3d.tolist(), some.measured.indices.tolist()) == ([3, 8], [5, 6], [3, 8])
     np.testing.assert_array_equal(some.all3d, points[[5, 6]])
     left = problem.without(np.array([0, 1, 2]))
-    assert (len(left.bearings), left.taken2d, left.dropped2d) == (37, 3, 0)
-    np.testing.assert_array_equal(left.usable, np.arange(3, 40))
+    assert (len(left.bearings), left.measured.taken, left.measured.dropped) == (37, 3, 0)
+    np.testing.assert_array_equal(left.measured.indices, np.arange(3, 40))
     fewer = left.without(np.array([5, 7]))
-    assert (len(fewer.bearings), fewer.taken2d, fewer.dropped2d) == (35, 5, 0)
+    assert (len(fewer.bearings), fewer.measured.taken, fewer.measured.dropped) == (35, 5, 0)
 
 
 def test_the_record_is_frozen() -> None:

@@ -169,7 +169,7 @@ def _near_origin(problem: Problem) -> Array:
 
 def _seen(problem: Problem) -> Array:
     """Return the usable, finite 2D points (m, 2)."""
-    points2d = problem.all2d[problem.usable]
+    points2d = problem.measured.plane[problem.measured.indices]
     return points2d[np.isfinite(points2d).all(-1)]
 
 

@@ -316,7 +316,7 @@ class Rig:
         if covariance is None:
             return None
         scale, (_, shift) = 1 / translation[3], first.to_user(rotation, translation[:3])
-        has_focal, camera = self.model.lens is not None, first.camera
+        has_focal, camera = self.model.lens is not None, first.measured.camera
         moved = np.eye(6 + has_focal + self.model.scale)  # from an error about the centroid, in unit size
         moved[3:6, 3:6] *= scale * first.size
         moved[3:6, :3] = scale * crossed(rotation @ first.centre3d_of_user)
