@@ -49,9 +49,9 @@ def verify_images(
     from bpnp.maps.scene_map import SceneMap
     from bpnp.maps.verified_map import as_csv, as_json, page_html, summary, verify_map
     from bpnp.search.arguments import seconds_from
-    from bpnp.search.config import TIME
+    from bpnp.search.solvers import TIME_LIMIT
 
-    limit = seconds_from(time_limit, TIME.one)
+    limit = seconds_from(time_limit, TIME_LIMIT)
     scene = SceneMap.from_colmap(map)
     check_outputs([output, page])
     with count_items("verifying", len(scene.views), quiet=quiet) as done:

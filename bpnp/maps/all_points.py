@@ -12,7 +12,7 @@ from bpnp.maps.views import Array
 from bpnp.poses import MIN_POINTS
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
 from bpnp.search.assemble import OneCamera, Solved, assembled
-from bpnp.search.config import DEFAULT, MAPS, Evidence
+from bpnp.search.config import DEFAULT, Evidence
 from bpnp.search.focal_length import AROUND, UnknownCamera, fit_camera
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
 from bpnp.search.problem import Problem, UnknownFocal
@@ -25,6 +25,8 @@ from bpnp.search.verdict.contest import contest, rivals_of
 from bpnp.search.verdict.decide import Case, decide
 from bpnp.search.verdict.reasons import Unfinished
 from bpnp.search.verdict.rivals.lens import lens
+
+JUDGED_COMPETITORS = 4  # competing poses of an ambiguous solution that are judged with it on all points [poses; cost]
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +77,7 @@ def refine_on_all_points(solution: Solution, photo: Photo, whole: Region, deadli
     scene, confident = Scene(problem, photo.seed, DEFAULT, deadline), solution.verdict == "confident"
     local_searches = int(poses.scale[0] > scale) if confident else local_searches_for_certainty(DEFAULT.evidence)
     significant = [one for one in solution.candidates[1:] if one.log10_false_alarms < 0]
-    others = [] if confident else significant[: MAPS.competitors]
+    others = [] if confident else significant[:JUDGED_COMPETITORS]
     if others:
         turns, shifts = problem.from_user(
             np.stack([one.rotation for one in others]), np.stack([one.translation for one in others])

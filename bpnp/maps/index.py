@@ -13,10 +13,22 @@ from bpnp.bounded_files import read_npz
 from bpnp.cameras import camera_from, camera_to_json
 from bpnp.datamodules.colmap.model_files import FILES
 from bpnp.files import cache_folder, file_states, fingerprint, lock_folder, write_atomically
-from bpnp.maps.views import Array, Cones, Pictures, View
-from bpnp.search.config import MAPS, RANK
+from bpnp.maps.views import (
+    DENSITY_CELLS,
+    HALF_WIDTH,
+    NARROW_SIGMA,
+    REACH_FRACTION,
+    VIEW_MARGIN_DEG,
+    WIDE_SIGMA,
+    Array,
+    Cones,
+    Pictures,
+    View,
+)
 
 FORMAT = 1  # version of the file [1; convention]
+# Constants that the stored arrays depend on.
+STORED_WITH = VIEW_MARGIN_DEG, DENSITY_CELLS, REACH_FRACTION, HALF_WIDTH, NARROW_SIGMA, WIDE_SIGMA
 
 
 class Index(NamedTuple):
@@ -34,7 +46,7 @@ def model_stamp(folder: Path) -> str:
     """Return a fingerprint of the files of a model and of the constants of its index."""
     files = [folder / f"{name}.{suffix}" for name in FILES for suffix in ("bin", "txt")]
     model = file_states(file for file in files if file.is_file())
-    return fingerprint([FORMAT, MAPS.margin_deg, repr(RANK), model])
+    return fingerprint([FORMAT, VIEW_MARGIN_DEG, *STORED_WITH, model])
 
 
 def index_file(folder: Path) -> Path:

@@ -21,7 +21,7 @@ from bpnp.maps.viewed_points import Place, Region, ViewedPoints
 from bpnp.runtime import NEVER, Clock, Deadline
 from bpnp.search.arguments import checked_prior
 from bpnp.search.assemble import Solved, with_unfinished
-from bpnp.search.config import DEFAULT, MAPS, TIME, SearchSettings
+from bpnp.search.config import DEFAULT, SearchSettings
 from bpnp.search.focal_length import UnknownCamera, solve_with_focal_length
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.solution import Candidate, Solution
@@ -30,10 +30,20 @@ from bpnp.search.verdict import reasons
 from bpnp.search.verdict.decide import Case
 from bpnp.search.verdict.reasons import objection
 
+# Half of the 2,000 largest SIFT keypoints have a map point, an eighth of the next ones.
+MOST_KEYPOINTS = 2048  # largest number of keypoints that are used [keypoints; measured, the photos are not recorded]
+ITERATIONS = 1  # iterations of a search near a view [iterations; not tuned]
+LONGER_ITERATIONS = 16  # iterations of a longer search near a promising view [iterations; not tuned]
+PROMISING_VIEWS = 3  # number of views that get a longer search if none is confident [views; not tuned]
+# Largest log10 NFA with which a view gets a longer search before the next view.
+LIKELY_ALARMS = -20.0  # [decades; not tuned]
+# Time to judge the pose of a photo on all points of a map after the searches; at most half of a limit is kept for it.
+JUDGING_SECONDS = 1.5  # [seconds; cost]
+
 # The search stays near the view's pose, not near the best pose of an unsuccessful earlier search.
 # A search in a fourth of the time finds four fifths as many poses, so that short searches near many views pay.
-BRIEF = replace(DEFAULT, near=(DEFAULT.everywhere,)).limited(MAPS.once)
-ONCE, LONGER = DEFAULT.limited(MAPS.once), DEFAULT.limited(MAPS.longer)
+BRIEF = replace(DEFAULT, near=(DEFAULT.everywhere,)).limited(ITERATIONS)
+ONCE, LONGER = DEFAULT.limited(ITERATIONS), DEFAULT.limited(LONGER_ITERATIONS)
 RANKS = {"failed": 0, "ambiguous": 1, "confident": 2}
 
 
@@ -71,7 +81,7 @@ def localize(
     is left. `views` are tried in their order, None stands for all. `time_limit` is in seconds. Raise ValueError if no
     view sees 4 or more points.
     """
-    start, deadline, tried = Clock.now(), Deadline.after(time_limit).before(TIME.judging), set[str]()
+    start, deadline, tried = Clock.now(), Deadline.after(time_limit).before(JUDGING_SECONDS), set[str]()
     results = list[LoopResult]()
     for k, scene in enumerate(maps):
         until = deadline if k + 1 == len(maps) else replace(deadline.share(1 / 2), unfinished=set())
@@ -112,8 +122,8 @@ def _localize_in(
         if None in (own.case.objection, found.solved.case.objection):
             return LoopResult(found.solution, found.solution.reason_code not in reasons.UNTESTED)
         earlier += significant(found.solution)
-        best = sorted([*best, found], key=lambda one: one.rank, reverse=True)[: MAPS.promising]
-        again = [found] if found.solution.log10_false_alarms < MAPS.likely and len(longer) < MAPS.promising else []
+        best = sorted([*best, found], key=lambda one: one.rank, reverse=True)[:PROMISING_VIEWS]
+        again = [found] if found.solution.log10_false_alarms < LIKELY_ALARMS and len(longer) < PROMISING_VIEWS else []
         if not queue:  # not significant so far, but perhaps with all points of the map
             best = [judge_in_map(scene, photo, one, earlier, options.until) for one in best]
             best.sort(key=lambda one: one.rank, reverse=True)
@@ -230,7 +240,7 @@ def strongest_of(scores: Any, shape: tuple[int, ...]) -> NDArray[np.int64]:
     """Return the indices of the strongest keypoints, ascending; raise ValueError unless each keypoint has a score."""
     if np.shape(scores) != shape:
         raise ValueError(f"`scores` has the shape {np.shape(scores)}, not {shape}, one score per keypoint")
-    return np.sort(np.argsort(-np.asarray(scores), kind="stable")[: MAPS.most_keypoints])
+    return np.sort(np.argsort(-np.asarray(scores), kind="stable")[:MOST_KEYPOINTS])
 
 
 def among_all(solution: Solution, used: NDArray[np.int64], keypoints: Any) -> Solution:

@@ -9,7 +9,6 @@ import numpy.typing as npt
 from bpnp.cameras import camera_from
 from bpnp.report.images import size_in_camera
 from bpnp.report.terminal import LIGHT, QUIET, VERDICTS, number
-from bpnp.search.config import DRAWING
 from bpnp.search.solution import Solution
 from bpnp.search.verdict.uncertainty import centre_covariance
 
@@ -22,6 +21,11 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[Any]
 BOUND = 3.72  # bound of 99.9 % of a plane's normal distribution [standard deviations; derived]
+PHOTO_CONTRAST = 0.55  # fraction of the photo's contrast that is kept, so that points stand out [fraction; convention]
+SHOWN_PERCENT = 98.0  # fraction of the map's points within the drawing [per cent; convention]
+FARTHEST_CAMERA = 4.0  # largest distance of a camera that is drawn in place [extents of the points; convention]
+MOST_DRAWN_POINTS = 20_000  # largest number of map points in a picture [points; cost]
+FIGURE_WIDTHS = (9.0, 6.0)  # widths of photo and map [inches; convention]
 
 
 def localized_picture(
@@ -39,8 +43,8 @@ def localized_picture(
     from bpnp.report.figures import shown_text
     from bpnp.report.solutions import solution_points
 
-    figure = Figure(figsize=(sum(DRAWING.widths), 6.5), layout="constrained")
-    image, above = figure.subplots(1, 2, width_ratios=DRAWING.widths)
+    figure = Figure(figsize=(sum(FIGURE_WIDTHS), 6.5), layout="constrained")
+    image, above = figure.subplots(1, 2, width_ratios=FIGURE_WIDTHS)
     marks = draw_matches(image, solution, photo=photo)
     if marks is not None:
         figure.colorbar(marks, ax=image, location="bottom", shrink=0.5, aspect=40, label=f"residual, {solution.unit}")
@@ -65,7 +69,7 @@ def draw_matches(axes: "Axes", solution: Solution, *, photo: Array | None = None
     residuals = np.linalg.norm(seen[image] - reprojected, axis=-1)
     if photo is not None:
         width, height = size_in_camera(photo, camera)
-        faded = (255 - DRAWING.contrast * (255 - photo.astype(float))).astype(np.uint8)
+        faded = (255 - PHOTO_CONTRAST * (255 - photo.astype(float))).astype(np.uint8)
         axes.imshow(faded, extent=(0, width, height, 0), zorder=0)
         axes.set(xlim=(0, width), ylim=(height, 0))
     else:
@@ -107,7 +111,7 @@ def draw_from_above(axes: "Axes", scene: "SceneMap", solution: Solution) -> None
     """
     found = solution.verdict != "failed"
     plane = plane_from_above(scene.views, solution.rotation[2] if found else scene.views[0].rotation[2])
-    step = -(-len(scene.points3d) // DRAWING.most_points)
+    step = -(-len(scene.points3d) // MOST_DRAWN_POINTS)
     points, centres = scene.points3d[::step] @ plane.T, np.array([view.centre for view in scene.views]) @ plane.T
     axes.plot(*points.T, ".", color=QUIET, ms=1, alpha=0.35, zorder=1)
     viewing_axes = np.array([view.rotation[2] for view in scene.views]) @ plane.T
@@ -115,8 +119,8 @@ def draw_from_above(axes: "Axes", scene: "SceneMap", solution: Solution) -> None
     if solution.verdict == "ambiguous" and len(solution.candidates) > 1:
         drawn.append(("or here", solution.candidates[1].centre, solution.candidates[1].rotation))
     stars = np.array([centre for _, centre, _ in drawn]).reshape(-1, 3) @ plane.T
-    low, high = np.percentile(points, [(100 - DRAWING.shown) / 2, (100 + DRAWING.shown) / 2], axis=0)
-    farthest = DRAWING.farthest * (high - low)
+    low, high = np.percentile(points, [(100 - SHOWN_PERCENT) / 2, (100 + SHOWN_PERCENT) / 2], axis=0)
+    farthest = FARTHEST_CAMERA * (high - low)
     placed = np.clip(np.concatenate([centres, stars]), low - farthest, high + farthest)
     low, high = np.minimum(low, placed.min(0)), np.maximum(high, placed.max(0))
     drawing_centre, reach = (low + high) / 2, 0.5 * 1.15 * float((high - low).max())

@@ -22,11 +22,10 @@ from bpnp.datamodules.colmap.model_files import FILES, model_format
 from bpnp.files import delay_interrupts, fingerprint, write_text
 from bpnp.maps.localized_picture import localized_picture
 from bpnp.maps.photos import photo_keypoints
-from bpnp.maps.scene_map import UNKNOWN, SceneMap
+from bpnp.maps.scene_map import PHOTO_TIME_LIMIT, UNKNOWN, SceneMap
 from bpnp.report.figure_files import save_figure
 from bpnp.report.images import read_photo
 from bpnp.search.arguments import seconds_from
-from bpnp.search.config import TIME
 from bpnp.search.solution import Solution
 from bpnp.search.verdict.decide import Verdict
 
@@ -89,7 +88,7 @@ def photo_task(
         keypoints = keypoints.absolute()
         points = photo_keypoints(photo, keypoints, name)
         points_content = fingerprint([points.pixels.tolist(), points.scores.tolist()])
-    limit = seconds_from(search.get("time_limit"), TIME.photo)
+    limit = seconds_from(search.get("time_limit"), PHOTO_TIME_LIMIT)
     shared = {"views": shown, **search}
     made_with = {
         "photo": photo_content,

@@ -11,8 +11,10 @@ from distributed.comm import connect
 
 from bpnp.maps.many_photos import Attempt, PhotoTask, attempt
 from bpnp.maps.scene_map import SceneMap
-from bpnp.search.config import MAPS, TIME
 from bpnp.search.solution import Solution
+
+QUEUED_PHOTOS = 4  # photos per worker thread on a cluster: no thread waits, and the scheduler holds few [photos; cost]
+SCHEDULER_SECONDS = 10  # time until a Dask scheduler must answer [seconds; convention]
 
 
 class MapOfWorker(WorkerPlugin):
@@ -42,7 +44,7 @@ def attempts_on_cluster(scene: SceneMap, tasks: Iterable[PhotoTask], cluster: st
 
         try:
             waiting = submit()
-            done = as_completed(islice(waiting, MAPS.queued * max(sum(client.nthreads().values()), 1)))
+            done = as_completed(islice(waiting, QUEUED_PHOTOS * max(sum(client.nthreads().values()), 1)))
             for future in done:
                 task = running.pop(future.key)
                 yield task, str(future.exception()) if future.status == "error" else future.result()
@@ -70,13 +72,13 @@ def connect_client(cluster: str) -> Iterator[Client]:
         raise ValueError(
             f"--cluster is {cluster}, not a number of processes, and no Dask scheduler answers there: {error}"
         ) from error
-    with Client(cluster, timeout=TIME.scheduler) as client:
+    with Client(cluster, timeout=SCHEDULER_SECONDS) as client:
         yield client
 
 
 async def _answers(address: str) -> None:
     """Raise OSError or ValueError if no scheduler answers."""
-    comm = await connect(address, timeout=TIME.scheduler)
+    comm = await connect(address, timeout=SCHEDULER_SECONDS)
     await comm.close()
 
 

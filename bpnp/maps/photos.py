@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from bpnp.bounded_files import MOST_TEXT, check_size, open_input
 from bpnp.cameras import CENTRE, outside_image, same_aspect_ratio
 from bpnp.report.images import open_photo
-from bpnp.search.config import MAPS
 
 Array = NDArray[np.float64]
 Size = tuple[int, int]  # width and height, pixels
@@ -34,6 +33,10 @@ MILLIMETRES = {2: 25.4, 3: 10.0}  # per unit of the resolution, by EXIF number: 
 SQLITE = b"SQLite format 3\0"
 # x, y; and scale, orientation; or and a 2x2 matrix of the local shape. https://colmap.github.io/database.html
 COLUMNS = (2, 4, 6)  # [numbers; convention]
+MOST_DETECTED = 8192  # largest number of SIFT keypoints of a photo, COLMAP's [keypoints; convention]
+# Contrast threshold of the keypoints, of three layers together: COLMAP's peak_threshold of 0.02 / 3, half of OpenCV's
+# default.
+CONTRAST_THRESHOLD = 0.02  # [intensity, 0 to 1; convention]
 QUERY = """SELECT rows, cols, data, width, height FROM images
     LEFT JOIN keypoints USING (image_id) LEFT JOIN cameras USING (camera_id) WHERE name = ?"""
 
@@ -146,7 +149,7 @@ def photo_keypoints(photo: Path, file: str | Path | None, name: str) -> Keypoint
     return (read_database if head == SQLITE else read_features)(path, name, size)
 
 
-def detected_keypoints(photo: Path, *, most: int = MAPS.most_detected) -> Keypoints:
+def detected_keypoints(photo: Path, *, most: int = MOST_DETECTED) -> Keypoints:
     """Detect SIFT keypoints (Lowe 2004, with OpenCV), one per position; the score is the scale in pixels.
 
     The contrast threshold is COLMAP's. Like COLMAP, the `most` largest keypoints are kept. Large keypoints are more
@@ -163,7 +166,7 @@ def detected_keypoints(photo: Path, *, most: int = MAPS.most_detected) -> Keypoi
         raise ValueError(unreadable) from error
     if image is None:
         raise ValueError(unreadable)
-    points = cv2.SIFT.create(contrastThreshold=MAPS.contrast, enable_precise_upscale=True).detect(image)
+    points = cv2.SIFT.create(contrastThreshold=CONTRAST_THRESHOLD, enable_precise_upscale=True).detect(image)
     rows = np.array([(*point.pt, point.size) for point in points], np.float64).reshape(-1, 3)
     rows = rows[np.argsort(-rows[:, 2], kind="stable")[:most]]
     pixels, first = np.unique(rows[:, :2], axis=0, return_index=True)

@@ -32,10 +32,15 @@ from bpnp.search.arguments import (
     seconds_from,
     source_from,
 )
-from bpnp.search.config import MAPS, TIME
 from bpnp.search.focal_length import UnknownCamera, unknown_camera
 from bpnp.search.solution import Solution
-from bpnp.search.solvers import Options
+from bpnp.search.solvers import TIME_LIMIT, Options
+
+# Smallest number of points of a map that gets an index; smaller maps open in two seconds without one.
+INDEXED_POINTS = 200_000  # [points; cost]
+SAME_FOCAL = 1.05  # largest ratio of the focal lengths of views whose camera a photo can get [ratio; not tuned]
+# Default time limit of a photo; the photos of cities are measured with it (docs/maps.md).
+PHOTO_TIME_LIMIT = 60.0  # [seconds; convention]
 
 if TYPE_CHECKING:
     import torch
@@ -86,7 +91,7 @@ class SceneMap(ViewedPoints):
             return cls._from_index(stored)
         stamp = index.model_stamp(folder)
         scene = cls._read_colmap(folder)
-        if len(scene.points3d) < MAPS.indexed:
+        if len(scene.points3d) < INDEXED_POINTS:
             return scene
         parts = scene.points3d, scene.point_ids, scene.track_lengths, scene.views
         return cls._from_index(
@@ -182,7 +187,7 @@ class SceneMap(ViewedPoints):
         Raises:
             ValueError: A view is unknown, or `bpnp.solve` rejects the input.
         """
-        limit = seconds_from(time_limit, TIME.photo)
+        limit = seconds_from(time_limit, PHOTO_TIME_LIMIT)
         pixels = pixels_from(keypoints, camera, image_size)
         lens = self._lens(camera, image_size, focal_error, distortion)
         if image_size is not None:
@@ -230,7 +235,7 @@ class SceneMap(ViewedPoints):
             ValueError: The name is not in the map, there are fewer than 4 keypoints, or the view can see fewer than 4
                 of the remaining points.
         """
-        limit = seconds_from(time_limit, TIME.one)
+        limit = seconds_from(time_limit, TIME_LIMIT)
         view, rest = self.named([name])[0], self.without([name])
         pixels = np.asarray(pixels_from(keypoints, view.camera), np.float64)
         regions = partial(rest.ranked_regions, view.camera)
@@ -351,7 +356,7 @@ class SceneMap(ViewedPoints):
             if camera_size == size or (not exif and camera_size is not None and same_aspect_ratio(camera_size, size))
         ]
         fitting.sort(key=lambda item: item[0].focal)
-        if fitting and fitting[-1][0].focal <= MAPS.same_focal * fitting[0][0].focal:
+        if fitting and fitting[-1][0].focal <= SAME_FOCAL * fitting[0][0].focal:
             return fitting[len(fitting) // 2]
         if exif:
             return None, "unknown focal length"

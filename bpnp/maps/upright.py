@@ -11,7 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.maps.views import Array, View
-from bpnp.search.config import MAPS
+
+UPRIGHT_DEG = 30.0  # largest angle between the upward directions of upright views [degrees; not tuned]
+LEAST_UPRIGHT = 0.5  # smallest fraction of the views that agree on the direction up [fraction; not tuned]
+# Least length of the direction up in the image plane: a steeper view has no upright side.
+LEAST_IN_PLANE = 0.5  # [1; not tuned]
 
 
 def up_of_views(views: Sequence[View]) -> Array | None:
@@ -21,9 +25,9 @@ def up_of_views(views: Sequence[View]) -> Array | None:
     """
     ups = -np.array([view.rotation[1] for view in views])
     cosines = ups @ ups[:: -(-len(ups) // 200)].T  # compared with at most 200 views
-    agree = cosines > np.cos(np.radians(MAPS.upright_deg))
+    agree = cosines > np.cos(np.radians(UPRIGHT_DEG))
     best = agree[:, int(agree.sum(0).argmax())]
-    if best.mean() < MAPS.least_upright:
+    if best.mean() < LEAST_UPRIGHT:
         return None
     mean = ups[best].mean(0)
     return np.asarray(mean / np.linalg.norm(mean))
@@ -36,12 +40,12 @@ def count_quarter_turns(views: Sequence[View], up_camera: Array) -> NDArray[np.i
     frame. It is 0 for views that point steeply up or down, and for all views if the direction up in the map is unknown.
     """
     up = up_of_views(views)
-    if up is None or np.hypot(*up_camera[:2]) < MAPS.in_plane * np.linalg.norm(up_camera):
+    if up is None or np.hypot(*up_camera[:2]) < LEAST_IN_PLANE * np.linalg.norm(up_camera):
         return np.zeros(len(views), np.int64)
     ups = np.array([view.rotation @ up for view in views])
     angles = np.arctan2(up_camera[1], up_camera[0]) - np.arctan2(ups[:, 1], ups[:, 0])
     quarters = np.round(angles / (np.pi / 2)).astype(np.int64) % 4
-    return np.where(np.hypot(ups[:, 0], ups[:, 1]) < MAPS.in_plane, 0, quarters)
+    return np.where(np.hypot(ups[:, 0], ups[:, 1]) < LEAST_IN_PLANE, 0, quarters)
 
 
 def rotate_view(view: View, quarters: int) -> View:

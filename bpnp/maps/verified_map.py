@@ -18,8 +18,11 @@ from bpnp.maps.localized_picture import plane_from_above
 from bpnp.maps.scene_map import SceneMap
 from bpnp.report.templates import render_page
 from bpnp.report.terminal import VERDICTS, number
-from bpnp.search.config import DRAWING, TIME
+from bpnp.search.solvers import TIME_LIMIT
 from bpnp.search.verdict.decide import fits_by_chance
+
+MOST_PAGE_POINTS = 3000  # largest number of map points on a page [points; cost]
+DRAWING_SIDE = 1000.0  # side of the drawing on a page [pixels; convention]
 
 UNTESTED = "untested"
 MATCHED_ONLY = "Significant on the matched keypoints alone, log10 NFA {0:.1f}, but not on all {2} keypoints, {1:.1f}"
@@ -53,7 +56,7 @@ def verify_map(
     scene: SceneMap,
     *,
     seed: int = 0,
-    time_limit: float = TIME.one,
+    time_limit: float = TIME_LIMIT,
     done: Callable[[str], None] = lambda words: None,
 ) -> list[VerifiedView]:
     """Verify the pose of each image of a COLMAP model without the image's own observations.
@@ -144,7 +147,7 @@ def page_html(verified: Sequence[VerifiedView], scene: SceneMap, folder: Path) -
         summary=summary(verified),
         rows=[(one, *cells(one)) for one in verified],
         drawing=_drawing(verified, scene),
-        side=DRAWING.side,
+        side=DRAWING_SIDE,
     )
 
 
@@ -161,14 +164,14 @@ def _drawing(verified: Sequence[VerifiedView], scene: SceneMap) -> dict[str, Any
     plane = plane_from_above(scene.views, scene.views[0].rotation[2]) * np.array([[1.0], [-1.0]])  # y is down
     views = scene.named([one.name for one in verified])
     centres = np.array([view.centre for view in views]) @ plane.T
-    points = scene.points3d[:: -(-len(scene.points3d) // DRAWING.most_points_of_page)] @ plane.T
+    points = scene.points3d[:: -(-len(scene.points3d) // MOST_PAGE_POINTS)] @ plane.T
     low, high = np.percentile(np.concatenate([points, centres]), [1, 99], axis=0)
     low, high = np.minimum(low, centres.min(0)), np.maximum(high, centres.max(0))
-    scale = 0.92 * DRAWING.side / max(float((high - low).max()), 1e-9)
-    size = (high - low) * scale + 0.08 * DRAWING.side
+    scale = 0.92 * DRAWING_SIDE / max(float((high - low).max()), 1e-9)
+    size = (high - low) * scale + 0.08 * DRAWING_SIDE
 
     def to_drawing(values: Any) -> Any:
-        return np.round((np.asarray(values) - low) * scale + 0.04 * DRAWING.side, 1).tolist()
+        return np.round((np.asarray(values) - low) * scale + 0.04 * DRAWING_SIDE, 1).tolist()
 
     inside = ((points >= low) & (points <= high)).all(-1)
     directions = np.array([view.rotation[2] for view in views]) @ plane.T

@@ -22,10 +22,18 @@ from bpnp.maps.views import (
     viewing_cones,
 )
 from bpnp.poses import MIN_POINTS
-from bpnp.search.config import FOCAL, MAPS
+from bpnp.search.config import FOCAL
 from bpnp.search.focal_length import UnknownCamera
 from bpnp.search.problem import faces
 from bpnp.search.starts import PosePrior
+
+VIEWS_AHEAD = 4  # number of views that are tried with one focal length before the next one starts [views; not tuned]
+# Standard deviation of the rotation of a photo from that of a view, about the largest angle per axis between photos
+# that share a third of their points.
+VIEW_SIGMA_DEG = 15.0  # [degrees; not tuned]
+# Standard deviation of its translation, about the largest shift of the viewed points, as a fraction of their distance.
+VIEW_SIGMA_SHIFT = 0.2  # [fraction; not tuned]
+LEAST_TRACK = 2  # least number of views of a point after a view is removed [views; convention]
 
 Map = TypeVar("Map", bound="ViewedPoints")
 RankViews = Callable[[Array, Sequence[View]], ArrayLike]  # normalised keypoints (m, 2), views -> scores (views,)
@@ -51,7 +59,7 @@ class Region:
 
     def prior(self) -> PosePrior:
         """Return a prior at the view's pose, as wide as the poses of photos of one place differ."""
-        return PosePrior(self.view.rotation, self.view.translation, MAPS.view_deg, MAPS.view_shift * self.distance)
+        return PosePrior(self.view.rotation, self.view.translation, VIEW_SIGMA_DEG, VIEW_SIGMA_SHIFT * self.distance)
 
     def part(self, points: NDArray[np.integer]) -> "Region":
         """Return the region with only the points of these indices (j,)."""
@@ -128,7 +136,7 @@ class ViewedPoints:
         """
         left_out = {view.name for view in self.named(names)}
         views = tuple(view for view in self.views if view.name not in left_out)
-        return replace(self, views=views).seen_by(MAPS.least_track)
+        return replace(self, views=views).seen_by(LEAST_TRACK)
 
     def seen_by(self: Map, least: int) -> Map:
         """Return the map with only the points that enough views see.
@@ -160,7 +168,7 @@ class ViewedPoints:
 
         With `views` these are the given views in their order. Each gets the points that any of them sees, since they
         show one place. Otherwise they are all views of the map by rank (`bpnp.maps.views`), each with its own points.
-        With an unknown focal length several are tried, the likeliest first: each begins `MAPS.views_ahead` views after
+        With an unknown focal length several are tried, the likeliest first: each begins `VIEWS_AHEAD` views after
         the one before.
         Views with too few points to fix a pose are skipped.
 
@@ -182,7 +190,7 @@ class ViewedPoints:
         cameras: list[Camera] = camera.focal_steps(FOCAL.step_few) if isinstance(camera, UnknownCamera) else [camera]
         scores = self.scores(cameras[0], keypoints, known_focal=isinstance(camera, Camera), rank_views=rank_views)
         order = list(places_first(self.views, scores, len(self.points3d)))
-        ahead = MAPS.views_ahead
+        ahead = VIEWS_AHEAD
         queue = [(rank + ahead * step, step, k) for step in range(len(cameras)) for rank, k in enumerate(order)]
         tried = [camera.near(one) if isinstance(camera, UnknownCamera) else camera for one in cameras]
         return [

@@ -11,7 +11,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bpnp.geometry import transform
-from bpnp.search.config import RANSAC
+
+# Number of residuals scored at a time: 1 MiB in float32, which stays in the cache of a core.
+RESIDUALS_AT_ONCE = 2**18  # [residuals; cost]
 
 
 def distinct_triples(pool: Float[Tensor, "b d"], seed: int, *, skip: int = 0) -> Int[Tensor, "b d 3"]:
@@ -144,7 +146,7 @@ def truncated_scores(
     # x' - x = (row_0 - x row_2) [p; 1] / depth: one product for the numerator, and the depth is only squared.
     along_x, along_y = torch.cat([scene, -x * scene], 1), torch.cat([scene, -y * scene], 1)
     scores = []
-    for part in poses.float().split(max(1, RANSAC.chunk // max(1, x.shape[0] * x.shape[2])), dim=1):
+    for part in poses.float().split(max(1, RESIDUALS_AT_ONCE // max(1, x.shape[0] * x.shape[2])), dim=1):
         row0, row1, row2 = part.unbind(2)
         squared = (torch.cat([row0, row2], -1) @ along_x).square_()
         squared += (torch.cat([row1, row2], -1) @ along_y).square_()

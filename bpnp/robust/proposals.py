@@ -14,7 +14,13 @@ from bpnp.poses import distinct
 from bpnp.precision import full_precision
 from bpnp.robust.matches import Matches, in_scene, normalise_matches, truncated_scores, weighted_draws
 from bpnp.robust.minimal_solvers import poses_of_triples, take
-from bpnp.search.config import RANSAC
+
+SOLVED_TRIPLES = 1024  # number of triples of an assignment that are solved, for each sample of a batch [triples; cost]
+DRAWN_EACH = 4  # number of triples drawn for each that is solved; the widest triangles are solved [triples; not tuned]
+SCORED_MATCHES = 512  # number of matches drawn to score the proposals [matches; cost]
+APART_DEG = 15.0  # smallest angle between two proposals [degrees; not tuned]
+# Residual that counts half, in root mean square distances of the image points from their mean.
+HALF_RESIDUAL = 0.2  # [fraction; not tuned]
 
 
 @full_precision
@@ -32,7 +38,7 @@ def pose_hypotheses(
 
     Triples with the largest products of their triangles' areas on both sides are solved (`p3p`): a small triangle
     magnifies the errors of its matches. A pose scores sum_k min(r_k^2, t^2) over other matches k drawn from P. r_k is
-    the reprojection error, infinite behind the camera, and t = `RANSAC.threshold`. This estimates the expectation
+    the reprojection error, infinite behind the camera, and t = `HALF_RESIDUAL`. This estimates the expectation
     under P.
 
     The draws are the same for each sample: a result depends neither on the other samples nor on padding.
@@ -54,24 +60,24 @@ def pose_hypotheses(
     mass = probability.sum(-1, dtype=torch.float64)
     usable = mass.isfinite() & (mass > 0) & (torch.minimum(mask2d.sum(-1), mask3d.sum(-1)) >= 3)
 
-    draws = RANSAC.scored + 3 * RANSAC.drawn_each * RANSAC.triples
+    draws = SCORED_MATCHES + 3 * DRAWN_EACH * SOLVED_TRIPLES
     drawn = weighted_draws(torch.where(usable.unsqueeze(-1), probability, 1), draws, 0)
     chosen = Matches(take(points2d, drawn // n), take(points3d, drawn % n), usable.unsqueeze(-1).expand_as(drawn))
     matches, centre, scale = normalise_matches(chosen)
-    poses = _poses_of_widest(*(points[:, RANSAC.scored :].unflatten(1, (-1, 3)) for points in matches[:2]))
-    sample = Matches(*(values[:, : RANSAC.scored] for values in matches))
+    poses = _poses_of_widest(*(points[:, SCORED_MATCHES:].unflatten(1, (-1, 3)) for points in matches[:2]))
+    sample = Matches(*(values[:, :SCORED_MATCHES] for values in matches))
     size = mask2d.sum(-1, keepdim=True).clamp(min=1)
     mean = torch.where(mask2d.unsqueeze(-1), points2d, 0).sum(1) / size
     spread = torch.where(mask2d, (points2d - mean.unsqueeze(1)).square().sum(-1), 0).sum(-1) / size.squeeze(-1)
-    threshold2 = RANSAC.threshold**2 * spread
+    threshold2 = HALF_RESIDUAL**2 * spread
     score = truncated_scores(poses, sample, threshold2.float()[:, None, None])
 
     best = poses.new_full((len(poses), count, 3, 4), torch.nan)
     for i in usable.nonzero().flatten().tolist():
         r, t, value = (
-            x.float().cpu().numpy() for x in (poses[i, ..., :3], poses[i, ..., 3], -score[i] / RANSAC.scored)
+            x.float().cpu().numpy() for x in (poses[i, ..., :3], poses[i, ..., 3], -score[i] / SCORED_MATCHES)
         )
-        index = torch.as_tensor(distinct(r, t, value, count, RANSAC.apart_deg, math.inf), device=poses.device)
+        index = torch.as_tensor(distinct(r, t, value, count, APART_DEG, math.inf), device=poses.device)
         best[i, : len(index)] = poses[i, index]
     rotation, translation = in_scene(best, centre, scale)
     return rotation.to(points3d), translation.to(points3d)
@@ -125,7 +131,7 @@ def _poses_of_widest(
         seen = torch.cat([along, across], -1)[..., [0, 1, 3, 4]]
         alike = torch.cosine_similarity(torch.cat([x, y], -1), seen, dim=-1)
         alike = alike.masked_fill(wide < wide.median(-1, keepdim=True).values, -1)
-        chosen = alike.topk(image.shape[1] // (2 * RANSAC.drawn_each)).indices
+        chosen = alike.topk(image.shape[1] // (2 * DRAWN_EACH)).indices
     else:
-        chosen = wide.topk(image.shape[1] // RANSAC.drawn_each).indices
+        chosen = wide.topk(image.shape[1] // DRAWN_EACH).indices
     return poses_of_triples(bearings(take(image, chosen)), take(scene, chosen))

@@ -20,7 +20,19 @@ from bpnp.poses import MIN_POINTS
 from bpnp.robust.matches import Matches, distinct_triples, residuals, truncated_scores
 from bpnp.robust.minimal_solvers import poses_of_triples, take
 from bpnp.runtime import in_threads
-from bpnp.search.config import RANSAC
+
+# Number of matches of largest weight from which the first triples of a growing pool are drawn.
+SMALLEST_POOL = 16  # [matches; not tuned]
+# Number of matches of largest weight on which all hypotheses are scored. With 256, poses are lost at 10 % inliers.
+SUBSET = 512  # [matches; measured, the problems are not recorded]
+SHORTLIST = 256  # number of hypotheses that are then scored on all matches [hypotheses; cost]
+REFINED = 16  # number of hypotheses that are refined locally on the subset [hypotheses; cost]
+LOCAL_STEPS = 4  # Gauss-Newton steps of these [steps; not tuned]
+FINAL_STEPS = 6  # Gauss-Newton steps of the best one on all matches [steps; not tuned]
+DAMPING = 1e-9  # damping, a fraction of the Hessian's mean diagonal [fraction; numerics]
+# It ends after 3 times the number that has a true triple with probability 0.9999.
+FEWEST_HYPOTHESES = 25  # least number of hypotheses of PoseLib [hypotheses; not tuned]
+LEAST_KEPT = 0.9  # fraction of its inliers that OpenCV's refit must keep [fraction; not tuned]
 
 Array = NDArray[np.float64]
 # points2d (k, 2), points3d (k, 3), threshold, most hypotheses, seed -> pose [R | t] and hypotheses, None for no pose
@@ -48,10 +60,10 @@ def consensus(
         Poses, and the number of hypotheses. The pose of a sample without one is arbitrary or NaN.
     """
     threshold2 = threshold**2
-    subset = Matches(*(values[:, : RANSAC.subset] for values in matches))
+    subset = Matches(*(values[:, :SUBSET] for values in matches))
     progress = (torch.arange(hypotheses, device=matches.real.device, dtype=torch.float64) + 0.5) / hypotheses
     last = matches.real.sum(-1, keepdim=True).clamp(min=3).double()
-    first = last.clamp(max=RANSAC.smallest_pool)
+    first = last.clamp(max=SMALLEST_POOL)
     triples = distinct_triples((first * (last / first) ** progress).ceil(), seed)
     # With fewer than three matches, a triple repeats one and has no pose.
     triples = triples.clamp(max=matches.real.shape[1] - 1).flatten(1)
@@ -59,11 +71,11 @@ def consensus(
         take(v, triples).unflatten(1, (hypotheses, 3)) for v in (bearings(matches.points2d), matches.points3d)
     )
     poses = poses_of_triples(rays, scene)
-    poses = _best(poses, truncated_scores(poses, subset, threshold2), RANSAC.shortlist)
-    poses = _best(poses, truncated_scores(poses, matches, threshold2), RANSAC.refined)
-    poses = refine_locally(poses, subset, threshold2, RANSAC.local_steps)
+    poses = _best(poses, truncated_scores(poses, subset, threshold2), SHORTLIST)
+    poses = _best(poses, truncated_scores(poses, matches, threshold2), REFINED)
+    poses = refine_locally(poses, subset, threshold2, LOCAL_STEPS)
     pose = _best(poses, truncated_scores(poses, matches, threshold2), 1)
-    pose = refine_locally(pose, matches, threshold2, RANSAC.final_steps)
+    pose = refine_locally(pose, matches, threshold2, FINAL_STEPS)
     return pose.squeeze(1), matches.real.sum(-1).fill_(hypotheses)
 
 
@@ -90,7 +102,7 @@ def refine_locally(
     """
     best = poses
     lowest = torch.full(poses.shape[:2], torch.inf, dtype=poses.dtype, device=poses.device)
-    damping = RANSAC.damping * torch.eye(6, dtype=poses.dtype, device=poses.device)
+    damping = DAMPING * torch.eye(6, dtype=poses.dtype, device=poses.device)
     for _ in range(steps + 1):
         squared, inlier, residual, camera = residuals(poses, matches, threshold2)
         score = torch.where(inlier, squared, threshold2).mul(matches.real.unsqueeze(1)).sum(-1)
@@ -149,7 +161,7 @@ def _poselib(x: Array, p: Array, threshold: float, max_iterations: int, seed: in
     options = {
         "max_reproj_error": threshold,
         "max_iterations": max_iterations,
-        "min_iterations": min(RANSAC.fewest, max_iterations),
+        "min_iterations": min(FEWEST_HYPOTHESES, max_iterations),
         "progressive_sampling": True,
         "seed": seed,
     }
@@ -171,7 +183,7 @@ def _opencv(x: Array, p: Array, threshold: float, max_iterations: int, seed: int
         # EPnP has no unique solution for points of one plane: its result may be far from the RANSAC pose.
         x, p = x[inliers.ravel()], p[inliers.ravel()]
         kept = _count_inliers(pose, x, p, threshold)
-        if kept < RANSAC.kept * len(x):
+        if kept < LEAST_KEPT * len(x):
             ok, rotvec, translation = cv2.solvePnP(p, x, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP)
             other = np.column_stack([cv2.Rodrigues(rotvec)[0], translation])
             pose = other if ok and _count_inliers(other, x, p, threshold) > kept else pose

@@ -27,14 +27,15 @@ from bpnp.search.arguments import (
     seconds_from,
     source_from,
 )
-from bpnp.search.config import TIME
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.focal_length import solve_with_focal_length, unknown_camera
 from bpnp.search.inputs import problem_from
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.rig.arguments import RigOptions, prepare
 from bpnp.search.solution import Solution
-from bpnp.search.solvers import Options, Progress, solve_problems
+from bpnp.search.solvers import TIME_LIMIT, Options, Progress, solve_problems
+
+TIME_LIMIT_OF_MANY = 5.0  # default time limit of each problem of `solve_many` [seconds; convention]
 
 if TYPE_CHECKING:
     import torch
@@ -154,7 +155,7 @@ def solve(
     """
     options = dict(locals())
     options |= {name: [options[name]] for name in PER_PROBLEM}
-    options["time_limit"] = seconds_from(time_limit, TIME.one)
+    options["time_limit"] = seconds_from(time_limit, TIME_LIMIT)
     return solve_many(**options)[0]
 
 
@@ -231,7 +232,7 @@ def solve_many(
     begun = Clock.now()
     images = each_set("points2d", points2d, None)
     count = len(images)
-    seconds = seconds_from(time_limit, TIME.of_many)
+    seconds = seconds_from(time_limit, TIME_LIMIT_OF_MANY)
     options = Options(
         solver=None if rig is not None else source_from(solver),
         asks=solver == "auto",

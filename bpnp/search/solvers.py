@@ -13,7 +13,7 @@ import numpy as np
 from bpnp.runtime import Clock, Deadline
 from bpnp.search.arguments import Array
 from bpnp.search.assemble import OneCamera, Solved, assembled
-from bpnp.search.config import DEFAULT, TIME, SearchSettings
+from bpnp.search.config import DEFAULT, SearchSettings
 from bpnp.search.enumeration.search import exceeds_enumeration
 from bpnp.search.plan import Proposals
 from bpnp.search.problem import Problem
@@ -29,6 +29,12 @@ MATCHER_ENTRIES = 2**22  # largest assignment matrix of a packaged matcher; larg
 # left.
 MATCHER_SECONDS = 2e-7  # [seconds; cost]
 LOADING_SECONDS = 2.0  # time to import torch and to load the weights [seconds; cost]
+TIME_LIMIT = 10.0  # default time limit of `solve`, and of `verify` [seconds; convention]
+# Time of the verdict and of the matching after a search; at most half of a limit is kept for it.
+ENDING_SECONDS = 4e-3  # [seconds; cost]
+ENDING_SECONDS_A_POINT = 1.2e-5  # time that each 2D or 3D point adds to it [seconds per point; cost]
+# Time by which verdict and matching may exceed a limit, before what is left of them is cut off.
+GRACE_SECONDS = 0.3  # [seconds; convention]
 
 if TYPE_CHECKING:
     import torch
@@ -85,16 +91,16 @@ class Options(NamedTuple):
         return self.limit().before(ending_seconds(problem))
 
     def limit(self) -> Deadline:
-        """Return the deadline of what starts now, without time for its ending, which may last `TIME.grace` longer."""
+        """Return the deadline of what starts now, without time for its ending, at most `GRACE_SECONDS` longer."""
         until, at = self.until, min(Deadline.after(self.time_limit).at, self.until.at)
         unfinished = set[str]() if math.isinf(until.final) else until.unfinished
-        return Deadline(at, until.end if until.end is not None else at + TIME.grace, unfinished)
+        return Deadline(at, until.end if until.end is not None else at + GRACE_SECONDS, unfinished)
 
 
 def ending_seconds(*problems: Problem) -> float:
     """Return the expected time of the verdict and the matching after a search."""
     points = sum(len(problem.bearings) + len(problem.points3d) for problem in problems)
-    return TIME.ending + TIME.ending_a_point * points
+    return ENDING_SECONDS + ENDING_SECONDS_A_POINT * points
 
 
 def solve_problems(problems: Mapping[int, Problem], options: Options) -> dict[int, Solved]:

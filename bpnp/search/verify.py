@@ -13,14 +13,13 @@ from bpnp.cameras import CameraLike, camera_from
 from bpnp.runtime import NEVER, Deadline, default_float_errors
 from bpnp.search.arguments import Array, Labels, checked_pose, checked_seed, numbers, positive, seconds_from
 from bpnp.search.assemble import OneCamera, Solved, assembled
-from bpnp.search.config import TIME
 from bpnp.search.given_pose import given_pose
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.inputs import problem_from
 from bpnp.search.measured import Measured
 from bpnp.search.problem import Problem
 from bpnp.search.solution import Solution
-from bpnp.search.solvers import Options, at_deadline, without_pose
+from bpnp.search.solvers import TIME_LIMIT, Options, at_deadline, without_pose
 from bpnp.search.verdict.decide import decide, match_count
 from bpnp.search.verdict.uncertainty import linearised, pose_covariance
 
@@ -94,7 +93,7 @@ def verify(
     >>> bpnp.verify(image, scene, np.eye(3), [0, 1, 6]).verdict
     'failed'
     """
-    limit = seconds_from(time_limit, TIME.one)
+    limit = seconds_from(time_limit, TIME_LIMIT)
     threshold = positive("inlier_threshold", inlier_threshold, finite=True)
     pose = checked_pose("", rotation, translation)
     problem = problem_from(
@@ -132,7 +131,7 @@ def verify_problem(
     refine: bool = True,
     inlier_threshold: float | None = None,
     seed: int = 0,
-    time_limit: float = TIME.one,
+    time_limit: float = TIME_LIMIT,
     until: Deadline = NEVER,
 ) -> Solved:
     """Verify a pose of a problem whose points have been checked; see `verify`.

@@ -22,7 +22,6 @@ from bpnp.maps.localize import BRIEF
 from bpnp.maps.photo_problem import Photo
 from bpnp.maps.views import View
 from bpnp.search.assemble import Solved, with_verdict
-from bpnp.search.config import MAPS
 from bpnp.search.solvers import Options
 from bpnp.search.verdict.decide import Case, decide
 from bpnp.search.verdict.false_alarms import alarms_of
@@ -196,7 +195,7 @@ def test_only_strong_keypoints_are_tried_and_matches_are_among_all_of_them(
     scene, truth = planted
     keypoints, ids = photo_of(truth, 1)
     scores = (ids > 0).astype(float)
-    monkeypatch.setattr("bpnp.maps.localize.MAPS", replace(MAPS, most_keypoints=90))
+    monkeypatch.setattr("bpnp.maps.localize.MOST_KEYPOINTS", 90)
     shuffled = np.random.default_rng(0).permutation(len(ids))
     solution = scene.localize(keypoints[shuffled], PINHOLE, views=["photo 1.jpg"], scores=scores[shuffled])
     assert_right(solution, truth, 1, ids[shuffled])

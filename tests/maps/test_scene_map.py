@@ -4,7 +4,6 @@ import shutil
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ from bpnp import SceneMap
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
 from bpnp.maps import index, scene_map
 from bpnp.maps.many_photos import read_views
-from bpnp.search.config import MAPS
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +51,7 @@ def test_a_large_map_is_indexed_once(tmp_path: Path, monkeypatch: pytest.MonkeyP
     files = sorted(folder.iterdir())
     SceneMap.from_colmap(folder)
     assert not (tmp_path / "cache").exists()
-    monkeypatch.setattr(scene_map, "MAPS", replace(MAPS, indexed=10))
+    monkeypatch.setattr(scene_map, "INDEXED_POINTS", 10)
     first = SceneMap.from_colmap(folder)
     assert sorted(folder.iterdir()) == files
     with monkeypatch.context() as without_model:
@@ -82,7 +80,7 @@ def test_a_large_map_is_indexed_once(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_a_damaged_index_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Any damage of a file in the cache is noticed; the map is read from its model again."""
     monkeypatch.setenv("BPNP_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(scene_map, "MAPS", replace(MAPS, indexed=10))
+    monkeypatch.setattr(scene_map, "INDEXED_POINTS", 10)
     truth = plant_model(tmp_path / "model", images=2, points=30, seen=25)
     SceneMap.from_colmap(tmp_path / "model")
     (file,) = (tmp_path / "cache").rglob("*.npz")
@@ -103,7 +101,7 @@ def test_a_model_that_is_replaced_while_it_is_read_is_read_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("BPNP_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(scene_map, "MAPS", replace(MAPS, indexed=10))
+    monkeypatch.setattr(scene_map, "INDEXED_POINTS", 10)
     folder = tmp_path / "model"
     plant_model(folder, images=4, points=60, seen=25)
 
@@ -197,7 +195,7 @@ def test_a_reconstruction_of_pycolmap_is_a_map_without_an_index(
     monkeypatch.setenv("BPNP_CACHE", str(tmp_path / "cache"))
     plant_model(tmp_path, images=4, points=60, seen=25)
     expected = SceneMap.from_colmap(tmp_path)
-    monkeypatch.setattr(scene_map, "MAPS", replace(MAPS, indexed=10))
+    monkeypatch.setattr(scene_map, "INDEXED_POINTS", 10)
     scene = SceneMap.from_colmap(pycolmap.Reconstruction(str(tmp_path)))
     assert not (tmp_path / "cache").exists()
     np.testing.assert_array_equal(scene.points3d, expected.points3d)
