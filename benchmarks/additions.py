@@ -1,7 +1,6 @@
 """Short trainings with one of our additions to the paper's training each.
 
     python -m benchmarks additions --data DATA    # 2 CPU hours; a run that was stopped goes on
-    python -m benchmarks additions --check        # whether docs/table1.md is what the record says
 
 DATA is a folder with the shapes of `modelnet10` (docs/data.md). The training is configs/paper/modelnet40.yaml from the
 start, with L_c alone, but for the data, `POINTS` points a shape, and a learning rate of 1e-4. Each row has one of
@@ -17,22 +16,21 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from pages import markdown, publish
 from paper_tables import (
     ESTIMATES,
     NEVER,
     Training,
     digest,
     effect,
+    effect_cells,
     effect_head,
-    effect_text,
     figures,
-    fill_pages,
     head,
-    is_published,
     network,
     provenance,
     read_record,
-    row_text,
+    row_cells,
     solve_problems,
     trained_steps,
 )
@@ -44,7 +42,7 @@ from bpnp.report.results import ProblemRow
 
 EPOCH = 50  # steps between checkpoints
 POINTS, BATCH = 256, 16
-FILE, PAGES = ROOT / "benchmarks" / "additions.json", (ROOT / "docs" / "table1.md",)
+FILE = ROOT / "benchmarks" / "additions.json"
 TESTED = ("pnp", "ransac")  # of the paper's inference
 
 FEATURES = tuple(word for word in SETTINGS if word.startswith(f"{SOLVER}.features"))
@@ -56,16 +54,13 @@ FEW_FIRST = ((64, 0.5), (POINTS, 0.5))
 
 @dataclass(frozen=True)
 class Addition:
-    """A training.
-
-    parts: points of each problem and fraction of all points of the training, one after the other.
-    schedule: whether the learning rate rises over 50 steps, and falls by a half cosine in the second half.
-    """
+    """A training."""
 
     arguments: tuple[str, ...] = ()
+    # Points of each problem and fraction of all points of the training, one after the other.
     parts: tuple[tuple[int, float], ...] = ((POINTS, 1.0),)
     batch: int = BATCH
-    schedule: bool = False
+    schedule: bool = False  # the rate rises over 50 steps, and falls by a half cosine in the second half
 
 
 NONE = "none"
@@ -130,19 +125,18 @@ def measure(options: argparse.Namespace, record: dict[str, Any]) -> None:
         write_json(options.output, record)
 
 
-def markdown(record: Mapping[str, Any]) -> dict[str, str]:
-    """By name, the Markdown of the rows, and of their differences from the row without an addition."""
+def tables(record: Mapping[str, Any]) -> dict[str, str]:
+    """Return the tables of the rows, and of their differences from the row without an addition."""
     order = [(name, estimate) for estimate in TESTED for name in ADDITIONS]
     seeds = sorted({int(key.split("|")[0]) for key in record["rows"]})
     result = {}
-    tables = (("rows", head, row_text), ("effects", effect_head, effect_text))
-    for title, first, text in tables:
-        result[title] = first(TABLE.recall) + "".join(
-            text(f"{name}{ESTIMATES[estimate]}" + (f", seed {seed}" if len(seeds) > 1 else ""), record[title][key])
+    for title, first, cells in (("rows", head, row_cells), ("effects", effect_head, effect_cells)):
+        result[title] = markdown(first(TABLE.recall), [
+            cells(f"{name}{ESTIMATES[estimate]}" + (f", seed {seed}" if len(seeds) > 1 else ""), record[title][key])
             for name, estimate in order
             for seed in seeds
             if (key := f"{seed}|{name}|{estimate}") in record[title]
-        )
+        ])  # fmt: skip
     return result
 
 
@@ -154,11 +148,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=400, help="of the row without addition (default: %(default)s)")
     parser.add_argument("--problems", type=int, default=SETS["modelnet10"], help="at most (default: %(default)s)")
     parser.add_argument("--output", type=Path, default=FILE, help="(default: %(default)s)")
-    parser.add_argument("--check", action="store_true", help="compare the page with the record, measure nothing")
     chosen = parser.parse_args()
     record = read_record(chosen.output)
-    if not chosen.check:
-        torch.set_num_threads(1)
-        measure(chosen, record)
-    published = is_published(parser, chosen)
-    fill_pages(PAGES, "additions", markdown(record), check=chosen.check, published=published)
+    torch.set_num_threads(1)
+    measure(chosen, record)
+    publish("additions", chosen.output)

@@ -1,7 +1,6 @@
 """Calibration of the miss probability 2^-k on symmetric objects, without the comparison of poses under their motions.
 
-    python -m benchmarks completeness          # 3 CPU minutes; writes benchmarks/completeness.json and docs/verdict.md
-    python -m benchmarks completeness --check  # compare docs/verdict.md with the record
+    python -m benchmarks completeness    # 3 CPU minutes; writes benchmarks/completeness.json and docs/verdict.md
 
 Every search runs `TURNS` rounds. After each round the best pose has the basin count k. For each k the table lists how
 many best poses reached it, how many of them were wrong at that moment, and the bound 2^-k. Objects have eight or more
@@ -10,7 +9,6 @@ the true pose, and the motions found from the matches of the rotated pose give t
 """
 
 import argparse
-import json
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
@@ -19,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import symmetric
-from paper_tables import fill_pages, is_published
+from pages import markdown, publish
 from record import ROOT, Problem, write
 from scipy.spatial.transform import Rotation
 
@@ -32,7 +30,7 @@ from bpnp.search.propose.repetitions import competing_poses
 from bpnp.search.search_frame import Scene
 from bpnp.search.verdict.decide import Case
 
-FILE, PAGES = ROOT / "benchmarks" / "completeness.json", (ROOT / "docs" / "verdict.md",)
+FILE = ROOT / "benchmarks" / "completeness.json"
 TURNS = 8
 BASIN_COUNTS = (1, 2, 3, 4, 6, 8, 10)
 UNIQUE = 8  # smallest number of points that no symmetry maps onto others
@@ -108,22 +106,24 @@ def measure(seed: int, limit: int, trials: int) -> dict[str, Any]:
     }
 
 
-def table(record: Mapping[str, Any]) -> str:
-    """Return the Markdown of a record: the fraction of wrong poses by basin count, the motions, and the command."""
-    lines = ["| basin count $k$ | poses that reached it | wrong | fraction | $2^{-k}$ |\n", f"|{' --- |' * 5}\n"]
+def tables(record: Mapping[str, Any]) -> dict[str, str]:
+    """Return the table of the fraction of wrong poses by basin count, with the motions and the command below."""
+    head = ("basin count $k$", "poses that reached it", "wrong", "fraction", "$2^{-k}$")
+    rows = []
     for k, found in record["basin_counts"].items():
         fraction = found["wrong"] / max(found["poses"], 1)
-        lines.append(f"| {k} | {found['poses']} | {found['wrong']} | {fraction:.3f} | {0.5 ** int(k):.3f} |\n")
+        rows.append((k, str(found["poses"]), str(found["wrong"]), f"{fraction:.3f}", f"{0.5 ** int(k):.3f}"))
     motions = record["motions"]
     options = " ".join(f"--{name} {value}" for name, value in record["settings"].items())
-    return "".join(
+    text = "".join(
         [
-            *lines,
+            markdown(head, rows),
             f"\n{record['searched']:,} objects were searched. The motions gave the true pose back in ",
             f"{motions['led_back']:,} of {motions['trials']:,} trials.\n",
             f"\n`python -m benchmarks completeness {options}`.\n",
         ]
     )
+    return {"data": text}
 
 
 def main() -> None:
@@ -132,9 +132,6 @@ def main() -> None:
     parser.add_argument("--limit", type=int, default=25, help="objects of a kind to search (default: %(default)s)")
     parser.add_argument("--trials", type=int, default=130, help="of motions for each kind (default: %(default)s)")
     parser.add_argument("--output", type=Path, default=FILE, help="(default: %(default)s)")
-    parser.add_argument("--check", action="store_true", help="compare the page with the record, measure nothing")
     chosen = parser.parse_args()
-    if not chosen.check:
-        write(chosen.output, measure(chosen.seed, chosen.limit, chosen.trials))
-    tables = {"data": table(json.loads(chosen.output.read_text()))}
-    fill_pages(PAGES, "completeness", tables, check=chosen.check, published=is_published(parser, chosen))
+    write(chosen.output, measure(chosen.seed, chosen.limit, chosen.trials))
+    publish("completeness", chosen.output)

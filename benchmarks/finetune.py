@@ -1,7 +1,6 @@
 """Fine-tuning without labels (section 5 of the paper): packaged weights before and after 120 steps on new data.
 
     python -m benchmarks finetune --data DATA    # 10 CPU minutes
-    python -m benchmarks finetune --check        # whether docs/train.md is what the record says
 
 DATA is a folder with the COLMAP models `colmap/<scene>` and the shapes of `modelnet10` (docs/data.md). The loss is the
 reprojection error of the pose that the network finds (configs/paper/finetune_reprojection.yaml). Poses and matches only
@@ -22,19 +21,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from lightning import LightningDataModule
+from pages import is_default, markdown, publish
 from paper_tables import (
     PICTURES,
     check_beginning,
     digest,
     draw_recall,
     figures,
-    fill_pages,
     finish_recall,
     head,
-    is_published,
     network,
     provenance,
-    row_text,
+    row_cells,
     solve_problems,
     trained_steps,
 )
@@ -60,7 +58,7 @@ POINTS = 128
 TEST_SHAPES = 100
 STEPS = 120
 RECALL = (10.0, 1.0)  # degrees, scene units
-FILE, PAGES = ROOT / "benchmarks" / "finetune.json", (ROOT / "docs" / "train.md",)
+FILE = ROOT / "benchmarks" / "finetune.json"
 PICTURE = PICTURES / "finetune.png"
 TUNED, HELD_OUT = "tuned on", "not tuned on"
 Rows = Mapping[str, Sequence[ProblemRow]]  # by "<data>|<part>|<before or after>|<estimate>"
@@ -147,13 +145,13 @@ def measure(options: argparse.Namespace, record: dict[str, Any]) -> dict[str, li
     return found
 
 
-def table(record: dict[str, Any]) -> str:
-    """The rows of all data, before and after."""
-    lines = []
+def tables(record: dict[str, Any]) -> dict[str, str]:
+    """Return the table of the rows of all data, before and after."""
+    rows = []
     for key, found in record["rows"].items():
         name, part, when, estimate = key.split("|")
-        lines.append(row_text(f"{name}, {part}, `{estimate}`, {when}", found))
-    return head(RECALL) + "".join(lines)
+        rows.append(row_cells(f"{name}, {part}, `{estimate}`, {when}", found))
+    return {"data": markdown(head(RECALL), rows)}
 
 
 def recall_picture(rows: Rows) -> "Figure":
@@ -179,15 +177,12 @@ def main() -> None:
     parser.add_argument("--shapes", nargs="*", default=[SHAPES], help="folders of shapes (default: %(default)s)")
     parser.add_argument("--output", type=Path, default=FILE, help="(default: %(default)s)")
     parser.add_argument("--picture", type=Path, default=PICTURE, help="(default: %(default)s)")
-    parser.add_argument("--check", action="store_true", help="compare the page with the record, measure nothing")
     chosen = parser.parse_args()
     record: dict[str, Any] = json.loads(chosen.output.read_text()) if chosen.output.is_file() else {}
     record = {"rows": record.get("rows", {})}
-    published = is_published(parser, chosen)
-    if not chosen.check:
-        torch.set_num_threads(1)
-        rows = measure(chosen, record)
-        own = not is_published(parser, chosen, "picture")
-        if own or (published and rows.keys() == record["rows"].keys()):  # the picture of the page has all data
-            save_figure(recall_picture(rows), chosen.picture)
-    fill_pages(PAGES, "finetune", {"data": table(record)}, check=chosen.check, published=published)
+    torch.set_num_threads(1)
+    rows = measure(chosen, record)
+    is_whole = is_default(parser, chosen) and rows.keys() == record["rows"].keys()
+    if is_whole or not is_default(parser, chosen, "picture"):  # the picture of the page has all data
+        save_figure(recall_picture(rows), chosen.picture)
+    publish("finetune", chosen.output)

@@ -15,10 +15,8 @@ import shutil
 import subprocess
 import sys
 import time
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -27,6 +25,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import torch
 from lightning import LightningDataModule
+from pages import is_default, markdown, publish
 from record import DATA, ROOT, measured_today, write_json
 from torch import nn
 
@@ -52,6 +51,7 @@ ERRORS = {
     "translation": "translation_error",
     "reprojection": "reprojection_error_deg",
 }
+MEASURES = ("rotation, deg", "translation", "reprojection, deg")  # columns of `ERRORS`
 QUARTERS = (0.25, 0.5, 0.75)
 # Of 2,500 steps an epoch: 120 epochs, then 20 to 80 with the pose loss (section 3.5).
 PRINTED_STEPS = {"Lc": "300,000", "Lc Lp": "350,000 to 500,000"}
@@ -97,19 +97,14 @@ class Table:
 
 @dataclass(frozen=True)
 class Method:
-    """A solver of a table.
-
-    limit: how many problems it gets.
-    identity: what its results depend on, besides the problems.
-    settings: options of the command that these results depend on.
-    """
+    """A solver of a table."""
 
     group: str
     label: str
     build: Callable[[], nn.Module]
-    limit: int
-    identity: dict[str, Any]
-    settings: dict[str, Any]
+    limit: int  # number of problems
+    identity: dict[str, Any]  # values that its results depend on, besides the problems
+    settings: dict[str, Any]  # options of the command that these results depend on
 
     @property
     def file(self) -> str:
@@ -137,17 +132,14 @@ class Training:
 
     Its arguments, and the content of the weights that it starts from, are kept in `training.json` of the folder: a
     training that was begun with others is not taken for this one.
-
-    start: checkpoint to go on from where the folder has none of its own.
-    forks: whether branches start from here; a copy of the checkpoint at exactly `steps` is kept for them.
     """
 
     folder: Path
     arguments: tuple[str, ...]
     steps: int
     epoch: int
-    start: Path | None = None
-    forks: bool = False
+    start: Path | None = None  # checkpoint to go on from where the folder has none of its own
+    forks: bool = False  # branches start from here; a copy of the checkpoint at exactly `steps` is kept for them
 
     @property
     def checkpoint(self) -> Path:
@@ -199,7 +191,7 @@ def workers() -> int:
 def check_beginning(folder: Path, arguments: Iterable[str], starts: Iterable[Path], **settings: Any) -> None:
     """Exit if the training in a folder was begun with others; write how this one begins to its `training.json`.
 
-    starts: weights that it starts from, compared by content if all of them still exist.
+    The weights that it starts from are compared by content if all of them still exist.
     """
     content = [digest(path) if path.is_file() else None for path in starts]
     now = {"arguments": list(arguments), "starts": content} | settings
@@ -265,7 +257,7 @@ def solve_problems(
     lines = read_lines(file)
     found = lines[0] if lines else {}
     same = all(found.get(name) == value for name, value in head.items())
-    rows = [ProblemRow(**row) for line in lines[1:] for row in rows_of_line(line)] if same else []
+    rows = [ProblemRow(**row) for line in lines[1:] if isinstance(line, list) for row in line] if same else []
     missing = [i for i in order if i not in {row.index for row in rows}]
     if not order or (missing and not solve):
         return []
@@ -297,23 +289,9 @@ def solve_problems(
 
 
 def read_lines(file: Path) -> list[Any]:
-    """Return the complete lines of a file of `solve_problems`; none if there is no file.
-
-    The last line, or in a file with a line for each estimate the last problem, is left out if it is incomplete.
-    """
+    """Return the complete lines of a file of `solve_problems`; none if there is no file."""
     text = file.read_text() if file.is_file() else ""
-    lines = [json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")]
-    counts = Counter(row["index"] for line in lines for row in rows_of_line(line))
-    if lines and isinstance(lines[-1], dict) and (last := rows_of_line(lines[-1])):
-        index = last[0]["index"]
-        if counts[index] < max(counts.values()):
-            lines = [line for line in lines if index not in {row["index"] for row in rows_of_line(line)}]
-    return lines
-
-
-def rows_of_line(line: Any) -> list[dict[str, Any]]:
-    """Return the rows in a line of a file of `solve_problems`: those of a problem, or a single one in an older file."""
-    return line if isinstance(line, list) else [line] if "index" in line else []
+    return [json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")]
 
 
 def measurements(lines: Iterable[Any]) -> list[dict[str, str]]:
@@ -322,19 +300,17 @@ def measurements(lines: Iterable[Any]) -> list[dict[str, str]]:
 
 
 def provenance(file: Path) -> dict[str, str]:
-    """Return commit, date and processor of the rows that `solve_problems` wrote, each several ones if they were
-    measured in several runs; the date alone for an older file."""
-    if parts := measurements(read_lines(file)):
-        return {key: ", ".join(dict.fromkeys(part[key] for part in parts)) for key in parts[0]}
-    return {"date": f"{datetime.fromtimestamp(file.stat().st_mtime, UTC):%Y-%m-%d}"}
+    """Return commit, date and processor of the rows of `solve_problems`, each several ones if of several runs."""
+    parts = measurements(read_lines(file))
+    return {key: ", ".join(dict.fromkeys(part[key] for part in parts)) for key in parts[0]}
 
 
 def branches(
     folder: Path, arguments: tuple[str, ...], options: argparse.Namespace, after: tuple[str, ...] | None = None
 ) -> dict[str, Training]:
-    """A training with L_c, and two that go on from it at the switch for as many steps: with L_c, and with L_c + L_p.
+    """Return a training with L_c, and two that go on from it for as many steps: with L_c, and with L_c + L_p.
 
-    after: arguments of these two, if others.
+    These two have the arguments `after`, if others.
     """
     steps, epoch, rate = options.steps, options.epoch, options.pose_learning_rate
     later = () if rate is None else (f"--model.learning_rate={rate}",)
@@ -400,13 +376,10 @@ def measure(
     table: Table,
     trained: Mapping[str, Training],
     methods: Callable[[], Iterable[Method]],
-    data: Callable[[str], LightningDataModule],
+    data: Callable[[str], LightningDataModule],  # by the name of a test set
     options: argparse.Namespace,
 ) -> dict[str, Any]:
-    """Train what is missing, test the chosen methods on all sets, and return the record, written after each set.
-
-    data: of the name of a test set.
-    """
+    """Train what is missing, test the chosen methods on all sets, and return the record, written after each set."""
     record = read_record(options.output)
     known = {row["settings"]["test_seed"] for row in record["rows"].values()}
     if known - {options.test_seed}:
@@ -499,15 +472,14 @@ def finish_recall(figure: "Figure") -> "Figure":
     return figure
 
 
-def markdown(table: Table, record: Mapping[str, Any]) -> dict[str, str]:
-    """By name, the Markdown of the tables.
+def tables(table: Table, record: Mapping[str, Any]) -> dict[str, str]:
+    """Return the tables of a record by name.
 
     These are the rows of a set and a group (of several seeds, the lowest), the rows of all seeds, the effects of L_p,
     the trainings, and the commands.
     """
-    result: dict[str, str] = {}
-    lines: dict[str, list[tuple[int, str]]] = {}
-    spreads: dict[str, list[tuple[int, str, int, str]]] = {}
+    groups: dict[str, list[tuple[int, list[str]]]] = {}
+    spreads: dict[str, list[tuple[int, str, int, list[str]]]] = {}
     split = {key: key.split("|") for key in record["rows"]}
     lowest: dict[tuple[str, str], int] = {}
     for name, seed, group, _, _ in split.values():
@@ -518,47 +490,49 @@ def markdown(table: Table, record: Mapping[str, Any]) -> dict[str, str]:
         title = f"{name}-{group}".replace(", ", "-").replace(" ", "-").lower()
         label += ESTIMATES.get(estimate, "")
         if int(seed) == lowest[name, group]:
-            lines.setdefault(title, []).append((place, row_text(label, found)))
+            groups.setdefault(title, []).append((place, row_cells(label, found)))
         if group == "paper":
-            row = (place, label, int(seed), row_text(f"{label}, seed {seed}", found))
+            row = (place, label, int(seed), row_cells(f"{label}, seed {seed}", found))
             spreads.setdefault(f"{name}-spread", []).append(row)
-    printed = list(printed_rows(table.paper))
-    for title, rows in lines.items():
+    result = {"commands": "```\n" + "".join(f"{line}\n" for line in commands(table, record)) + "```\n"}
+    printed = printed_rows(table.paper)
+    for title, rows in groups.items():
         local = printed[3:] if title.endswith("-paper") else printed[:3] if title.endswith("-baselines") else []
-        ours = [text for _, text in sorted(rows, key=lambda row: row[0])]
-        result[title] = "".join([head(table.recall), *ours, *local])
+        ours = [cells for _, cells in sorted(rows, key=lambda row: row[0])]
+        result[title] = markdown(head(table.recall), [*ours, *local])
     for title, several in spreads.items():
         many = len({seed for _, _, seed, _ in several}) > 1
-        texts = [head(table.recall), *(text for *_, text in sorted(several))]
-        result[title] = "".join(texts) if many else "Measured with one seed.\n"
-    for title, texts in effect_lines(record["effects"]).items():
-        result[title] = effect_head(table.recall) + "".join(texts)
-    result["commands"] = "```\n" + "".join(f"{line}\n" for line in commands(table, record)) + "```\n"
-    names = ("training", "steps until the switch", "steps of Lc", "steps of Lc Lp", "learning rate")
+        rows_of_seeds = markdown(head(table.recall), [cells for *_, cells in sorted(several)])
+        result[title] = rows_of_seeds if many else "Measured with one seed.\n"
+    for title, effects in effect_rows(record["effects"]).items():
+        result[title] = markdown(effect_head(table.recall), effects)
+    return result | training_table(record)
+
+
+def training_table(record: Mapping[str, Any]) -> dict[str, str]:
+    """Return the table of the trainings of a record, if it has any."""
     trained: dict[tuple[str, int, str, str], dict[str, int]] = {}
     for key, found in record["rows"].items():
-        _, seed, group, label, _ = split[key]
+        _, seed, group, label, _ = key.split("|")
         if group == "paper":
             settings = found["settings"]
             drawn = " + ".join(f"{steps:,}" for steps in settings.get("drawn_steps", ()))
             rates = [settings[name] for name in ("learning_rate", "pose_learning_rate") if name in settings]
             name = (seed, settings["steps"], ", then ".join(f"{rate:g}" for rate in rates), drawn)
             trained.setdefault(name, {})[label] = found["steps"]
-    if trained:
-        cells = [
-            (f"seed {seed}{f', after {drawn} steps on drawn maps' if drawn else ''}", switch,
-             *(steps.get(label, "") for label in BRANCHES), rates)
-            for (seed, switch, rates, drawn), steps in trained.items()
-        ]  # fmt: skip
-        lines_of_trainings = (names, ["---"] * len(names), *cells)
-        result["training"] = "".join(f"| {' | '.join(map(str, cells))} |\n" for cells in lines_of_trainings)
-    return result
+    names = ("training", "steps until the switch", "steps of Lc", "steps of Lc Lp", "learning rate")
+    rows = [
+        [f"seed {seed}{f', after {drawn} steps on drawn maps' if drawn else ''}", str(switch),
+         *(str(steps.get(label, "")) for label in BRANCHES), rates]
+        for (seed, switch, rates, drawn), steps in trained.items()
+    ]  # fmt: skip
+    return {"training": markdown(names, rows)} if rows else {}
 
 
-def effect_lines(effects: Mapping[str, Any]) -> dict[str, list[str]]:
-    """By name of the table, a line for each pair, seed and estimate."""
+def effect_rows(effects: Mapping[str, Any]) -> dict[str, list[list[str]]]:
+    """Return a row for each pair, seed and estimate, by name of the table."""
     seeds = {key.split("|")[1] for key in effects}
-    result: dict[str, list[str]] = {}
+    result: dict[str, list[list[str]]] = {}
     for key in sorted(effects, key=lambda key: (*key.split("|")[:2], list(ESTIMATES).index(key.split("|")[-1]))):
         name, seed, group, first, second, estimate = key.split("|")
         before, after = effects[key]["steps"]
@@ -566,7 +540,7 @@ def effect_lines(effects: Mapping[str, Any]) -> dict[str, list[str]]:
         label += f", seed {seed}" if len(seeds) > 1 and group == "paper" else ""
         label += ", unequal training" if before != after else ""
         title = f"{name}-effect" if group == "paper" else f"{name}-{group}-effect"
-        result.setdefault(title, []).append(effect_text(label, effects[key]))
+        result.setdefault(title, []).append(effect_cells(label, effects[key]))
     return result
 
 
@@ -615,7 +589,6 @@ def options(
     found.add_argument("--only_test", action="store_true", help="no training")
     found.add_argument("--output", type=Path, default=file, help="(default: %(default)s)")
     found.add_argument("--quick", action="store_true", help="few steps, 20 problems, its own folder")
-    found.add_argument("--check", action="store_true", help="compare the pages with the record, measure nothing")
     found.set_defaults(**DEFAULTS | {"epoch": epoch})
     return found
 
@@ -623,25 +596,22 @@ def options(
 def run(
     table: Table,
     parser: argparse.ArgumentParser,
-    pages: Iterable[Path],
-    measured: Callable[[argparse.Namespace], dict[str, Any]],
+    measure: Callable[[argparse.Namespace], object],
     quick: Mapping[str, Any] = QUICK,
 ) -> None:
-    """Parse the options, measure, and fill the pages.
+    """Parse the options, measure, which writes the record, and write the pages.
 
     A quick run, with the options `quick`, and one with a record of its own print the tables instead, and draw nothing.
     """
     chosen = parser.parse_args()
-    if chosen.check:
-        fill_pages(pages, table.name, markdown(table, read_record(chosen.output)), check=True)
-        return
     torch.set_num_threads(1)
     if chosen.quick:
         chosen.run = chosen.run.with_name(f"{chosen.run.name}-quick")
         chosen.output = chosen.run / "record.json"
         vars(chosen).update(quick)
-    chosen.published = is_published(parser, chosen)
-    fill_pages(pages, table.name, markdown(table, measured(chosen)), check=False, published=chosen.published)
+    chosen.published = is_default(parser, chosen)
+    measure(chosen)
+    publish(table.name, chosen.output)
 
 
 def figures(rows: Sequence[ProblemRow], recall: tuple[float, float]) -> dict[str, Any]:
@@ -678,8 +648,8 @@ def _round_interval(interval: Interval) -> list[float]:
     return [float(f"{value:.4g}") for value in (interval.value, interval.low, interval.high)]
 
 
-def row_text(label: str, found: Mapping[str, Any]) -> str:
-    """A line of a table; the interval of the median and of the recall in brackets."""
+def row_cells(label: str, found: Mapping[str, Any]) -> list[str]:
+    """Return a row of a table; the interval of the median and of the recall is in brackets."""
     steps = "" if found.get("steps") is None else f"{found['steps']:,}"
     cells = [label, steps, str(found["problems"])]
     for name in ERRORS:
@@ -688,104 +658,44 @@ def row_text(label: str, found: Mapping[str, Any]) -> str:
             f"{_short(low[0])} / {_short(middle[0])} [{_short(middle[1])}, {_short(middle[2])}] / {_short(high[0])}"
         )
     value, low, high = (100 * x for x in found["recall"])
-    cells += [f"{value:.0f} [{low:.0f}, {high:.0f}]", _short(found["seconds"])]
-    return f"| {' | '.join(cells)} |\n"
+    return [*cells, f"{value:.0f} [{low:.0f}, {high:.0f}]", _short(found["seconds"])]
 
 
-def printed_rows(paper: Paper) -> Iterator[str]:
-    """The lines of the paper's table."""
+def printed_rows(paper: Paper) -> list[list[str]]:
+    """Return the rows of the paper's table."""
+    rows = []
     for line in _lines(paper):
         label, values = line.split("|")
         numbers = values.split()
         cells = [f"*paper: {label.strip()}*", PRINTED_STEPS.get(label.split(" R")[0].strip(), ""), ""]
         cells += [" / ".join(numbers[k : k + 3]) for k in (0, 3, 6)]
         cells += [numbers[10] if len(numbers) > 10 else "", numbers[9]]
-        yield f"| {' | '.join(cells)} |\n"
+        rows.append(cells)
+    return rows
 
 
 def _lines(paper: Paper) -> list[str]:
     return PRINTED[paper][2].strip().splitlines()
 
 
-def head(recall: tuple[float, float]) -> str:
-    names = (
-        "row",
-        "steps",
-        "problems",
-        "rotation, deg",
-        "translation",
-        "reprojection, deg",
-        f"% within {recall[0]:g} deg, {recall[1]:g}",
-        "seconds",
-    )
-    return f"| {' | '.join(names)} |\n|{' --- |' * len(names)}\n"
+def head(recall: tuple[float, float]) -> list[str]:
+    return ["row", "steps", "problems", *MEASURES, f"% within {recall[0]:g} deg, {recall[1]:g}", "seconds"]
 
 
-def effect_text(label: str, found: Mapping[str, Any]) -> str:
-    """A line on a paired difference."""
+def effect_head(recall: tuple[float, float]) -> list[str]:
+    return ["estimate", "problems", *MEASURES, f"% within {recall[0]:g} deg, {recall[1]:g}"]
+
+
+def effect_cells(label: str, found: Mapping[str, Any]) -> list[str]:
+    """Return a row on a paired difference."""
     cells = [label, str(found["problems"])]
     for name in ERRORS:
         value, low, high = found[name]
         shown = "-" if np.isnan(value) else f"{value:+.2g}"  # of two infinite medians
         cells.append(f"{shown} [{low:+.2g}, {high:+.2g}], better in {100 * found[f'{name} better']:.0f} %")
     value, low, high = (100 * x for x in found["recall"])
-    cells.append(f"{value:+.0f} [{low:+.0f}, {high:+.0f}]")
-    return f"| {' | '.join(cells)} |\n"
-
-
-def effect_head(recall: tuple[float, float]) -> str:
-    names = (
-        "estimate",
-        "problems",
-        "rotation, deg",
-        "translation",
-        "reprojection, deg",
-        f"% within {recall[0]:g} deg, {recall[1]:g}",
-    )
-    return f"| {' | '.join(names)} |\n|{' --- |' * len(names)}\n"
+    return [*cells, f"{value:+.0f} [{low:+.0f}, {high:+.0f}]"]
 
 
 def _short(value: float) -> str:
     return f"{value:.0f}" if value >= 99.5 else f"{value:.2g}" if value < 10 else f"{value:.3g}"
-
-
-def fill_tables(text: str, marker: str, tables: Mapping[str, str]) -> str:
-    """Return a page with the tables between `<!-- marker: name -->` and `<!-- end of marker -->`."""
-
-    def replace_table(match: re.Match[str]) -> str:
-        new = tables.get(match[1])
-        return match[0] if new is None else f"<!-- {marker}: {match[1]} -->\n{new}<!-- end of {marker} -->"
-
-    return re.sub(
-        rf"<!-- {marker}: ([a-z0-9-]+) -->\n(.*?)<!-- end of {marker} -->", replace_table, text, flags=re.DOTALL
-    )
-
-
-def is_published(parser: argparse.ArgumentParser, chosen: argparse.Namespace, option: str = "output") -> bool:
-    """Return whether a path is its default: that of the record of the pages, or of their pictures."""
-    return bool(getattr(chosen, option).resolve() == parser.get_default(option).resolve())
-
-
-def fill_pages(
-    pages: Iterable[Path], marker: str, tables: Mapping[str, str], *, check: bool, published: bool = True
-) -> None:
-    """Write the tables into the pages, or exit with status 1 if a page differs and `check` is set.
-
-    A table of a page that is not in `tables` is kept, and is an error with `check`. Tables of a record that is not
-    published are printed instead.
-    """
-    if not (published or check):
-        print("\n\n".join(f"{name}\n{text}" for name, text in tables.items()))
-        return
-    stale = []
-    for page in pages:
-        text = page.read_text(encoding="utf-8")
-        if check and (unknown := set(re.findall(rf"<!-- {marker}: (.+?) -->", text)) - set(tables)):
-            sys.exit(f"{page.name} has tables that are not in the record: {', '.join(sorted(unknown))}")
-        if (new := fill_tables(text, marker, tables)) != text:
-            stale.append(page.name)
-            if not check:
-                with write_atomically(page) as temporary:
-                    temporary.write_text(new, encoding="utf-8")
-    if check and stale:
-        sys.exit(f"tables of {', '.join(stale)} are not those of the record; run without --check")

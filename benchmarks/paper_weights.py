@@ -38,27 +38,19 @@ ADAM = 0.2  # learning rate of Adam for the parameters that Muon does not train,
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of the training; it continues the one before.
-
-    points: of each problem, out of the 1,000 fixed points of its shape.
-    kind: of the drawn shapes (`MeshDataModule`).
-    learning_rate: of the optimizer; constant, or with `decay` falling by a half cosine within the stage.
-    pose_weight: gamma_p of Eq. 15 in a stage with the pose loss; the paper has 1.
-    muon: whether Muon is the optimizer, or Adam, as in the paper. Adam starts at step 0, with a warm-up.
-    packaged: whether its end is one of the packaged weights.
-    """
+    """One stage of the training; it continues the one before."""
 
     name: str
-    points: int
+    points: int  # of each problem, out of the 1,000 fixed points of its shape
     steps: int
-    learning_rate: float
+    learning_rate: float  # constant, or with `decay` falling by a half cosine within the stage
     loss: MatchingLoss = "likelihood"
-    kind: ProceduralKind = "aligned"
+    kind: ProceduralKind = "aligned"  # of the drawn shapes (`MeshDataModule`)
     pose_loss: bool = False
-    pose_weight: float = 1.0
+    pose_weight: float = 1.0  # gamma_p of Eq. 15 in a stage with the pose loss; the paper has 1
     decay: bool = True
-    muon: bool = True
-    packaged: bool = False
+    muon: bool = True  # False: Adam, as in the paper, which starts at step 0, with a warm-up
+    packaged: bool = False  # its end is one of the packaged weights
 
 
 STAGES = (

@@ -5,14 +5,13 @@
     python -m benchmarks results --quick --check  # compare few problems per row (minutes) with results.json
 
 `ROWS` lists the rows. The default seed is that of the row, and 9 with --quick. --check draws the problems of the file
-again, with the seed of each row; it writes nothing, and the exit status is 1 if a figure is outside the tolerance or a
-table differs from the file. Searches that their time limit ends, 10 seconds or 60, find less on a busy machine. Times
+again, with the seed of each row; it writes nothing, and the exit status is 1 if a figure is outside the tolerance.
+Searches that their time limit ends, 10 seconds or 60, find less on a busy machine. Times
 are shown and not compared. Rows whose data are missing are named and skipped.
 """
 
 import argparse
 import json
-import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -30,7 +29,8 @@ import shapes
 import symmetric
 import torch
 from hard_scenes import SCENES
-from paper_tables import is_published, network
+from pages import is_default, markdown, write_pages
+from paper_tables import network
 from record import ROOT, TIME_LIMIT, Outcome, Problem, measure_rows, measured_today, parser, select, write
 from torch import nn
 from view_problems import REPORTED, photos
@@ -43,13 +43,11 @@ from bpnp.models.weights import checkpoint_path
 
 FILE = ROOT / "benchmarks" / "results.json"
 SEED, NETWORKS_SEED, RELIABILITY_SEED, QUICK_SEED = 1711, 506, 1811, 9
-DOCUMENTS = (ROOT / "README.md", *(ROOT / "docs" / f"{name}.md" for name in ("results", "solve", "verdict")))
 COLUMNS = ("data", "problems", "rotation, deg (quartiles)", "success", "confident", "confident but wrong", "CPU s")
 # What may differ between two runs of a row, on another machine and with other libraries: problems that are right or
 # confident, and the ratio of the median errors where one exceeds FLOOR_DEG.
 PROBLEMS, MEDIAN, FLOOR_DEG = 1, 1.5, 0.05
 NAMED = {"maps": "photo ", "leds": "LEDs: "}  # what the README's rows of a table begin with
-TABLE = r"<!-- results: {} -->\n(.*?)<!-- end of results -->"
 
 
 @dataclass(frozen=True)
@@ -289,7 +287,7 @@ def table(name: str, results: dict[str, Any]) -> str | None:
     if not rows or any(key(row) not in results for row in rows):
         return None
     lines = {"reliability": reliability_table, "sigmas": sigmas_table}.get(name, partial(rows_table, name))(results)
-    text = "".join(f"| {' | '.join(cells)} |\n" for cells in (lines[0], ("---",) * len(lines[0]), *lines[1:]))
+    text = markdown(lines[0], lines[1:])
     if name == "readme":
         return text
     parts = " ".join(dict.fromkeys(f"{row.table}:" for row in rows))
@@ -341,14 +339,10 @@ def sigmas_table(results: dict[str, Any]) -> list[tuple[str, ...]]:
     return [*lines, ("normal errors", "68.3%", "95.4%", "99.7%")]
 
 
-def fill_tables(text: str, results: dict[str, Any]) -> str:
-    """Return a document with the tables between its markers; a table with a row that is not measured is kept."""
-
-    def replace_table(match: re.Match[str]) -> str:
-        new = table(match[1], results)
-        return match[0] if new is None else f"<!-- results: {match[1]} -->\n{new}<!-- end of results -->"
-
-    return re.sub(TABLE.format("([a-z]+)"), replace_table, text, flags=re.DOTALL)
+def tables(record: dict[str, Any]) -> dict[str, str]:
+    """Return the tables whose rows are all measured."""
+    names = dict.fromkeys([*(row.table for row in ROWS), "readme", "sigmas"])
+    return {name: text for name in names if (text := table(name, record["full"])) is not None}
 
 
 def main() -> None:
@@ -372,13 +366,7 @@ def main() -> None:
             continue
         results[row.name] = result
         write(chosen.file, {name: kept.get(name, {}) for name in ("quick", "full")} | {part: results})
-    for document in DOCUMENTS if chosen.check or is_published(options, chosen, "file") else ():
-        text = document.read_text(encoding="utf-8")
-        if (new := fill_tables(text, results if part == "full" else kept.get("full", {}))) == text:
-            continue
-        if chosen.check:
-            failures.append(f"{document.name}: a table is not that of {chosen.file.name}; try without --check")
-        else:
-            document.write_text(new, encoding="utf-8")
+    if not chosen.check and is_default(options, chosen, "file"):
+        write_pages()
     if failures:
         sys.exit("\n".join(failures))

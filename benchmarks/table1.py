@@ -4,7 +4,6 @@
     python -m benchmarks table1 --data DATA --steps 5000    # a longer training goes on from a shorter one
     python -m benchmarks table1 --data DATA --seed 1        # another training, tested on the same problems
     python -m benchmarks table1 --data DATA --quick         # 20 minutes, another folder, no page
-    python -m benchmarks table1 --check                     # whether docs/table1.md is what the record says
 
 DATA is a folder with the data sets `modelnet10` and `psb` (docs/data.md). The training is configs/paper/modelnet40.yaml
 but for data, steps and learning rate. At step `--steps` it forks: one branch goes on with L_c, the other with
@@ -31,7 +30,6 @@ from bpnp.models.weights import checkpoint_path, pretrained_names
 SETS = {"modelnet10": 500, "psb": 100}  # test shapes
 TABLE = Table("table1", "modelnet40", (15.0, 0.5), tuple(SETS))
 FILE = ROOT / "benchmarks" / "table1.json"
-PAGES = tuple(ROOT / page for page in ("README.md", "docs/index.md", "docs/table1.md", "docs/model-card.md"))
 PACKAGED = ("procedural-euler", "paper-lc", "paper-lclp")
 BASELINES: dict[str, Callable[[], nn.Module]] = {"SoftPOSIT": SoftPOSIT, "RANSAC": RandomRansac, "GOSMA": GOSMA}
 
@@ -79,6 +77,10 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     return paper_tables.measure(TABLE, trained, partial(methods, options, trained), data, options)
 
 
+def tables(record: dict[str, Any]) -> dict[str, str]:
+    return paper_tables.tables(TABLE, record)
+
+
 def main() -> None:
     run = ROOT / "runs" / "table1"
     parser = paper_tables.options(__doc__, file=FILE, run=run, sets=TABLE.sets, steps=3000, pose_steps=600, epoch=100)
@@ -86,4 +88,4 @@ def main() -> None:
         "--weights", nargs="*", default=[], metavar="NAME=CHECKPOINT",
         help=f"more rows of the group of the packaged weights; {LONGER!r} is compared with paper-lclp",
     )  # fmt: skip
-    paper_tables.run(TABLE, parser, PAGES, measure)
+    paper_tables.run(TABLE, parser, measure)

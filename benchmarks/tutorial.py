@@ -1,7 +1,6 @@
 """Figures of the tutorial *Reproduce the paper*: run its commands and fill the page with what they give.
 
-    python -m benchmarks tutorial            # 6 CPU minutes: tables and pictures
-    python -m benchmarks tutorial --check    # whether docs/tutorials/train.md is what the record says
+    python -m benchmarks tutorial    # 6 CPU minutes: tables and pictures
 
 The commands are those that the page shows before "Change something", with one thread each. They run in a folder of
 their own. A command that ended there is not run again, unless it or one before it is another now. Delete the folder to
@@ -19,14 +18,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from paper_tables import PICTURES, effect, effect_head, effect_text, figures, fill_pages, head, is_published, row_text
+from pages import is_default, markdown, publish
+from paper_tables import PICTURES, effect, effect_cells, effect_head, figures, head, row_cells
 from record import ROOT, measured_today, write_json
 
 from bpnp.report.results import ProblemRow, read_results
 from bpnp.report.tables import named_runs
 
 PAGE = ROOT / "docs" / "tutorials" / "train.md"
-README = ROOT / "README.md"  # has its first table
 FILE = ROOT / "benchmarks" / "tutorial.json"
 END = "## Change something"
 BEFORE, AFTER, COMPARED = "runs/quickstart/Lc", "runs/quickstart/LcLp", "runs/table"
@@ -95,13 +94,11 @@ def measure(folder: Path) -> dict[str, Any]:
 
 
 def tables(record: dict[str, Any]) -> dict[str, str]:
-    """Return the tables of the page by name; none without a record."""
-    if not record:
-        return {}
+    """Return the tables of the page by name."""
     return {
         "test": "```text\n" + "".join(f"{line}\n" for line in record["test"]) + "```\n",
-        "effect": effect_head(RECALL) + "".join(effect_text(f"`{k}`", v) for k, v in record["effects"].items()),
-        "compare": head(RECALL) + "".join(row_text(label, found) for label, found in record["compared"].items()),
+        "effect": markdown(effect_head(RECALL), [effect_cells(f"`{k}`", v) for k, v in record["effects"].items()]),
+        "compare": markdown(head(RECALL), [row_cells(label, found) for label, found in record["compared"].items()]),
     }
 
 
@@ -110,14 +107,8 @@ def main() -> None:
     parser.add_argument("--run", type=Path, default=ROOT / "runs" / "tutorial", help="(default: %(default)s)")
     parser.add_argument("--output", type=Path, default=FILE, help="(default: %(default)s)")
     parser.add_argument("--pictures", type=Path, default=PICTURES, help="folder of the pictures (default: %(default)s)")
-    parser.add_argument("--check", action="store_true", help="compare the page with the record, measure nothing")
     chosen = parser.parse_args()
-    published = is_published(parser, chosen)
-    if chosen.check:
-        record: dict[str, Any] = json.loads(chosen.output.read_text()) if chosen.output.is_file() else {}
-    else:
-        record = measure(chosen.run)
-        write_json(chosen.output, record)
-        for name in DRAWN if published or not is_published(parser, chosen, "pictures") else ():
-            shutil.copyfile(chosen.run / name, chosen.pictures / name)
-    fill_pages([PAGE, README], "tutorial", tables(record), check=chosen.check, published=published)
+    write_json(chosen.output, measure(chosen.run))
+    for name in DRAWN if is_default(parser, chosen) or not is_default(parser, chosen, "pictures") else ():
+        shutil.copyfile(chosen.run / name, chosen.pictures / name)
+    publish("tutorial", chosen.output)

@@ -6,6 +6,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import additions
+import pages
 import paper_tables
 import pytest
 from additions import Addition
@@ -27,13 +28,14 @@ def test_each_addition_is_trained_with_as_many_points_and_compared(
     write_mesh_tree(tmp_path / "modelnet10")
     page = tmp_path / "table1.md"
     page.write_text("".join(f"<!-- additions: {name} -->\n<!-- end of additions -->\n" for name in ("rows", "effects")))
+    monkeypatch.setattr(pages, "PAGES", (page,))
     few = Addition(parts=((8, 0.5), (16, 0.5)))
     tried = {
         additions.NONE: Addition(parts=((16, 1.0),), batch=2),
         "few first": Addition(parts=few.parts, batch=2),
         "one": Addition(("--model.matching_loss=likelihood",), parts=((16, 1.0),), batch=1, schedule=True),
     }
-    for name, value in {"PAGES": (page,), "FILE": tmp_path / "record.json", "ADDITIONS": tried}.items():
+    for name, value in {"FILE": tmp_path / "record.json", "ADDITIONS": tried}.items():
         monkeypatch.setattr(additions, name, value)
     for name, value in {"EPOCH": 1, "POINTS": 16, "BATCH": 2}.items():
         monkeypatch.setattr(additions, name, value)
@@ -65,8 +67,7 @@ def test_each_addition_is_trained_with_as_many_points_and_compared(
         difference = median[name] - median[additions.NONE]
         assert record["effects"][f"0|{name}|pnp"]["rotation"][0] == pytest.approx(difference, rel=2e-3, abs=1e-3)
     assert "| few first R | 3 | 2 |" in page.read_text()
-    monkeypatch.setattr("sys.argv", ["additions", *options, "--check"])
-    additions.main()
+    pages.write_pages(check=True)
     additions.main()
     assert len(commands) == len(lengths), "what is there is not trained again"
 

@@ -19,6 +19,7 @@ import bench_left_out
 import bench_rigs
 import guard
 import numpy as np
+import pages
 import pytest
 import rebuilt_maps
 import record
@@ -170,7 +171,7 @@ def test_the_time_limit_of_the_command_holds_for_every_search(tmp_path: Path, mo
     drawn = [
         row for row in rows if not row.name.startswith(("photos", "maps", "wrong focal, one", "wrong focal, whole"))
     ]
-    assert len(drawn) > 100
+    assert len(drawn) > 90
     for row in drawn:
         for problem in row.draw():
             assert problem.solve.keywords["time_limit"] == 4.0, row.name
@@ -255,10 +256,10 @@ def test_tables_are_filled_and_checked(tmp_path: Path, monkeypatch: pytest.Monke
         made.seeds.append(seed)
         return [made.outcome] * limit
 
-    rows = [here.Row("leds", "two rings", measure, (2, 1), 3.0, seed=506)]
+    rows = [here.Row("rigs", "two rings", measure, (2, 1), 3.0, seed=506)]
     made.outcome = record.Outcome("", 0.25, 0.0, "confident", 0.5)
     monkeypatch.setattr(here, "ROWS", rows)
-    monkeypatch.setattr(here, "DOCUMENTS", (guide,))
+    monkeypatch.setattr(pages, "PAGES", (guide,))
     monkeypatch.setattr(here, "FILE", file)
     monkeypatch.setattr(record, "warm_up", lambda: None)
 
@@ -266,18 +267,18 @@ def test_tables_are_filled_and_checked(tmp_path: Path, monkeypatch: pytest.Monke
         monkeypatch.setattr("sys.argv", ["results", *arguments])
         here.main()
 
-    guide.write_text("before\n<!-- results: leds -->\nold\n<!-- end of results -->\nafter\n")
+    guide.write_text("before\n<!-- results: rigs -->\nold\n<!-- end of results -->\nafter\n")
     run()
     text = guide.read_text()
     assert "| two rings | 2 | 0.25 / 0.25 / 0.25 | 100.0% (3 deg) | 100.0% | 0 | 0.5 |" in text
-    assert "`python -m benchmarks results --only leds:`, seed 506.\n<!-- end" in text
+    assert "`python -m benchmarks results --only rigs:`, seed 506.\n<!-- end" in text
     assert text.startswith("before\n")
     assert text.endswith("after\n")
     assert "old" not in text
     written = json.loads(file.read_text())
-    assert written["full"]["leds: two rings"]["seed"] == 506
-    assert written["full"]["leds: two rings"]["commit"] == written["commit"]
-    assert {"cpu", "date"} <= written["full"]["leds: two rings"].keys()
+    assert written["full"]["rigs: two rings"]["seed"] == 506
+    assert written["full"]["rigs: two rings"]["commit"] == written["commit"]
+    assert {"cpu", "date"} <= written["full"]["rigs: two rings"].keys()
     assert written["commit"]
     run("--check")
     run("--seed", "7")
@@ -285,21 +286,17 @@ def test_tables_are_filled_and_checked(tmp_path: Path, monkeypatch: pytest.Monke
     assert made.seeds == [506, 506, 7, 7], "a check draws the problems of the file"
     assert "seed 7." in guide.read_text()
     text = guide.read_text()
-    guide.write_text(text.replace("0.25 /", "0.24 /"))
-    with pytest.raises(SystemExit, match=r"guide\.md: a table is not that of results\.json"):
-        run("--check")
-    guide.write_text(text)
     made.outcome = record.Outcome("", 8.0, 0.0, "confident", 0.5)
-    with pytest.raises(SystemExit, match="leds: two rings: 2 confident and wrong, not 0"):
+    with pytest.raises(SystemExit, match="rigs: two rings: 2 confident and wrong, not 0"):
         run("--check")
-    with pytest.raises(SystemExit, match="leds: two rings: never measured"):
+    with pytest.raises(SystemExit, match="rigs: two rings: never measured"):
         run("--quick", "--check")
     assert made.seeds[-1] == 9
     rows[0] = replace(rows[0], problems=(2, 0))
     run("--quick", "--check")  # a row without quick problems is not measured
     other = tmp_path / "other.json"
     run("--file", str(other))
-    assert json.loads(other.read_text())["full"]["leds: two rings"]["confident_and_wrong"] == 2
+    assert json.loads(other.read_text())["full"]["rigs: two rings"]["confident_and_wrong"] == 2
     assert guide.read_text() == text, "a record of its own fills no page"
     with pytest.raises(SystemExit, match="2"):
         run("--limit", "2")  # an option of the other benchmarks
@@ -339,13 +336,6 @@ def test_the_record_has_every_row_and_no_other(part: str) -> None:
     assert all(result["problems"] and result["commit"] for result in recorded.values())
 
 
-@pytest.mark.parametrize("document", results.DOCUMENTS, ids=lambda file: file.name)
-def test_the_tables_of_the_pages_are_those_of_the_record(document: Path) -> None:
-    text, recorded = document.read_text(encoding="utf-8"), json.loads(results.FILE.read_text())["full"]
-    assert "<!-- results: " in text
-    assert results.fill_tables(text, recorded) == text
-
-
 def test_basin_counts_and_trials_of_motions_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     """Planted outcomes: poses with one hypothesis are wrong for objects of three parts, and lead back elsewhere."""
     kinds = [kind for kind in symmetric.KINDS if kind.unique >= 8]
@@ -360,20 +350,9 @@ def test_basin_counts_and_trials_of_motions_are_counted(monkeypatch: pytest.Monk
     assert found["basin_counts"]["2"] == {"poses": 2 * len(searched), "wrong": 0}
     assert found["basin_counts"]["3"] == {"poses": 0, "wrong": 0}
     assert found["motions"] == {"trials": 3 * len(kinds), "led_back": 3 * sum(kind.fold != 3 for kind in kinds)}
-    text = completeness.table(found)
+    text = completeness.tables(found)["data"]
     assert f"\n| 1 | {2 * len(searched)} | {wrong} | {wrong / 2 / len(searched):.3f} | 0.500 |\n" in text
     assert text.endswith("`python -m benchmarks completeness --seed 5 --limit 2 --trials 3`.\n")
-
-
-def test_the_calibration_on_the_page_is_that_of_its_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pass for the committed page and the default settings, and fail if the record has another figure."""
-    monkeypatch.setattr("sys.argv", ["completeness", "--check"])
-    completeness.main()
-    changed = tmp_path / "record.json"
-    changed.write_text(completeness.FILE.read_text().replace('"wrong": ', '"wrong": 9'))
-    monkeypatch.setattr("sys.argv", ["completeness", "--check", "--output", str(changed)])
-    with pytest.raises(SystemExit, match=r"tables of verdict\.md are not those of the record"):
-        completeness.main()
 
 
 def test_models_of_the_same_views_are_aligned() -> None:

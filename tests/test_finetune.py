@@ -5,6 +5,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import finetune
+import pages
 import paper_tables
 import pytest
 from planted_model import plant_model
@@ -24,7 +25,7 @@ def test_photos_and_shapes_are_tested_before_and_after_and_the_page_is_filled(
     write_mesh_tree(tmp_path / "shapes")
     page = tmp_path / "train.md"
     page.write_text("<!-- finetune: data -->\nold\n<!-- end of finetune -->\n")
-    monkeypatch.setattr(finetune, "PAGES", (page,))
+    monkeypatch.setattr(pages, "PAGES", (page,))
     monkeypatch.setattr(finetune, "FILE", tmp_path / "record.json")
     monkeypatch.setattr(finetune, "TEST_SHAPES", 2)
     monkeypatch.setenv("BPNP_CACHE", str(tmp_path / "cache"))
@@ -51,8 +52,7 @@ def test_photos_and_shapes_are_tested_before_and_after_and_the_page_is_filled(
         assert tested.estimates == ("ransac", "pnp")
     assert "| scene, not tuned on, `pnp`, after | 2 | 2 |" in page.read_text()
     assert (tmp_path / "recall.png").stat().st_size > 0
-    monkeypatch.setattr("sys.argv", ["finetune", *paths, "--check"])
-    finetune.main()
+    pages.write_pages(check=True)
     picture = tmp_path / "picture.png"
     monkeypatch.setattr(finetune, "PICTURE", picture)
     options = paths[: paths.index("--picture")]

@@ -1,22 +1,17 @@
 """The benchmarks of the paper's tables: what was stopped goes on, figures are those of the rows, pages are filled."""
 
-import json
 import shlex
 import shutil
 from argparse import Namespace
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import additions
-import finetune
 import numpy as np
 import paper_tables
 import paper_weights
 import pytest
-import results
 import table1
 import table2
 import torch
@@ -26,10 +21,9 @@ from paper_tables import (
     Training,
     effect,
     figures,
-    fill_tables,
     network,
     printed_rows,
-    row_text,
+    row_cells,
     solve_problems,
 )
 from paper_weights import EPOCH, STAGES, trainings
@@ -269,35 +263,20 @@ def test_a_file_that_was_cut_off_is_continued_and_names_every_commit(
     measured = paper_tables.provenance(file)
     assert measured["commit"] == "early, late"
     assert "," not in measured["cpu"]
-    # A file of an older form has a line for each estimate; the second one of its third problem is missing.
-    head = json.loads(file.read_text().splitlines()[0])
-    found = [asdict(r) | {"estimate": name} for r in rows[:3] for name in ("pnp", "ransac")]
-    file.write_text("".join(json.dumps(line) + "\n" for line in [head, *found[:-1]]))
-    solver = Known(3)
-    assert len({r.index for r in solve_problems(file, lambda: solver, data, 5, {"steps": 1})}) == 5
-    assert solver.left == 0
 
 
-def test_a_record_of_its_own_leaves_the_pages_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_the_pictures_of_the_pages_are_drawn_from_their_record_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    page, text = tmp_path / "page.md", "<!-- table1: commands -->\nold\n<!-- end of table1 -->\n"
-    page.write_text(text)
-    published = []
-
-    def measured(options: Namespace) -> dict[str, Any]:
-        published.append(options.published)
-        return {"rows": {}, "effects": {}}
-
+    drawn: list[bool] = []
+    monkeypatch.setattr(paper_tables, "publish", lambda *_: None)
     for name in ("other.json", "record.json"):
         parser = paper_tables.options(
             None, file=tmp_path / "record.json", run=tmp_path, sets=[], steps=1, pose_steps=1, epoch=1
         )
         monkeypatch.setattr("sys.argv", ["table1", "--output", str(tmp_path / name)])
-        paper_tables.run(table1.TABLE, parser, [page], measured)
-        assert (page.read_text() == text) == (name == "other.json")
-        assert ("commands\n" in capsys.readouterr().out) == (name == "other.json")
-    assert published == [False, True]
+        paper_tables.run(table1.TABLE, parser, lambda options: drawn.append(options.published))
+    assert drawn == [False, True]
 
 
 def test_the_figures_are_those_of_the_rows() -> None:
@@ -316,28 +295,17 @@ def test_the_figures_are_those_of_the_rows() -> None:
     assert paired["rotation"] == [-0.5, -0.5, -0.5]
     assert paired["rotation better"] == 1.0
     assert paired["recall"][0] == 0.25
-    assert row_text("Lc", found | {"steps": 1200}).startswith("| Lc | 1,200 | 4 | 1.8 / 2.5 [")
-    assert row_text("GOSMA", found).startswith("| GOSMA |  | 4 |")
+    label, steps, problems, rotation, *_ = row_cells("Lc", found | {"steps": 1200})
+    assert (label, steps, problems) == ("Lc", "1,200", "4")
+    assert rotation.startswith("1.8 / 2.5 [")
+    assert row_cells("GOSMA", found)[:3] == ["GOSMA", "", "4"]
 
 
 def test_the_papers_rows_are_printed_as_in_the_paper() -> None:
-    rows = list(printed_rows("modelnet40"))
-    start = "| *paper: Lc Lp* | 350,000 to 500,000 |  | 4.88 / 9.66 / 16.0 | 0.04 / 0.08 / 0.15 | "
-    assert rows[4] == start + "0.36 / 0.61 / 1.03 | 72 | 0.1 |\n"
+    rows = printed_rows("modelnet40")
+    errors = ["4.88 / 9.66 / 16.0", "0.04 / 0.08 / 0.15", "0.36 / 0.61 / 1.03"]
+    assert rows[4] == ["*paper: Lc Lp*", "350,000 to 500,000", "", *errors, "72", "0.1"]
     assert len(rows) == 7
-
-
-def test_tables_stand_between_their_markers_and_a_page_that_differs_is_found(tmp_path: Path) -> None:
-    page = "a\n<!-- t: one -->\nold\n<!-- end of t -->\nb\n<!-- t: two -->\nkept\n<!-- end of t -->\n"
-    new = fill_tables(page, "t", {"one": "new\n"})
-    assert new == page.replace("old", "new")
-    (tmp_path / "page.md").write_text(page)
-    with pytest.raises(SystemExit, match="tables of page.md are not those of the record"):
-        paper_tables.fill_pages([tmp_path / "page.md"], "t", {"one": "new\n", "two": "kept\n"}, check=True)
-    paper_tables.fill_pages([tmp_path / "page.md"], "t", {"one": "new\n"}, check=False)
-    with pytest.raises(SystemExit, match="page.md has tables that are not in the record: two"):
-        paper_tables.fill_pages([tmp_path / "page.md"], "t", {"one": "new\n"}, check=True)
-    paper_tables.fill_pages([tmp_path / "page.md"], "t", {"one": "new\n", "two": "kept\n"}, check=True)
 
 
 def settings(**other: float) -> dict[str, float]:
@@ -366,7 +334,7 @@ def test_a_record_becomes_the_tables_of_the_page() -> None:
             }.items()
         },
     }
-    tables = paper_tables.markdown(table1.TABLE, record)
+    tables = paper_tables.tables(table1.TABLE, record)
     lines = tables["modelnet10-paper"].splitlines()
     assert [line.split(" | ")[0] for line in lines[2:]] == [
         "| Lc", "| Lc R", "| *paper: Lc*", "| *paper: Lc Lp*", "| *paper: Lc R*", "| *paper: Lc Lp R*",
@@ -398,14 +366,14 @@ def test_the_page_has_the_commands_of_its_rows_and_a_line_for_each_seed(monkeypa
     record["rows"]["psb|0|baselines|GOSMA|pose"] = one | {"settings": {"baseline_problems": 20, "test_seed": 0}}
     longer = one | {"steps": 9, "settings": {"weights": paper_tables.LONGER, "problems": 500, "test_seed": 0}}
     record["rows"][f"psb|0|training|{paper_tables.LONGER}|pnp"] = longer
-    tables = paper_tables.markdown(table1.TABLE, record)
+    tables = paper_tables.tables(table1.TABLE, record)
     assert [line.split(" | ")[0] for line in tables["psb-spread"].splitlines()[2:]] == [
         "| Lc, seed 0", "| Lc, seed 1", "| Lc Lp, seed 0", "| Lc Lp, seed 1",
     ]  # fmt: skip
     assert len(tables["psb-paper"].splitlines()) == 2 + 2 + 4  # the lowest seed and the paper's rows
     parsed = []
     monkeypatch.setattr(table1, "measure", lambda options: parsed.append(options) or record)
-    monkeypatch.setattr(paper_tables, "fill_pages", lambda *_, **__: None)
+    monkeypatch.setattr(paper_tables, "publish", lambda *_: None)
     for line in tables["commands"].splitlines()[1:-1]:
         words = shlex.split(line)
         assert words[:4] == ["python", "-m", "benchmarks", "table1"]
@@ -469,7 +437,7 @@ def test_the_seed_of_the_training_does_not_choose_the_test_problems(
 ) -> None:
     seeds, trainings = [], []
     monkeypatch.setattr(benchmark, "data_module", lambda root, seed, name: seeds.append(seed))
-    monkeypatch.setattr(paper_tables, "fill_pages", lambda *_, **__: None)
+    monkeypatch.setattr(paper_tables, "publish", lambda *_: None)
 
     def measure(table: Table, trained: dict[str, Training], methods: object, data: Any, options: object) -> Any:
         data(table.sets[0])
@@ -492,6 +460,7 @@ def test_a_quick_run_is_short_in_every_part_and_leaves_the_record_alone(
 ) -> None:
     chosen = []
     monkeypatch.setattr(benchmark, "measure", lambda options: chosen.append(options) or {"rows": {}, "effects": {}})
+    monkeypatch.setattr(paper_tables, "publish", lambda *_: None)
     monkeypatch.setattr("sys.argv", ["benchmark", "--quick"])
     benchmark.main()
     (options,) = chosen
@@ -507,7 +476,7 @@ def test_a_quick_run_is_short_in_every_part_and_leaves_the_record_alone(
 def test_weights_from_a_file_stand_beside_the_packaged_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = shutil.copy(str(table1.checkpoint_path("procedural-euler")), tmp_path / "longer.ckpt")
     found = []
-    monkeypatch.setattr(paper_tables, "fill_pages", lambda *_, **__: None)
+    monkeypatch.setattr(paper_tables, "publish", lambda *_: None)
 
     def measure(table: Table, trained: dict[str, Training], methods: Any, data: object, options: object) -> Any:
         found.extend(methods())
@@ -534,24 +503,3 @@ def test_the_picture_has_a_curve_a_row_and_the_papers_quartiles() -> None:
     assert rotation.lines[0].get_ydata().tolist() == [25, 50, 75, 100]
     assert rotation.lines[1].get_xdata().tolist() == [5.49, 11.7, 20.0]
     assert translation.lines[1].get_xdata().tolist() == [0.04, 0.09, 0.20]
-
-
-@pytest.mark.parametrize("benchmark", [table1, table2, additions, finetune], ids=lambda module: module.__name__)
-def test_the_pages_hold_the_tables_of_their_records(
-    benchmark: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Pass for the committed pages, and fail if a record has another figure."""
-    monkeypatch.setattr("sys.argv", ["benchmark", "--check"])
-    benchmark.main()
-    changed = benchmark.FILE.read_text().replace('"problems": ', '"problems": 9')
-    (tmp_path / "record.json").write_text(changed)
-    monkeypatch.setattr("sys.argv", ["benchmark", "--check", "--output", str(tmp_path / "record.json")])
-    with pytest.raises(SystemExit, match="are not those of the record"):
-        benchmark.main()
-
-
-def test_the_guides_hold_the_tables_of_the_results() -> None:
-    kept = json.loads(results.FILE.read_text())["full"]
-    for document in results.DOCUMENTS:
-        text = document.read_text(encoding="utf-8")
-        assert results.fill_tables(text, kept) == text, document.name
