@@ -95,15 +95,9 @@ def refine_on_all_points(solution: Solution, photo: Photo, whole: Region, deadli
 
 @one_blas_thread
 def judge_on_all_points(own: Solved, refined: Refined | None) -> Solved:
-    """Judge a refined pose on all map points in view.
+    """Return the refined solution if its NFA is smaller, or if it is confident and the given one was not.
 
-    Args:
-        own: Pose that was found with the points of one view.
-        refined: The pose and its competing poses on all points in view; None if it was not refined.
-
-    Returns:
-        The refined solution if its NFA is smaller, or if it is confident and the given one was not. Otherwise the given
-            solution, against a competing pose among all points.
+    Otherwise return the given solution, against a competing pose among all points.
     """
     if refined is None:
         return own
