@@ -74,8 +74,7 @@ def leads_back(kind: symmetric.Kind, problem: Problem) -> bool:
     shift = translation - turned @ (other.mean(0) - turn @ one.mean(0))
     (turned, shift), (_, translation) = points.from_user(turned, shift), points.from_user(rotation, translation)
     rotations, translations, *_ = competing_poses(points, turned, shift, symmetric.NOISE, DEFAULT.evidence)
-    poses = np.concatenate([rotation[None], rotations]), np.vstack([translation, translations])
-    return bool(points.same_pose(*poses, Tolerance(RIGHT_DEG))[1:].any())
+    return bool(points.same_as((rotation, translation), rotations, translations, Tolerance(RIGHT_DEG)).any())
 
 
 def measure(seed: int, limit: int, trials: int) -> dict[str, Any]:

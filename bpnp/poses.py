@@ -32,19 +32,30 @@ SAME = Tolerance()
 
 
 def same_pose(
-    rotation: Array, centroid: Array, i: int | NDArray[np.int64] = 0, tolerance: Tolerance = SAME
+    pose: tuple[Array, Array], rotation: Array, translation: Array, centre: Array, tolerance: Tolerance = SAME
 ) -> NDArray[np.bool_]:
-    """Find the poses that are the same as pose i, or as several indices (k,): a mask (c,) or (k, c).
+    """Find the poses that are the same as a given one.
 
-    `centroid` (c, 3) is that of the scene in the camera's frame, or (c, k, 3) in the frames of several cameras.
+    Args:
+        pose: Rotation (3, 3) and translation (3,).
+        rotation: Rotations (c, 3, 3).
+        translation: Translations (c, 3).
+        centre: (3,) centroid of the scene.
+        tolerance: Largest differences.
 
-    >>> import numpy as np
-    >>> from bpnp.poses import same_pose
-    >>> middle = np.array([[0, 0, 10], [0.4, 0, 10], [0, 0, 10.6]])
-    >>> same_pose(np.stack([np.eye(3)] * 3), middle)
-    array([ True,  True, False])
+    Returns:
+        Mask (c,).
+
+    Examples:
+        >>> import numpy as np
+        >>> from bpnp.poses import same_pose
+        >>> shifts = np.array([[0, 0, 10], [0.4, 0, 10], [0, 0, 10.6]])
+        >>> same_pose((np.eye(3), shifts[0]), np.stack([np.eye(3)] * 3), shifts, np.zeros(3))
+        array([ True,  True, False])
     """
-    return close_poses(rotation, polar_coordinates(centroid), i, *tolerance)
+    rotations = np.concatenate([pose[0][None], rotation])
+    centroid = rotations @ centre + np.concatenate([pose[1][None], translation])
+    return close_poses(rotations, polar_coordinates(centroid), 0, *tolerance)[1:]
 
 
 def polar_coordinates(points: Array) -> Array:

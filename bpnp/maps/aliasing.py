@@ -120,8 +120,7 @@ def refine_elsewhere(
     centroid = np.median(problem.points_from_user(solution.points3d[solution.matches[:, 1]]), 0)
 
     def differ(rotations: Array, translations: Array) -> NDArray[np.bool_]:
-        rotations, translations = np.concatenate([best[0][None], rotations]), np.r_[best[1][None], translations]
-        return np.asarray(~same_pose(rotations, rotations @ centroid + translations, 0, DEFAULT.evidence.same)[1:])
+        return ~same_pose(best, rotations, translations, centroid, DEFAULT.evidence.same)
 
     rotations = np.array([rotation for rotation, _ in proposals]).reshape(-1, 3, 3)
     translations = np.array([translation for _, translation in proposals]).reshape(-1, 3)

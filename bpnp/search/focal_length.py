@@ -26,7 +26,7 @@ from bpnp.cameras import (
     scale_focal_length,
     with_radial_distortion,
 )
-from bpnp.poses import rotation_angle, same_pose
+from bpnp.poses import close_poses, polar_coordinates, rotation_angle
 from bpnp.runtime import NEVER, Clock, Deadline, one_blas_thread
 from bpnp.search.arguments import Array, checked_size
 from bpnp.search.assemble import Solved, with_unfinished
@@ -312,7 +312,7 @@ class FocalSweep(ABC):
                 zoom = end.focal_length / best.focal_length
                 if (
                     behind < settings.margin
-                    and not same_pose(rotations, moved, 0, settings.same)[1]
+                    and not close_poses(rotations, polar_coordinates(moved), 0, *settings.same)[1]
                     and not is_within_bound(best, other.rotation, zoom)
                 ):
                     away = math.degrees(rotation_angle(best.rotation, other.rotation))

@@ -293,16 +293,11 @@ class Problem:
         centre = self.size * self.centre3d
         return centre if self.origin is None else centre + self.origin
 
-    def same_pose(self, rotation: Array, translation: Array, tolerance: Tolerance = SAME) -> NDArray[np.bool_]:
-        """Return a mask of the poses (c, 3, 3), (c, 3) that are equal to the first one."""
-        return same_pose(rotation, rotation @ self.centre3d + translation, 0, tolerance)
-
     def same_as(
         self, pose: tuple[Array, Array], rotation: Array, translation: Array, tolerance: Tolerance = SAME
     ) -> NDArray[np.bool_]:
         """Return a mask of the poses (c, 3, 3), (c, 3) that are equal to a given one, (3, 3) and (3,)."""
-        rotations = np.concatenate([pose[0][None], rotation])
-        return self.same_pose(rotations, np.concatenate([pose[1][None], translation]), tolerance)[1:]
+        return same_pose(pose, rotation, translation, self.centre3d, tolerance)
 
     @property
     def has_known_rotation(self) -> bool:

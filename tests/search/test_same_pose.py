@@ -30,8 +30,11 @@ def test_a_pose_is_the_same_up_to_two_degrees_and_a_twentieth_of_the_distance(
     seen = unit * np.array([0.0, 0, 5])
     rotations = np.stack([np.eye(3), turn])
     translations = np.stack([seen - centroid, seen + unit * np.array(shift) - turn @ centroid])
-    assert same_pose(rotations, rotations @ centroid + translations).tolist() == [True, expected]
+    poses = rotations, translations
+    assert same_pose((rotations[0], translations[0]), *poses, centroid).tolist() == [True, expected]
     bearings = (points - centroid + seen) / np.linalg.norm(points - centroid + seen, axis=1, keepdims=True)
     problem = Problem.of(bearings, points)
-    assert problem.same_pose(*problem.from_user(rotations, translations)).tolist() == [True, expected]
-    assert problem.same_pose(*problem.from_user(rotations, translations), SAME.times(2)).all()
+    rotations, translations = problem.from_user(*poses)
+    first = rotations[0], translations[0]
+    assert problem.same_as(first, rotations, translations).tolist() == [True, expected]
+    assert problem.same_as(first, rotations, translations, SAME.times(2)).all()

@@ -70,8 +70,10 @@ class EnumeratedPoses:
     @property
     def has_competitors(self) -> bool:
         """True if the competing poses of the best pose were proposed."""
-        every = Hypotheses.concatenate([self.found[:1], *self._leaders])
-        return bool(self.run.problem.same_pose(every.rotation, every.translation)[1:].any())
+        if not len(self.found) or not self._leaders:
+            return False
+        leaders = Hypotheses.concatenate(self._leaders)
+        return bool(self.run.problem.same_as(self.found.pose(), leaders.rotation, leaders.translation).any())
 
     def advance(self, deadline: float) -> Hypotheses:
         """Solve further hypotheses, and return all poses."""

@@ -393,7 +393,7 @@ def margin(poses: Hypotheses, problem: Problem) -> float:
     """Return the nats by which the best pose exceeds both chance after all tests, and every different pose."""
     if poses.evidence is None or not len(poses):
         return -math.inf
-    other = poses.evidence[~problem.same_pose(poses.rotation, poses.translation)]
+    other = poses.evidence[~problem.same_as(poses.pose(), poses.rotation, poses.translation)]
     margin = float(poses.evidence[0] - other.max()) if len(other) else math.inf
     return min(float(poses.evidence[0]), margin)
 

@@ -175,7 +175,7 @@ def competing_poses(
         for parts, some in zip(every, (*images, reflections.scale), strict=True):
             parts.append(some)
     rotations, translations, scales = (np.concatenate(parts) for parts in every)
-    other = np.flatnonzero(~problem.same_pose(rotations, translations, settings.same))
+    other = np.flatnonzero(~problem.same_as((rotation, translation), rotations, translations, settings.same))
     return rotations[other], translations[other], scales[other], motions
 
 

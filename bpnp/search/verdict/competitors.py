@@ -35,7 +35,7 @@ def other_pose(candidates: Hypotheses, problem: Problem, settings: Evidence) -> 
         problem: Points of the problem.
         settings: Constants of the verdict; a competing pose differs from the best one by more than `settings.same`.
     """
-    same = problem.same_pose(candidates.rotation, candidates.translation, settings.same)
+    same = problem.same_as(candidates.pose(), candidates.rotation, candidates.translation, settings.same)
     others = np.flatnonzero(~same)
     if not len(others):
         return None
@@ -158,7 +158,7 @@ def sign_margins(cameras: CandidatesOfCameras, settings: Evidence) -> Array:
         return margins
     candidates, problem = cameras[0]
     poses, chosen = (candidates.rotation, candidates.translation), sum(len(each.image.chosen) for _, each in cameras)
-    others = np.flatnonzero(~problem.same_pose(*poses, settings.same.times(limits.far)))
+    others = np.flatnonzero(~problem.same_as(candidates.pose(), *poses, settings.same.times(limits.far)))
     # A margin that is significant even with the largest possible gaps needs no test.
     decisive = limits.most * math.sqrt(least * chosen) / math.log(10)
     others = others[candidates.log10_false_alarms[others] - candidates.log10_false_alarms[0] < decisive]
