@@ -34,6 +34,10 @@ from bpnp.search.verdict.competitors import sign_margins
 from bpnp.search.verdict.decide import add_false_alarms, rank_poses
 from bpnp.search.verdict.reasons import Unfinished, objection
 
+MOST_VIEWS = 8  # largest number of views [views; cost]
+LEAST_OTHER = 0.5  # least fraction of a view's points that the pose does not see [fraction; not tuned]
+FEWEST_OTHER_POINTS = 12  # least number of such points, and of image points that the pose explains [points; not tuned]
+
 Pose = tuple[Array, Array]  # rotation (3, 3) and translation (3,), in the frame of a problem
 
 
@@ -183,17 +187,17 @@ def _candidate(problem: Problem, solution: Solution, pose: Hypotheses, margin: f
 
 def _other_regions(regions: Iterable[Region], place: Region, problem: Problem, solution: Solution) -> Iterator[Region]:
     """Yield the first regions with mostly points that are not visible from the pose of a solution."""
-    if len(solution.matches) < ALIASING.fewest:
+    if len(solution.matches) < FEWEST_OTHER_POINTS:
         return
     assert problem.measured.camera is not None
     pose = solution.rotation, solution.translation
     seen, count = place.point_ids[place.in_view(*pose, problem.measured.camera, problem.measured.points)], 0
     for region in regions:
         other = ~np.isin(region.point_ids, seen)
-        if other.sum() >= ALIASING.fewest and other.mean() >= ALIASING.least_other:
+        if other.sum() >= FEWEST_OTHER_POINTS and other.mean() >= LEAST_OTHER:
             yield region
             count += 1
-        if count == ALIASING.most_views:
+        if count == MOST_VIEWS:
             return
 
 

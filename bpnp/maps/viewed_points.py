@@ -22,8 +22,7 @@ from bpnp.maps.views import (
     viewing_cones,
 )
 from bpnp.poses import MIN_POINTS
-from bpnp.search.config import FOCAL
-from bpnp.search.focal_length import UnknownCamera
+from bpnp.search.focal_length import FOCAL_STEP_FEW, UnknownCamera
 from bpnp.search.problem import faces
 from bpnp.search.starts import PosePrior
 
@@ -187,7 +186,7 @@ class ViewedPoints:
                 raise ValueError("`views` is empty; give names of views, or None for all views of the map")
             points = np.unique(np.concatenate([view.points for view in named]))
             return [Place(view, points, camera) for view in named if len(view.points) and len(points) >= MIN_POINTS]
-        cameras: list[Camera] = camera.focal_steps(FOCAL.step_few) if isinstance(camera, UnknownCamera) else [camera]
+        cameras: list[Camera] = camera.focal_steps(FOCAL_STEP_FEW) if isinstance(camera, UnknownCamera) else [camera]
         scores = self.scores(cameras[0], keypoints, known_focal=isinstance(camera, Camera), rank_views=rank_views)
         order = list(places_first(self.views, scores, len(self.points3d)))
         ahead = VIEWS_AHEAD

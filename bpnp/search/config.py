@@ -170,138 +170,6 @@ class Stage(NamedTuple):
 
 
 @dataclass(frozen=True)
-class AlarmSettings:
-    """Number of false alarms (`bpnp.search.verdict.false_alarms`).
-
-    Attributes:
-        inliers: Inlier fractions w over which the likelihood ratio is averaged; finer steps give the same evidence in
-            twice the time. [fractions; measured, the problems are not recorded]
-        least_inliers: Smallest w if clutter or scores are given. [fraction; convention]
-        most_inliers: Largest w if clutter or scores are given. [fraction; convention]
-        outline: Smoothing width of the density of unrelated points; the outline beyond it is no evidence. [RMS angular
-            radii; not tuned]
-        smoothed: Largest number of projected points from which that density is estimated. [points; cost]
-        farthest: Distance beyond which a pair does not contribute to the density of a match: e^-9. [scales; numerics]
-        own: Largest factor between a scale and that of the residuals at which it is a pose's own. [factor; convention]
-        rough: Smallest factor at which it is rougher (`rough_residuals`). [factor; convention]
-    """
-
-    inliers: tuple[float, ...] = (0.15, 0.4, 0.75)
-    least_inliers: float = 0.02
-    most_inliers: float = 0.98
-    outline: float = 0.5
-    smoothed: int = 256
-    farthest: float = math.sqrt(18.0)
-    own: float = 2.0
-    rough: float = 4.0
-
-
-ALARMS = AlarmSettings()
-
-
-@dataclass(frozen=True)
-class PrecisionSettings:
-    """Covariance and tests of the residuals (`bpnp.search.verdict.covariance`, `uncertainty`).
-
-    Attributes:
-        exceeded: Probability that an error exceeds its bound, and significance level of a test. [probability;
-            convention]
-        far: Squared distance of a pose from its optimum, in its covariance, from which on they differ: the quantile of
-            chi-squared with 6 degrees of freedom at 1 - `exceeded`. [1; derived]
-        slight: Fraction of the information below which an image point hardly moves the estimate. [fraction; numerics]
-        fixed: Smallest eigenvalue of the normalised information of points that fix the estimate. [1; numerics]
-        blocks: Number of blocks of image points along each axis of the image. [blocks; not tuned]
-    """
-
-    exceeded: float = 1e-3
-    far: float = 22.5
-    slight: float = 0.01
-    fixed: float = 1e-9
-    blocks: int = 4
-
-
-PRECISION = PrecisionSettings()
-
-
-@dataclass(frozen=True)
-class ReasonSettings:
-    """Least differences that a reason shows (`bpnp.search.verdict.reasons`, `competitors`).
-
-    Attributes:
-        decades: Logarithm of a number of false alarms below which 0.0 is shown. [decades; convention]
-        degrees: Rotation below which the shift of a pose is shown instead. [degrees; convention]
-        zoom: Relative change of the focal length that is omitted. [fraction; convention]
-    """
-
-    decades: float = 0.05
-    degrees: float = 0.5
-    zoom: float = 0.005
-
-
-REASONS = ReasonSettings()
-
-
-@dataclass(frozen=True)
-class FocalSettings:
-    """Search for a focal length (`bpnp.search.focal_length`).
-
-    Lengths in the image are relative to the larger image side, distortions to the distance from the principal point.
-
-    Attributes:
-        smallest: Least focal length that is tried: a field of view of 90 degrees. [image sides; convention]
-        largest: Largest focal length that is tried: a field of view of 19 degrees. [image sides; convention]
-        usual: Focal length that is tried first. [image sides; convention]
-        step: Factor between successive focal lengths, for many points; four steps lead from `smallest` to `largest`.
-            [factor; not tuned]
-        step_few: Factor between successive focal lengths, for few points and for photos in maps. [factor; not tuned]
-        sigmas: Half width of the range of an approximate focal length. [standard deviations; convention]
-        iterations: Iterations of the first search with each focal length. [iterations; not tuned]
-        alternations: Largest number of alternations of search and refinement from each focal length. [rounds; not
-            tuned]
-        promising: Largest log10 NFA of a failed search whose poses are refined. [decades; not tuned]
-        rounds: Largest number of iterations of a refinement. [iterations; numerics]
-        same: Change of the logarithm of the focal length below which a refinement stops. [nats; numerics]
-        bends: Radial displacements at the image corner from which a fit of the distortion also starts. Started at zero
-            distortion, too few points match to reach a large one. [fractions; not tuned]
-        bend_sigma: Standard deviation of the radial displacement at the image corner by an unknown distortion.
-            [fraction; not tuned]
-        most_bend: Largest radial displacement at the image corner, that of `OtherFocal`. [fraction; derived]
-        fewest_bent: Least number of matches for a fit of the distortion, that of `OtherFocal`. [matches; derived]
-        centre_sigma: Standard deviation of the principal point, as a fraction of the distance to the image corner:
-            about a quarter of a per cent of the larger image side. [fraction; not tuned]
-        tangential_sigma: Standard deviation of the displacement at the image corner by a tangential coefficient, as a
-            fraction of the distance to the corner. It was chosen on statue_of_liberty, whose map has one camera for
-            photos of many. [fraction; calibration]
-        quartic_sigma: Standard deviation of the displacement at the image corner by the second radial coefficient, as a
-            fraction of the distance to the corner. [fraction; not tuned]
-        least_reach: Smallest distance from the principal point to the image corner. [focal lengths; numerics]
-    """
-
-    smallest: float = 0.5
-    largest: float = 3.0
-    usual: float = 1.0
-    step: float = 1.57
-    step_few: float = 1.25
-    sigmas: float = 3.0
-    iterations: int = 8
-    alternations: int = 3
-    promising: float = -math.inf
-    rounds: int = 12
-    same: float = 5e-4
-    bends: tuple[float, ...] = (-0.2, 0.2)
-    bend_sigma: float = 0.05
-    most_bend: float = OtherFocal.bend
-    fewest_bent: int = OtherFocal.fewest
-    centre_sigma: float = 0.004
-    tangential_sigma: float = 0.002
-    quartic_sigma: float = 0.01
-    least_reach: float = 1e-3
-
-
-FOCAL = FocalSettings()
-
-
-@dataclass(frozen=True)
 class StartSampling:
     """Sampling of initial poses around the weak-perspective pose.
 
@@ -682,9 +550,6 @@ class AliasingSettings:
     Attributes:
         search: Search near each view. Few of the explained image points are outliers for a competing pose. So fewer,
             more smoothed initial poses suffice than near a view that is tried.
-        most_views: Largest number of views. [views; cost]
-        least_other: Least fraction of a view's points that the pose does not see. [fraction; not tuned]
-        fewest: Least number of such points, and of image points that the pose explains. [points; not tuned]
     """
 
     search: DensitySearch = DensitySearch(
@@ -693,9 +558,6 @@ class AliasingSettings:
         Narrowing(0.1, 0.015, steps=6, points=300),
         annealed=6,
     )
-    most_views: int = 8
-    least_other: float = 0.5
-    fewest: int = 12
 
 
 ALIASING = AliasingSettings()

@@ -30,7 +30,7 @@ from bpnp.poses import close_poses, polar_coordinates, rotation_angle
 from bpnp.runtime import NEVER, Clock, Deadline, one_blas_thread
 from bpnp.search.arguments import Array, checked_size
 from bpnp.search.assemble import Solved, with_unfinished
-from bpnp.search.config import DEFAULT, FOCAL, OtherFocal
+from bpnp.search.config import DEFAULT, OtherFocal
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, UnknownFocal
@@ -46,6 +46,39 @@ from bpnp.search.verdict.uncertainty import is_within
 ProblemAt = Callable[[Camera, UnknownFocal], Problem]
 RADIAL_PLACES = {"SIMPLE_RADIAL": 3, "OPENCV": 4}  # index of the radial coefficient in the parameters of a camera model
 AROUND = (1.0, OtherFocal.step, 1 / OtherFocal.step)  # focal lengths around one that has converged [factors; derived]
+# Lengths in the image are relative to the larger image side, distortions to the distance from the principal point.
+SMALLEST_FOCAL = 0.5  # least focal length that is tried: a field of view of 90 degrees [image sides; convention]
+LARGEST_FOCAL = 3.0  # largest focal length that is tried: a field of view of 19 degrees [image sides; convention]
+USUAL_FOCAL = 1.0  # focal length that is tried first [image sides; convention]
+# Factor between successive focal lengths, for many points; four steps lead from the smallest to the largest.
+FOCAL_STEP = 1.57  # [factor; not tuned]
+# Factor between successive focal lengths, for few points and for photos in maps.
+FOCAL_STEP_FEW = 1.25  # [factor; not tuned]
+FOCAL_SIGMAS = 3.0  # half width of the range of an approximate focal length [standard deviations; convention]
+FIRST_ITERATIONS = 8  # iterations of the first search with each focal length [iterations; not tuned]
+ALTERNATIONS = 3  # largest number of alternations of search and refinement from each focal length [rounds; not tuned]
+PROMISING_ALARMS = -math.inf  # largest log10 NFA of a failed search whose poses are refined [decades; not tuned]
+REFINEMENT_ITERATIONS = 12  # largest number of iterations of a refinement [iterations; numerics]
+SAME_FOCAL_NATS = 5e-4  # change of the logarithm of the focal length below which a refinement stops [nats; numerics]
+# Radial displacements at the image corner from which a fit of the distortion also starts. Started at zero distortion,
+# too few points match to reach a large one.
+BENDS = (-0.2, 0.2)  # [fractions; not tuned]
+# Standard deviation of the radial displacement at the image corner by an unknown distortion.
+BEND_SIGMA = 0.05  # [fraction; not tuned]
+# Largest radial displacement at the image corner, that of the competing lenses.
+MOST_BEND = OtherFocal.bend  # [fraction; derived]
+# Least number of matches for a fit of the distortion, that of the competing lenses.
+FEWEST_BENT = OtherFocal.fewest  # [matches; derived]
+# Standard deviation of the principal point, as a fraction of the distance to the image corner: about a quarter of a per
+# cent of the larger image side.
+CENTRE_SIGMA = 0.004  # [fraction; not tuned]
+# Standard deviation of the displacement at the image corner by a tangential coefficient, as a fraction of the distance
+# to the corner. It was chosen on statue_of_liberty, whose map has one camera for photos of many.
+TANGENTIAL_SIGMA = 0.002  # [fraction; calibration]
+# Standard deviation of the displacement at the image corner by the second radial coefficient, as a fraction of the
+# distance to the corner.
+QUARTIC_SIGMA = 0.01  # [fraction; not tuned]
+LEAST_REACH = 1e-3  # smallest distance from the principal point to the image corner [focal lengths; numerics]
 
 
 class UnknownCamera(NamedTuple):
@@ -90,22 +123,22 @@ class UnknownCamera(NamedTuple):
 
     def outermost(self, zoom: float) -> float:
         """Return the reach in focal lengths of the camera with `zoom` times that of the reference."""
-        return max(self.reach / zoom, FOCAL.least_reach)
+        return max(self.reach / zoom, LEAST_REACH)
 
     def focal(self, camera: Camera) -> UnknownFocal:
         """Return the prior of the focal length and distortion of one of these cameras."""
         zoom, radial = self.parts(camera)
-        sigma = math.inf if radial is not None else FOCAL.bend_sigma if self.bends else 0.0
+        sigma = math.inf if radial is not None else BEND_SIGMA if self.bends else 0.0
         return UnknownFocal(
             math.log(self.largest / self.smallest),
             self.sigma,
             math.log(zoom),
             radial or 0.0,
             radial_sigma=sigma / self.outermost(zoom) ** 2,
-            radial_range=0.0 if radial is None else 2 * FOCAL.most_bend / self.outermost(zoom) ** 2,
-            centre_sigma=FOCAL.centre_sigma * self.outermost(zoom),
-            tangential_sigma=FOCAL.tangential_sigma / self.outermost(zoom),
-            quartic_sigma=FOCAL.quartic_sigma / self.outermost(zoom) ** 4,
+            radial_range=0.0 if radial is None else 2 * MOST_BEND / self.outermost(zoom) ** 2,
+            centre_sigma=CENTRE_SIGMA * self.outermost(zoom),
+            tangential_sigma=TANGENTIAL_SIGMA / self.outermost(zoom),
+            quartic_sigma=QUARTIC_SIGMA / self.outermost(zoom) ** 4,
         )
 
     def focal_steps(self, step: float) -> list[Camera]:
@@ -161,9 +194,9 @@ def unknown_camera(
         reference = camera_from(("SIMPLE_PINHOLE", width, height, (max(width, height), width / 2, height / 2)))
         return UnknownCamera(
             reference,
-            FOCAL.smallest,
-            FOCAL.largest,
-            FOCAL.usual,
+            SMALLEST_FOCAL,
+            LARGEST_FOCAL,
+            USUAL_FOCAL,
             bends=True,
             distorted=bool(distortion),
             reach=math.hypot(width, height) / 2 / max(width, height),
@@ -174,7 +207,7 @@ def unknown_camera(
         )
     if focal_error is None or not 0 < focal_error < 1:
         raise ValueError(f"`focal_error` is {focal_error}; it is a fraction of the focal length, above 0 and below 1")
-    widest, lens = math.exp(FOCAL.sigmas * focal_error), camera_from(camera)
+    widest, lens = math.exp(FOCAL_SIGMAS * focal_error), camera_from(camera)
     if distortion and not is_pinhole(lens):
         raise ValueError(
             f"`distortion=True` needs a pinhole `camera`; the distortion of {camera_to_json(lens)} is known"
@@ -230,8 +263,8 @@ class FocalSweep(ABC):
         """Return the solution with the fewest false alarms; `few` is True for points that are enumerated."""
         most, begun = self.options.settings.schedule.iterations, Clock.now()
         self.deadline = self.options.limit()
-        for camera in (focal_steps := self.unknown.focal_steps(FOCAL.step_few if few else FOCAL.step)):
-            self.search_from(self.preselect(camera), min(FOCAL.iterations, most), len(focal_steps))
+        for camera in (focal_steps := self.unknown.focal_steps(FOCAL_STEP_FEW if few else FOCAL_STEP)):
+            self.search_from(self.preselect(camera), min(FIRST_ITERATIONS, most), len(focal_steps))
             if self.best.case.objection is None and not few:
                 break
             if len(self.ends) < len(focal_steps) and self.deadline.passed(Unfinished.focal_lengths):
@@ -239,7 +272,7 @@ class FocalSweep(ABC):
         if (
             self.best.case.objection is not None
             and not few
-            and most > FOCAL.iterations
+            and most > FIRST_ITERATIONS
             and self.best.solution.camera is not None
             and not self.deadline.passed(Unfinished.focal_lengths)
         ):
@@ -263,9 +296,9 @@ class FocalSweep(ABC):
     def search_from(self, camera: Camera, iterations: int, steps: int) -> None:
         """Search with a camera, then with cameras that fit the found poses better."""
         found = self._search(camera, iterations, steps)
-        for _ in range(FOCAL.alternations):
+        for _ in range(ALTERNATIONS):
             solution = found.solution
-            if solution.verdict == "failed" and solution.log10_false_alarms > FOCAL.promising:
+            if solution.verdict == "failed" and solution.log10_false_alarms > PROMISING_ALARMS:
                 break
             better, settled = self._refined(solution, camera)
             if settled:  # a better optimum may lie at a slightly different focal length
@@ -294,7 +327,7 @@ class FocalSweep(ABC):
         fitted = self.refine(solution, camera, zooms)
         (zoom, radial), (before, old) = self.unknown.parts(fitted), self.unknown.parts(camera)
         bend = abs((radial or 0.0) - (old or 0.0)) * self.unknown.outermost(zoom) ** 2
-        return fitted, max(abs(math.log(zoom / before)), bend) < FOCAL.same
+        return fitted, max(abs(math.log(zoom / before)), bend) < SAME_FOCAL_NATS
 
     def other_focal_length(self) -> Objection | None:
         """Return another focal length with a different pose that fits about as well as the best solution, or None.
@@ -399,13 +432,13 @@ def fit_camera(
         return min(fits, key=lambda one: one.log10_false_alarms)
 
     plain = fit([(each, None) for each in zooms])
-    few = min(len(plain.problem.bearings), len(plain.problem.points3d)) < FOCAL.fewest_bent
+    few = min(len(plain.problem.bearings), len(plain.problem.points3d)) < FEWEST_BENT
     if unknown.bends and not few and not deadline.passed(Unfinished.focal_lengths):
-        others = [] if radial is not None else [each / unknown.outermost(zoom) ** 2 for each in FOCAL.bends]
+        others = [] if radial is not None else [each / unknown.outermost(zoom) ** 2 for each in BENDS]
         bent = fit([*((each, radial or 0.0) for each in zooms), *((1.0, each) for each in others)])
         matches = match_count(bent.poses)
         lead = math.inf if unknown.distorted else math.log10(DEFAULT.evidence.focal_chance)
-        if matches >= FOCAL.fewest_bent and bent.log10_false_alarms < plain.log10_false_alarms + lead:
+        if matches >= FEWEST_BENT and bent.log10_false_alarms < plain.log10_false_alarms + lead:
             return bent
     return plain
 
@@ -439,17 +472,17 @@ def _fit_track(
     centre = (rotation @ problem.centre3d + translation) * (1, 1, farther)
     translation = centre - rotation @ problem.centre3d
     end = _anneal_pose(problem, rotation, translation, scale, seed, deadline)
-    for _ in range(FOCAL.rounds):
+    for _ in range(REFINEMENT_ITERATIONS):
         if deadline.passed(Unfinished.focal_lengths):
             break
         pinhole = unknown.at(zoom)
         flat = problem if radial is None else problem_at(pinhole, unknown.focal(pinhole))
         centre = rotation @ flat.centre3d + translation
         fitted = fit_lens(flat, rotation, centre, scale, radial)
-        if fitted is None or not 1 / FOCAL.step < zoom * fitted.zoom / first < FOCAL.step:
+        if fitted is None or not 1 / FOCAL_STEP < zoom * fitted.zoom / first < FOCAL_STEP:
             break
         bend = abs((fitted.radial or 0.0) - (radial or 0.0)) * unknown.outermost(zoom) ** 2
-        if bend > FOCAL.most_bend:
+        if bend > MOST_BEND:
             break
         zoom, radial, camera = zoom * fitted.zoom, fitted.radial, unknown.at(zoom * fitted.zoom, fitted.radial)
         problem = problem_at(camera, unknown.focal(camera))
@@ -457,7 +490,7 @@ def _fit_track(
         end = _anneal_pose(problem, rotation, fitted.centre3d - rotation @ problem.centre3d, scale, seed, deadline)
         rotation, scale = end.rotation[0], min(scale, float(end.scale[0]))
         translation = end.translation[0]
-        if max(abs(math.log(fitted.zoom)), bend) < FOCAL.same:
+        if max(abs(math.log(fitted.zoom)), bend) < SAME_FOCAL_NATS:
             break
     return FittedCamera(camera, problem, end)
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from bpnp.poses import rotation_angle
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
-from bpnp.search.config import DEFAULT, PRECISION, Evidence
+from bpnp.search.config import DEFAULT, Evidence
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.pose_model import PoseModel
@@ -31,6 +31,7 @@ from bpnp.search.refine.annealing import anneal_on_points, anneal_to_end, finish
 from bpnp.search.search_frame import Scene
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict.contest import contest, rivals_of
+from bpnp.search.verdict.covariance import FAR_SQUARED
 from bpnp.search.verdict.decide import Case, add_false_alarms
 from bpnp.search.verdict.false_alarms import likeliest_scale
 from bpnp.search.verdict.reasons import Unfinished, objection
@@ -105,7 +106,7 @@ def _nearby(case: Case, *, claim: Hypotheses, optimum: Hypotheses) -> Case:
     Source: S. S. Wilks, The large-sample distribution of the likelihood ratio, Ann. Math. Statist. 1938.
     """
     margin = float(claim.log10_false_alarms[0] - optimum.log10_false_alarms[0])
-    if 2 * math.log(10) * margin <= PRECISION.far:
+    if 2 * math.log(10) * margin <= FAR_SQUARED:
         return case
     off = math.degrees(rotation_angle(claim.rotation[0], optimum.rotation[0]))
     return case.against(objection("better_nearby", margin, degrees=off))
@@ -162,4 +163,4 @@ def _is_same(problem: Problem, claim: Hypotheses, pose: Hypotheses, settings: Ev
     vector = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
     centre, other = (one.rotation[0] @ problem.centre3d + one.translation[0] for one in (claim, pose))
     step = np.r_[vector, centre - other]
-    return bool(step @ np.linalg.solve(covariance, step) < PRECISION.far)
+    return bool(step @ np.linalg.solve(covariance, step) < FAR_SQUARED)

@@ -16,11 +16,11 @@ from scipy.spatial import cKDTree
 from bpnp.poses import MIN_POINTS
 from bpnp.runtime import NEVER, Clock, Deadline
 from bpnp.search.arguments import Array, Labels
-from bpnp.search.config import PRECISION
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.possible_matches import DENSE_MATCHES, FEW_NEIGHBOURS
 from bpnp.search.problem import Problem
 from bpnp.search.refine.gauss_newton import FIRST_DAMPING, Iteration, image_equations, refine
+from bpnp.search.verdict.covariance import FAR_SQUARED
 from bpnp.search.verdict.reasons import Unfinished
 
 # Number of points whose neighbours are looked up, or that are assigned, between two checks of the deadline.
@@ -57,7 +57,7 @@ def fit_to_matches(
         trial = fit_pose(problem.measured.project, points, target, rotation, translation, scale=threshold)
         after = problem.measured.project(points @ trial[0].T + trial[1])
         squares = [float(((each - target) ** 2).sum()) for each in (projected[j], after)]
-        if not squares[0] > squares[1] * math.exp(PRECISION.far / target.size):
+        if not squares[0] > squares[1] * math.exp(FAR_SQUARED / target.size):
             break
         rotation, translation = trial
     return rotation, translation

@@ -12,11 +12,14 @@ import pytest
 from scipy.stats import chi2
 
 from bpnp.search import config
-from bpnp.search.config import ALARMS, PRECISION, Repetitions
+from bpnp.search.config import Repetitions
 from bpnp.search.possible_matches import FARTHEST_MATCH, MATCH_REACH
 from bpnp.search.propose.known_matches import MOST_TRIPLES
 from bpnp.search.propose.symmetries import BASES, FIRST_SAMPLED
 from bpnp.search.refine.gauss_newton import DIFFERENCE_STEP
+from bpnp.search.verdict.covariance import FAR_SQUARED
+from bpnp.search.verdict.false_alarms import FARTHEST_PAIR
+from bpnp.search.verdict.uncertainty import EXCEEDED
 
 PACKAGE = Path(config.__file__).parents[1]
 FILES = [file for folder in ("search", "maps", "robust") for file in sorted((PACKAGE / folder).rglob("*.py"))]
@@ -75,8 +78,8 @@ def test_groups_have_units_and_origins(group: Any) -> None:
 
 def test_derived_constants_follow_from_their_laws() -> None:
     """The numbers that the documentation derives: quantiles, probabilities of a miss, tails of a normal density."""
-    assert chi2.ppf(1 - PRECISION.exceeded, 6) == pytest.approx(PRECISION.far, abs=0.1)
-    assert ALARMS.farthest**2 / 2 == pytest.approx(9)
+    assert chi2.ppf(1 - EXCEEDED, 6) == pytest.approx(FAR_SQUARED, abs=0.1)
+    assert pytest.approx(9) == FARTHEST_PAIR**2 / 2
     assert pytest.approx(8) == FARTHEST_MATCH**2 / 2
     assert chi2.cdf(MATCH_REACH**2, 2) == pytest.approx(0.989, abs=5e-4)
     assert pytest.approx(3e-4, rel=0.1) == (1 - 0.2**3) ** MOST_TRIPLES

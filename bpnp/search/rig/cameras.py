@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from bpnp.runtime import NEVER, Deadline
-from bpnp.search.config import ALARMS
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.pose_model import PoseModel, crossed
 from bpnp.search.problem import Problem, UnknownFocal
@@ -33,7 +32,7 @@ from bpnp.search.search_frame import Scene
 from bpnp.search.solution import FOCAL_LENGTH, POSE_PARAMETERS, SCALE
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
 from bpnp.search.verdict.covariance import covariance_of, join, student_factor
-from bpnp.search.verdict.false_alarms import Terms, camera_terms, directions_of, log10_nfa, match_shares
+from bpnp.search.verdict.false_alarms import FARTHEST_PAIR, Terms, camera_terms, directions_of, log10_nfa, match_shares
 from bpnp.search.verdict.uncertainty import linearise, matches_of
 
 # Scale at which proposals are compared: a pose of one camera is inaccurate in another.
@@ -204,7 +203,7 @@ class Rig:
             _, nearest = KDTree(own[seen]).query(problem.bearings[problem.image.chosen])
             nearest = seen[nearest]
             distances = [_distances(*each) for each in zip(self._images, (d[nearest] for d in directions), strict=True)]
-            near = np.array(distances)[:, :, None] <= ALARMS.farthest * scales
+            near = np.array(distances)[:, :, None] <= FARTHEST_PAIR * scales
             near[k] = True
             cameras = near.sum(0)  # (points, scales), as `widest`
             parallax = self._parallax(k, seen, directions, rotation, translation)

@@ -14,13 +14,16 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bpnp.poses import rotation_angle
-from bpnp.search.config import REASONS, Evidence
+from bpnp.search.config import Evidence
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.possible_matches import MATCH_REACH
 from bpnp.search.problem import Problem, label_groups
 from bpnp.search.verdict.false_alarms import directions_of, own_evidence
 from bpnp.search.verdict.reasons import Objection, objection
 from bpnp.search.verdict.uncertainty import Misfit
+
+SHOWN_DEGREES = 0.5  # rotation below which the shift of a pose is shown instead [degrees; convention]
+SHOWN_ZOOM = 0.005  # relative change of the focal length that is omitted [fraction; convention]
 
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]
@@ -68,7 +71,7 @@ def distance_between(problem: Problem, first: Pose, second: Pose) -> str:
         Such as "12 deg" or "15 % of the distance", that of the scene centroid from the camera of the first pose.
     """
     degrees = math.degrees(rotation_angle(first[0], second[0]))
-    if degrees >= REASONS.degrees:
+    if degrees >= SHOWN_DEGREES:
         return f"{degrees:.0f} deg"
     centre, moved = (rotation @ problem.centre3d + translation for rotation, translation in (first, second))
     shift = float(np.linalg.norm(moved - centre) / max(float(np.linalg.norm(centre)), 1e-300))
@@ -103,7 +106,7 @@ def other_camera(off: Misfit, settings: Evidence) -> Objection | None:
         return None
     other = f"{off.zoom:.2f} times the focal length" if off.zoom != 1 else "other proportions of the scene"
     if off.radial:
-        also_zoom = f" and {off.zoom:.2f} times the focal length" if abs(off.zoom - 1) > REASONS.zoom else ""
+        also_zoom = f" and {off.zoom:.2f} times the focal length" if abs(off.zoom - 1) > SHOWN_ZOOM else ""
         other = f"a radial distortion of {off.radial:.2g}{also_zoom}"
     return objection("other_camera", camera=other, degrees=math.degrees(off.turn), percent=100 * off.shift)
 

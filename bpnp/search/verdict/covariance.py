@@ -11,11 +11,16 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.special import stdtrit
 
-from bpnp.search.config import PRECISION
-
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
 ONE_SIGMA = 0.8413447460685429  # of a normal variable below one standard deviation [probability; derived]
+# Squared distance of a pose from its optimum, in its covariance, from which on they differ: the quantile of chi-squared
+# with 6 degrees of freedom at 1 - `EXCEEDED`.
+FAR_SQUARED = 22.5  # [1; derived]
+# Fraction of the information below which an image point hardly moves the estimate.
+SLIGHT_INFORMATION = 0.01  # [fraction; numerics]
+# Smallest eigenvalue of the normalised information of points that fix the estimate.
+LEAST_EIGENVALUE = 1e-9  # [1; numerics]
 
 
 class Linearisation(NamedTuple):
@@ -111,15 +116,15 @@ def covariance_of(
     # The complete information has a unit diagonal in these units, so that the rank can be determined.
     unit = 1 / np.sqrt(np.maximum(complete + np.diag(matches.known), 1e-300))
     values, vectors = np.linalg.eigh(observed * np.outer(unit, unit))
-    if values[0] <= PRECISION.fixed:
+    if values[0] <= LEAST_EIGENVALUE:
         return None
     root = unit[:, None] * vectors / np.sqrt(values)
     steps = expected @ root
-    matters = np.flatnonzero(own.reshape(-1, size * size) @ (root @ root.T).ravel() > PRECISION.slight)
+    matters = np.flatnonzero(own.reshape(-1, size * size) @ (root @ root.T).ravel() > SLIGHT_INFORMATION)
     if 2 * (round(float(counted.sum())) - 1) <= fitted:
         matters = matters[:0]  # without one of these matches, the others fix several estimates or none
     without = np.eye(size) - root.T @ own[matters] @ root
-    fixed = np.linalg.eigvalsh(without)[:, 0] > PRECISION.fixed  # the estimate is fixed without the point too
+    fixed = np.linalg.eigvalsh(without)[:, 0] > LEAST_EIGENVALUE  # the estimate is fixed without the point too
     steps[matters[fixed]] = np.linalg.solve(without[fixed], steps[matters[fixed], :, None])[..., 0]
     ratio, axes = np.linalg.eigh((weight[:, None] * steps).T @ steps + root.T @ matches.known @ root)
     along = root @ axes

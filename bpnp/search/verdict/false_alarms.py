@@ -46,16 +46,29 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.config import ALARMS
 from bpnp.search.image_statistics import ImageStatistics
 from bpnp.search.kernels.neighbours import sums_near
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem, faces, label_groups
 
+# Inlier fractions w over which the likelihood ratio is averaged; finer steps give the same evidence in twice the time.
+INLIER_FRACTIONS = (0.15, 0.4, 0.75)  # [fractions; measured, the problems are not recorded]
+LEAST_INLIERS = 0.02  # smallest w if clutter or scores are given [fraction; convention]
+MOST_INLIERS = 0.98  # largest w if clutter or scores are given [fraction; convention]
+# Smoothing width of the density of unrelated points; the outline beyond it is no evidence.
+OUTLINE_WIDTH = 0.5  # [RMS angular radii; not tuned]
+SMOOTHED_POINTS = 256  # largest number of projected points from which that density is estimated [points; cost]
+# Distance beyond which a pair does not contribute to the density of a match: e^-9.
+FARTHEST_PAIR = math.sqrt(18.0)  # [scales; numerics]
+# Largest factor between a scale and that of the residuals at which it is a pose's own.
+OWN_SCALES = 2.0  # [factor; convention]
+# Smallest factor between the scales at which residuals are rougher (`rough_residuals`).
+ROUGH_SCALES = 4.0  # [factor; convention]
+
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
 
-SHARES = np.array(ALARMS.inliers)  # w
+SHARES = np.array(INLIER_FRACTIONS)  # w
 
 
 class Terms(NamedTuple):
@@ -191,7 +204,7 @@ def camera_terms(
     if min(len(problem.bearings), int(np.isfinite(directions[:, 0]).sum())) <= PoseModel.of(problem).fixing:
         return None
     ratio = np.ones(len(problem.image.scales)) if scale is None else _ratio(problem.image, scale)
-    own, rough = _is_own(ratio), ratio >= ALARMS.rough
+    own, rough = _is_own(ratio), ratio >= ROUGH_SCALES
     finest = int(own.argmax())
     logs, less = _terms(problem, directions, finest), np.broadcast_to(fewer, own.shape)[finest:]
     pairs = len(own) * logs.shape[2]
@@ -228,7 +241,7 @@ def _ratio(image: ImageStatistics, scale: float) -> Array:
 
 
 def _is_own(ratio: Array) -> NDArray[np.bool_]:
-    return (ratio >= 1 / ALARMS.own) & (ratio <= ALARMS.own)
+    return (ratio >= 1 / OWN_SCALES) & (ratio <= OWN_SCALES)
 
 
 def match_shares(problem: Problem) -> Array:
@@ -245,7 +258,7 @@ def match_shares(problem: Problem) -> Array:
         shares = shares * problem.candidate_scores[problem.image.chosen][:, None, None]
     elif problem.clutter is None and problem.scores2d is None:
         return shares
-    return np.asarray(np.clip(shares, ALARMS.least_inliers, ALARMS.most_inliers))
+    return np.asarray(np.clip(shares, LEAST_INLIERS, MOST_INLIERS))
 
 
 def _terms(problem: Problem, directions: Array, finest: int) -> Array:
@@ -313,7 +326,7 @@ def _sums(problem: Problem, directions: Array, scales: Array, even: bool) -> tup
         every[rows] += odds * share.sum()
         inside[rows] += odds * share[in_view[columns]].sum()
         used, share, bearings = directions[columns][ahead], share[ahead], problem.bearings[image.chosen[rows]]
-        near = sums_near(bearings, used, image.axes, ALARMS.farthest * scales, 0.5 / scales**2, share)
+        near = sums_near(bearings, used, image.axes, FARTHEST_PAIR * scales, 0.5 / scales**2, share)
         predicted[rows] += odds[:, None] * near
         if not even:
             smooth[rows] += odds * _smoothed(image, bearings, used, share)
@@ -336,9 +349,9 @@ def _sums_of_pairs(
     ahead = np.isfinite(directions[j, 0])
     i, j = i[ahead], j[ahead]
     squared = ((problem.bearings[problem.image.chosen[i]] - directions[j]) ** 2).sum(-1)
-    near = (np.where(squared < (ALARMS.farthest * s) ** 2, np.exp(-0.5 * squared / s**2), 0.0) for s in scales.tolist())
+    near = (np.where(squared < (FARTHEST_PAIR * s) ** 2, np.exp(-0.5 * squared / s**2), 0.0) for s in scales.tolist())
     predicted = np.stack([np.bincount(i, weight[j] * kernel, count) for kernel in near], -1)
-    width2 = (ALARMS.outline * problem.image.spread) ** 2
+    width2 = (OUTLINE_WIDTH * problem.image.spread) ** 2
     outline = weight[j] * np.exp(-0.5 * squared / width2) / (2 * math.pi * width2)
     smooth = np.zeros(count) if even else np.asarray(np.bincount(i, outline, count), np.float64)
     return np.asarray(predicted, np.float64), smooth, inside, every
@@ -361,12 +374,12 @@ def _partners(problem: Problem, weight: Array) -> Iterator[tuple[Labels, Labels,
 
 
 def _smoothed(image: ImageStatistics, bearings: Array, directions: Array, share: Array) -> Array:
-    """Return the weighted directions per steradian around each bearing, smoothed by `ALARMS.outline` radii."""
-    step = -(-len(directions) // ALARMS.smoothed) or 1
+    """Return the weighted directions per steradian around each bearing, smoothed by `OUTLINE_WIDTH` radii."""
+    step = -(-len(directions) // SMOOTHED_POINTS) or 1
     some, share = directions[::step], share[::step]
     if not len(some):
         return np.zeros(len(bearings))
-    width2 = (ALARMS.outline * image.spread) ** 2
+    width2 = (OUTLINE_WIDTH * image.spread) ** 2
     # Relative to the centre of the view, float32 is precise enough for a narrow one.
     one, other = ((points - image.centre) / math.sqrt(2 * width2) for points in (bearings, some))
     one = np.column_stack([2 * one, -(one * one).sum(1), np.ones(len(one))]).astype(np.float32)

@@ -3,7 +3,7 @@
 import math
 from typing import NamedTuple
 
-from bpnp.search.config import REASONS
+SHOWN_DECADES = 0.05  # logarithm of a number of false alarms below which 0.0 is shown [decades; convention]
 
 MIRRORED = "the mirror image of the scene has a significant pose: check the directions of its axes"
 CONFIDENT = "confident"  # code of a pose without an objection
@@ -153,7 +153,7 @@ def rounded(bound: float) -> str:
 
 def nfa(log10_false_alarms: float) -> str:
     """Format the logarithm of a number of false alarms."""
-    shown = 0.0 if abs(log10_false_alarms) < REASONS.decades else log10_false_alarms
+    shown = 0.0 if abs(log10_false_alarms) < SHOWN_DECADES else log10_false_alarms
     return f"log10 NFA {shown:.1f}"
 
 

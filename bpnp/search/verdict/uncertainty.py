@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc, fdtri
 
-from bpnp.search.config import DEFAULT, PRECISION, Evidence
+from bpnp.search.config import DEFAULT, Evidence
 from bpnp.search.pose_model import PoseModel, PoseState, Sight, crossed, lens_columns, lens_error_columns
 from bpnp.search.problem import Problem
 from bpnp.search.refine.gauss_newton import soft_matches
@@ -32,6 +32,9 @@ STRAINS = np.array(
     np.float64,
 )
 POSE = 6  # parameters of a pose [parameters; derived]
+# Probability that an error exceeds its bound, and significance level of a test.
+EXCEEDED = 1e-3  # [probability; convention]
+BLOCKS = 4  # number of blocks of image points along each axis of the image [blocks; not tuned]
 
 
 def error_bounds(problem: Problem, linear: "Linearised | None", count: float) -> tuple[float, float]:
@@ -112,7 +115,7 @@ def exceeded_once(covariance: Array, free: float) -> float:
     squared, cubed = (float(np.trace(np.linalg.matrix_power(covariance / total, k))) for k in (2, 3))
     d = squared * (squared / cubed) ** 2
     b = math.sqrt(d * squared)
-    quantiles = fdtri(np.array([MANY, d]), free, 1 - PRECISION.exceeded)
+    quantiles = fdtri(np.array([MANY, d]), free, 1 - EXCEEDED)
     return math.sqrt(total * float(max(1 - b, 0.0) * quantiles[0] + b * quantiles[1]))
 
 
@@ -131,7 +134,7 @@ def is_within(error: Array, covariance: Array, free: float | int) -> bool:
         return False
     free, size = max(float(free), 1.0), len(error)
     squared = float(error @ np.linalg.pinv(covariance, hermitian=True) @ error) * student_factor(free)
-    return bool(squared < size * fdtri(size, free, 1 - PRECISION.exceeded))
+    return bool(squared < size * fdtri(size, free, 1 - EXCEEDED))
 
 
 def pose_covariance(problem: Problem, linear: "Linearised | None", count: float) -> Array | None:
@@ -244,7 +247,7 @@ def _of_louis(linear: "Linearised") -> Array | None:
 def _blocks(problem: Problem, matched: Array) -> Labels:
     """Return the block (k,) of each chosen image point; the blocks have equal expected matches.
 
-    There are at most `PRECISION.blocks`^2.
+    There are at most `BLOCKS`^2.
 
     Args:
         problem: Points.
@@ -252,18 +255,18 @@ def _blocks(problem: Problem, matched: Array) -> Labels:
     """
     x, y = ((problem.bearings[problem.image.chosen] - problem.image.centre) @ problem.image.axes).T
     column, row = _quantile(x, matched), np.zeros(len(x), np.int64)
-    for k in range(PRECISION.blocks):
+    for k in range(BLOCKS):
         row[column == k] = _quantile(y[column == k], matched[column == k])
-    return column * PRECISION.blocks + row
+    return column * BLOCKS + row
 
 
 def _quantile(values: Array, weights: Array) -> Labels:
-    """Return the index of each value among `PRECISION.blocks` intervals of equal weight."""
+    """Return the index of each value among `BLOCKS` intervals of equal weight."""
     order = np.argsort(values, kind="stable")
     below = np.empty(len(values))
     below[order] = np.cumsum(weights[order]) - weights[order] / 2
-    block = below * PRECISION.blocks / max(float(weights.sum()), 1e-300)
-    return np.minimum(block, PRECISION.blocks - 1).astype(np.int64)
+    block = below * BLOCKS / max(float(weights.sum()), 1e-300)
+    return np.minimum(block, BLOCKS - 1).astype(np.int64)
 
 
 class Linearised(NamedTuple):
@@ -382,7 +385,7 @@ def systematic_misfit(linear: Linearised | None, count: float, settings: Evidenc
     pose = np.linalg.pinv(products[:POSE, :POSE], hermitian=True)
     found = []
     strains = slice(POSE + 1, POSE + 1 + len(STRAINS))
-    for fitted, chance in ((slice(POSE, POSE + 1), settings.focal_chance), (strains, PRECISION.exceeded)):
+    for fitted, chance in ((slice(POSE, POSE + 1), settings.focal_chance), (strains, EXCEEDED)):
         moved, step = _moved(products, pose, fitted, free, chance)
         zoom = math.exp(float(step[0])) if len(step) == 1 else 1.0
         found.append(Misfit(float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:])), zoom))
