@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from bpnp.argument_types import ArrayLike, HasArray, HasCameraModel, Numbers, short_repr
+from bpnp.arrays import Array
 
-Array = npt.NDArray[np.float64]
 ROUND_TRIP = 0.01  # largest error of a pixel that is undistorted and distorted again, pixels
 # Models whose image radius at the angle t from the axis is t (1 + k1 t^2 + ...): number of focal lengths and of k.
 FISHEYE = {

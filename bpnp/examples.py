@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageEnhance
 from scipy.spatial.transform import Rotation
 
+from bpnp.arrays import Array
 from bpnp.cameras import import_pycolmap
 from bpnp.datamodules.shapes import procedural_shape, sample_surface
 from bpnp.datamodules.synthetic_maps.maps import LONG_SIDE, MapOptions, draw_map_problem
@@ -30,7 +31,6 @@ COLOURS = {
     "wood": np.array([(170, 110, 60), (120, 70, 40), (200, 150, 90), (180, 190, 200)]),
     "slate": np.array([(60, 70, 90), (90, 100, 120), (50, 50, 60), (120, 130, 140)]),
 }  # RGB
-Array = np.ndarray[Any, np.dtype[np.float64]]
 Face = tuple[Array, Array, Array, Image.Image]  # corner, edges a and b (metres, a x b outward), texture
 
 

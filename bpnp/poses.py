@@ -1,17 +1,18 @@
 """Comparison of poses that are NumPy arrays."""
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.arrays import Floats
+
 AT_ONCE = 16  # poses compared with all others in one matrix product
 MIN_POINTS = 4  # matches that fix a pose; three fit up to four poses exactly
-Array = NDArray[np.floating[Any]]
 
 
-def rotation_angle(one: Array, other: Array) -> float:
+def rotation_angle(one: Floats, other: Floats) -> float:
     """Return the angle between two rotations (3, 3), radians, in [0, pi]."""
     cosine = (float((one * other).sum()) - 1) / 2
     return math.acos(min(max(cosine, -1.0), 1.0))
@@ -32,33 +33,22 @@ SAME = Tolerance()
 
 
 def same_pose(
-    pose: tuple[Array, Array], rotation: Array, translation: Array, centre: Array, tolerance: Tolerance = SAME
+    pose: tuple[Floats, Floats], rotation: Floats, translation: Floats, centre: Floats, tolerance: Tolerance = SAME
 ) -> NDArray[np.bool_]:
-    """Find the poses that are the same as a given one.
+    """Find the poses (c,) that are the same as a given one, for a scene with the centroid `centre` (3,).
 
-    Args:
-        pose: Rotation (3, 3) and translation (3,).
-        rotation: Rotations (c, 3, 3).
-        translation: Translations (c, 3).
-        centre: (3,) centroid of the scene.
-        tolerance: Largest differences.
-
-    Returns:
-        Mask (c,).
-
-    Examples:
-        >>> import numpy as np
-        >>> from bpnp.poses import same_pose
-        >>> shifts = np.array([[0, 0, 10], [0.4, 0, 10], [0, 0, 10.6]])
-        >>> same_pose((np.eye(3), shifts[0]), np.stack([np.eye(3)] * 3), shifts, np.zeros(3))
-        array([ True,  True, False])
+    >>> import numpy as np
+    >>> from bpnp.poses import same_pose
+    >>> shifts = np.array([[0, 0, 10], [0.4, 0, 10], [0, 0, 10.6]])
+    >>> same_pose((np.eye(3), shifts[0]), np.stack([np.eye(3)] * 3), shifts, np.zeros(3))
+    array([ True,  True, False])
     """
     rotations = np.concatenate([pose[0][None], rotation])
     centroid = rotations @ centre + np.concatenate([pose[1][None], translation])
     return close_poses(rotations, polar_coordinates(centroid), 0, *tolerance)[1:]
 
 
-def polar_coordinates(points: Array) -> Array:
+def polar_coordinates(points: Floats) -> Floats:
     """Return the directions and log distances (c, 4 k) of points (c, 3) or (c, k, 3) in cameras' frames."""
     distance = np.maximum(np.linalg.norm(points, axis=-1, keepdims=True), 1e-300)
     polar = np.concatenate([points / distance, np.log(distance)], -1)
@@ -66,7 +56,7 @@ def polar_coordinates(points: Array) -> Array:
 
 
 def close_poses(
-    rotation: Array, translation: Array, i: int | NDArray[np.int64], degrees: float, shift: float
+    rotation: Floats, translation: Floats, i: int | NDArray[np.int64], degrees: float, shift: float
 ) -> NDArray[np.bool_]:
     """Find the poses that are close to pose i, or to several indices (k,): a mask (c,) or (k, c).
 
@@ -81,7 +71,7 @@ def close_poses(
 
 
 def distinct(
-    rotation: Array, translation: Array, score: Array, count: int, degrees: float, shift: float
+    rotation: Floats, translation: Floats, score: Floats, count: int, degrees: float, shift: float
 ) -> NDArray[np.int64]:
     """Return the indices of at most `count` poses, best first, of which no two are closer than both limits.
 

@@ -10,6 +10,7 @@ PACKAGE = Path(__file__).parents[1] / "bpnp"
 FILES = sorted(PACKAGE.rglob("*.py"))
 GROUND = {
     "argument_types",
+    "arrays",
     "types",
     "geometry",
     "poses",

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.arrays import Array, PoseArrays
 from bpnp.maps.photo_problem import Photo
 from bpnp.maps.viewed_points import Region
-from bpnp.maps.views import Array
 from bpnp.poses import rotation_angle, same_pose
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
 from bpnp.search.assemble import Solved, candidates_of
@@ -37,8 +37,6 @@ from bpnp.search.verdict.reasons import Unfinished, objection
 MOST_VIEWS = 8  # largest number of views [views; cost]
 LEAST_OTHER = 0.5  # least fraction of a view's points that the pose does not see [fraction; not tuned]
 FEWEST_OTHER_POINTS = 12  # least number of such points, and of image points that the pose explains [points; not tuned]
-
-Pose = tuple[Array, Array]  # rotation (3, 3) and translation (3,), in the frame of a problem
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +98,7 @@ def propose_elsewhere(
     earlier: Sequence[Candidate],
     regions: Iterable[Region],
     deadline: Deadline,
-) -> list[Pose]:
+) -> list[PoseArrays]:
     """Return unrefined poses elsewhere in the map that may explain the image points of a solution.
 
     `problem` has the points of `place`. Of the `regions`, ranked for the explained image points, the first ones with
@@ -117,7 +115,7 @@ def propose_elsewhere(
 
 
 def refine_elsewhere(
-    problem: Problem, solution: Solution, proposals: Sequence[Pose], seed: int, deadline: Deadline
+    problem: Problem, solution: Solution, proposals: Sequence[PoseArrays], seed: int, deadline: Deadline
 ) -> Hypotheses:
     """Return the proposals that differ from a solution before and after their refinement, refined."""
     best = _pose_of(problem, solution)
@@ -166,7 +164,7 @@ def explained_keypoints(photo: Photo, solution: Solution) -> Array:
     return photo.keypoints[np.sort(solution.matches[:, 0])]
 
 
-def _pose_of(problem: Problem, pose: Solution | Candidate) -> Pose:
+def _pose_of(problem: Problem, pose: Solution | Candidate) -> PoseArrays:
     return problem.from_user(pose.rotation, pose.translation)
 
 
@@ -203,7 +201,7 @@ def _other_regions(regions: Iterable[Region], place: Region, problem: Problem, s
 
 def _find_poses_in(
     regions: Iterable[Region], photo: Photo, problem: Problem, solution: Solution, deadline: Deadline
-) -> Iterator[Pose]:
+) -> Iterator[PoseArrays]:
     """Yield the poses that short searches in other regions find for the explained image points of a solution."""
     explained = replace(photo, keypoints=explained_keypoints(photo, solution), view_count=1)
     density_maps: dict[tuple[DensityShape, float], DensityMap] = {}  # shared, since the image points are the same

@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from bpnp.arrays import Array
 from bpnp.cameras import camera_from
 from bpnp.maps.photo_problem import Photo, with_ids
 from bpnp.maps.viewed_points import Region
-from bpnp.maps.views import Array
 from bpnp.poses import MIN_POINTS
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
 from bpnp.search.assemble import OneCamera, Solved, assembled

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.arrays import Array
 from bpnp.bounded_files import read_npz
 from bpnp.cameras import camera_from, camera_to_json
 from bpnp.datamodules.colmap.model_files import FILES
@@ -20,7 +21,6 @@ from bpnp.maps.views import (
     REACH_FRACTION,
     VIEW_MARGIN_DEG,
     WIDE_SIGMA,
-    Array,
     Cones,
     Pictures,
     View,

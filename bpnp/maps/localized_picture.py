@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
+from bpnp.arrays import AnyArray
 from bpnp.cameras import camera_from
 from bpnp.report.images import size_in_camera
 from bpnp.report.terminal import LIGHT, QUIET, VERDICTS, number
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from bpnp.maps.scene_map import SceneMap
     from bpnp.maps.views import View
 
-Array = npt.NDArray[Any]
 BOUND = 3.72  # bound of 99.9 % of a plane's normal distribution [standard deviations; derived]
 PHOTO_CONTRAST = 0.55  # fraction of the photo's contrast that is kept, so that points stand out [fraction; convention]
 SHOWN_PERCENT = 98.0  # fraction of the map's points within the drawing [per cent; convention]
@@ -29,7 +28,7 @@ FIGURE_WIDTHS = (9.0, 6.0)  # widths of photo and map [inches; convention]
 
 
 def localized_picture(
-    scene: "SceneMap", solution: Solution, *, photo: Array | None = None, title: str | None = None
+    scene: "SceneMap", solution: Solution, *, photo: AnyArray | None = None, title: str | None = None
 ) -> "Figure":
     """Draw a photo and its pose in a map.
 
@@ -55,7 +54,7 @@ def localized_picture(
     return figure
 
 
-def draw_matches(axes: "Axes", solution: Solution, *, photo: Array | None = None) -> Any:
+def draw_matches(axes: "Axes", solution: Solution, *, photo: AnyArray | None = None) -> Any:
     """Draw keypoints faint and, unless the solution is failed, matches coloured by their reprojection errors.
 
     Return the coloured lines; None without matches.
@@ -86,7 +85,7 @@ def draw_matches(axes: "Axes", solution: Solution, *, photo: Array | None = None
     return axes.scatter(x, y, c=residuals, cmap="plasma", s=14, edgecolors="white", linewidths=0.3, zorder=3)
 
 
-def plane_from_above(views: "Sequence[View]", forward: Array) -> Array:
+def plane_from_above(views: "Sequence[View]", forward: AnyArray) -> AnyArray:
     """Return the axes (2, 3) of a drawing of a map from above: right, and ahead along `forward` (3,).
 
     Photos are assumed upright: down is the mean of their y axes. If these cancel each other, or if `forward` is
@@ -97,7 +96,7 @@ def plane_from_above(views: "Sequence[View]", forward: Array) -> Array:
     return np.stack([np.cross(down, ahead), ahead])
 
 
-def _unit(vector: Array, otherwise: Array) -> Array:
+def _unit(vector: AnyArray, otherwise: AnyArray) -> AnyArray:
     """Return a vector (3,) of length 1 along another one, or along `otherwise` if that has no length."""
     chosen = vector if np.linalg.norm(vector) > 1e-6 else otherwise
     return np.asarray(chosen / np.linalg.norm(chosen))
@@ -147,7 +146,7 @@ def draw_from_above(axes: "Axes", scene: "SceneMap", solution: Solution) -> None
     axes.legend(loc="lower right", fontsize=8)
 
 
-def draw_ellipse(axes: "Axes", solution: Solution, plane: Array, colour: str) -> None:
+def draw_ellipse(axes: "Axes", solution: Solution, plane: AnyArray, colour: str) -> None:
     """Draw the 99.9 % ellipse of the camera's centre in a plane (2, 3) of the scene, if its covariance is known."""
     from matplotlib.patches import Ellipse
 

@@ -4,9 +4,9 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any
 
+from bpnp.arrays import Array
 from bpnp.cameras import Camera, camera_from
 from bpnp.maps.viewed_points import RankViews, Region
-from bpnp.maps.views import Array
 from bpnp.search.focal_length import UnknownCamera
 from bpnp.search.inputs import problem_from
 from bpnp.search.problem import Problem, UnknownFocal

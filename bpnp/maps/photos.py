@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bpnp.arrays import Array
 from bpnp.bounded_files import MOST_TEXT, check_size, open_input
 from bpnp.cameras import CENTRE, outside_image, same_aspect_ratio
 from bpnp.report.images import open_photo
 
-Array = NDArray[np.float64]
 Size = tuple[int, int]  # width and height, pixels
 # Pillow may not read the last four; they are listed so that the error names the photo.
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".avif", ".dng"}

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from bpnp.argument_types import ArrayLike, HasReconstruction, ImageSize, PointsLike
+from bpnp.arrays import Array
 from bpnp.cameras import CENTRE, Camera, CameraLike, camera_from, is_opencv, resize_camera, same_aspect_ratio
 from bpnp.cameras import image_size as image_size_of
 from bpnp.datamodules.colmap.model_files import ColmapError
@@ -20,7 +21,7 @@ from bpnp.maps.photo_problem import Photo
 from bpnp.maps.photos import focal_from_exif, photo_keypoints, photo_size, up_from_exif
 from bpnp.maps.verify_view import verify_pose
 from bpnp.maps.viewed_points import RankViews, ViewedPoints
-from bpnp.maps.views import Array, View
+from bpnp.maps.views import View
 from bpnp.runtime import default_float_errors
 from bpnp.search.arguments import (
     PriorLike,

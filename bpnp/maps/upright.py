@@ -10,7 +10,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.maps.views import Array, View
+from bpnp.arrays import Array
+from bpnp.maps.views import View
 
 UPRIGHT_DEG = 30.0  # largest angle between the upward directions of upright views [degrees; not tuned]
 LEAST_UPRIGHT = 0.5  # smallest fraction of the views that agree on the direction up [fraction; not tuned]

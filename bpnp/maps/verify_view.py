@@ -3,11 +3,12 @@
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
+from bpnp.arrays import Array
 from bpnp.cameras import camera_from
 from bpnp.maps.aliasing import best_competitor, explained_keypoints, judge_against
 from bpnp.maps.photo_problem import Photo, with_ids
 from bpnp.maps.viewed_points import Region
-from bpnp.maps.views import Array, View
+from bpnp.maps.views import View
 from bpnp.poses import MIN_POINTS
 from bpnp.runtime import Deadline
 from bpnp.search.assemble import Solved, with_unfinished

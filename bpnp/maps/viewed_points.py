@@ -9,18 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.argument_types import ArrayLike
+from bpnp.arrays import Array
 from bpnp.cameras import Camera
 from bpnp.maps.upright import count_quarter_turns, rotate_view
-from bpnp.maps.views import (
-    Array,
-    Cones,
-    Pictures,
-    View,
-    pictures_of_views,
-    places_first,
-    scores_of_views,
-    viewing_cones,
-)
+from bpnp.maps.views import Cones, Pictures, View, pictures_of_views, places_first, scores_of_views, viewing_cones
 from bpnp.poses import MIN_POINTS
 from bpnp.search.focal_length import FOCAL_STEP_FEW, UnknownCamera
 from bpnp.search.problem import faces

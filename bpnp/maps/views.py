@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from bpnp.arrays import Array
 from bpnp.cameras import Camera
 
 DENSITY_CELLS = 32  # cells along a side of a density image [cells; not tuned]
@@ -33,8 +34,6 @@ OTHER_PLACE = 0.5  # [fraction; not tuned]
 # the points that project into these photos and are not detected, 21 to 85 % would be seen from more than 30 degrees
 # beyond.
 VIEW_MARGIN_DEG = 25.0  # [degrees; measured, photos of five models]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

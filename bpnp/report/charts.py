@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 import torch
 
+from bpnp.arrays import AnyArray
 from bpnp.metrics import joint_error, recall_curve
 from bpnp.report.results import Results
 from bpnp.report.tables import Line, joint_limits, lines_of, paper_quartiles
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
 Error = Literal["rotation_deg", "translation", "joint", "reprojection_deg"]
-Array = npt.NDArray[Any]
 POINTS = 200  # points of a curve
 RECALLS: dict[Error, tuple[str, str, float]] = {
     "rotation_deg": ("Rotation", "rotation error, degrees", 90.0),
@@ -56,7 +55,7 @@ def errors_of(runs: Mapping[str, Results], line: Line, error: Error) -> torch.Te
     return values[~values.isnan()]
 
 
-def recall_of(runs: Mapping[str, Results], line: Line, error: Error, limits: Array) -> Array:
+def recall_of(runs: Mapping[str, Results], line: Line, error: Error, limits: AnyArray) -> AnyArray:
     """Return the fraction (k,) of problems with an error up to each limit (k,)."""
     return recall_curve(errors_of(runs, line, error), limits.tolist()).numpy()
 

@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from bpnp.arrays import AnyArray
 from bpnp.cameras import in_front
 from bpnp.report.charts import Error, axis_title, recall_of
 from bpnp.report.images import size_in_camera
-from bpnp.report.points import Array, ProblemPoints, utf8
+from bpnp.report.points import ProblemPoints, utf8
 from bpnp.report.results import Results
 from bpnp.report.tables import lines_of, paper_quartiles, read_runs
 from bpnp.report.terminal import DASHES, INKS, LIGHT, QUIET, Paper, number
@@ -126,7 +127,7 @@ def plot_problem(problem: ProblemPoints, *, estimate: str | None = None, lines: 
     return figure
 
 
-def plot_photo(problem: ProblemPoints, photo: Array, *, estimates: Sequence[str] | None = None) -> "Figure":
+def plot_photo(problem: ProblemPoints, photo: AnyArray, *, estimates: Sequence[str] | None = None) -> "Figure":
     """Draw the 3D points over a photo (h, w, 3), uint8, as each pose projects them, an image per estimate (Fig. 4).
 
     Rings are the image points. The titles have the errors of the poses, if the true pose is known. Raise ValueError if
@@ -200,7 +201,7 @@ def plot_scene(axes: Any, problem: ProblemPoints) -> Any:
 
 def plot_image(
     axes: "Axes", problem: ProblemPoints, *, estimate: str | None = None, lines: Lines | None = "match3d",
-    photo: Array | None = None,
+    photo: AnyArray | None = None,
 ) -> "Axes":  # fmt: skip
     """Draw rings around image points, crosses at projected 3D points, and lines between matches.
 
@@ -300,7 +301,7 @@ def plot_residuals(
 
 
 def plot_matches(
-    problem: ProblemPoints, *, colour: str, photo: Array | None = None, competing: ProblemPoints | None = None
+    problem: ProblemPoints, *, colour: str, photo: AnyArray | None = None, competing: ProblemPoints | None = None
 ) -> "Figure":
     """Draw the image of a problem and a close-up of its residuals, under its id in a colour.
 
@@ -327,7 +328,7 @@ def plot_matches(
     return figure
 
 
-def _estimate(problem: ProblemPoints, estimate: str | None) -> tuple[str, tuple[Array, Array]]:
+def _estimate(problem: ProblemPoints, estimate: str | None) -> tuple[str, tuple[AnyArray, AnyArray]]:
     """Return the name and the pose of an estimate, by default the first; the pose is NaN if there is none."""
     if estimate is not None and estimate not in problem.estimates:
         raise ValueError(f"there is no estimate {estimate!r}; the estimates are {list(problem.estimates)}")
@@ -337,7 +338,7 @@ def _estimate(problem: ProblemPoints, estimate: str | None) -> tuple[str, tuple[
 
 def _prepare_drawing(
     problem: ProblemPoints, estimate: str | None, lines: Lines | None
-) -> tuple[Array, Array, Array, str]:
+) -> tuple[AnyArray, AnyArray, AnyArray, str]:
     """Return image points (m, 2), projected 3D points (n, 2), links (n,) and the colour of the estimate.
 
     Points are in the units of the axes; projected ones are NaN without a pose. A link is the index of the image point
@@ -357,7 +358,7 @@ def _prepare_drawing(
     return image, projected, targets, LIGHT[order % len(LIGHT)]
 
 
-def _facing_away(problem: ProblemPoints, estimate: str | None) -> Array:
+def _facing_away(problem: ProblemPoints, estimate: str | None) -> AnyArray:
     """Return which 3D points (n,) have normals that face away from the camera of an estimate; none without normals."""
     if problem.normals3d is None:
         return np.zeros(len(problem.points3d), bool)
@@ -366,7 +367,7 @@ def _facing_away(problem: ProblemPoints, estimate: str | None) -> Array:
     return np.asarray(((problem.normals3d @ rotation.T) * camera).sum(-1) >= 0)
 
 
-def _extent(points2d: Array) -> tuple[float, float, float, float]:
+def _extent(points2d: AnyArray) -> tuple[float, float, float, float]:
     """Return left, top, right and bottom of the image points, with a margin."""
     finite = points2d[np.isfinite(points2d).all(-1)].astype(float)
     if not len(finite):
@@ -386,7 +387,7 @@ def shown_text(name: str) -> str:
     return f" {shown}" if shown.startswith("_") else shown
 
 
-def _upright(points: Array, frame: tuple[Array, Array]) -> Array:
+def _upright(points: AnyArray, frame: tuple[AnyArray, AnyArray]) -> AnyArray:
     """Transform scene points to the axes right, forward, up of a camera."""
     rotation, translation = frame
     x, y, z = (points @ rotation.T + translation).T

@@ -3,18 +3,16 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
+from bpnp.arrays import AnyArray
 from bpnp.bounded_files import open_input
 from bpnp.cameras import Camera, image_size, same_aspect_ratio
 
 if TYPE_CHECKING:
     from PIL.Image import Image
-
-Array = npt.NDArray[Any]
 
 
 @contextmanager
@@ -34,13 +32,13 @@ def open_photo(path: Path | str) -> "Iterator[Image]":
         raise ValueError(f"cannot read the photo {path}: {error}; give a JPEG or PNG file") from error
 
 
-def read_photo(path: Path | str) -> Array:
+def read_photo(path: Path | str) -> AnyArray:
     """Read the pixels (h, w, 3) of a photo, uint8."""
     with open_photo(path) as photo:
         return np.asarray(photo.convert("RGB"))
 
 
-def size_in_camera(photo: Array, camera: Camera | None) -> tuple[int, int]:
+def size_in_camera(photo: AnyArray, camera: Camera | None) -> tuple[int, int]:
     """Return the width and height of a photo (h, w, 3) in pixels of its camera, which differ if the photo was resized.
 
     Raise ValueError if the photo has another aspect ratio than the camera's images.

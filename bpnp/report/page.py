@@ -21,13 +21,14 @@ import numpy as np
 from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
+from bpnp.arrays import AnyArray
 from bpnp.files import write_text
 from bpnp.report.charts import CONFIG, RECALLS, chart_text, figures, look, recall_chart
 from bpnp.report.groups import differences, group_table, training_configs
 from bpnp.report.intervals import CAPTION as INTERVAL_CAPTION
 from bpnp.report.intervals import IntervalTable, interval_table
 from bpnp.report.photos import PhotoFinder, PhotoSource
-from bpnp.report.points import Array, ProblemPoints, read_points, utf8
+from bpnp.report.points import ProblemPoints, read_points, utf8
 from bpnp.report.results import (
     CAUSES,
     PLAUSIBLE_INLIERS,
@@ -355,13 +356,13 @@ def _photo(runs: Mapping[str, ProblemPoints], photos: Mapping[str, PhotoSource])
     return None if photo is None else {"jpeg": photo.jpeg, "extent": [round(x, DIGITS) for x in photo.extent]}
 
 
-def _decimals(points: Array) -> int:
+def _decimals(points: AnyArray) -> int:
     """Return the number of decimal places for `DIGITS` digits of the points' extent."""
     extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
     return DIGITS - math.floor(math.log10(extent)) if extent > 0 else DIGITS
 
 
-def _pose(pose: tuple[Array, Array] | None, decimals: int) -> list[float] | None:
+def _pose(pose: tuple[AnyArray, AnyArray] | None, decimals: int) -> list[float] | None:
     """Return quaternion (x, y, z, w) and translation; None without a pose."""
     if pose is None or not np.isfinite(np.c_[pose]).all():
         return None

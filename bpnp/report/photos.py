@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bpnp.arrays import AnyArray
 from bpnp.cameras import Camera, Pinhole
 from bpnp.report.images import size_in_camera
-from bpnp.report.points import Array, ProblemPoints
+from bpnp.report.points import ProblemPoints
 from bpnp.report.results import Results
 
 SIDE = 480  # longer side of a photo, pixels
@@ -22,7 +23,7 @@ GREY = (128, 128, 128)  # outside the photo
 class ProblemPhoto:
     """Photo of a problem, as a pinhole camera would have taken it."""
 
-    pixels: Array  # (h, w, 3), uint8
+    pixels: AnyArray  # (h, w, 3), uint8
     camera: Pinhole  # camera of these pixels, without distortion
 
     @property
@@ -46,7 +47,7 @@ PhotoSource = Callable[[ProblemPoints], ProblemPhoto | None]  # finds the photo 
 PhotoFinder = Callable[[Results, Sequence[ProblemPoints]], PhotoSource | None]  # finds the photos of a test
 
 
-def undistort_photo(photo: Array, camera: Camera, points2d: Array, *, side: int = SIDE) -> ProblemPhoto:
+def undistort_photo(photo: AnyArray, camera: Camera, points2d: AnyArray, *, side: int = SIDE) -> ProblemPhoto:
     """Return the part of a photo (h, w, 3), uint8, around image points (m, 2), normalised, without distortion.
 
     The photo may be resized; `side` is the longer one of the result, pixels. Raise ValueError if the photo has another

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from torch import Tensor
 
+from bpnp.arrays import AnyArray
 from bpnp.bounded_files import read_npz
 from bpnp.cameras import Camera
 from bpnp.files import write_atomically
@@ -26,8 +26,6 @@ POINTS: dict[str, tuple[Any, ...]] = {  # type and width of the columns, with al
     **dict.fromkeys(("match3d", "assigned3d", *IDS), (np.int32,)),
 }
 
-Array = npt.NDArray[Any]
-
 
 @dataclass(frozen=True)
 class ProblemPoints:
@@ -35,21 +33,21 @@ class ProblemPoints:
 
     index: int
     id: str
-    points2d: Array  # image points (m, 2)
-    points3d: Array  # scene points (n, 3)
-    match3d: Array  # index of the true 2D point of each 3D point (n,), -1 for none
-    assigned3d: Array  # index of the 2D point with the largest probability in the solver's assignment (n,), -1 for none
-    pose: tuple[Array, Array] | None = None  # true R (3, 3) and t (3,), None if unknown
+    points2d: AnyArray  # image points (m, 2)
+    points3d: AnyArray  # scene points (n, 3)
+    match3d: AnyArray  # index of the true 2D point of each 3D point (n,), -1 for none
+    assigned3d: AnyArray  # index of each 3D point's likeliest 2D point in the assignment (n,), -1 for none
+    pose: tuple[AnyArray, AnyArray] | None = None  # true R (3, 3) and t (3,), None if unknown
     # R (3, 3) and t (3,) by the name of the estimate; NaN without a pose.
-    estimates: dict[str, tuple[Array, Array]] = field(default_factory=dict)
+    estimates: dict[str, tuple[AnyArray, AnyArray]] = field(default_factory=dict)
     error: float = 180.0  # rotation error of the first estimate, degrees
-    ids2d: Array | None = None  # indices of the 2D points in the whole problem, None if all points are here
-    ids3d: Array | None = None  # indices of the 3D points in the whole problem, None if all points are here
+    ids2d: AnyArray | None = None  # indices of the 2D points in the whole problem, None if all points are here
+    ids3d: AnyArray | None = None  # indices of the 3D points in the whole problem, None if all points are here
     # Camera in whose pixels the problem is drawn, None for normalised coordinates; not stored on disk.
     camera: Camera | None = None
-    normals3d: Array | None = None  # outward normals (n, 3), None for points without normals; not stored on disk
+    normals3d: AnyArray | None = None  # outward normals (n, 3), None for points without normals; not stored on disk
 
-    def numbers(self) -> tuple[Array, Array]:
+    def numbers(self) -> tuple[AnyArray, AnyArray]:
         """Return `ids2d` and `ids3d`, counted where they are None."""
         count2d, count3d = np.arange(len(self.points2d)), np.arange(len(self.points3d))
         return count2d if self.ids2d is None else self.ids2d, count3d if self.ids3d is None else self.ids3d
@@ -167,7 +165,7 @@ def read_points(folder: Path | str) -> tuple[ProblemPoints, ...]:
     raise ValueError(f"{path} has format {version}, not {FORMAT}; use the version of bpnp that wrote it")
 
 
-def _unpack_problems(arrays: dict[str, Array]) -> Iterable[ProblemPoints]:
+def _unpack_problems(arrays: dict[str, AnyArray]) -> Iterable[ProblemPoints]:
     ends = {side: arrays[f"count{side}"].cumsum()[:-1] for side in ("2d", "3d")}
     points: dict[str, Any] = {name: np.split(arrays[name], ends[name[-2:]]) for name in POINTS}
     prefix = "estimate."
@@ -183,33 +181,33 @@ def _unpack_problems(arrays: dict[str, Array]) -> Iterable[ProblemPoints]:
         )
 
 
-def _stack_poses(poses: Sequence[tuple[Array, Array] | None]) -> Array:
+def _stack_poses(poses: Sequence[tuple[AnyArray, AnyArray] | None]) -> AnyArray:
     """Return [R | t] of each problem (k, 3, 4), NaN for none."""
     missing = np.full((3, 4), np.nan)
     return np.array([missing if pose is None else np.c_[pose] for pose in poses], np.float64).reshape(-1, 3, 4)
 
 
-def _split(pose: Array) -> tuple[Array, Array]:
+def _split(pose: AnyArray) -> tuple[AnyArray, AnyArray]:
     return pose[:, :3], pose[:, 3]
 
 
-def _host(values: Tensor) -> Array:
+def _host(values: Tensor) -> AnyArray:
     return values.detach().cpu().numpy()
 
 
-def _first_then_rest(first: Array, most: int) -> Array:
+def _first_then_rest(first: AnyArray, most: int) -> AnyArray:
     """Return indices where `first` holds, then of the rest, each thinned evenly where there is no room; ascending."""
     head = _thin_rows(np.flatnonzero(first), most)
     return np.sort(np.r_[head, _thin_rows(np.flatnonzero(~first), most - len(head))]).astype(np.int64)
 
 
-def _thin_rows(values: Array, most: int) -> Array:
+def _thin_rows(values: AnyArray, most: int) -> AnyArray:
     if len(values) <= most:
         return values
     return values[np.linspace(0, len(values) - 1, most).astype(np.int64)] if most else values[:0]
 
 
-def _renumber_targets(targets: Array, chosen: Array, count: int) -> Array:
+def _renumber_targets(targets: AnyArray, chosen: AnyArray, count: int) -> AnyArray:
     """Return the positions of `targets` in `chosen`, both indices of `count` points, or -1."""
     position = np.full(count + 1, -1, np.int32)  # the last entry is for targets of -1
     position[chosen] = np.arange(len(chosen))

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bpnp.arrays import Array
 from bpnp.datamodules.synthetic_maps.scene import (
-    Array,
     Blobs,
     DrawnScene,
     Surface,

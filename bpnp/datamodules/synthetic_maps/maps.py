@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from bpnp.arrays import Array
 from bpnp.checks import check_positive, check_within
 from bpnp.datamodules.augment import Augmentation, NumberOrRange, bounds
 from bpnp.datamodules.loader import PARTS, ProblemDataModule
 from bpnp.datamodules.problem import Counts, Problem, stack_problems
 from bpnp.datamodules.synthetic_maps.kinds import facades, statue, street
 from bpnp.datamodules.synthetic_maps.scene import (
-    Array,
     DrawnCamera,
     DrawnScene,
     Viewpoint,

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from bpnp.arrays import Array
+
 MIN_DEPTH = 0.1  # least depth of a visible point, metres
 GRAZING = 0.35  # cosine between a normal and the direction to the camera, below which detections get rarer
 ONE_PHOTO = 0.5  # probability of a keypoint at a visible point that no other photo has a keypoint of
