@@ -53,12 +53,9 @@ def features() -> tuple[Tensor, Tensor]:
     return a, torch.nn.functional.normalize(a + 0.002 * torch.randn(2, 40, 64, generator=generator), dim=-1)
 
 
-@pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.usefixtures("high")
-def test_layers_keep_their_digits(compiled: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_layers_keep_their_digits() -> None:
     a, b = (x.requires_grad_() for x in features())
-    if not compiled:
-        monkeypatch.setattr("bpnp.layers.compiled.applies_to", lambda _tensor: False)
     planted = plant(2, 40, noise=0.002, dtype=torch.float32)
     start = planted.near(0.1)
 

@@ -11,12 +11,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-import bpnp.layers.compiled as compiled
 from bpnp.layers.implicit import BackwardStats, first_derivative, record
 from bpnp.layers.plan import Plan, cached_parts, divide, times, transpose_times
 
 ITERATIONS = 150  # limit of conjugate gradients; slower systems are factorised
-BETWEEN_TESTS = 8  # torch iterations between two tests for convergence; a test makes the host wait for a GPU
+BETWEEN_TESTS = 8  # iterations on a GPU between two tests for convergence, for which the host waits
 RIDGE = 1e-13  # added to the diagonal before the factorisation, relative to its scale
 FACTORISED = 1e-6  # largest relative residual of a factorised system that counts as solved
 TOLERANCE = {torch.float32: 5e-6, torch.float64: 1e-13}  # relative, for conjugate gradients
@@ -53,11 +52,10 @@ def solve_laplacian(
     Returns:
         b (b, n) with a weighted mean of zero, P b / rows (b, m), and which samples met the tolerance (b,).
     """
-    solve = compiled.conjugate_gradients if compiled.applies_to(rhs) else conjugate_gradients
     # A power of two brings the largest entry into [1, 2): no digit changes, and no square underflows or overflows.
     largest = rhs.abs().amax(-1, keepdim=True)
     size = torch.where(largest > 0, largest / (2 * torch.frexp(largest).mantissa), 1)
-    x, mean, solved = solve(plan, rows, cols, degree, rhs / size, tolerance, ITERATIONS)
+    x, mean, solved = _conjugate_gradients(plan, rows, cols, degree, rhs / size, tolerance, ITERATIONS)
     x, mean = size * x, size * mean
     shift = _mean(x, cols)
     b, mean = torch.where(cols > 0, x - shift, 0), torch.where(rows > 0, mean - shift, 0)
@@ -69,7 +67,7 @@ def solve_laplacian(
     return b, mean, solved
 
 
-def conjugate_gradients(
+def _conjugate_gradients(
     plan: Plan, rows: Tensor, cols: Tensor, degree: Tensor, rhs: Tensor, tolerance: Float[Tensor, " b"], limit: int
 ) -> LinearSolution:
     """Solve S x = rhs by preconditioned conjugate gradients.
@@ -93,8 +91,9 @@ def conjugate_gradients(
     target = torch.linalg.vecdot(unit * r, r) * tolerance**2
     active = rz > 0
     solved = ~active
+    between_tests = 1 if rhs.is_cpu else BETWEEN_TESTS
     for k in range(limit):
-        if k % BETWEEN_TESTS == 0 and not bool(active.any()):
+        if k % between_tests == 0 and not bool(active.any()):
             break
         mean_p = per_row * plan.times(p)
         sp = cols * p - plan.transpose_times(mean_p)
