@@ -216,18 +216,18 @@ def pose_recalls(errors: PoseErrors, thresholds: RecallThresholds | None = None)
     for name, unit, error in known_errors(errors):
         limits = getattr(thresholds, f"{name}_{unit}".rstrip("_"))
         keys = [f"recall_{name}_{limit:g}{unit}" for limit in limits]
-        values |= zip(keys, recall_curve(error, limits), strict=True)
+        values |= zip(keys, recall_at(error, limits), strict=True)
     for degrees, length in thresholds.joint:
-        (values[f"recall_joint_{degrees:g}deg_{length:g}"],) = recall_curve(joint_error(errors, length), [degrees])
+        (values[f"recall_joint_{degrees:g}deg_{length:g}"],) = recall_at(joint_error(errors, length), [degrees])
     return values
 
 
-def recall_curve(error: Float[Tensor, " b"], limits: Limits) -> Float[Tensor, " k"]:
+def recall_at(error: Float[Tensor, " b"], limits: Limits) -> Float[Tensor, " k"]:
     """Return the fraction of errors up to each limit, float64.
 
     >>> import torch
-    >>> from bpnp.metrics import recall_curve
-    >>> recall_curve(torch.tensor([1.0, 3.0, 3.0, 9.0]), [1, 3, 4]).tolist()
+    >>> from bpnp.metrics import recall_at
+    >>> recall_at(torch.tensor([1.0, 3.0, 3.0, 9.0]), [1, 3, 4]).tolist()
     [0.25, 0.75, 0.75]
     """
     ordered = error.double().sort().values

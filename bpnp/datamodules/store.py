@@ -71,7 +71,6 @@ class Store:
         return np.diff(self.starts[bulk])
 
     def name(self, row: int) -> str:
-        """Return the name of a row."""
         return bytes(self.columns["name"][row]).decode()
 
     def row(self, row: int) -> dict[str, NDArray[np.float32]]:

@@ -66,8 +66,6 @@ class ViewSolution(NamedTuple):
 
 @dataclass(frozen=True)
 class LoopResult:
-    """Result of the loop."""
-
     solution: Solution
     is_complete: bool  # false if the time limit ended the loop without a confident pose
 

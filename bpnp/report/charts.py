@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from bpnp.arrays import AnyArray
-from bpnp.metrics import joint_error, recall_curve
+from bpnp.metrics import joint_error, recall_at
 from bpnp.report.results import Results
 from bpnp.report.tables import Line, joint_limits, lines_of, paper_quartiles
 from bpnp.report.terminal import DASHES, INKS, LIGHT, Paper
@@ -57,7 +57,7 @@ def errors_of(runs: Mapping[str, Results], line: Line, error: Error) -> torch.Te
 
 def recall_of(runs: Mapping[str, Results], line: Line, error: Error, limits: AnyArray) -> AnyArray:
     """Return the fraction (k,) of problems with an error up to each limit (k,)."""
-    return recall_curve(errors_of(runs, line, error), limits.tolist()).numpy()
+    return recall_at(errors_of(runs, line, error), limits.tolist()).numpy()
 
 
 def recall_chart(runs: Mapping[str, Results], error: Error, *, paper: Paper | None = None) -> "Figure | None":

@@ -42,8 +42,6 @@ class ColmapError(ValueError):
 
 
 class CameraRecord(NamedTuple):
-    """Record of a camera."""
-
     model: str
     params: NDArray[np.float64]  # parameters in COLMAP's order
     size: tuple[int, int]  # width and height of the image, pixels
