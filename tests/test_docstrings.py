@@ -42,7 +42,6 @@ PACKAGES = (
 NOT_YET = {
     "bpnp/layers",
     "bpnp/models",
-    "bpnp/robust",
     "bpnp/runtime.py",
     "bpnp/search",
     "bpnp/training",

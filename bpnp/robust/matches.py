@@ -17,12 +17,9 @@ RESIDUALS_AT_ONCE = 2**18  # [residuals; cost]
 
 
 def distinct_triples(pool: Float[Tensor, "b d"], seed: int, *, skip: int = 0) -> Int[Tensor, "b d 3"]:
-    """Draw triples of different indices, uniform and in random order.
+    """Draw triples of different indices below the pool size of each draw, uniform and in random order.
 
-    Args:
-        pool: (b, d) pool size of each draw; indices are below it.
-        seed: Seed of the draws.
-        skip: Draws of earlier calls with this seed, whose random numbers are not used again.
+    The random numbers of `skip` draws, by earlier calls with this seed, are not used again.
     """
     draws = pool.shape[1]
     uniform = hashed_uniform(3 * draws, seed, pool.device, skip=3 * skip).view(3, draws)
@@ -35,13 +32,7 @@ def distinct_triples(pool: Float[Tensor, "b d"], seed: int, *, skip: int = 0) ->
 
 
 def weighted_draws(weights: Float[Tensor, "b k"], count: int, seed: int) -> Int[Tensor, "b c"]:
-    """Draw indices with replacement in proportion to the weights.
-
-    Args:
-        weights: (b, k), not negative and not all zero.
-        count: Number of draws.
-        seed: Seed of the draws.
-    """
+    """Draw indices with replacement in proportion to weights, which are not negative and not all zero."""
     total = weights.double().cumsum(-1)
     uniform = hashed_uniform(count, seed, weights.device)
     # The first sum above the number drawn: never an index of weight zero.
@@ -52,12 +43,6 @@ def hashed_uniform(size: int, seed: int, device: torch.device, *, skip: int = 0)
     """Return float64 numbers in (0, 1) by a 32-bit integer hash of counter and seed.
 
     The hash takes two multiplications and shifts a round.
-
-    Args:
-        size: Number of values.
-        seed: Seed of the hash.
-        device: Device of the result.
-        skip: First value of the counter.
     """
     state = torch.arange(skip, skip + size, device=device)
     for salt in (0, (seed * 0x9E3779B1 + 1) & 0xFFFFFFFF):
@@ -69,42 +54,27 @@ def hashed_uniform(size: int, seed: int, device: torch.device, *, skip: int = 0)
 
 
 class Matches(NamedTuple):
-    """Candidate matches of a 2D and a 3D point.
+    """Candidate matches of a 2D and a 3D point."""
 
-    Attributes:
-        points2d: (b, k, 2) normalised image coordinates.
-        points3d: (b, k, 3) scene points.
-        real: (b, k), False for padding, whose points are zero.
-    """
-
-    points2d: Float[Tensor, "b k 2"]
-    points3d: Float[Tensor, "b k 3"]
-    real: Bool[Tensor, "b k"]
+    points2d: Float[Tensor, "b k 2"]  # normalised image coordinates
+    points3d: Float[Tensor, "b k 3"]  # scene points
+    real: Bool[Tensor, "b k"]  # False for padding, whose points are zero
 
 
 class Residuals(NamedTuple):
-    """Residuals of c poses on k matches.
+    """Residuals of c poses on k matches."""
 
-    Attributes:
-        squared: (b, c, k) squared reprojection errors.
-        inlier: (b, c, k) True for a real match in front of the camera with an error below the threshold.
-        residual: (b, c, k, 2) reprojection errors.
-        camera: (b, c, k, 3) points in the camera frame.
-    """
-
-    squared: Float[Tensor, "b c k"]
+    squared: Float[Tensor, "b c k"]  # squared reprojection errors
+    # True for a real match in front of the camera with an error below the threshold.
     inlier: Bool[Tensor, "b c k"]
-    residual: Float[Tensor, "b c k 2"]
-    camera: Float[Tensor, "b c k 3"]
+    residual: Float[Tensor, "b c k 2"]  # reprojection errors
+    camera: Float[Tensor, "b c k 3"]  # points in the camera frame
 
 
 def normalise_matches(matches: Matches) -> tuple[Matches, Float[Tensor, "b 3"], Float[Tensor, "b 1"]]:
-    """Convert matches to float64 with centred scene points of unit variance.
+    """Return float64 matches with centred points q of unit variance, and centre and scale of p = scale q + centre.
 
     A scene far from its origin then loses no digits in the minimal solver. Points with NaN or infinity are not real.
-
-    Returns:
-        Matches with 3D points q, and centre (b, 3) and scale (b, 1) of p = scale q + centre.
     """
     usable = matches.real & matches.points2d.isfinite().all(-1) & matches.points3d.isfinite().all(-1)
     real = usable.unsqueeze(-1)
@@ -119,16 +89,7 @@ def normalise_matches(matches: Matches) -> tuple[Matches, Float[Tensor, "b 3"], 
 def in_scene(
     poses: Float[Tensor, "b c 3 4"], centre: Float[Tensor, "b 3"], scale: Float[Tensor, "b 1"]
 ) -> tuple[Float[Tensor, "b c 3 3"], Float[Tensor, "b c 3"]]:
-    """Convert poses of normalised matches to the scene's own coordinates.
-
-    Args:
-        poses: (b, c, 3, 4) poses [R | t].
-        centre: (b, 3) of `normalise_matches`.
-        scale: (b, 1) of `normalise_matches`.
-
-    Returns:
-        Rotation and translation.
-    """
+    """Convert poses [R | t] of `normalise_matches` to rotations and translations in the scene's own coordinates."""
     rotation = poses[..., :3]
     return rotation, scale.unsqueeze(1) * poses[..., 3] - (rotation @ centre[:, None, :, None]).squeeze(-1)
 

@@ -10,28 +10,18 @@ from bpnp.search.propose.minimal_solvers import p3p_poses
 
 
 class P3P(NamedTuple):
-    """Poses of three matches, camera = R p + t; up to four for each sample.
+    """Poses of three matches, camera = R p + t; up to four for each sample."""
 
-    Attributes:
-        rotation: (*b, 4, 3, 3); NaN in an empty slot.
-        translation: (*b, 4, 3); NaN in an empty slot.
-        valid: (*b, 4), False for an empty slot.
-    """
-
-    rotation: Float[Tensor, "*b 4 3 3"]
-    translation: Float[Tensor, "*b 4 3"]
-    valid: Bool[Tensor, "*b 4"]
+    rotation: Float[Tensor, "*b 4 3 3"]  # NaN in an empty slot
+    translation: Float[Tensor, "*b 4 3"]  # NaN in an empty slot
+    valid: Bool[Tensor, "*b 4"]  # False for an empty slot
 
 
 def p3p(bearings: Float[Tensor, "*b 3 3"], points3d: Float[Tensor, "*b 3 3"]) -> P3P:
     """Solve d_i f_i = R p_i + t, d_i > 0, for triples of matches; see `p3p_poses` for the method.
 
-    Args:
-        bearings: rays in the camera frame, of any length.
-        points3d: scene points, any scale and offset.
-
-    Returns:
-        Poses in the type and on the device of `points3d`, computed in float64 on the CPU. The four slots have no order.
+    Rays f_i have any length, points p_i any scale and offset. Poses have the type and device of `points3d` and are
+    computed in float64 on the CPU. The four slots have no order.
 
     >>> import torch
     >>> from bpnp.robust.minimal_solvers import p3p

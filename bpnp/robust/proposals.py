@@ -36,24 +36,14 @@ def pose_hypotheses(
 ) -> tuple[Float[Tensor, "b s 3 3"], Float[Tensor, "b s 3"]]:
     """Propose the best poses of triples of matches drawn in proportion to P, any two of them 15 degrees apart.
 
+    P is non-negative, of any sum; image points are normalised. Poses come best first, NaN in empty slots. A sample has
+    no pose if P has no mass or is not finite, or with fewer than 3 points on a side.
+
     Triples with the largest products of their triangles' areas on both sides are solved (`p3p`): a small triangle
     magnifies the errors of its matches. A pose scores sum_k min(r_k^2, t^2) over other matches k drawn from P. r_k is
-    the reprojection error, infinite behind the camera, and t = `HALF_RESIDUAL`. This estimates the expectation
-    under P.
+    the reprojection error, infinite behind the camera, and t = `HALF_RESIDUAL`. This estimates the expectation under P.
 
     The draws are the same for each sample: a result depends neither on the other samples nor on padding.
-
-    Args:
-        assignment: (b, m, n) P, non-negative, of any sum.
-        points2d: (b, m, 2) normalised image coordinates.
-        points3d: (b, n, 3) scene units.
-        mask2d: (b, m), False for padding.
-        mask3d: (b, n), False for padding.
-        count: Number s of poses.
-
-    Returns:
-        Rotation (b, s, 3, 3) and translation (b, s, 3), best first, NaN in empty slots. A sample has no pose if P has
-        no mass or is not finite, or with fewer than 3 points on a side.
     """
     n = assignment.shape[2]
     probability = assignment.masked_fill(~(mask2d.unsqueeze(-1) & mask3d.unsqueeze(-2)), 0).flatten(1)
@@ -94,21 +84,11 @@ def drawn_poses(
     seed: int,
     aligned: bool = False,
 ) -> Float[Tensor, "b s 3 4"]:
-    """Return all poses of the widest quarter of triples of matches drawn in proportion to P.
+    """Return all poses [R | t] of the widest quarter of match triples drawn in proportion to P, NaN in empty slots.
 
-    With `aligned`, an eighth of the triples is solved, from the wider half. They have the largest cosine between the
-    edges of the image triangle and those of the scene triangle seen along the third axis.
-
-    Args:
-        assignment: (b, m, n) P, non-negative, with mass.
-        points2d: (b, m, 2) normalised image coordinates, without padding.
-        points3d: (b, n, 3) scene units, without padding.
-        triples: Number of triples that are drawn.
-        seed: Seed of the draws.
-        aligned: True if the axes of the scene are about those of the camera.
-
-    Returns:
-        Poses [R | t], NaN in empty slots.
+    P is non-negative, with mass; image points are normalised, and there is no padding. With `aligned`, for axes of the
+    scene that are about those of the camera, an eighth of the triples is solved, from the wider half. They have the
+    largest cosine between the edges of the image triangle and those of the scene triangle seen along the third axis.
     """
     drawn = weighted_draws(assignment.flatten(1), 3 * triples, seed)
     n = assignment.shape[2]

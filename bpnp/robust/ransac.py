@@ -45,19 +45,10 @@ def consensus(
 ) -> tuple[Float[Tensor, "b 3 4"], Int[Tensor, " b"]]:
     """Estimate the pose [R | t] of lowest truncated squared reprojection error sum_i min(r_i^2, threshold^2).
 
-    Triples come from a pool of the most probable matches that grows to all matches (PROSAC; Chum, Matas, CVPR 2005).
-    `p3p` solves each, all poses are scored (MSAC; a point behind the camera is an outlier), and the best are refined.
-    Only the scores are computed in float32.
-
-    Args:
-        matches: Matches of `bpnp.robust.matches.normalise_matches`, most probable first. A point may be in many of
-            them.
-        threshold: Largest reprojection error of an inlier.
-        hypotheses: Triples for each sample.
-        seed: Seed of the draws.
-
-    Returns:
-        Poses, and the number of hypotheses. The pose of a sample without one is arbitrary or NaN.
+    Triples come from a pool of the most probable matches (`normalise_matches`, the most probable first; a point may be
+    in many) that grows to all matches (PROSAC; Chum, Matas, CVPR 2005). `p3p` solves each, all poses are scored (MSAC;
+    a point behind the camera is an outlier), and the best are refined. Only the scores are computed in float32. The
+    number of hypotheses is returned too; the pose of a sample without one is arbitrary or NaN.
     """
     threshold2 = threshold**2
     subset = Matches(*(values[:, :SUBSET] for values in matches))
@@ -87,18 +78,9 @@ def _best(poses: Float[Tensor, "b c 3 4"], score: Float[Tensor, "b c"], size: in
 def refine_locally(
     poses: Float[Tensor, "b c 3 4"], matches: Matches, threshold2: float, steps: int
 ) -> Float[Tensor, "b c 3 4"]:
-    """Reduce sum_i min(r_i^2, threshold2) by Gauss-Newton steps on the inliers of the current pose.
+    """Reduce sum_i min(r_i^2, threshold2) by Gauss-Newton steps on the inliers of the current pose [R | t].
 
-    Poses are refined independently.
-
-    Args:
-        poses: (b, c, 3, 4) initial poses [R | t].
-        matches: Candidate matches.
-        threshold2: Largest squared reprojection error of an inlier.
-        steps: Number of steps.
-
-    Returns:
-        The best pose visited, which may be the initial one.
+    Poses are refined independently. The result is the best pose visited, which may be the initial one.
     """
     best = poses
     lowest = torch.full(poses.shape[:2], torch.inf, dtype=poses.dtype, device=poses.device)
@@ -124,10 +106,7 @@ def _jacobian(
 ) -> Float[Tensor, "b c 6 2*k"]:
     """Return the derivatives of x/z, then of y/z, by the step (w, s) of `retract`; zero for outliers.
 
-    Args:
-        camera: y = R p + t, which a step moves by w x R p + s.
-        turned: R p.
-        inlier: True for inliers.
+    A step moves y = R p + t, `camera`, by w x R p + s; `turned` is R p.
     """
     inverse = torch.where(inlier, 1 / camera[..., 2], 0)
     u, v = camera[..., 0] * inverse, camera[..., 1] * inverse
