@@ -22,12 +22,12 @@ from record import ROOT, Problem, write
 from scipy.spatial.transform import Rotation
 
 from bpnp.poses import Tolerance
-from bpnp.search.config import DEFAULT
 from bpnp.search.inputs import problem_from
 from bpnp.search.plan import Plan
 from bpnp.search.pool import Pool
 from bpnp.search.propose.repetitions import competing_poses
 from bpnp.search.search_frame import Scene
+from bpnp.search.settings import DEFAULT
 from bpnp.search.verdict.decide import Case
 
 FILE = ROOT / "benchmarks" / "completeness.json"

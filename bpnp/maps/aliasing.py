@@ -19,15 +19,15 @@ from bpnp.maps.viewed_points import Region
 from bpnp.poses import rotation_angle, same_pose
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
 from bpnp.search.assemble import Solved, candidates_of
-from bpnp.search.config import ALIASING, DEFAULT, DensityShape
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
 from bpnp.search.kernels.density_map import DensityMap
 from bpnp.search.matching import count_one_to_one
 from bpnp.search.problem import Problem
-from bpnp.search.propose.density_map import search_around, search_near
+from bpnp.search.propose.density_map import LOCAL, search_around, search_near
 from bpnp.search.propose.repetitions import repeated_poses, repetition_margins
 from bpnp.search.refine.annealing import anneal_to_end, finish
 from bpnp.search.search_frame import Scene
+from bpnp.search.settings import DEFAULT, DensitySearch, DensityShape, Draws, Narrowing, Preselection
 from bpnp.search.solution import Candidate, Solution
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict.competitors import sign_margins
@@ -37,6 +37,14 @@ from bpnp.search.verdict.reasons import Unfinished, objection
 MOST_VIEWS = 8  # largest number of views [views; cost]
 LEAST_OTHER = 0.5  # least fraction of a view's points that the pose does not see [fraction; not tuned]
 FEWEST_OTHER_POINTS = 12  # least number of such points, and of image points that the pose explains [points; not tuned]
+# Few of the explained image points are outliers for a competing pose. So fewer, more smoothed initial poses suffice
+# than near a view that is tried.
+IN_OTHER_VIEW = DensitySearch(  # search near each view [`DensitySearch`; calibration]
+    Draws(2**13, least_starts=2**13),
+    Preselection((50, 300), (2**11, 2**8)),
+    Narrowing(0.1, 0.015, steps=6, points=300),
+    annealed=6,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,10 +222,10 @@ def _find_poses_in(
         assert near.prior is not None
         prior = scene.enter_prior(near.prior)
         assert isinstance(prior, PosePrior)
-        found = _likeliest(finish(scene, search_near(scene, prior, ALIASING.search)), scene, near)
+        found = _likeliest(finish(scene, search_near(scene, prior, IN_OTHER_VIEW)), scene, near)
         if len(found) and found.log10_false_alarms[0] < 0:
             start = Hypotheses.from_poses(*scene.enter(found.rotation, found.translation))
-            local = _likeliest(finish(scene, search_around(scene, start, DEFAULT.local)), scene, near)
+            local = _likeliest(finish(scene, search_around(scene, start, LOCAL)), scene, near)
             for one in (found, local):
                 yield problem.from_user(*near.to_user(*one.pose()))
 

@@ -12,13 +12,14 @@ from bpnp.maps.viewed_points import Region
 from bpnp.poses import MIN_POINTS
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
 from bpnp.search.assemble import OneCamera, Solved, assembled
-from bpnp.search.config import DEFAULT, Evidence
+from bpnp.search.config import Evidence
 from bpnp.search.focal_length import AROUND, UnknownCamera, fit_camera
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
 from bpnp.search.problem import Problem, UnknownFocal
-from bpnp.search.propose.density_map import search_around
-from bpnp.search.refine.annealing import anneal_to_end, finish
+from bpnp.search.propose.density_map import LOCAL, search_around
+from bpnp.search.refine.annealing import FINISHED_POSES, anneal_to_end, finish
 from bpnp.search.search_frame import Scene
+from bpnp.search.settings import DEFAULT
 from bpnp.search.solution import Solution
 from bpnp.search.verdict.competitors import competing_pose
 from bpnp.search.verdict.contest import contest, rivals_of
@@ -88,7 +89,7 @@ def refine_on_all_points(solution: Solution, photo: Photo, whole: Region, deadli
     for _ in range(local_searches):
         if deadline.passed(Unfinished.competing_poses):
             break
-        local = finish(scene, search_around(scene, start, DEFAULT.local), DEFAULT.finished)
+        local = finish(scene, search_around(scene, start, LOCAL), FINISHED_POSES)
         poses = Hypotheses.concatenate([poses, to_problem_frame(local, scene)])
     return Refined(region, problem, (rotation, shift), poses, scene)
 

@@ -21,9 +21,10 @@ from bpnp.maps.viewed_points import Place, Region, ViewedPoints
 from bpnp.runtime import NEVER, Clock, Deadline
 from bpnp.search.arguments import checked_prior
 from bpnp.search.assemble import Solved, with_unfinished
-from bpnp.search.config import DEFAULT, SearchSettings
 from bpnp.search.focal_length import UnknownCamera, solve_with_focal_length
 from bpnp.search.problem import Problem, UnknownFocal
+from bpnp.search.propose.density_map import EVERYWHERE
+from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.solution import Candidate, Solution
 from bpnp.search.solvers import Options, solve_problems
 from bpnp.search.verdict import reasons
@@ -42,7 +43,7 @@ JUDGING_SECONDS = 1.5  # [seconds; cost]
 
 # The search stays near the view's pose, not near the best pose of an unsuccessful earlier search.
 # A search in a fourth of the time finds four fifths as many poses, so that short searches near many views pay.
-BRIEF = replace(DEFAULT, near=(DEFAULT.everywhere,)).limited(ITERATIONS)
+BRIEF = replace(DEFAULT, near=(EVERYWHERE,)).limited(ITERATIONS)
 ONCE, LONGER = DEFAULT.limited(ITERATIONS), DEFAULT.limited(LONGER_ITERATIONS)
 RANKS = {"failed": 0, "ambiguous": 1, "confident": 2}
 

@@ -21,11 +21,11 @@ from bpnp.checks import check_positive, check_within
 from bpnp.geometry import bearings, choose, chords
 from bpnp.robust.proposals import pose_hypotheses
 from bpnp.runtime import Deadline, default_float_errors
-from bpnp.search.config import DEFAULT, SearchSettings
 from bpnp.search.problem import Problem
 from bpnp.search.propose.given import anneal_given
 from bpnp.search.search import fixing_no_pose, search_poses
 from bpnp.search.search_frame import Scene, degenerate
+from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.verdict.decide import Case, SearchResult, decide
 from bpnp.types import Batch, Pose, Prediction, SolveStats
 

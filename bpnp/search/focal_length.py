@@ -30,13 +30,14 @@ from bpnp.poses import close_poses, polar_coordinates, rotation_angle
 from bpnp.runtime import NEVER, Clock, Deadline, one_blas_thread
 from bpnp.search.arguments import Array, checked_size
 from bpnp.search.assemble import Solved, with_unfinished
-from bpnp.search.config import DEFAULT, OtherFocal
+from bpnp.search.config import OtherFocal
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.propose.lens import fit_lens
 from bpnp.search.refine.annealing import anneal_to_end
 from bpnp.search.search_frame import Scene
+from bpnp.search.settings import DEFAULT
 from bpnp.search.solution import FOCAL_LENGTH, ROTATION_PARAMETERS, Solution
 from bpnp.search.solvers import Options, solve_problems
 from bpnp.search.verdict.decide import match_count, rank_poses
@@ -261,7 +262,7 @@ class FocalSweep(ABC):
 
     def sweep(self, *, few: bool = False) -> Solved:
         """Return the solution with the fewest false alarms; `few` is True for points that are enumerated."""
-        most, begun = self.options.settings.schedule.iterations, Clock.now()
+        most, begun = self.options.settings.iterations, Clock.now()
         self.deadline = self.options.limit()
         for camera in (focal_steps := self.unknown.focal_steps(FOCAL_STEP_FEW if few else FOCAL_STEP)):
             self.search_from(self.preselect(camera), min(FIRST_ITERATIONS, most), len(focal_steps))

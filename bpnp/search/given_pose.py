@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from bpnp.poses import rotation_angle
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
-from bpnp.search.config import DEFAULT, Evidence
+from bpnp.search.config import Evidence
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.pose_model import PoseModel
@@ -27,8 +27,9 @@ from bpnp.search.problem import EQUALLY_NEAR_SIGMAS, Problem, in_bulk
 from bpnp.search.propose.density_map import perturb_each
 from bpnp.search.propose.repetitions import competing_poses
 from bpnp.search.propose.symmetries import mirror_pose
-from bpnp.search.refine.annealing import anneal_on_points, anneal_to_end, finish
+from bpnp.search.refine.annealing import FINISHED_POSES, MIDDLE, anneal_on_points, anneal_to_end, finish
 from bpnp.search.search_frame import Scene
+from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict.contest import contest, rivals_of
 from bpnp.search.verdict.covariance import FAR_SQUARED
@@ -118,7 +119,7 @@ def _proposed(problem: Problem, claim: Hypotheses, scene: Scene) -> Hypotheses:
     It starts from the pose, from perturbed copies, and from its mirror image in front of a flat scene.
     """
     start = to_scene_frame(claim, scene)
-    wide = scene.settings.middle[-1].last_scale * scene.spread
+    wide = MIDDLE[-1].last_scale * scene.spread
     bulk = problem.points3d[in_bulk(problem.points3d)]
     mirrored = mirror_pose(bulk, *claim.pose())
     starts = [start, perturb_each(scene, start)]
@@ -126,7 +127,7 @@ def _proposed(problem: Problem, claim: Hypotheses, scene: Scene) -> Hypotheses:
         starts.append(to_scene_frame(Hypotheses.from_poses(mirrored[0][None], mirrored[1][None]), scene))
     around = Hypotheses.concatenate(starts)
     parts = [anneal_on_points(scene, start, wide), anneal_on_points(scene, around, wide), finish(scene, start)]
-    poses = finish(scene, merge_hypotheses(parts, scene), scene.settings.finished)
+    poses = finish(scene, merge_hypotheses(parts, scene), FINISHED_POSES)
     return to_problem_frame(poses, scene)
 
 

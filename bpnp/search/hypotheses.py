@@ -12,6 +12,10 @@ from bpnp.poses import close_poses, distinct
 from bpnp.search.search_frame import Scene
 
 SIGNIFICANT = 1e3  # more than any log-likelihood per bearing [nats; derived]
+KEPT_CANDIDATES = 8  # number of candidates that a search keeps from one iteration to the next [poses; cost]
+SAME_DEG = 3.0  # angle below which two poses can be the same, degrees [degrees; convention]
+# Shift below which they can be, in extents of the scene; both conditions are necessary.
+SAME_SHIFT = 0.05  # [extents of the scene; convention]
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,8 +128,7 @@ def select_distinct(poses: Hypotheses, scene: Scene, count: int, apart_deg: floa
     Returns:
         Hypotheses with the basin counts of all poses equal to them.
     """
-    settings = scene.settings
-    limits = (settings.same_deg, settings.same_shift) if apart_deg is None else (apart_deg, math.inf)
+    limits = (SAME_DEG, SAME_SHIFT) if apart_deg is None else (apart_deg, math.inf)
     compared = poses.rotation, poses.translation * scene.shift_weight
     kept = distinct(*compared, poses.sort_key, count, *limits)
     if not len(kept):
@@ -137,7 +140,7 @@ def select_distinct(poses: Hypotheses, scene: Scene, count: int, apart_deg: floa
 
 def merge_hypotheses(parts: Sequence[Hypotheses], scene: Scene) -> Hypotheses:
     """Return the best distinct hypotheses of several batches, with the basin counts of all batches."""
-    return select_distinct(Hypotheses.concatenate(parts), scene, scene.settings.kept)
+    return select_distinct(Hypotheses.concatenate(parts), scene, KEPT_CANDIDATES)
 
 
 def to_problem_frame(poses: Hypotheses, scene: Scene) -> Hypotheses:

@@ -24,6 +24,7 @@ from bpnp.search.hypotheses import Hypotheses, select_distinct, to_scene_frame
 from bpnp.search.loop import Step
 from bpnp.search.pool import Pool
 from bpnp.search.propose.density_map import (
+    LOCAL,
     is_near,
     search_around,
     search_density,
@@ -32,9 +33,23 @@ from bpnp.search.propose.density_map import (
     select_admitted,
 )
 from bpnp.search.propose.given import enter_given
-from bpnp.search.refine.annealing import multistart
+from bpnp.search.refine.annealing import batch_size, multistart
+from bpnp.search.settings import DensitySearch
 from bpnp.search.starts import PosePrior, Prior
 from bpnp.search.verdict.completeness import far_missed, near_missed
+
+GUESSED_BATCHES = 4  # number of batches around a guess of the pose, before all others [batches; calibration]
+NEAR_STEPS = 12  # steps near a rough prior before the search treats the prior as possibly wrong [steps; calibration]
+UNAIDED_ROUNDS = 10  # number of rounds without a significant pose before proposals are requested [rounds; calibration]
+# Starts in a batch that take as long as one density-map search over all rotations.
+STARTS_A_SEARCH = 96  # [starts; measured, CPU time of both]
+SURROUNDED_POSES = 6  # poses of a source that density-map searches are made around, at most [poses; calibration]
+SURROUNDED_APART_DEG = 10.0  # least angle between the rotations of these poses, degrees [degrees; calibration]
+# Number of consecutive searches without a better pose after which the other poses of the source are skipped.
+MOST_FRUITLESS = 3  # [searches; calibration]
+LOCAL_SEARCHES = 3  # local searches around a significant pose that find nothing better, at most [searches; calibration]
+PROPOSED_AFTER = 4  # number of steps near a prior after which proposals are requested [steps; not tuned]
+PROPOSED = DensitySearch()  # density-map search from proposed poses [`DensitySearch`; calibration]
 
 Proposals = Callable[[], tuple[NDArray[np.float64], NDArray[np.float64]]]  # rotations (s, 3, 3), translations (s, 3)
 
@@ -66,7 +81,7 @@ class Source:
             number, self.searches, self.waiting = self.searches, self.searches + 1, self.waiting - 1
             return Step(partial(search_everywhere, scene, number, self.scene_prior))
         number, self.batches = self.batches, self.batches + 1
-        self.waiting = scene.settings.batch(number) // scene.settings.schedule.starts_a_search
+        self.waiting = batch_size(number) // STARTS_A_SEARCH
         return Step(partial(multistart, scene, number, None if number % 3 == 2 else self.scene_prior))
 
 
@@ -91,15 +106,15 @@ class Surroundings:
 
     def next_step(self) -> Step | None:
         """Return the next local search; None after the last one."""
-        pool, settings = self.pool, self.pool.scene.settings
+        pool = self.pool
         if self.best is not None:
             self.in_vain = 0 if pool.best_key > self.best else self.in_vain + 1
-        while len(self.poses) and self.in_vain < settings.schedule.in_vain and pool.alarms >= 0:
+        while len(self.poses) and self.in_vain < MOST_FRUITLESS and pool.alarms >= 0:
             pose, self.poses = self.poses[:1], self.poses[1:]
             if not pool.is_searched(pose):
                 self.best = pool.best_key
                 pool.searched.append(pose)
-                return Step(partial(search_around, pool.scene, pose, settings.local))
+                return Step(partial(search_around, pool.scene, pose, LOCAL))
         return None
 
 
@@ -159,11 +174,11 @@ class Plan:
 
     def next_step(self) -> Step | None:
         """Return the next step; None if there is none."""
-        if self.guess is not None and self.taken < self.pool.scene.settings.schedule.around:
+        if self.guess is not None and self.taken < GUESSED_BATCHES:
             self.taken += 1
             return Step(partial(_dependent_batch, self.pool, self.taken - 1, self.guess))
         if self.near is not None:
-            if self.taken_near < self.pool.scene.settings.schedule.near:
+            if self.taken_near < NEAR_STEPS:
                 return self._next_near(self.near)
             if self.pool.alarms < 0:
                 return self._next_of_significant(partial(self._next_near, self.near))
@@ -177,7 +192,7 @@ class Plan:
         scene, number = self.pool.scene, self.taken_near - self.asked_near
         undecided = self.pool.alarms > scene.settings.evidence.false_alarms
         self.taken_near += 1
-        if number == scene.settings.schedule.proposed_after and self.proposals is not None and undecided:
+        if number == PROPOSED_AFTER and self.proposals is not None and undecided:
             self.asked_near = True
             return Step(self._take_proposals())
         if number % 2:
@@ -191,7 +206,7 @@ class Plan:
         while True:
             if (step := self._next_in_surroundings()) is not None:
                 return step
-            unaided = self.rounds > self.pool.scene.settings.schedule.unaided and self.pool.alarms >= 0
+            unaided = self.rounds > UNAIDED_ROUNDS and self.pool.alarms >= 0
             if unaided and self.proposals is not None:
                 return self._and_surroundings(Step(self._take_proposals()))
             self.rounds += 1
@@ -206,7 +221,7 @@ class Plan:
         if (step := self._next_in_surroundings()) is not None:
             return step
         pool = self.pool
-        enough = pool.alarms >= 0 or pool.local_searches(pool.leaders()) >= pool.scene.settings.schedule.local_searches
+        enough = pool.alarms >= 0 or pool.local_searches(pool.leaders()) >= LOCAL_SEARCHES
         return None if enough else self._local_search()
 
     def _take_proposals(self) -> Callable[[], Hypotheses]:
@@ -227,8 +242,7 @@ class Plan:
     def _next_in_surroundings(self) -> Step | None:
         """Return the next local search around the poses of the last step; None if there is none."""
         if self._found:
-            found, schedule = self._found.pop(), self.pool.scene.settings.schedule
-            poses = select_distinct(found, self.pool.scene, schedule.around_each, schedule.apart_deg)
+            poses = select_distinct(self._found.pop(), self.pool.scene, SURROUNDED_POSES, SURROUNDED_APART_DEG)
             self.surroundings = Surroundings(self.pool, poses)
         step = None if self.surroundings is None else self.surroundings.next_step()
         if step is None:
@@ -243,10 +257,7 @@ class Plan:
         symmetric = pool.symmetry.is_known(leaders) and pool.symmetry.is_symmetric(leaders)
         basin_count = pool.symmetry.basin_count(leaders, with_copies=symmetric)
         far = far_missed(basin_count, verdict_settings, symmetric=symmetric)
-        if (
-            local_searches < settings.schedule.local_searches
-            and near_missed(basin_count, local_searches, verdict_settings) > far
-        ):
+        if local_searches < LOCAL_SEARCHES and near_missed(basin_count, local_searches, verdict_settings) > far:
             return self._local_search()
         return next_start()
 
@@ -254,7 +265,7 @@ class Plan:
         """Return a local search around the best pose."""
         scene = self.pool.scene
         leader = to_scene_frame(self.pool.leaders()[:1], scene)
-        return Step(partial(search_around, scene, leader, scene.settings.local), leader)
+        return Step(partial(search_around, scene, leader, LOCAL), leader)
 
 
 def _dependent_batch(pool: Pool, number: int, guess: Prior) -> Hypotheses:
@@ -283,4 +294,4 @@ def search_proposed(pool: Pool, proposals: Proposals) -> Hypotheses:
     poses = select_admitted(pool.scene, enter_given(pool.scene, rotation, translation), pool.problem.prior)
     if not len(poses):
         return poses
-    return search_density(pool.scene, poses, pool.scene.settings.proposed)
+    return search_density(pool.scene, poses, PROPOSED)

@@ -8,11 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.poses import close_poses
-from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
+from bpnp.search.hypotheses import (
+    KEPT_CANDIDATES,
+    SAME_DEG,
+    SAME_SHIFT,
+    Hypotheses,
+    merge_hypotheses,
+    to_problem_frame,
+    to_scene_frame,
+)
 from bpnp.search.loop import Step
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem
-from bpnp.search.refine.annealing import finish
+from bpnp.search.refine.annealing import FINE_BEARINGS, FINISHED_POSES, finish
 from bpnp.search.search_frame import Scene
 from bpnp.search.verdict.completeness import Symmetry
 from bpnp.search.verdict.contest import rivals_of
@@ -27,7 +35,7 @@ class Pool:
         scene: Points in the frame of the search.
         problem: Points in the frame of the problem.
         enumerated: Case of the enumeration of few points, whose poses are the first candidates.
-        candidates: Best poses in the frame of the scene, at most `settings.kept`.
+        candidates: Best poses in the frame of the scene, at most `KEPT_CANDIDATES`.
         iterations: Number of iterations so far.
         missed: log10 of the probability that the search missed a better optimum.
         surrounded: Significant poses whose local search found nothing better.
@@ -38,7 +46,7 @@ class Pool:
     def __init__(self, scene: Scene, problem: Problem, enumerated: Case) -> None:
         self.scene, self.problem, self.enumerated = scene, problem, enumerated
         self.iterations, self._judged_alarms = 0, 0.0
-        self._is_thinned = len(problem.bearings) > scene.settings.fine.bearings
+        self._is_thinned = len(problem.bearings) > FINE_BEARINGS
         self._tests = PoseModel.of(problem).log10_tests([problem])
         self.symmetry = Symmetry(problem, scene.settings.evidence)
         self.forget()
@@ -89,7 +97,7 @@ class Pool:
         None for `count` means as many as a verdict needs.
         """
         if count is None:
-            count = self.scene.settings.finished if self.problem.prior is None else self.scene.settings.kept
+            count = FINISHED_POSES if self.problem.prior is None else KEPT_CANDIDATES
         places = np.flatnonzero(self._promising(candidates[:count]))
         first = add_false_alarms(to_problem_frame(candidates[places], self.scene), self.problem)
         alarms, rough = candidates.log10_false_alarms.copy(), candidates.log10_rough.copy()
@@ -134,9 +142,9 @@ class Pool:
 
     def is_searched(self, pose: Hypotheses) -> bool:
         """Return True if the surroundings of a pose (1,), or of one equal to it, were searched before."""
-        together, settings = Hypotheses.concatenate([pose, *self.searched]), self.scene.settings
+        together = Hypotheses.concatenate([pose, *self.searched])
         poses = together.rotation, together.translation * self.scene.shift_weight
-        return bool(close_poses(*poses, 0, settings.same_deg, settings.same_shift)[1:].any())
+        return bool(close_poses(*poses, 0, SAME_DEG, SAME_SHIFT)[1:].any())
 
     def _missed(self) -> float:
         """Compute `missed` from the current candidates."""
@@ -161,12 +169,12 @@ class Pool:
         """Return what is known of the best candidates, or the case of the enumeration if it has fewer false alarms.
 
         Args:
-            ended: True after the last iteration, where the `settings.finished` best candidates are annealed on all
+            ended: True after the last iteration, where the `FINISHED_POSES` best candidates are annealed on all
                 points; False to anneal only the best one.
         """
         scene, problem = self.scene, self.problem
         self._judged_alarms = min(self._judged_alarms, self.alarms)
-        annealed = scene.settings.finished if ended else 1
+        annealed = FINISHED_POSES if ended else 1
         ends = finish(scene, self.candidates, annealed) if len(self.candidates) else self.candidates
         if len(ends) and problem.prior is not None:  # keep the version of each pose with the smaller NFA
             ends = self._with_false_alarms(ends)

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.search.config import DEFAULT
 from bpnp.search.problem import Problem, faces
+from bpnp.search.settings import OUTLIERS
 
 # Distance within which an image point has a match, and default inlier threshold; 98.9 % of the errors of two normal
 # coordinates are within it.
@@ -80,10 +80,8 @@ def possible_matches(
         i, j, squared, odds = i[agree], j[agree], squared[agree], odds[agree]
         of_label = np.bincount(others + 1, minlength=int(label.max(initial=0)) + 2)
         candidates = np.where(label < 0, len(directions), of_label[label + 1] + of_label[0])
-    density = (
-        odds * np.exp(squared * (-0.5 / scale**2)) * (1 - DEFAULT.outliers) / (candidates[i] * 2 * math.pi * scale**2)
-    )
-    every = np.bincount(i, density, len(bearings)) + DEFAULT.outliers / problem.image.solid_angle
+    density = odds * np.exp(squared * (-0.5 / scale**2)) * (1 - OUTLIERS) / (candidates[i] * 2 * math.pi * scale**2)
+    every = np.bincount(i, density, len(bearings)) + OUTLIERS / problem.image.solid_angle
     return i, j, np.asarray(density, np.float64), np.asarray(every, np.float64)
 
 

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
-from bpnp.search.config import DEFAULT, SearchSettings
 from bpnp.search.enumeration.plan import EnumeratedPoses, EnumerationPlan
 from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
 from bpnp.search.hypotheses import Hypotheses
@@ -19,17 +18,24 @@ from bpnp.search.loop import Progress, run, teller
 from bpnp.search.plan import Plan, Proposals
 from bpnp.search.pool import Pool
 from bpnp.search.problem import Problem
-from bpnp.search.propose.density_map import preselect
+from bpnp.search.propose.density_map import LOCAL, preselect
 from bpnp.search.propose.known_matches import known_matches, poses_of_matches
 from bpnp.search.propose.minimal_solvers import p3p_poses
 from bpnp.search.propose.symmetries import self_motions
 from bpnp.search.refine.annealing import run_batch
 from bpnp.search.search_frame import Scene, degenerate
+from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.starts import Prior
 from bpnp.search.verdict.contest import contest, rivals_of
 from bpnp.search.verdict.decide import Case, SearchResult, decide, fits_by_chance
 from bpnp.search.verdict.reasons import objection
 from bpnp.search.verdict.rivals import SceneOf
+
+# Clusters keep every one of so small a set, and further iterations end at the same poses.
+ENUMERATED_ITERATIONS = 12  # iterations, at most, for points few enough to be enumerated [iterations; calibration]
+# Fewer points have no smooth optimum and are only enumerated.
+LEAST_ANNEALED = 12  # least number of points of the smaller set for annealing [points; calibration]
+WARMING_POINTS = 8  # number of points of the problem that compiles the loops [points; convention]
 
 
 def search_poses(problem: Problem, **options: Any) -> SearchResult:
@@ -96,7 +102,7 @@ def find_case(
     if matches is not None and (problem.prior is None or not is_enumerable(problem)):
         return _of_known_matches(problem, *matches, scene_of, seed, settings, deadline)
     if not many:
-        settings = settings.limited(min(settings.schedule.iterations, settings.schedule.enumerated))
+        settings = settings.limited(min(settings.iterations, ENUMERATED_ITERATIONS))
     if not only_proposals and is_enumerable(problem) and not deadline.passed():
         poses = EnumeratedPoses(problem, scene_of, settings)
         enumerated = run(EnumerationPlan(poses, deadline), poses, most=1, deadline=NEVER)
@@ -105,7 +111,7 @@ def find_case(
             return _of_known_matches(problem, *matches, scene_of, seed, settings, deadline)
         tell(0)
         # More search helps only if no pose is significant yet, and there are enough points to anneal.
-        small = min(len(problem.bearings), len(problem.points3d)) < settings.least_annealed
+        small = min(len(problem.bearings), len(problem.points3d)) < LEAST_ANNEALED
         settled = poses.is_exhausted or not by_chance
         if enumerated.objection is None or small or (settled and not many):
             return enumerated
@@ -118,7 +124,7 @@ def find_case(
     pool = Pool(scene, problem, enumerated)
     is_asked = many or only_proposals
     plan = Plan.of(pool, around, proposals if is_asked else None, only_proposals=only_proposals)
-    return run(plan, pool, most=settings.schedule.iterations, deadline=deadline, tell=tell)
+    return run(plan, pool, most=settings.iterations, deadline=deadline, tell=tell)
 
 
 def _of_known_matches(
@@ -153,7 +159,7 @@ def warm_up() -> None:
 
     A tracker calls it before its first frame, since loops cached on disk are still loaded at their first call.
     """
-    points = np.random.default_rng(0).uniform(-1, 1, (DEFAULT.warming, 3))
+    points = np.random.default_rng(0).uniform(-1, 1, (WARMING_POINTS, 3))
     rays = points + (0, 0, 6)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     problem = Problem(rays, points)
@@ -163,5 +169,5 @@ def warm_up() -> None:
     scene = Scene(problem, 0, DEFAULT)
     start = Hypotheses.from_poses(*scene.enter(np.eye(3)[None], np.array([[0, 0, 6.0]])))
     run_batch(scene, start)
-    local_searches = DEFAULT.local.density_map, DEFAULT.local.narrowing.first_scale
-    preselect(scene, start, *local_searches, DEFAULT.warming, 1)
+    local_searches = LOCAL.density_map, LOCAL.narrowing.first_scale
+    preselect(scene, start, *local_searches, WARMING_POINTS, 1)

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.poses import MIN_POINTS
 from bpnp.runtime import NEVER, Deadline
-from bpnp.search.config import DensityShape, SearchSettings
 from bpnp.search.kernels.density_map import DensityMap
 from bpnp.search.kernels.sides import (
     FORWARD,
@@ -23,10 +22,15 @@ from bpnp.search.kernels.sides import (
 )
 from bpnp.search.kernels.sparse import Tiles, build_tiles
 from bpnp.search.problem import LINE_RATIO, Problem, in_bulk
+from bpnp.search.settings import DensityShape, SearchSettings
 from bpnp.search.starts import Array, GravityPrior, Prior, turned_to
 
 # Weight of a shift along the view over one across it, for an RMS angular radius of one radian; at most 1.
 SHIFT_ALONG = 5.0  # [per radian; not tuned]
+# An annealing ends at the least of the next two scales and of `Problem.floor`.
+SMALLEST_ANNEALED = 2e-4  # a tenth of a pixel at a focal length of 500 pixels [radians; convention]
+# Smallest scale of the annealing in units of the RMS angular radius of the bearings, for narrow views.
+SMALLEST_RELATIVE = 1e-3  # [RMS angular radii; convention]
 
 Sides = tuple[WeightedBearings, WeightedPoints]
 
@@ -87,9 +91,8 @@ class Scene:
         self.image, self.seen = with_partners(self.image, self.seen), with_partners(self.seen, self.image)
         self.spread, self.solid_angle = problem.image.spread, problem.image.solid_angle
         self.shift_weight = np.array([1, 1, min(1, SHIFT_ALONG * self.spread)], np.float32)
-        fine = settings.fine
         floor = math.inf if problem.floor is None else problem.floor
-        self.smallest_scale = min(fine.smallest_scale, fine.relative_smallest * self.spread, floor)
+        self.smallest_scale = min(SMALLEST_ANNEALED, SMALLEST_RELATIVE * self.spread, floor)
 
     def outlier_density(self, share: float) -> np.float32:
         """Return the density of outliers over that of a kernel (Myronenko, Song).
@@ -142,17 +145,17 @@ class Scene:
         """
         sides, image, seen = {}, self.image, self.seen
         for count in sorted(set(counts), reverse=True):
-            image = image.clustered(count, self.settings, self.rng)
+            image = image.clustered(count, self.rng)
             f = image.points.astype(np.float64) + FORWARD  # a mean of unit vectors is shorter
             unit = (f / np.linalg.norm(f, axis=-1, keepdims=True) - FORWARD).astype(np.float32)
-            seen = seen.clustered(count, self.settings, self.rng)
-            bearings, points = kernel_sides(image._replace(points=unit), seen, self.settings.facing)
+            seen = seen.clustered(count, self.rng)
+            bearings, points = kernel_sides(image._replace(points=unit), seen)
             sides[count] = bearings, points._replace(blocks=blocks_of(image.labels, seen.labels))
         return [sides[count] for count in counts]
 
     def sides(self, bearings: int | None = None, points: int | None = None) -> Sides:
         """Return bearings and points in random order; the first `bearings` and `points` of them, None for all."""
-        return kernel_sides(self.image.at(slice(bearings)), self.seen.at(slice(points)), self.settings.facing)
+        return kernel_sides(self.image.at(slice(bearings)), self.seen.at(slice(points)))
 
     def seen_points(self, count: int) -> WeightedPoints:
         """Return the first `count` points as the density map scores them, from a cache."""

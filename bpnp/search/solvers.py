@@ -13,12 +13,12 @@ import numpy as np
 from bpnp.runtime import Clock, Deadline
 from bpnp.search.arguments import Array
 from bpnp.search.assemble import OneCamera, Solved, assembled
-from bpnp.search.config import DEFAULT, SearchSettings
 from bpnp.search.enumeration.search import exceeds_enumeration
 from bpnp.search.plan import Proposals
 from bpnp.search.problem import Problem
 from bpnp.search.propose.mirror import mirrored_alarms
 from bpnp.search.search import find_case
+from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import reasons
 from bpnp.search.verdict.decide import Case, SearchResult, decide

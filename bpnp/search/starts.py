@@ -7,8 +7,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.search.config import StartSampling
-
 # RMS angular radius above which bearings fill about 220 degrees or more, so that the camera is among the points.
 ALL_AROUND_SPREAD = 0.95  # [radians; derived]
 # Step of the spiral of positions at which searches aim, with radii of `aim_step` times the square root of the number;
@@ -16,6 +14,15 @@ ALL_AROUND_SPREAD = 0.95  # [radians; derived]
 AIM_STEP = 0.16  # [RMS angular radii; not tuned]
 
 Array = NDArray[np.float32]
+
+
+class StartSampling(NamedTuple):
+    """Sampling of initial poses around the weak-perspective pose."""
+
+    # 0 puts the centroid of the 3D points on the mean bearing. 1 puts a random 3D point there, for cameras that see a
+    # part of the scene. Values between interpolate.
+    off_centre: float
+    log_depth: float  # the depth is multiplied by exp(u), u uniform in [-log_depth, log_depth], nats
 
 
 class PosePrior(NamedTuple):

@@ -13,7 +13,7 @@ from bpnp.models import Refinement
 from bpnp.models.evaluation import round_widths
 from bpnp.models.nets import PointFeatures
 from bpnp.report.results import rows_from
-from bpnp.search.config import DEFAULT
+from bpnp.search.propose.density_map import COPIES
 from bpnp.training.losses import correspondence_loss, pose_terms
 
 
@@ -74,7 +74,7 @@ def test_refinement_starts_from_hypotheses_too_unless_there_are_none() -> None:
     crowd = net(batch).poses["refined"].stats.iterations
     net.refinement.hypotheses = 0
     alone = net(batch).poses["refined"].stats.iterations
-    assert int(alone) <= 2 * (1 + DEFAULT.copies) < int(crowd)
+    assert int(alone) <= 2 * (1 + COPIES) < int(crowd)
     with pytest.raises(ValueError, match="`hypotheses` is -1; it must be 0 or more"):
         Refinement(hypotheses=-1)
 

@@ -56,6 +56,14 @@ def test_constants_have_a_unit_and_an_origin(file: Path) -> None:
         assert tag[2].startswith(ORIGINS), f"{name} has the origin {tag[2]!r}"
 
 
+def test_fields_of_density_map_searches_have_a_unit_and_an_origin() -> None:
+    source = (PACKAGE / "search" / "settings.py").read_text()
+    numbers = re.findall(r"^    \w+: (?:int|float|tuple)[^=\n]* = (?![A-Z])(.*)$", source, re.MULTILINE)
+    assert len(numbers) == 19
+    for number in numbers:
+        assert re.search(r"  # .*\[[^\[\];]+; (calibration|derived|cost)\]$", number), number
+
+
 def fields_of(group: Any) -> list[str]:
     return [one.name for one in dataclasses.fields(group)] if dataclasses.is_dataclass(group) else list(group._fields)
 

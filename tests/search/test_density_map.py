@@ -12,11 +12,11 @@ from planted import degrees_between, view_with_outliers
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest, truncnorm
 
-from bpnp.search.config import DEFAULT
 from bpnp.search.problem import Problem
 from bpnp.search.propose.density_map import draw_around, search_near
 from bpnp.search.search import search_poses
 from bpnp.search.search_frame import Scene
+from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import PosePrior
 
 Array = NDArray[np.float64]

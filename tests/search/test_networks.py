@@ -1,6 +1,5 @@
 """Inputs of a network and their axes, and the use that a search makes of the proposed poses."""
 
-from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -11,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from bpnp import GravityPrior, PosePrior, solve, solve_many
 from bpnp.models import Matcher
-from bpnp.search.config import DEFAULT
 from bpnp.search.inputs import problem_from
 from bpnp.search.propose import networks
+from bpnp.search.settings import DEFAULT
 from bpnp.search.solvers import Options, solve_problems
 from bpnp.types import Batch, Prediction
 
@@ -124,7 +123,8 @@ def test_an_undecided_search_asks_the_matcher_and_a_confident_one_does_not(
     rng = np.random.default_rng(0)
     noise2d, noise3d = rng.uniform(-0.5, 0.5, (150, 2)), rng.normal(size=(150, 3))
     problem = problem_from(noise2d, noise3d, None, prior=prior)
-    brief = replace(DEFAULT, schedule=replace(DEFAULT.schedule, iterations=24, unaided=4))
+    monkeypatch.setattr("bpnp.search.plan.UNAIDED_ROUNDS", 4)
+    brief = DEFAULT.limited(24)
     alone, helped = (
         solve_problems({0: problem}, Options(asks=asks, seed=3, settings=brief))[0].solution for asks in (False, True)
     )

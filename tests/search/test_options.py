@@ -18,7 +18,7 @@ import bpnp
 from bpnp import GravityPrior, PosePrior, Solution, solve
 from bpnp.cli import main
 from bpnp.search.arguments import checked_prior, scene_points
-from bpnp.search.config import DEFAULT
+from bpnp.search.settings import DEFAULT
 from bpnp.search.solvers import Options
 
 Array = NDArray[np.float64]

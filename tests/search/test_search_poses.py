@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 from bpnp.metrics import rotation_error
 from bpnp.models import Search
 from bpnp.models.evaluation import best_poses
-from bpnp.search.config import DEFAULT, Schedule, SearchSettings
+from bpnp.search.plan import GUESSED_BATCHES
 from bpnp.search.problem import Problem
 from bpnp.search.search import search_poses
+from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.starts import PosePrior
 
 pytestmark = pytest.mark.slow
@@ -40,7 +41,7 @@ def test_a_guess_from_the_same_points_is_tried_first_and_is_no_prior(problem, of
     result = search_poses(points, around=points.prior_from_user(PosePrior(rotation, translation, 4.0, 0.1)))
     assert result.verdict == "confident"
     assert rotation_error(torch.as_tensor(result.best[0])[None], problem.rotation[:1]) < 0.5
-    assert (result.iterations <= DEFAULT.schedule.around) == (off < 0.1)
+    assert (result.iterations <= GUESSED_BATCHES) == (off < 0.1)
 
 
 @pytest.mark.parametrize(
@@ -48,10 +49,7 @@ def test_a_guess_from_the_same_points_is_tried_first_and_is_no_prior(problem, of
     [
         (lambda: Search(time_limit=0.0), "`time_limit` is 0.0; it must be above 0"),
         (lambda: DEFAULT.expecting(1.0), "`clutter` is 1.0; it is a fraction of the points"),
-        (lambda: SearchSettings(Schedule(iterations=0)), "`iterations` is 0"),
-        (lambda: SearchSettings(starts=0), "`starts` 0"),
-        (lambda: SearchSettings(first_starts=0), "`first_starts` 0"),
-        (lambda: SearchSettings(recipes=()), "number of `recipes` 0"),
+        (lambda: SearchSettings(iterations=0), "`iterations` is 0"),
         (lambda: SearchSettings(outliers=1.0), "`outliers` is 1.0"),
     ],
 )

@@ -6,10 +6,10 @@ from numpy.typing import NDArray
 from planted import degrees_between, directions, seen
 from scipy.spatial.transform import Rotation
 
-from bpnp.search.config import DEFAULT
 from bpnp.search.kernels.sides import kernel_sides, side_of
 from bpnp.search.problem import Problem, faces
 from bpnp.search.search import search_poses
+from bpnp.search.settings import DEFAULT
 
 Array = NDArray[np.float64]
 TRANSLATION = np.array([0.1, -0.1, 5.0])
@@ -80,12 +80,12 @@ def test_clusters_keep_the_weight_of_few_likely_points_among_many_impossible_one
     count, points = 20_000, rng.uniform(-1, 1, (20_000, 3)).astype(np.float32)
     scores = np.where(np.arange(count) < likely, 1.0, 1e-50)
     side = side_of(points, scores, np.zeros(count, np.int64), None, np.arange(count))
-    clusters = side.clustered(64, DEFAULT, rng)
+    clusters = side.clustered(64, rng)
     assert clusters.weights.sum() == likely
     if likely:
         mean = clusters.weights @ clusters.points / likely
         np.testing.assert_allclose(mean, points[:likely].mean(0), atol=0.01)
     bearings = side.at(slice(0, 40))._replace(weights=np.ones(40, np.float32))
-    seen, scene = kernel_sides(bearings, clusters, DEFAULT.facing)
+    seen, scene = kernel_sides(bearings, clusters)
     assert scene.b.sum() == likely
     assert np.isfinite(seen.odds).all()

@@ -15,13 +15,13 @@ from scipy.spatial.transform import Rotation
 from bpnp import Solution, solve, solve_many, verify
 from bpnp.runtime import Clock, Deadline
 from bpnp.search import matching
-from bpnp.search.config import DEFAULT
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.inputs import problem_from
 from bpnp.search.matching import POINTS_A_CHECK, count_one_to_one, one_to_one
 from bpnp.search.problem import Problem
 from bpnp.search.refine import annealing
 from bpnp.search.search_frame import Scene
+from bpnp.search.settings import DEFAULT
 from bpnp.search.solvers import _proposals_of_matcher
 
 K = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])

@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 from scipy.special import stdtrit
 
 from bpnp.runtime import NEVER, Deadline
-from bpnp.search.config import DEFAULT
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.propose.known_matches import poses_of_matches
 from bpnp.search.search_frame import Scene
+from bpnp.search.settings import DEFAULT
 from bpnp.search.verdict.contest import contest, rivals_of
 from bpnp.search.verdict.decide import Case, SearchResult, decide
 from bpnp.search.verdict.rivals.lens import AtZoom, lens, likeliest_zoom

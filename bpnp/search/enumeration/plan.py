@@ -13,14 +13,14 @@ from functools import partial
 import numpy as np
 
 from bpnp.runtime import Deadline
-from bpnp.search.config import SearchSettings
 from bpnp.search.enumeration.points import predicted_pose
 from bpnp.search.enumeration.search import PATIENCE, STAGES, Enumeration, enumerate_poses, margin
-from bpnp.search.hypotheses import Hypotheses
+from bpnp.search.hypotheses import KEPT_CANDIDATES, Hypotheses
 from bpnp.search.loop import Step
 from bpnp.search.possible_matches import score_pose
 from bpnp.search.problem import Problem
 from bpnp.search.propose.repetitions import competing_poses
+from bpnp.search.settings import SearchSettings
 from bpnp.search.starts import GravityPrior
 from bpnp.search.verdict.completeness import Symmetry
 from bpnp.search.verdict.contest import rivals_of
@@ -135,14 +135,14 @@ class EnumeratedPoses:
             order = np.argsort(every.log10_false_alarms, kind="stable")
         else:
             order = np.argsort(-every.log_likelihood, kind="stable")
-        self.candidates = every[order[: self.settings.kept]]
+        self.candidates = every[order[:KEPT_CANDIDATES]]
 
     def _candidates(self) -> Hypotheses:
         """Return the poses not far less likely than the best, with the scale and likelihood of the annealing."""
         poses = self.found
         if poses.evidence is None or not len(poses):
             return poses
-        poses = poses[poses.evidence >= poses.evidence.max() - NEAR_NATS][: self.settings.kept]
+        poses = poses[poses.evidence >= poses.evidence.max() - NEAR_NATS][:KEPT_CANDIDATES]
         scale = np.maximum(poses.scale, self.problem.floor or SMALLEST_SCALE)
         each = zip(poses.rotation, poses.translation, scale, strict=True)
         likelihood = np.array([score_pose(self.problem, *one)[0] for one in each])

@@ -7,7 +7,7 @@ visibility
     v_j = min(max(1/2 + (n_j . c_j - k_j) / 2 h, l), 1),
 
 n_j its normal, c_j the unit vector from it to the camera's centre, k_j the cosine at which it is half visible, h the
-softness and l the least weight of a point that should not be seen (`settings.Facing`).
+softness and l the least weight of a point that should not be seen.
 """
 
 import math
@@ -16,8 +16,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.config import Facing, SearchSettings
 from bpnp.search.kernels.vectors import F, part
+
+# Difference of the cosine between the edge of the viewing cone and full or least visibility. Poses during the annealing
+# are some degrees off, and so are normals.
+SOFTNESS = 0.2  # [1; calibration]
+UNSEEN_WEIGHT = 0.02  # least weight of a point, for a point outside its viewing cone [weight; calibration]
+# Distance, in extents of the scene, that clustering treats like one radian between normals.
+NORMAL_EXTENT = 0.5  # [extents of the scene; calibration]
+CLUSTERED_POINTS = 8  # number of points per cluster from which the cluster centres are computed [points; cost]
+LLOYD_ITERATIONS = 5  # number of iterations of the clustering [iterations; cost]
 
 Array = NDArray[np.float32]
 FORWARD = np.array([0.0, 0.0, 1.0])
@@ -100,7 +108,7 @@ class Side(NamedTuple):
         """Return a subset of the points."""
         return Side(self.points[chosen], self.weights[chosen], self.labels[chosen], self.cones[chosen])
 
-    def clustered(self, count: int, settings: SearchSettings, rng: np.random.Generator) -> "Side":
+    def clustered(self, count: int, rng: np.random.Generator) -> "Side":
         """Return about `count` clusters in the order of their labels, each of points of one label; the weights add up.
 
         Points with normals are only close if the normals are too: half an extent counts as much as half a radian.
@@ -109,7 +117,7 @@ class Side(NamedTuple):
         for label in np.unique(self.labels):
             members = np.flatnonzero(self.labels == label)
             share = count if len(members) == len(self.labels) else -(-count * len(members) // len(self.labels))
-            parts.append(_clusters(self.at(members), share, settings, rng))
+            parts.append(_clusters(self.at(members), share, rng))
         return Side(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
 
@@ -146,23 +154,23 @@ def fit_any(labels: NDArray[Any], others: NDArray[Any]) -> NDArray[np.bool_]:
     return np.asarray((labels < 0) | np.isin(labels, others) | (others < 0).any())
 
 
-def _clusters(side: Side, count: int, settings: SearchSettings, rng: np.random.Generator) -> Side:
+def _clusters(side: Side, count: int, rng: np.random.Generator) -> Side:
     """Return at most `count` clusters of points of one label."""
     side = side.at(np.flatnonzero(side.weights > 0))  # a sample of the others may contain none of these
     k = len(side.points)
     if k <= count:
         return side
-    size = min(k, settings.sampled * count)
+    size = min(k, CLUSTERED_POINTS * count)
     chosen = slice(None) if size == k else rng.choice(k, size, replace=False)
-    sample = np.concatenate([side.points, settings.facing.extent * side.cones], 1)[chosen]
+    sample = np.concatenate([side.points, NORMAL_EXTENT * side.cones], 1)[chosen]
     first = sample[rng.choice(size, count, replace=False)]
-    centres, weights = lloyd(sample, first, settings.lloyd_iterations, side.weights[chosen])
+    centres, weights = lloyd(sample, first, LLOYD_ITERATIONS, side.weights[chosen])
     centres, weights = centres[weights > 0], weights[weights > 0]
     return Side(
         np.ascontiguousarray(centres[:, :3]),
         weights.astype(np.float32) * np.float32(k / size),
         np.full(len(centres), side.labels[0], np.int32),
-        centres[:, 3:] / np.float32(settings.facing.extent),
+        centres[:, 3:] / np.float32(NORMAL_EXTENT),
     )
 
 
@@ -192,7 +200,7 @@ def lloyd(points: Array, centres: Array, iterations: int, weights: Array) -> tup
     return centres, members
 
 
-def kernel_sides(bearings: Side, points: Side, facing: Facing) -> tuple[WeightedBearings, WeightedPoints]:
+def kernel_sides(bearings: Side, points: Side) -> tuple[WeightedBearings, WeightedPoints]:
     """Convert both sides to the arrays of the compiled loops; the blocks are empty (`blocks_of`)."""
     return (
         WeightedBearings(
@@ -204,7 +212,7 @@ def kernel_sides(bearings: Side, points: Side, facing: Facing) -> tuple[Weighted
             _fitting(points, bearings),
             points.labels,
             np.empty((0, 4), np.uintp),
-            _cones(points, facing),
+            _cones(points),
         ),
     )
 
@@ -233,11 +241,11 @@ def _fitting(side: Side, other: Side) -> Array:
     return np.maximum(np.where(side.labels < 0, total, fitting) / total, 1e-6).astype(np.float32)
 
 
-def _cones(points: Side, facing: Facing) -> Array:
+def _cones(points: Side) -> Array:
     """Return the coefficients (6, n) of the visibility of `WeightedPoints`."""
     if not points.cones.shape[1]:
         return np.empty((6, 0), np.float32)
-    normals, cosine, slope = points.cones[:, :3], points.cones[:, 3], 1 / (2 * facing.softness)
+    normals, cosine, slope = points.cones[:, :3], points.cones[:, 3], 1 / (2 * SOFTNESS)
     towards = -slope * (normals * points.points).sum(1)
-    rest = 0.5 - slope * cosine, np.full(len(cosine), facing.unseen)
+    rest = 0.5 - slope * cosine, np.full(len(cosine), UNSEEN_WEIGHT)
     return np.ascontiguousarray(np.stack([*(slope * normals).T, towards, *rest]), np.float32)

@@ -25,17 +25,36 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr, ndtri
 
 from bpnp.runtime import in_time
-from bpnp.search.config import DensitySearch, DensityShape
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.kernels.density_map import DensityMap, add_up
-from bpnp.search.refine.annealing import anneal_on_points, perturb_about_centroid
+from bpnp.search.refine.annealing import RECIPES, anneal_on_points, perturb_about_centroid
 from bpnp.search.search_frame import Scene
+from bpnp.search.settings import DensitySearch, DensityShape, Draws, Narrowing, Preselection
 from bpnp.search.starts import PosePrior, Prior, aim_of, draw_poses
 
 KERNEL_SIGMAS = 5.0  # distance beyond which a smoothing kernel is 0 [standard deviations; numerics]
 # Half side of the largest density map: 120 degrees off the axis.
 WIDEST_MAP = 2 * math.tan(math.radians(60))  # [stereographic coordinate; convention]
 NARROW_CELLS = 4.0  # standard deviation below which a smoothing is computed cell by cell [cells; cost]
+# Largest volume of a prior that counts as near, in multiples of the widest one with a full number of starts; the prior
+# of a map view has 9.
+MOST_VOLUMES = 100.0  # [volumes; calibration]
+# Standard deviations of a prior within which proposed poses are used; 94 % of the poses drawn from it.
+ADMITTED_SIGMAS = 3.5  # [standard deviations; derived]
+COPIES = 6  # number of copies of each pose from another source [poses; calibration]
+# Angular distance of the points of a copy from those of its pose, in units of the RMS angular radius of the bearings.
+# Optima of one basin are about as far apart.
+COPIED_SCALE = 0.1  # [RMS angular radii; calibration]
+LOOKUPS_A_CHECK = 4096  # number of poses scored on the density map between two checks of the deadline [poses; cost]
+LOCAL = DensitySearch(  # density-map search around a pose that the search has found [`DensitySearch`; calibration]
+    Draws(2**13, 10.0, 0.1, 2**13),
+    Preselection((50, 300), (2**11, 2**8)),
+    Narrowing(0.08, 0.015, points=600),
+    annealed=12,
+)
+EVERYWHERE = DensitySearch(  # density-map search over all rotations [`DensitySearch`; calibration]
+    Draws(2**15), Preselection((50, 300), (2**12, 2**9)), Narrowing(0.08, 0.015, points=600), annealed=12
+)
 
 
 def search_near(scene: Scene, prior: PosePrior, density: DensitySearch | None = None) -> Hypotheses:
@@ -100,9 +119,8 @@ def search_everywhere(scene: Scene, number: int, prior: Prior | None) -> Hypothe
     Returns:
         Distinct annealed poses.
     """
-    settings = scene.settings
-    density, aim = settings.everywhere, aim_of(number)
-    drawn = draw_poses(scene.spread, scene.bulk3d, density.draws.starts, settings.recipes[0], prior, scene.rng, aim)
+    density, aim = EVERYWHERE, aim_of(number)
+    drawn = draw_poses(scene.spread, scene.bulk3d, density.draws.starts, RECIPES[0], prior, scene.rng, aim)
     return search_density(scene, Hypotheses.from_poses(*drawn, basin_count=1), density)
 
 
@@ -124,9 +142,7 @@ def search_around(scene: Scene, pose: Hypotheses, density: DensitySearch) -> Hyp
 
 def is_near(scene: Scene, prior: PosePrior) -> bool:
     """Return True if a prior has a translation and is narrow enough for its starts to reach the right basin."""
-    return (
-        prior.translation is not None and _volume(scene, prior, scene.settings.near[0]) <= scene.settings.most_volumes
-    )
+    return prior.translation is not None and _volume(scene, prior, scene.settings.near[0]) <= MOST_VOLUMES
 
 
 def starts_of(scene: Scene, prior: PosePrior, density: DensitySearch) -> int:
@@ -193,7 +209,7 @@ def _truncated(normal: NDArray[np.float32], low: float, high: float) -> NDArray[
 
 
 def select_admitted(scene: Scene, poses: Hypotheses, prior: Prior | None) -> Hypotheses:
-    """Select the poses within `settings.admitted` standard deviations of a prior.
+    """Select the poses within `ADMITTED_SIGMAS` standard deviations of a prior.
 
     Args:
         scene: Points and settings.
@@ -210,7 +226,7 @@ def select_admitted(scene: Scene, poses: Hypotheses, prior: Prior | None) -> Hyp
     if mean.translation is not None:
         shift = poses.rotation @ centroid + poses.translation - (rotation @ centroid + np.asarray(mean.translation))
         off = off + np.square(shift / mean.translation_sigma).sum(-1)
-    return poses[off <= scene.settings.admitted**2]
+    return poses[off <= ADMITTED_SIGMAS**2]
 
 
 def perturb(scene: Scene, poses: Hypotheses, scale: float, copies: int) -> Hypotheses:
@@ -235,7 +251,7 @@ def perturb(scene: Scene, poses: Hypotheses, scale: float, copies: int) -> Hypot
 
 def perturb_each(scene: Scene, poses: Hypotheses) -> Hypotheses:
     """Return poses from other sources with perturbed copies; basin counts are 0, since copies are dependent."""
-    return perturb(scene, poses, scene.settings.copied_scale, scene.settings.copies).as_dependent()
+    return perturb(scene, poses, COPIED_SCALE, COPIES).as_dependent()
 
 
 def preselect(
@@ -265,7 +281,7 @@ def preselect(
             add_up(density_map, seen, rotation[i:j], translation[i:j], own, weight, cell)
             score[i:j] += own
 
-    done = in_time(look_up, len(poses), scene.deadline, scene.settings.lookups_a_check)
+    done = in_time(look_up, len(poses), scene.deadline, LOOKUPS_A_CHECK)
     best = np.arange(done)
     if len(best) > kept:  # much faster than sorting all of them
         best = best[np.sort(np.argpartition(-score[best], kept)[:kept])]

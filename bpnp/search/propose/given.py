@@ -10,8 +10,11 @@ from bpnp.runtime import one_blas_thread
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame
 from bpnp.search.kernels.sides import FORWARD
 from bpnp.search.propose.density_map import perturb_each
-from bpnp.search.refine.annealing import anneal_on_clusters, anneal_on_points, finish
+from bpnp.search.refine.annealing import COARSE, MIDDLE, STARTS, anneal_on_clusters, anneal_on_points, finish
 from bpnp.search.search_frame import Scene
+
+REFINED_DIRECTLY = 8  # largest number of given poses that need no clusters [poses; cost]
+COPIED_POSES = 4  # number of poses from other sources, the best first, that are also copied [poses; calibration]
 
 Array = NDArray[np.float64]
 
@@ -32,14 +35,14 @@ def anneal_given(scene: Scene, rotation: Array, translation: Array) -> Hypothese
     Returns:
         Distinct poses in the frame of the problem, without an NFA; none without an initial pose.
     """
-    settings, starts = scene.settings, enter_given(scene, rotation, translation)
+    starts = enter_given(scene, rotation, translation)
     if not len(starts):
         return Hypotheses.empty()
-    if len(starts) > settings.refined_directly:
-        starts = anneal_on_clusters(scene, starts, (*settings.coarse, *settings.middle), settings.starts)
-    around = Hypotheses.concatenate([starts, perturb_each(scene, starts[: settings.copied])])
-    first_scale = settings.middle[-1].last_scale * scene.spread
-    clustered = anneal_on_clusters(scene, around, settings.middle, settings.starts)
+    if len(starts) > REFINED_DIRECTLY:
+        starts = anneal_on_clusters(scene, starts, (*COARSE, *MIDDLE), STARTS)
+    around = Hypotheses.concatenate([starts, perturb_each(scene, starts[:COPIED_POSES])])
+    first_scale = MIDDLE[-1].last_scale * scene.spread
+    clustered = anneal_on_clusters(scene, around, MIDDLE, STARTS)
     clustered = anneal_on_points(scene, clustered, first_scale)
     # A correct initial pose needs no clusters, which would only perturb it.
     direct = anneal_on_points(scene, starts, first_scale)

@@ -10,10 +10,10 @@ from torch import Tensor, nn
 
 from bpnp.runtime import Deadline
 from bpnp.search.arguments import Array
-from bpnp.search.config import DEFAULT
 from bpnp.search.problem import Problem
 from bpnp.search.propose.given import score_given
 from bpnp.search.search_frame import Scene
+from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict.contest import contest, rivals_of
 from bpnp.search.verdict.decide import Case

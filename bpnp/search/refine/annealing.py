@@ -1,22 +1,72 @@
 """Stages of the search: anneal starts on coarse clusters, the best on finer ones, and few on all points."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bpnp.runtime import Clock, in_time, thread_count
-from bpnp.search.config import Stages
-from bpnp.search.hypotheses import Hypotheses, select_distinct, to_problem_frame
+from bpnp.search.hypotheses import KEPT_CANDIDATES, Hypotheses, select_distinct, to_problem_frame
 from bpnp.search.kernels.dense import dense_scratch, descend
 from bpnp.search.kernels.sparse import descend_sparse, sparse_scratch
 from bpnp.search.search_frame import Scene, Sides
-from bpnp.search.starts import Array, Prior, draw_poses
+from bpnp.search.starts import Array, Prior, StartSampling, draw_poses
 
 # Pairs of bearings and points from which the first step of an annealing on all of them is timed.
 TIMED_PAIRS = 3e8  # [count; cost]
+# More cost time and rarely change the best pose.
+FINE_BEARINGS = 1000  # number of bearings before the last stage, which uses all [bearings; cost]
+COOLING = 0.82  # factor from one scale to the next [factor; calibration]
+COOLING_PATIENCE = 3  # scales after the likeliest one before the annealing of a pose stops [scales; calibration]
+STARTS = 1200  # number of starts of a full batch; 1200 leave no gap of 25 degrees [starts; derived]
+# Each next batch has twice as many until it is full.
+FIRST_STARTS = 48  # number of starts of the first batch, enough for easy problems [starts; calibration]
+# A small batch keeps the square root of its fraction of a full one.
+LEAST_KEPT = 3  # least number of poses that a stage keeps [poses; calibration]
+# Number of candidates whose NFA each batch computes and that are annealed on all bearings at the end.
+FINISHED_POSES = 3  # [poses; cost]
+# Scale at which the last stage begins, in multiples of the scale of the pose, so that other points can enter.
+END_SCALE = 2.0  # [factor; calibration]
+STARTS_A_CHECK = 32  # number of starts annealed on clusters between two checks of the deadline [starts; cost]
+
+
+class ClusterStage(NamedTuple):
+    """Annealing of many poses on weighted clusters of both point sets."""
+
+    clusters: int  # of each set, at most; the cost of an iteration grows with its square
+    first_scale: float  # of the first iteration, in units of the RMS angular radius of the bearings
+    last_scale: float  # of the last iteration, in the same unit
+    iterations: int  # number of scales between the two, with one Gauss-Newton step each
+    kept: int  # number of poses that the next stage receives
+    apart_deg: float  # least angle between the rotations of two kept poses, degrees
+    # Iterations after which only the likelier half of the poses is kept, and at least twice `kept`. Below 6 iterations,
+    # this step loses correct poses in clutter.
+    halvings: tuple[int, ...] = ()
+
+
+COARSE = (  # first stages on clusters [`ClusterStage`; calibration]
+    ClusterStage(64, 0.3, 0.1, iterations=10, kept=48, apart_deg=3.0, halvings=(6, 8)),
+)
+MIDDLE = (  # stages on finer clusters [`ClusterStage`; calibration]
+    ClusterStage(128, 0.1, 0.065, iterations=7, kept=24, apart_deg=1.0),
+    ClusterStage(256, 0.062, 0.04, iterations=7, kept=10, apart_deg=1.0),
+)
+# Sampling of the batches, in turn.
+RECIPES = StartSampling(0.0, 0.5), StartSampling(1.0, 0.8), StartSampling(0.5, 1.2)  # [`StartSampling`; calibration]
+
+
+def batch_size(number: int) -> int:
+    """Return the number of starts of a batch; `number` counts batches from 0."""
+    return min(STARTS, FIRST_STARTS * 2 ** min(number, 60))
+
+
+def kept_by(stage: ClusterStage, starts: int) -> int:
+    """Return the number of poses that a stage keeps from a batch with this number of starts."""
+    return min(stage.kept, max(LEAST_KEPT, math.ceil(math.sqrt(starts / STARTS) * stage.kept)))
 
 
 def multistart(scene: Scene, number: int, prior: Prior | None) -> Hypotheses:
@@ -30,20 +80,19 @@ def multistart(scene: Scene, number: int, prior: Prior | None) -> Hypotheses:
     Returns:
         Distinct poses with their basin counts.
     """
-    settings = scene.settings
-    recipe = settings.recipes[number % len(settings.recipes)]
-    drawn = draw_poses(scene.spread, scene.bulk3d, settings.batch(number), recipe, prior, scene.rng)
+    recipe = RECIPES[number % len(RECIPES)]
+    drawn = draw_poses(scene.spread, scene.bulk3d, batch_size(number), recipe, prior, scene.rng)
     return run_batch(scene, Hypotheses.from_poses(*drawn, basin_count=1))
 
 
 def run_batch(scene: Scene, starts: Hypotheses) -> Hypotheses:
     """Anneal one batch of starts, from clusters to all points."""
-    stages = *scene.settings.coarse, *scene.settings.middle
+    stages = *COARSE, *MIDDLE
     poses = anneal_on_clusters(scene, starts, stages, len(starts))
     return anneal_on_points(scene, poses, stages[-1].last_scale * scene.spread)
 
 
-def anneal_on_clusters(scene: Scene, poses: Hypotheses, stages: Stages, starts: int) -> Hypotheses:
+def anneal_on_clusters(scene: Scene, poses: Hypotheses, stages: Sequence[ClusterStage], starts: int) -> Hypotheses:
     """Anneal poses on clusters, stage by stage.
 
     Args:
@@ -57,7 +106,7 @@ def anneal_on_clusters(scene: Scene, poses: Hypotheses, stages: Stages, starts: 
     """
     outlier = scene.outlier_density(scene.settings.outliers)
     for stage, clusters in zip(stages, scene.clusters([stage.clusters for stage in stages]), strict=True):
-        kept = scene.settings.kept_by(stage, starts)
+        kept = kept_by(stage, starts)
         scales = (scene.spread * np.geomspace(stage.first_scale, stage.last_scale, stage.iterations)).astype(np.float32)
         for k, part in enumerate(np.split(scales, stage.halvings)):
             if k:  # best first, since only the first ones are annealed after the deadline
@@ -75,7 +124,7 @@ def _annealed(scene: Scene, starts: Hypotheses, sides: Sides, scales: Array, out
         scratch = dense_scratch(*(len(side.label) for side in sides))
         descend(*sides, rotation[i:j], translation[i:j], scales, outlier, score[i:j], scratch)
 
-    done = in_time(anneal, len(starts), scene.deadline, scene.settings.starts_a_check)
+    done = in_time(anneal, len(starts), scene.deadline, STARTS_A_CHECK)
     return replace(starts, rotation=rotation, translation=translation, log_likelihood=score)[:done]
 
 
@@ -101,10 +150,10 @@ def anneal_on_points(
     Returns:
         Distinct poses, without an NFA.
     """
-    fine, bearings = scene.settings.fine, None if every else scene.settings.fine.bearings
+    bearings = None if every else FINE_BEARINGS
     outliers = scene.settings.outliers if outliers is None else outliers
-    rounds = max(4, math.ceil(math.log(scene.smallest_scale / first_scale) / math.log(fine.cooling)))
-    scales = (first_scale * fine.cooling ** np.arange(rounds if steps is None else steps)).astype(np.float32)
+    rounds = max(4, math.ceil(math.log(scene.smallest_scale / first_scale) / math.log(COOLING)))
+    scales = (first_scale * COOLING ** np.arange(rounds if steps is None else steps)).astype(np.float32)
     tiles, points = scene.tiles(bearings)
     tiles, outlier = tiles.with_margin(first_scale), scene.outlier_density(outliers)
     rotation, translation = starts.rotation.copy(), starts.translation.copy()
@@ -115,7 +164,7 @@ def anneal_on_points(
         while i < j:
             scratch = sparse_scratch(tiles, len(points.b), pairs)
             poses = rotation[i:j], translation[i:j]
-            i += descend_sparse(tiles, points, *poses, scales, outlier, fine.patience, result[i:j], scratch)
+            i += descend_sparse(tiles, points, *poses, scales, outlier, COOLING_PATIENCE, result[i:j], scratch)
             pairs = 2 * len(scratch.near.point)  # the buffer was too small for the number of close points
 
     done = in_time(anneal, len(starts), scene.deadline, thread_count())
@@ -177,12 +226,12 @@ def finish(scene: Scene, poses: Hypotheses, annealed: int | None = None) -> Hypo
     for i, share in runs:
         if scene.deadline.passed():
             break
-        first_scale = settings.end_scale * float(poses.scale[i])
+        first_scale = END_SCALE * float(poses.scale[i])
         if _outlasts_deadline(scene, poses[i : i + 1], first_scale):
             break
         end = anneal_on_points(scene, poses[i : i + 1], first_scale, outliers=share, every=True)
         ends.append(end if len(ends) < count else end.as_dependent())
-    return select_distinct(Hypotheses.concatenate([*ends, poses[min(len(ends), count) :]]), scene, settings.kept)
+    return select_distinct(Hypotheses.concatenate([*ends, poses[min(len(ends), count) :]]), scene, KEPT_CANDIDATES)
 
 
 def anneal_to_end(
@@ -215,4 +264,4 @@ def _outlasts_deadline(scene: Scene, pose: Hypotheses, first_scale: float) -> bo
     begun = Clock.now()
     anneal_on_points(scene, pose, first_scale, every=True, steps=1)
     now = Clock.now()
-    return now + (now - begun) / (1 - scene.settings.fine.cooling**2) > scene.deadline.at
+    return now + (now - begun) / (1 - COOLING**2) > scene.deadline.at

@@ -16,20 +16,20 @@ from numpy.typing import NDArray
 
 from bpnp.poses import distinct, polar_coordinates
 from bpnp.runtime import NEVER, Clock, Deadline, one_blas_thread
-from bpnp.search.config import DEFAULT, SearchSettings
 from bpnp.search.enumeration.points import predicted_pose
 from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.loop import Progress, Step, run, teller
-from bpnp.search.plan import Plan
+from bpnp.search.plan import SURROUNDED_APART_DEG, Plan
 from bpnp.search.pool import Pool
 from bpnp.search.problem import Problem
-from bpnp.search.propose.density_map import search_around
+from bpnp.search.propose.density_map import LOCAL, search_around
 from bpnp.search.propose.known_matches import known_matches, poses_of_matches
 from bpnp.search.propose.repetitions import repeated_poses
 from bpnp.search.rig.cameras import WIDE_SCALES, Array, Pose, Rig
 from bpnp.search.search import lacks_partners
 from bpnp.search.search_frame import Scene
+from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.verdict.competitors import distance_between
 from bpnp.search.verdict.completeness import Symmetry
 from bpnp.search.verdict.contest import Rival, contest
@@ -92,7 +92,7 @@ def search_rig(
     tell(0)
     if poses.may_be_decided() and (case := contest(poses.case(ended=False), poses.rivals)).objection is None:
         return case
-    return run(RigPlan(poses), poses, most=settings.schedule.iterations, deadline=deadline, tell=tell)
+    return run(RigPlan(poses), poses, most=settings.iterations, deadline=deadline, tell=tell)
 
 
 def _of_few_points(
@@ -197,7 +197,7 @@ class RigPoses:
             return None
         poses = Hypotheses.concatenate([self.searched, self.starts])
         score = np.r_[np.full(len(self.searched), BEFORE), self.starts.log_likelihood]
-        apart = DEFAULT.schedule.apart_deg
+        apart = SURROUNDED_APART_DEG
         order = distinct(poses.rotation, poses.translation, score, len(self.searched) + 1, apart, math.inf)
         new = poses[order[len(self.searched) :]]
         self.searched = Hypotheses.concatenate([self.searched, new])
@@ -207,7 +207,7 @@ class RigPoses:
         turn, shift = self.rig.pose_of(k, new.rotation, new.translation)
         scene = self.pools[k].scene
         pose = to_scene_frame(Hypotheses.from_poses(turn, shift), scene)
-        return Step(partial(search_around, scene, pose, scene.settings.local), camera=k, counts=False)
+        return Step(partial(search_around, scene, pose, LOCAL), camera=k, counts=False)
 
     def add_refined(self, refined: Hypotheses) -> None:
         """Add refined poses; the basin count of the best one is the sum over all cameras."""

@@ -19,9 +19,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.config import DEFAULT, Evidence
+from bpnp.search.config import Evidence
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem
+from bpnp.search.settings import DEFAULT
 from bpnp.search.verdict import reasons
 from bpnp.search.verdict.competitors import (
     CandidatesOfCameras,

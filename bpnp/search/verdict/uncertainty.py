@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc, fdtri
 
-from bpnp.search.config import DEFAULT, Evidence
+from bpnp.search.config import Evidence
 from bpnp.search.pose_model import PoseModel, PoseState, Sight, crossed, lens_columns, lens_error_columns
 from bpnp.search.problem import Problem
 from bpnp.search.refine.gauss_newton import soft_matches
+from bpnp.search.settings import DEFAULT
 from bpnp.search.verdict.covariance import Linearisation, covariance_of, student_factor
 
 Array = NDArray[np.float64]

@@ -16,12 +16,21 @@ from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.propose.density_map import search_around
 from bpnp.search.propose.lens import LensFit, fit_lens
 from bpnp.search.search_frame import Scene
+from bpnp.search.settings import DensitySearch, Draws, Narrowing, Preselection
 from bpnp.search.verdict.competitors import other_camera
 from bpnp.search.verdict.decide import Case
 from bpnp.search.verdict.false_alarms import alarms_of
 from bpnp.search.verdict.reasons import Objection, Unfinished, objection
 from bpnp.search.verdict.rivals import SceneOf
 from bpnp.search.verdict.uncertainty import Linearised, Misfit, bends_significantly, linearised, systematic_misfit
+
+# Density-map search around a pose at the next step of the focal length.
+AT_FOCAL_STEP = DensitySearch(  # [`DensitySearch`; calibration]
+    Draws(2**10, 3.0, 0.04, 2**10),
+    Preselection((300,), (2**5,)),
+    Narrowing(0.04, 0.015, steps=3, points=600),
+    annealed=3,
+)
 
 Array = NDArray[np.float64]
 
@@ -166,7 +175,7 @@ def search_at_zoom(found: AtZoom, zoom: float, scene: Scene) -> AtZoom:
     there = Scene(problem, 0, scene.settings, scene.deadline)
     shift = found.centre3d * (1, 1, zoom) - found.pose.rotation[0] @ problem.centre3d
     start = Hypotheses.from_poses(*there.enter(found.pose.rotation, shift[None]))
-    poses = to_problem_frame(search_around(there, start, scene.settings.focal_step)[:1], there)
+    poses = to_problem_frame(search_around(there, start, AT_FOCAL_STEP)[:1], there)
     return AtZoom(zoom * found.zoom, problem, poses) if len(poses) else found
 
 
