@@ -32,7 +32,7 @@ from torch import nn
 from bpnp.files import fingerprint, write_atomically, write_text
 from bpnp.layers import RansacPnP, WeightedPnP
 from bpnp.models import BPnPNet, Search, TrainedNet
-from bpnp.models.evaluation import round_widths
+from bpnp.models.pose_stages import round_widths
 from bpnp.models.weights import read_checkpoint
 from bpnp.report.figure_files import save_figure
 from bpnp.report.figures import line_style

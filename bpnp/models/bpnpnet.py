@@ -18,8 +18,9 @@ from bpnp.layers.assignment import Sinkhorn
 from bpnp.layers.implicit import first_derivative
 from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import Backend, RansacPnP
-from bpnp.models.evaluation import Refinement, StageClock, match_again, pnp_pose, ransac_pose, round_widths
 from bpnp.models.nets import ImageFeatures, SceneFeatures
+from bpnp.models.pose_stages import StageClock, match_again, pnp_pose, ransac_pose, round_widths
+from bpnp.models.refinement import Refinement
 from bpnp.models.weights import AnyModule, TrainedNet, module_or_default
 from bpnp.precision import full_precision
 from bpnp.types import Batch, Prediction
@@ -67,7 +68,7 @@ class BPnPNet(TrainedNet):
             assignment. None for `WeightedPnP()`.
         refinement: Computes the third pose "refined" in evaluation. None for `Refinement()`.
         rounds: Number of times that the points are matched again under the last pose in evaluation, starting from that
-            of RANSAC (`bpnp.models.evaluation.match_again`). Default 0. A round adds the squared residuals, in units
+            of RANSAC (`bpnp.models.pose_stages.match_again`). Default 0. A round adds the squared residuals, in units
             of a width, to the cost; the width decreases from round to round, to `ransac.threshold` in the last one.
             Rounds need a `ransac` with that attribute and a `transport` with the attribute `entropy`.
 

@@ -14,8 +14,9 @@ from bpnp.layers.implicit import BackwardStats
 from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import RansacPnP
 from bpnp.models.bpnpnet import pairwise_distance
-from bpnp.models.evaluation import Refinement, StageClock, pnp_pose, ransac_pose
 from bpnp.models.nets import ExchangeBlock, Neighbourhood, subtract_mean
+from bpnp.models.pose_stages import StageClock, pnp_pose, ransac_pose
+from bpnp.models.refinement import Refinement
 from bpnp.models.weights import AnyModule, TrainedNet, module_or_default
 from bpnp.types import Batch, Prediction, SolveStats
 

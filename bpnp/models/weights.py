@@ -19,8 +19,8 @@ from bpnp.files import write_atomically
 from bpnp.layers.assignment import Sinkhorn
 from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import RansacPnP
-from bpnp.models.evaluation import Refinement
 from bpnp.models.nets import ImageFeatures, PointFeatures, SceneFeatures
+from bpnp.models.refinement import Refinement
 
 PARTS = (ImageFeatures, SceneFeatures, PointFeatures, Sinkhorn, RansacPnP, WeightedPnP, Refinement)
 WEIGHTS = resources.files("bpnp") / "weights"

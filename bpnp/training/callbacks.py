@@ -17,8 +17,8 @@ from torch import Tensor, nn
 
 from bpnp.bounded_files import read_json
 from bpnp.checks import check_within
-from bpnp.models.evaluation import refinement_enabled
 from bpnp.models.nets import subtract_mean
+from bpnp.models.refinement import refinement_enabled
 from bpnp.report.points import ProblemPoints, points_from, write_points
 from bpnp.report.results import SUMMARY, ProblemRow, rows_from, write_results
 from bpnp.report.tables import read_runs, results_table

@@ -23,7 +23,7 @@ from bpnp.layers.implicit import BackwardStats
 from bpnp.layers.pnp import WeightedPnP
 from bpnp.metrics import MeanOverProblems, PoseQuartiles, PoseRecall, prediction_errors
 from bpnp.models.bpnpnet import BPnPNet
-from bpnp.models.evaluation import REFINED, refinement_enabled
+from bpnp.models.refinement import REFINED, refinement_enabled
 from bpnp.models.weights import (
     AnyModule,
     TrainedNet,

@@ -10,8 +10,8 @@ from bpnp import Batch, BPnPNet, Prediction
 from bpnp.layers import RansacPnP, sinkhorn
 from bpnp.metrics import rotation_error
 from bpnp.models import Refinement
-from bpnp.models.evaluation import round_widths
 from bpnp.models.nets import PointFeatures
+from bpnp.models.pose_stages import round_widths
 from bpnp.report.results import rows_from
 from bpnp.search.propose.density_map import COPIES
 from bpnp.training.losses import correspondence_loss, pose_terms

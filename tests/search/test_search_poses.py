@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.metrics import rotation_error
 from bpnp.models import Search
-from bpnp.models.evaluation import best_poses
+from bpnp.models.batch_search import best_poses
 from bpnp.search.plan import GUESSED_BATCHES
 from bpnp.search.problem import Problem
 from bpnp.search.search import search_poses

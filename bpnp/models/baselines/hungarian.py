@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from bpnp.layers.ransac import Backend, RansacPnP
 from bpnp.models.bpnpnet import BPnPNet
-from bpnp.models.evaluation import pnp_pose, ransac_pose
+from bpnp.models.pose_stages import pnp_pose, ransac_pose
 from bpnp.types import Batch, Prediction
 
 

@@ -9,12 +9,13 @@ import torch
 from planted import padded, plant, posed
 from torch import Tensor
 
-import bpnp.models.evaluation
+import bpnp.models.refinement
 from bpnp import Batch, Pose, Prediction
 from bpnp.geometry import choose, rotation_angle
 from bpnp.layers import Sinkhorn, WeightedPnP
 from bpnp.models import Refinement
-from bpnp.models.evaluation import cost_under_pose, log_support, match_again
+from bpnp.models.pose_stages import cost_under_pose, match_again
+from bpnp.models.refinement import log_support
 
 
 def chord(batch: Batch, pose: Pose, b: int, i: int, j: int) -> float:
@@ -104,7 +105,7 @@ def test_an_unsupported_refined_pose_gives_way_to_a_supported_one(monkeypatch: p
         pairs = zip(planted.pose, wrong[len(results) - 1], strict=True)
         return posed(*(choose(right, true, other) for true, other in pairs))
 
-    monkeypatch.setattr(bpnp.models.evaluation, "refine", refined)
+    monkeypatch.setattr(bpnp.models.refinement, "refine", refined)
     network = posed(*planted.near(0.01))
     prediction = Prediction(planted.permutation(), poses={"pnp": network})
     found = Refinement(hypotheses=3)(prediction, batch).poses["refined"]

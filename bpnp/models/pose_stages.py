@@ -1,0 +1,152 @@
+"""Poses from an assignment: RANSAC, weighted PnP, and rounds of matching under the last pose.
+
+A match (i, j) is rated by d_ij = r_ij^2 / (2 s^2). Here r_ij is the chord between bearing i and the direction of
+R p_j + t, and s the standard deviation of the residuals in radians. d_ij is -log of a normal density, up to a constant.
+"""
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from bpnp.checks import check_within
+from bpnp.geometry import bearings, chords
+from bpnp.types import Batch, Pose, Prediction
+
+FIRST_WIDTH = 5.0  # s of the first round, relative to the last
+FEATURE_WEIGHT = 0.03  # weight of the feature distances in a round; the pose separates matches better than features
+FARTHEST = 12.0  # largest d, nats: that of points five widths apart
+
+
+class StageClock:
+    """Stopwatch of the estimates of a batch, started at construction."""
+
+    def __init__(self) -> None:
+        self.start, self.seconds = time.perf_counter(), dict[str, float]()
+
+    def record(self, estimate: str) -> None:
+        """Record the time of an estimate."""
+        self.seconds[estimate] = time.perf_counter() - self.start
+
+    def add_times(self, prediction: Prediction) -> Prediction:
+        """Return the prediction with its `seconds`; poses that were not recorded get the current time."""
+        for estimate in prediction.poses.keys() - self.seconds.keys():
+            self.record(estimate)
+        return replace(prediction, seconds={name: self.seconds[name] for name in prediction.poses})
+
+
+def ransac_pose(ransac: nn.Module, assignment: Float[Tensor, "b m n"], batch: Batch) -> Pose:
+    """Estimate an initial pose from the most probable matches; no gradient reaches the assignment.
+
+    Args:
+        ransac: Module with the arguments of `bpnp.layers.RansacPnP`.
+        assignment: P (b, m, n).
+        batch: Problems.
+    """
+    return Pose(*ransac(assignment.detach(), batch.points2d, batch.points3d, batch.mask2d, batch.mask3d))
+
+
+def pnp_pose(pnp: nn.Module, assignment: Float[Tensor, "b m n"], batch: Batch, start: Pose) -> Pose:
+    """Compute the pose that best explains the whole assignment, differentiable in the assignment.
+
+    Args:
+        pnp: Module with the arguments of `bpnp.layers.WeightedPnP`.
+        assignment: P (b, m, n).
+        batch: Problems.
+        start: Initial pose.
+    """
+    rays = bearings(batch.points2d)
+    return Pose(*pnp(assignment, rays, batch.points3d, start.rotation, start.translation))
+
+
+def residual_energy(
+    batch: Batch, rotation: Float[Tensor, "b 3 3"], translation: Float[Tensor, "b 3"], width: float
+) -> Float[Tensor, "b m n"]:
+    """Return d_ij = r_ij^2 / (2 s^2), (b, m, n), in the dtype of the pose; NaN without a pose.
+
+    Args:
+        batch: Problems.
+        rotation: R (b, 3, 3).
+        translation: t (b, 3), scene units.
+        width: s, radians.
+    """
+    rays, points3d = bearings(batch.points2d).to(rotation), batch.points3d.to(rotation)
+    return chords(rays, points3d, rotation, translation).square() / (2 * width**2)
+
+
+def round_widths(rounds: int, ransac: nn.Module) -> list[float]:
+    """Return s of each round in radians, decreasing geometrically to the `threshold` of `ransac`.
+
+    Args:
+        rounds: Number of rounds.
+        ransac: RANSAC module.
+
+    Raises:
+        ValueError: `rounds` is negative, or `ransac` has no `threshold`.
+    """
+    check_within(0, math.inf, rounds=rounds)
+    if rounds == 0:
+        return []
+    last = getattr(ransac, "threshold", None)
+    if last is None:
+        raise ValueError(
+            f"`rounds` needs the `threshold` of `ransac`, which {type(ransac).__name__} lacks; use rounds 0"
+        )
+    return [float(width) for width in np.geomspace(last, FIRST_WIDTH * last, rounds)[::-1]]  # one round has the last
+
+
+def match_again(
+    prediction: Prediction,
+    cost: Float[Tensor, "b m n"],
+    batch: Batch,
+    *,
+    transport: nn.Module,
+    pnp: nn.Module,
+    widths: Sequence[float],
+) -> Prediction:
+    """Replace the pose "pnp" by the result of rounds of transport and weighted PnP.
+
+    The first round matches the points under the pose "ransac", each later one under the pose of the round before. The
+    assignment of the last round becomes `rematched`; `assignment` stays.
+
+    Args:
+        prediction: Prediction with the pose "ransac".
+        cost: Cost of the network's own assignment (b, m, n).
+        batch: Problems.
+        transport: Transport with `entropy`, its mu.
+        pnp: Weighted PnP.
+        widths: s of each round, radians; an empty list leaves the prediction unchanged.
+    """
+    pose, assignment = prediction.poses["ransac"], None
+    for width in widths:
+        under_pose = cost_under_pose(cost, batch, pose, width=width, mu=transport.entropy)  # type: ignore[arg-type]
+        assignment, _ = transport(under_pose, batch.mask2d, batch.mask3d)
+        pose = pnp_pose(pnp, assignment, batch, pose)
+    if assignment is None:
+        return prediction
+    return replace(prediction, poses=prediction.poses | {"pnp": pose}, rematched=assignment)
+
+
+def cost_under_pose(
+    cost: Float[Tensor, "b m n"], batch: Batch, pose: Pose, *, width: float, mu: float | Tensor
+) -> Float[Tensor, "b m n"]:
+    """Combine feature distances and residuals under a pose: w M_ij + mu min(d_ij, L).
+
+    The entropic transport of this cost assigns in proportion to exp(-w M_ij / mu) times a normal density of the
+    residual with a floor. No gradient reaches the pose. A sample without a pose keeps its M.
+
+    Args:
+        cost: Feature distances M (b, m, n).
+        batch: Problems.
+        pose: Poses.
+        width: s, radians.
+        mu: Entropy weight of the transport.
+    """
+    rotation, translation = pose.rotation.detach().to(cost), pose.translation.detach().to(cost)
+    energy = residual_energy(batch, rotation, translation, width).clamp(max=FARTHEST)
+    return torch.where(pose.found[:, None, None], FEATURE_WEIGHT * cost + mu * energy, cost)
