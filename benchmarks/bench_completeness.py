@@ -11,9 +11,9 @@ the true pose, and the motions found from the matches of the rotated pose give t
 import argparse
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import symmetric
@@ -29,23 +29,25 @@ from bpnp.search.propose.repetitions import competing_poses
 from bpnp.search.search_frame import Scene
 from bpnp.search.settings import DEFAULT
 from bpnp.search.verdict.decide import Case
+from bpnp.search.verdict.limits import MOST_FALSE_ALARMS
 
 FILE = ROOT / "benchmarks" / "completeness.json"
 TURNS = 8
 BASIN_COUNTS = (1, 2, 3, 4, 6, 8, 10)
 UNIQUE = 8  # smallest number of points that no symmetry maps onto others
 RIGHT_DEG = 3.0
-# No motion maps more than all of the points: no competitor is proposed, and no scene counts as symmetric.
-BLIND = replace(
-    DEFAULT.evidence, repetitions=replace(DEFAULT.evidence.repetitions, share=2.0, share_of_scene=2.0, symmetric=2.0)
-)
 
 
+@patch.multiple("bpnp.search.propose.repetitions", MAPPED=2.0, MAPPED_OF_SCENE=2.0, SYMMETRIC=2.0)
+@patch("bpnp.search.verdict.completeness.SYMMETRIC", 2.0)
 def reached(problem: Problem) -> dict[int, bool]:
-    """Return, for each basin count that a best pose reached, whether the first pose that did was correct."""
+    """Return, for each basin count that a best pose reached, whether the first pose that did was correct.
+
+    No motion maps more than all of the points: no competitor is proposed, and no scene counts as symmetric.
+    """
     points2d, points3d = problem.solve.args  # type: ignore[attr-defined]
-    points, settings = problem_from(points2d, points3d, None), replace(DEFAULT, evidence=BLIND)
-    pool = Pool(Scene(points, 0, settings), points, Case.without_pose(points))
+    points = problem_from(points2d, points3d, None)
+    pool = Pool(Scene(points, 0, DEFAULT), points, Case.without_pose(points))
     found: dict[int, bool] = {}
     plan = Plan.of(pool)
     for _ in range(TURNS):
@@ -53,7 +55,7 @@ def reached(problem: Problem) -> dict[int, bool]:
         assert step is not None
         pool.add(step, step.propose())
         leaders = pool.leaders()
-        if not len(leaders) or leaders.log10_false_alarms[0] > BLIND.false_alarms:
+        if not len(leaders) or leaders.log10_false_alarms[0] > MOST_FALSE_ALARMS:
             continue
         hits = pool.symmetry.basin_count(leaders)
         turn = leaders.rotation[0].T @ problem.poses[0][0]
@@ -73,7 +75,7 @@ def leads_back(kind: symmetric.Kind, problem: Problem) -> bool:
     turned = rotation @ turn.T
     shift = translation - turned @ (other.mean(0) - turn @ one.mean(0))
     (turned, shift), (_, translation) = points.from_user(turned, shift), points.from_user(rotation, translation)
-    rotations, translations, *_ = competing_poses(points, turned, shift, symmetric.NOISE, DEFAULT.evidence)
+    rotations, translations, *_ = competing_poses(points, turned, shift, symmetric.NOISE)
     return bool(points.same_as((rotation, translation), rotations, translations, Tolerance(RIGHT_DEG)).any())
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from bpnp.arrays import Array, PoseArrays
 from bpnp.maps.photo_problem import Photo
 from bpnp.maps.viewed_points import Region
-from bpnp.poses import rotation_angle, same_pose
+from bpnp.poses import SAME, rotation_angle, same_pose
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
 from bpnp.search.assemble import Solved, candidates_of
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
@@ -32,6 +32,7 @@ from bpnp.search.solution import Candidate, Solution
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict.competitors import sign_margins
 from bpnp.search.verdict.decide import add_false_alarms, rank_poses
+from bpnp.search.verdict.limits import LEAST_MARGIN
 from bpnp.search.verdict.reasons import Unfinished, objection
 
 MOST_VIEWS = 8  # largest number of views [views; cost]
@@ -92,7 +93,7 @@ def margins_elsewhere(problem: Problem, solution: Solution, competing: Hypothese
     margins = repetition_margins(problem, best, poses, poses, scale)
     leader = Hypotheses.from_poses(best[0][None], best[1][None], scale=np.array([scale]))
     candidates = add_false_alarms(Hypotheses.concatenate([leader, competing]), problem)
-    signs = sign_margins([(candidates, problem)], DEFAULT.evidence)[1:]
+    signs = sign_margins([(candidates, problem)])[1:]
     margins = np.where(np.abs(signs) < np.abs(margins), signs, margins)
     fractions = [problem.log10_prior_fraction(*pose) for pose in zip(*poses, strict=True)]
     return margins + fractions - problem.log10_prior_fraction(*best)
@@ -114,7 +115,7 @@ def propose_elsewhere(
     """
     scale = _scale_of(problem, solution)
     best = _pose_of(problem, solution)
-    repeated = repeated_poses(problem, *best, scale, DEFAULT.evidence, deadline=deadline).poses
+    repeated = repeated_poses(problem, *best, scale, deadline=deadline).poses
     return [
         *(_pose_of(problem, one) for one in earlier),
         *zip(repeated.rotation, repeated.translation, strict=True),
@@ -130,7 +131,7 @@ def refine_elsewhere(
     centroid = np.median(problem.points_from_user(solution.points3d[solution.matches[:, 1]]), 0)
 
     def differ(rotations: Array, translations: Array) -> NDArray[np.bool_]:
-        return ~same_pose(best, rotations, translations, centroid, DEFAULT.evidence.same)
+        return ~same_pose(best, rotations, translations, centroid, SAME)
 
     rotations = np.array([rotation for rotation, _ in proposals]).reshape(-1, 3, 3)
     translations = np.array([translation for _, translation in proposals]).reshape(-1, 3)
@@ -148,7 +149,7 @@ def judge_against(own: Solved, competitor: Competitor | None) -> Solved:
 
     It then has both poses as its first candidates.
     """
-    least_margin, solution = DEFAULT.evidence.margin, own.solution
+    least_margin, solution = LEAST_MARGIN, own.solution
     if competitor is None or competitor.margin >= least_margin:
         return own
     other, margin = competitor.pose, competitor.margin

@@ -9,10 +9,9 @@ from bpnp.arrays import Array
 from bpnp.cameras import camera_from
 from bpnp.maps.photo_problem import Photo, with_ids
 from bpnp.maps.viewed_points import Region
-from bpnp.poses import MIN_POINTS
+from bpnp.poses import MIN_POINTS, SAME
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
 from bpnp.search.assemble import OneCamera, Solved, assembled
-from bpnp.search.config import Evidence
 from bpnp.search.focal_length import AROUND, UnknownCamera, fit_camera
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
 from bpnp.search.problem import Problem, UnknownFocal
@@ -22,8 +21,10 @@ from bpnp.search.search_frame import Scene
 from bpnp.search.settings import DEFAULT
 from bpnp.search.solution import Solution
 from bpnp.search.verdict.competitors import competing_pose
+from bpnp.search.verdict.completeness import AGAIN_FAILS, LOOK_FAILS
 from bpnp.search.verdict.contest import contest, rivals_of
 from bpnp.search.verdict.decide import Case, decide
+from bpnp.search.verdict.limits import LEAST_MARGIN, MOST_MISSED
 from bpnp.search.verdict.reasons import Unfinished
 from bpnp.search.verdict.rivals.lens import lens
 
@@ -76,7 +77,7 @@ def refine_on_all_points(solution: Solution, photo: Photo, whole: Region, deadli
             Scene(problem, photo.seed, DEFAULT, deadline), rotation[None], shift[None], max(scale, least)
         )
     scene, confident = Scene(problem, photo.seed, DEFAULT, deadline), solution.verdict == "confident"
-    local_searches = int(poses.scale[0] > scale) if confident else local_searches_for_certainty(DEFAULT.evidence)
+    local_searches = int(poses.scale[0] > scale) if confident else local_searches_for_certainty()
     significant = [one for one in solution.candidates[1:] if one.log10_false_alarms < 0]
     others = [] if confident else significant[:JUDGED_COMPETITORS]
     if others:
@@ -102,14 +103,14 @@ def judge_on_all_points(own: Solved, refined: Refined | None) -> Solved:
     """
     if refined is None:
         return own
-    problem, limits, solution, confident = refined.problem, DEFAULT.evidence, own.solution, own.case.objection is None
+    problem, solution, confident = refined.problem, own.solution, own.case.objection is None
     deadline = refined.scene.deadline
     alone = Case.of(refined.poses, problem, exhaustive=True, iterations=1)
     case = contest(alone, rivals_of(lambda: refined.scene, deadline))
     behind = case.log10_false_alarms - solution.log10_false_alarms
     rotation, translation = case.pose
-    if confident and not problem.same_as(refined.pose, rotation[None], translation[None], limits.same)[0]:
-        return own if behind >= limits.margin else own.against(competing_pose(problem, refined.pose, case.pose, behind))
+    if confident and not problem.same_as(refined.pose, rotation[None], translation[None], SAME)[0]:
+        return own if behind >= LEAST_MARGIN else own.against(competing_pose(problem, refined.pose, case.pose, behind))
     if behind < 0 or (not confident and case.objection is None):
         found = assembled(OneCamera(problem), decide(case), seconds=solution.seconds, deadline=deadline)
         stats = replace(found.stats, iterations=solution.stats.iterations)
@@ -123,7 +124,7 @@ def judge_on_all_points(own: Solved, refined: Refined | None) -> Solved:
     return own.against(case.objection)
 
 
-def local_searches_for_certainty(settings: Evidence) -> int:
+def local_searches_for_certainty() -> int:
     """Return the number of local searches that exclude a better pose nearby, whatever its initial poses were."""
-    again = (settings.missed - math.log10(settings.look_fails)) / math.log10(settings.again_fails)
+    again = (MOST_MISSED - math.log10(LOOK_FAILS)) / math.log10(AGAIN_FAILS)
     return 1 + max(math.ceil(again), 0)

@@ -29,6 +29,7 @@ from bpnp.search.solution import Candidate, Solution
 from bpnp.search.solvers import Options, solve_problems
 from bpnp.search.verdict import reasons
 from bpnp.search.verdict.decide import Case
+from bpnp.search.verdict.limits import LEAST_MARGIN
 from bpnp.search.verdict.reasons import objection
 
 # Half of the 2,000 largest SIFT keypoints have a map point, an eighth of the next ones.
@@ -160,7 +161,7 @@ def judge_in_map(
 ) -> ViewSolution:
     """Refine and judge a pose on all map points in view and, if it is confident, against poses elsewhere in the map.
 
-    If a pose elsewhere is more likely by `Evidence.margin`, it is refined and judged in the same way, and used instead
+    If a pose elsewhere is more likely by `LEAST_MARGIN`, it is refined and judged in the same way, and used instead
     if it is confident. A pose that was judged before is returned unchanged; one whose competing poses were not all
     tested by the deadline is "ambiguous" at best.
     """
@@ -175,7 +176,7 @@ def judge_in_map(
     if on_all.case.objection is None:
         earlier = [*earlier, *significant(own.solution)]
         competitor = find_competitor(scene, photo, place, on_all.solution, earlier, deadline)
-        if competitor is not None and competitor.margin <= -DEFAULT.evidence.margin:
+        if competitor is not None and competitor.margin <= -LEAST_MARGIN:
             better = _judge_competitor(scene, photo, on_all.solution, competitor.pose, deadline)
             if better.case.objection is None:
                 earlier = [*earlier, *significant(on_all.solution)]

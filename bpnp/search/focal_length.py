@@ -3,7 +3,7 @@
 The search tries a sweep of focal lengths. With many points it still ends near the pose if the focal length is a quarter
 off. From there, Gauss-Newton steps of pose and focal length alternate with annealing of the pose. The search then runs
 again at the optimum. Its NFA counts the focal length as a seventh unknown (`bpnp.search.verdict.false_alarms`), and a
-confident pose needs a well-determined focal length (`Evidence.focal`). The solutions of the other focal lengths of the
+confident pose needs a well-determined focal length (`FOCAL_BOUND`). The solutions of the other focal lengths of the
 sweep are competing poses.
 """
 
@@ -26,11 +26,10 @@ from bpnp.cameras import (
     scale_focal_length,
     with_radial_distortion,
 )
-from bpnp.poses import close_poses, polar_coordinates, rotation_angle
+from bpnp.poses import SAME, close_poses, polar_coordinates, rotation_angle
 from bpnp.runtime import NEVER, Clock, Deadline, one_blas_thread
 from bpnp.search.arguments import Array, checked_size
 from bpnp.search.assemble import Solved, with_unfinished
-from bpnp.search.config import OtherFocal
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, UnknownFocal
@@ -40,13 +39,16 @@ from bpnp.search.search_frame import Scene
 from bpnp.search.settings import DEFAULT
 from bpnp.search.solution import FOCAL_LENGTH, ROTATION_PARAMETERS, Solution
 from bpnp.search.solvers import Options, solve_problems
+from bpnp.search.verdict.competitors import FAR_TOLERANCES
 from bpnp.search.verdict.decide import match_count, rank_poses
+from bpnp.search.verdict.limits import LEAST_MARGIN
 from bpnp.search.verdict.reasons import TESTS, Objection, Unfinished, objection, undecided
-from bpnp.search.verdict.uncertainty import is_within
+from bpnp.search.verdict.rivals.lens import FEWEST_MATCHES, MOST_BEND, ZOOM_STEP
+from bpnp.search.verdict.uncertainty import FOCAL_CHANCE, is_within
 
 ProblemAt = Callable[[Camera, UnknownFocal], Problem]
 RADIAL_PLACES = {"SIMPLE_RADIAL": 3, "OPENCV": 4}  # index of the radial coefficient in the parameters of a camera model
-AROUND = (1.0, OtherFocal.step, 1 / OtherFocal.step)  # focal lengths around one that has converged [factors; derived]
+AROUND = (1.0, ZOOM_STEP, 1 / ZOOM_STEP)  # focal lengths around one that has converged [factors; derived]
 # Lengths in the image are relative to the larger image side, distortions to the distance from the principal point.
 SMALLEST_FOCAL = 0.5  # least focal length that is tried: a field of view of 90 degrees [image sides; convention]
 LARGEST_FOCAL = 3.0  # largest focal length that is tried: a field of view of 19 degrees [image sides; convention]
@@ -66,10 +68,6 @@ SAME_FOCAL_NATS = 5e-4  # change of the logarithm of the focal length below whic
 BENDS = (-0.2, 0.2)  # [fractions; not tuned]
 # Standard deviation of the radial displacement at the image corner by an unknown distortion.
 BEND_SIGMA = 0.05  # [fraction; not tuned]
-# Largest radial displacement at the image corner, that of the competing lenses.
-MOST_BEND = OtherFocal.bend  # [fraction; derived]
-# Least number of matches for a fit of the distortion, that of the competing lenses.
-FEWEST_BENT = OtherFocal.fewest  # [matches; derived]
 # Standard deviation of the principal point, as a fraction of the distance to the image corner: about a quarter of a per
 # cent of the larger image side.
 CENTRE_SIGMA = 0.004  # [fraction; not tuned]
@@ -335,7 +333,7 @@ class FocalSweep(ABC):
 
         A pose within the uncertainty of the best solution does not count as different.
         """
-        best, settings = self.best.solution, DEFAULT.evidence
+        best = self.best.solution
         centre = np.median(best.points3d, 0)
         for end in (each.solution for each in self.ends):
             for other in end.candidates if end is not best else ():
@@ -345,8 +343,8 @@ class FocalSweep(ABC):
                 moved = scales * (rotations @ centre) + np.stack([best.translation, other.translation])
                 zoom = end.focal_length / best.focal_length
                 if (
-                    behind < settings.margin
-                    and not close_poses(rotations, polar_coordinates(moved), 0, *settings.same)[1]
+                    behind < LEAST_MARGIN
+                    and not close_poses(rotations, polar_coordinates(moved), 0, *SAME)[1]
                     and not is_within_bound(best, other.rotation, zoom)
                 ):
                     away = math.degrees(rotation_angle(best.rotation, other.rotation))
@@ -372,10 +370,10 @@ class _OneCamera(FocalSweep):
 def is_within_bound(solution: Solution, rotation: Array, zoom: float) -> bool:
     """Return True if a rotation and `zoom` times the focal length are within the 99.9 % bound of a solution.
 
-    A rotation difference of more than `Contested.far` times the limit of the same pose is outside, whatever the bound.
+    A rotation difference of more than `FAR_TOLERANCES` times the limit of the same pose is outside, whatever the bound.
     """
-    turn, settings = Rotation.from_matrix(rotation @ solution.rotation.T).as_rotvec(), DEFAULT.evidence
-    if math.degrees(float(np.linalg.norm(turn))) > settings.contested.far * settings.same.degrees:
+    turn = Rotation.from_matrix(rotation @ solution.rotation.T).as_rotvec()
+    if math.degrees(float(np.linalg.norm(turn))) > FAR_TOLERANCES * SAME.degrees:
         return False
     chosen = [solution.parameters.index(name) for name in (*ROTATION_PARAMETERS, FOCAL_LENGTH)]
     unit = np.array([1.0, 1.0, 1.0, 1 / solution.focal_length])  # covariance of the logarithm of the focal length
@@ -409,7 +407,7 @@ def fit_camera(
     """Fit focal length, distortion and pose to the points, starting from a pose and a camera.
 
     The camera with radial distortion competes with the one without. It is used if its NFA, which counts the additional
-    unknown, is smaller by the factor `Evidence.focal_chance`.
+    unknown, is smaller by the factor `FOCAL_CHANCE`.
 
     Args:
         problem_at: Returns the problem of a camera.
@@ -433,13 +431,13 @@ def fit_camera(
         return min(fits, key=lambda one: one.log10_false_alarms)
 
     plain = fit([(each, None) for each in zooms])
-    few = min(len(plain.problem.bearings), len(plain.problem.points3d)) < FEWEST_BENT
+    few = min(len(plain.problem.bearings), len(plain.problem.points3d)) < FEWEST_MATCHES
     if unknown.bends and not few and not deadline.passed(Unfinished.focal_lengths):
         others = [] if radial is not None else [each / unknown.outermost(zoom) ** 2 for each in BENDS]
         bent = fit([*((each, radial or 0.0) for each in zooms), *((1.0, each) for each in others)])
         matches = match_count(bent.poses)
-        lead = math.inf if unknown.distorted else math.log10(DEFAULT.evidence.focal_chance)
-        if matches >= FEWEST_BENT and bent.log10_false_alarms < plain.log10_false_alarms + lead:
+        lead = math.inf if unknown.distorted else math.log10(FOCAL_CHANCE)
+        if matches >= FEWEST_MATCHES and bent.log10_false_alarms < plain.log10_false_alarms + lead:
             return bent
     return plain
 

@@ -16,9 +16,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.poses import rotation_angle
+from bpnp.poses import SAME, rotation_angle
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
-from bpnp.search.config import Evidence
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.pose_model import PoseModel
@@ -35,6 +34,7 @@ from bpnp.search.verdict.contest import contest, rivals_of
 from bpnp.search.verdict.covariance import FAR_SQUARED
 from bpnp.search.verdict.decide import Case, add_false_alarms
 from bpnp.search.verdict.false_alarms import likeliest_scale
+from bpnp.search.verdict.limits import MOST_FALSE_ALARMS
 from bpnp.search.verdict.reasons import Unfinished, objection
 from bpnp.search.verdict.uncertainty import linearised, local_covariance
 
@@ -67,20 +67,19 @@ def given_pose(
         The verdict, with the judged pose as the first candidate; and the optimum (1,) near the given pose, or (0,)
         if there is none.
     """
-    settings = DEFAULT.evidence
     one = replace(problem, log10_tried=0.0)
     claim = _unrefined(one, rotation, translation)
     scene, few = Scene(one, seed, DEFAULT, deadline), is_enumerable(problem)
     others = _proposed(problem, claim, scene)
     if few:  # as in an enumeration, whose candidates are refined
         scale = float(claim.scale[0])
-        copies = competing_poses(one, rotation, translation, scale, settings)[:2]
+        copies = competing_poses(one, rotation, translation, scale)[:2]
         if len(copies[0]):
             others = Hypotheses.concatenate([others, anneal_to_end(scene, *copies, scale)])
     deadline.passed(Unfinished.competing_poses)  # noted: then not all of them were refined
     others = _with_new_false_alarms(others, one)
     others = others[np.argsort(others.log10_false_alarms, kind="stable")]
-    same = np.array([_is_same(one, claim, others[k : k + 1], settings) for k in range(len(others))], np.bool_)
+    same = np.array([_is_same(one, claim, others[k : k + 1]) for k in range(len(others))], np.bool_)
     optimum = others[same][:1]
     better = len(optimum) and optimum.log10_false_alarms[0] <= claim.log10_false_alarms[0]
     if refine and better:
@@ -150,12 +149,12 @@ def _unrefined(problem: Problem, rotation: Array, translation: Array) -> Hypothe
     return add_false_alarms(pose, problem)
 
 
-def _is_same(problem: Problem, claim: Hypotheses, pose: Hypotheses, settings: Evidence) -> bool:
+def _is_same(problem: Problem, claim: Hypotheses, pose: Hypotheses) -> bool:
     """Return whether a pose (1,) is the given one, within the tolerance or within its uncertainty."""
-    if problem.same_as(claim.pose(), pose.rotation, pose.translation, settings.same)[0]:
+    if problem.same_as(claim.pose(), pose.rotation, pose.translation, SAME)[0]:
         return True
     turn = claim.rotation[0] @ pose.rotation[0].T
-    if pose.log10_false_alarms[0] > settings.false_alarms or np.trace(turn) <= 1:  # over 90 degrees away
+    if pose.log10_false_alarms[0] > MOST_FALSE_ALARMS or np.trace(turn) <= 1:  # over 90 degrees away
         return False
     linear = linearised(problem, *pose.pose(), float(pose.scale[0]))
     covariance = local_covariance(linear)

@@ -37,6 +37,7 @@ from bpnp.search.refine.annealing import batch_size, multistart
 from bpnp.search.settings import DensitySearch
 from bpnp.search.starts import PosePrior, Prior
 from bpnp.search.verdict.completeness import far_missed, near_missed
+from bpnp.search.verdict.limits import MOST_FALSE_ALARMS
 
 GUESSED_BATCHES = 4  # number of batches around a guess of the pose, before all others [batches; calibration]
 NEAR_STEPS = 12  # steps near a rough prior before the search treats the prior as possibly wrong [steps; calibration]
@@ -190,7 +191,7 @@ class Plan:
     def _next_near(self, prior: PosePrior) -> Step:
         """Return a step near the prior: in turn near it and over all rotations, and the proposals once."""
         scene, number = self.pool.scene, self.taken_near - self.asked_near
-        undecided = self.pool.alarms > scene.settings.evidence.false_alarms
+        undecided = self.pool.alarms > MOST_FALSE_ALARMS
         self.taken_near += 1
         if number == PROPOSED_AFTER and self.proposals is not None and undecided:
             self.asked_near = True
@@ -252,12 +253,12 @@ class Plan:
     def _next_of_significant(self, next_start: Callable[[], Step]) -> Step:
         """Return the step that reduces the larger miss probability: a local search around the best pose, or a start."""
         pool = self.pool
-        leaders, settings = pool.leaders(), pool.scene.settings
-        local_searches, verdict_settings = pool.local_searches(leaders), settings.evidence
+        leaders = pool.leaders()
+        local_searches = pool.local_searches(leaders)
         symmetric = pool.symmetry.is_known(leaders) and pool.symmetry.is_symmetric(leaders)
         basin_count = pool.symmetry.basin_count(leaders, with_copies=symmetric)
-        far = far_missed(basin_count, verdict_settings, symmetric=symmetric)
-        if local_searches < LOCAL_SEARCHES and near_missed(basin_count, local_searches, verdict_settings) > far:
+        far = far_missed(basin_count, symmetric=symmetric)
+        if local_searches < LOCAL_SEARCHES and near_missed(basin_count, local_searches) > far:
             return self._local_search()
         return next_start()
 

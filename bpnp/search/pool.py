@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.poses import close_poses
+from bpnp.poses import SAME, close_poses
 from bpnp.search.hypotheses import (
     KEPT_CANDIDATES,
     SAME_DEG,
@@ -25,6 +25,7 @@ from bpnp.search.search_frame import Scene
 from bpnp.search.verdict.completeness import Symmetry
 from bpnp.search.verdict.contest import rivals_of
 from bpnp.search.verdict.decide import Case, add_false_alarms, rank_poses
+from bpnp.search.verdict.limits import LEAST_MARGIN, MOST_MISSED
 from bpnp.search.verdict.rivals import Rival
 
 
@@ -48,7 +49,7 @@ class Pool:
         self.iterations, self._judged_alarms = 0, 0.0
         self._is_thinned = len(problem.bearings) > FINE_BEARINGS
         self._tests = PoseModel.of(problem).log10_tests([problem])
-        self.symmetry = Symmetry(problem, scene.settings.evidence)
+        self.symmetry = Symmetry(problem)
         self.forget()
         if len(enumerated.candidates):
             self.candidates = to_scene_frame(enumerated.candidates, scene)
@@ -63,33 +64,29 @@ class Pool:
         """Add the poses of an iteration.
 
         Their NFA is computed first: a significant pose may be close to a likelier one that is not significant. A local
-        search was unsuccessful if the best NFA does not fall by `Evidence.margin` decades.
+        search was unsuccessful if the best NFA does not fall by `LEAST_MARGIN` decades.
 
         Args:
             step: Step that found them.
             found: Poses in the frame of the scene.
         """
-        verdict_settings, before = self.scene.settings.evidence, self.alarms
+        before = self.alarms
         self.iterations += 1
         self.candidates = self._with_false_alarms(
             merge_hypotheses([self.candidates, self._with_false_alarms(found)], self.scene), 1
         )
-        if (
-            step.around is not None
-            and self.alarms > before - verdict_settings.margin
-            and not self.scene.deadline.passed()
-        ):
+        if step.around is not None and self.alarms > before - LEAST_MARGIN and not self.scene.deadline.passed():
             self.surrounded = Hypotheses.concatenate([self.surrounded, step.around])
         self.missed = self._missed()
-        if self.missed > verdict_settings.missed:  # otherwise `case` computes the NFA of the others
+        if self.missed > MOST_MISSED:  # otherwise `case` computes the NFA of the others
             self.candidates = self._with_false_alarms(self.candidates)
             self.candidates = self.candidates[np.argsort(-self.candidates.sort_key, kind="stable")]
             self.missed = self._missed()
 
     def may_be_decided(self) -> bool:
         """Return True if the best pose may be confident, or match more points than before."""
-        bettered = self._is_thinned and self.alarms < self._judged_alarms - self.scene.settings.evidence.margin
-        return bettered or self.missed <= self.scene.settings.evidence.missed
+        bettered = self._is_thinned and self.alarms < self._judged_alarms - LEAST_MARGIN
+        return bettered or self.missed <= MOST_MISSED
 
     def _with_false_alarms(self, candidates: Hypotheses, count: int | None = None) -> Hypotheses:
         """Compute the NFA of the promising poses among the first `count` candidates.
@@ -116,7 +113,7 @@ class Pool:
     def leaders(self) -> Hypotheses:
         """Return the candidates with an NFA, in the frame of the problem, the best one first."""
         judged = self.candidates[~np.isnan(self.candidates.log10_false_alarms)]
-        return rank_poses(to_problem_frame(judged, self.scene), self.problem, self.scene.settings.evidence)
+        return rank_poses(to_problem_frame(judged, self.scene), self.problem)
 
     @property
     def best_key(self) -> float:
@@ -136,8 +133,8 @@ class Pool:
         """
         if not len(leaders) or not len(self.surrounded):
             return 0
-        verdict_settings, around = self.scene.settings.evidence, to_problem_frame(self.surrounded, self.scene)
-        same = self.problem.same_as(leaders.pose(), around.rotation, around.translation, verdict_settings.same)
+        around = to_problem_frame(self.surrounded, self.scene)
+        same = self.problem.same_as(leaders.pose(), around.rotation, around.translation, SAME)
         return int(same.sum())
 
     def is_searched(self, pose: Hypotheses) -> bool:
@@ -156,7 +153,6 @@ class Pool:
             self.problem,
             local_searches=self.local_searches(leaders),
             iterations=self.iterations,
-            limits=self.scene.settings.evidence,
             motions=self.symmetry,
         )
 
@@ -179,7 +175,7 @@ class Pool:
         if len(ends) and problem.prior is not None:  # keep the version of each pose with the smaller NFA
             ends = self._with_false_alarms(ends)
             ends = merge_hypotheses([ends, self.candidates.as_dependent()], scene)
-        case = self._case_of(rank_poses(to_problem_frame(ends, scene), problem, scene.settings.evidence))
+        case = self._case_of(rank_poses(to_problem_frame(ends, scene), problem))
         if self.enumerated.log10_false_alarms < case.log10_false_alarms:
             return replace(self.enumerated, iterations=self.iterations)
         return case

@@ -100,15 +100,15 @@ def find_case(
     many = exceeds_enumeration(problem)
     matches = None if only_proposals else known_matches(problem)
     if matches is not None and (problem.prior is None or not is_enumerable(problem)):
-        return _of_known_matches(problem, *matches, scene_of, seed, settings, deadline)
+        return _of_known_matches(problem, *matches, scene_of, seed, deadline)
     if not many:
         settings = settings.limited(min(settings.iterations, ENUMERATED_ITERATIONS))
     if not only_proposals and is_enumerable(problem) and not deadline.passed():
-        poses = EnumeratedPoses(problem, scene_of, settings)
+        poses = EnumeratedPoses(problem, scene_of)
         enumerated = run(EnumerationPlan(poses, deadline), poses, most=1, deadline=NEVER)
         by_chance = fits_by_chance(enumerated.log10_false_alarms)
         if matches is not None and by_chance:  # residuals may exceed its match radius
-            return _of_known_matches(problem, *matches, scene_of, seed, settings, deadline)
+            return _of_known_matches(problem, *matches, scene_of, seed, deadline)
         tell(0)
         # More search helps only if no pose is significant yet, and there are enough points to anneal.
         small = min(len(problem.bearings), len(problem.points3d)) < LEAST_ANNEALED
@@ -133,12 +133,11 @@ def _of_known_matches(
     j: NDArray[np.int64],
     scene_of: SceneOf,
     seed: int,
-    settings: SearchSettings,
     deadline: Deadline,
 ) -> Case:
     """Return the case of the poses that known matches, indices (k,) of image and of scene points, fit best."""
-    poses, limits = poses_of_matches(problem, i, j, seed), settings.evidence
-    case = Case.of(poses, problem, exhaustive=True, is_fitted=True, limits=limits)
+    poses = poses_of_matches(problem, i, j, seed)
+    case = Case.of(poses, problem, exhaustive=True, is_fitted=True)
     return contest(case, rivals_of(scene_of, deadline))
 
 

@@ -2,8 +2,6 @@
 
 from dataclasses import dataclass, replace
 
-from bpnp.search.config import Evidence
-
 MOST_ITERATIONS = 400  # largest number of iterations of a search [iterations; convention]
 OUTLIERS = 0.3  # outlier fraction of the annealing if the caller gives none [fraction; calibration]
 # Other outlier fractions with which the last stage anneals the best poses; the likelihood chooses.
@@ -92,7 +90,6 @@ class SearchSettings:
     outliers: float = OUTLIERS  # expected fraction of points without a correspondence
     end_outliers: tuple[float, ...] = END_OUTLIERS  # other fractions of the last stage
     near: tuple[DensitySearch, ...] = NEAR  # searches around a prior
-    evidence: Evidence = Evidence()
 
     def __post_init__(self) -> None:
         if self.iterations < 1:

@@ -22,6 +22,7 @@ from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import reasons
 from bpnp.search.verdict.decide import Case, SearchResult, decide
+from bpnp.search.verdict.limits import MOST_FALSE_ALARMS
 
 BATCH_ENTRIES = 2**26  # largest assignment matrix of a batch on a GPU, 2D points times 3D points [entries; cost]
 MATCHER_ENTRIES = 2**22  # largest assignment matrix of a packaged matcher; larger ones take seconds [entries; cost]
@@ -175,7 +176,7 @@ def _by_search(i: int, problem: Problem, options: Options) -> Solved:
     )
     seconds = time.perf_counter() - start
     result = at_deadline(decide(case), options, deadline, seconds)
-    if result.verdict == "failed" and mirrored_alarms(problem, deadline) <= options.settings.evidence.false_alarms:
+    if result.verdict == "failed" and mirrored_alarms(problem, deadline) <= MOST_FALSE_ALARMS:
         result = replace(result, reason=f"{result.reason}; {reasons.MIRRORED}")
     return _solved(problem, case, result, options, deadline, seconds)
 

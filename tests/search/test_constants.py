@@ -1,29 +1,25 @@
 """Constants of the search, of maps and of RANSAC: each has a unit and an origin where it stands."""
 
 import ast
-import dataclasses
-import inspect
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from bpnp.search import config
-from bpnp.search.config import Repetitions
+import bpnp
 from bpnp.search.possible_matches import FARTHEST_MATCH, MATCH_REACH
 from bpnp.search.propose.known_matches import MOST_TRIPLES
+from bpnp.search.propose.repetitions import BASES_OF_SCENE
 from bpnp.search.propose.symmetries import BASES, FIRST_SAMPLED
 from bpnp.search.refine.gauss_newton import DIFFERENCE_STEP
 from bpnp.search.verdict.covariance import FAR_SQUARED
 from bpnp.search.verdict.false_alarms import FARTHEST_PAIR
 from bpnp.search.verdict.uncertainty import EXCEEDED
 
-PACKAGE = Path(config.__file__).parents[1]
+PACKAGE = Path(bpnp.__file__).parent
 FILES = [file for folder in ("search", "maps", "robust") for file in sorted((PACKAGE / folder).rglob("*.py"))]
-GROUPS = [each for each in vars(config).values() if inspect.isclass(each) and each.__module__ == config.__name__]
 ORIGINS = ("calibration", "chosen on ", "measured, ", "derived", "convention", "cost", "numerics", "not tuned")
 
 
@@ -64,26 +60,6 @@ def test_fields_of_density_map_searches_have_a_unit_and_an_origin() -> None:
         assert re.search(r"  # .*\[[^\[\];]+; (calibration|derived|cost)\]$", number), number
 
 
-def fields_of(group: Any) -> list[str]:
-    return [one.name for one in dataclasses.fields(group)] if dataclasses.is_dataclass(group) else list(group._fields)
-
-
-def is_group(value: Any) -> bool:
-    return isinstance(value, tuple(group for group in GROUPS))
-
-
-@pytest.mark.parametrize("group", GROUPS, ids=lambda group: group.__name__)
-def test_groups_have_units_and_origins(group: Any) -> None:
-    text = inspect.getdoc(group) or ""
-    entries = re.findall(r"^    (\w+): ((?:.*\n?)(?:        .*\n?)*)", text.partition("Attributes:\n")[2], re.MULTILINE)
-    assert [name for name, _ in entries] == fields_of(group)
-    for name, entry in entries:
-        if not is_group(getattr(group, name, None)):
-            tag = re.search(r"\. \[([^\[\];]+); ([^\[\];]+)\]$", " ".join(entry.split()))
-            assert tag is not None, f"{group.__name__}.{name} ends without [unit; origin]"
-            assert tag[2].startswith(ORIGINS), f"{group.__name__}.{name} has the origin {tag[2]!r}"
-
-
 def test_derived_constants_follow_from_their_laws() -> None:
     """The numbers that the documentation derives: quantiles, probabilities of a miss, tails of a normal density."""
     assert chi2.ppf(1 - EXCEEDED, 6) == pytest.approx(FAR_SQUARED, abs=0.1)
@@ -93,5 +69,5 @@ def test_derived_constants_follow_from_their_laws() -> None:
     assert pytest.approx(3e-4, rel=0.1) == (1 - 0.2**3) ** MOST_TRIPLES
     assert pytest.approx(0.014, rel=0.05) == (1 - 0.5**3) ** BASES
     assert pytest.approx(1 / 17, rel=0.05) == (1 - 1 / 3) ** FIRST_SAMPLED
-    assert (1 - 1 / 27) ** Repetitions.bases_of_scene == pytest.approx(0.008, rel=0.05)
+    assert pytest.approx(0.008, rel=0.05) == (1 - 1 / 27) ** BASES_OF_SCENE
     assert pytest.approx(np.cbrt(np.finfo(float).eps), rel=0.02) == DIFFERENCE_STEP

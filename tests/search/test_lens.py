@@ -11,11 +11,10 @@ from planted import degrees_between, directions
 from scipy.spatial.transform import Rotation
 
 from bpnp.cameras import camera_from
-from bpnp.search.config import OtherFocal
 from bpnp.search.pose_model import lens_columns, lens_error_columns, log10_lenses
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.propose import lens
-from bpnp.search.propose.lens import fit_lens, lens_model
+from bpnp.search.propose.lens import FITTED_BEARINGS, fit_lens, lens_model
 from bpnp.search.refine.gauss_newton import soft_equations
 from bpnp.search.verdict.uncertainty import linearised, local_covariance
 
@@ -74,7 +73,7 @@ def test_first_steps_use_at_most_the_stated_number_of_bearings(count: int, monke
     assert fit is not None
     assert fit.zoom == pytest.approx(0.97, rel=1e-3)
     assert len(used) == 1
-    assert OtherFocal.bearings / 2 <= used[0] <= OtherFocal.bearings
+    assert FITTED_BEARINGS / 2 <= used[0] <= FITTED_BEARINGS
 
 
 @pytest.mark.parametrize("radial", [-0.2, 0.0, 0.3])

@@ -1,12 +1,14 @@
 """Motions of the matched points of a pose, against fractions counted point by point."""
 
+from unittest.mock import patch
+
 import numpy as np
 from numpy.typing import NDArray
 from planted import directions
 from scipy.optimize import nnls
 
-from bpnp.search.config import Evidence, Repetitions
 from bpnp.search.problem import Problem
+from bpnp.search.propose import repetitions
 from bpnp.search.propose.repetitions import _among, registered
 from bpnp.search.propose.symmetries import Motions, matching_tolerance
 
@@ -16,9 +18,10 @@ GRID = np.stack(np.meshgrid(np.arange(10.0), np.arange(5.0), [0.0], indexing="ij
 LEFT = GRID[:, 0] < -1
 
 
-def motions_of(problem: Problem, limits: Repetitions | None = None) -> Motions:
-    settings = Evidence() if limits is None else Evidence(repetitions=limits)
-    return registered(problem, np.eye(3), TRANSLATION, 1e-4, settings)
+def motions_of(problem: Problem, **constants: float) -> Motions:
+    """Return the motions that are registered with other values of the constants."""
+    with patch.multiple(repetitions, **({"MAPPED": repetitions.MAPPED} | constants)):
+        return registered(problem, np.eye(3), TRANSLATION, 1e-4)
 
 
 def counted(motions: Motions, fits: NDArray[np.bool_], normals: Array | None = None) -> list[float]:
@@ -52,7 +55,7 @@ def test_points_with_other_normals_are_not_mapped() -> None:
     assert np.abs(motions.fraction - counted(motions, everything)).max() > 0.05
 
 
-def test_the_registration_of_a_scene_follows_its_settings() -> None:
+def test_the_registration_of_a_scene_follows_its_constants() -> None:
     """Two copies of 16 points and 18 others: a motion maps 16 of 50, and only a base within a copy shows it."""
     few = many = none = 0
     for seed in range(10):
@@ -60,9 +63,9 @@ def test_the_registration_of_a_scene_follows_its_settings() -> None:
         part = rng.uniform(-1, 1, (16, 3))
         points = np.concatenate([part, part + [3, 0, 0], rng.uniform(-1, 4, (18, 3)) * [1, 0.5, 0.5]])
         problem = Problem(directions(points + TRANSLATION), points)
-        many += len(motions_of(problem, Repetitions(share=0.2)).fraction) > 0
-        few += len(motions_of(problem, Repetitions(share=0.2, bases_of_scene=1)).fraction) > 0
-        none += len(motions_of(problem, Repetitions(share=0.2, share_of_scene=0.5)).fraction) > 0
+        many += len(motions_of(problem, MAPPED=0.2).fraction) > 0
+        few += len(motions_of(problem, MAPPED=0.2, BASES_OF_SCENE=1).fraction) > 0
+        none += len(motions_of(problem, MAPPED=0.2, MAPPED_OF_SCENE=0.5).fraction) > 0
     assert many >= 9
     assert few <= 7
     assert none == 0

@@ -170,7 +170,7 @@ def test_a_focal_length_sweep_reaches_the_true_focal_length(factor: float) -> No
     turned = Rotation.from_euler("x", 3, degrees=True).as_matrix()
     away = shift * (1, 1, factor) - turned @ problem.centre3d
     met = AtZoom(1.0, problem, Hypotheses.from_poses(turned[None], away[None], scale=np.array([4e-3])))
-    climbed = likeliest_zoom(met, Scene(problem, 0, DEFAULT), DEFAULT.evidence.other_focal)
+    climbed = likeliest_zoom(met, Scene(problem, 0, DEFAULT))
     assert climbed.zoom == pytest.approx(1 / factor, rel=0.09 if factor == 1 else 0.045)  # half a step; never none
     assert np.degrees(Rotation.from_matrix(climbed.pose.rotation[0]).magnitude()) < 0.5
     seen = case_of(problem, np.eye(3)[None], met.centre3d[None], 4e-3, 0.6)

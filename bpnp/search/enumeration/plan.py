@@ -20,11 +20,11 @@ from bpnp.search.loop import Step
 from bpnp.search.possible_matches import score_pose
 from bpnp.search.problem import Problem
 from bpnp.search.propose.repetitions import competing_poses
-from bpnp.search.settings import SearchSettings
 from bpnp.search.starts import GravityPrior
 from bpnp.search.verdict.completeness import Symmetry
 from bpnp.search.verdict.contest import rivals_of
 from bpnp.search.verdict.decide import REFINED, Case, add_false_alarms
+from bpnp.search.verdict.limits import MOST_FALSE_ALARMS
 from bpnp.search.verdict.rivals import Rival, SceneOf
 
 NEAR_NATS = 25.0  # evidence in nats by which a competing pose may be behind the best [nats; calibration]
@@ -36,7 +36,6 @@ class EnumeratedPoses:
 
     Attributes:
         problem: Points.
-        settings: Constants of the search.
         found: Poses of the current enumeration, likeliest first.
         candidates: Poses of the earlier enumerations, and of the current one once it has ended or is certain.
         is_certain: True if the best pose passes the cheap tests of the verdict.
@@ -46,14 +45,14 @@ class EnumeratedPoses:
 
     iterations = 0
 
-    def __init__(self, problem: Problem, scene_of: SceneOf, settings: SearchSettings) -> None:
-        self.problem, self._scene_of, self.settings = problem, scene_of, settings
+    def __init__(self, problem: Problem, scene_of: SceneOf) -> None:
+        self.problem, self._scene_of = problem, scene_of
         self.found = self.candidates = Hypotheses.empty()
         self.is_certain = self.is_exhausted = False
         # Without viewing cones, which an enumeration ignores.
         has_cones = problem.cosines3d is not None
         self.enumerated = replace(problem, normals3d=None, cosines3d=None) if has_cones else problem
-        self._symmetry = Symmetry(self.enumerated, settings.evidence)
+        self._symmetry = Symmetry(self.enumerated)
         self._case: Case | None = None
         is_tracked = predicted_pose(problem.prior) is not None
         self.begin(self.enumerated, predicted_only=is_tracked and problem.fixing_matches == 2)
@@ -84,9 +83,9 @@ class EnumeratedPoses:
         """Refine the competing poses of the best pose, and return all poses."""
         leader = self.found[:1]
         self._leaders.append(leader)
-        pose, verdict_settings = leader.pose(), self.settings.evidence
+        pose = leader.pose()
         scale = max(float(leader.scale[0]), self.problem.floor or SMALLEST_SCALE)
-        rotations, translations, *_ = competing_poses(self.problem, *pose, scale, verdict_settings)
+        rotations, translations, *_ = competing_poses(self.problem, *pose, scale)
         rest = self._poses_of_rest(leader, deadline)
         rotations = np.concatenate([rotations, rest.rotation])
         translations = np.concatenate([translations, rest.translation])
@@ -112,7 +111,7 @@ class EnumeratedPoses:
         run = self.run
         if not (run.is_significant and self.has_competitors and margin(self.found, run.problem) >= run.safe_margin):
             return False
-        known = {"local_searches": REFINED, "limits": self.settings.evidence, "motions": self._symmetry}
+        known = {"local_searches": REFINED, "motions": self._symmetry}
         case = Case.of(self._candidates(), self.enumerated, **known)
         self.is_certain = case.is_certain
         if self.is_certain:
@@ -150,10 +149,10 @@ class EnumeratedPoses:
 
     def is_better_without_prior(self) -> bool:
         """Return True if the enumeration that has ended shall be repeated without the prior."""
-        prior, verdict_settings = self.problem.prior, self.settings.evidence
+        prior = self.problem.prior
         if isinstance(prior, GravityPrior):
             self.candidates = add_false_alarms(self.candidates, self.enumerated)
-            return float(self.candidates.log10_false_alarms.min(initial=math.inf)) > verdict_settings.false_alarms
+            return float(self.candidates.log10_false_alarms.min(initial=math.inf)) > MOST_FALSE_ALARMS
         if predicted_pose(prior) is None:
             return False
         return self.problem.fixing_matches == 2 or margin(self.found, self.enumerated) < 0
@@ -172,7 +171,6 @@ class EnumeratedPoses:
                 local_searches=REFINED,
                 exhaustive=self.is_exhausted,
                 is_fitted=True,
-                limits=self.settings.evidence,
                 motions=self._symmetry if self.problem is self.enumerated else None,
             )
         return self._case

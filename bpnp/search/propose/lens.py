@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.config import OtherFocal
 from bpnp.search.pose_model import PoseModel, PoseState
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.refine.gauss_newton import refine, soft_equations
@@ -26,6 +25,7 @@ MOST_LAST_STEPS = 40  # largest number of last steps [steps; numerics]
 FIRST_WIDTHS = (4.0,)  # scales of the steps before the first round [scales of the residuals; not tuned]
 ROUND_WIDTHS = (4.0, 2.0, 2.0, 1.0, 1.0)  # scales of the steps of each round [scales of the residuals; not tuned]
 LENS_DAMPING = 1e-6  # damping, a fraction of the diagonal of the normal equations [fraction; numerics]
+FITTED_BEARINGS = 400  # largest number of bearings that most steps are fitted to [bearings; cost]
 
 Array = NDArray[np.float64]
 
@@ -92,7 +92,7 @@ def fit_lens(
         outermost = float(((problem.bearings[:, :2] / problem.bearings[:, 2:]) ** 2).sum(-1).max())
         largest[model.columns["radial"]] = MOST_BEND_STEP / outermost
     chosen = problem.image.chosen
-    some = chosen[:: max(math.ceil(len(chosen) / OtherFocal.bearings), 1)]
+    some = chosen[:: max(math.ceil(len(chosen) / FITTED_BEARINGS), 1)]
     linearise = soft_equations(model, [problem], chosen=some, most=CORRESPONDENCES)
     state = PoseState(rotation, centre3d, radial=radial or 0.0)
     for widths in (FIRST_WIDTHS + ROUND_WIDTHS, *[ROUND_WIDTHS] * (MOST_ROUNDS - 1)):

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
+from bpnp.poses import SAME
 from bpnp.runtime import NEVER, Deadline
-from bpnp.search.config import Evidence, Repetitions
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.possible_matches import MATCH_REACH
 from bpnp.search.problem import Problem
@@ -18,9 +18,31 @@ from bpnp.search.propose.symmetries import Motions, matching_tolerance, mirror_p
 from bpnp.search.verdict.false_alarms import SHARES, alarms_of, directions_of, point_evidence
 from bpnp.search.verdict.reasons import Unfinished
 
+# Smallest number of matched points; with fewer, the three that fix a pose are too large a part.
+FEWEST_MATCHED = 6  # [points; derived]
+MAPPED = 0.3  # smallest fraction of the matched points that a motion maps [fraction; calibration]
+MAPPED_OF_SCENE = 0.2  # smallest fraction of all points that a motion of a whole scene maps [fraction; calibration]
+# Fraction of the matched points from which a motion could by itself explain a better pose.
+SYMMETRIC = 0.5  # [fraction; calibration]
+# Largest number of points of a scene that is registered as a whole, once for all problems of it.
+WHOLE_SCENE = 64  # [points; cost]
+# A motion of a third of the points is missed by at most (1 - 1/27)^128 = 0.8 % of the registrations.
+BASES_OF_SCENE = 128  # number of bases of that registration [bases; derived]
+# Number of points nearest to the matched ones that these are registered with, in a larger scene.
+AROUND_MATCHED = 4096  # [points; cost]
+# Number of points up to which such a registration has `BASES_OF_FEW` bases; with more, `BASES_OF_MANY`.
+MANY_AROUND = 500  # [points; cost]
+BASES_OF_FEW = 16  # number of bases with few points [bases; cost]
+# A motion of nine tenths of the matches is missed by (1 - 0.9^3)^8 = 3e-5 of the registrations.
+BASES_OF_MANY = 8  # number of bases with many points [bases; derived]
+# Largest ratio of the sizes of a part and its copy, in a registration of at most `MANY_AROUND` points.
+SIZE_RATIO = 4.0  # [factor; not tuned]
+KEPT_REPETITIONS = 6  # largest number of competing poses; those with the fewest false alarms are kept [poses; cost]
+SCORED_AT_ONCE = 100_000  # points, times poses, that are scored between two checks of the deadline [points; cost]
+MOST_MISSING = 1 / 3  # largest fraction of its points that a map may lack [fraction; not tuned]
+
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]
-DEFAULT = Repetitions()
 
 
 class Repeated(NamedTuple):
@@ -37,7 +59,7 @@ class Repeated(NamedTuple):
     motions: Motions
 
 
-def registered(problem: Problem, rotation: Array, translation: Array, scale: float, settings: Evidence) -> Motions:
+def registered(problem: Problem, rotation: Array, translation: Array, scale: float) -> Motions:
     """Return the motions that map the matched points of a pose onto other scene points.
 
     If a pose is wrong because of a symmetry or a repetition, one of these motions maps nearly all of its matched points
@@ -48,15 +70,12 @@ def registered(problem: Problem, rotation: Array, translation: Array, scale: flo
         rotation: (3, 3) of the pose.
         translation: (3,) of the pose.
         scale: Standard deviation of its residuals, radians.
-        settings: Constants of the verdict.
 
     Returns:
         Motions with the fraction of the matched points that each maps, the largest first; none if there are too few
         matched points.
     """
-    return _motions_of(
-        problem, rotation, translation, scale, matched_points(problem, rotation, translation, scale), settings
-    )
+    return _motions_of(problem, rotation, translation, scale, matched_points(problem, rotation, translation, scale))
 
 
 def _motions_of(
@@ -65,25 +84,24 @@ def _motions_of(
     translation: Array,
     scale: float,
     matched: NDArray[np.int64],
-    settings: Evidence,
     *,
     reflected: bool = False,
 ) -> Motions:
     """Return the motions that map the matched points (k,) of a pose onto other scene points; see `registered`."""
-    limits, points = settings.repetitions, problem.points3d
-    if len(matched) < limits.fewest:
+    points = problem.points3d
+    if len(matched) < FEWEST_MATCHED:
         return Motions.none()
     noise = scale * float(np.median(np.linalg.norm(points[matched] @ rotation.T + translation, axis=-1)))
     labels, normals = problem.labels3d, problem.normals3d if problem.cosines3d is None else None
-    if len(points) <= limits.whole:
+    if len(points) <= WHOLE_SCENE:
         tolerance = matching_tolerance(points, np.arange(len(points)), noise)
         arrays = (_frozen(x) for x in (points, labels, normals))
-        motions = _of_scene(*arrays, tolerance, limits.share_of_scene, limits.bases_of_scene, limits.factor, reflected)
-        return motions.of(points, matched, tolerance, limits.share, labels3d=labels, normals3d=normals)
+        motions = _of_scene(*arrays, tolerance, MAPPED_OF_SCENE, BASES_OF_SCENE, SIZE_RATIO, reflected)
+        return motions.of(points, matched, tolerance, MAPPED, labels3d=labels, normals3d=normals)
     centre = np.median(points[matched], 0)
-    near = np.sort(np.argsort(np.linalg.norm(points - centre, axis=-1), kind="stable")[: limits.around])
+    near = np.sort(np.argsort(np.linalg.norm(points - centre, axis=-1), kind="stable")[:AROUND_MATCHED])
     sources = np.flatnonzero(np.isin(near, matched))
-    if len(sources) < limits.fewest:
+    if len(sources) < FEWEST_MATCHED:
         return Motions.none()
     part = points[near]
     return self_motions(
@@ -92,9 +110,9 @@ def _motions_of(
         sources=sources,
         labels3d=None if labels is None else labels[near],
         normals3d=None if normals is None else normals[near],
-        least=limits.share,
-        bases=limits.bases if len(part) <= limits.many else limits.fewer_bases,
-        factor=limits.factor if len(part) <= limits.many else 1.0,
+        least=MAPPED,
+        bases=BASES_OF_FEW if len(part) <= MANY_AROUND else BASES_OF_MANY,
+        factor=SIZE_RATIO if len(part) <= MANY_AROUND else 1.0,
         reflected=reflected,
     )
 
@@ -141,7 +159,7 @@ def _of_scene(
 
 
 def competing_poses(
-    problem: Problem, rotation: Array, translation: Array, scale: float, settings: Evidence, *, least: float = 0.0
+    problem: Problem, rotation: Array, translation: Array, scale: float, *, least: float = 0.0
 ) -> tuple[Array, Array, Array, Motions]:
     """Return the competing poses of a pose: by motions of its matched points, about a line of these, and from afar by
     reflections of these or the mirror image of a flat scene.
@@ -151,15 +169,14 @@ def competing_poses(
         rotation: (3, 3) of the pose.
         translation: (3,) of the pose.
         scale: Standard deviation of its residuals, radians.
-        settings: Constants of the verdict.
         least: Smallest fraction of the matched points that a motion maps, default 0.
 
     Returns:
-        Rotations (c, 3, 3) and translations (c, 3) of poses that differ from the given one by over `settings.same`, the
+        Rotations (c, 3, 3) and translations (c, 3) of poses that differ from the given one by over `SAME`, the
         scales (c,) of their motions, and all motions.
     """
     matched = matched_points(problem, rotation, translation, scale)
-    motions = _motions_of(problem, rotation, translation, scale, matched, settings).mapping(least)
+    motions = _motions_of(problem, rotation, translation, scale, matched).mapping(least)
     poses = motions.competitors(rotation, translation)
     every = [rotation[None], poses[0]], [translation[None], poses[1]], [np.ones(1), motions.scale]
     if (line := find_line(problem.points3d[matched])) is not None:
@@ -169,28 +186,26 @@ def competing_poses(
     if (mirrored := mirror_pose(problem.points3d, rotation, translation)) is not None:
         for parts, one in zip(every, (*mirrored, np.ones(())), strict=True):
             parts.append(one[None])
-    if _is_far(problem, rotation, translation, scale, matched, settings):
-        reflections = _motions_of(problem, rotation, translation, scale, matched, settings, reflected=True)
+    if _is_far(problem, rotation, translation, scale, matched):
+        reflections = _motions_of(problem, rotation, translation, scale, matched, reflected=True)
         images = reflections.mirror_images(rotation, translation, problem.points3d[matched].mean(0))
         for parts, some in zip(every, (*images, reflections.scale), strict=True):
             parts.append(some)
     rotations, translations, scales = (np.concatenate(parts) for parts in every)
-    other = np.flatnonzero(~problem.same_as((rotation, translation), rotations, translations, settings.same))
+    other = np.flatnonzero(~problem.same_as((rotation, translation), rotations, translations, SAME))
     return rotations[other], translations[other], scales[other], motions
 
 
-def _is_far(
-    problem: Problem, rotation: Array, translation: Array, scale: float, matched: NDArray[np.int64], settings: Evidence
-) -> bool:
+def _is_far(problem: Problem, rotation: Array, translation: Array, scale: float, matched: NDArray[np.int64]) -> bool:
     """Return whether half of the matched points (k,) would still be matched if their depths were reversed."""
-    if len(matched) < settings.repetitions.fewest:
+    if len(matched) < FEWEST_MATCHED:
         return False
     camera = problem.points3d[matched] @ rotation.T + translation
     seen = camera.mean(0)
     mirrored = seen + (camera - seen) @ reflection(seen)
     one, other = (x / np.maximum(np.linalg.norm(x, axis=-1, keepdims=True), 1e-300) for x in (camera, mirrored))
     near = np.linalg.norm(one - other, axis=-1) < MATCH_REACH * scale
-    return float(near.mean()) >= settings.repetitions.symmetric
+    return float(near.mean()) >= SYMMETRIC
 
 
 def repeated_poses(
@@ -198,7 +213,6 @@ def repeated_poses(
     rotation: Array,
     translation: Array,
     scale: float,
-    settings: Evidence,
     *,
     least: float = 0.0,
     deadline: Deadline = NEVER,
@@ -210,12 +224,11 @@ def repeated_poses(
         rotation: (3, 3) of the pose.
         translation: (3,) of the pose.
         scale: Standard deviation of its residuals, radians.
-        settings: Constants of the verdict.
         least: Smallest fraction of the matched points that a motion maps, default 0.
         deadline: Deadline, after whose end the poses that are not scored yet are left out.
 
     Returns:
-        Unrefined poses that differ from the given one (`Evidence.same`), at most `Repetitions.kept`, the fewest false
+        Unrefined poses that differ from the given one (`SAME`), at most `KEPT_REPETITIONS`, the fewest false
         alarms first. A flat scene adds the mirror image.
 
     Examples:
@@ -224,16 +237,14 @@ def repeated_poses(
         >>> scene = np.concatenate([motif + [2 * k, 0, 6] for k in range(3)])
         >>> image = motif + [0, 0, 6]  # the first of three equal things
         >>> problem = Problem(image / np.linalg.norm(image, axis=1, keepdims=True), scene)
-        >>> repeated = repeated_poses(problem, np.eye(3), np.zeros(3), 1e-3, Evidence())
+        >>> repeated = repeated_poses(problem, np.eye(3), np.zeros(3), 1e-3)
         >>> sorted(repeated.poses.translation[:2, 0].round(6).tolist())
         [-4.0, -2.0]
     """
-    rotations, translations, sizes, motions = competing_poses(
-        problem, rotation, translation, scale, settings, least=least
-    )
+    rotations, translations, sizes, motions = competing_poses(problem, rotation, translation, scale, least=least)
     scales = np.full(len(rotations), scale)
     alarms = np.full(len(scales), math.inf)
-    step = max(settings.repetitions.scored_points // (len(problem.bearings) + len(problem.points3d)), 1)
+    step = max(SCORED_AT_ONCE // (len(problem.bearings) + len(problem.points3d)), 1)
     for k in range(0, len(scales), step):
         if k and deadline.ended(Unfinished.competing_poses):
             break
@@ -242,7 +253,7 @@ def repeated_poses(
     poses = Hypotheses.from_poses(
         rotations, translations, scale=scales, log10_false_alarms=alarms, log10_rough=alarms.copy()
     )
-    kept = np.argsort(alarms, kind="stable")[: settings.repetitions.kept]
+    kept = np.argsort(alarms, kind="stable")[:KEPT_REPETITIONS]
     kept = kept[np.isfinite(alarms[kept])]
     return Repeated(poses[kept], sizes[kept], motions)
 
@@ -253,7 +264,7 @@ def repetition_margins(
     repeated: Pose,
     competitors: Pose,
     scale: float,
-    limits: Repetitions = DEFAULT,
+    most_missing: float = MOST_MISSING,
     *,
     fraction: float = 0.0,
 ) -> Array:
@@ -272,14 +283,14 @@ def repetition_margins(
             with ever smaller copies.
         competitors: Rotations (c, 3, 3) and translations (c, 3) of the competing poses.
         scale: Scale of the residuals, radians.
-        limits: Constants.
+        most_missing: Largest fraction of its points that the map may lack.
         fraction: Fraction of the matched points that every motion maps; it limits q to 1 - `fraction`. Default 0.
     """
     seen = [directions_of(problem, *best), *(directions_of(problem, r, t) for r, t in zip(*competitors, strict=True))]
     logs = np.stack([point_evidence(problem, one, np.array([scale]), SHARES[-1:], even=True)[:, 0, 0] for one in seen])
     count = logs.shape[1]
     missing = min((int((logs[0] < 0).sum()) + 1) / (count + 2), (count * (1 - fraction) + 1) / (count + 2))
-    missing = min(missing, limits.most_missing)
+    missing = min(missing, most_missing)
     most = math.log((1 - missing) / missing)
     is_repeated = _is_repeated(problem, best, repeated, MATCH_REACH * scale)
     counted = np.stack([_among(problem, one) for one in seen[1:]]) | ~is_repeated

@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.poses import distinct, polar_coordinates
+from bpnp.poses import SAME, distinct, polar_coordinates
 from bpnp.runtime import NEVER, Clock, Deadline, one_blas_thread
 from bpnp.search.enumeration.points import predicted_pose
 from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
@@ -33,8 +33,9 @@ from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.verdict.competitors import distance_between
 from bpnp.search.verdict.completeness import Symmetry
 from bpnp.search.verdict.contest import Rival, contest
-from bpnp.search.verdict.decide import Case, fits_by_chance, is_object
+from bpnp.search.verdict.decide import FOCAL_BOUND, FOCAL_BOUND_OF_OBJECT, Case, fits_by_chance, is_object
 from bpnp.search.verdict.false_alarms import alarms_of
+from bpnp.search.verdict.limits import LEAST_MARGIN, MOST_FALSE_ALARMS, MOST_MISSED
 from bpnp.search.verdict.reasons import Objection, Unfinished, focal_length_not_fixed, objection
 from bpnp.search.verdict.rivals.lens import fitted_lens
 from bpnp.search.verdict.uncertainty import linearised, share_bound
@@ -49,6 +50,7 @@ AGREE_SHIFT = 0.2  # distance below which they agree, in distances of the scene 
 COMPARED_PAIRS = 50_000  # largest number of pairs of poses that are compared [pairs; cost]
 # Smallest baseline of two cameras that determines the scale, in distances of the scene.
 LEAST_BASELINE = 0.01  # [fraction; not tuned]
+SCALE_BOUND = 0.2  # largest 99.9 % bound of the scale of a rig's scene, as a fraction [fraction; convention]
 
 
 @one_blas_thread
@@ -154,11 +156,11 @@ class RigPoses:
 
     def __init__(self, rig: Rig, deadline: Deadline = NEVER) -> None:
         self.deadline = deadline
-        self.rig, self.verdict_settings, self.exhaustive = rig, DEFAULT.evidence, True
+        self.rig, self.exhaustive = rig, True
         self.found = [Hypotheses.empty() for _ in rig.problems]
         self.starts = Hypotheses.empty(4)
         self.best, self.searched, self.pools = self.starts, self.starts, dict[int, Pool]()
-        self._symmetries = [Symmetry(problem, self.verdict_settings) for problem in rig.problems]
+        self._symmetries = [Symmetry(problem) for problem in rig.problems]
 
     @property
     def iterations(self) -> int:
@@ -224,7 +226,7 @@ class RigPoses:
         for k, problem in enumerate(self.rig.problems):
             rotations_of_camera, shifts = self.rig.pose_of(k, poses.rotation, poses.translation)
             seen.append(rotations_of_camera @ problem.centre3d + shifts)
-        return distinct(poses.rotation, polar_coordinates(np.stack(seen, 1)), score, count, *self.verdict_settings.same)
+        return distinct(poses.rotation, polar_coordinates(np.stack(seen, 1)), score, count, *SAME)
 
     def _local_searches(self) -> int:
         """Return the number of local searches around the best pose that found no better one."""
@@ -234,18 +236,18 @@ class RigPoses:
 
     def _as_best(self, k: int, poses: Hypotheses) -> NDArray[np.bool_]:
         """Return which poses of camera k are the same as the best pose."""
-        best, tolerance = self.rig.pose_of(k, *self.best.pose()), self.verdict_settings.same
+        best, tolerance = self.rig.pose_of(k, *self.best.pose()), SAME
         return self.rig.problems[k].same_as(best, poses.rotation, poses.translation, tolerance)
 
     def is_significant(self) -> bool:
         """Return whether the number of false alarms of the best pose is small enough."""
-        return bool((self.best.log10_false_alarms[:1] <= self.verdict_settings.false_alarms).any())
+        return bool((self.best.log10_false_alarms[:1] <= MOST_FALSE_ALARMS).any())
 
     def may_be_decided(self) -> bool:
         """Return whether the best pose is significant and its miss probability is low enough."""
         if not self.is_significant():
             return False
-        return self._case().missed <= self.verdict_settings.missed
+        return self._case().missed <= MOST_MISSED
 
     def _strongest(self) -> tuple[int, Hypotheses]:
         """Return the index of the camera with the most evidence for the best pose, and the poses in that camera."""
@@ -274,7 +276,6 @@ class RigPoses:
             cameras=cameras,
             distinct=self._distinct_fraction(),
             of_rig=self.best,
-            limits=self.verdict_settings,
             motions=self._symmetries[strongest],
         )
 
@@ -284,7 +285,7 @@ class RigPoses:
             return case.against(objection("untested"))
         strongest, seen = self._strongest()
         problem, pose_and_scale = self.rig.problems[strongest], (*seen.pose(), float(seen.scale[0]))
-        repeated, sizes, _ = repeated_poses(problem, *pose_and_scale, self.verdict_settings, deadline=self.deadline)
+        repeated, sizes, _ = repeated_poses(problem, *pose_and_scale, deadline=self.deadline)
         unit = self.best.translation[0, 3]
         if self.rig.model.scale:  # a copy of another size looks the same if the rig is larger as well
             unit = unit * sizes[:, None]
@@ -302,16 +303,15 @@ class RigPoses:
         if self.rig.model.lens is not None:
             return case
         linear = linearised(case.problem, *case.pose, case.residual)
-        return case.against(fitted_lens(linear, case.match_count, self.verdict_settings))
+        return case.against(fitted_lens(linear, case.match_count))
 
     def _unknowns(self, case: Case) -> Case:
         """Return the case against a focal length or a scale that the points do not fix."""
-        limits = self.verdict_settings
         most: dict[str, float] = {}
         if self.rig.model.lens:
-            most["focal"] = limits.focal_few if is_object(self.rig.problems[0], limits) else limits.focal
+            most["focal"] = FOCAL_BOUND_OF_OBJECT if is_object(self.rig.problems[0]) else FOCAL_BOUND
         if self.rig.model.scale:
-            most["scale"] = limits.scale
+            most["scale"] = SCALE_BOUND
         if not most:
             return case
         best = self.best.rotation[0], self.best.translation[0], float(self.best.scale[0])
@@ -333,14 +333,13 @@ class RigPoses:
         proposed is significant, and its log10 NFA lower by the margin of a competing pose, at the same scale of the
         residuals. Wrong extrinsics are the likely cause.
         """
-        settings = self.verdict_settings
         for k, found in enumerate(self.found):
             seen = self.rig.seen(k, self.best[:1])
             here = float(self._alarms_alone(k, seen)[0])
             if not fits_by_chance(here) or not len(found):
                 continue
             own = self._alarms_alone(k, found[:REFINED_RIG_POSES])  # those of an enumeration begin with the likeliest
-            if own.min() <= min(settings.false_alarms, here - settings.margin):
+            if own.min() <= min(MOST_FALSE_ALARMS, here - LEAST_MARGIN):
                 away = distance_between(self.rig.problems[k], seen.pose(), found.pose(int(own.argmin())))
                 return objection("other_extrinsics", camera=k, away=away)
         return None

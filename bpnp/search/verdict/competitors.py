@@ -13,32 +13,43 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.poses import rotation_angle
-from bpnp.search.config import Evidence
+from bpnp.poses import SAME, rotation_angle
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.possible_matches import MATCH_REACH
 from bpnp.search.problem import Problem, label_groups
 from bpnp.search.verdict.false_alarms import directions_of, own_evidence
+from bpnp.search.verdict.limits import LEAST_MARGIN
 from bpnp.search.verdict.reasons import Objection, objection
 from bpnp.search.verdict.uncertainty import Misfit
 
 SHOWN_DEGREES = 0.5  # rotation below which the shift of a pose is shown instead [degrees; convention]
 SHOWN_ZOOM = 0.005  # relative change of the focal length that is omitted [fraction; convention]
+# Smallest distance of a far pose, in multiples of `SAME`; nearer poses slide along the same lines and surfaces.
+FAR_TOLERANCES = 5.0  # [multiples of `SAME`; calibration]
+# Largest evidence of an image point, nats: that of a match among 100 scene points at the finest scale.
+MOST_POINT_NATS = 13.0  # [nats; derived]
+# A pose is no repetition of the best one from this ratio on: points that only it explains, over points that only the
+# best one explains.
+ALONE_RATIO = 0.5  # [ratio; calibration]
+# Fraction of the matches of a pose that coincide with those of the best one; from it on, they agree.
+AGREEING_MATCHES = 0.5  # [fraction; calibration]
+BEND_DEG = 1.0  # rotation, degrees, from which poses with radial distortion are different [degrees; convention]
+# Shift, in distances of the scene, from which poses with radial distortion are different.
+BEND_SHIFT = 0.02  # [fraction; convention]
 
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]
 CandidatesOfCameras = Sequence[tuple[Hypotheses, Problem]]
 
 
-def other_pose(candidates: Hypotheses, problem: Problem, settings: Evidence) -> Objection | None:
+def other_pose(candidates: Hypotheses, problem: Problem) -> Objection | None:
     """Return the competing pose with the fewest false alarms, or None.
 
     Args:
         candidates: Poses, best first.
         problem: Points of the problem.
-        settings: Constants of the verdict; a competing pose differs from the best one by more than `settings.same`.
     """
-    same = problem.same_as(candidates.pose(), candidates.rotation, candidates.translation, settings.same)
+    same = problem.same_as(candidates.pose(), candidates.rotation, candidates.translation, SAME)
     others = np.flatnonzero(~same)
     if not len(others):
         return None
@@ -89,19 +100,13 @@ def rough_residuals(candidates: Hypotheses) -> Objection | None:
     return objection("rough_residuals", decades)
 
 
-def other_camera(off: Misfit, settings: Evidence) -> Objection | None:
+def other_camera(off: Misfit) -> Objection | None:
     """Return another camera or other proportions of the scene as an objection, or None if their pose is the same.
 
     Args:
         off: Difference between a pose and the pose fitted with them.
-        settings: Constants of the verdict; poses that differ by more than `settings.same`, or with a radial distortion
-            by more than the limits of `settings.other_focal`, are different.
     """
-    limits = (
-        (settings.other_focal.bend_deg, settings.other_focal.bend_shift)
-        if off.radial
-        else (settings.same.degrees, settings.same.shift)
-    )
+    limits = (BEND_DEG, BEND_SHIFT) if off.radial else (SAME.degrees, SAME.shift)
     if math.degrees(off.turn) <= limits[0] and off.shift <= limits[1]:
         return None
     other = f"{off.zoom:.2f} times the focal length" if off.zoom != 1 else "other proportions of the scene"
@@ -111,15 +116,14 @@ def other_camera(off: Misfit, settings: Evidence) -> Objection | None:
     return objection("other_camera", camera=other, degrees=math.degrees(off.turn), percent=100 * off.shift)
 
 
-def unrelated_competitor(cameras: CandidatesOfCameras, settings: Evidence) -> Objection | None:
+def unrelated_competitor(cameras: CandidatesOfCameras) -> Objection | None:
     """Return a far candidate whose likelihood is not significantly below that of the first one, or None.
 
     Args:
         cameras: Candidates, best first, and points of each camera of a rig.
-        settings: Constants of the verdict.
     """
-    margins = sign_margins(cameras, settings)
-    weaker = np.flatnonzero(margins < settings.margin)
+    margins = sign_margins(cameras)
+    weaker = np.flatnonzero(margins < LEAST_MARGIN)
     if not len(weaker):
         return None
     k, (candidates, problem) = int(weaker[0]), cameras[0]
@@ -127,7 +131,7 @@ def unrelated_competitor(cameras: CandidatesOfCameras, settings: Evidence) -> Ob
     return objection("other_points", max(float(margins[k]), 0.0), away=away)
 
 
-def sign_margins(cameras: CandidatesOfCameras, settings: Evidence) -> Array:
+def sign_margins(cameras: CandidatesOfCameras) -> Array:
     """Compute the margins of the first candidate over far ones by a sign test of the evidence of the image points.
 
     The number of false alarms assumes independent image points. Points on lines or curves are dependent: a pose that
@@ -147,23 +151,22 @@ def sign_margins(cameras: CandidatesOfCameras, settings: Evidence) -> Array:
 
     Args:
         cameras: Candidates, best first, and points of each camera of a rig; cameras with too few points are left out.
-        settings: Constants of the verdict.
 
     Returns:
         Margins (c,) in decades, negative if the other candidate explains more; infinite where there is no such test.
 
     Source: W. Hoeffding, Probability inequalities for sums of bounded random variables, JASA 1963.
     """
-    limits, least = settings.contested, 2 * math.log(10) * settings.margin
+    least = 2 * math.log(10) * LEAST_MARGIN
     margins = np.full(len(cameras[0][0]), math.inf)
     cameras = [(candidates, problem) for candidates, problem in cameras if len(problem.image.chosen) >= least]
     if not cameras:
         return margins
     candidates, problem = cameras[0]
     poses, chosen = (candidates.rotation, candidates.translation), sum(len(each.image.chosen) for _, each in cameras)
-    others = np.flatnonzero(~problem.same_as(candidates.pose(), *poses, settings.same.times(limits.far)))
+    others = np.flatnonzero(~problem.same_as(candidates.pose(), *poses, SAME.times(FAR_TOLERANCES)))
     # A margin that is significant even with the largest possible gaps needs no test.
-    decisive = limits.most * math.sqrt(least * chosen) / math.log(10)
+    decisive = MOST_POINT_NATS * math.sqrt(least * chosen) / math.log(10)
     others = others[candidates.log10_false_alarms[others] - candidates.log10_false_alarms[0] < decisive]
     if not len(others):
         return margins
@@ -179,8 +182,8 @@ def sign_margins(cameras: CandidatesOfCameras, settings: Evidence) -> Array:
         same = (first.points == other.points) | (np.linalg.norm(first.places - other.places, axis=-1) < reach)
         same |= _with_reversed_depths(first, other, reach)
         alone, others_alone = int((first.near & ~other.near).sum()), int((other.near & ~first.near).sum())
-        apart = others_alone >= limits.alone * alone and alone + others_alone >= least
-        if apart or (same & first.near & other.near).sum() < limits.same * other.near.sum():
+        apart = others_alone >= ALONE_RATIO * alone and alone + others_alone >= least
+        if apart or (same & first.near & other.near).sum() < AGREEING_MATCHES * other.near.sum():
             total = float(gap.sum())
             margins[k] = total * abs(total) / max(squared, 1e-300) / (2 * math.log(10))
     return margins

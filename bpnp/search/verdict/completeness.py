@@ -1,25 +1,35 @@
 """Completeness of a search: the probability that a better pose exists and was not visited."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.config import Evidence
+from bpnp.poses import SAME
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem
 from bpnp.search.propose.collinear import find_line
-from bpnp.search.propose.repetitions import matched_points, registered
+from bpnp.search.propose.repetitions import SYMMETRIC, matched_points, registered
 from bpnp.search.propose.symmetries import Motions
+from bpnp.search.verdict.limits import MOST_MISSED
+
+# Number of matches that must be coincidences for a better optimum to exist, as many as fix a pose.
+INDEPENDENT_MATCHES = 3  # [matches; derived]
+# Probability of a better optimum although several initial poses ended at a significant one.
+ANOTHER = 0.01  # [probability; calibration]
+# Probability that a better pose of a symmetric scene is not among those of its motions.
+UNCOMPARED = 1e-3  # [probability; measured, symmetric objects of `benchmarks completeness`]
+# Probability that a local search around a wrong pose misses a better one near it: 40 of 922 did.
+LOOK_FAILS = 1 / 20  # [probability; calibration]
+AGAIN_FAILS = 1 / 3  # probability that a further local search misses it as well: 8 of 29 did [probability; calibration]
 
 
 def log10_missed(
     basin_count: int,
     decades_a_match: float,
     local_searches: float | int,
-    settings: Evidence,
     *,
+    independent: int = INDEPENDENT_MATCHES,
     symmetric: bool = False,
 ) -> float:
     """Return log10 of the probability that a better optimum than the best pose exists and was missed.
@@ -40,7 +50,8 @@ def log10_missed(
       is a coincidence with a probability of 10^-e. Matches are dependent; but three fix a pose, and at least three
       others must be independent coincidences: 10^-3e.
 
-    The term 2^-k is the posterior of unseen optima of Boender and Rinnooy Kan for two optima.
+    mu1 is `LOOK_FAILS`, mu2 is `AGAIN_FAILS`, q is `ANOTHER`. The term 2^-k is the posterior of unseen optima of
+    Boender and Rinnooy Kan for two optima.
     Source: C. G. E. Boender, A. H. G. Rinnooy Kan, Bayesian stopping rules for multistart global optimization methods,
     Math. Programming 1987.
 
@@ -48,29 +59,28 @@ def log10_missed(
         basin_count: Number k of independent initial poses that ended at the best pose or at one that is not different.
         decades_a_match: Evidence e of a match; 0 if matches do not confirm each other, as in repeated structures.
         local_searches: Number L of local searches around the best pose that found no better one.
-        settings: Constants; mu1 is `settings.look_fails`, mu2 is `settings.again_fails`, q is `settings.another`.
-        symmetric: Use `settings.uncompared` as q of a far optimum, since the scene's motions were tried.
+        independent: Number of matches that are independent coincidences, 3 in P.
+        symmetric: Use `UNCOMPARED` as q of a far optimum, since the scene's motions were tried.
 
-    >>> settings = Evidence()
-    >>> [round(log10_missed(*basins, settings), 2) for basins in ((0, 0.0, 0), (7, 0.0, 0), (7, 0.0, 1), (1, 1.0, 0))]
+    >>> [round(log10_missed(*basins), 2) for basins in ((0, 0.0, 0), (7, 0.0, 0), (7, 0.0, 1), (1, 1.0, 0))]
     [0.0, -2.0, -3.24, -3.3]
     """
-    unseen = near_missed(basin_count, local_searches, settings) + far_missed(basin_count, settings, symmetric=symmetric)
-    return min(math.log10(unseen) - settings.independent * max(decades_a_match, 0.0), 0.0)
+    unseen = near_missed(basin_count, local_searches) + far_missed(basin_count, symmetric=symmetric)
+    return min(math.log10(unseen) - independent * max(decades_a_match, 0.0), 0.0)
 
 
-def near_missed(basin_count: int, local_searches: float | int, settings: Evidence) -> float:
+def near_missed(basin_count: int, local_searches: float | int) -> float:
     """Return the probability that a better optimum near the best pose was missed; arguments as for `log10_missed`."""
-    overlooked = settings.look_fails * settings.again_fails ** (local_searches - 1) if local_searches else 1.0
-    return max(0.5**basin_count, settings.another) * overlooked
+    overlooked = LOOK_FAILS * AGAIN_FAILS ** (local_searches - 1) if local_searches else 1.0
+    return max(0.5**basin_count, ANOTHER) * overlooked
 
 
-def far_missed(basin_count: int, settings: Evidence, *, symmetric: bool = False) -> float:
+def far_missed(basin_count: int, *, symmetric: bool = False) -> float:
     """Return the probability that a better optimum far from the best pose was missed.
 
-    The prior probability is `settings.uncompared` in a symmetric scene, else `settings.another`.
+    The prior probability is `UNCOMPARED` in a symmetric scene, else `ANOTHER`.
     """
-    return (settings.uncompared if symmetric else settings.another) * 0.5**basin_count
+    return (UNCOMPARED if symmetric else ANOTHER) * 0.5**basin_count
 
 
 class Symmetry:
@@ -79,15 +89,15 @@ class Symmetry:
     A motion that maps a large part of them could by itself explain a better pose.
     """
 
-    def __init__(self, problem: Problem, limits: Evidence) -> None:
-        self._problem, self._limits = problem, limits
+    def __init__(self, problem: Problem) -> None:
+        self._problem = problem
         self._known: list[tuple[NDArray[np.float64], NDArray[np.float64], Motions]] = []
 
     def of(self, poses: Hypotheses) -> Motions:
         """Return the motions of the first pose."""
         if (motions := self._find(poses)) is None:
             pose, least = poses.pose(), float(self._problem.image.scales[0])
-            motions = registered(self._problem, *pose, max(float(poses.scale[0]), least), self._limits)
+            motions = registered(self._problem, *pose, max(float(poses.scale[0]), least))
             self._known.append((*pose, motions))
         return motions
 
@@ -96,13 +106,13 @@ class Symmetry:
         return len(poses) > 0 and self._find(poses) is not None
 
     def is_symmetric(self, poses: Hypotheses) -> bool:
-        """Return True if a motion maps `Repetitions.symmetric` of the matched points of the first pose.
+        """Return True if a motion maps `SYMMETRIC` of the matched points of the first pose.
 
         Motions of another scale are left out if there is a baseline.
         """
         motions = self.of(poses)
         fraction = motions.fraction[motions.scale == 1] if self._problem.baseline else motions.fraction
-        return float(fraction.max(initial=0)) >= self._limits.repetitions.symmetric
+        return float(fraction.max(initial=0)) >= SYMMETRIC
 
     def basin_count(self, poses: Hypotheses, *, with_copies: bool = False) -> int:
         """Return the basin count of the first pose and of all poses equal to it.
@@ -114,14 +124,14 @@ class Symmetry:
         if with_copies:
             copies = self.of(poses).competitors(first[0][0], first[1][0])
             first = np.concatenate([first[0], copies[0]]), np.concatenate([first[1], copies[1]])
-        counted, tolerance = np.zeros(len(poses), bool), self._limits.same
+        counted, tolerance = np.zeros(len(poses), bool), SAME
         for pose in zip(*first, strict=True):
             counted |= self._problem.same_as(pose, poses.rotation, poses.translation, tolerance)
         return int(poses.basin_count[counted].sum())
 
     def _find(self, poses: Hypotheses) -> Motions | None:
         for rotation, translation, motions in self._known:
-            if self._problem.same_as(poses.pose(), rotation[None], translation[None], self._limits.same)[0]:
+            if self._problem.same_as(poses.pose(), rotation[None], translation[None], SAME)[0]:
                 return motions
         return None
 
@@ -131,7 +141,6 @@ def missed(
     problem: Problem,
     symmetry: Symmetry,
     local_searches: float | int,
-    limits: Evidence,
     *,
     decades_a_match: float,
 ) -> float:
@@ -141,26 +150,26 @@ def missed(
     basin counts reduce the value. A prior then reduces the probability of a better pose elsewhere.
     """
     count = symmetry.basin_count(poses)
-    value = log10_missed(count, decades_a_match, local_searches, limits)
-    if value <= limits.missed and decades_a_match:
-        fewer = replace(limits, independent=independent_matches(poses, problem, limits))
-        value = log10_missed(count, decades_a_match, local_searches, fewer)
-    if value > limits.missed or not symmetry.is_symmetric(poses):
+    value = log10_missed(count, decades_a_match, local_searches)
+    if value <= MOST_MISSED and decades_a_match:
+        independent = independent_matches(poses, problem)
+        value = log10_missed(count, decades_a_match, local_searches, independent=independent)
+    if value > MOST_MISSED or not symmetry.is_symmetric(poses):
         return value
     count = symmetry.basin_count(poses, with_copies=True)
     fraction = problem.log10_prior_fraction(*poses.pose())
-    return min(log10_missed(count, 0.0, local_searches, limits, symmetric=True) + fraction, 0.0)
+    return min(log10_missed(count, 0.0, local_searches, symmetric=True) + fraction, 0.0)
 
 
-def independent_matches(poses: Hypotheses, problem: Problem, limits: Evidence) -> int:
+def independent_matches(poses: Hypotheses, problem: Problem) -> int:
     """Return the number of matches that must be independent coincidences if the first pose is wrong.
 
-    It is `Evidence.independent`, unless most matched points lie on a line of the scene. Wrong poses then share these
+    It is `INDEPENDENT_MATCHES`, unless most matched points lie on a line of the scene. Wrong poses then share these
     matches, one of the other points fixes the rotation about the line, and only the rest are coincidences.
     """
     scale = max(float(poses.scale[0]), float(problem.image.scales[0]))
     points = problem.points3d[matched_points(problem, *poses.pose(), scale)]
     line = find_line(points)
     if line is None:
-        return limits.independent
-    return int(np.clip((line.distances(points) > line.radius).sum() - 1, 0, limits.independent))
+        return INDEPENDENT_MATCHES
+    return int(np.clip((line.distances(points) > line.radius).sum() - 1, 0, INDEPENDENT_MATCHES))

@@ -3,9 +3,9 @@
 The criterion is the number of false alarms (NFA, `bpnp.search.verdict.false_alarms`): the expected number of poses
 that fit as well if image and scene are unrelated.
 
-- "confident": log10 NFA is at most `Evidence.false_alarms`. The margin to every competing pose is at least
-  `Evidence.margin` decades. log10 of the probability that the search missed a better optimum is at most
-  `Evidence.missed` (`bpnp.search.verdict.completeness`). No rival objects (`bpnp.search.verdict.contest`).
+- "confident": log10 NFA is at most `MOST_FALSE_ALARMS`. The margin to every competing pose is at least
+  `LEAST_MARGIN` decades. log10 of the probability that the search missed a better optimum is at most
+  `MOST_MISSED` (`bpnp.search.verdict.completeness`). No rival objects (`bpnp.search.verdict.contest`).
 - "ambiguous": The best pose fits better than chance (log10 NFA below 0), but one of these conditions does not hold.
   Points that do not fix the rotation or the focal length give this verdict too.
 - "failed": No pose was found, or none fits better than chance, or a given pose is refuted by a confident one.
@@ -19,10 +19,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.config import Evidence
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem
-from bpnp.search.settings import DEFAULT
+from bpnp.search.propose.repetitions import WHOLE_SCENE
 from bpnp.search.verdict import reasons
 from bpnp.search.verdict.competitors import (
     CandidatesOfCameras,
@@ -34,11 +33,17 @@ from bpnp.search.verdict.competitors import (
 )
 from bpnp.search.verdict.completeness import Symmetry, missed
 from bpnp.search.verdict.false_alarms import alarms_of
+from bpnp.search.verdict.limits import LEAST_MARGIN, MOST_FALSE_ALARMS, MOST_MISSED
 from bpnp.search.verdict.reasons import CONFIDENT, NO_POSE, Objection, focal_length_not_fixed, objection
 from bpnp.search.verdict.uncertainty import Linearised, error_bounds, is_redundant, linearised, systematic_misfit
 
 Verdict = Literal["confident", "ambiguous", "failed"]
 HALF_TURN = 180.0  # a larger bound does not constrain a rotation [degrees; derived]
+# The distance has the same error, and from `SAME.shift` on the pose is a different one.
+FOCAL_BOUND = 0.05  # largest 99.9 % bound of a fitted focal length, as a fraction [fraction; derived]
+# The same for an object: a scene of at most `WHOLE_SCENE` points that is no map, such as LEDs. Its rotation is correct
+# long before its distance. The reason gives the bound.
+FOCAL_BOUND_OF_OBJECT = 1.0  # [fraction; convention]
 REFINED = math.inf  # number of local searches that the exact refinement of an enumeration replaces
 
 
@@ -59,15 +64,12 @@ class Case:
     claim: Hypotheses | None = None  # (1,) pose in question, if it was given
     note: str = ""  # added to the reason of a confident pose
     of_rig: Hypotheses | None = None  # the candidates as poses of a rig
-    limits: Evidence = DEFAULT.evidence
     motions: Symmetry | None = None  # those of the scene that other cases of the problem have registered
 
     @classmethod
     def of(cls, candidates: Hypotheses, problem: Problem, **known: object) -> "Case":
         """Return a case with the candidates ranked by `rank_poses`."""
-        limits = known.get("limits", DEFAULT.evidence)
-        assert isinstance(limits, Evidence)
-        return cls(rank_poses(candidates, problem, limits), problem, **known)  # type: ignore[arg-type]
+        return cls(rank_poses(candidates, problem), problem, **known)  # type: ignore[arg-type]
 
     @classmethod
     def without_pose(cls, problem: Problem, failure: Objection = NO_POSE, *, exhaustive: bool = False) -> "Case":
@@ -76,7 +78,7 @@ class Case:
 
     def among(self, rivals: Hypotheses) -> "Case":
         """Return the case with rivals among the candidates; objections to another leader do not count."""
-        ranked = rank_poses(Hypotheses.concatenate([self.candidates, rivals]), self.problem, self.limits)
+        ranked = rank_poses(Hypotheses.concatenate([self.candidates, rivals]), self.problem)
         case = replace(self, candidates=ranked)
         return case if case.has_leader_of(self) else replace(case, objections=())
 
@@ -111,7 +113,7 @@ class Case:
     @cached_property
     def symmetry(self) -> Symmetry:
         """Motions of the scene that map matched points."""
-        return self.motions or Symmetry(self.problem, self.limits)
+        return self.motions or Symmetry(self.problem)
 
     @cached_property
     def missed(self) -> float:
@@ -123,14 +125,14 @@ class Case:
         """True if more search would not help: no test fails, or nothing was missed even if matches are no evidence."""
         if self.exhaustive or not len(self.candidates):
             return self.exhaustive
-        return self._shortcoming is None or self._missed(with_matches=False) <= self.limits.missed
+        return self._shortcoming is None or self._missed(with_matches=False) <= MOST_MISSED
 
     @cached_property
     def is_certain(self) -> bool:
         """True if the leader passes the cheap tests: the NFA, the miss probability, other poses, rough residuals."""
-        if self.log10_false_alarms > self.limits.false_alarms:
+        if self.log10_false_alarms > MOST_FALSE_ALARMS:
             return False
-        return all(one.margin >= self.limits.margin for one in self._rivals) and self.missed <= self.limits.missed
+        return all(one.margin >= LEAST_MARGIN for one in self._rivals) and self.missed <= MOST_MISSED
 
     @property
     def objection(self) -> Objection | None:
@@ -146,17 +148,17 @@ class Case:
     @cached_property
     def _shortcoming(self) -> Objection | None:
         """Test that the leader fails; costly ones run only if the verdict depends on them."""
-        limits, alarms = self.limits, self.log10_false_alarms
+        alarms = self.log10_false_alarms
         if not len(self.candidates):
             return self.failure
         if fits_by_chance(alarms):
             return objection("chance", what="no pose fits")
         if self.is_certain:
             return self._not_fixed or min(self._doubts, default=None)
-        if near := [one for one in self._rivals if one.margin < limits.margin]:
+        if near := [one for one in self._rivals if one.margin < LEAST_MARGIN]:
             return min(near)
-        if alarms > limits.false_alarms:
-            return objection("insignificant", alarms=reasons.nfa(alarms), most=limits.false_alarms)
+        if alarms > MOST_FALSE_ALARMS:
+            return objection("insignificant", alarms=reasons.nfa(alarms), most=MOST_FALSE_ALARMS)
         return objection("incomplete", what="pose", probability=reasons.miss_probability(self.missed))
 
     def _missed(self, *, with_matches: bool) -> float:
@@ -164,7 +166,7 @@ class Case:
         if fits_by_chance(self.log10_false_alarms):
             return 0.0
         decades = -self.log10_false_alarms / max(self.distinct * self.match_count, 1.0) if with_matches else 0.0
-        known = self.problem, self.symmetry, self.local_searches, self.limits
+        known = self.problem, self.symmetry, self.local_searches
         return missed(self.candidates, *known, decades_a_match=decades)
 
     @cached_property
@@ -174,7 +176,7 @@ class Case:
     @cached_property
     def _rivals(self) -> list[Objection]:
         """Best other pose in each camera, and the pose itself at rough residuals."""
-        others = [other_pose(*each, self.limits) for each in self._cameras]
+        others = [other_pose(*each) for each in self._cameras]
         return [one for one in (*others, rough_residuals(self.candidates)) if one is not None]
 
     @property
@@ -187,15 +189,15 @@ class Case:
         (off, share), count = self.bounds, self.match_count
         if off >= HALF_TURN or not (self.cameras or is_redundant(self.problem, count)):
             return objection("rotation_not_fixed", count=count, what="the rotation")
-        most = self.limits.focal_few if is_object(self.problem, self.limits) else self.limits.focal
+        most = FOCAL_BOUND_OF_OBJECT if is_object(self.problem) else FOCAL_BOUND
         return focal_length_not_fixed(share) if share > most else None
 
     @property
     def _doubts(self) -> list[Objection]:
         """Other cameras that the residuals support, and far poses that explain other points."""
-        misfit = systematic_misfit(self._linear, self.match_count, self.limits)
-        doubts = other_camera(misfit, self.limits), unrelated_competitor(self._cameras, self.limits)
-        return [one for one in doubts if one is not None and one.margin < self.limits.margin]
+        misfit = systematic_misfit(self._linear, self.match_count)
+        doubts = other_camera(misfit), unrelated_competitor(self._cameras)
+        return [one for one in doubts if one is not None and one.margin < LEAST_MARGIN]
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +234,7 @@ def decide(case: Case) -> SearchResult:
     """Return the verdict on the leader of a case, or on the pose that it claims.
 
     A claim is "failed" if the leader is another pose without an objection, or if an objection is a pose that is more
-    likely by `Evidence.margin`; it is "ambiguous" if the leader is another pose.
+    likely by `LEAST_MARGIN`; it is "ambiguous" if the leader is another pose.
     """
     candidates, one, refuted = case.candidates, case.objection, False
     if case.claim is not None:
@@ -244,13 +246,13 @@ def decide(case: Case) -> SearchResult:
             one = objection("better_pose", margin, away=away)
         elif fits_by_chance(alarms):
             one = objection("chance", what="the pose fits no")
-        elif refuting := [each for each in case.objections if -math.inf < each.margin <= -case.limits.margin]:
+        elif refuting := [each for each in case.objections if -math.inf < each.margin <= -LEAST_MARGIN]:
             refuted, one = True, min(refuting)
         candidates = candidates[np.r_[place, np.delete(np.arange(len(candidates)), place)]]
     verdict: Verdict = "confident"
     if one is None:
         code = CONFIDENT
-        reason = reasons.confident(case.log10_false_alarms, case.limits.margin, *case.bounds)
+        reason = reasons.confident(case.log10_false_alarms, LEAST_MARGIN, *case.bounds)
         reason = "; ".join([reason, case.note] if case.note else [reason])
     else:
         verdict, code = "failed" if refuted or one.code in reasons.FAILURES else "ambiguous", one.code
@@ -279,17 +281,17 @@ def add_false_alarms(candidates: Hypotheses, problem: Problem) -> Hypotheses:
     return replace(candidates, log10_false_alarms=alarms, log10_rough=rough)
 
 
-def rank_poses(candidates: Hypotheses, problem: Problem, limits: Evidence = DEFAULT.evidence) -> Hypotheses:
+def rank_poses(candidates: Hypotheses, problem: Problem) -> Hypotheses:
     """Compute the NFA of the candidates and move the best one to the front; the others keep their order.
 
-    The best is the first one in the order of the search whose log10 NFA is within `Evidence.margin` of the smallest.
+    The best is the first one in the order of the search whose log10 NFA is within `LEAST_MARGIN` of the smallest.
     The order of the search is that of the likelihood. It decides among poses that the NFA cannot separate.
     """
     if not len(candidates):
         return candidates
     candidates = add_false_alarms(candidates, problem)
     alarms = candidates.log10_false_alarms
-    first = int(np.flatnonzero(alarms <= alarms.min() + limits.margin)[0])
+    first = int(np.flatnonzero(alarms <= alarms.min() + LEAST_MARGIN)[0])
     order = np.r_[first, np.delete(np.arange(len(alarms)), first)]
     return candidates[order]
 
@@ -299,6 +301,6 @@ def match_count(candidates: Hypotheses) -> float:
     return float(candidates.match_count[0])
 
 
-def is_object(problem: Problem, limits: Evidence) -> bool:
+def is_object(problem: Problem) -> bool:
     """Return True if the scene is an object: few points without the viewing cones of a map."""
-    return problem.cosines3d is None and len(problem.points3d) <= limits.repetitions.whole
+    return problem.cosines3d is None and len(problem.points3d) <= WHOLE_SCENE

@@ -10,11 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc, fdtri
 
-from bpnp.search.config import Evidence
 from bpnp.search.pose_model import PoseModel, PoseState, Sight, crossed, lens_columns, lens_error_columns
 from bpnp.search.problem import Problem
 from bpnp.search.refine.gauss_newton import soft_matches
-from bpnp.search.settings import DEFAULT
 from bpnp.search.verdict.covariance import Linearisation, covariance_of, student_factor
 
 Array = NDArray[np.float64]
@@ -36,6 +34,8 @@ POSE = 6  # parameters of a pose [parameters; derived]
 # Probability that an error exceeds its bound, and significance level of a test.
 EXCEEDED = 1e-3  # [probability; convention]
 BLOCKS = 4  # number of blocks of image points along each axis of the image [blocks; not tuned]
+# With 0.001, cameras with a focal length off by a tenth are accepted 1.5 times as often.
+FOCAL_CHANCE = 0.01  # significance level of a test for another focal length [probability; calibration]
 
 
 def error_bounds(problem: Problem, linear: "Linearised | None", count: float) -> tuple[float, float]:
@@ -350,20 +350,19 @@ class Misfit(NamedTuple):
     radial: float = 0.0
 
 
-def systematic_misfit(linear: Linearised | None, count: float, settings: Evidence = DEFAULT.evidence) -> Misfit:
+def systematic_misfit(linear: Linearised | None, count: float) -> Misfit:
     """Return the largest change of a pose that its residuals support significantly.
 
     - Five strains of the scene are fitted to the residuals together with the pose. Correspondences are weighted with
       their probabilities. The pose is eliminated, and the principal directions of the strains with a significant F
       statistic count (level 0.001).
-    - The log of the focal length is fitted and tested likewise (level `settings.focal_chance`, 0.01). The
+    - The log of the focal length is fitted and tested likewise (level `FOCAL_CHANCE`, 0.01). The
       correspondences of the pose bias it towards the given one; `bpnp.search.verdict.rivals.lens` fits a
       significant one with new ones.
 
     Args:
         linear: Pose from `linearised`, or None for no change.
         count: Number of matches.
-        settings: Constants of the verdict.
 
     >>> import numpy as np
     >>> rng = np.random.default_rng(0)
@@ -386,7 +385,7 @@ def systematic_misfit(linear: Linearised | None, count: float, settings: Evidenc
     pose = np.linalg.pinv(products[:POSE, :POSE], hermitian=True)
     found = []
     strains = slice(POSE + 1, POSE + 1 + len(STRAINS))
-    for fitted, chance in ((slice(POSE, POSE + 1), settings.focal_chance), (strains, EXCEEDED)):
+    for fitted, chance in ((slice(POSE, POSE + 1), FOCAL_CHANCE), (strains, EXCEEDED)):
         moved, step = _moved(products, pose, fitted, free, chance)
         zoom = math.exp(float(step[0])) if len(step) == 1 else 1.0
         found.append(Misfit(float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:])), zoom))
@@ -397,7 +396,7 @@ def systematic_misfit(linear: Linearised | None, count: float, settings: Evidenc
     )
 
 
-def bends_significantly(linear: Linearised | None, count: float, settings: Evidence = DEFAULT.evidence) -> bool:
+def bends_significantly(linear: Linearised | None, count: float) -> bool:
     """Return whether radial distortion explains the residuals of a pose significantly better than a focal length.
 
     An F test of the radial coefficient at the level `focal_chance`, with pose and focal length eliminated.
@@ -405,7 +404,6 @@ def bends_significantly(linear: Linearised | None, count: float, settings: Evide
     Args:
         linear: The pose and its possible matches.
         count: Number of matches.
-        settings: Constants of the verdict.
     """
     if linear is None or not (linear.problem.bearings[:, 2] > 0).all():
         return False
@@ -416,7 +414,7 @@ def bends_significantly(linear: Linearised | None, count: float, settings: Evide
     # The last column of R ends with the gain of the radial coefficient and the remaining residual.
     triangle = np.asarray(np.linalg.qr(rows, mode="r"))
     gain, rest = float(triangle[-2, -1] ** 2), float(triangle[-1, -1] ** 2)
-    return bool(free > 0 and fdtrc(1, free, gain * free / max(rest, free, 1.0)) < settings.focal_chance)
+    return bool(free > 0 and fdtrc(1, free, gain * free / max(rest, free, 1.0)) < FOCAL_CHANCE)
 
 
 def _moved(products: Array, pose: Array, fitted: slice, free: float, chance: float) -> tuple[Array, Array]:

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from bpnp.poses import rotation_angle
 from bpnp.runtime import NEVER, Deadline
-from bpnp.search.config import Evidence, OtherFocal
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
 from bpnp.search.pose_model import undistort
 from bpnp.search.problem import Problem, UnknownFocal
@@ -18,11 +17,20 @@ from bpnp.search.propose.lens import LensFit, fit_lens
 from bpnp.search.search_frame import Scene
 from bpnp.search.settings import DensitySearch, Draws, Narrowing, Preselection
 from bpnp.search.verdict.competitors import other_camera
+from bpnp.search.verdict.completeness import INDEPENDENT_MATCHES
 from bpnp.search.verdict.decide import Case
 from bpnp.search.verdict.false_alarms import alarms_of
+from bpnp.search.verdict.limits import MOST_MISSED
 from bpnp.search.verdict.reasons import Objection, Unfinished, objection
 from bpnp.search.verdict.rivals import SceneOf
-from bpnp.search.verdict.uncertainty import Linearised, Misfit, bends_significantly, linearised, systematic_misfit
+from bpnp.search.verdict.uncertainty import (
+    FOCAL_CHANCE,
+    Linearised,
+    Misfit,
+    bends_significantly,
+    linearised,
+    systematic_misfit,
+)
 
 # Density-map search around a pose at the next step of the focal length.
 AT_FOCAL_STEP = DensitySearch(  # [`DensitySearch`; calibration]
@@ -31,6 +39,11 @@ AT_FOCAL_STEP = DensitySearch(  # [`DensitySearch`; calibration]
     Narrowing(0.04, 0.015, steps=3, points=600),
     annealed=3,
 )
+ZOOM_STEP = 1.08  # factor from one focal length to the next [factor; calibration]
+WIDEST_ZOOM = 1.6  # largest factor on the given focal length; its inverse is the smallest [factor; calibration]
+FEWEST_MATCHES = 24  # smallest number of matches; with fewer, a seventh unknown fits their noise [matches; calibration]
+# Largest radial distortion, as a fraction of the distance of the outermost image point from the axis.
+MOST_BEND = 0.5  # [fraction; convention]
 
 Array = NDArray[np.float64]
 
@@ -52,55 +65,54 @@ def lens(case: Case, *, scene_of: SceneOf, deadline: Deadline = NEVER) -> Case:
 
 
 def _other_lens(case: Case, scene_of: SceneOf, deadline: Deadline) -> Objection | None:
-    problem, settings = case.problem, case.limits
+    problem = case.problem
     if problem.focal is not None:
         return None
     if deadline.ended(Unfinished.focal_lengths):
         return objection("camera_untested")
     count, (rotation, translation) = case.match_count, case.pose
     linear = linearised(problem, rotation, translation, case.residual)
-    other = fitted_lens(linear, count, settings)
-    if other is not None or count < settings.other_focal.fewest:
+    other = fitted_lens(linear, count)
+    if other is not None or count < FEWEST_MATCHES:
         return other
     if case.residual < problem.image.scales[0]:
         linear = linearised(problem, rotation, translation, problem.image.scales[0])
     centre = rotation @ problem.centre3d + translation
-    starts = (None, 0.0) if bends_significantly(linear, count, settings) else (None,)
+    starts = (None, 0.0) if bends_significantly(linear, count) else (None,)
 
     def better(found: AtZoom) -> Objection | None:
         least = max(float(found.pose.scale[0]), found.problem.image.scales[0])
         fits = (fit_lens(found.problem, found.pose.rotation[0], found.centre3d, least, start) for start in starts)
         others = [fit._replace(zoom=found.zoom * fit.zoom) for fit in fits if fit is not None]
-        alarms = [_alarms(problem, other, settings) for other in others]
-        if min(alarms, default=math.inf) >= case.log10_false_alarms + math.log10(settings.focal_chance):
+        alarms = [_alarms(problem, other) for other in others]
+        if min(alarms, default=math.inf) >= case.log10_false_alarms + math.log10(FOCAL_CHANCE):
             return None
-        return other_camera(misfit_of(rotation, centre, others[int(np.argmin(alarms))]), settings)
+        return other_camera(misfit_of(rotation, centre, others[int(np.argmin(alarms))]))
 
     if deadline.ended(Unfinished.focal_lengths):
         return objection("camera_untested")
     leader = AtZoom(1.0, problem, case.candidates[:1])
     other = better(leader)
-    if other is not None or settings.independent * case.log10_false_alarms / count <= settings.missed:
+    if other is not None or INDEPENDENT_MATCHES * case.log10_false_alarms / count <= MOST_MISSED:
         return other
-    likeliest = None if deadline.passed() else likeliest_zoom(leader, scene_of(), settings.other_focal)
+    likeliest = None if deadline.passed() else likeliest_zoom(leader, scene_of())
     if likeliest is None or deadline.passed(Unfinished.focal_lengths):
         return objection("camera_untested")
     return better(likeliest)
 
 
-def fitted_lens(linear: Linearised | None, count: float, settings: Evidence) -> Objection | None:
+def fitted_lens(linear: Linearised | None, count: float) -> Objection | None:
     """Return a focal length that the residuals of a pose support significantly, if its pose is a different one.
 
     Args:
         linear: Pose of a given camera from `linearised`, at the standard deviation of its residuals; or None.
         count: Number of its matches.
-        settings: Constants of the verdict.
     """
-    if linear is None or systematic_misfit(linear, count, settings).zoom == 1:
+    if linear is None or systematic_misfit(linear, count).zoom == 1:
         return None
     rotation, centre = linear.state.rotation, linear.state.centroid
     fit = fit_lens(linear.problem, rotation, centre, linear.scale)
-    return None if fit is None else other_camera(misfit_of(rotation, centre, fit), settings)
+    return None if fit is None else other_camera(misfit_of(rotation, centre, fit))
 
 
 def misfit_of(rotation: Array, centre: Array, other: LensFit) -> Misfit:
@@ -139,7 +151,7 @@ class AtZoom(NamedTuple):
         return float(self.pose.log_likelihood[0]) + math.log(self.problem.image.solid_angle)
 
 
-def likeliest_zoom(start: AtZoom, scene: Scene, settings: OtherFocal) -> AtZoom:
+def likeliest_zoom(start: AtZoom, scene: Scene) -> AtZoom:
     """Return the likeliest pose at other focal lengths.
 
     One step is tried to either side. The likelier side is followed while the likelihood grows.
@@ -147,11 +159,10 @@ def likeliest_zoom(start: AtZoom, scene: Scene, settings: OtherFocal) -> AtZoom:
     Args:
         start: Pose at the given focal length.
         scene: Scene whose settings and deadline are used.
-        settings: Constants of the steps.
     """
-    steps = [(step, search_at_zoom(start, step, scene)) for step in (1 / settings.step, settings.step)]
+    steps = [(step, search_at_zoom(start, step, scene)) for step in (1 / ZOOM_STEP, ZOOM_STEP)]
     step, best = max(steps, key=lambda one: one[1].likelihood)
-    while 1 / settings.widest < best.zoom * step < settings.widest:
+    while 1 / WIDEST_ZOOM < best.zoom * step < WIDEST_ZOOM:
         further = search_at_zoom(best, step, scene)
         if further.likelihood <= best.likelihood:
             break
@@ -179,14 +190,14 @@ def search_at_zoom(found: AtZoom, zoom: float, scene: Scene) -> AtZoom:
     return AtZoom(zoom * found.zoom, problem, poses) if len(poses) else found
 
 
-def _alarms(problem: Problem, other: LensFit, settings: Evidence) -> float:
+def _alarms(problem: Problem, other: LensFit) -> float:
     """Return log10 NFA of a pose with its lens counted as unknown."""
-    focal = UnknownFocal(2 * math.log(settings.other_focal.widest))
+    focal = UnknownFocal(2 * math.log(WIDEST_ZOOM))
     rescaled = replace(at_focal_length(problem, other.zoom), focal=focal)
     if other.radial is not None:
         bearings = undistort(problem.bearings, other.zoom, other.radial)
         outermost = float(((bearings[:, :2] / bearings[:, 2:]) ** 2).sum(-1).max())
-        focal = focal._replace(radial_sigma=math.inf, radial_range=2 * settings.other_focal.bend / outermost)
+        focal = focal._replace(radial_sigma=math.inf, radial_range=2 * MOST_BEND / outermost)
         rescaled = replace(problem, bearings=bearings, focal=focal)
     translation = other.centre3d - other.rotation @ problem.centre3d
     return float(alarms_of(rescaled, other.rotation[None], translation[None]).own[0])

@@ -6,12 +6,17 @@ import numpy as np
 
 from bpnp.runtime import NEVER, Deadline
 from bpnp.search.hypotheses import Hypotheses
-from bpnp.search.propose.repetitions import repeated_poses, repetition_margins
+from bpnp.search.propose.repetitions import MOST_MISSING, SYMMETRIC, repeated_poses, repetition_margins
 from bpnp.search.refine.annealing import anneal_to_end
 from bpnp.search.verdict.decide import Case, add_false_alarms
 from bpnp.search.verdict.false_alarms import likeliest_scale
+from bpnp.search.verdict.limits import LEAST_MARGIN
 from bpnp.search.verdict.reasons import Unfinished, objection
 from bpnp.search.verdict.rivals import SceneOf
+
+# Fraction of the matched points that a motion which was not compared has to map to hide a better pose. A motion maps at
+# least 0.9 of the matches of a wrong pose onto those of the correct one.
+HIDING = 0.8  # [fraction; calibration]
 
 
 def symmetries(case: Case, *, scene_of: SceneOf, deadline: Deadline = NEVER, enumerated: bool = False) -> Case:
@@ -43,30 +48,29 @@ def _repeated(case: Case, scene_of: SceneOf, deadline: Deadline, *, enumerated: 
     (`repetition_margins`). Poses that were enumerated are refined already, but for those that a prior excluded. They
     are scored again under the assumption that the map may end anywhere, which makes them likelier.
     """
-    problem, limits = case.problem, case.limits
+    problem = case.problem
     if enumerated and not case.symmetry.is_symmetric(case.candidates):
         return Hypotheses.empty()
     best = case.pose
     # The scale at which the annealing ended may be coarser than that of the residuals.
     scale = case.residual if enumerated else min(case.residual, likeliest_scale(problem, *best))
     scale = max(scale, problem.image.scales[0])
-    least = limits.repetitions.symmetric if enumerated else 0.0
-    repeated, sizes, motions = repeated_poses(problem, *best, scale, limits, least=least, deadline=deadline)
+    least = SYMMETRIC if enumerated else 0.0
+    repeated, sizes, motions = repeated_poses(problem, *best, scale, least=least, deadline=deadline)
     if not len(repeated) or deadline.ended(Unfinished.competing_poses):
         return repeated[:0]
-    poses, repetitions, rigid = (repeated.rotation, repeated.translation), limits.repetitions, sizes == 1
-    if enumerated:
-        repetitions = replace(repetitions, most_missing=1e-12)
+    poses, rigid = (repeated.rotation, repeated.translation), sizes == 1
+    most_missing = 1e-12 if enumerated else MOST_MISSING
     if enumerated and problem.prior is None:
         refined = repeated
     else:
         refined = add_false_alarms(anneal_to_end(scene_of(), *poses, scale), problem)
     others, fraction = (refined.rotation, refined.translation), float(motions.fraction.min(initial=1.0))
     shifted = poses[0][rigid], poses[1][rigid]
-    behind = repetition_margins(problem, best, shifted, others, scale, repetitions, fraction=fraction)
+    behind = repetition_margins(problem, best, shifted, others, scale, most_missing, fraction=fraction)
     # If the pose is wrong, a motion maps nearly all of its matches; of a lattice it may not be among these.
-    behind = np.maximum(behind, 0) if motions.left_out < repetitions.hiding else np.zeros(len(refined))
-    if enumerated and (behind >= limits.margin).all():
+    behind = np.maximum(behind, 0) if motions.left_out < HIDING else np.zeros(len(refined))
+    if enumerated and (behind >= LEAST_MARGIN).all():
         return Hypotheses.empty()
     alarms = np.minimum(refined.log10_false_alarms, case.log10_false_alarms + behind)
     return replace(refined, log10_false_alarms=alarms)
