@@ -38,37 +38,23 @@ class Block(NamedTuple):
     """Image sets paired with scene triangles, each in every order.
 
     Sets below `old_image` are paired only with triangles from `old_scene` on: the other pairs were tried before.
-
-    Attributes:
-        size: Matches that fix a pose, 3 or 2.
-        sets: (t, 3) image points; with size 2 the last index repeats the second.
-        orders: (6, 3) or (2, 3) orders of a set.
-        triangles: Triangles of the scene; with size 2 the last point repeats the second.
-        by_label: (t,) indices of the triangles in the order of the label of their first point, -1 first.
-        low: (m,) index in `by_label` of the first triangle whose first point has the label of an image point, or has a
-            label if that is -1.
-        high: (m,) index behind the last one.
-        free: Number of triangles whose first point has the label -1.
-        old_image: Number of sets of an earlier block.
-        old_scene: Number of triangles of an earlier block.
-        witnesses: (n, w) preverification points near each scene point.
-        need: Preverification points that must be matched.
-        reach: Radius of their matches, in match radii.
     """
 
-    size: int
-    sets: Places
-    orders: Places
-    triangles: Triangles
-    by_label: Places
+    size: int  # matches that fix a pose, 3 or 2
+    sets: Places  # (t, 3) image points; with size 2 the last index repeats the second
+    orders: Places  # (6, 3) or (2, 3) orders of a set
+    triangles: Triangles  # triangles of the scene; with size 2 the last point repeats the second
+    by_label: Places  # (t,) indices of the triangles in the order of the label of their first point, -1 first
+    # (m,) index in `by_label` of the first triangle whose first point has the label of an image point, or has a label
+    # if that is -1.
     low: Places
-    high: Places
-    free: int
-    old_image: int
-    old_scene: int
-    witnesses: Places
-    need: int
-    reach: float
+    high: Places  # (m,) index behind the last one
+    free: int  # number of triangles whose first point has the label -1
+    old_image: int  # number of sets of an earlier block
+    old_scene: int  # number of triangles of an earlier block
+    witnesses: Places  # (n, w) preverification points near each scene point
+    need: int  # preverification points that must be matched
+    reach: float  # radius of their matches, in match radii
 
 
 @compiled
@@ -88,24 +74,12 @@ def explore(
 
 @part
 def sweep(row: int, first: int, budget: int, stop: float, block: Any, problem: Any, kept: Any, work: Any) -> Any:
-    """Solve up to `budget` hypotheses, and keep the refined poses.
+    """Solve up to `budget` hypotheses from a row and one of its triangles on, and keep the refined poses.
 
     A row is an image set in one order, paired with the triangles whose first point fits the label of its first point.
-    The sweep also ends after an image set once the best evidence reaches `stop`, and after `VISITED_PAIRS` pairs of a
-    row and a triangle per hypothesis: labels may exclude most pairs.
-
-    Args:
-        row: First row.
-        first: First triangle of this row, counted among its own.
-        budget: Largest number of hypotheses.
-        stop: Evidence that ends the sweep, nats.
-        block: A `Block`.
-        problem: `EnumerationTables`.
-        kept: A `Kept`, updated.
-        work: A `Work`, overwritten.
-
-    Returns:
-        The next row, its next triangle, the number of hypotheses solved, and the number of pairs visited.
+    The sweep also ends after an image set once the best evidence reaches `stop`, nats, and after `VISITED_PAIRS` pairs
+    of a row and a triangle per hypothesis: labels may exclude most pairs. Return the next row, its next triangle, and
+    the numbers of hypotheses solved and of pairs visited.
     """
     triangles, orders, rays, best, poses = block.triangles, block.orders, problem.image.rays, kept.best, work.poses
     labels2d, labels3d, normals = problem.image.grid.labels, problem.scene.labels, problem.scene.normals
@@ -176,16 +150,9 @@ def facing(pose: Any, normals: Any, a: int, rays: Any, i: int) -> bool:
 
 @part
 def witnessed(pose: Any, points: Any, seen: Any, block: Any, problem: Any) -> bool:
-    """Return whether enough preverification points near the first point are seen near image points.
+    """Return whether enough preverification points near the first of three points are seen near image points.
 
-    The points of the hypothesis and its own image points do not count.
-
-    Args:
-        pose: (4, 3).
-        points: Three indices of scene points.
-        seen: Three indices of image points.
-        block: A `Block`.
-        problem: `EnumerationTables`.
+    The three points of the hypothesis, and its own image points `seen`, do not count.
     """
     witnesses, need, reach, scene, grid = block.witnesses, block.need, block.reach, problem.scene, problem.image.grid
     hits, left = 0, witnesses.shape[1]
@@ -208,31 +175,18 @@ def witnessed(pose: Any, points: Any, seen: Any, block: Any, problem: Any) -> bo
 
 
 class Kept(NamedTuple):
-    """Distinct poses of the enumeration, with their matches.
+    """Distinct poses of the enumeration, with their matches."""
 
-    Attributes:
-        poses: (c, 4, 3).
-        evidence: (c,) nats; -inf for an empty slot.
-        counts: (c,) numbers of matches.
-        point: (c, m) scene point of each image point, or -1.
-        distance2: (c, m) squared distances, in match radii.
-        best: (1,) index of the best pose.
-        most: (1,) largest number of matches of a hypothesis in this stage, less `LACKING` for each missing point.
-        basin_count: (c,) number of image sets with a hypothesis that ended at the pose.
-        last: (c,) image set that was counted last.
-        at: (1,) current image set; -1 for a pose from elsewhere.
-    """
-
-    poses: Array
-    evidence: Array
-    counts: Places
-    point: Places
-    distance2: Array
-    best: Places
-    most: Array
-    basin_count: Places
-    last: Places
-    at: Places
+    poses: Array  # (c, 4, 3)
+    evidence: Array  # (c,) nats; -inf for an empty slot
+    counts: Places  # (c,) numbers of matches
+    point: Places  # (c, m) scene point of each image point, or -1
+    distance2: Array  # (c, m) squared distances, in match radii
+    best: Places  # (1,) index of the best pose
+    most: Array  # (1,) largest number of matches of a hypothesis in this stage, less `LACKING` for each missing point
+    basin_count: Places  # (c,) number of image sets with a hypothesis that ended at the pose
+    last: Places  # (c,) image set that was counted last
+    at: Places  # (1,) current image set; -1 for a pose from elsewhere
 
 
 class Work(NamedTuple):
@@ -262,17 +216,10 @@ def consider(pose: Any, reach: float, problem: Any, kept: Any, work: Any) -> Non
 
 @part
 def settle(pose: Any, reach: float, problem: Any, kept: Any, work: Any) -> None:
-    """Refine a pose in place and keep it, at radius 1 and then at its most significant radius.
+    """Refine a pose (4, 3) in place and keep it, at radius 1 and then at its most significant radius.
 
-    The matches are those within a radius that shrinks from `reach` to 1. If the evidence is largest at a smaller
-    radius, the pose is refined there too, and also kept.
-
-    Args:
-        pose: (4, 3), overwritten.
-        reach: First radius, in match radii; 0 if the pose is refined already.
-        problem: `EnumerationTables`.
-        kept: A `Kept`, updated.
-        work: A `Work`, overwritten.
+    The matches are those within a radius that shrinks from `reach` match radii to 1; 0 for a pose that is refined
+    already. If the evidence is largest at a smaller radius, the pose is refined there too, and also kept.
     """
     last = 1.0
     for _ in range(2):
@@ -292,10 +239,8 @@ def settle(pose: Any, reach: float, problem: Any, kept: Any, work: Any) -> None:
 def tightened(pose: Any, reach: float, last: float, problem: Any, matches: Any, system: Any) -> bool:
     """Refine a pose in place by Gauss-Newton steps on matches within a shrinking radius.
 
-    The radius shrinks from `reach` to `last`, in match radii; `FINAL_STEPS` steps follow there.
-
-    Returns:
-        False for too few matches, a singular step, or a pose that the prior excludes.
+    The radius shrinks from `reach` to `last`, in match radii; `FINAL_STEPS` steps follow there. Return False for too
+    few matches, a singular step, or a pose that the prior excludes.
     """
     left, directions = FINAL_STEPS, len(problem.prior.in_scene)
     while left > 0:

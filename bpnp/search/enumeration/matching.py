@@ -23,43 +23,28 @@ MISSED_NATS = 1.5  # nats subtracted for each expected but missing point; one in
 
 
 class EnumerationTables(NamedTuple):
-    """Inputs of the compiled loops.
-
-    Attributes:
-        scene: Scene points.
-        image: Image points.
-        prior: Prior directions and translation.
-        heading: Input of P2P, where two matches fix a pose.
-        fixing: Number of matches that fix a pose; they are no evidence for it.
-        density: Probability that a scene point, seen anywhere, is within one radius of a given image point.
-    """
+    """Inputs of the compiled loops."""
 
     scene: SceneArrays
     image: ImageArrays
-    prior: PriorArrays
-    heading: Heading
-    fixing: int
-    density: float
+    prior: PriorArrays  # prior directions and translation
+    heading: Heading  # input of P2P, where two matches fix a pose
+    fixing: int  # number of matches that fix a pose; they are no evidence for it
+    density: float  # probability that a scene point, seen anywhere, is within one radius of a given image point
 
 
 class Matches(NamedTuple):
-    """One-to-one matches of the image points.
+    """One-to-one matches of the image points."""
 
-    Attributes:
-        point: (m,) scene point of each image point, or -1.
-        distance2: (m,) squared residuals, in match radii.
-    """
-
-    point: Places
-    distance2: Array
+    point: Places  # (m,) scene point of each image point, or -1
+    distance2: Array  # (m,) squared residuals, in match radii
 
 
 @part
 def sight(pose: Any, scene: Any, j: int) -> tuple[float, float, float]:
-    """Project point j to stereographic coordinates.
+    """Return both stereographic coordinates of point j, and the cosine between its normal and the line of sight.
 
-    Returns:
-        Both coordinates, and the cosine between the normal and the line of sight; 1 without normals.
+    The cosine is 1 without normals.
     """
     points, normals = scene.points, scene.normals
     x, y, z = rotated(pose, points[j, 0], points[j, 1], points[j, 2])
@@ -105,19 +90,10 @@ def nearest(u: float, v: float, cell: int, label: int, reach2: float, grid: Any)
 
 @part
 def match(pose: Any, reach: float, scene: Any, grid: Any, matches: Any) -> tuple[int, int, int]:
-    """Match image and scene points one-to-one within a radius.
+    """Match image and scene points one-to-one within `reach` match radii under a pose (4, 3).
 
-    A scene point proposes its nearest image point, and an image point accepts the nearest proposal.
-
-    Args:
-        pose: (4, 3).
-        reach: Radius, in match radii.
-        scene: `SceneArrays`.
-        grid: Grid of the image points.
-        matches: A `Matches`, overwritten.
-
-    Returns:
-        The numbers of matches, of scene points that fall in the grid, and of scene points expected to be seen.
+    A scene point proposes its nearest image point, and an image point accepts the nearest proposal. Return the numbers
+    of matches, of scene points that fall in the grid, and of scene points expected to be seen.
     """
     for i in range(len(matches.point)):
         matches.point[i], matches.distance2[i] = -1, reach * reach
@@ -138,21 +114,11 @@ def match(pose: Any, reach: float, scene: Any, grid: Any, matches: Any) -> tuple
 
 @part
 def evidence(count: int, visible: int, expected: int, matches: Any, fixing: int, density: float) -> tuple[float, float]:
-    """Return the largest evidence of the matches at the radii 1, 1/2, 1/4 ..., and its radius.
+    """Return the largest evidence, nats, of matches at the radii 1, 1/2, 1/4 ... match radii, and its radius.
 
-    The evidence is -log of C(m - f, k - f) p^(k - f), with p the probability of a chance match and f = `fixing`. Each
-    expected but missing point reduces it.
-
-    Args:
-        count: Number of matches.
-        visible: Number of scene points that fall in the grid.
-        expected: Number of scene points expected to be seen.
-        matches: Matches within one radius.
-        fixing: Number of matches that fix a pose.
-        density: As in `EnumerationTables`.
-
-    Returns:
-        Evidence in nats, and the radius in match radii.
+    The evidence is -log of C(m - f, k - f) p^(k - f), with p the probability of a chance match
+    (`EnumerationTables.density`), m the number of visible scene points, k that of matches, f = `fixing`. Each expected
+    but missing point reduces it.
     """
     best, radius, radius2 = -math.inf, 1.0, 1.0
     for _ in range(TESTED_RADII):
@@ -175,19 +141,10 @@ def _log_choose(n: int, k: int) -> float:
 
 @part
 def step(pose: Any, matched: Any, problem: Any, system: Any) -> bool:
-    """Take one Gauss-Newton step of a pose, in place, on its matches and the prior directions.
+    """Take one Gauss-Newton step of a pose (4, 3), in place, on its matches and the prior directions.
 
-    The cost is sum_i w_i^2 |f_i - g(R p + t)|^2 with g(y) = y/|y| and w_i one over a radius. The step (w, s) moves
-    y = R p + t by w x Rp + s.
-
-    Args:
-        pose: (4, 3), overwritten.
-        matched: (m,) scene point of each image point, or -1.
-        problem: `EnumerationTables`.
-        system: (8, 6), overwritten.
-
-    Returns:
-        False if the equations have no solution.
+    The cost is sum_i w_i^2 |f_i - g(R p + t)|^2 with g(y) = y/|y| and w_i one over a radius. The step (w, s) moves y =
+    R p + t by w x Rp + s. Return False if the equations (8, 6) have no solution.
     """
     rays, per_radian, points = problem.image.rays, problem.image.per_radian, problem.scene.points
     in_scene, in_camera, weight = problem.prior.in_scene, problem.prior.in_camera, problem.prior.weight

@@ -32,22 +32,17 @@ SMALLEST_SCALE = 1e-5  # smallest scale of the residuals if the pixel size is un
 
 
 class EnumeratedPoses:
-    """Poses of few points that enumerations have found so far.
-
-    Attributes:
-        problem: Points.
-        found: Poses of the current enumeration, likeliest first.
-        candidates: Poses of the earlier enumerations, and of the current one once it has ended or is certain.
-        is_certain: True if the best pose passes the cheap tests of the verdict.
-        is_exhausted: True if the last enumeration tried every hypothesis.
-        iterations: 0, since an enumeration does not count as an iteration.
-    """
+    """Poses of few points that enumerations have found so far."""
 
     iterations = 0
 
     def __init__(self, problem: Problem, scene_of: SceneOf) -> None:
         self.problem, self._scene_of = problem, scene_of
+        # candidates: poses of the earlier enumerations, and of the current one once it has ended or is certain.
+        # found: poses of the current enumeration, likeliest first.
         self.found = self.candidates = Hypotheses.empty()
+        # is_exhausted: the last enumeration tried every hypothesis.
+        # is_certain: the best pose passes the cheap tests of the verdict.
         self.is_certain = self.is_exhausted = False
         # Without viewing cones, which an enumeration ignores.
         has_cones = problem.cosines3d is not None
@@ -177,12 +172,7 @@ class EnumeratedPoses:
 
 
 class EnumerationPlan:
-    """Steps of an enumeration, and of another one without the prior if it is not successful.
-
-    Args:
-        poses: Poses found so far, and the state of the enumeration.
-        deadline: When to stop.
-    """
+    """Steps of an enumeration, and of another one without the prior if it is not successful."""
 
     def __init__(self, poses: EnumeratedPoses, deadline: Deadline) -> None:
         self._poses, self._deadline = poses, deadline

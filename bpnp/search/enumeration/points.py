@@ -32,39 +32,23 @@ Places = NDArray[np.int64]
 
 
 class SceneArrays(NamedTuple):
-    """Scene points as arrays.
+    """Scene points as arrays."""
 
-    Attributes:
-        points: (n, 3) in unit size.
-        normals: (n, 3); (0, 3) if every point can be seen.
-        labels: (n,); -1 fits any label.
-    """
-
-    points: Array
-    normals: Array
-    labels: Places
+    points: Array  # (n, 3) in unit size
+    normals: Array  # (n, 3); (0, 3) if every point can be seen
+    labels: Places  # (n,); -1 fits any label
 
 
 class Grid(NamedTuple):
-    """Image points in the cells of a grid, each in all cells within its reach.
+    """Image points in the cells of a grid, each in all cells within its reach."""
 
-    Attributes:
-        flat: (m, 2) stereographic coordinates.
-        gain: (m,) radii a unit of the coordinates (`ImageArrays`).
-        labels: (m,); -1 fits any label.
-        low_u: First coordinate of the lower corner.
-        low_v: Second coordinate of the lower corner.
-        per_cell: Cells a unit of the coordinates.
-        starts: (cells^2 + 1,) index in `items` of the first item of each cell; the second coordinate varies fastest.
-        items: Indices of image points.
-    """
-
-    flat: Array
-    gain: Array
-    labels: Places
-    low_u: float
-    low_v: float
-    per_cell: float
+    flat: Array  # (m, 2) stereographic coordinates
+    gain: Array  # (m,) radii a unit of the coordinates (`ImageArrays`)
+    labels: Places  # (m,); -1 fits any label
+    low_u: float  # first coordinate of the lower corner
+    low_v: float  # second coordinate of the lower corner
+    per_cell: float  # cells a unit of the coordinates
+    # (cells^2 + 1,) index in `items` of the first item of each cell; the second coordinate varies fastest.
     starts: Places
     items: Places
 
@@ -74,81 +58,50 @@ class ImageArrays(NamedTuple):
 
     A difference s of coordinates is an angle of s (1 + cos theta), theta from the axis. `Grid.gain` converts
     differences near an image point to match radii.
-
-    Attributes:
-        rays: (m, 3) unit vectors.
-        per_radian: Match radii a radian.
-        grid: Grid of the coordinates.
     """
 
-    rays: Array
-    per_radian: float
+    rays: Array  # (m, 3) unit vectors
+    per_radian: float  # match radii a radian
     grid: Grid
 
 
 class PriorArrays(NamedTuple):
-    """Prior of the pose, in the frames of the points.
+    """Prior of the pose, in the frames of the points."""
 
-    Attributes:
-        in_scene: (k, 3) directions a.
-        in_camera: (k, 3) directions b = R a.
-        weight: Weight of R a - b, in match radii.
-        farthest2: Largest sum of the squares of R a - b.
-        translation: (3,).
-        farthest_shift2: Largest squared distance from it; infinite without a prior translation.
-    """
-
-    in_scene: Array
-    in_camera: Array
-    weight: float
-    farthest2: float
-    translation: Array
-    farthest_shift2: float
+    in_scene: Array  # (k, 3) directions a
+    in_camera: Array  # (k, 3) directions b = R a
+    weight: float  # weight of R a - b, in match radii
+    farthest2: float  # largest sum of the squares of R a - b
+    translation: Array  # (3,)
+    farthest_shift2: float  # largest squared distance from it; infinite without a prior translation
 
 
 class Heading(NamedTuple):
-    """Points and rotations for P2P, in frames whose z axis is the prior direction.
+    """Points and rotations for P2P, in frames whose z axis is the prior direction."""
 
-    Attributes:
-        rays: (m, 3); empty without a prior.
-        points: (n, 3); empty without a prior.
-        terms: (3, 3, 3) terms of R: the first plus the others times cosine and sine of the angle about the direction.
-            With a prior rotation this angle is 0.
-        sine2: Squared sine of the largest rotation from the prior rotation, or 1.
-    """
-
-    rays: Array
-    points: Array
+    rays: Array  # (m, 3); empty without a prior
+    points: Array  # (n, 3); empty without a prior
+    # (3, 3, 3) terms of R: the first plus the others times cosine and sine of the angle about the direction. With a
+    # prior rotation this angle is 0.
     terms: Array
-    sine2: float
+    sine2: float  # squared sine of the largest rotation from the prior rotation, or 1
 
 
 class SceneSide:
-    """Scene of one problem, or of many, as when a device is tracked.
-
-    Attributes:
-        arrays: Points, normals and labels.
-        nearest: (n, k) nearest points of each point.
-        tables: Triangles by (size, near) that were built so far.
-        orders: Their orders by label.
-    """
+    """Scene of one problem, or of many, as when a device is tracked."""
 
     def __init__(self, points3d: Array, normals3d: Array | None, labels3d: Places | None) -> None:
         normals = np.empty((0, 3)) if normals3d is None else np.array(normals3d, np.float64, order="C")
         labels = np.full(len(points3d), -1) if labels3d is None else np.array(labels3d, np.int64)
         self.arrays = SceneArrays(np.array(points3d, np.float64, order="C"), normals, labels)
-        self.nearest = nearest_of(self.arrays.points, normals)
-        self.tables: dict[tuple[int, int], Triangles] = {}
+        self.nearest = nearest_of(self.arrays.points, normals)  # (n, k) nearest points of each point
+        self.tables: dict[tuple[int, int], Triangles] = {}  # triangles by (size, near) that were built so far
         self.orders: dict[tuple[int, int], tuple[Places, Places]] = {}
 
     def triangles(self, size: int, near: int) -> Triangles:
-        """Return the triangles of a point and two of its `near` nearest, or the `pairs` with one of them.
+        """Return the triangles of a point and two of its `near` nearest, or with size 2 the `pairs` with one of them.
 
         Those of a smaller neighbourhood are the first rows.
-
-        Args:
-            size: Points of a set, 3 or 2.
-            near: Number of neighbours.
         """
         near = min(near, self.nearest.shape[1])
         if (size, near) not in self.tables:
@@ -159,12 +112,7 @@ class SceneSide:
         return self.tables[size, near]
 
     def by_label(self, size: int, near: int) -> tuple[Places, Places]:
-        """Return the order of the `triangles` by the label of their first point, stable, and the labels in this order.
-
-        Args:
-            size: Points of a set, 3 or 2.
-            near: Number of neighbours.
-        """
+        """Return the stable order of the `triangles` by the label of their first point, and the sorted labels."""
         near = min(near, self.nearest.shape[1])
         if (size, near) not in self.orders:
             labels = self.arrays.labels[self.triangles(size, near).triples[:, 0]]
@@ -174,22 +122,16 @@ class SceneSide:
 
 
 class ImageSide:
-    """Image points of one problem, with what the enumeration looks up about them.
-
-    Attributes:
-        turn: R, which maps a bearing f to R f in the frame of the arrays.
-        arrays: Bearings and their grid.
-        density: Probability that a point drawn uniformly in the view is within one radius of a given image point.
-        nearest: (m, k) nearest points of each point.
-    """
+    """Image points of one problem, with what the enumeration looks up about them."""
 
     def __init__(self, bearings: Array, radius: float, labels2d: Places | None, reach: float) -> None:
-        self.turn = turned_to(axis_of(bearings))
+        self.turn = turned_to(axis_of(bearings))  # R, which maps a bearing f to R f in the frame of the arrays
         rays = bearings @ self.turn.T
         per_radian = 1 / float(radius)
         flat, gain = rays[:, :2] / np.maximum(1 + rays[:, 2:], 1e-9), (1 + rays[:, 2]) * per_radian
         labels = np.full(len(rays), -1) if labels2d is None else np.array(labels2d, np.int64)
         self.arrays = ImageArrays(np.ascontiguousarray(rays), per_radian, grid_of(flat, gain, labels, reach))
+        # Probability that a point drawn uniformly in the view is within one radius of a given image point.
         self.density = float(math.pi * (1 / gain**2).mean() / _area(flat, float(1 / gain.mean())))
 
     @functools.cached_property
@@ -234,11 +176,7 @@ def _remembered(points3d: bytes, normals3d: bytes | None, labels3d: bytes | None
 def nearest_of(points: Array, normals: Array) -> Places:
     """Return the nearest points (n, k) of each point, without the point itself.
 
-    Points whose normals no camera can face at once come last.
-
-    Args:
-        points: (n, 3).
-        normals: (n, 3), or (0, 3) for none.
+    Points whose normals, (n, 3) or (0, 3), no camera can face at once come last.
     """
     n = len(points)
     if n > RANKED_NEIGHBOURS:
@@ -269,13 +207,7 @@ def sets_within(nearest: Places, near: int, size: int) -> Places:
 
 
 def visible_triangles(points: Array, normals: Array, triples: Places) -> Triangles:
-    """Return the triangles of scene triples that a camera can see.
-
-    Args:
-        points: (n, 3).
-        normals: (n, 3), or (0, 3) for none.
-        triples: (t, 3) indices.
-    """
+    """Return the triangles of scene triples (t, 3) that a camera can see; normals are (n, 3) or (0, 3)."""
     triangles = triangles_of(points, triples)
     orientation = triangles.orientation
     if len(normals):
@@ -340,18 +272,10 @@ def predicted_pose(prior: Prior | None) -> tuple[Array, Array] | None:
 
 
 def prior_arrays(problem: Problem, scene: SceneSide, image: ImageSide) -> tuple[PriorArrays, Heading, float]:
-    """Convert the prior to the frames of the loops.
+    """Return the prior as arrays, the input of P2P, and the log of the fraction of rotations that it allows.
 
     Where two matches fix a pose, one direction is taken as exact. It is the vertical, or the direction of the view: the
     image measures a rotation about this one best.
-
-    Args:
-        problem: Points and prior.
-        scene: Scene of the problem.
-        image: Image of the problem.
-
-    Returns:
-        The prior as arrays, the input of P2P, and the logarithm of the fraction of rotations that the prior allows.
     """
     prior, none = problem.prior, np.empty((0, 3))
     translation, farthest_shift2, log_share, sine2 = np.zeros(3), math.inf, 0.0, 1.0

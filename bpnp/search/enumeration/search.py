@@ -78,37 +78,18 @@ Ended = Literal["exhausted", "safe", "interrupted", "most"]
 
 
 class Enumerated(NamedTuple):
-    """Result of an enumeration.
+    """Result of an enumeration."""
 
-    Attributes:
-        poses: Distinct hypotheses, likeliest first, with matches and residuals. `evidence` is in nats, less the
-            logarithm of the number of tests. `basin_count` is the number of image sets with a hypothesis that ended at
-            the pose.
-        ended: "exhausted" after every minimal problem, "safe" if `is_safe` returned True, "interrupted" by the
-            deadline, "most" after the largest number of hypotheses.
-    """
-
+    # Distinct hypotheses, likeliest first, with matches and residuals. `evidence` is in nats, less the logarithm of the
+    # number of tests. `basin_count` is the number of image sets with a hypothesis that ended at the pose.
     poses: Hypotheses
+    # "exhausted" after every minimal problem, "safe" if the best pose leads by a safe margin, "interrupted" by the
+    # deadline, "most" after the largest number of hypotheses.
     ended: Ended
 
 
 class Enumeration:
-    """Enumeration of one problem.
-
-    Attributes:
-        problem: Points.
-        scene: Scene of the problem.
-        image: Image of the problem.
-        most: Largest number of hypotheses.
-        reach: Largest radius of a match, in match radii.
-        fixing: Number of matches that fix a pose.
-        solved: Number of minimal problems solved so far.
-        ended: Why the enumeration ended, as in `Enumerated`; None before.
-        tests: Logarithm of the number of minimal problems of these points times the number of radii tested.
-        tables: Inputs of the compiled loops.
-        kept: Poses found so far.
-        work: Buffers of the compiled loops.
-    """
+    """Enumeration of one problem."""
 
     def __init__(
         self,
@@ -120,18 +101,22 @@ class Enumeration:
         kept: int = KEPT_POSES,
     ) -> None:
         scene = scene_side(problem.points3d, problem.normals3d, problem.labels3d)
-        self.reach = _reach(problem, radius, stages)
+        self.reach = _reach(problem, radius, stages)  # largest radius of a match, in match radii
         image = ImageSide(problem.bearings, radius, problem.labels2d, self.reach)
         (prior, heading, log_share), fixing = prior_arrays(problem, scene, image), problem.fixing_matches
+        # most: largest number of hypotheses.
         self.problem, self.scene, self.image, self.most = problem, scene, image, most
+        # solved: number of minimal problems solved so far.
+        # fixing: number of matches that fix a pose.
         self.fixing, self.solved, self._pace = fixing, 0, HYPOTHESIS_SECONDS
-        self.ended: Ended | None = None
+        self.ended: Ended | None = None  # why the enumeration ended, as in `Enumerated`; None before
         self._predicted, self._safe = predicted_pose(problem.prior), 0.0
         self._last_reach = stages[-1].reach if stages else 0.0
         self._stages = [stage for stage in stages if stage.matches >= fixing]
         self._stage: Stage | None = None
         self._is_checked = self._is_complete = True
         m, n = len(image.arrays.rays), len(scene.arrays.points)
+        # Inputs of the compiled loops.
         self.tables = EnumerationTables(scene.arrays, image.arrays, prior, heading, fixing, image.density)
         self.kept = Kept(
             poses=np.zeros((kept, 4, 3)),
@@ -147,11 +132,12 @@ class Enumeration:
         )
         self._may_match = fit_any(image.arrays.grid.labels, scene.arrays.labels)
         matches = Matches(np.empty(m, np.int64), np.empty(m))
-        self.work = Work(np.empty((4, 4, 3)), matches, np.empty((8, 6)))
+        self.work = Work(np.empty((4, 4, 3)), matches, np.empty((8, 6)))  # buffers of the compiled loops
         seen = SEEN_WITNESSES * n / max(m - fixing, 1)
         near = int(np.clip(seen, FEWEST_WITNESSES, MOST_WITNESSES))
         self._witnesses = np.ascontiguousarray(scene.nearest[:, :near])
         problems = _log_choose(m, fixing) + _log_choose(n, fixing) + math.lgamma(fixing + 1) + log_share
+        # Logarithm of the number of minimal problems of these points times the number of radii tested.
         self.tests = math.log(TESTED_RADII) + max(problems, 0.0)
         self._done: dict[tuple[int, float], tuple[int, int]] = {}
         none = np.empty((0, fixing), np.int64)
@@ -228,16 +214,10 @@ class Enumeration:
         self.kept.most[0] = 0.0
 
     def advance(self, deadline: float) -> bool:
-        """Continue until the best pose is significant, or to the end.
+        """Continue until the best pose is significant, or to the end; return False at the end, which `ended` explains.
 
         The predicted pose of the prior is tried first, then the hypotheses stage by stage. Once a pose is significant,
-        the function returns after every `HYPOTHESES_A_LOOK` hypotheses.
-
-        Args:
-            deadline: When to stop (`Clock.now`).
-
-        Returns:
-            False at the end; `ended` then has the reason.
+        the function returns after every `HYPOTHESES_A_LOOK` hypotheses. The deadline is a time of `Clock`.
         """
         if self._predicted is not None:
             predicted, self._predicted = self._predicted, None
@@ -277,12 +257,9 @@ class Enumeration:
             self.begin(self._stage)
 
     def sweep(self, most: int, deadline: float) -> None:
-        """Solve hypotheses of the stage.
+        """Solve `most` hypotheses of the stage.
 
-        Args:
-            most: Number of hypotheses. Fewer are solved if a better significant pose is found, half of the time is
-                over, or labels exclude almost all.
-            deadline: When to stop (`Clock.now`).
+        Fewer are solved if a better significant pose is found, half of the time is over, or labels exclude almost all.
         """
         start, stop = Clock.now(), max(self.best + 1e-9, self.tests)
         most = int(min(most, max(0.5 * (deadline - start) / self._pace, 1)))
@@ -339,21 +316,11 @@ def enumerate_poses(
     most: int = MOST_HYPOTHESES,
     kept: int = KEPT_POSES,
 ) -> Enumerated:
-    """Enumerate poses under which image points see scene points, one-to-one within a radius.
+    """Enumerate poses under which image points see scene points, one-to-one within a radius in radians.
 
     With prior gravity, or a rotation within a few degrees, two matches fix a pose. A predicted pose is tried first.
-
-    Args:
-        problem: Points.
-        radius: Largest residual of a match, radians; None for the match radius of the problem.
-        deadline: When to stop (`Clock.now`).
-        to_the_end: True to try every hypothesis; False to stop once the best pose is significant and leads every other
-            pose by a safe margin.
-        most: Largest number of hypotheses.
-        kept: Number of distinct poses that are kept.
-
-    Returns:
-        The poses, and why the enumeration ended.
+    Unless it runs `to_the_end`, the enumeration stops once the best pose is significant and leads every other pose by a
+    safe margin.
 
     >>> import numpy as np
     >>> rng = np.random.default_rng(0)

@@ -105,11 +105,7 @@ def solve_normal_equations(system: Any) -> bool:
 
 @part
 def move(q: Any, p: Any, rotation: Any, translation: Any, length: Any, system: Any) -> bool:
-    """Take `length` times a damped Gauss-Newton step of the pose, in place.
-
-    Returns:
-        False if the points do not fix the pose.
-    """
+    """Take `length` times a damped Gauss-Newton step of the pose, in place; False if the points do not fix it."""
     normal_equations(q, p, rotation, translation, system)
     for k in range(6):
         system[k, k] *= F(1 + STEP_DAMPING)
@@ -153,22 +149,11 @@ def dense_scratch(m: int, n: int) -> DenseScratch:
 
 @part
 def assign(bearings: Any, points: Any, rotation: Any, translation: Any, scale: Any, outlier: Any, scratch: Any) -> Any:
-    """Fill q with the soft assignment in product form.
+    """Fill q with the soft assignment in product form; return the mean log-likelihood of the bearings.
 
-    The kernel is (1 + z/256)^256, z = -|f - u|^2 / 2 s^2. It is within 3 % of exp(z) where that exceeds 0.02, and needs
-    no function call.
-
-    Args:
-        bearings: A `WeightedBearings`, in the order of the labels.
-        points: A `WeightedPoints`, in the order of the labels; their weights under this pose are in the scratch.
-        rotation: (3, 3).
-        translation: (3,).
-        scale: s, radians.
-        outlier: o of `Scene.outlier_density`.
-        scratch: A `DenseScratch`, overwritten.
-
-    Returns:
-        The mean log-likelihood of the bearings.
+    The kernel is (1 + z/256)^256, z = -|f - u|^2 / 2 s^2, s the scale in radians. It is within 3 % of exp(z) where that
+    exceeds 0.02, and needs no function call. Bearings and points are in the order of the labels; the weights of the
+    points under this pose are in the scratch. `outlier` is o of `Scene.outlier_density`.
     """
     f, a, p, blocks = bearings.f, bearings.a, points.p, points.blocks
     kernel, base, row, u, column, weight, q, _ = scratch
@@ -229,18 +214,10 @@ def assign(bearings: Any, points: Any, rotation: Any, translation: Any, scale: A
 def descend(
     bearings: Any, points: Any, rotation: Any, translation: Any, scales: Any, outlier: Any, score: Any, scratch: Any
 ) -> None:
-    """Anneal poses in place through decreasing scales.
+    """Anneal poses (S, 3, 3), (S, 3) in place through decreasing scales (k,), radians.
 
-    Args:
-        bearings: A `WeightedBearings`, in the order of the labels.
-        points: A `WeightedPoints`, in the order of the labels.
-        rotation: (S, 3, 3), overwritten.
-        translation: (S, 3), overwritten.
-        scales: (k,) radians.
-        outlier: o / s^2 of the scene.
-        score: (S,) mean log-likelihood at the last scale, written. It is -inf for a pose that is not finite, or that
-            the points do not fix.
-        scratch: A `DenseScratch`, overwritten.
+    Bearings and points are in the order of the labels; `outlier` is o / s^2 of the scene. The score (S,) is the mean
+    log-likelihood at the last scale, -inf for a pose that is not finite, or that the points do not fix.
     """
     for k in range(len(rotation)):
         for step in range(len(scales)):

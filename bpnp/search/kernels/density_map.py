@@ -14,17 +14,11 @@ from bpnp.search.kernels.vectors import F, compiled, part, rotated
 
 
 class DensityMap(NamedTuple):
-    """Density map: the score that a point adds by its location in the view.
+    """Density map: the score that a point adds by its location in the view."""
 
-    Attributes:
-        values: (g, g), rows are y; the outermost cells are 0.
-        half: The first cell begins at -half in both coordinates.
-        per_cell: Cells a unit.
-    """
-
-    values: Array
-    half: np.float32
-    per_cell: np.float32
+    values: Array  # (g, g), rows are y; the outermost cells are 0
+    half: np.float32  # the first cell begins at -half in both coordinates
+    per_cell: np.float32  # cells a unit
 
 
 @part
@@ -38,16 +32,9 @@ def place(half: Any, per_cell: Any, p: Any, j: Any, turn: Any, t: Any) -> Any:
 
 @compiled
 def add_up(density_map: Any, points: Any, rotation: Any, translation: Any, score: Any, weight: Any, cell: Any) -> None:
-    """Score poses by the density map: sum the weighted values at the projections of all points, 0 outside.
+    """Score poses (S, 3, 3), (S, 3) by the sum of the map's weighted values where they see the points, 0 outside.
 
-    Args:
-        density_map: A density map.
-        points: A `WeightedPoints`; the labels are ignored.
-        rotation: (S, 3, 3).
-        translation: (S, 3).
-        score: (S,), written.
-        weight: (n,), overwritten.
-        cell: (n,) int32, overwritten.
+    Labels are ignored; weight (n,) and cell (n,) are buffers.
     """
     cells, values = np.int32(len(density_map.values)), density_map.values.reshape(-1)
     half, per_cell = density_map.half, density_map.per_cell

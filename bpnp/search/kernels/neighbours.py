@@ -16,18 +16,10 @@ Array = NDArray[np.float64]
 def sums_near(
     bearings: Array, directions: Array, axes: Array, radii: Array, sharpness: Array, weights: Array | None = None
 ) -> Array:
-    """Sum w_j exp(-sharpness_s |f_i - u_j|^2) over the directions u_j nearer than radii_s to each bearing f_i.
+    """Return the sums (m, S) of w_j exp(-sharpness_s |f_i - u_j|^2) over the u_j nearer than radii_s to each f_i.
 
-    Args:
-        bearings: (m, 3) unit vectors f.
-        directions: (n, 3) unit vectors u.
-        axes: (3, 2) orthonormal axes of the grid, along which the bearings spread most.
-        radii: (S,) ascending radii.
-        sharpness: (S,); 0 counts the directions.
-        weights: (n,); None for weights of 1.
-
-    Returns:
-        (m, S) sums.
+    f (m, 3) and u (n, 3) are unit vectors, the radii (S,) ascend, and a sharpness of 0 counts the directions; without
+    `weights` all w are 1. The orthonormal `axes` (3, 2) of the grid are those along which the bearings spread most.
     """
     at = bearings @ axes
     low, extent = at.min(0), float(np.ptp(at, 0).max())
@@ -58,19 +50,10 @@ def _add_up(
     sharpness: Any,
     sums: Any,
 ) -> None:
-    """Add to the sums (S, k) of `sums_near`.
+    """Add to the sums (S, k) of `sums_near`, of bearings (3, k) sorted by cell.
 
-    Args:
-        bearings: (3, k) sorted by cell.
-        start: Index of the first bearing of cell (x, y), at x * side + y.
-        side: Cells along a side of the grid.
-        directions: (n, 3).
-        weights: (n,).
-        cells: (n, 2, 2) first cells in x and y around each direction, and those after the last; no cell beyond the
-            grid.
-        squares: (S,) squared radii.
-        sharpness: (S,).
-        sums: (S, k), updated.
+    The first bearing of cell (x, y) is start[x * side + y]. `cells` (n, 2, 2) are the first cells in x and y around
+    each direction (n, 3), and those after the last; no cell beyond the grid. `squares` (S,) are the squared radii.
     """
     for j in range(len(directions)):
         x, y, z = directions[j, 0], directions[j, 1], directions[j, 2]
@@ -85,19 +68,12 @@ def _add_up(
 
 
 class HashedPoints(NamedTuple):
-    """Points in cells of twice a tolerance, each in the cells of the corners of the cube around it.
+    """Points in cells of twice a tolerance, each in the cells of the corners of the cube around it."""
 
-    Attributes:
-        points: (n, 3).
-        tolerance: Distance within which a location lies on a point.
-        heads: (2^k,) last slot of a cell, or -1.
-        links: (8 n,) previous slot of the same cell; slot e belongs to point e // 8.
-    """
-
-    points: Array
-    tolerance: float
-    heads: NDArray[np.int64]
-    links: NDArray[np.int64]
+    points: Array  # (n, 3)
+    tolerance: float  # distance within which a location lies on a point
+    heads: NDArray[np.int64]  # (2^k,) last slot of a cell, or -1
+    links: NDArray[np.int64]  # (8 n,) previous slot of the same cell; slot e belongs to point e // 8
 
 
 def hashed(points: Array, tolerance: float) -> HashedPoints:

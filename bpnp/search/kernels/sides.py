@@ -32,41 +32,26 @@ FORWARD = np.array([0.0, 0.0, 1.0])
 
 
 class WeightedBearings(NamedTuple):
-    """Bearings with weights.
+    """Bearings with weights."""
 
-    Attributes:
-        f: (3, m) offsets (`kernels.dense`).
-        a: (m,) weights.
-        odds: (m,) fraction of the points with a fitting label; it multiplies the density of outliers.
-        label: (m,); -1 fits any label.
-    """
-
-    f: Array
-    a: Array
-    odds: Array
-    label: NDArray[np.int32]
+    f: Array  # (3, m) offsets (`kernels.dense`)
+    a: Array  # (m,) weights
+    odds: Array  # (m,) fraction of the points with a fitting label; it multiplies the density of outliers
+    label: NDArray[np.int32]  # (m,); -1 fits any label
 
 
 class WeightedPoints(NamedTuple):
-    """Scene points with weights.
+    """Scene points with weights."""
 
-    Attributes:
-        p: (3, n).
-        b: (n,) weights.
-        odds: (n,) fraction of the bearings with a fitting label.
-        label: (n,); -1 fits any label.
-        blocks: (k, 4) of clusters in the order of their labels. The bearings from blocks[:, 0] to [:, 1] fit the points
-            from [:, 2] to [:, 3].
-        cones: (6, n) coefficients of the visibility, (6, 0) if all points are seen from everywhere:
-            v_j = min(max((cones[:3, j] . C + cones[3, j]) / |C - p_j| + cones[4, j], cones[5, j]), 1), C the camera's
-            centre.
-    """
-
-    p: Array
-    b: Array
-    odds: Array
-    label: NDArray[np.int32]
+    p: Array  # (3, n)
+    b: Array  # (n,) weights
+    odds: Array  # (n,) fraction of the bearings with a fitting label
+    label: NDArray[np.int32]  # (n,); -1 fits any label
+    # (k, 4) of clusters in the order of their labels. The bearings from blocks[:, 0] to [:, 1] fit the points from
+    # [:, 2] to [:, 3].
     blocks: NDArray[np.uintp]
+    # (6, n) coefficients of the visibility, (6, 0) if all points are seen from everywhere:
+    # v_j = min(max((cones[:3, j] . C + cones[3, j]) / |C - p_j| + cones[4, j], cones[5, j]), 1), C the camera's centre.
     cones: Array
 
 
@@ -89,19 +74,13 @@ def visible_weights(points: Any, rotation: Any, translation: Any, weight: Any) -
 
 
 class Side(NamedTuple):
-    """One side of a problem in random order.
+    """One side of a problem in random order."""
 
-    Attributes:
-        points: (k, 3) offsets of bearings, or points.
-        weights: (k,) probability of a correspondence; 1 without annotations.
-        labels: (k,); -1 fits any label.
-        cones: (k, 4) unit normals and the cosine at which a point is half visible. (k, 0) for bearings, and for points
-            that are seen from everywhere.
-    """
-
-    points: Array
-    weights: Array
-    labels: NDArray[np.int32]
+    points: Array  # (k, 3) offsets of bearings, or points
+    weights: Array  # (k,) probability of a correspondence; 1 without annotations
+    labels: NDArray[np.int32]  # (k,); -1 fits any label
+    # (k, 4) unit normals and the cosine at which a point is half visible. (k, 0) for bearings, and for points that are
+    # seen from everywhere.
     cones: Array
 
     def at(self, chosen: slice | NDArray[np.int64]) -> "Side":
@@ -122,14 +101,9 @@ class Side(NamedTuple):
 
 
 def side_of(points: Array, scores: Any, labels: Any, cones: Any, order: NDArray[np.int64]) -> Side:
-    """Build a side.
+    """Return a side of points (k, 3) that are in the given order (k,) of the user's indices already.
 
-    Args:
-        points: (k, 3) points, already in the given order.
-        scores: Probabilities of a correspondence in the user's order; None for 1.
-        labels: Labels in the user's order; None for none.
-        cones: (-, 4) normals and cosines in the user's order; None for none.
-        order: (k,) indices in the user's order.
+    The annotations are in the user's order: None for scores of 1, no labels, no cones.
     """
     k = len(points)
     return Side(
@@ -175,17 +149,9 @@ def _clusters(side: Side, count: int, rng: np.random.Generator) -> Side:
 
 
 def lloyd(points: Array, centres: Array, iterations: int, weights: Array) -> tuple[Array, NDArray[np.float64]]:
-    """Run k-means (Lloyd).
+    """Run k-means (Lloyd) from initial centres (k, d); return the centres, and the weights (k,) of the points of each.
 
-    Args:
-        points: (n, d).
-        centres: (k, d) initial centres.
-        iterations: Number of iterations.
-        weights: (n,) weights of the points.
-
-    Returns:
-        Centres (k, d), and the weights (k,) of the points nearest to each. A centre without points keeps its last
-        value.
+    A centre without points keeps its last value.
     """
     extended = np.column_stack([points, np.ones(len(points), points.dtype)])
     for i in range(iterations + 1):

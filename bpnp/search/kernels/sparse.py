@@ -32,26 +32,16 @@ class Tiles(NamedTuple):
     """Bearings in c tiles of `LANES`, and a grid across the view.
 
     Cell (i, j) of the grid is number 1 + i * shape[1] + j; number 0 is outside.
-
-    Attributes:
-        f: (c, 3, lanes) offsets.
-        a: (c, lanes) weights; the last tile is filled up with bearings of weight 0.
-        odds: (c, lanes), as in `WeightedBearings`.
-        label: (c, lanes), as in `WeightedBearings`.
-        box: (c, 4) least x and y of a tile, and largest.
-        low: (2,) corner of the grid.
-        cell: Width of a cell.
-        shape: (2,) cells along x and y.
     """
 
-    f: Array
-    a: Array
-    odds: Array
-    label: NDArray[np.int32]
-    box: Array
-    low: Array
+    f: Array  # (c, 3, lanes) offsets
+    a: Array  # (c, lanes) weights; the last tile is filled up with bearings of weight 0
+    odds: Array  # (c, lanes), as in `WeightedBearings`
+    label: NDArray[np.int32]  # (c, lanes), as in `WeightedBearings`
+    box: Array  # (c, 4) least x and y of a tile, and largest
+    low: Array  # (2,) corner of the grid
     cell: np.float32
-    shape: NDArray[np.int32]
+    shape: NDArray[np.int32]  # (2,) cells along x and y
 
     def with_margin(self, scale: float) -> "Tiles":
         """Return the tiles with a grid that covers the bearings and the reach of a kernel of this scale, radians."""
@@ -62,17 +52,11 @@ class Tiles(NamedTuple):
 
 
 class Near(NamedTuple):
-    """Pairs e of a tile and a point near it, in the order of the tiles: those of tile t from end[t] to end[t + 1].
+    """Pairs e of a tile and a point near it, in the order of the tiles: those of tile t from end[t] to end[t + 1]."""
 
-    Attributes:
-        point: (e,) indices of points.
-        kernel: (e, lanes) kernel of the tile's bearings and this point.
-        end: (c + 1,).
-    """
-
-    point: NDArray[np.int32]
-    kernel: Array
-    end: NDArray[np.int32]
+    point: NDArray[np.int32]  # (e,) indices of points
+    kernel: Array  # (e, lanes) kernel of the tile's bearings and this point
+    end: NDArray[np.int32]  # (c + 1,)
 
 
 def build_tiles(bearings: WeightedBearings) -> Tiles:
@@ -123,22 +107,11 @@ def cells_between(first: Any, last: Any, low: Any, cell: Any, size: Any) -> tupl
 
 @part
 def meet(tiles: Any, labels: Any, u: Any, scale: Any, start: Any, order: Any, near: Any) -> bool:
-    """Fill `near` with the pairs of a tile and a point within reach, and their kernels.
+    """Fill `near` with the pairs of a tile and a point within reach, and their kernels; False if it is too small.
 
-    The kernel is (1 + y + y^2/2 + y^3/6)^64, y = -|f - u|^2 / 128 s^2, within 1e-4 of exp(64 y), and 0 beyond `reach`.
-    It is also 0 for labels that do not fit.
-
-    Args:
-        tiles: Tiles of the bearings.
-        labels: (n,) labels of the points.
-        u: (3, n) offsets of their directions.
-        scale: s, radians.
-        start: Ends of the cells, from `sort_points`.
-        order: Points by their cells, from `sort_points`.
-        near: A `Near`, overwritten.
-
-    Returns:
-        False if `near` is too small for all pairs.
+    The kernel is (1 + y + y^2/2 + y^3/6)^64, y = -|f - u|^2 / 128 s^2, within 1e-4 of exp(64 y), and 0 beyond
+    `KERNEL_REACH`. It is also 0 for labels that do not fit. u (3, n) are the offsets of the points' directions, s the
+    scale in radians; `start` and `order` are those of `sort_points`.
     """
     f, label, box, low, cell, shape = tiles.f, tiles.label, tiles.box, tiles.low, tiles.cell, tiles.shape
     point, kernel, end = near
@@ -227,37 +200,21 @@ def add_moments(f: Any, u: Any, row: Any, column: Any, near: Any, q: Any) -> Non
 
 
 class SparseScratch(NamedTuple):
-    """Buffers of `descend_sparse`, for c tiles and n points.
+    """Buffers of `descend_sparse`, for c tiles and n points."""
 
-    Attributes:
-        u: (3, n) directions of the points.
-        cells: (n,) their cells.
-        start: End of each cell in the order, which is the start of the next.
-        order: (n,) points by their cells.
-        near: Pairs of tiles and points.
-        sums: (c, lanes).
-        row: (c, lanes).
-        column: (n,).
-        weight: (n,).
-        q: (4, n).
-        system: (8, 6) normal equations.
-        best: (4, 3) best pose of an annealing.
-        first: (4, 3) its initial pose.
-    """
-
-    u: Any
-    cells: Any
-    start: Any
-    order: Any
+    u: Any  # (3, n) directions of the points
+    cells: Any  # (n,) their cells
+    start: Any  # end of each cell in the order, which is the start of the next
+    order: Any  # (n,) points by their cells
     near: Near
-    sums: Any
-    row: Any
-    column: Any
-    weight: Any
-    q: Any
-    system: Any
-    best: Any
-    first: Any
+    sums: Any  # (c, lanes)
+    row: Any  # (c, lanes)
+    column: Any  # (n,)
+    weight: Any  # (n,)
+    q: Any  # (4, n)
+    system: Any  # (8, 6) normal equations
+    best: Any  # (4, 3) best pose of an annealing
+    first: Any  # (4, 3) its initial pose
 
 
 def sparse_scratch(tiles: Tiles, n: int, pairs: int = 0) -> SparseScratch:
@@ -274,24 +231,13 @@ def sparse_scratch(tiles: Tiles, n: int, pairs: int = 0) -> SparseScratch:
 def assign_sparse(
     tiles: Any, points: Any, rotation: Any, translation: Any, scale: Any, outlier: Any, scratch: Any
 ) -> Any:
-    """Fill q by Sinkhorn iterations with slack.
+    """Fill q by Sinkhorn iterations with slack at a scale in radians.
 
     W_ij = x_i K_ij y_j, x_i = a_i/(e_i + sum_j K_ij y_j), y_j = b_j/(e_j + sum_i K_ij x_i), e^2 = o sqrt(A B) times the
     odds, A and B the sums of the weights a and b. Among points of weight 1 a lone pair is matched where its kernel
-    exceeds e^2. The outlier density dominates below that in the product form too.
-
-    Args:
-        tiles: Tiles of the bearings.
-        points: A `WeightedPoints`; the weights b_j under this pose are in the scratch.
-        rotation: (3, 3).
-        translation: (3,).
-        scale: Radians.
-        outlier: o of `Scene.outlier_density`.
-        scratch: A `SparseScratch`, overwritten.
-
-    Returns:
-        The mean log-likelihood of the bearings, the matched fraction, and False if the scratch is too small for all
-        pairs.
+    exceeds e^2. The outlier density dominates below that in the product form too. The weights b_j under this pose are
+    in the scratch; `outlier` is o of `Scene.outlier_density`. Return the mean log-likelihood of the bearings, the
+    matched fraction, and False if the scratch is too small for all pairs.
     """
     a, odds2d, odds3d, n = tiles.a, tiles.odds, points.odds, points.p.shape[1]
     u, near, sums = scratch.u, scratch.near, scratch.sums
@@ -336,23 +282,12 @@ def descend_sparse(
     result: Any,
     scratch: Any,
 ) -> int:
-    """Anneal poses in place to the scale that explains the bearings best.
+    """Anneal poses (S, 3, 3), (S, 3) in place to the scale that explains the bearings best.
 
-    An annealing stops `patience` scales after its likelihood was highest and returns to the pose of that scale.
-
-    Args:
-        tiles: Tiles of the bearings.
-        points: A `WeightedPoints`.
-        rotation: (S, 3, 3), overwritten.
-        translation: (S, 3), overwritten.
-        scales: (k,) radians.
-        outlier: o / s^2 of `Scene.outlier_density`.
-        patience: Scales without a higher likelihood.
-        result: (S, 3) likelihood, matched fraction and scale, written; -inf, 0, 0 for a pose that is not finite.
-        scratch: A `SparseScratch`, overwritten.
-
-    Returns:
-        The number of poses annealed. If it is less than S, the scratch was too small for the next pose, left unchanged.
+    An annealing stops `patience` scales after its likelihood was highest and returns to the pose of that scale. The
+    scales (k,) are in radians; `outlier` is o / s^2 of `Scene.outlier_density`. The result (S, 3) is likelihood,
+    matched fraction and scale; -inf, 0, 0 for a pose that is not finite. Return the number of poses annealed: if it is
+    less than S, the scratch was too small for the next pose, left unchanged.
     """
     best, first = scratch.best, scratch.first
     for k in range(len(rotation)):

@@ -60,7 +60,7 @@ def direction(x: Any, y: Any, z: Any) -> Any:
 
 @part
 def turn(rotation: Any, vector: Any) -> None:
-    """Apply R <- exp([w]x) R in place through a unit quaternion; w = vector[:3], clipped to length `largest_turn`."""
+    """Apply R <- exp([w]x) R in place through a unit quaternion; w = vector[:3], clipped to length `LARGEST_TURN`."""
     x, y, z = vector[0], vector[1], vector[2]
     angle: Any = math.sqrt(x * x + y * y + z * z)
     shrink = F(LARGEST_TURN) / angle if angle > F(LARGEST_TURN) else F(1)

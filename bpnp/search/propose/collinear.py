@@ -32,17 +32,11 @@ Array = NDArray[np.float64]
 
 
 class Line(NamedTuple):
-    """Line through many of some points.
+    """Line through many of some points."""
 
-    Attributes:
-        point: (3,) a point of the line.
-        axis: (3,) unit vector along it.
-        radius: Largest distance from the line of a point that lies on it.
-    """
-
-    point: Array
-    axis: Array
-    radius: float
+    point: Array  # (3,) a point of the line
+    axis: Array  # (3,) unit vector along it
+    radius: float  # largest distance from the line of a point that lies on it
 
     def distances(self, points: Array) -> Array:
         """Return the distances (n,) of points (n, 3) from the line."""
@@ -50,13 +44,10 @@ class Line(NamedTuple):
 
 
 def find_line(points: Array) -> Line | None:
-    """Return the line through most of the points, of those through two of them.
+    """Return the line through most of the points (n, 3), of those through two of them.
 
-    Args:
-        points: (n, 3) points; of more than `LINE_PAIRS` a sample of this size is used.
-
-    Returns:
-        The line, or None if fewer than `FEWEST_ON_LINE` points or less than `LEAST_ON_LINE` of them lie on it.
+    None if fewer than `FEWEST_ON_LINE` points or less than `LEAST_ON_LINE` of them lie on it. Of more than `LINE_PAIRS`
+    points a sample of this size is used.
 
     >>> points = np.concatenate([np.outer(np.linspace(-1, 1, 9), [1, 0, 0]), np.eye(3)])
     >>> line = find_line(points)
@@ -91,15 +82,8 @@ def rotations_about(
 ) -> tuple[Array, Array]:
     """Return a pose rotated about a line by those angles under which most other points are seen at image points.
 
-    Args:
-        problem: Points of the problem.
-        rotation: (3, 3) of the pose.
-        translation: (3,) of the pose.
-        line: Line that holds most of its matched points.
-        scale: Standard deviation of its residuals, radians.
-
-    Returns:
-        Rotations (c, 3, 3) and translations (c, 3) of at most `KEPT_ANGLES` poses.
+    The line holds most matched points of the pose; `scale` is the standard deviation of its residuals, radians. There
+    are at most `KEPT_ANGLES` poses.
 
     >>> line = np.outer(np.linspace(-1, 1, 9), [1, 0, 0])
     >>> points = np.concatenate([line, [[0.1, 1, 0], [-0.4, 0, 0.9], [0.7, 0.2, -0.6]]])

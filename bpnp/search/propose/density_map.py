@@ -58,15 +58,9 @@ EVERYWHERE = DensitySearch(  # density-map search over all rotations [`DensitySe
 
 
 def search_near(scene: Scene, prior: PosePrior, density: DensitySearch | None = None) -> Hypotheses:
-    """Run density-map searches from initial poses drawn from a prior.
+    """Return the distinct annealed poses of density-map searches from a prior with a translation, in the scene's frame.
 
-    Args:
-        scene: Points, settings and deadline.
-        prior: Prior with a translation, in the frame of the scene.
-        density: Settings of one search; None for all of `settings.near`.
-
-    Returns:
-        Distinct annealed poses of all searches.
+    None for all searches of `settings.near`.
     """
     searches = scene.settings.near if density is None else (density,)
     starts = (
@@ -78,13 +72,7 @@ def search_near(scene: Scene, prior: PosePrior, density: DensitySearch | None = 
 def search_density(scene: Scene, poses: Hypotheses, density: DensitySearch) -> Hypotheses:
     """Preselect initial poses on a density map, narrow the scale, and anneal the best.
 
-    Args:
-        scene: Points, settings and deadline.
-        poses: Initial poses in the frame of the scene.
-        density: Settings of the search.
-
-    Returns:
-        Distinct annealed poses. Copies of one initial pose count once for the basin counts.
+    Copies of one initial pose count once for the basin counts.
     """
     for points, kept in zip(density.preselection.points, density.preselection.kept, strict=True):
         poses, _ = preselect(scene, poses, density.density_map, density.narrowing.first_scale, points, kept)
@@ -107,17 +95,10 @@ def search_density(scene: Scene, poses: Hypotheses, density: DensitySearch) -> H
 
 
 def search_everywhere(scene: Scene, number: int, prior: Prior | None) -> Hypotheses:
-    """Run a density-map search over all rotations, aimed at one position in the view.
+    """Run a density-map search over all rotations, or those of a prior, aimed at one position in the view.
 
-    Near one position the correct pose has fewer competitors. If the position is correct, few searches miss the pose.
-
-    Args:
-        scene: Points, settings and deadline.
-        number: Index of the search, from 0, which determines the position.
-        prior: Prior of the rotations, in the frame of the scene; None for all rotations.
-
-    Returns:
-        Distinct annealed poses.
+    The position is that of the search's number, from 0. Near one position the correct pose has fewer competitors: if it
+    is correct, few searches miss the pose.
     """
     density, aim = EVERYWHERE, aim_of(number)
     drawn = draw_poses(scene.spread, scene.bulk3d, density.draws.starts, RECIPES[0], prior, scene.rng, aim)
@@ -125,15 +106,9 @@ def search_everywhere(scene: Scene, number: int, prior: Prior | None) -> Hypothe
 
 
 def search_around(scene: Scene, pose: Hypotheses, density: DensitySearch) -> Hypotheses:
-    """Run a local search around a pose.
+    """Run a local search around one pose in the frame of the scene, with the widest prior of the settings.
 
-    Args:
-        scene: Points, settings and deadline.
-        pose: One pose in the frame of the scene; the widest prior of the settings is centred on it.
-        density: Settings of the search.
-
-    Returns:
-        Distinct annealed poses with basin counts of 0.
+    The distinct annealed poses have basin counts of 0.
     """
     prior = PosePrior(pose.rotation[0], pose.translation[0], density.draws.wide_deg)
     sigma = density.draws.wide_shift * distance_of(scene, prior)
@@ -163,12 +138,10 @@ def _volume(scene: Scene, prior: PosePrior, density: DensitySearch) -> float:
 
 
 def reach_across(scene: Scene, prior: PosePrior, density: DensitySearch) -> float:
-    """Return how far from the centre of the view the centroid of the points may lie, across the view.
+    """Return how far from the centre of the view the centroid of the points may lie along each axis, scene units.
 
-    Farther away, most of the points are outside the view. A telephoto view is much narrower than most priors.
-
-    Returns:
-        Distance along each axis, scene units; infinite for a rig, whose other cameras see the points too.
+    Farther away, most of the points are outside the view; a telephoto view is much narrower than most priors. Infinite
+    for a rig, whose other cameras see the points too.
     """
     if scene.companions:
         return math.inf
@@ -178,16 +151,10 @@ def reach_across(scene: Scene, prior: PosePrior, density: DensitySearch) -> floa
 
 
 def draw_around(scene: Scene, prior: PosePrior, count: int, reach: float = math.inf) -> Hypotheses:
-    """Draw poses from a prior, with the centroid of the points at most `reach` from the centre of the view.
+    """Draw poses with basin counts of 1 from a prior with a translation; the first is its mean.
 
-    Args:
-        scene: Points and random generator.
-        prior: Prior with a translation, in the frame of the scene.
-        count: Number of poses; the first is the mean of the prior.
-        reach: Largest distance along each axis across the view, scene units; extended to the mean of the prior.
-
-    Returns:
-        (count,) hypotheses with basin counts of 1.
+    The centroid of the points is at most `reach` scene units from the centre of the view along each axis; the bound is
+    extended to the mean of the prior.
     """
     mean = np.asarray(prior.rotation, np.float32)[None], np.asarray(prior.translation, np.float32)[None]
     vectors = math.radians(prior.rotation_sigma_deg) * scene.rng.standard_normal((count, 3), np.float32)
@@ -209,12 +176,9 @@ def _truncated(normal: NDArray[np.float32], low: float, high: float) -> NDArray[
 
 
 def select_admitted(scene: Scene, poses: Hypotheses, prior: Prior | None) -> Hypotheses:
-    """Select the poses within `ADMITTED_SIGMAS` standard deviations of a prior.
+    """Select the poses of a scene within `ADMITTED_SIGMAS` standard deviations of a prior of the problem.
 
-    Args:
-        scene: Points and settings.
-        poses: Poses in the frame of the scene.
-        prior: Prior in the frame of the problem; all poses are returned unless it is a `PosePrior`.
+    All poses are returned unless it is a `PosePrior`.
     """
     if not isinstance(prior, PosePrior):
         return poses
@@ -230,16 +194,9 @@ def select_admitted(scene: Scene, poses: Hypotheses, prior: Prior | None) -> Hyp
 
 
 def perturb(scene: Scene, poses: Hypotheses, scale: float, copies: int) -> Hypotheses:
-    """Return the poses and randomly perturbed copies of them.
+    """Return each pose followed by `copies` - 1 randomly perturbed ones, with its basin count.
 
-    Args:
-        scene: Points and random generator.
-        poses: (k,) in the frame of the scene.
-        scale: Angular distance by which the points move, in units of the RMS angular radius of the bearings.
-        copies: Number of poses that replace each one, itself first.
-
-    Returns:
-        (k * copies,) poses with the basin counts of their originals.
+    The points move by an angular distance of `scale` RMS angular radii of the bearings.
     """
     vectors, shifts = np.float32(scale) * scene.rng.standard_normal((2, copies * len(poses), 3), np.float32)
     depth = np.linalg.norm(poses.rotation @ scene.bulk3d.mean(0) + poses.translation, axis=-1)
@@ -257,18 +214,10 @@ def perturb_each(scene: Scene, poses: Hypotheses) -> Hypotheses:
 def preselect(
     scene: Scene, poses: Hypotheses, shape: DensityShape, scale: float, points: int, kept: int
 ) -> tuple[Hypotheses, NDArray[np.int64]]:
-    """Score poses on the density maps of all rig cameras and select the best.
+    """Return the best poses on the density maps of all rig cameras, at most `kept`, and their indices.
 
-    Args:
-        scene: Points, settings and deadline.
-        poses: Poses in the frame of the scene.
-        shape: Shape of the density map.
-        scale: Smoothing of the bearings, in units of their RMS angular radius.
-        points: Number of 3D points to score.
-        kept: Number of poses to return, at most; fewer are scored after the deadline.
-
-    Returns:
-        The poses, best first, and their indices in `poses`.
+    The bearings are smoothed by `scale` of their RMS angular radii, and `points` 3D points are scored. Fewer poses are
+    scored after the deadline.
     """
     score = np.zeros(len(poses), np.float32)
     cameras = [(scene, poses.rotation, poses.translation)]
@@ -290,12 +239,9 @@ def preselect(
 
 
 def density_map_of(scene: Scene, shape: DensityShape, scale: float) -> DensityMap:
-    """Return the density map of the bearings of a scene; the scene stores it.
+    """Return the density map of the bearings of a scene, smoothed by `scale` of their RMS angular radii.
 
-    Args:
-        scene: Bearings.
-        shape: Shape of the map.
-        scale: Smoothing, in units of the RMS angular radius of the bearings.
+    The scene stores it.
     """
     if (shape, scale) not in scene.density_maps:
         scene.density_maps[shape, scale] = _draw_density_map(scene, shape, scale)

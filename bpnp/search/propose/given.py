@@ -21,19 +21,11 @@ Array = NDArray[np.float64]
 
 @one_blas_thread
 def anneal_given(scene: Scene, rotation: Array, translation: Array) -> Hypotheses:
-    """Anneal poses, with perturbed copies of the first few.
+    """Anneal poses of a problem, with perturbed copies of the first few; the poses that result have no NFA.
 
     The objective is that of `bpnp.search.search.search_poses`. An initial pose may be about 10 degrees off, and more if
-    there are many. If there are more than `refined_directly`, all are first annealed on clusters, as in the search, and
-    the likeliest go on.
-
-    Args:
-        scene: Points, settings and deadline.
-        rotation: (s, 3, 3) initial rotations in the frame of the problem; NaN for a missing one.
-        translation: (s, 3) initial translations.
-
-    Returns:
-        Distinct poses in the frame of the problem, without an NFA; none without an initial pose.
+    there are many; NaN for a missing one. If there are more than `REFINED_DIRECTLY`, all are first annealed on
+    clusters, as in the search, and the likeliest go on.
     """
     starts = enter_given(scene, rotation, translation)
     if not len(starts):
@@ -51,18 +43,11 @@ def anneal_given(scene: Scene, rotation: Array, translation: Array) -> Hypothese
 
 @one_blas_thread
 def score_given(scene: Scene, rotation: Array, translation: Array) -> Hypotheses:
-    """Anneal poses a little, to score them like those of a search.
+    """Anneal poses of a problem a little, to score them like those of a search; NaN for a missing one.
 
     The residuals are assumed to have the median distance of a point to the nearest bearing. Basin counts are 0, since
-    no other starts were tried: only overwhelming evidence makes the best pose confident.
-
-    Args:
-        scene: Points, settings and deadline, after which the remaining poses are not annealed.
-        rotation: (c, 3, 3) rotations in the frame of the problem; NaN for a missing one.
-        translation: (c, 3) translations.
-
-    Returns:
-        Distinct poses in the frame of the problem, without an NFA; none without a pose.
+    no other starts were tried: only overwhelming evidence makes the best pose confident. After the deadline the
+    remaining poses are not annealed.
     """
     starts = enter_given(scene, rotation, translation)
     if not len(starts):

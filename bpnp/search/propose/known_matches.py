@@ -35,11 +35,9 @@ NEGLIGIBLE_SUM = 1e-24  # sum of squares that ends the steps [radians squared; n
 
 
 def known_matches(problem: Problem) -> tuple[Labels, Labels] | None:
-    """Return the matches that unique labels define, or None.
+    """Return the indices (k,) of the image and of the scene points that unique labels match, or None.
 
-    Returns:
-        Indices (k,) of image points and (k,) of scene points. None unless each point with a possible correspondence has
-        exactly one, and there are more matches than fix a pose.
+    None unless each point with a possible correspondence has exactly one, and there are more matches than fix a pose.
 
     >>> problem = Problem(np.eye(4, 3), np.eye(4, 3), labels2d=np.array([3, 2, 1, 0]), labels3d=np.arange(4))
     >>> known_matches(problem)
@@ -55,17 +53,11 @@ def known_matches(problem: Problem) -> tuple[Labels, Labels] | None:
 
 
 def poses_of_matches(problem: Problem, i: Labels, j: Labels, seed: int = 0) -> Hypotheses:
-    """Return distinct poses that matches fit best.
+    """Return distinct poses that more than three matches of image points i (k,) and scene points j (k,) fit best.
 
-    Args:
-        problem: Points of the problem.
-        i: (k,) indices of image points, more than three.
-        j: (k,) indices of their scene points.
-        seed: Of the triples that are drawn where there are more than `MOST_TRIPLES`.
-
-    Returns:
-        The least-squares poses of all matches, then those of the matches that agree, each with the fewest residuals
-        first; empty if no triple has a pose.
+    These are the least-squares poses of all matches, then those of the matches that agree, each with the fewest
+    residuals first; none if no triple has a pose. The seed is that of the triples, drawn where there are more than
+    `MOST_TRIPLES`.
     """
     rays, points = problem.bearings[i], problem.points3d[j]
     centroid = points.mean(0)

@@ -31,27 +31,18 @@ Array = NDArray[np.float64]
 
 
 class LensFit(NamedTuple):
-    """Pose and camera model.
+    """Pose and camera model."""
 
-    Attributes:
-        rotation: (3, 3).
-        centre3d: (3,) centroid of the scene in the camera's frame.
-        zoom: Scale factor: focal length over that of the bearings.
-        radial: Radial coefficient k; None if only the focal length is fitted.
-    """
-
-    rotation: Array
-    centre3d: Array
-    zoom: float
-    radial: float | None
+    rotation: Array  # (3, 3)
+    centre3d: Array  # (3,) centroid of the scene in the camera's frame
+    zoom: float  # scale factor: focal length over that of the bearings
+    radial: float | None  # radial coefficient k; None if only the focal length is fitted
 
 
 def lens_model(problem: Problem, *, bends: bool) -> PoseModel:
-    """Return the model of a pose and its focal length, with the prior of the problem.
+    """Return the model of a pose and its focal length, with the prior of a problem without distortion.
 
-    Args:
-        problem: Points; the bearings are those of a camera without distortion.
-        bends: True if a radial coefficient is unknown too; it has no prior.
+    If it `bends`, a radial coefficient is unknown too; it has no prior.
     """
     lens = UnknownFocal(0.0) if problem.focal is None else problem.focal
     return PoseModel(problem.centre3d, lens._replace(radial=0.0, radial_sigma=math.inf if bends else 0.0))
@@ -62,18 +53,10 @@ def fit_lens(
 ) -> LensFit | None:
     """Fit pose, focal length and optionally the radial coefficient to soft matches by Gauss-Newton steps.
 
-    The first steps use some of the image points and matches of wider scales. The last ones use all points, until the
-    focal length has converged.
-
-    Args:
-        problem: Points; the bearings are those of a camera without distortion.
-        rotation: (3, 3) initial rotation.
-        centre3d: (3,) initial centroid of the scene in the camera's frame.
-        scale: Scale of the residuals, radians.
-        radial: Initial radial coefficient; None to fit no distortion.
-
-    Returns:
-        The fit, or None if no points match.
+    The pose is given by rotation and centroid of the scene in the camera's frame, the residuals have the scale of
+    `scale` radians, and `radial` is None to fit no distortion; the bearings are those of a camera without one. The
+    first steps use some of the image points and matches of wider scales. The last ones use all points, until the focal
+    length has converged. None if no points match.
 
     >>> rng = np.random.default_rng(0)
     >>> points = rng.uniform(-1, 1, (80, 3)) + [0, 0, 3]

@@ -28,21 +28,14 @@ Array = NDArray[np.float64]
 
 
 class Triangles(NamedTuple):
-    """Triangles of scene points, for P3P.
+    """Triangles of scene points, for P3P."""
 
-    Attributes:
-        triples: (t, 3) indices of the points, in cyclic order so that the longest side is 12.
-        sides: (t, 3) |p_0 - p_1|^2 / s^2, |p_2 - p_0|^2 / s^2 and s = |p_1 - p_2|.
-        frames: (t, 3, 3), rows along the longest side, across it, and the normal.
-        centroids: (t, 3) centroids.
-        orientation: (t,), 1 where a camera can see the points in the order of the triangle's normal, 2 in the other
-            order, 3 either, 0 where the points lie on a line or are not finite.
-    """
-
-    triples: NDArray[np.int64]
-    sides: Array
-    frames: Array
-    centroids: Array
+    triples: NDArray[np.int64]  # (t, 3) indices of the points, in cyclic order so that the longest side is 12
+    sides: Array  # (t, 3) |p_0 - p_1|^2 / s^2, |p_2 - p_0|^2 / s^2 and s = |p_1 - p_2|
+    frames: Array  # (t, 3, 3), rows along the longest side, across it, and the normal
+    centroids: Array  # (t, 3) centroids
+    # (t,), 1 where a camera can see the points in the order of the triangle's normal, 2 in the other order, 3 either, 0
+    # where the points lie on a line or are not finite.
     orientation: NDArray[np.int64]
 
 
@@ -63,21 +56,16 @@ def triangles_of(points: Array, triples: NDArray[np.int64]) -> Triangles:
 
 
 def p3p_poses(rays: Array, points: Array) -> Array:
-    """Solve d_i f_i = R p_i + t, d_i > 0, for triples of matches in float64.
+    """Solve d_i f_i = R p_i + t, d_i > 0, for triples of rays f and points p, (t, 3, 3) each, in float64.
 
     With x = d_0/d_2 and y = d_1/d_2 the law of cosines in the triangles at the camera gives two conics in (x, y). One
     real root s of the cubic det(C1 + s C2) = 0 makes their pencil a pair of lines, and each line meets the conics in at
-    most two points (Ding, Yang, Larsson, Olsson, Astrom: Revisiting the P3P Problem, CVPR 2023). Newton steps on
-    |d_i f_i - d_j f_j| = |p_i - p_j| then make the depths exact.
+    most two points (Ding, Yang, Larsson, Olsson, Astrom: Revisiting the P3P Problem, CVPR 2023). Newton steps on |d_i
+    f_i - d_j f_j| = |p_i - p_j| then make the depths exact.
 
-    Args:
-        rays: (t, 3, 3) rays of three matches in the camera frame, of any length.
-        points: (t, 3, 3) their scene points, any scale and offset.
-
-    Returns:
-        (t, 4, 4, 3) up to four poses of each triple in no order, R and t below it; NaN where there is none: for points
-        on a line, within a millionth of the longest side, for rays that no pose explains, for NaN and infinity. A
-        double solution appears twice.
+    Rays may have any length, points any scale and offset. Up to four poses (t, 4, 4, 3) of each triple are in no order,
+    R and t below it; a double solution appears twice. NaN where there is none: for points on a line, within a millionth
+    of the longest side, for rays that no pose explains, for NaN and infinity.
     """
     poses = np.full((len(points), 4, 4, 3), np.nan)
 
@@ -107,19 +95,7 @@ def _solve_each(rays: Any, triangles: Any, poses: Any, scratch: Any) -> None:
 
 @part
 def solve_p3p(rays: Any, seen: Any, chords: Any, triangles: Any, t: int, poses: Any) -> int:
-    """Fill `poses` with those under which triangle t is seen along three of the rays.
-
-    Args:
-        rays: (m, 3) unit vectors.
-        seen: Three indices of rays.
-        chords: Result of `chords_between` for these rays.
-        triangles: A `Triangles`.
-        t: Index of the triangle.
-        poses: (4, 4, 3), written.
-
-    Returns:
-        The number of poses.
-    """
+    """Fill `poses` with those under which triangle t is seen along three of the unit rays; return their number."""
     i, j, k = seen
     sides, frame, centroid = triangles.sides[t], triangles.frames[t], triangles.centroids[t]
     count = 0
@@ -164,18 +140,10 @@ def _distance2(f: Any, g: Any) -> float:
 
 @part
 def p3p_depths(chords: Any, a: float, b: float, poses: Any) -> int:
-    """Solve |d_i f_i - d_j f_j| = |p_i - p_j| for the depths d_i > 0 of three rays.
+    """Solve |d_i f_i - d_j f_j| = |p_i - p_j| for the depths d_i > 0 of three rays; return the number of solutions.
 
-    `p3p_poses` defines the conics and lines.
-
-    Args:
-        chords: Result of `chords_between` for the rays.
-        a: |p_0 - p_1|^2 over |p_1 - p_2|^2.
-        b: |p_2 - p_0|^2 over |p_1 - p_2|^2.
-        poses: The depths are written to poses[:, 3], in units of |p_1 - p_2|.
-
-    Returns:
-        The number of solutions, 0 to 4.
+    a is |p_0 - p_1|^2 and b |p_2 - p_0|^2, over |p_1 - p_2|^2. The 0 to 4 depths are written to poses[:, 3], in units
+    of |p_1 - p_2|. `p3p_poses` defines the conics and lines.
     """
     m01, m12, m20 = 1 - 0.5 * chords[0], 1 - 0.5 * chords[1], 1 - 0.5 * chords[2]
     # Symmetric matrices by their components xx, xy, xw, yy, yw, ww.
@@ -287,7 +255,7 @@ def _meet(line: Any, conics: Any, chords: Any, a: float, b: float, poses: Any, c
         if not (x > 0 and y > 0 and x < math.inf and y < math.inf):
             continue
         d2 = 1 / math.sqrt((1 - y) * (1 - y) + y * chords[1])
-        if anneal_to_end(x * d2, y * d2, d2, chords, a, b, poses[count, 3]):
+        if polish_depths(x * d2, y * d2, d2, chords, a, b, poses[count, 3]):
             count += 1
     return count
 
@@ -303,11 +271,10 @@ def _restricted(conic: Any, steep: bool, slope: float, offset: float) -> tuple[f
 
 
 @part
-def anneal_to_end(d0: float, d1: float, d2: float, chords: Any, a: float, b: float, depths: Any) -> bool:
+def polish_depths(d0: float, d1: float, d2: float, chords: Any, a: float, b: float, depths: Any) -> bool:
     """Refine depths by Newton steps on the three equations, written to `depths` (3,).
 
-    Returns:
-        True if the equations hold there and all d_i > 0.
+    Return True if the equations hold there and all d_i > 0.
     """
     (chord01, chord12, chord20), worst = chords, math.inf
     for step in range(4):
@@ -334,22 +301,10 @@ def anneal_to_end(d0: float, d1: float, d2: float, chords: Any, a: float, b: flo
 def solve_p2p(i: int, j: int, a: int, b: int, heading: Any, rays: Any, points: Any, poses: Any) -> int:
     """Fill `poses` with those under which points a and b are seen along the rays i and j, with a prior direction.
 
-    f, g: the rays, p, q: the points, in frames whose z axis is the direction. With d g - c f = R (q - p), its z
+    f, g: the unit rays, p, q: the points, in frames whose z axis is the direction. With d g - c f = R (q - p), its z
     component is linear in the depths c and d, and the length of its horizontal part quadratic (Kukelova, Bujnak,
-    Pajdla: Closed-form solutions to minimal absolute pose problems with known vertical direction, ACCV 2010).
-
-    Args:
-        i: Index of the first ray.
-        j: Index of the second ray.
-        a: Index of the first point.
-        b: Index of the second point.
-        heading: A `Heading`.
-        rays: (m, 3) unit vectors.
-        points: (n, 3) scene points.
-        poses: (4, 4, 3), written.
-
-    Returns:
-        The number of poses, up to two.
+    Pajdla: Closed-form solutions to minimal absolute pose problems with known vertical direction, ACCV 2010). Return
+    the number of poses, up to two.
     """
     f, g, p, q = heading.rays[i], heading.rays[j], heading.points[a], heading.points[b]
     if max(abs(f[2]), abs(g[2])) < LEVEL_SINE:

@@ -16,15 +16,10 @@ MIRROR = np.array([1.0, 1.0, -1.0])
 
 
 def mirrored_alarms(problem: Problem, deadline: Deadline) -> float:
-    """Compute log10 of the false alarms of a mirrored scene.
+    """Return log10 of the false alarms of the mirror image of a scene without a significant pose.
 
-    Args:
-        problem: Points of a problem without a significant pose.
-        deadline: When to stop.
-
-    Returns:
-        Logarithm for the best pose of a short enumeration; infinite where the points are too many to be enumerated,
-        where a prior of the pose is given, or where no pose was found.
+    It is that of the best pose of a short enumeration; infinite where the points are too many to be enumerated, where a
+    prior of the pose is given, or where no pose was found.
 
     >>> points = np.random.default_rng(0).uniform(-1, 1, (9, 3))
     >>> seen = points * MIRROR + [0, 0, 6]

@@ -34,13 +34,9 @@ ESTIMATES = ("refined", "ransac", "pnp")  # estimates of a prediction, the most 
 
 
 def evaluation_copy(module: nn.Module, device: torch.device | None) -> nn.Module:
-    """Return the module in evaluation mode on a device; a copy unless it is so already.
+    """Return the module in evaluation mode on a device, None for its own; a copy unless it is so already.
 
     The caller's module keeps its device and its training flags, and may be in use by other threads.
-
-    Args:
-        module: The module.
-        device: Device to run on; None for the module's own device.
     """
     evaluates = not any(part.training for part in module.modules())
     if evaluates and device in (None, device_of(module)):
@@ -139,10 +135,8 @@ class NetworkFrame(NamedTuple):
 def view_for(net: nn.Module, problem: Problem) -> NetworkFrame:
     """Return the coordinates in which a network expects the 3D points: the user's, or those of the view of the prior.
 
-    A prior without a translation gets one at which the points appear as large as the image points.
-
-    Raises:
-        ValueError: The network has the frame "view" and there is no `PosePrior`.
+    A prior without a translation gets one at which the points appear as large as the image points. ValueError if the
+    network has the frame "view" and there is no `PosePrior`.
     """
     if getattr(net, "frame", "any") == "any":
         return NetworkFrame(np.eye(3), _near_origin(problem), problem.size)

@@ -46,34 +46,19 @@ Pose = tuple[Array, Array]
 
 
 class Repeated(NamedTuple):
-    """Competing poses due to the motions of a scene, and to the mirror image of a flat one.
+    """Competing poses due to the motions of a scene, and to the mirror image of a flat one."""
 
-    Attributes:
-        poses: (c,) unrefined poses.
-        scale: (c,) scale of the motion of each pose, 1 for rigid ones.
-        motions: All motions, from which the poses were chosen.
-    """
-
-    poses: Hypotheses
-    scale: Array
-    motions: Motions
+    poses: Hypotheses  # (c,) unrefined poses
+    scale: Array  # (c,) scale of the motion of each pose, 1 for rigid ones
+    motions: Motions  # all motions, from which the poses were chosen
 
 
 def registered(problem: Problem, rotation: Array, translation: Array, scale: float) -> Motions:
-    """Return the motions that map the matched points of a pose onto other scene points.
+    """Return the motions that map the matched points of a pose onto other scene points, the largest fraction first.
 
     If a pose is wrong because of a symmetry or a repetition, one of these motions maps nearly all of its matched points
-    onto those of the correct pose. They may be any fraction of the scene.
-
-    Args:
-        problem: Points of the problem.
-        rotation: (3, 3) of the pose.
-        translation: (3,) of the pose.
-        scale: Standard deviation of its residuals, radians.
-
-    Returns:
-        Motions with the fraction of the matched points that each maps, the largest first; none if there are too few
-        matched points.
+    onto those of the correct pose. They may be any fraction of the scene. There are none if too few points are matched.
+    The residuals of the pose have the standard deviation `scale`, radians.
     """
     return _motions_of(problem, rotation, translation, scale, matched_points(problem, rotation, translation, scale))
 
@@ -118,14 +103,7 @@ def _motions_of(
 
 
 def matched_points(problem: Problem, rotation: Array, translation: Array, scale: float) -> NDArray[np.int64]:
-    """Return the indices of the scene points that a pose shows at an image point.
-
-    Args:
-        problem: Points of the problem.
-        rotation: (3, 3) of the pose.
-        translation: (3,) of the pose.
-        scale: Standard deviation of its residuals, radians.
-    """
+    """Return the indices of the scene points that a pose shows at an image point, by residuals of `scale` radians."""
     camera = problem.points3d @ rotation.T + translation
     depth = np.linalg.norm(camera, axis=-1)
     away, nearest = cKDTree(camera / np.maximum(depth, 1e-300)[:, None]).query(problem.bearings)
@@ -161,19 +139,11 @@ def _of_scene(
 def competing_poses(
     problem: Problem, rotation: Array, translation: Array, scale: float, *, least: float = 0.0
 ) -> tuple[Array, Array, Array, Motions]:
-    """Return the competing poses of a pose: by motions of its matched points, about a line of these, and from afar by
-    reflections of these or the mirror image of a flat scene.
+    """Return the competing poses of a pose, the scales (c,) of their motions, and all motions.
 
-    Args:
-        problem: Points of the problem.
-        rotation: (3, 3) of the pose.
-        translation: (3,) of the pose.
-        scale: Standard deviation of its residuals, radians.
-        least: Smallest fraction of the matched points that a motion maps, default 0.
-
-    Returns:
-        Rotations (c, 3, 3) and translations (c, 3) of poses that differ from the given one by over `SAME`, the
-        scales (c,) of their motions, and all motions.
+    They differ from the pose by over `SAME`. They are images by motions of its matched points, about a line of these,
+    and from afar by reflections of these or the mirror image of a flat scene. A motion maps at least the fraction
+    `least` of the matched points.
     """
     matched = matched_points(problem, rotation, translation, scale)
     motions = _motions_of(problem, rotation, translation, scale, matched).mapping(least)
@@ -219,27 +189,17 @@ def repeated_poses(
 ) -> Repeated:
     """Return the competing poses of a pose due to the motions of the scene, and these motions.
 
-    Args:
-        problem: Points of the problem.
-        rotation: (3, 3) of the pose.
-        translation: (3,) of the pose.
-        scale: Standard deviation of its residuals, radians.
-        least: Smallest fraction of the matched points that a motion maps, default 0.
-        deadline: Deadline, after whose end the poses that are not scored yet are left out.
+    The unrefined poses differ from the given one by over `SAME`; there are at most `KEPT_REPETITIONS`, the fewest false
+    alarms first. A flat scene adds the mirror image. Poses that are not scored at the end of the deadline are left out.
 
-    Returns:
-        Unrefined poses that differ from the given one (`SAME`), at most `KEPT_REPETITIONS`, the fewest false
-        alarms first. A flat scene adds the mirror image.
-
-    Examples:
-        >>> import numpy as np
-        >>> motif = np.random.default_rng(0).uniform(0, 1, (12, 3))
-        >>> scene = np.concatenate([motif + [2 * k, 0, 6] for k in range(3)])
-        >>> image = motif + [0, 0, 6]  # the first of three equal things
-        >>> problem = Problem(image / np.linalg.norm(image, axis=1, keepdims=True), scene)
-        >>> repeated = repeated_poses(problem, np.eye(3), np.zeros(3), 1e-3)
-        >>> sorted(repeated.poses.translation[:2, 0].round(6).tolist())
-        [-4.0, -2.0]
+    >>> import numpy as np
+    >>> motif = np.random.default_rng(0).uniform(0, 1, (12, 3))
+    >>> scene = np.concatenate([motif + [2 * k, 0, 6] for k in range(3)])
+    >>> image = motif + [0, 0, 6]  # the first of three equal things
+    >>> problem = Problem(image / np.linalg.norm(image, axis=1, keepdims=True), scene)
+    >>> repeated = repeated_poses(problem, np.eye(3), np.zeros(3), 1e-3)
+    >>> sorted(repeated.poses.translation[:2, 0].round(6).tolist())
+    [-4.0, -2.0]
     """
     rotations, translations, sizes, motions = competing_poses(problem, rotation, translation, scale, least=least)
     scales = np.full(len(rotations), scale)
@@ -270,21 +230,13 @@ def repetition_margins(
 ) -> Array:
     """Return the margins (c,), in decades, by which competing poses explain the image points worse than the best one.
 
-    All poses are compared at one scale and against an even density of scene points, since their actual density does not
-    distinguish between copies of a structure. An image point does not count against a competing pose if the map may end
-    there. It then lies outside the projected points of that pose, and a motion of the `repeated` poses maps its scene
-    point onto another one. Any point may be missing in the map. With q the fraction of image points that the best
-    pose does not explain, no point counts for more than (1 - q) / q.
-
-    Args:
-        problem: Points of the problem.
-        best: Rotation (3, 3) and translation (3,) of the best pose.
-        repeated: Rotations and translations of the unrefined poses that the rigid motions give. A map does not go on
-            with ever smaller copies.
-        competitors: Rotations (c, 3, 3) and translations (c, 3) of the competing poses.
-        scale: Scale of the residuals, radians.
-        most_missing: Largest fraction of its points that the map may lack.
-        fraction: Fraction of the matched points that every motion maps; it limits q to 1 - `fraction`. Default 0.
+    All poses are compared at one scale, radians, and against an even density of scene points, since their actual
+    density does not distinguish between copies of a structure. An image point does not count against a competing pose
+    if the map may end there. It then lies outside the projected points of that pose, and a motion of the `repeated`
+    poses, unrefined and by rigid motions, maps its scene point onto another one: a map does not go on with ever smaller
+    copies. Any point may be missing in the map. With q the fraction of image points that the best pose does not
+    explain, no point counts for more than (1 - q) / q; q is at most `most_missing`, and 1 - `fraction` if every motion
+    maps this fraction of the matched points.
     """
     seen = [directions_of(problem, *best), *(directions_of(problem, r, t) for r, t in zip(*competitors, strict=True))]
     logs = np.stack([point_evidence(problem, one, np.array([scale]), SHARES[-1:], even=True)[:, 0, 0] for one in seen])

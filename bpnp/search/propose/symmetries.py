@@ -67,22 +67,16 @@ Indices = NDArray[np.int64]
 
 
 class Motions(NamedTuple):
-    """Motions p -> scale rotation p + shift of a scene, those that map the largest fraction first.
+    """Motions p -> scale rotation p + shift of a scene, those that map the largest fraction first."""
 
-    Attributes:
-        rotation: (k, 3, 3); those of reflections have the determinant -1.
-        shift: (k, 3), in the unit of the scene.
-        scale: (k,) size of the copy over that of the part; exactly 1 for rigid motions.
-        fraction: (k,) of the source points that come to lie within the tolerance of a scene point. The tolerance of a
-            smaller copy is smaller by its scale.
-        left_out: Largest fraction that a rigid motion which is not among these may map. It is 0 unless a scene has more
-            than are refined, as a lattice has, and 1 if the registration was cut off (`SymmetrySettings.most_work`).
-    """
-
-    rotation: Array
-    shift: Array
-    scale: Array
+    rotation: Array  # (k, 3, 3); those of reflections have the determinant -1
+    shift: Array  # (k, 3), in the unit of the scene
+    scale: Array  # (k,) size of the copy over that of the part; exactly 1 for rigid motions
+    # (k,) of the source points that come to lie within the tolerance of a scene point. The tolerance of a smaller copy
+    # is smaller by its scale.
     fraction: Array
+    # Largest fraction that a rigid motion which is not among these may map. It is 0 unless a scene has more than are
+    # refined, as a lattice has, and 1 if the registration was cut off (`MOST_WORK`).
     left_out: float
 
     @classmethod
@@ -110,10 +104,7 @@ class Motions(NamedTuple):
     def mirror_images(self, rotation: Array, translation: Array, centre3d: Array) -> tuple[Array, Array]:
         """Return the poses (k, 3, 3), (k, 3) that these reflections confuse with the pose (3, 3), (3,) from afar.
 
-        Args:
-            rotation: (3, 3) of the pose.
-            translation: (3,) of the pose.
-            centre3d: (3,) scene point whose distance from the camera remains; the line of sight goes through it.
+        The scene point `centre3d`, through which the line of sight goes, keeps its distance from the camera.
         """
         seen = rotation @ centre3d + translation
         across = reflection(seen)
@@ -145,15 +136,9 @@ class Motions(NamedTuple):
         labels3d: Indices | None = None,
         normals3d: Array | None = None,
     ) -> "Motions":
-        """Return those motions of a scene that map at least a fraction `least` of some of its points.
+        """Return those motions of a scene that map at least a fraction `least` of some of its points, `sources` (s,).
 
-        Args:
-            points3d: (n, 3) scene points.
-            sources: (s,) indices of the points that are moved.
-            tolerance: As for `self_motions`.
-            least: Smallest fraction of the sources that a motion maps.
-            labels3d: As for `self_motions`.
-            normals3d: As for `self_motions`.
+        The other arguments are those of `self_motions`.
         """
         moved, reach = self.apply(points3d[sources]), tolerance * np.minimum(self.scale, 1)[:, None]
         near, _ = _mapped(cKDTree(points3d), moved, self.rotation, sources, reach, labels3d, normals3d)
@@ -175,14 +160,8 @@ def reflection(normal: Array) -> Array:
 def mirror_pose(points3d: Array, rotation: Array, translation: Array) -> tuple[Array, Array] | None:
     """Return the pose that sees a flat scene nearly the same, its normal on the other side of the line of sight.
 
-    Args:
-        points3d: (n, 3) scene points.
-        rotation: (3, 3), translation: (3,) of a pose.
-
-    Returns:
-        Rotation (3, 3) and translation (3,), or None where the scene is not flat (`FLAT_SCENE`).
-
-    Source: D. Oberkampf, D. DeMenthon, L. Davis, Iterative pose estimation using coplanar feature points, CVIU 1996.
+    None where the scene is not flat (`FLAT_SCENE`). Source: D. Oberkampf, D. DeMenthon, L. Davis, Iterative pose
+    estimation using coplanar feature points, CVIU 1996.
     """
     centroid = points3d.mean(0)
     _, extents, axes = np.linalg.svd(points3d - centroid, full_matrices=False)
@@ -206,33 +185,23 @@ def self_motions(
     factor: float | int = 1,
     reflected: bool = False,
 ) -> Motions:
-    """Find motions that map a fraction of a scene's points onto its points.
+    """Return distinct motions that map a fraction of a scene's points onto its points, the largest fraction first.
 
-    Args:
-        points3d: (n, 3) scene points.
-        tolerance: distance within which a moved point lies on a scene point, in the unit of the scene.
-        sources: (k,) indices of the points that are moved, for example those that an image shows; all by default.
-        labels3d: (n,) a point only maps onto points of its own label; -1 fits any label.
-        normals3d: (n, 3) unit normals; a point only maps onto points with a normal within 60 degrees of its moved one.
-        least: smallest fraction of the sources that a motion maps.
-        bases: number of bases that are matched.
-        factor: largest ratio of the sizes of a part and its copy; 1 for rigid motions only.
-        reflected: True for motions with a reflection instead, of the same size only. Default False.
+    They map at least the fraction `least` of the `sources`, indices of the points that an image shows, for example; of
+    all points without them. A moved point lies on a scene point of its own label (-1 fits any), with a normal within 60
+    degrees of its moved one, if it is within `tolerance`. `factor` is the largest ratio of the sizes of a part and its
+    copy, 1 for rigid motions only. If `reflected`, the motions have a reflection instead, of the same size only. The
+    identity, and reflections that hardly move the sources, as in a flat scene, are left out.
 
-    Returns:
-        Distinct motions without the identity, the largest fraction first. Reflections that hardly move the sources, as
-        in a flat scene, are left out.
-
-    Examples:
-        >>> import numpy as np
-        >>> part = np.random.default_rng(0).uniform(-1, 1, (20, 3))
-        >>> third = np.array([[-0.5, -(3**0.5) / 2, 0], [3**0.5 / 2, -0.5, 0], [0, 0, 1]])
-        >>> motions = self_motions(np.concatenate([part, part @ third.T, part @ third]), 0.02)
-        >>> cosines = (np.trace(motions.rotation, axis1=1, axis2=2) - 1) / 2
-        >>> np.degrees(np.arccos(cosines)).round(), motions.fraction
-        (array([120., 120.]), array([1., 1.]))
-        >>> np.sort(self_motions(np.concatenate([part, part / 2 + [3, 0, 0]]), 0.02, factor=4).scale).round(6)
-        array([0.5, 2. ])
+    >>> import numpy as np
+    >>> part = np.random.default_rng(0).uniform(-1, 1, (20, 3))
+    >>> third = np.array([[-0.5, -(3**0.5) / 2, 0], [3**0.5 / 2, -0.5, 0], [0, 0, 1]])
+    >>> motions = self_motions(np.concatenate([part, part @ third.T, part @ third]), 0.02)
+    >>> cosines = (np.trace(motions.rotation, axis1=1, axis2=2) - 1) / 2
+    >>> np.degrees(np.arccos(cosines)).round(), motions.fraction
+    (array([120., 120.]), array([1., 1.]))
+    >>> np.sort(self_motions(np.concatenate([part, part / 2 + [3, 0, 0]]), 0.02, factor=4).scale).round(6)
+    array([0.5, 2. ])
     """
     points = np.ascontiguousarray(points3d, np.float64)
     moved = np.arange(len(points)) if sources is None else np.asarray(sources, np.int64)
@@ -321,15 +290,9 @@ def extent(points: Array) -> float:
 def matching_tolerance(points3d: Array, sources: Indices, noise: float) -> float:
     """Return the distance within which a moved point lies on a scene point.
 
-    Args:
-        points3d: (n, 3) scene points.
-        sources: (k,) indices of the points that are moved.
-        noise: standard deviation of a match, in the unit of the scene.
-
-    Returns:
-        Three standard deviations or `near_symmetry` of the extent, whichever is larger, rounded up to a power of two of
-        the latter; at most `spacing` of the median distance of a source from its nearest neighbour, beyond which points
-        lie on others by chance.
+    It is three standard deviations of a match, `noise` in the unit of the scene, or `NEAR_SYMMETRY` of the extent,
+    whichever is larger, rounded up to a power of two of the latter. It is at most `TOLERANCE_SPACINGS` of the median
+    distance of a source from its nearest neighbour, beyond which points lie on others by chance.
     """
     least = NEAR_SYMMETRY * extent(points3d[sources])
     if not least > 0:
@@ -341,37 +304,22 @@ def matching_tolerance(points3d: Array, sources: Indices, noise: float) -> float
 
 
 class SceneIndex(NamedTuple):
-    """Inputs of the compiled loops.
+    """Inputs of the compiled loops."""
 
-    Attributes:
-        points: (n, 3).
-        table: Hash table of the points.
-        distance: (n, c) distances of the nearest points, ascending.
-        neighbours: (n, c) their indices.
-        labels: (n,); -1 fits any label.
-        normals: (n, 3), or (0, 3) for none.
-    """
-
-    points: Array
+    points: Array  # (n, 3)
     table: HashedPoints
-    distance: Array
-    neighbours: Indices
-    labels: Indices
-    normals: Array
+    distance: Array  # (n, c) distances of the nearest points, ascending
+    neighbours: Indices  # (n, c) their indices
+    labels: Indices  # (n,); -1 fits any label
+    normals: Array  # (n, 3), or (0, 3) for none
 
 
 class Found(NamedTuple):
-    """Motions that the compiled loops write.
+    """Motions that the compiled loops write."""
 
-    Attributes:
-        linear: (c, 3, 3) rotations times scales.
-        shift: (c, 3).
-        score: (c,) numbers of confirming points.
-    """
-
-    linear: Array
-    shift: Array
-    score: Array
+    linear: Array  # (c, 3, 3) rotations times scales
+    shift: Array  # (c, 3)
+    score: Array  # (c,) numbers of confirming points
 
 
 def _bases(points: Array, moved: Indices, count: int) -> Indices:
@@ -450,19 +398,10 @@ def _mapped(
     labels3d: Indices | None,
     normals3d: Array | None,
 ) -> tuple[NDArray[np.bool_], Indices]:
-    """Return which moved points lie on a scene point with a fitting label and normal.
+    """Return which moved points (..., s, 3) of the sources (s,) lie on a scene point with a fitting label and normal.
 
-    Args:
-        tree: cKDTree of the scene points.
-        moved: (..., s, 3) moved points.
-        rotation: (..., 3, 3) of the motions.
-        sources: (s,) indices of the moved points.
-        reach: Largest distance from the nearest scene point, one or (..., 1) of the motions.
-        labels3d: As for `self_motions`.
-        normals3d: As for `self_motions`.
-
-    Returns:
-        The mask (..., s), and the indices (..., s) of the nearest scene points; 0 if none is within reach.
+    A point lies on the nearest scene point within `reach`, one or (..., 1) of the motions; the indices (..., s) of
+    these are 0 if none is within reach.
     """
     distance, target = tree.query(moved, distance_upper_bound=np.max(reach, initial=0.0))
     near = distance < reach
@@ -494,24 +433,12 @@ def _register(
     found: Any,
     work: Any,
 ) -> Any:
-    """Find the motions that map a base onto a congruent or similar one and that enough sampled points confirm.
+    """Find the motions that map a base (3,) onto a congruent or similar one and that enough sampled points confirm.
 
-    Args:
-        scene: A `SceneIndex`.
-        bases: (b, 3) indices of points.
-        sample: Indices of sampled points.
-        tolerance: Largest distance of a moved point from a scene point.
-        least: Sampled points that must confirm a motion.
-        factor: Largest ratio of the sizes of two similar bases, which differ by more than the tolerance; 1 for
-            congruent bases.
-        hand: -1 to reflect a base in its plane before it is mapped, else 1.
-        most: Largest work for a base.
-        found: A `Found`, written; the motions with the most confirming points are kept.
-        work: (4, 3, 3), overwritten.
-
-    Returns:
-        The number of motions, which may exceed the slots of `found`; and False if a base took more than the largest
-        work, so that the rest of the scene was left out for it.
+    Two similar bases differ in size by more than the tolerance, and by at most the ratio `factor`, 1 for congruent
+    bases. With the `hand` -1 a base is reflected in its plane before it is mapped. `found` keeps the motions that the
+    most points confirm. Return the number of motions, which may exceed its slots; and False if a base took more than
+    the largest work, so that the rest of the scene was left out for it.
     """
     points, count, complete = scene.points, 0, True
     frame, target, linear, shift = work[0], work[1], work[2], work[3, 0]
@@ -587,15 +514,7 @@ def _register(
 
 @part
 def _keep(found: Any, count: int, score: int, linear: Any, shift: Any) -> None:
-    """Write a motion into a free slot of `found`, or into that of the worst motion if it is better.
-
-    Args:
-        found: A `Found`, written.
-        count: Number of motions found before.
-        score: Number of sampled points that confirm the motion.
-        linear: (3, 3) of the motion.
-        shift: (3,) of the motion.
-    """
+    """Write the next motion, after `count` others, into a free slot of `found`, or over the worst if it is better."""
     slot = count
     if count >= len(found.score):
         slot = 0

@@ -70,16 +70,7 @@ def kept_by(stage: ClusterStage, starts: int) -> int:
 
 
 def multistart(scene: Scene, number: int, prior: Prior | None) -> Hypotheses:
-    """Run one batch of starts over all rotations, or over those that a prior allows.
-
-    Args:
-        scene: Points, settings and deadline.
-        number: Index of the batch, from 0.
-        prior: Prior in the frame of the scene; None for all rotations.
-
-    Returns:
-        Distinct poses with their basin counts.
-    """
+    """Run one batch of starts over all rotations, or over those that a prior in the frame of the scene allows."""
     recipe = RECIPES[number % len(RECIPES)]
     drawn = draw_poses(scene.spread, scene.bulk3d, batch_size(number), recipe, prior, scene.rng)
     return run_batch(scene, Hypotheses.from_poses(*drawn, basin_count=1))
@@ -93,16 +84,9 @@ def run_batch(scene: Scene, starts: Hypotheses) -> Hypotheses:
 
 
 def anneal_on_clusters(scene: Scene, poses: Hypotheses, stages: Sequence[ClusterStage], starts: int) -> Hypotheses:
-    """Anneal poses on clusters, stage by stage.
+    """Anneal poses on clusters, stage by stage, coarse to fine; the poses have different rotations, best first.
 
-    Args:
-        scene: Points, settings and deadline.
-        poses: Initial poses.
-        stages: Stages, coarse to fine.
-        starts: Number of starts of the batch, which determines how many poses each stage keeps.
-
-    Returns:
-        Poses with different rotations, best first.
+    The number of starts of the batch determines how many poses each stage keeps.
     """
     outlier = scene.outlier_density(scene.settings.outliers)
     for stage, clusters in zip(stages, scene.clusters([stage.clusters for stage in stages]), strict=True):
@@ -137,18 +121,10 @@ def anneal_on_points(
     every: bool = False,
     steps: int | None = None,
 ) -> Hypotheses:
-    """Anneal poses on all 3D points.
+    """Anneal poses on all 3D points from a first scale, radians, down to the smallest one or for some `steps`.
 
-    Args:
-        scene: Points, settings and deadline.
-        starts: Initial poses.
-        first_scale: Scale of the first step, radians.
-        outliers: Expected outlier fraction; None for that of the settings.
-        every: True to use all bearings; False for the number of the fine stage.
-        steps: Number of scales; None for all down to the smallest one.
-
-    Returns:
-        Distinct poses, without an NFA.
+    The distinct poses have no NFA. The bearings are those of the fine stage, or `every` one; the expected outlier
+    fraction is that of the settings unless it is given.
     """
     bearings = None if every else FINE_BEARINGS
     outliers = scene.settings.outliers if outliers is None else outliers
@@ -183,20 +159,9 @@ def anneal_on_points(
 def perturb_about_centroid(
     scene: Scene, rotation: Array, translation: Array, vectors: Array, shifts: Array, *, basin_count: int = 0
 ) -> Hypotheses:
-    """Return perturbed copies of poses, rotated about the centroid of the points.
+    """Return copies of k poses, adjacent for each, rotated by vectors (s, 3) about the centroid and shifted (s, 3).
 
-    With this centre, an error of the rotation moves the camera and leaves the points in view.
-
-    Args:
-        scene: Points.
-        rotation: (k, 3, 3) poses.
-        translation: (k, 3) poses.
-        vectors: (s, 3) rotation vectors, s a multiple of k.
-        shifts: (s, 3) translations.
-        basin_count: Basin count of all copies.
-
-    Returns:
-        (s,) hypotheses; the copies of a pose are adjacent.
+    s is a multiple of k. With this centre, an error of the rotation moves the camera and leaves the points in view.
     """
     centroid, copies = scene.bulk3d.mean(0), len(vectors) // max(len(rotation), 1)
     perturbations = Rotation.from_rotvec(vectors).as_matrix().astype(np.float32)
@@ -207,17 +172,9 @@ def perturb_about_centroid(
 
 
 def finish(scene: Scene, poses: Hypotheses, annealed: int | None = None) -> Hypotheses:
-    """Anneal the best poses again on every bearing.
+    """Anneal the best `annealed` poses, None for all, again on every bearing; the others are kept.
 
     The best two are also annealed with each of `settings.end_outliers`.
-
-    Args:
-        scene: Points, settings and deadline.
-        poses: Distinct poses in the frame of the scene, best first.
-        annealed: Number of poses to anneal; None for all.
-
-    Returns:
-        Distinct poses, best first. Poses that are not annealed are kept.
     """
     settings, count = scene.settings, len(poses) if annealed is None else min(annealed, len(poses))
     runs = [(i, settings.outliers) for i in range(count)]
@@ -237,16 +194,9 @@ def finish(scene: Scene, poses: Hypotheses, annealed: int | None = None) -> Hypo
 def anneal_to_end(
     scene: Scene, rotations: NDArray[np.float64], translations: NDArray[np.float64], scale: float
 ) -> Hypotheses:
-    """Anneal poses of a problem to the end on all points; after the deadline they are returned unchanged.
+    """Anneal poses (c, 3, 3), (c, 3) of a problem to the end on all points, from residuals of `scale` radians.
 
-    Args:
-        scene: Points, settings and deadline.
-        rotations: (c, 3, 3).
-        translations: (c, 3).
-        scale: Standard deviation of their residuals, radians.
-
-    Returns:
-        Distinct hypotheses in the frame of the problem.
+    After the deadline they are returned unchanged.
     """
     starts = Hypotheses.from_poses(*scene.enter(rotations, translations))
     starts = replace(starts, scale=np.full(len(starts), scale, np.float32))

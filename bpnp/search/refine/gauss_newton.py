@@ -31,19 +31,12 @@ Labels = NDArray[np.int64]
 
 
 class Equations(NamedTuple):
-    """Normal equations of a step, of one pose or of several (...).
+    """Normal equations of a step, of one pose or of several (...)."""
 
-    Attributes:
-        products: (..., p, p) J^T W J.
-        gradient: (..., p) J^T W r.
-        cost: (...) r^T W r; NaN for possible matches, whose weights change from step to step.
-        matched: (...) expected number of matches.
-    """
-
-    products: Array
-    gradient: Array
-    cost: NDArray[np.float64] | float
-    matched: NDArray[np.float64] | float
+    products: Array  # (..., p, p) J^T W J
+    gradient: Array  # (..., p) J^T W r
+    cost: NDArray[np.float64] | float  # (...) r^T W r; NaN for possible matches, whose weights change from step to step
+    matched: NDArray[np.float64] | float  # (...) expected number of matches
 
     def step(self, damping: Array | float | int = 0) -> Array:
         """Return the step (..., p), damped by a fraction of the diagonal."""
@@ -59,37 +52,23 @@ Linearise = Callable[[PoseState, float], Equations | None]
 
 
 class Iteration(NamedTuple):
-    """One step of a refinement.
+    """One step of a refinement."""
 
-    Attributes:
-        state: State after the step; before it where the step was not taken.
-        scale: Scale of the residuals.
-        step: (..., p) step that was tried.
-        before: Normal equations of the step.
-        gain: (...) reduction of the cost by the step; NaN without the damping of Levenberg and Marquardt.
-    """
-
-    state: PoseState
+    state: PoseState  # state after the step; before it where the step was not taken
     scale: float
-    step: Array
-    before: Equations
+    step: Array  # (..., p) step that was tried
+    before: Equations  # normal equations of the step
+    # (...) reduction of the cost by the step; NaN without the damping of Levenberg and Marquardt.
     gain: NDArray[np.float64] | float
 
 
 class Refined(NamedTuple):
-    """End of a refinement.
-
-    Attributes:
-        state: Last state.
-        iterations: Number of steps.
-        converged: True if the steps settled before the last scale.
-        lost: True if the points of a state matched too little for another step.
-    """
+    """End of a refinement."""
 
     state: PoseState
     iterations: int
-    converged: bool
-    lost: bool
+    converged: bool  # the steps settled before the last scale
+    lost: bool  # the points of a state matched too little for another step
 
 
 def steps(
@@ -102,19 +81,11 @@ def steps(
     adaptive: bool = False,
     largest: Array | None = None,
 ) -> Iterator[Iteration]:
-    """Take one step at each scale.
+    """Yield the state after one step at each scale of the residuals, radians, of one pose or of several.
 
-    Args:
-        model: Unknowns.
-        state: Initial state, or several.
-        linearise: Returns the normal equations of a state at a scale.
-        scales: Scale of the residuals of each step, radians.
-        damping: Fraction of the diagonal that is added to the normal equations; the first one if it is `adaptive`.
-        adaptive: Levenberg-Marquardt damping of each pose. The scales should then be equal, so that costs compare.
-        largest: (p,) largest absolute step of each unknown; None for no limit.
-
-    Yields:
-        State after each step. Ends early if the points of a state match too little.
+    The steps end early if the points of a state match too little. The damping is a fraction of the diagonal; if it is
+    `adaptive`, that of Levenberg and Marquardt of each pose, which begins with this one. The scales should then be
+    equal, so that costs compare. No unknown moves by more than `largest` (p,); None for no limit.
     """
     factor, here = np.full(state.rotation.shape[:-2], float(damping)), None
     for scale in scales:
@@ -151,20 +122,7 @@ def refine(
     adaptive: bool = False,
     largest: Array | None = None,
 ) -> Refined:
-    """Refine a pose until its steps settle; the other arguments are those of `steps`.
-
-    Args:
-        model: Unknowns.
-        state: Initial state, or several.
-        linearise: Returns the normal equations of a state at a scale.
-        scales: Scale of the residuals of each step, radians; their number is the largest number of steps.
-        settled: Returns True after the last step that is needed; None to take all.
-        damping: Fraction of the diagonal that is added to the normal equations.
-        adaptive: Levenberg-Marquardt damping.
-        largest: (p,) largest absolute step of each unknown.
-
-    Returns:
-        The last state and how the refinement ended.
+    """Refine a pose, or several, until `settled` is true of a step, at most for one step a scale; as for `steps`.
 
     >>> rng = np.random.default_rng(0)
     >>> points = rng.uniform(-1, 1, (20, 3))
@@ -187,12 +145,9 @@ def refine(
 
 
 def normal_equations(jacobian: Array, residual: Array, weight: Array) -> Equations:
-    """Return the normal equations of matches.
+    """Return the normal equations of measurements less predictions (..., k, d) with derivatives (..., k, d, p).
 
-    Args:
-        jacobian: (..., k, d, p) derivatives of the predictions.
-        residual: (..., k, d) measurements less predictions.
-        weight: (..., k) of each match, or (..., k, d) of each of its numbers.
+    The weights are (..., k) of each match, or (..., k, d) of each of its numbers.
     """
     per_match = weight.ndim < residual.ndim
     each = weight[..., None] if per_match else weight
@@ -208,14 +163,7 @@ def normal_equations(jacobian: Array, residual: Array, weight: Array) -> Equatio
 
 
 def match_equations(model: PoseModel, bearings: Array, points: Array, weight: Array | None = None) -> Linearise:
-    """Return the linearisation of given matches of one camera.
-
-    Args:
-        model: Unknowns.
-        bearings: (k, 3) of the image points.
-        points: (k, 3) scene points.
-        weight: (..., k) of the matches; None for equal ones.
-    """
+    """Return the linearisation of given matches of one camera: bearings (k, 3), points (k, 3) and weights (..., k)."""
 
     def linearise(state: PoseState, _scale: float) -> Equations:
         sight = model.sight(state, points)
@@ -230,16 +178,9 @@ def image_equations(
 ) -> Linearise:
     """Return the linearisation of k given matches of one given camera of any model, whose residuals are in the image.
 
-    The derivatives of the camera model are central differences by the points in the camera's frame, since there are
-    many camera models. Those by the pose follow from them.
-
-    Args:
-        model: Unknowns of a pose.
-        project: Function that returns the image points (k, d) of points (k, 3) in the camera's frame; NaN outside the
-            view.
-        points: (k, 3) scene points.
-        target: (k, d) their image points.
-        lost: Residual of a point that leaves the view.
+    `project` returns the image points (k, d) of points (k, 3) in the camera's frame, NaN outside the view; `lost` is
+    the residual of a point that leaves the view. The derivatives of the camera model are central differences by the
+    points in the camera's frame, since there are many camera models. Those by the pose follow from them.
     """
 
     def linearise(state: PoseState, _scale: float) -> Equations:
@@ -256,19 +197,12 @@ def image_equations(
 
 
 class SoftMatches(NamedTuple):
-    """Possible matches of the image points of one camera under a state.
+    """Possible matches of the image points of one camera under a state."""
 
-    Attributes:
-        sight: Scene points that the camera may see.
-        image: (k,) index of each match among the chosen image points.
-        point: (k,) index among the points of `sight`.
-        probability: (k,) of each match.
-    """
-
-    sight: Sight
-    image: Labels
-    point: Labels
-    probability: Array
+    sight: Sight  # scene points that the camera may see
+    image: Labels  # (k,) index of each match among the chosen image points
+    point: Labels  # (k,) index among the points of `sight`
+    probability: Array  # (k,) of each match
 
 
 def soft_matches(
@@ -283,14 +217,8 @@ def soft_matches(
 ) -> SoftMatches | None:
     """Return the possible matches of one camera under a state, or None if there are none.
 
-    Args:
-        model: Unknowns.
-        problem: Points of the camera.
-        state: State.
-        scale: Standard deviation of the residuals, radians; the points of a match are within a few of it.
-        camera: Index of the camera.
-        chosen: (m,) indices of the image points that are used; None for those of `ImageStatistics.chosen`.
-        most: Largest number of scene points of an image point.
+    The scene points of an image point, at most `most`, are within a few standard deviations `scale`, radians, of it.
+    The image points are `chosen` (m,), or those of `ImageStatistics.chosen`.
     """
     sight = model.sight(state, problem.points3d, camera)
     rotation = state.rotation if model.mounts is None else model.mounts[camera][0] @ state.rotation
@@ -315,14 +243,9 @@ def soft_equations(
 ) -> Linearise:
     """Return the linearisation of the possible matches of all cameras, weighted with their probabilities.
 
-    The matches of a scene point are added up first: they have one derivative.
-
-    Args:
-        model: Unknowns. A prior of the focal length is added.
-        problems: Points of each camera.
-        chosen: (m,) indices of the image points that are used; None for those of `ImageStatistics.chosen`.
-        most: Largest number of scene points of an image point.
-        fewest: Expected number of matches that is too small for a step.
+    The matches of a scene point are added up first: they have one derivative. A prior of the focal length is added. No
+    step is taken if the expected number of matches is `fewest` or less. The other arguments are those of
+    `soft_matches`.
     """
 
     def linearise(state: PoseState, scale: float) -> Equations | None:
