@@ -72,7 +72,7 @@ class _Fisheye(NamedTuple):
     focals: Array  # (1,) or (2,) focal lengths, pixels
     centre: Array  # (2,) principal point, pixels
     distance: np.polynomial.Polynomial  # radius as a polynomial of the angle
-    widest: float  # angle up to which the radius rises (root of its derivative), radians; at most 180 degrees
+    widest: float  # angle up to which the radius rises (first root of its derivative), radians; at most 180 degrees
 
 
 @dataclass(frozen=True, eq=False)

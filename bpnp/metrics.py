@@ -79,7 +79,7 @@ def centre_error(
     rotation_gt: Float[Tensor, "b 3 3"],
     translation_gt: Float[Tensor, "b 3"],
 ) -> Float[Tensor, " b"]:
-    """Return the distance of the camera centres, |R^T t - R_gt^T t_gt|, float64; infinite where the pose is not finite.
+    """Return the distance of the camera centres, |R^T t - R_gt^T t_gt|, scene units; infinite if a pose is not finite.
 
     Unlike |t - t_gt|, it does not depend on the origin of the scene.
     """

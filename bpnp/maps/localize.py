@@ -78,8 +78,8 @@ def localize(
     """Estimate the pose of a photo in a map; see `SceneMap.localize`.
 
     The last of `maps` is the map; those before it have rotated views and are tried first, each in half of the time that
-    is left. `views` are tried in their order, None stands for all. `time_limit` is in seconds. Raise ValueError if no
-    view sees 4 or more points.
+    is left. `views` are tried in their order, best first; None stands for all. `time_limit` is in seconds, math.inf for
+    no limit. Raise ValueError if no view sees 4 or more points.
     """
     start, deadline, tried = Clock.now(), Deadline.after(time_limit).before(JUDGING_SECONDS), set[str]()
     results = list[LoopResult]()
