@@ -26,7 +26,7 @@ from bpnp.search.inputs import problem_from
 from bpnp.search.plan import Plan
 from bpnp.search.pool import Pool
 from bpnp.search.propose.repetitions import competing_poses
-from bpnp.search.search_frame import Scene
+from bpnp.search.search_frame import SearchFrame
 from bpnp.search.settings import DEFAULT
 from bpnp.search.verdict.decide import Case
 from bpnp.search.verdict.limits import MOST_FALSE_ALARMS
@@ -47,7 +47,7 @@ def reached(problem: Problem) -> dict[int, bool]:
     """
     points2d, points3d = problem.solve.args  # type: ignore[attr-defined]
     points = problem_from(points2d, points3d, None)
-    pool = Pool(Scene(points, 0, DEFAULT), points, Case.without_pose(points))
+    pool = Pool(SearchFrame(points, 0, DEFAULT), points, Case.without_pose(points))
     found: dict[int, bool] = {}
     plan = Plan.of(pool)
     for _ in range(TURNS):

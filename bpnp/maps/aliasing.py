@@ -26,7 +26,7 @@ from bpnp.search.problem import Problem
 from bpnp.search.propose.density_map import LOCAL, search_around, search_near
 from bpnp.search.propose.repetitions import repeated_poses, repetition_margins
 from bpnp.search.refine.annealing import anneal_to_end, finish
-from bpnp.search.search_frame import Scene
+from bpnp.search.search_frame import SearchFrame
 from bpnp.search.settings import DEFAULT, DensitySearch, DensityShape, Draws, Narrowing, Preselection
 from bpnp.search.solution import Candidate, Solution
 from bpnp.search.starts import PosePrior
@@ -138,7 +138,7 @@ def refine_elsewhere(
     other = differ(rotations, translations)
     if not other.any():
         return Hypotheses.from_poses(rotations[other], translations[other])
-    scene = Scene(problem, seed, DEFAULT, deadline)
+    scene = SearchFrame(problem, seed, DEFAULT, deadline)
     refined = anneal_to_end(scene, rotations[other], translations[other], _scale_of(problem, solution))
     deadline.passed(Unfinished.competing_poses)  # noted: then not all of them were refined
     return refined[differ(refined.rotation, refined.translation)]
@@ -218,7 +218,7 @@ def _find_poses_in(
         if deadline.passed(Unfinished.competing_poses):
             return
         near = explained.problem(region, solution.camera, region.prior())
-        scene = Scene(near, photo.seed, DEFAULT, deadline)
+        scene = SearchFrame(near, photo.seed, DEFAULT, deadline)
         scene.density_maps = density_maps
         assert near.prior is not None
         prior = scene.enter_prior(near.prior)
@@ -231,6 +231,6 @@ def _find_poses_in(
                 yield problem.from_user(*near.to_user(*one.pose()))
 
 
-def _likeliest(poses: Hypotheses, scene: Scene, problem: Problem) -> Hypotheses:
+def _likeliest(poses: Hypotheses, scene: SearchFrame, problem: Problem) -> Hypotheses:
     """Return the pose (1,) with the fewest false alarms, in the frame of the problem."""
     return rank_poses(to_problem_frame(poses, scene), problem)[:1]

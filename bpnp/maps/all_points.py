@@ -17,7 +17,7 @@ from bpnp.search.hypotheses import Hypotheses, to_problem_frame
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.propose.density_map import LOCAL, search_around
 from bpnp.search.refine.annealing import FINISHED_POSES, anneal_to_end, finish
-from bpnp.search.search_frame import Scene
+from bpnp.search.search_frame import SearchFrame
 from bpnp.search.settings import DEFAULT
 from bpnp.search.solution import Solution
 from bpnp.search.verdict.competitors import competing_pose
@@ -40,7 +40,7 @@ class Refined:
     pose: tuple[Array, Array]  # refined rotation (3, 3) and translation (3,), in the frame of the problem
     # The pose, its competing poses and the optima of local searches around it, in the frame of the problem.
     poses: Hypotheses
-    scene: Scene  # normalised points of the problem
+    scene: SearchFrame  # normalised points of the problem
 
 
 @one_blas_thread
@@ -74,9 +74,9 @@ def refine_on_all_points(solution: Solution, photo: Photo, whole: Region, deadli
         rotation, shift = problem.from_user(*pose)
         least = problem.image.scales[0]
         poses = anneal_to_end(
-            Scene(problem, photo.seed, DEFAULT, deadline), rotation[None], shift[None], max(scale, least)
+            SearchFrame(problem, photo.seed, DEFAULT, deadline), rotation[None], shift[None], max(scale, least)
         )
-    scene, confident = Scene(problem, photo.seed, DEFAULT, deadline), solution.verdict == "confident"
+    scene, confident = SearchFrame(problem, photo.seed, DEFAULT, deadline), solution.verdict == "confident"
     local_searches = int(poses.scale[0] > scale) if confident else local_searches_for_certainty()
     significant = [one for one in solution.candidates[1:] if one.log10_false_alarms < 0]
     others = [] if confident else significant[:JUDGED_COMPETITORS]

@@ -20,7 +20,7 @@ from bpnp.runtime import default_float_errors
 from bpnp.search.problem import Problem
 from bpnp.search.propose.given import anneal_given
 from bpnp.search.search import fixing_no_pose
-from bpnp.search.search_frame import Scene, degenerate
+from bpnp.search.search_frame import SearchFrame, degenerate
 from bpnp.search.settings import DEFAULT
 from bpnp.search.verdict.decide import Case, SearchResult, decide
 from bpnp.types import Batch, Pose, Prediction, SolveStats
@@ -95,7 +95,7 @@ def _refine(problem: Problem, rotation: NDArray[np.float64], translation: NDArra
     """Return the annealed poses of one problem, the best one first."""
     if degenerate(problem.bearings) or degenerate(problem.points3d):
         return decide(fixing_no_pose(problem, "too few points, or all on one line"))
-    poses = anneal_given(Scene(problem, 0, DEFAULT), rotation, translation)
+    poses = anneal_given(SearchFrame(problem, 0, DEFAULT), rotation, translation)
     return decide(Case.of(poses, problem, iterations=int(np.isfinite(rotation).all((-2, -1)).sum())))
 
 

@@ -35,7 +35,7 @@ from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.propose.lens import fit_lens
 from bpnp.search.refine.annealing import anneal_to_end
-from bpnp.search.search_frame import Scene
+from bpnp.search.search_frame import SearchFrame
 from bpnp.search.settings import DEFAULT
 from bpnp.search.solution import FOCAL_LENGTH, ROTATION_PARAMETERS, Solution
 from bpnp.search.solvers import Options, solve_problems
@@ -497,5 +497,5 @@ def _fit_track(
 def _anneal_pose(
     problem: Problem, rotation: Array, translation: Array, scale: float, seed: int, deadline: Deadline
 ) -> Hypotheses:
-    scene = Scene(problem, seed, DEFAULT, deadline)
+    scene = SearchFrame(problem, seed, DEFAULT, deadline)
     return rank_poses(anneal_to_end(scene, rotation[None], translation[None], scale), problem)[:1]

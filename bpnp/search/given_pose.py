@@ -27,7 +27,7 @@ from bpnp.search.propose.density_map import perturb_each
 from bpnp.search.propose.repetitions import competing_poses
 from bpnp.search.propose.symmetries import mirror_pose
 from bpnp.search.refine.annealing import FINISHED_POSES, MIDDLE, anneal_on_points, anneal_to_end, finish
-from bpnp.search.search_frame import Scene
+from bpnp.search.search_frame import SearchFrame
 from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict.contest import contest, rivals_of
@@ -69,7 +69,7 @@ def given_pose(
     """
     one = replace(problem, log10_tried=0.0)
     claim = _unrefined(one, rotation, translation)
-    scene, few = Scene(one, seed, DEFAULT, deadline), is_enumerable(problem)
+    scene, few = SearchFrame(one, seed, DEFAULT, deadline), is_enumerable(problem)
     others = _proposed(problem, claim, scene)
     if few:  # as in an enumeration, whose candidates are refined
         scale = float(claim.scale[0])
@@ -112,7 +112,7 @@ def _nearby(case: Case, *, claim: Hypotheses, optimum: Hypotheses) -> Case:
     return case.against(objection("better_nearby", margin, degrees=off))
 
 
-def _proposed(problem: Problem, claim: Hypotheses, scene: Scene) -> Hypotheses:
+def _proposed(problem: Problem, claim: Hypotheses, scene: SearchFrame) -> Hypotheses:
     """Return the distinct poses that annealing reaches from a pose (1,).
 
     It starts from the pose, from perturbed copies, and from its mirror image in front of a flat scene.

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.poses import close_poses, distinct
-from bpnp.search.search_frame import Scene
+from bpnp.search.search_frame import SearchFrame
 
 SIGNIFICANT = 1e3  # more than any log-likelihood per bearing [nats; derived]
 KEPT_CANDIDATES = 8  # number of candidates that a search keeps from one iteration to the next [poses; cost]
@@ -25,7 +25,7 @@ class Hypotheses:
     A stage fills the columns that it computes; the others have the values of `from_poses`.
 
     Attributes:
-        rotation: (c, 3, 3). Float32 in the frame of a `Scene`, float64 in that of a `Problem`.
+        rotation: (c, 3, 3). Float32 in the frame of a `SearchFrame`, float64 in that of a `Problem`.
         translation: (c, 3), in the same frame; (c, 4) homogeneous for a rig.
         log_likelihood: (c,) mean over the bearings, nats; -inf for a pose that was not scored.
         match_count: (c,) expected number of matches.
@@ -115,7 +115,7 @@ class Hypotheses:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
-def select_distinct(poses: Hypotheses, scene: Scene, count: int, apart_deg: float | None = None) -> Hypotheses:
+def select_distinct(poses: Hypotheses, scene: SearchFrame, count: int, apart_deg: float | None = None) -> Hypotheses:
     """Return the best hypotheses of a scene, best first, no two of them equal.
 
     Args:
@@ -138,13 +138,13 @@ def select_distinct(poses: Hypotheses, scene: Scene, count: int, apart_deg: floa
     return replace(poses[kept], basin_count=first @ poses.basin_count)
 
 
-def merge_hypotheses(parts: Sequence[Hypotheses], scene: Scene) -> Hypotheses:
+def merge_hypotheses(parts: Sequence[Hypotheses], scene: SearchFrame) -> Hypotheses:
     """Return the best distinct hypotheses of several batches, with the basin counts of all batches."""
     return select_distinct(Hypotheses.concatenate(parts), scene, KEPT_CANDIDATES)
 
 
-def to_problem_frame(poses: Hypotheses, scene: Scene) -> Hypotheses:
-    """Return hypotheses in the frame of the problem of their `Scene`, in float64."""
+def to_problem_frame(poses: Hypotheses, scene: SearchFrame) -> Hypotheses:
+    """Return hypotheses in the frame of the problem of their `SearchFrame`, in float64."""
     rotation, translation = scene.leave(poses.rotation, poses.translation)
     return replace(
         poses,
@@ -156,7 +156,7 @@ def to_problem_frame(poses: Hypotheses, scene: Scene) -> Hypotheses:
     )
 
 
-def to_scene_frame(poses: Hypotheses, scene: Scene) -> Hypotheses:
-    """Return hypotheses of a problem in the frame of a `Scene`, in float32."""
+def to_scene_frame(poses: Hypotheses, scene: SearchFrame) -> Hypotheses:
+    """Return hypotheses of a problem in the frame of a `SearchFrame`, in float32."""
     rotation, translation = scene.enter(poses.rotation, poses.translation)
     return replace(poses, rotation=rotation, translation=translation)

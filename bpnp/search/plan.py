@@ -56,7 +56,7 @@ Proposals = Callable[[], tuple[NDArray[np.float64], NDArray[np.float64]]]  # rot
 
 
 @dataclass
-class Source:
+class GlobalSteps:
     """Batches of starts, and after each the density-map searches over all rotations that take as long.
 
     Every third batch ignores the prior, which may be wrong.
@@ -87,7 +87,7 @@ class Source:
 
 
 @dataclass
-class Surroundings:
+class LocalSearches:
     """Local searches around the best poses of a step, of different rotations.
 
     Poses whose surroundings were searched before are skipped. The searches end after several without a better pose, or
@@ -96,21 +96,21 @@ class Surroundings:
     Attributes:
         pool: Poses found so far.
         poses: Poses to search around, best first.
-        in_vain: Number of consecutive searches without a better pose.
+        fruitless: Number of consecutive searches without a better pose.
         best: Largest sort key of the pool before the search that runs; None if none runs.
     """
 
     pool: Pool
     poses: Hypotheses
-    in_vain: int = 0
+    fruitless: int = 0
     best: float | None = None
 
     def next_step(self) -> Step | None:
         """Return the next local search; None after the last one."""
         pool = self.pool
         if self.best is not None:
-            self.in_vain = 0 if pool.best_key > self.best else self.in_vain + 1
-        while len(self.poses) and self.in_vain < MOST_FRUITLESS and pool.alarms >= 0:
+            self.fruitless = 0 if pool.best_key > self.best else self.fruitless + 1
+        while len(self.poses) and self.fruitless < MOST_FRUITLESS and pool.alarms >= 0:
             pose, self.poses = self.poses[:1], self.poses[1:]
             if not pool.is_searched(pose):
                 self.best = pool.best_key
@@ -133,19 +133,19 @@ class Plan:
         taken_near: Number of steps near the prior.
         asked_near: True if the proposals were requested near the prior.
         rounds: Number of rounds over all rotations.
-        surroundings: Local searches that are under way.
+        local: Local searches that are under way.
     """
 
     pool: Pool
     guess: Prior | None
     proposals: Proposals | None
     near: PosePrior | None
-    source: Source | None
+    source: GlobalSteps | None
     taken: int = 0
     taken_near: int = 0
     asked_near: bool = False
     rounds: int = 0
-    surroundings: Surroundings | None = None
+    local: LocalSearches | None = None
     _found: list[Hypotheses] = field(default_factory=list)
 
     @classmethod
@@ -171,7 +171,7 @@ class Plan:
             None if prior is None else pool.scene.enter_prior(prior) for prior in (around, pool.problem.prior)
         )
         near = scene_prior if isinstance(scene_prior, PosePrior) and is_near(pool.scene, scene_prior) else None
-        return cls(pool, guess, proposals, near, Source(pool, None if near is not None else scene_prior))
+        return cls(pool, guess, proposals, near, GlobalSteps(pool, None if near is not None else scene_prior))
 
     def next_step(self) -> Step | None:
         """Return the next step; None if there is none."""
@@ -200,26 +200,26 @@ class Plan:
             return Step(partial(multistart, scene, number // 2, None))
         return Step(partial(search_near, scene, prior))
 
-    def _next_anywhere(self, source: Source) -> Step:
+    def _next_anywhere(self, source: GlobalSteps) -> Step:
         """Return a step over all rotations or a wide prior, a local search, or the proposals."""
         if not source.batches:
             return source.next_step()
         while True:
-            if (step := self._next_in_surroundings()) is not None:
+            if (step := self._next_local()) is not None:
                 return step
             unaided = self.rounds > UNAIDED_ROUNDS and self.pool.alarms >= 0
             if unaided and self.proposals is not None:
-                return self._and_surroundings(Step(self._take_proposals()))
+                return self._with_local_searches(Step(self._take_proposals()))
             self.rounds += 1
             if self.pool.alarms < 0:
                 return self._next_of_significant(source.next_step)
-            return self._and_surroundings(source.next_step())
+            return self._with_local_searches(source.next_step())
 
     def _next_of_proposals(self) -> Step | None:
         """Return the proposals, a local search around one of them, or one around a significant pose."""
         if self.proposals is not None:
-            return self._and_surroundings(Step(self._take_proposals()))
-        if (step := self._next_in_surroundings()) is not None:
+            return self._with_local_searches(Step(self._take_proposals()))
+        if (step := self._next_local()) is not None:
             return step
         pool = self.pool
         enough = pool.alarms >= 0 or pool.local_searches(pool.leaders()) >= LOCAL_SEARCHES
@@ -231,7 +231,7 @@ class Plan:
         assert proposals is not None
         return partial(search_proposed, self.pool, proposals)
 
-    def _and_surroundings(self, step: Step) -> Step:
+    def _with_local_searches(self, step: Step) -> Step:
         """Return a step after which the surroundings of its best poses are searched."""
 
         def propose() -> Hypotheses:
@@ -240,14 +240,14 @@ class Plan:
 
         return step._replace(propose=propose)
 
-    def _next_in_surroundings(self) -> Step | None:
+    def _next_local(self) -> Step | None:
         """Return the next local search around the poses of the last step; None if there is none."""
         if self._found:
             poses = select_distinct(self._found.pop(), self.pool.scene, SURROUNDED_POSES, SURROUNDED_APART_DEG)
-            self.surroundings = Surroundings(self.pool, poses)
-        step = None if self.surroundings is None else self.surroundings.next_step()
+            self.local = LocalSearches(self.pool, poses)
+        step = None if self.local is None else self.local.next_step()
         if step is None:
-            self.surroundings = None
+            self.local = None
         return step
 
     def _next_of_significant(self, next_start: Callable[[], Step]) -> Step:

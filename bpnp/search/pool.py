@@ -21,7 +21,7 @@ from bpnp.search.loop import Step
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem
 from bpnp.search.refine.annealing import FINE_BEARINGS, FINISHED_POSES, finish
-from bpnp.search.search_frame import Scene
+from bpnp.search.search_frame import SearchFrame
 from bpnp.search.verdict.completeness import Symmetry
 from bpnp.search.verdict.contest import rivals_of
 from bpnp.search.verdict.decide import Case, add_false_alarms, rank_poses
@@ -44,7 +44,7 @@ class Pool:
         symmetry: Motions of the scene that were registered with matched points.
     """
 
-    def __init__(self, scene: Scene, problem: Problem, enumerated: Case) -> None:
+    def __init__(self, scene: SearchFrame, problem: Problem, enumerated: Case) -> None:
         self.scene, self.problem, self.enumerated = scene, problem, enumerated
         self.iterations, self._judged_alarms = 0, 0.0
         self._is_thinned = len(problem.bearings) > FINE_BEARINGS

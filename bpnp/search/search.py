@@ -23,7 +23,7 @@ from bpnp.search.propose.known_matches import known_matches, poses_of_matches
 from bpnp.search.propose.minimal_solvers import p3p_poses
 from bpnp.search.propose.symmetries import self_motions
 from bpnp.search.refine.annealing import run_batch
-from bpnp.search.search_frame import Scene, degenerate
+from bpnp.search.search_frame import SearchFrame, degenerate
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.starts import Prior
 from bpnp.search.verdict.contest import contest, rivals_of
@@ -94,8 +94,8 @@ def find_case(
     tell, enumerated = teller(progress), Case.without_pose(problem)
 
     @cache
-    def scene_of() -> Scene:
-        return Scene(problem, seed, settings, deadline)
+    def scene_of() -> SearchFrame:
+        return SearchFrame(problem, seed, settings, deadline)
 
     many = exceeds_enumeration(problem)
     matches = None if only_proposals else known_matches(problem)
@@ -146,7 +146,7 @@ def fixing_no_pose(problem: Problem, why: str) -> Case:
     return Case.without_pose(problem, objection("degenerate", why=f"no pose fits: {why}"), exhaustive=True)
 
 
-def lacks_partners(scene: Scene) -> bool:
+def lacks_partners(scene: SearchFrame) -> bool:
     """Return True if the points whose label occurs on the other side are too few or all on one line."""
     lacking = (side for side in (scene.image, scene.seen) if not side.weights.all())
     return any(degenerate(side.points[side.weights > 0].astype(np.float64)) for side in lacking)
@@ -165,7 +165,7 @@ def warm_up() -> None:
     enumerate_poses(problem)
     p3p_poses(rays[None, :3], points[None, :3])
     self_motions(points, 0.1)
-    scene = Scene(problem, 0, DEFAULT)
+    scene = SearchFrame(problem, 0, DEFAULT)
     start = Hypotheses.from_poses(*scene.enter(np.eye(3)[None], np.array([[0, 0, 6.0]])))
     run_batch(scene, start)
     local_searches = LOCAL.density_map, LOCAL.narrowing.first_scale

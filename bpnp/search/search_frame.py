@@ -44,12 +44,12 @@ class Companion(NamedTuple):
         shift: (3,) translation, in the unit of both scenes.
     """
 
-    scene: "Scene"
+    scene: "SearchFrame"
     turn: Array
     shift: Array
 
 
-class Scene:
+class SearchFrame:
     """Problem in float32 and in random order, with the camera turned to the mean bearing.
 
     Attributes:
@@ -101,7 +101,7 @@ class Scene:
         """
         return np.float32(2 * math.pi * share / ((1 - share) * self.solid_angle))
 
-    def join(self, other: "Scene", turn: NDArray[np.float64], shift: NDArray[np.float64]) -> None:
+    def join(self, other: "SearchFrame", turn: NDArray[np.float64], shift: NDArray[np.float64]) -> None:
         """Add a rig camera with the same points.
 
         Args:

@@ -15,7 +15,7 @@ from scipy.stats import kstest, truncnorm
 from bpnp.search.problem import Problem
 from bpnp.search.propose.density_map import draw_around, search_near
 from bpnp.search.search import search_poses
-from bpnp.search.search_frame import Scene
+from bpnp.search.search_frame import SearchFrame
 from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import PosePrior
 
@@ -111,7 +111,7 @@ def test_one_search_near_a_prior_finds_a_telephoto_view() -> None:
     """The prior is as wide as for an ordinary lens, many times the view: from most of its poses no point is in view."""
     for seed in range(10):
         problem, rotation = telephoto(np.random.default_rng(seed))
-        scene = Scene(problem, seed, DEFAULT)
+        scene = SearchFrame(problem, seed, DEFAULT)
         found = search_near(scene, scene.enter_prior(problem.prior))
         ends, _ = scene.leave(found.rotation, found.translation)
         assert min(degrees_between(end, rotation) for end in ends) < 0.5, seed
@@ -121,7 +121,7 @@ def test_one_search_near_a_prior_finds_a_telephoto_view() -> None:
 def test_poses_drawn_from_a_prior_are_normal_and_cut_to_the_view(reach: float) -> None:
     """The position of the centroid across the view is distributed like `scipy.stats.truncnorm`."""
     problem, _ = telephoto(np.random.default_rng(3))
-    scene = Scene(problem, 0, DEFAULT)
+    scene = SearchFrame(problem, 0, DEFAULT)
     prior = scene.enter_prior(problem.prior)
     assert isinstance(prior, PosePrior)
     drawn = draw_around(scene, prior, 4000, reach)

@@ -20,7 +20,7 @@ from bpnp.search.inputs import problem_from
 from bpnp.search.matching import POINTS_A_CHECK, count_one_to_one, one_to_one
 from bpnp.search.problem import Problem
 from bpnp.search.refine import annealing
-from bpnp.search.search_frame import Scene
+from bpnp.search.search_frame import SearchFrame
 from bpnp.search.settings import DEFAULT
 from bpnp.search.solvers import _proposals_of_matcher
 
@@ -247,7 +247,7 @@ def test_an_annealing_on_many_points_is_begun_only_if_it_ends_in_time(
     points, pixels, turn = scene_and_pixels(60)
     rays = np.column_stack([(pixels - K[:2, 2]) / K[0, 0], np.ones(60)])
     problem = Problem.of(rays / np.linalg.norm(rays, axis=1, keepdims=True), points)
-    scene = Scene(problem, 0, DEFAULT, Deadline.after(2.5))
+    scene = SearchFrame(problem, 0, DEFAULT, Deadline.after(2.5))
     problem_turn, shift = problem.from_user(turn, np.array([0, 0, 5.0]))
     start = to_scene_frame(Hypotheses.from_poses(problem_turn[None], shift[None]), scene)
     start = annealing.anneal_on_points(scene, start, 0.05)

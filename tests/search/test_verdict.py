@@ -18,7 +18,7 @@ from bpnp.runtime import NEVER, Deadline
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.propose.known_matches import poses_of_matches
-from bpnp.search.search_frame import Scene
+from bpnp.search.search_frame import SearchFrame
 from bpnp.search.settings import DEFAULT
 from bpnp.search.verdict.contest import contest, rivals_of
 from bpnp.search.verdict.decide import Case, SearchResult, decide
@@ -170,11 +170,11 @@ def test_a_focal_length_sweep_reaches_the_true_focal_length(factor: float) -> No
     turned = Rotation.from_euler("x", 3, degrees=True).as_matrix()
     away = shift * (1, 1, factor) - turned @ problem.centre3d
     met = AtZoom(1.0, problem, Hypotheses.from_poses(turned[None], away[None], scale=np.array([4e-3])))
-    climbed = likeliest_zoom(met, Scene(problem, 0, DEFAULT))
+    climbed = likeliest_zoom(met, SearchFrame(problem, 0, DEFAULT))
     assert climbed.zoom == pytest.approx(1 / factor, rel=0.09 if factor == 1 else 0.045)  # half a step; never none
     assert np.degrees(Rotation.from_matrix(climbed.pose.rotation[0]).magnitude()) < 0.5
     seen = case_of(problem, np.eye(3)[None], met.centre3d[None], 4e-3, 0.6)
-    scenes = [Scene(problem, 0, DEFAULT, end) for end in (NEVER, Deadline(0.0))]
+    scenes = [SearchFrame(problem, 0, DEFAULT, end) for end in (NEVER, Deadline(0.0))]
     other, (untried,) = (lens(seen, scene_of=lambda one=one: one, deadline=one.deadline).objections for one in scenes)
     if not other:
         assert (factor, untried.clause) == (1.0, "there was no time to try other focal lengths")
@@ -194,7 +194,7 @@ def test_a_pose_is_not_confident_if_there_was_no_time_to_refine_its_competing_po
     alone = Case.of(found, problem, exhaustive=True)
     assert (alone.objection, len(alone.candidates)) == (None, 1)
     in_time, late = (
-        decide(contest(alone, rivals_of(partial(Scene, problem, 0, DEFAULT, end), end)))
+        decide(contest(alone, rivals_of(partial(SearchFrame, problem, 0, DEFAULT, end), end)))
         for end in (NEVER, Deadline(0.0))
     )
     assert degrees_between(in_time.best[0], np.eye(3)) < 1

@@ -1,8 +1,8 @@
 """Annealing of many poses on clusters, with a kernel for each pair of a bearing and a point; one pose fits the cache.
 
 docs/search.md states the mathematics. Arrays are float32 and coordinate-major, so that loops over points vectorise.
-Directions are held as offsets d = f - e, e = (0, 0, 1) the view's mean bearing (`Scene`). The small numbers of a narrow
-view keep their digits, where float32 rounds f . u - 1 to a multiple of 6e-8.
+Directions are held as offsets d = f - e, e = (0, 0, 1) the view's mean bearing (`SearchFrame`). The small numbers of a
+narrow view keep their digits, where float32 rounds f . u - 1 to a multiple of 6e-8.
 
 Shapes, for m bearings and n points:
     f: (3, m) offsets of the bearings.
@@ -153,7 +153,7 @@ def assign(bearings: Any, points: Any, rotation: Any, translation: Any, scale: A
 
     The kernel is (1 + z/256)^256, z = -|f - u|^2 / 2 s^2, s the scale in radians. It is within 3 % of exp(z) where that
     exceeds 0.02, and needs no function call. Bearings and points are in the order of the labels; the weights of the
-    points under this pose are in the scratch. `outlier` is o of `Scene.outlier_density`.
+    points under this pose are in the scratch. `outlier` is o of `SearchFrame.outlier_density`.
     """
     f, a, p, blocks = bearings.f, bearings.a, points.p, points.blocks
     kernel, base, row, u, column, weight, q, _ = scratch

@@ -236,7 +236,7 @@ def assign_sparse(
     W_ij = x_i K_ij y_j, x_i = a_i/(e_i + sum_j K_ij y_j), y_j = b_j/(e_j + sum_i K_ij x_i), e^2 = o sqrt(A B) times the
     odds, A and B the sums of the weights a and b. Among points of weight 1 a lone pair is matched where its kernel
     exceeds e^2. The outlier density dominates below that in the product form too. The weights b_j under this pose are
-    in the scratch; `outlier` is o of `Scene.outlier_density`. Return the mean log-likelihood of the bearings, the
+    in the scratch; `outlier` is o of `SearchFrame.outlier_density`. Return the mean log-likelihood of the bearings, the
     matched fraction, and False if the scratch is too small for all pairs.
     """
     a, odds2d, odds3d, n = tiles.a, tiles.odds, points.odds, points.p.shape[1]
@@ -285,7 +285,7 @@ def descend_sparse(
     """Anneal poses (S, 3, 3), (S, 3) in place to the scale that explains the bearings best.
 
     An annealing stops `patience` scales after its likelihood was highest and returns to the pose of that scale. The
-    scales (k,) are in radians; `outlier` is o / s^2 of `Scene.outlier_density`. The result (S, 3) is likelihood,
+    scales (k,) are in radians; `outlier` is o / s^2 of `SearchFrame.outlier_density`. The result (S, 3) is likelihood,
     matched fraction and scale; -inf, 0, 0 for a pose that is not finite. Return the number of poses annealed: if it is
     less than S, the scratch was too small for the next pose, left unchanged.
     """

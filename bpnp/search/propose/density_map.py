@@ -28,7 +28,7 @@ from bpnp.runtime import in_time
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.kernels.density_map import DensityMap, add_up
 from bpnp.search.refine.annealing import RECIPES, anneal_on_points, perturb_about_centroid
-from bpnp.search.search_frame import Scene
+from bpnp.search.search_frame import SearchFrame
 from bpnp.search.settings import DensitySearch, DensityShape, Draws, Narrowing, Preselection
 from bpnp.search.starts import PosePrior, Prior, aim_of, draw_poses
 
@@ -57,7 +57,7 @@ EVERYWHERE = DensitySearch(  # density-map search over all rotations [`DensitySe
 )
 
 
-def search_near(scene: Scene, prior: PosePrior, density: DensitySearch | None = None) -> Hypotheses:
+def search_near(scene: SearchFrame, prior: PosePrior, density: DensitySearch | None = None) -> Hypotheses:
     """Return the distinct annealed poses of density-map searches from a prior with a translation, in the scene's frame.
 
     None for all searches of `settings.near`.
@@ -69,7 +69,7 @@ def search_near(scene: Scene, prior: PosePrior, density: DensitySearch | None = 
     return Hypotheses.concatenate([search_density(scene, *each) for each in zip(starts, searches, strict=True)])
 
 
-def search_density(scene: Scene, poses: Hypotheses, density: DensitySearch) -> Hypotheses:
+def search_density(scene: SearchFrame, poses: Hypotheses, density: DensitySearch) -> Hypotheses:
     """Preselect initial poses on a density map, narrow the scale, and anneal the best.
 
     Copies of one initial pose count once for the basin counts.
@@ -94,7 +94,7 @@ def search_density(scene: Scene, poses: Hypotheses, density: DensitySearch) -> H
     return anneal_on_points(scene, poses, scale * scene.spread, outliers=outliers)
 
 
-def search_everywhere(scene: Scene, number: int, prior: Prior | None) -> Hypotheses:
+def search_everywhere(scene: SearchFrame, number: int, prior: Prior | None) -> Hypotheses:
     """Run a density-map search over all rotations, or those of a prior, aimed at one position in the view.
 
     The position is that of the search's number, from 0. Near one position the correct pose has fewer competitors: if it
@@ -105,7 +105,7 @@ def search_everywhere(scene: Scene, number: int, prior: Prior | None) -> Hypothe
     return search_density(scene, Hypotheses.from_poses(*drawn, basin_count=1), density)
 
 
-def search_around(scene: Scene, pose: Hypotheses, density: DensitySearch) -> Hypotheses:
+def search_around(scene: SearchFrame, pose: Hypotheses, density: DensitySearch) -> Hypotheses:
     """Run a local search around one pose in the frame of the scene, with the widest prior of the settings.
 
     The distinct annealed poses have basin counts of 0.
@@ -115,18 +115,18 @@ def search_around(scene: Scene, pose: Hypotheses, density: DensitySearch) -> Hyp
     return search_near(scene, prior._replace(translation_sigma=sigma), density).as_dependent()
 
 
-def is_near(scene: Scene, prior: PosePrior) -> bool:
+def is_near(scene: SearchFrame, prior: PosePrior) -> bool:
     """Return True if a prior has a translation and is narrow enough for its starts to reach the right basin."""
     return prior.translation is not None and _volume(scene, prior, scene.settings.near[0]) <= MOST_VOLUMES
 
 
-def starts_of(scene: Scene, prior: PosePrior, density: DensitySearch) -> int:
+def starts_of(scene: SearchFrame, prior: PosePrior, density: DensitySearch) -> int:
     """Return the number of starts that covers a narrow prior as densely as `Draws.starts` cover a wide one."""
     share = min(_volume(scene, prior, density), 1.0)
     return int(np.clip(density.draws.starts * share, density.draws.least_starts, density.draws.starts))
 
 
-def _volume(scene: Scene, prior: PosePrior, density: DensitySearch) -> float:
+def _volume(scene: SearchFrame, prior: PosePrior, density: DensitySearch) -> float:
     """Return the volume of the poses that a prior allows in this view, in multiples of the wide prior."""
     distance, draws = distance_of(scene, prior), density.draws
     turn = math.radians(prior.rotation_sigma_deg) / math.radians(draws.wide_deg)
@@ -137,7 +137,7 @@ def _volume(scene: Scene, prior: PosePrior, density: DensitySearch) -> float:
     return turn**3 * across**2 * prior.translation_sigma / (draws.wide_shift * distance)
 
 
-def reach_across(scene: Scene, prior: PosePrior, density: DensitySearch) -> float:
+def reach_across(scene: SearchFrame, prior: PosePrior, density: DensitySearch) -> float:
     """Return how far from the centre of the view the centroid of the points may lie along each axis, scene units.
 
     Farther away, most of the points are outside the view; a telephoto view is much narrower than most priors. Infinite
@@ -150,7 +150,7 @@ def reach_across(scene: Scene, prior: PosePrior, density: DensitySearch) -> floa
     return density.draws.reach * math.hypot(scene.spread * distance_of(scene, prior), width)
 
 
-def draw_around(scene: Scene, prior: PosePrior, count: int, reach: float = math.inf) -> Hypotheses:
+def draw_around(scene: SearchFrame, prior: PosePrior, count: int, reach: float = math.inf) -> Hypotheses:
     """Draw poses with basin counts of 1 from a prior with a translation; the first is its mean.
 
     The centroid of the points is at most `reach` scene units from the centre of the view along each axis; the bound is
@@ -175,7 +175,7 @@ def _truncated(normal: NDArray[np.float32], low: float, high: float) -> NDArray[
     return np.asarray(ndtri(first + (last - first) * ndtr(normal.astype(np.float64))), np.float32)
 
 
-def select_admitted(scene: Scene, poses: Hypotheses, prior: Prior | None) -> Hypotheses:
+def select_admitted(scene: SearchFrame, poses: Hypotheses, prior: Prior | None) -> Hypotheses:
     """Select the poses of a scene within `ADMITTED_SIGMAS` standard deviations of a prior of the problem.
 
     All poses are returned unless it is a `PosePrior`.
@@ -193,7 +193,7 @@ def select_admitted(scene: Scene, poses: Hypotheses, prior: Prior | None) -> Hyp
     return poses[off <= ADMITTED_SIGMAS**2]
 
 
-def perturb(scene: Scene, poses: Hypotheses, scale: float, copies: int) -> Hypotheses:
+def perturb(scene: SearchFrame, poses: Hypotheses, scale: float, copies: int) -> Hypotheses:
     """Return each pose followed by `copies` - 1 randomly perturbed ones, with its basin count.
 
     The points move by an angular distance of `scale` RMS angular radii of the bearings.
@@ -206,13 +206,13 @@ def perturb(scene: Scene, poses: Hypotheses, scale: float, copies: int) -> Hypot
     return replace(copied, basin_count=poses.basin_count.repeat(copies))
 
 
-def perturb_each(scene: Scene, poses: Hypotheses) -> Hypotheses:
+def perturb_each(scene: SearchFrame, poses: Hypotheses) -> Hypotheses:
     """Return poses from other sources with perturbed copies; basin counts are 0, since copies are dependent."""
     return perturb(scene, poses, COPIED_SCALE, COPIES).as_dependent()
 
 
 def preselect(
-    scene: Scene, poses: Hypotheses, shape: DensityShape, scale: float, points: int, kept: int
+    scene: SearchFrame, poses: Hypotheses, shape: DensityShape, scale: float, points: int, kept: int
 ) -> tuple[Hypotheses, NDArray[np.int64]]:
     """Return the best poses on the density maps of all rig cameras, at most `kept`, and their indices.
 
@@ -238,7 +238,7 @@ def preselect(
     return poses[best], best
 
 
-def density_map_of(scene: Scene, shape: DensityShape, scale: float) -> DensityMap:
+def density_map_of(scene: SearchFrame, shape: DensityShape, scale: float) -> DensityMap:
     """Return the density map of the bearings of a scene, smoothed by `scale` of their RMS angular radii.
 
     The scene stores it.
@@ -248,7 +248,7 @@ def density_map_of(scene: Scene, shape: DensityShape, scale: float) -> DensityMa
     return scene.density_maps[shape, scale]
 
 
-def _draw_density_map(scene: Scene, shape: DensityShape, scale: float) -> DensityMap:
+def _draw_density_map(scene: SearchFrame, shape: DensityShape, scale: float) -> DensityMap:
     """Compute the density map that `density_map_of` stores."""
     d = scene.offsets.astype(np.float64)
     at = 2 * d[:, :2] / np.maximum(2 + d[:, 2:], 1e-9)
@@ -270,7 +270,7 @@ def _draw_density_map(scene: Scene, shape: DensityShape, scale: float) -> Densit
     return DensityMap(np.where(inside, gain - mean, 0).astype(np.float32), np.float32(half), np.float32(per_cell))
 
 
-def distance_of(scene: Scene, prior: PosePrior) -> float:
+def distance_of(scene: SearchFrame, prior: PosePrior) -> float:
     """Return the distance of the centroid of the points from the camera of the prior, at least 1e-6."""
     centroid = scene.bulk3d.mean(0)
     return max(float(np.linalg.norm(np.asarray(prior.rotation) @ centroid + np.asarray(prior.translation))), 1e-6)

@@ -11,7 +11,7 @@ from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_fram
 from bpnp.search.kernels.sides import FORWARD
 from bpnp.search.propose.density_map import perturb_each
 from bpnp.search.refine.annealing import COARSE, MIDDLE, STARTS, anneal_on_clusters, anneal_on_points, finish
-from bpnp.search.search_frame import Scene
+from bpnp.search.search_frame import SearchFrame
 
 REFINED_DIRECTLY = 8  # largest number of given poses that need no clusters [poses; cost]
 COPIED_POSES = 4  # number of poses from other sources, the best first, that are also copied [poses; calibration]
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 
 @one_blas_thread
-def anneal_given(scene: Scene, rotation: Array, translation: Array) -> Hypotheses:
+def anneal_given(scene: SearchFrame, rotation: Array, translation: Array) -> Hypotheses:
     """Anneal poses of a problem, with perturbed copies of the first few; the poses that result have no NFA.
 
     The objective is that of `bpnp.search.search.search_poses`. An initial pose may be about 10 degrees off, and more if
@@ -42,7 +42,7 @@ def anneal_given(scene: Scene, rotation: Array, translation: Array) -> Hypothese
 
 
 @one_blas_thread
-def score_given(scene: Scene, rotation: Array, translation: Array) -> Hypotheses:
+def score_given(scene: SearchFrame, rotation: Array, translation: Array) -> Hypotheses:
     """Anneal poses of a problem a little, to score them like those of a search; NaN for a missing one.
 
     The residuals are assumed to have the median distance of a point to the nearest bearing. Basin counts are 0, since
@@ -59,7 +59,7 @@ def score_given(scene: Scene, rotation: Array, translation: Array) -> Hypotheses
     return to_problem_frame(finish(scene, replace(starts, scale=scale)), scene)
 
 
-def enter_given(scene: Scene, rotation: Array, translation: Array) -> Hypotheses:
+def enter_given(scene: SearchFrame, rotation: Array, translation: Array) -> Hypotheses:
     """Return the poses of a problem that are not NaN, in the frame of a scene."""
     finite = np.isfinite(rotation).all((-2, -1)) & np.isfinite(translation).all(-1)
     return Hypotheses.from_poses(*scene.enter(rotation[finite], translation[finite]))

@@ -12,7 +12,7 @@ from bpnp.runtime import Deadline
 from bpnp.search.arguments import Array
 from bpnp.search.problem import Problem
 from bpnp.search.propose.given import score_given
-from bpnp.search.search_frame import Scene
+from bpnp.search.search_frame import SearchFrame
 from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict.contest import contest, rivals_of
@@ -76,7 +76,7 @@ def predicted(net: nn.Module, members: list[Problem], deadline: Deadline) -> lis
 
 
 def _case_of(problem: Problem, rotation: Array, translation: Array, deadline: Deadline) -> Case:
-    scene = Scene(problem, 0, DEFAULT, deadline)
+    scene = SearchFrame(problem, 0, DEFAULT, deadline)
     poses = score_given(scene, rotation, translation)
     if not len(poses):
         return Case.without_pose(problem, objection("no_pose")._replace(clause="the module found no pose"))

@@ -13,7 +13,7 @@ from bpnp.runtime import Clock, in_time, thread_count
 from bpnp.search.hypotheses import KEPT_CANDIDATES, Hypotheses, select_distinct, to_problem_frame
 from bpnp.search.kernels.dense import dense_scratch, descend
 from bpnp.search.kernels.sparse import descend_sparse, sparse_scratch
-from bpnp.search.search_frame import Scene, Sides
+from bpnp.search.search_frame import SearchFrame, Sides
 from bpnp.search.starts import Array, Prior, StartSampling, draw_poses
 
 # Pairs of bearings and points from which the first step of an annealing on all of them is timed.
@@ -69,21 +69,23 @@ def kept_by(stage: ClusterStage, starts: int) -> int:
     return min(stage.kept, max(LEAST_KEPT, math.ceil(math.sqrt(starts / STARTS) * stage.kept)))
 
 
-def multistart(scene: Scene, number: int, prior: Prior | None) -> Hypotheses:
+def multistart(scene: SearchFrame, number: int, prior: Prior | None) -> Hypotheses:
     """Run one batch of starts over all rotations, or over those that a prior in the frame of the scene allows."""
     recipe = RECIPES[number % len(RECIPES)]
     drawn = draw_poses(scene.spread, scene.bulk3d, batch_size(number), recipe, prior, scene.rng)
     return run_batch(scene, Hypotheses.from_poses(*drawn, basin_count=1))
 
 
-def run_batch(scene: Scene, starts: Hypotheses) -> Hypotheses:
+def run_batch(scene: SearchFrame, starts: Hypotheses) -> Hypotheses:
     """Anneal one batch of starts, from clusters to all points."""
     stages = *COARSE, *MIDDLE
     poses = anneal_on_clusters(scene, starts, stages, len(starts))
     return anneal_on_points(scene, poses, stages[-1].last_scale * scene.spread)
 
 
-def anneal_on_clusters(scene: Scene, poses: Hypotheses, stages: Sequence[ClusterStage], starts: int) -> Hypotheses:
+def anneal_on_clusters(
+    scene: SearchFrame, poses: Hypotheses, stages: Sequence[ClusterStage], starts: int
+) -> Hypotheses:
     """Anneal poses on clusters, stage by stage, coarse to fine; the poses have different rotations, best first.
 
     The number of starts of the batch determines how many poses each stage keeps.
@@ -100,7 +102,7 @@ def anneal_on_clusters(scene: Scene, poses: Hypotheses, stages: Sequence[Cluster
     return poses
 
 
-def _annealed(scene: Scene, starts: Hypotheses, sides: Sides, scales: Array, outlier: np.float32) -> Hypotheses:
+def _annealed(scene: SearchFrame, starts: Hypotheses, sides: Sides, scales: Array, outlier: np.float32) -> Hypotheses:
     """Take one step at each scale (k,), radians; return the poses that were annealed before the deadline."""
     rotation, translation, score = starts.rotation.copy(), starts.translation.copy(), starts.log_likelihood.copy()
 
@@ -113,7 +115,7 @@ def _annealed(scene: Scene, starts: Hypotheses, sides: Sides, scales: Array, out
 
 
 def anneal_on_points(
-    scene: Scene,
+    scene: SearchFrame,
     starts: Hypotheses,
     first_scale: float,
     *,
@@ -157,7 +159,7 @@ def anneal_on_points(
 
 
 def perturb_about_centroid(
-    scene: Scene, rotation: Array, translation: Array, vectors: Array, shifts: Array, *, basin_count: int = 0
+    scene: SearchFrame, rotation: Array, translation: Array, vectors: Array, shifts: Array, *, basin_count: int = 0
 ) -> Hypotheses:
     """Return copies of k poses, adjacent for each, rotated by vectors (s, 3) about the centroid and shifted (s, 3).
 
@@ -171,7 +173,7 @@ def perturb_about_centroid(
     return Hypotheses.from_poses(turned.reshape(-1, 3, 3), shifted.astype(np.float32), basin_count=basin_count)
 
 
-def finish(scene: Scene, poses: Hypotheses, annealed: int | None = None) -> Hypotheses:
+def finish(scene: SearchFrame, poses: Hypotheses, annealed: int | None = None) -> Hypotheses:
     """Anneal the best `annealed` poses, None for all, again on every bearing; the others are kept.
 
     The best two are also annealed with each of `settings.end_outliers`.
@@ -192,7 +194,7 @@ def finish(scene: Scene, poses: Hypotheses, annealed: int | None = None) -> Hypo
 
 
 def anneal_to_end(
-    scene: Scene, rotations: NDArray[np.float64], translations: NDArray[np.float64], scale: float
+    scene: SearchFrame, rotations: NDArray[np.float64], translations: NDArray[np.float64], scale: float
 ) -> Hypotheses:
     """Anneal poses (c, 3, 3), (c, 3) of a problem to the end on all points, from residuals of `scale` radians.
 
@@ -204,7 +206,7 @@ def anneal_to_end(
     return to_problem_frame(ends if len(ends) else starts, scene)
 
 
-def _outlasts_deadline(scene: Scene, pose: Hypotheses, first_scale: float) -> bool:
+def _outlasts_deadline(scene: SearchFrame, pose: Hypotheses, first_scale: float) -> bool:
     """Return whether annealing a pose (1,) on every bearing would last beyond the deadline; False for few points.
 
     The time is that of one step at the first scale, and of further ones whose close points become fewer.

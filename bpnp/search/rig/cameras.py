@@ -28,7 +28,7 @@ from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.pose_model import PoseModel, crossed
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.refine.gauss_newton import refine, soft_equations, steps
-from bpnp.search.search_frame import Scene
+from bpnp.search.search_frame import SearchFrame
 from bpnp.search.solution import FOCAL_LENGTH, POSE_PARAMETERS, SCALE
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
 from bpnp.search.verdict.covariance import covariance_of, join, student_factor
@@ -117,7 +117,7 @@ class Rig:
         units = np.broadcast_to(unit, (*translation.shape[:-1], 1))
         return turn.T @ rotation, np.concatenate([(translation - units * shift) @ turn, units], -1)
 
-    def join(self, scenes: Mapping[int, Scene]) -> None:
+    def join(self, scenes: Mapping[int, SearchFrame]) -> None:
         """Register the scenes of the cameras with each other for common searches, if the unit is known."""
         for k, other in () if self.model.scale else permutations(scenes, 2):
             (turn, shift), (others, moved) = self.mounts[k], self.mounts[other]

@@ -28,7 +28,7 @@ from bpnp.search.propose.known_matches import known_matches, poses_of_matches
 from bpnp.search.propose.repetitions import repeated_poses
 from bpnp.search.rig.cameras import WIDE_SCALES, Array, Pose, Rig
 from bpnp.search.search import lacks_partners
-from bpnp.search.search_frame import Scene
+from bpnp.search.search_frame import SearchFrame
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.verdict.competitors import distance_between
 from bpnp.search.verdict.completeness import Symmetry
@@ -81,7 +81,7 @@ def search_rig(
     poses, tell = RigPoses(rig, deadline), teller(progress)
     for k, problem in enumerate(rig.problems):
         if exceeds_enumeration(problem):
-            scene = Scene(problem, seed + k, settings, deadline)
+            scene = SearchFrame(problem, seed + k, settings, deadline)
             if not lacks_partners(scene):
                 poses.pools[k] = Pool(scene, problem, Case.without_pose(problem))
     rig.join({k: pool.scene for k, pool in poses.pools.items()})

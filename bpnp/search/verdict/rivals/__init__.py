@@ -2,8 +2,8 @@
 
 from collections.abc import Callable
 
-from bpnp.search.search_frame import Scene
+from bpnp.search.search_frame import SearchFrame
 from bpnp.search.verdict.decide import Case
 
-SceneOf = Callable[[], Scene]
+SceneOf = Callable[[], SearchFrame]
 Rival = Callable[[Case], Case]  # the case with competing poses or an objection; the same one if there is none

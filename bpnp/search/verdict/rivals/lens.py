@@ -14,7 +14,7 @@ from bpnp.search.pose_model import undistort
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.propose.density_map import search_around
 from bpnp.search.propose.lens import LensFit, fit_lens
-from bpnp.search.search_frame import Scene
+from bpnp.search.search_frame import SearchFrame
 from bpnp.search.settings import DensitySearch, Draws, Narrowing, Preselection
 from bpnp.search.verdict.competitors import other_camera
 from bpnp.search.verdict.completeness import INDEPENDENT_MATCHES
@@ -151,7 +151,7 @@ class AtZoom(NamedTuple):
         return float(self.pose.log_likelihood[0]) + math.log(self.problem.image.solid_angle)
 
 
-def likeliest_zoom(start: AtZoom, scene: Scene) -> AtZoom:
+def likeliest_zoom(start: AtZoom, scene: SearchFrame) -> AtZoom:
     """Return the likeliest pose at other focal lengths.
 
     One step is tried to either side. The likelier side is followed while the likelihood grows.
@@ -170,7 +170,7 @@ def likeliest_zoom(start: AtZoom, scene: Scene) -> AtZoom:
     return best
 
 
-def search_at_zoom(found: AtZoom, zoom: float, scene: Scene) -> AtZoom:
+def search_at_zoom(found: AtZoom, zoom: float, scene: SearchFrame) -> AtZoom:
     """Return the likeliest pose at `zoom` times the focal length of a given one, or the given one after the deadline.
 
     The search starts from the pose that shows the scene at the same size.
@@ -183,7 +183,7 @@ def search_at_zoom(found: AtZoom, zoom: float, scene: Scene) -> AtZoom:
     if scene.deadline.passed():
         return found
     problem = at_focal_length(found.problem, zoom)
-    there = Scene(problem, 0, scene.settings, scene.deadline)
+    there = SearchFrame(problem, 0, scene.settings, scene.deadline)
     shift = found.centre3d * (1, 1, zoom) - found.pose.rotation[0] @ problem.centre3d
     start = Hypotheses.from_poses(*there.enter(found.pose.rotation, shift[None]))
     poses = to_problem_frame(search_around(there, start, AT_FOCAL_STEP)[:1], there)
