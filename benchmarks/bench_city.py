@@ -29,11 +29,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from record import Array, Pose, Problem, Row, Similarity, degrees, parser, run, spread
+from record import Problem, Row, Similarity, degrees, parser, run, spread
 from scipy.spatial.transform import Rotation
 from view_problems import REPORTED, map_of, median_distance, model_of, part_of
 
 from bpnp import SceneMap, warm_up
+from bpnp.arrays import Array, PoseArrays
 from bpnp.cameras import camera_from
 from bpnp.datamodules.colmap.reconstruction import ImagePoints, Reconstruction
 from bpnp.maps.views import View
@@ -54,7 +55,7 @@ class CityPhoto(NamedTuple):
     name: str
     points2d: Array  # all its keypoints (m, 2), normalised
     focal: float
-    poses: tuple[Pose, ...]  # the true one, and of a repeated place the one there
+    poses: tuple[PoseArrays, ...]  # the true one, and of a repeated place the one there
     distance: float  # of the median point that it sees
 
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 from leds import Setting, frames
-from record import Array, Problem, Row, parser, run
+from record import Problem, Row, parser, run
 from view_problems import (
     REPORTED,
     ViewProblem,
@@ -30,6 +30,7 @@ from view_problems import (
     view_problem,
 )
 
+from bpnp.arrays import Array
 from bpnp.cameras import camera_from, image_size
 
 RIGHT_DEG = {"maps": 1.5, "lenses": 1.5, "leds": 3.0}

@@ -20,11 +20,12 @@ import poselib
 import pycolmap
 from numpy.typing import NDArray
 from rebuilt_maps import PhotoScene, align
-from record import Array, Problem, Row, parser, run, spread
+from record import Problem, Row, parser, run, spread
 from scipy.cluster.vq import kmeans2, vq
 from view_problems import median_distance
 
 from bpnp import SceneMap, Solution
+from bpnp.arrays import Array
 from bpnp.datamodules.colmap.model_files import read_records
 from bpnp.maps.photos import detected_keypoints
 

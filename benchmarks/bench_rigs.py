@@ -16,11 +16,12 @@ from typing import Any
 
 import numpy as np
 from leds import Camera, device
-from record import Array, Problem, Row, parser, run
+from record import Problem, Row, parser, run
 from scipy.spatial.transform import Rotation
 from view_problems import LEAST_MATCHES, MOST_POINTS, REPORTED, images_of, model_of, overlapping, view_problem
 
 import bpnp
+from bpnp.arrays import Array
 
 RIGHT_DEG = 3.0
 LEAST, MOST, NOISE_PX, AROUND = 4, 6, 0.2, 0.5  # LEDs of a camera, noise, metres from the device to a camera

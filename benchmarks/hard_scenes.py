@@ -8,10 +8,11 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from record import Array, Pose
 from scipy.spatial.transform import Rotation
 
-Drawn = tuple[Array, Array, list[Pose]]
+from bpnp.arrays import Array, PoseArrays
+
+Drawn = tuple[Array, Array, list[PoseArrays]]
 FOCAL, WIDTH, HEIGHT = 500.0, 640, 480  # pixels
 CAMERA = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
 NOISE = 0.5  # pixels
@@ -138,18 +139,18 @@ def _line(rng: np.random.Generator, axes: int) -> Array:
     return rng.uniform(-1, 1, axes) + np.outer(np.linspace(0, 1, 15), rng.uniform(-1.5, 1.5, axes))
 
 
-def _any(rng: np.random.Generator) -> Pose:
+def _any(rng: np.random.Generator) -> PoseArrays:
     return Rotation.random(rng=rng).as_matrix(), np.array([*rng.normal(0, 0.3, 2), rng.uniform(4, 8)])
 
 
-def _facing(rng: np.random.Generator, degrees: float, distance: tuple[float, float], aside: float = 0.4) -> Pose:
+def _facing(rng: np.random.Generator, degrees: float, distance: tuple[float, float], aside: float = 0.4) -> PoseArrays:
     """Return a pose in front of a plane, with the optical axis rotated by up to `degrees` and shifted by `aside`."""
     axis = rng.standard_normal(3)
     turn = Rotation.from_rotvec(np.radians(rng.uniform(5, degrees)) * axis / np.linalg.norm(axis)).as_matrix()
     return turn, np.array([*rng.uniform(-aside, aside, 2), rng.uniform(*distance)])
 
 
-def _project(image: Array, scene: Array, pose: Pose, rng: np.random.Generator, focal: float = 1.0) -> Drawn:
+def _project(image: Array, scene: Array, pose: PoseArrays, rng: np.random.Generator, focal: float = 1.0) -> Drawn:
     """Return the shuffled pixels of the points `image` under the pose, with `focal` times the focal length."""
     camera = image @ pose[0].T + pose[1]
     pixels = camera[:, :2] / camera[:, 2:] * focal * FOCAL + (WIDTH / 2, HEIGHT / 2)
@@ -157,7 +158,7 @@ def _project(image: Array, scene: Array, pose: Pose, rng: np.random.Generator, f
 
 
 def _in_frame(
-    seen: Array, points: Array, pose: Pose, rng: np.random.Generator, mapped: NDArray[np.bool_] | None = None
+    seen: Array, points: Array, pose: PoseArrays, rng: np.random.Generator, mapped: NDArray[np.bool_] | None = None
 ) -> Drawn:  # fmt: skip
     """Return the visible points that lie in the image, and the points of the map, both relative to their centroid."""
     centroid = points.mean(0)

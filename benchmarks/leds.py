@@ -12,10 +12,11 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from record import Array, Problem
+from record import Problem
 from scipy.spatial.transform import Rotation
 
 import bpnp
+from bpnp.arrays import Array
 from bpnp.cameras import camera_from
 
 Kind = Literal["ring", "headset", "drone", "marker"]

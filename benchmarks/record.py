@@ -16,11 +16,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import fdtri
 
 from bpnp import Solution, warm_up
+from bpnp.arrays import Array, PoseArrays
 from bpnp.files import write_atomically
 from bpnp.search.verdict.covariance import student_factor
 
@@ -34,8 +34,6 @@ FAR_DEG = 3.0  # from which a confident pose with an unknown focal length is cou
 BOUND = 0.999  # probability of the region around a pose that `beyond_bound` tests
 
 T = TypeVar("T")
-Array = NDArray[np.float64]
-Pose = tuple[Array, Array]  # rotation, translation: camera = R p + t
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +47,7 @@ class Similarity:
     def points(self, points3d: Array) -> Array:
         return self.scale * points3d @ self.turn.T + self.shift
 
-    def pose(self, rotation: Array, translation: Array) -> Pose:
+    def pose(self, rotation: Array, translation: Array) -> PoseArrays:
         """A camera's pose, its depths in the unit of the new frame."""
         turned = rotation @ self.turn.T
         return turned, self.scale * translation - turned @ self.shift
@@ -102,7 +100,7 @@ class Problem:
 
     name: str
     solve: Callable[[], Solution]
-    poses: Sequence[Pose]
+    poses: Sequence[PoseArrays]
     points3d: Array = field(default_factory=lambda: np.zeros((1, 3)))  # the centroid is used for the errors
     distance: float = 1.0  # unit of the error of the camera's centre
     focal: float = np.nan  # true focal length in pixels, if it is estimated
@@ -174,7 +172,7 @@ def nearest(problem: Problem, rotation: Array, translation: Array) -> tuple[floa
     return min(errors, default=(NO_POSE_DEG, np.inf, np.inf, None), key=lambda error: error[0])
 
 
-def beyond_bound(found: Solution, pose: Pose) -> bool:
+def beyond_bound(found: Solution, pose: PoseArrays) -> bool:
     """Return True if the true rotation, or the true pose, lies outside the 99.9 % region of the solution.
 
     As for the bound in `reason`, the region holds the errors e with e^T C^-1 e / d below the quantile of F with d and
@@ -186,7 +184,7 @@ def beyond_bound(found: Solution, pose: Pose) -> bool:
     return not len(squared) or any(squared[:d].sum() > d * fdtri(d, free, BOUND) / widened for d in {3, len(squared)})
 
 
-def sigmas(found: Solution, pose: Pose, centroid: Array) -> list[float]:
+def sigmas(found: Solution, pose: PoseArrays, centroid: Array) -> list[float]:
     """Return the errors along six independent directions, in their standard deviations by the covariance.
 
     The directions of the rotation come first. The shift is that of the centroid of the scene (3,), because far from it

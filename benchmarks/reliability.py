@@ -36,11 +36,12 @@ import numpy as np
 import shapes
 import symmetric
 from hard_scenes import CAMERA, SCENES, Drawn, wrong_focal_plane
-from record import Array, Pose, Problem, Row, parser, run
+from record import Problem, Row, parser, run
 from scipy.special import softmax
 from view_problems import LEAST_MATCHES, REPORTED, Against, ViewProblem, scene_problems
 
 from bpnp import Solution, solve
+from bpnp.arrays import Array, PoseArrays
 from bpnp.cameras import camera_from
 from bpnp.search.inputs import problem_from
 from bpnp.search.solvers import Options, solve_problems
@@ -152,7 +153,7 @@ def of_classes(kind: str, options: argparse.Namespace) -> Iterator[Problem]:
         yield leds.problem(f"{k}", shown, camera=shown.camera.model, **arguments, **limits(options))
 
 
-def problem(name: str, run: Callable[[], Solution], poses: Sequence[Pose], points3d: Array) -> Problem:
+def problem(name: str, run: Callable[[], Solution], poses: Sequence[PoseArrays], points3d: Array) -> Problem:
     """Return the problem of a frame; the error of the centre is in distances of the centroid of the scene."""
     centroid = np.median(points3d, 0)
     distance = float(np.linalg.norm(poses[0][0] @ centroid + poses[0][1])) if poses else 1.0

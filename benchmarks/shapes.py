@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from record import Array, Problem, spread
+from record import Problem, spread
 from scipy.spatial.transform import Rotation
 from view_problems import REPORTED
 
 from bpnp import solve
+from bpnp.arrays import Array
 from bpnp.datamodules import ColmapDataModule, MeshDataModule, Outliers
 from bpnp.datamodules.shapes import normalise, procedural_shape, sample_surface
 

@@ -11,10 +11,11 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from record import Array, Problem
+from record import Problem
 from scipy.spatial.transform import Rotation
 
 import bpnp
+from bpnp.arrays import Array
 
 NOISE = 1e-3  # of normalised image coordinates
 JITTER = 0.004  # of a near symmetry, in extents of the device

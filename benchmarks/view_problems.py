@@ -12,9 +12,10 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from record import Array, Pose, Problem, spread
+from record import Problem, spread
 
 from bpnp import solve
+from bpnp.arrays import Array, PoseArrays
 from bpnp.datamodules.colmap.reconstruction import ImagePoints, Reconstruction, read_reconstruction
 from bpnp.maps.scene_map import SceneMap
 from bpnp.maps.views import View
@@ -35,7 +36,7 @@ class ViewProblem:
     points2d: Array  # (m, 2), normalised
     points3d: Array  # (n, 3)
     matched: NDArray[np.bool_]  # (n,) which of them the photo sees
-    pose: Pose  # of the photo
+    pose: PoseArrays  # of the photo
     view: str | None  # whose points they are, None for those of the whole map
     focal: float  # pixels
     scene: SceneMap  # without the photo, of these points alone, in this order
@@ -51,7 +52,7 @@ class ViewProblem:
         return median_distance(self.points3d, self.pose)
 
 
-def median_distance(points3d: Array, pose: Pose) -> float:
+def median_distance(points3d: Array, pose: PoseArrays) -> float:
     """Return the median distance of points from a camera."""
     return float(np.median(np.linalg.norm(points3d @ pose[0].T + pose[1], axis=-1)))
 

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bpnp import SceneMap
+from bpnp.arrays import Array
 from bpnp.cameras import camera_from
 from bpnp.maps.views import View, places_first, scores_of_views
 
-Array = NDArray[np.float64]
 PLACES, POINTS = 60, 900
 
 

@@ -7,17 +7,16 @@ import numpy as np
 import pytest
 import torch
 from authors_network import Released, checkpoint, plan
-from numpy.typing import NDArray
 from planted import seen
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 from torch import nn
 
 from bpnp import Batch, BPnPNet
+from bpnp.arrays import Array
 from bpnp.cli import main
 
 DISTANCE = 4.0
-Array = NDArray[np.float64]
 
 
 @pytest.fixture(scope="module")

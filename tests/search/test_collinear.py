@@ -4,15 +4,14 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from planted import degrees_between, directions
 from scipy.spatial.transform import Rotation
 
 import bpnp
+from bpnp.arrays import Array
 from bpnp.search.problem import Problem
 from bpnp.search.propose.collinear import find_line, rotations_about
 
-Array = NDArray[np.float64]
 FOCAL = 800.0
 
 

@@ -2,11 +2,9 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from bpnp.arrays import Array
 from bpnp.search.verdict.covariance import covariance_of, join, of_sure_matches
-
-Array = NDArray[np.float64]
 
 
 def rows(seed: int, count: int = 60, size: int = 3) -> Array:

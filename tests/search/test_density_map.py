@@ -7,19 +7,17 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from planted import degrees_between, view_with_outliers
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest, truncnorm
 
+from bpnp.arrays import Array
 from bpnp.search.problem import Problem
 from bpnp.search.propose.density_map import draw_around, search_near
 from bpnp.search.search import search_poses
 from bpnp.search.search_frame import SearchFrame
 from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import PosePrior
-
-Array = NDArray[np.float64]
 
 
 def cluttered(seed: int, true: int = 80, outliers: int = 220, **view: float) -> tuple[Array, Array, Array, Array]:

@@ -10,6 +10,7 @@ from planted import degrees_between, directions
 from scipy.spatial.transform import Rotation
 
 import bpnp
+from bpnp.arrays import Array
 from bpnp.robust.minimal_solvers import p3p
 from bpnp.runtime import Clock
 from bpnp.search.enumeration import search
@@ -19,7 +20,6 @@ from bpnp.search.enumeration.search import Enumerated, Enumeration, Stage, enume
 from bpnp.search.problem import Problem
 from bpnp.search.starts import PosePrior
 
-Array = NDArray[np.float64]
 RADIUS = 2e-3
 NOISE = 4e-4
 

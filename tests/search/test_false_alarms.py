@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from planted import directions
 from scipy.spatial.transform import Rotation
 
+from bpnp.arrays import Array
 from bpnp.search import problem as problem_module
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem
@@ -22,7 +22,6 @@ from bpnp.search.verdict.false_alarms import (
     point_evidence,
 )
 
-Array = NDArray[np.float64]
 SHIFT = np.array([0.1, -0.2, 6.0])
 
 

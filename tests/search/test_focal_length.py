@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from planted import degrees_between
 from scipy.spatial.transform import Rotation
 
 from bpnp import Solution, solve
+from bpnp.arrays import Array
 from bpnp.cameras import Camera, camera_from, camera_to_json
 from bpnp.search.assemble import Solved
 from bpnp.search.focal_length import FocalSweep, fit_camera, is_within_bound, unknown_camera
@@ -22,7 +22,6 @@ from bpnp.search.solution import FOCAL_LENGTH, POSE_PARAMETERS, SCALE, Candidate
 from bpnp.search.solvers import Options
 from bpnp.search.verdict.decide import Case
 
-Array = NDArray[np.float64]
 SIZE = (640, 480)
 LIMIT = 300.0  # seconds, more than any of them takes
 

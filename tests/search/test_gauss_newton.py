@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from planted import degrees_between, directions
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from bpnp.arrays import Array
 from bpnp.cameras import camera_from
 from bpnp.search.pose_model import PoseModel, PoseState
 from bpnp.search.problem import Problem, UnknownFocal
@@ -21,7 +21,6 @@ from bpnp.search.refine.gauss_newton import (
     steps,
 )
 
-Array = NDArray[np.float64]
 RNG = np.random.default_rng(0)
 POINTS = RNG.uniform(-1, 1, (40, 3))
 ROTATION, TRANSLATION = Rotation.from_rotvec([0.4, -0.3, 0.2]).as_matrix(), np.array([0.1, -0.2, 5.0])

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from planted import degrees_between, directions
 from scipy.spatial.transform import Rotation
 
+from bpnp.arrays import Array
 from bpnp.cameras import camera_from
 from bpnp.search.pose_model import lens_columns, lens_error_columns, log10_lenses
 from bpnp.search.problem import Problem, UnknownFocal
@@ -18,7 +18,6 @@ from bpnp.search.propose.lens import FITTED_BEARINGS, fit_lens, lens_model
 from bpnp.search.refine.gauss_newton import soft_equations
 from bpnp.search.verdict.uncertainty import linearised, local_covariance
 
-Array = NDArray[np.float64]
 FOCAL = 1000.0
 
 

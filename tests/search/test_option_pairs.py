@@ -15,8 +15,8 @@ from planted import degrees_between
 from scipy.spatial.transform import Rotation
 
 from bpnp import GravityPrior, PosePrior, Solution, solve, solve_many
+from bpnp.arrays import Array
 
-Array = NDArray[np.float64]
 Options = frozenset[str]
 FOCAL, SIZE, NOISE = 400.0, (640, 480), 0.15
 COLOURS = 4

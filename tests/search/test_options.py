@@ -10,18 +10,17 @@ import pycolmap
 import pytest
 import torch
 import trimesh
-from numpy.typing import NDArray
 from planted import degrees_between, plant, seen
 from scipy.spatial.transform import Rotation
 
 import bpnp
 from bpnp import GravityPrior, PosePrior, Solution, solve
+from bpnp.arrays import Array
 from bpnp.cli import main
 from bpnp.search.arguments import checked_prior, scene_points
 from bpnp.search.settings import DEFAULT
 from bpnp.search.solvers import Options
 
-Array = NDArray[np.float64]
 RNG = np.random.default_rng(5)
 OBJECT = RNG.uniform(-1, 1, (80, 3))
 POSES = [(Rotation.random(random_state=k).as_matrix(), np.array([side, 0.1, 7.0])) for k, side in ((1, -0.8), (2, 0.9))]

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from planted import directions
 from scipy.spatial.transform import Rotation
 
@@ -14,7 +13,6 @@ from bpnp.search.pose_model import PoseModel, PoseState, undistort
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.starts import GravityPrior, PosePrior
 
-Array = NDArray[np.float64]
 FOCAL = 1000.0
 STEP = 1e-6
 RNG = np.random.default_rng(0)

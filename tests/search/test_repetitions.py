@@ -7,12 +7,12 @@ from numpy.typing import NDArray
 from planted import directions
 from scipy.optimize import nnls
 
+from bpnp.arrays import Array
 from bpnp.search.problem import Problem
 from bpnp.search.propose import repetitions
 from bpnp.search.propose.repetitions import _among, registered
 from bpnp.search.propose.symmetries import Motions, matching_tolerance
 
-Array = NDArray[np.float64]
 TRANSLATION = np.array([0.0, 0.0, 9.0])
 GRID = np.stack(np.meshgrid(np.arange(10.0), np.arange(5.0), [0.0], indexing="ij"), -1).reshape(-1, 3) - [4.5, 2, 0]
 LEFT = GRID[:, 0] < -1

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from planted import seen, view_with_outliers
 
 import bpnp
+from bpnp.arrays import Array
 
-Array = NDArray[np.float64]
 SHARP = 1.48  # the likeliest of four classes is right in 70 %
 
 

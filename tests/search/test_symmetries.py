@@ -2,15 +2,13 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from planted import degrees_between
 from scipy.spatial.transform import Rotation
 
 import bpnp
+from bpnp.arrays import Array
 from bpnp.search.propose import symmetries
 from bpnp.search.propose.symmetries import Motions, matching_tolerance, mirror_pose, self_motions
-
-Array = NDArray[np.float64]
 
 
 def parts(fold: int, each: int, unique: int, seed: int, axis: tuple[float, float, float] = (0, 0, 1)) -> Array:

@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, norm, t
 
 from bpnp import solve
+from bpnp.arrays import Array
 from bpnp.search.problem import Problem
 from bpnp.search.starts import GravityPrior, PosePrior
 from bpnp.search.verdict import uncertainty
 from bpnp.search.verdict.uncertainty import error_bounds, linearised, local_covariance, pose_covariance
 
-Array = NDArray[np.float64]
 SHIFT = np.array([0.1, -0.2, 6.0])
 NOISE = 1e-3
 

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from planted import degrees_between, directions
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.special import stdtrit
 
+from bpnp.arrays import Array
 from bpnp.runtime import NEVER, Deadline
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, UnknownFocal
@@ -24,7 +24,6 @@ from bpnp.search.verdict.contest import contest, rivals_of
 from bpnp.search.verdict.decide import Case, SearchResult, decide
 from bpnp.search.verdict.rivals.lens import AtZoom, lens, likeliest_zoom
 
-Array = NDArray[np.float64]
 SHIFT = np.array([0.0, 0.0, 6.0])
 
 
