@@ -2,7 +2,8 @@
 
 The network is that of the checkpoint: the description in `--ckpt_path` or `--model.weights` gives the defaults of
 `model.solver`. Options that a configuration leaves out are those of the checkpoint, and `BlindPnPTask` rejects options
-that contradict it.
+that contradict it. A training that is resumed has all its options of the model from the checkpoint, and its pose loss,
+but for those that the command names.
 """
 
 import math
@@ -36,7 +37,7 @@ from bpnp.models.bpnpnet import BPnPNet
 from bpnp.models.weights import PARTS, class_name, is_description, networks, read_checkpoint
 from bpnp.report.terminal import console, say
 from bpnp.report.training_run import training_of_checkpoint, wandb_run
-from bpnp.training.callbacks import ParameterCount, PoseLossWarmup, ProgressLines, ResultsWriter
+from bpnp.training.callbacks import WARMUP, ParameterCount, PoseLossWarmup, ProgressLines, ResultsWriter
 from bpnp.training.checkpoints import (
     BestCheckpoint,
     InterruptedCheckpoint,
@@ -144,6 +145,8 @@ class BpnpCLI(LightningCLI):
     The context managers `held` end after the run.
     """
 
+    resumed: Mapping[str, Any] = {}  # checkpoint of the training that is resumed
+
     def __init__(self, command: str, held: ExitStack, *args: Any, **kwargs: Any) -> None:
         self.command, self.held = command, held
         super().__init__(*args, **kwargs)
@@ -204,17 +207,23 @@ class BpnpCLI(LightningCLI):
         named = config.get("model.class_path")
         options = "model" if named is None else "model.init_args"
         weights = path or config.get(f"{options}.weights")
-        saved = None
+        saved: dict[str, Any] = {}
         if weights and (named is None or issubclass(_find_class(named), BlindPnPTask)):
-            saved = _solver_options(weights, config["model"])
-        if saved is not None:
-            network = [f"--model.solver={saved['class_path']}"] if network else []
+            content = read_checkpoint(weights)
+            self.resumed = content if path and self.command == "fit" else {}
+            saved = _model_options(weights, content, self.resumed.get("task", {}), config["model"])
+        if saved:
+            if network and "solver" in saved:
+                network = [f"--model.solver={saved['solver']['class_path']}"]
             root = f"--trainer.default_root_dir={config['trainer.default_root_dir']}"  # other options refer to it
-            given = parser.parse_args([self.command, root, *network, *words[1:]], defaults=False)
-            chosen = given[self.command].get(f"{options}.solver")
-            solver = _with_options(saved, chosen.as_dict() if isinstance(chosen, Namespace) else chosen)
-            full = f"--model.solver={yaml.safe_dump(solver, default_flow_style=True)}"
-            args = [self.command, *network, *args[1:], full]
+            given = parser.parse_args([self.command, root, *network, *words[1:]], defaults=False)[self.command]
+            chosen = given.get(f"{options}.solver")
+            kept = {name: value for name, value in saved.items() if f"{options}.{name}" not in given}
+            if "solver" in saved:
+                kept["solver"] = _with_options(
+                    saved["solver"], chosen.as_dict() if isinstance(chosen, Namespace) else chosen
+                )
+            args = [self.command, *network, *args[1:], *(f"--model.{name}={_as_yaml(kept[name])}" for name in kept)]
         self.config = parser.parse_args(args)
         config = self.config[self.command]
         config["ckpt_path"] = path
@@ -236,13 +245,15 @@ class BpnpCLI(LightningCLI):
                 "--model.warmup_steps and --model.decay_start are a schedule."
             )
         options = {name: value for name, value in vars(given["pose_loss"]).items() if value is not None}
+        trainer = given["trainer"]
+        if (joined := self.resumed.get("callbacks", {}).get(WARMUP)) is not None and not _has_switch(trainer.callbacks):
+            options = {name: joined[name] for name in POSE_LOSS} | options
         if not options:
             return
-        trainer = given["trainer"]
         callbacks = trainer.callbacks or []
         trainer.callbacks = list(callbacks) if isinstance(callbacks, list) else [callbacks]
         for callback in trainer.callbacks:
-            if issubclass(_find_class(callback.class_path), PoseLossWarmup):
+            if _has_switch(callback):
                 callback.init_args.update(Namespace(**options))
                 return
         if "start_epoch" not in options:
@@ -336,12 +347,11 @@ class BpnpCLI(LightningCLI):
             raise ValueError(f"{type(self.datamodule).__name__} has no problems to test on.")
 
 
-def _solver_options(path: str, model: Namespace) -> dict[str, Any] | None:
-    """Return the solver that a checkpoint describes as an option (class path and arguments), or None.
+def _model_options(path: str, content: Mapping[str, Any], task: Mapping[str, Any], model: Namespace) -> dict[str, Any]:
+    """Return the solver and the task that a checkpoint describes as options: classes by their paths and arguments.
 
     Classes are those of this package and those that the options of the model name; the checkpoint imports nothing.
     """
-    description = read_checkpoint(path).get("solver")
     named = [_find_class(name) for name in _class_paths(model.as_dict())]
     classes = {class_name(cls): cls for cls in (*networks(), *PARTS, *named)}
 
@@ -357,7 +367,17 @@ def _solver_options(path: str, model: Namespace) -> dict[str, Any] | None:
         arguments = {key: options_of(each) for key, each in settings.items()}
         return {"class_path": f"{cls.__module__}.{cls.__qualname__}", "init_args": arguments}
 
-    return options_of(description) if is_description(description) else None
+    descriptions = {"solver": content["solver"]} if is_description(content.get("solver")) else {}
+    return {name: options_of(value) for name, value in {**descriptions, **task}.items()}
+
+
+def _as_yaml(value: Any) -> str:
+    return yaml.safe_dump(value, default_flow_style=True, width=math.inf).removesuffix("...\n").strip()
+
+
+def _has_switch(callbacks: Any) -> bool:
+    """Return True if a `PoseLossWarmup` is among configured callbacks."""
+    return any(issubclass(_find_class(each.class_path), PoseLossWarmup) for each in _as_list(callbacks))
 
 
 def _with_options(saved: Any, given: Any) -> Any:

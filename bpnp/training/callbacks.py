@@ -24,9 +24,10 @@ from bpnp.report.results import SUMMARY, ProblemRow, rows_from, write_results
 from bpnp.report.tables import read_runs, results_table
 from bpnp.report.terminal import console, say
 from bpnp.training.predictions import folder_of_loader, gather_objects
-from bpnp.training.task import WARMUP, BlindPnPTask, number_globally
+from bpnp.training.task import BlindPnPTask, number_globally
 from bpnp.types import Batch, Prediction, map_tensors
 
+WARMUP = "PoseLossWarmup"  # its state in a checkpoint, also of subclasses, so that one can continue another's
 COLLAPSED = 0.05  # spread of unit features below which the assignment is nearly uniform
 LINE = ("train/loss", "val/correspondence_loss", "val/pnp/rotation_q2_deg", "val/pnp/translation_q2")  # per epoch
 RETURNED = 'a dictionary with "prediction", "seconds" and "losses", as BlindPnPTask\'s does'
@@ -53,7 +54,7 @@ class PoseLossWarmup(Callback):
 
     @property
     def state_key(self) -> str:
-        """Key of the state in a checkpoint, which subclasses share, so that one can continue another's training."""
+        """Key of the state in a checkpoint."""
         return WARMUP
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:

@@ -6,11 +6,10 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from lightning import LightningModule
-from lightning.pytorch.callbacks import StochasticWeightAveraging
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
@@ -52,10 +51,8 @@ from bpnp.types import Batch, Prediction
 Stage = Literal["val", "test"]
 REBUILT = {"solver", "weights"}  # options that are not saved under "task": the checkpoint has their result
 POSED = "pnp"  # estimate of the pose loss, which has a derivative
-WARMUP = "PoseLossWarmup"  # `state_key` of the callback that sets `pose_weight`; its module imports this one
 DECAYED = 0.02  # factor on the learning rate after the decay
 WIDEST_MATCH = 0.5  # largest `correspondence_angle`, radians; larger values are probably degrees
-MOMENTUM = {"momentum", "betas"}  # settings of an optimizer that `OneCycleLR` and `CyclicLR` change
 MOST_SKIPPED = 20  # consecutive steps without a finite gradient that end the run
 TOO_COARSE = ("bf16-true", "16-true")  # precisions in which even the points would have three digits
 
@@ -71,6 +68,22 @@ class Evaluation:
     poses: dict[str, MetricCollection]  # by estimate
     loss: MeanOverProblems
     numbers: set[int] = field(default_factory=set)  # indices of the problems so far
+
+
+class OptimizerSettings(NamedTuple):
+    """Class of an optimiser, and the settings of its parameter groups that a checkpoint can hold."""
+
+    name: str
+    groups: list[dict[str, Any]]
+
+    @classmethod
+    def of(cls, optimizer: Optimizer) -> "OptimizerSettings":
+        """Return the settings of an optimiser."""
+        groups = [
+            {key: value for key, value in group.items() if key != "params" and is_plain(value)}
+            for group in optimizer.param_groups
+        ]
+        return cls(type(optimizer).__name__, groups)
 
 
 class BlindPnPTask(LightningModule):
@@ -162,8 +175,8 @@ class BlindPnPTask(LightningModule):
         self.matching_loss, self.correspondence_angle = matching_loss, correspondence_angle
         self.skipped_steps = 0
         self.consecutive_skipped_steps = 0
-        self.optimizer_names: list[str] | None = None  # optimiser classes of this run or of its checkpoint
-        self.optimizer_settings: list[list[dict[str, Any]]] = []  # configured settings by optimizer and group
+        self.optimizer_settings: list[OptimizerSettings] = []  # as configured
+        self.saved_settings: list[OptimizerSettings] | None = None  # those of the checkpoint that is resumed
         self.refine_validation = refine_validation
         self.evaluations: list[Evaluation] = []  # of the loaders of this epoch
         self.table_metrics: set[str] = set()  # names of the metrics in the tables of a test
@@ -251,7 +264,7 @@ class BlindPnPTask(LightningModule):
             )
         if stage == "fit":
             self.skipped_steps = self.consecutive_skipped_steps = 0
-            self.optimizer_names = None
+            self.saved_settings = None
 
     def on_train_batch_start(self, batch: object, batch_idx: int) -> None:
         """Check the batch."""
@@ -424,43 +437,29 @@ class BlindPnPTask(LightningModule):
         Raises:
             ValueError: The checkpoint was trained with other optimisers.
         """
-        optimizers = self.trainer.optimizers
-        names = [type(optimizer).__name__ for optimizer in optimizers]
-        if self.optimizer_names is not None and self.optimizer_names != names:
-            raise ValueError(
-                f"The checkpoint was trained with {', '.join(self.optimizer_names)}, and this run uses "
-                f"{', '.join(names)}. Use the same optimizer, or start a new training with --model.weights."
-            )
-        self.optimizer_names = names
         for config in self.trainer.lr_scheduler_configs:
             _scale_schedule(config.scheduler)
-        self.optimizer_settings = [
-            [{key: value for key, value in group.items() if key != "params"} for group in optimizer.param_groups]
-            for optimizer in optimizers
-        ]
+        self.optimizer_settings = [OptimizerSettings.of(optimizer) for optimizer in self.trainer.optimizers]
+        if self.saved_settings is not None:
+            ours, theirs = (
+                ", ".join(each.name for each in settings) for settings in (self.optimizer_settings, self.saved_settings)
+            )
+            if ours != theirs:
+                raise ValueError(
+                    f"The checkpoint was trained with {theirs}, and this run uses {ours}. Use the same optimizer, or "
+                    "start a new training with --model.weights."
+                )
 
     def on_train_start(self) -> None:
-        """Apply the configured optimizer settings to the state that came from a checkpoint.
-
-        A scheduled learning rate keeps its ratio to the initial one. A scheduled momentum, and the learning rate of
-        `StochasticWeightAveraging`, keep their values.
-        """
-        schedulers = [config.scheduler for config in self.trainer.lr_scheduler_configs]
-        scheduled = {id(scheduler.optimizer) for scheduler in schedulers}
-        cycled = {id(each.optimizer) for each in schedulers if getattr(each, "cycle_momentum", False)}
-        averaged = any(isinstance(each, StochasticWeightAveraging) for each in self.trainer.callbacks)  # type: ignore[attr-defined]
-        for optimizer, configured in zip(self.trainer.optimizers, self.optimizer_settings, strict=False):
-            for group, settings in zip(optimizer.param_groups, configured, strict=True):
-                rate = group["lr"] if averaged and "swa_lr" in group else settings["lr"]
-                if id(optimizer) in scheduled and group.get("initial_lr"):
-                    rate = group["lr"] * settings.get("initial_lr", rate) / group["initial_lr"]
-                elif id(optimizer) in scheduled and "initial_lr" not in settings:
-                    rate = group["lr"]  # `ReduceLROnPlateau` has no initial rate
-                momentum = {key: group[key] for key in MOMENTUM & group.keys() if id(optimizer) in cycled}
-                group.update(settings | momentum, lr=rate)
-        for scheduler in schedulers:
-            if hasattr(scheduler, "base_lrs"):
-                scheduler.base_lrs = [group["initial_lr"] for group in scheduler.optimizer.param_groups]
+        """Change the restored optimisers where this run has other settings than that of the checkpoint."""
+        configured = zip(self.trainer.optimizers, self.optimizer_settings, self.saved_settings or (), strict=False)
+        for optimizer, ours, theirs in configured:
+            for group, own, saved in zip(optimizer.param_groups, ours.groups, theirs.groups, strict=True):
+                _change_group(group, own, saved)
+        for config in self.trainer.lr_scheduler_configs:
+            if hasattr(config.scheduler, "base_lrs"):
+                groups = zip(config.scheduler.optimizer.param_groups, config.scheduler.base_lrs, strict=True)
+                config.scheduler.base_lrs = [group.get("initial_lr", base) for group, base in groups]
 
     def rate_factor(self, step: int) -> float:
         """Return the factor on the learning rate: a linear rise, one, and a half cosine down to a fiftieth.
@@ -487,28 +486,14 @@ class BlindPnPTask(LightningModule):
             key: value for key, value in saved.items() if key not in REBUILT and (is_plain(value) or key == "loss")
         }
         checkpoint["skipped_steps"] = [self.skipped_steps, self.consecutive_skipped_steps]
-        checkpoint["optimizer_names"] = self.optimizer_names
-        checkpoint["pose_weight"] = self.pose_weight
+        checkpoint["optimizer_settings"] = [tuple(each) for each in self.optimizer_settings]
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Load the solver's weights, and restore the counts of skipped steps."""
         self._adopt(checkpoint, None if self._trainer is None else self.trainer.ckpt_path)
-        self._check_pose_loss_continues(checkpoint)
         self.skipped_steps, self.consecutive_skipped_steps = checkpoint.get("skipped_steps", (0, 0))
-        self.optimizer_names = checkpoint.get("optimizer_names")
-
-    def _check_pose_loss_continues(self, checkpoint: Mapping[str, Any]) -> None:
-        """Raise ValueError if a training with a pose loss, now or later, is resumed without one."""
-        if self._trainer is None or self.trainer.state.fn != "fit" or self.pose_weight > 0:
-            return
-        keys = {callback.state_key for callback in self.trainer.callbacks}  # type: ignore[attr-defined]
-        trained = checkpoint.get("pose_weight", 0.0)
-        if WARMUP not in keys and (WARMUP in checkpoint.get("callbacks", {}) or trained > 0):
-            how = WARMUP if WARMUP in checkpoint.get("callbacks", {}) else f"model.pose_weight {trained:g}"
-            raise ValueError(
-                f"The checkpoint was trained with {how}, and this run has neither {WARMUP} nor a model.pose_weight. "
-                "Use the configuration of its training, --pose_loss.start_epoch, or --model.weights for a new training."
-            )
+        if saved := checkpoint.get("optimizer_settings"):  # none yet in the checkpoint of `LearningRateFinder`
+            self.saved_settings = [OptimizerSettings(*each) for each in saved]
 
     def _adopt(self, content: Mapping[str, Any], file: str | Path | None, *, grown: bool = False) -> None:
         """Load the solver's weights, and print the settings in which it differs from the checkpoint on purpose.
@@ -644,6 +629,22 @@ def constructor_arguments(cls: type) -> set[str]:
         if not any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
             break
     return names
+
+
+def _change_group(group: dict[str, Any], own: Mapping[str, Any], saved: Mapping[str, Any]) -> None:
+    """Change a restored parameter group where its configuration is another than that of the checkpoint.
+
+    Another learning rate scales the scheduled one, which without a schedule is the learning rate itself.
+    """
+    rates = {"lr", "initial_lr"}
+    group.update({key: value for key, value in own.items() if key not in rates and value != saved.get(key)})
+    rate, before = (settings.get("initial_lr", settings["lr"]) for settings in (own, saved))
+    if "initial_lr" in saved and "initial_lr" not in own:
+        group["lr"] = rate
+    elif rate != before:
+        group["lr"] = group["lr"] * rate / before if before else rate
+    if "initial_lr" in own:
+        group["initial_lr"] = rate
 
 
 def _scale_schedule(scheduler: Any) -> None:

@@ -69,13 +69,37 @@ def test_an_optimizer_of_the_command_line_keeps_the_warm_up_of_the_task(tmp_path
     assert Observer.rates == pytest.approx([1e-5, 2e-5, 3e-5, 4e-5])
 
 
-def test_a_resumed_run_has_the_settings_of_its_command(tmp_path: Path) -> None:
-    fit(tmp_path, *SHORT, "--model.learning_rate=1e-4", "--model.weight_decay=0.1", "--trainer.max_steps=2")
+def test_a_resumed_run_has_the_options_of_its_checkpoint_and_those_of_its_command(tmp_path: Path) -> None:
+    own = ["--model.learning_rate=1e-4", "--model.weight_decay=0.1", "--model.matching_loss=likelihood"]
+    fit(tmp_path, *SHORT, *own, "--model.warmup_steps=1", "--trainer.max_steps=2")
+    assert Observer.rates == pytest.approx([5e-5, 1e-4])
     last = f"--ckpt_path={tmp_path}/run/checkpoints/last.ckpt"
-    fit(tmp_path, *SHORT, "--model.learning_rate=3e-6", "--model.weight_decay=0.2", last)
-    assert Observer.rates == pytest.approx([3e-6, 3e-6], rel=1e-12)
-    assert Observer.trainer.optimizers[0].param_groups[0]["weight_decay"] == 0.2
+    fit(tmp_path, *SHORT, last, "--trainer.max_steps=4")
+    task, group = Observer.task, Observer.trainer.optimizers[0].param_groups[0]
+    assert (task.learning_rate, task.warmup_steps, task.matching_loss) == (1e-4, 1, "likelihood")
+    assert (Observer.rates, group["weight_decay"]) == (pytest.approx([1e-4, 1e-4]), 0.1)
+    fit(tmp_path, *SHORT, last, "--trainer.max_steps=6", "--model.learning_rate=3e-6", "--model.warmup_steps=9")
+    task, group = Observer.task, Observer.trainer.optimizers[0].param_groups[0]
+    assert (task.hparams.learning_rate, task.hparams.weight_decay) == (3e-6, 0.1)
+    assert group["weight_decay"] == 0.1
+    assert Observer.rates[1:] == pytest.approx([0.6 * 3e-6])
     assert (Observer.weights[1] - Observer.weights[0]).abs().max() < 4e-6  # a step of Adam is at most its rate
+
+
+def test_a_resumed_run_has_the_rate_that_its_command_gives_an_optimizer(tmp_path: Path) -> None:
+    options = [*SHORT, "--optimizer=torch.optim.SGD", "--optimizer.momentum=0.5"]
+    fit(tmp_path, *options, "--optimizer.lr=1e-3", "--trainer.max_steps=1")
+    last = f"--ckpt_path={tmp_path}/run/checkpoints/last.ckpt"
+    fit(tmp_path, *options, "--optimizer.lr=1e-4", "--optimizer.momentum=0.25", last, "--trainer.max_steps=2")
+    assert Observer.rates == [1e-4]
+    assert Observer.trainer.optimizers[0].param_groups[0]["momentum"] == 0.25
+
+
+def test_a_resumed_run_without_its_schedule_has_the_whole_rate(tmp_path: Path) -> None:
+    fit(tmp_path, *SHORT, "--model.learning_rate=1e-4", "--model.warmup_steps=9", "--trainer.max_steps=2")
+    last = f"--ckpt_path={tmp_path}/run/checkpoints/last.ckpt"
+    fit(tmp_path, *SHORT, last, "--trainer.max_steps=4", "--model.warmup_steps=0", "--model.decay_start=null")
+    assert Observer.rates == pytest.approx([1e-4, 1e-4])
 
 
 def test_a_resumed_run_keeps_a_reduced_rate(tmp_path: Path) -> None:

@@ -354,6 +354,25 @@ def test_a_run_resumed_after_the_switch_has_the_pose_loss_from_its_first_step(tm
     assert Observer.pose_weights == [0.5]
 
 
+@pytest.mark.filterwarnings("ignore:The (pose loss joins|training has ended)")
+@pytest.mark.parametrize(
+    ("first", "later", "weights"),
+    [
+        (["--pose_loss.start_epoch=1", "--pose_loss.weight=0.5"], [], [0.5, 0.5]),
+        (["--pose_loss.start_epoch=3"], [], [0.0, 1.0]),
+        (["--pose_loss.start_epoch=3"], ["--pose_loss.weight=2"], [0.0, 2.0]),
+        (["--model.pose_weight=0.25"], [], [0.25, 0.25]),
+    ],
+)
+def test_a_resumed_run_has_the_pose_loss_of_its_checkpoint(
+    first: list[str], later: list[str], weights: list[float], tmp_path: Path
+) -> None:
+    """Two epochs, and two more."""
+    fit(tmp_path, *TWO_EPOCHS, *first)
+    fit(tmp_path, *TWO_EPOCHS, *later, "--trainer.max_epochs=4", f"--ckpt_path={tmp_path}/run/checkpoints/last.ckpt")
+    assert Observer.pose_weights == weights
+
+
 def test_predict_writes_the_poses_of_a_limited_number_of_batches(tmp_path: Path) -> None:
     fit(tmp_path, *TWO_STEPS)
     last = f"--ckpt_path={tmp_path}/run/checkpoints/last.ckpt"
