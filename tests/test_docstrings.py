@@ -40,8 +40,6 @@ PACKAGES = (
 )
 # Folders and files whose docstrings have not been read yet.
 NOT_YET = {
-    "bpnp/layers",
-    "bpnp/models",
     "bpnp/runtime.py",
     "bpnp/search/__init__.py",
     "bpnp/search/api.py",
@@ -69,7 +67,6 @@ NOT_YET = {
     "bpnp/search/starts.py",
     "bpnp/search/verdict",
     "bpnp/search/verify.py",
-    "bpnp/training",
 }
 SECTION = re.compile(r"^ *(Args|Attributes|Returns|Raises|Yields):$", re.MULTILINE)
 # What a configuration names.

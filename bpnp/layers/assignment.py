@@ -100,34 +100,18 @@ def sinkhorn(
 
 
 def uniform_marginal(real: Bool[Tensor, "b k"], dtype: torch.dtype) -> Float[Tensor, "b k"]:
-    """Return a uniform distribution over the real points.
-
-    Args:
-        real: True at real points (b, k).
-        dtype: Dtype of the result.
-
-    Returns:
-        Probabilities (b, k), zero at padded points.
-    """
+    """Return a uniform distribution over the real points, zero at padded points."""
     return real.to(dtype) / real.sum(-1, keepdim=True)
 
 
 def dustbin_marginals(
     rows: Float[Tensor, "b m"], cols: Float[Tensor, "b n"], real2d: Bool[Tensor, "b m"], real3d: Bool[Tensor, "b n"]
 ) -> tuple[Float[Tensor, "b rows"], Float[Tensor, "b cols"]]:
-    """Append a dustbin to each side, with room for all points of the other side.
+    """Append a dustbin, the last entry, to the marginal of each side, with room for all points of the other side.
 
     With m and n real points, the image points have m / (m + n) of the mass and their dustbin n / (m + n); the scene has
-    it the other way round. With uniform marginals each point of either side thus has the mass 1 / (m + n).
-
-    Args:
-        rows: Marginal of the image points (b, m), summing to one.
-        cols: Marginal of the scene points (b, n), summing to one.
-        real2d: True at real image points (b, m).
-        real3d: True at real scene points (b, n).
-
-    Returns:
-        Marginals (b, m + 1) and (b, n + 1), the dustbin last.
+    it the other way round. With uniform marginals each point of either side thus has the mass 1 / (m + n). Each
+    marginal sums to one.
     """
     m, n = (real.sum(-1, keepdim=True).to(rows.dtype) for real in (real2d, real3d))
     mass2d, mass3d = m / (m + n), n / (m + n)

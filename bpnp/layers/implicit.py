@@ -48,10 +48,7 @@ class BackwardStats:
 def record(stats: BackwardStats | None, layer: str, converged: Bool[Tensor, " b"]) -> None:
     """Count a backward pass, or warn of samples that did not converge if there is nothing to count in.
 
-    Args:
-        stats: Counts, or None.
-        layer: Name of the layer, for the warning.
-        converged: True where the linear solver converged (b,).
+    The warning names the layer; `converged` is that of the linear solver.
     """
     unconverged = int((~converged).sum())
     if stats is not None:

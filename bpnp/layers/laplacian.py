@@ -38,19 +38,10 @@ def solve_laplacian(
 ) -> LinearSolution:
     """Solve S b = rhs by preconditioned conjugate gradients; in float64, factorise the samples that stall.
 
-    The tolerance limits the residual per unit of mass, sqrt(sum r_j^2 / cols_j), relative to that of the right-hand
-    side. In the norm of the preconditioner, columns with weak links would outweigh all others.
-
-    Args:
-        plan: P (b, m, n).
-        rows: Row sums of P (b, m), zero at padded points.
-        cols: Column sums of P (b, n), zero at padded points.
-        degree: Preconditioner (b, n), the diagonal of S or an approximation.
-        rhs: Right-hand side (b, n).
-        tolerance: Relative tolerance (b,).
-
-    Returns:
-        b (b, n) with a weighted mean of zero, P b / rows (b, m), and which samples met the tolerance (b,).
+    `rows` and `cols` are the sums of P, zero at padded points; `degree` is the diagonal of S or an approximation.
+    Return b with a weighted mean of zero, P b / rows, and which samples met the tolerance. It limits the residual per
+    unit of mass, sqrt(sum r_j^2 / cols_j), relative to that of the right-hand side. In the norm of the preconditioner,
+    columns with weak links would outweigh all others.
     """
     # A power of two brings the largest entry into [1, 2): no digit changes, and no square underflows or overflows.
     largest = rhs.abs().amax(-1, keepdim=True)
@@ -70,19 +61,9 @@ def solve_laplacian(
 def _conjugate_gradients(
     plan: Plan, rows: Tensor, cols: Tensor, degree: Tensor, rhs: Tensor, tolerance: Float[Tensor, " b"], limit: int
 ) -> LinearSolution:
-    """Solve S x = rhs by preconditioned conjugate gradients.
+    """Solve S x = rhs as `solve_laplacian`, in at most `limit` iterations; a sample keeps the x that met the tolerance.
 
-    Args:
-        plan: P (b, m, n).
-        rows: Row sums of P (b, m).
-        cols: Column sums of P (b, n).
-        degree: Preconditioner (b, n).
-        rhs: Right-hand side (b, n).
-        tolerance: Relative tolerance (b,), as in `solve_laplacian`.
-        limit: Largest number of iterations.
-
-    Returns:
-        x (b, n), P x / rows (b, m), and which samples met the tolerance (b,). A sample keeps the x that met it.
+    Return x, P x / rows, and which samples met it.
     """
     inverse, unit, per_row = (divide(torch.ones_like(x), x) for x in (degree, cols, rows))
     x, mean, r = torch.zeros_like(rhs), torch.zeros_like(rows), rhs
@@ -148,19 +129,13 @@ def entropic_plan(
 ) -> Float[Tensor, "b m n"]:
     """Return `plan` with the gradients of the transport problem that it solves.
 
-    `plan` minimises <P, cost> + mu P (log P - 1) with the given marginals. With V = dL/dP and multipliers a, b from
-    [diag(P1) P; P^T diag(P^T 1)] [a; b] = [(P.V)1; (P.V)^T 1], the gradients are
+    `plan` minimises <P, cost> + mu P (log P - 1) with the given marginals r and c. With V = dL/dP and multipliers a, b
+    from [diag(P1) P; P^T diag(P^T 1)] [a; b] = [(P.V)1; (P.V)^T 1], the gradients are
+
     dL/dcost = -P.(V - a1^T - 1b^T)/mu, dL/dmu = <dL/dcost, log P>, dL/drow = a, dL/dcol = b,
+
     up to one constant added to a and subtracted from b, chosen so that the mean of b, weighted by c, is zero. The
     actual sums of P are used, so that a plan short of convergence has the gradient of the problem that it does solve.
-
-    Args:
-        plan: P (b, m, n).
-        cost: Cost M (b, m, n).
-        mu: Entropy weight, scalar.
-        row_marginal: r (b, m).
-        col_marginal: c (b, n).
-        backward_stats: As for `bpnp.layers.sinkhorn`.
     """
     return _EntropicPlan.apply(plan, cost, mu, row_marginal, col_marginal, backward_stats)
 
@@ -198,17 +173,10 @@ def _project_gradient(
 def solve_multipliers(
     plan: Float[Tensor, "b m n"], gradient: Float[Tensor, "b m n"]
 ) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b n"], Bool[Tensor, " b"]]:
-    """Compute the multipliers (a, b) that project `gradient` onto plans with the marginals of `plan`.
+    """Compute the multipliers (a, b) that project V = dL/dP onto plans with the marginals of P; sum(P^T 1 . b) = 0.
 
     Two kinds of samples are solved in float64, and by a Cholesky factorisation at last: those whose plan is sharp,
-    where differences of nearly equal numbers decide, and those that stall.
-
-    Args:
-        plan: P (b, m, n).
-        gradient: V = dL/dP (b, m, n).
-
-    Returns:
-        a (b, m), b (b, n) with sum(P^T 1 . b) = 0, and which samples converged (b,).
+    where differences of nearly equal numbers decide, and those that stall. The third result is which samples converged.
     """
     a, b, solved, trusted = _solve_parts(plan, gradient, TOLERANCE[plan.dtype])
     if plan.dtype != torch.float64 and not bool(trusted.all()):
@@ -227,15 +195,9 @@ def _solve_parts(plan: Tensor, gradient: Tensor, tolerance: float) -> tuple[Tens
 
 
 def _solve(plan: Tensor, gradient: Tensor, tolerance: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Solve for the multipliers in the precision of the plan.
+    """Solve for the multipliers a, b in the precision of the plan; return them, which are solved and which precisely.
 
-    Args:
-        plan: P (b, m, n).
-        gradient: V = dL/dP (b, m, n).
-        tolerance: Relative tolerance.
-
-    Returns:
-        a, b, which samples are solved (b,), and which of these have enough precision (b,).
+    These are tensors (b, m), (b, n), (b,) and (b,), of P and V = dL/dP (b, m, n).
     """
     weighted, rows, cols, kernel = plan * gradient, plan.sum(-1), plan.sum(-2), Plan.of(plan)
     row_mean, degree = divide(weighted.sum(-1), rows), kernel.degree(rows, cols)

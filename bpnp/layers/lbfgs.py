@@ -26,20 +26,11 @@ def lbfgs(
     tolerance: float,
     max_iterations: int,
 ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], Int[Tensor, " b"]]:
-    """Minimise the aggregated PnP objective with `torch.optim.LBFGS`, sample by sample.
+    """Minimise the aggregated PnP objective with `torch.optim.LBFGS`, sample by sample, and count the iterations.
 
-    The unknowns are an angle-axis vector, relative to the initial pose, and the translation.
-
-    Args:
-        q: Weighted bearings (b, 3, n), the weights of a sample summing to one.
-        points: Scene points of unit size (b, 3, n).
-        rotation: Initial R (b, 3, 3).
-        translation: Initial t (b, 3).
-        tolerance: Gradient norm at which a sample stops. Rounding of the objective ends the line search at about 1e-10.
-        max_iterations: Largest number of iterations of a sample.
-
-    Returns:
-        Rotation (b, 3, 3), translation (b, 3) and the iterations of each sample (b,).
+    The unknowns are an angle-axis vector, relative to the initial pose, and the translation. The weights of a sample in
+    q sum to one, and the points have unit size. A sample stops at the gradient norm `tolerance`; rounding of the
+    objective ends the line search at about 1e-10.
     """
     problem = [values.cpu().double().contiguous().numpy() for values in (q, points, rotation, translation)]
     found = [
@@ -53,18 +44,9 @@ def lbfgs(
 def _minimise(
     q: Array, points: Array, rotation: Array, translation: Array, *, tolerance: float, max_iterations: int
 ) -> tuple[Array, int]:
-    """Minimise the objective of one sample.
+    """Return the step (w, s) (6,) from the initial pose to the minimum of one sample, and the number of iterations.
 
-    Args:
-        q: Weighted bearings (3, n).
-        points: Scene points (3, n).
-        rotation: Initial R (3, 3).
-        translation: Initial t (3,).
-        tolerance: Gradient norm at which to stop.
-        max_iterations: Largest number of iterations.
-
-    Returns:
-        The step (w, s) from the initial pose to the minimum (6,), and the number of iterations.
+    q and the points are (3, n); the gradient norm `tolerance` ends it.
     """
     # The optimiser changes its parameter in place, which a trainer's inference mode forbids.
     with torch.inference_mode(False):
@@ -90,18 +72,12 @@ def _minimise(
 
 
 def _value_and_gradient(step: Array, q: Array, turned: Array, translation: Array, weights: Array) -> tuple[Any, Array]:
-    """Return sum_j |q_j| - q_j . g(exp([w]x) R p_j + t + s), and its gradient in the step (w, s).
+    """Return sum_j |q_j| - q_j . g(exp([w]x) R p_j + t + s), and its gradient in the step (w, s), (6,).
 
-    The constant sum |q_j| keeps the digits of the value where the residuals are small. With the rotated points x_j and
-    the derivative h_j of a term in its camera point, the gradient is (J(w)^T sum x_j cross h_j, sum h_j), where J(w) is
-    the left Jacobian of SO(3): exp([w + d]x) = exp([J(w) d]x) exp([w]x) to first order in d.
-
-    Args:
-        step: (w, s), (6,).
-        q: Weighted bearings q_j (3, n).
-        turned: R p_j (3, n).
-        translation: t (3,).
-        weights: |q_j| (n,).
+    The constant sum |q_j| keeps the digits of the value where the residuals are small. With the rotated points x_j = R
+    p_j, `turned` (3, n), and the derivative h_j of a term in its camera point, the gradient is (J(w)^T sum x_j cross
+    h_j, sum h_j), where J(w) is the left Jacobian of SO(3): exp([w + d]x) = exp([J(w) d]x) exp([w]x) to first order in
+    d. The weights are |q_j| (n,).
     """
     rotation, jacobian = _exponential(step[:3])
     x = rotation @ turned

@@ -15,17 +15,11 @@ LOST = 100.0  # a difference of this many units of rounding has no correct digit
 
 @dataclass(frozen=True)
 class Plan:
-    """Transport plan P = diag(alpha) K diag(beta), (b, m, n).
+    """Transport plan P = diag(alpha) K diag(beta), (b, m, n)."""
 
-    Attributes:
-        kernel: K (b, m, n).
-        alpha: Row scalings (b, m).
-        beta: Column scalings (b, n).
-    """
-
-    kernel: Float[Tensor, "b m n"]
-    alpha: Float[Tensor, "b m"]
-    beta: Float[Tensor, "b n"]
+    kernel: Float[Tensor, "b m n"]  # K
+    alpha: Float[Tensor, "b m"]  # row scalings
+    beta: Float[Tensor, "b n"]  # column scalings
 
     @classmethod
     def of(cls, kernel: Float[Tensor, "b m n"]) -> "Plan":
@@ -60,17 +54,10 @@ class Plan:
         return Plan(self.kernel[some], self.alpha[some], self.beta[some])
 
     def degree(self, rows: Float[Tensor, "b m"], cols: Float[Tensor, "b n"]) -> Float[Tensor, "b n"]:
-        """Return the diagonal of diag(cols) - P^T diag(1 / rows) P.
+        """Return the diagonal of diag(cols) - P^T diag(1 / rows) P, for the row and column sums of P.
 
-        It is cols - sum_i P^2 / rows. Where P is nearly a permutation this difference has no correct digits; then the
-        dense P gives the sum of the positive terms P (1 - P / rows).
-
-        Args:
-            rows: Row sums of P (b, m).
-            cols: Column sums of P (b, n).
-
-        Returns:
-            Diagonal (b, n), at least the rounding error of `cols`.
+        It is cols - sum_i P^2 / rows, at least the rounding error of `cols`. Where P is nearly a permutation this
+        difference has no correct digits; then the dense P gives the sum of the positive terms P (1 - P / rows).
         """
         weight = divide(torch.ones_like(rows), rows)
         parts = zip(self.kernel.split(CACHED, -2), (self.alpha**2 * weight).split(CACHED, -1), strict=True)
@@ -86,11 +73,7 @@ class Plan:
 
 
 def cached_parts(*values: Tensor) -> Iterator[tuple[Tensor, ...]]:
-    """Split the samples into groups that fit in a CPU's cache; on a GPU, return one group.
-
-    Args:
-        *values: Tensors with the samples on the first axis; the first is a matrix (b, m, n).
-    """
+    """Split the samples of tensors, first a matrix (b, m, n), into groups that fit in a CPU's cache; one on a GPU."""
     matrices = values[0]
     size = max(1, CACHE // matrices[0].nbytes) if matrices.is_cpu else len(matrices)
     return zip(*(value.split(size) for value in values), strict=True)

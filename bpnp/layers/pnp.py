@@ -39,14 +39,10 @@ class ClippedColumns:
     """Number of columns of the pose's derivative in backward passes, and of those that were clipped.
 
     Column ij is the derivative of the pose (angle-axis, translation) with respect to P_ij.
-
-    Attributes:
-        columns: Columns so far.
-        clipped: Columns whose norm was reduced.
     """
 
     columns: int = 0
-    clipped: int = 0
+    clipped: int = 0  # columns whose norm was reduced
 
     def reset(self) -> None:
         """Set both counts to zero."""
@@ -191,17 +187,9 @@ def newton(
 ) -> tuple[Rotations, Translations, Int[Tensor, " b"], Derivatives]:
     """Minimise the aggregated objective by Newton's method with Levenberg damping, for the whole batch at once.
 
-    Each sample has its own damping, zero until a step fails, and stops by itself.
-
-    Args:
-        objective: Objective, the weights |q_j| of a sample summing to one and the points of unit size.
-        rotation: Initial R (b, 3, 3).
-        translation: Initial t (b, 3).
-        tolerance: Largest gradient norm at the result.
-        max_iterations: Largest number of iterations of a sample.
-
-    Returns:
-        Rotation (b, 3, 3), translation (b, 3), the iterations of each sample (b,), and the derivatives at the end.
+    Each sample has its own damping, zero until a step fails, and stops by itself. The weights |q_j| of a sample sum to
+    one, and the points have unit size. `tolerance` is the largest gradient norm at the result. The iterations of each
+    sample and the derivatives at the end are returned too.
     """
     eye = torch.eye(6, dtype=rotation.dtype, device=rotation.device)
     current = objective.packed(rotation, translation)

@@ -23,21 +23,12 @@ def top_matches(
     mask3d: Bool[Tensor, "b n"] | None,
     matches_factor: float,
 ) -> tuple[Int[Tensor, "b k"], Int[Tensor, "b k"], Bool[Tensor, "b k"]]:
-    """Select the most probable matches of each sample.
+    """Select the most probable matches of each sample: indices of 2D points and of 3D points, and which are no padding.
 
-    A sample with m' and n' real points has floor(matches_factor * min(m', n')) matches, at most m' n'. The width k of
-    the result is the same of the padded sizes m and n, and at least 1. Matches of equal probability are in the order of
-    their 2D points, then of their 3D points, so that the result does not depend on padding.
-
-    Args:
-        assignment: P (b, m, n).
-        mask2d: True at real image points (b, m). None: all are real.
-        mask3d: True at real scene points (b, n). None: all are real.
-        matches_factor: Number of matches per point of the smaller side.
-
-    Returns:
-        Indices of the 2D points (b, k) and of the 3D points (b, k), most probable match first, and which of them are
-        matches of the sample rather than padding (b, k).
+    A sample with m' and n' real points has floor(matches_factor * min(m', n')) matches, at most m' n', the most
+    probable first. The width k of the result is the same of the padded sizes m and n, and at least 1. Matches of equal
+    probability are in the order of their 2D points, then of their 3D points, so that the result does not depend on
+    padding. Without a mask all points are real.
     """
     b, m, n = assignment.shape
     real2d = assignment.new_ones(b, m, dtype=torch.bool) if mask2d is None else mask2d

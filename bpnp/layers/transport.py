@@ -39,20 +39,11 @@ def solve_plan(
     tolerance: float,
     max_iterations: int,
 ) -> tuple[Float[Tensor, "b m n"], SolveStats]:
-    """Compute the plan whose row and column sums meet the marginals.
+    """Compute the plan whose row and column sums meet the marginals; a point with zero marginal gets no mass.
 
-    A point with zero marginal gets no mass. Samples for which float32 has too few digits are solved again in float64.
-
-    Args:
-        cost: Cost M (b, m, n).
-        rows: Required row sums (b, m).
-        cols: Required column sums (b, n).
-        mu: Entropy weight, float64 scalar.
-        tolerance: Largest L1 error of the sums of a sample.
-        max_iterations: Largest number of sweeps.
-
-    Returns:
-        The plan (b, m, n), and stats whose `iterations` count sweeps; a late sweep follows a Newton step.
+    The sums of a sample have at most the L1 error `tolerance`; mu, the entropy weight, is float64. Samples for which
+    float32 has too few digits are solved again in float64. The `iterations` of the stats count sweeps; a late sweep
+    follows a Newton step.
     """
     limit = torch.full((len(cost),), max_iterations, device=cost.device)
     plan, iterations, residual = _solve_parts(cost, rows, cols, limit, mu, tolerance)
@@ -112,19 +103,10 @@ def _solve(
 def sweep(
     plan: Plan, sums: Float[Tensor, "b m"], rows: Tensor, cols: Tensor, count: Int[Tensor, " b"], tolerance: float
 ) -> tuple[Plan, Float[Tensor, "b m"], Float[Tensor, " b"], Int[Tensor, " b"]]:
-    """Rescale the rows, then the columns, `count` times; a sample stops at the tolerance.
+    """Rescale the rows, then the columns, `count` times; a sample stops at the tolerance, the L1 error of its row sums.
 
-    Args:
-        plan: Plan (b, m, n).
-        sums: Its row sums (b, m).
-        rows: Required row sums (b, m).
-        cols: Required column sums (b, n).
-        count: Number of sweeps (b,).
-        tolerance: L1 error of the row sums at which a sample stops.
-
-    Returns:
-        The plan, its row sums (b, m), their L1 error (b,), infinite for a sample without sweeps, and the sweeps taken
-        (b,).
+    `sums` are the row sums of the plan, `rows` and `cols` the required ones. Return the plan, its row sums, their L1
+    error, infinite for a sample without sweeps, and the sweeps taken.
     """
     residual = torch.full_like(sums[:, 0], torch.inf)
     taken = torch.zeros_like(count)
@@ -150,11 +132,8 @@ def _newton(
     """Take one Newton step inside a trust region, unless it lowers the (concave) dual objective.
 
     The change (x, y) of the log scalings gives diag(e^x) P diag(e^y) the marginals to first order. The columns meet
-    theirs before the step.
-
-    Returns:
-        The plan, its row sums (b, m), the new radius (b,), and which samples continue (b,): those whose direction was
-        computed to enough digits.
+    theirs before the step. Return the plan, its row sums, the new radius, and which samples continue: those whose
+    direction was computed to enough digits.
     """
     error = (sums - rows).abs().sum(-1)
     precision = torch.maximum(SAFETY * tolerance / error, error.sqrt().clamp_max(LOOSEST))

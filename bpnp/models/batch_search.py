@@ -64,14 +64,10 @@ def problems_of(batch: Batch) -> list[Problem]:
 
 
 def best_poses(results: Iterable[tuple[Problem, SearchResult]], like: Tensor) -> Pose:
-    """Return the best pose of each problem, without a gradient; NaN where there is none.
+    """Return the best pose of each problem, without a gradient, on the device and in the dtype of `like`; NaN for none.
 
     In the stats, `iterations` counts batches of initial poses, `residual` is the scale of the residuals in radians, and
     `converged` is True for the verdict "confident".
-
-    Args:
-        results: Each problem and its result.
-        like: Tensor with the device and the dtype of the pose.
     """
     solved = list(results)
     poses = [problem.to_user(*result.best) for problem, result in solved]

@@ -163,14 +163,7 @@ class BPnPNet(TrainedNet):
 
 @full_precision
 def pairwise_distance(a: Float[Tensor, "b m c"], b: Float[Tensor, "b n c"]) -> Float[Tensor, "b m n"]:
-    """Return ||a_i - b_j||_2 (b, m, n) of unit vectors, from one matrix product.
-
-    The gradient at distance zero is zero.
-
-    Args:
-        a: Unit vectors (b, m, c).
-        b: Unit vectors (b, n, c).
-    """
+    """Return ||a_i - b_j||_2 of unit vectors, from one matrix product. The gradient at distance zero is zero."""
     return _PairwiseDistance.apply(a, b)
 
 
@@ -210,21 +203,11 @@ def tensor_maps() -> dict[str, tuple[tuple[int, ...], str]]:
 
 
 def load_authors_weights(path: str | Path, *, backend: Backend = "auto") -> BPnPNet:
-    """Load a ``*.pth.tar`` file of the authors, in evaluation mode.
+    """Load a ``*.pth.tar`` file of the authors on the CPU, in evaluation mode.
 
     The network computes the same assignment as the authors' network for every problem. Only tensors, plain containers
-    and numbers are unpickled.
-
-    Args:
-        path: File.
-        backend: Backend of `bpnp.layers.RansacPnP`, which has no weights. Default "auto".
-
-    Returns:
-        The network, on the CPU.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The file is no checkpoint, or a tensor is missing, unexpected, not finite or of another shape.
+    and numbers are unpickled. The backend is that of `bpnp.layers.RansacPnP`, which has no weights. Raise ValueError if
+    the file is no checkpoint, or a tensor is missing, unexpected, not finite or of another shape.
     """
     file = Path(path)
     state = _read_state(file)

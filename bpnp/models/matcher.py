@@ -195,16 +195,9 @@ class Matcher(TrainedNet):
 def robust_frame(
     points: Float[Tensor, "b k d"], mask: Bool[Tensor, "b k"]
 ) -> tuple[Float[Tensor, "b 1 d"], Float[Tensor, "b 1 1"]]:
-    """Return the median of each coordinate and the median distance from it.
+    """Return the median of each coordinate and the median distance from it; one for coinciding points.
 
     Up to half of the points may be clutter. Padding is ignored.
-
-    Args:
-        points: Points (b, k, d).
-        mask: True at real points (b, k).
-
-    Returns:
-        Centre (b, 1, d) and radius (b, 1, 1); the radius of coinciding points is one.
     """
     centre = masked_median(points.mT, mask.unsqueeze(1)).unsqueeze(1)
     radius = masked_median(torch.linalg.vector_norm(points - centre, dim=-1), mask)[:, None, None]
@@ -212,11 +205,7 @@ def robust_frame(
 
 
 def image_of(points3d: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 2"]:
-    """Return x/z, y/z of points in camera coordinates, limited to a wide image for points far off the axis or behind.
-
-    Args:
-        points3d: Camera coordinates (b, n, 3).
-    """
+    """Return x/z, y/z of points in camera coordinates, limited to a wide image for points far off or behind."""
     plane = points3d[..., :2]
     depth = torch.maximum(points3d[..., 2:], plane.norm(dim=-1, keepdim=True) / WIDEST)
     return plane / depth.clamp_min(torch.finfo(depth.dtype).tiny)

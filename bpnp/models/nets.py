@@ -20,12 +20,7 @@ CONTEXT_EPS = 1e-3  # added to the variance, as in the authors' code
 
 
 def subtract_mean(x: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
-    """Subtract the mean over the real points of each set, per channel.
-
-    Args:
-        x: Features (b, k, c).
-        mask: True at real points (b, k).
-    """
+    """Subtract the mean over the real points of each set, per channel."""
     weight = mask.unsqueeze(-1).to(x.dtype)
     return x - (x * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True)
 
@@ -41,17 +36,8 @@ def linear_context_norm(
 
     The statistics are over the points of each set, per channel; the variance is unbiased, and zero for a set of one
     point. The context norm is the only exchange between the points of a set. Statistics of half-precision values are
-    computed in float32. The bias has no effect and its gradient is zero.
-
-    Args:
-        x: Features (b, k, c).
-        weight: W (d, c).
-        bias: b (d,).
-        mask: True at real points (b, k), None without padding. Padded points have y = 0.
-        skip: If given, the result is skip + relu(y).
-
-    Returns:
-        Features (b, k, d).
+    computed in float32. The bias has no effect and its gradient is zero. Padded points have y = 0; with `skip`, the
+    result is skip + relu(y).
     """
     device = x.device.type
     if torch.is_autocast_enabled(device):
@@ -302,15 +288,7 @@ class InputTransform(nn.Module):
 
 
 def normalise_points3d(points3d: Float[Tensor, "b n 3"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b n 3"]:
-    """Centre the points of each set at their mean and scale them to a root mean square distance of one.
-
-    Args:
-        points3d: Points (b, n, 3).
-        mask: True at real points (b, n).
-
-    Returns:
-        Points (b, n, 3); padded points are zero.
-    """
+    """Centre the points of each set at their mean and scale them to a root mean square distance of 1; padding is 0."""
     weight = mask.unsqueeze(-1).to(points3d.dtype)
     around = subtract_mean(points3d, mask) * weight
     radius = ((around**2).sum((1, 2), keepdim=True) / weight.sum(1, keepdim=True)).sqrt()

@@ -43,10 +43,7 @@ class StageClock:
 def ransac_pose(ransac: nn.Module, assignment: Float[Tensor, "b m n"], batch: Batch) -> Pose:
     """Estimate an initial pose from the most probable matches; no gradient reaches the assignment.
 
-    Args:
-        ransac: Module with the arguments of `bpnp.layers.RansacPnP`.
-        assignment: P (b, m, n).
-        batch: Problems.
+    The module has the arguments of `bpnp.layers.RansacPnP`.
     """
     return Pose(*ransac(assignment.detach(), batch.points2d, batch.points3d, batch.mask2d, batch.mask3d))
 
@@ -54,11 +51,7 @@ def ransac_pose(ransac: nn.Module, assignment: Float[Tensor, "b m n"], batch: Ba
 def pnp_pose(pnp: nn.Module, assignment: Float[Tensor, "b m n"], batch: Batch, start: Pose) -> Pose:
     """Compute the pose that best explains the whole assignment, differentiable in the assignment.
 
-    Args:
-        pnp: Module with the arguments of `bpnp.layers.WeightedPnP`.
-        assignment: P (b, m, n).
-        batch: Problems.
-        start: Initial pose.
+    The module has the arguments of `bpnp.layers.WeightedPnP`.
     """
     rays = bearings(batch.points2d)
     return Pose(*pnp(assignment, rays, batch.points3d, start.rotation, start.translation))
@@ -67,14 +60,7 @@ def pnp_pose(pnp: nn.Module, assignment: Float[Tensor, "b m n"], batch: Batch, s
 def residual_energy(
     batch: Batch, rotation: Float[Tensor, "b 3 3"], translation: Float[Tensor, "b 3"], width: float
 ) -> Float[Tensor, "b m n"]:
-    """Return d_ij = r_ij^2 / (2 s^2), (b, m, n), in the dtype of the pose; NaN without a pose.
-
-    Args:
-        batch: Problems.
-        rotation: R (b, 3, 3).
-        translation: t (b, 3), scene units.
-        width: s, radians.
-    """
+    """Return d_ij = r_ij^2 / (2 s^2), with the width s in radians, in the dtype of the pose; NaN without a pose."""
     rays, points3d = bearings(batch.points2d).to(rotation), batch.points3d.to(rotation)
     return chords(rays, points3d, rotation, translation).square() / (2 * width**2)
 
@@ -82,12 +68,7 @@ def residual_energy(
 def round_widths(rounds: int, ransac: nn.Module) -> list[float]:
     """Return s of each round in radians, decreasing geometrically to the `threshold` of `ransac`.
 
-    Args:
-        rounds: Number of rounds.
-        ransac: RANSAC module.
-
-    Raises:
-        ValueError: `rounds` is negative, or `ransac` has no `threshold`.
+    Raise ValueError if `rounds` is negative, or `ransac` has no `threshold`.
     """
     check_within(0, math.inf, rounds=rounds)
     if rounds == 0:
@@ -109,18 +90,11 @@ def match_again(
     pnp: nn.Module,
     widths: Sequence[float],
 ) -> Prediction:
-    """Replace the pose "pnp" by the result of rounds of transport and weighted PnP.
+    """Replace the pose "pnp" by the result of rounds of transport and weighted PnP, one for each width s, radians.
 
     The first round matches the points under the pose "ransac", each later one under the pose of the round before. The
-    assignment of the last round becomes `rematched`; `assignment` stays.
-
-    Args:
-        prediction: Prediction with the pose "ransac".
-        cost: Cost of the network's own assignment (b, m, n).
-        batch: Problems.
-        transport: Transport with `entropy`, its mu.
-        pnp: Weighted PnP.
-        widths: s of each round, radians; an empty list leaves the prediction unchanged.
+    assignment of the last round becomes `rematched`; `assignment` stays. `cost` is that of the network's own
+    assignment; `entropy` of the transport is its mu. Without widths the prediction is unchanged.
     """
     pose, assignment = prediction.poses["ransac"], None
     for width in widths:
@@ -135,17 +109,10 @@ def match_again(
 def cost_under_pose(
     cost: Float[Tensor, "b m n"], batch: Batch, pose: Pose, *, width: float, mu: float | Tensor
 ) -> Float[Tensor, "b m n"]:
-    """Combine feature distances and residuals under a pose: w M_ij + mu min(d_ij, L).
+    """Combine feature distances M and residuals under a pose of width s, radians: w M_ij + mu min(d_ij, L).
 
     The entropic transport of this cost assigns in proportion to exp(-w M_ij / mu) times a normal density of the
     residual with a floor. No gradient reaches the pose. A sample without a pose keeps its M.
-
-    Args:
-        cost: Feature distances M (b, m, n).
-        batch: Problems.
-        pose: Poses.
-        width: s, radians.
-        mu: Entropy weight of the transport.
     """
     rotation, translation = pose.rotation.detach().to(cost), pose.translation.detach().to(cost)
     energy = residual_energy(batch, rotation, translation, width).clamp(max=FARTHEST)

@@ -76,14 +76,9 @@ class Refinement(nn.Module):
 
 @default_float_errors
 def refine(batch: Batch, rotation: Float[Tensor, "b s 3 3"], translation: Float[Tensor, "b s 3"]) -> Pose:
-    """Anneal poses (`anneal_given`) and return the best one of each sample.
+    """Anneal poses (`anneal_given`), NaN for a missing one, and return the best one of each sample.
 
     Iterations count the initial poses; converged is true where there is a pose, since annealing always ends.
-
-    Args:
-        batch: Problems.
-        rotation: Initial rotations (b, s, 3, 3), NaN for a missing one.
-        translation: Initial translations (b, s, 3).
     """
     samples = zip(problems_of(batch), rotation, translation, strict=True)
     results = ((problem, _refine(problem, *problem.from_user(on_host(r), on_host(t)))) for problem, r, t in samples)
@@ -100,18 +95,11 @@ def _refine(problem: Problem, rotation: NDArray[np.float64], translation: NDArra
 
 
 def log_support(prediction: Prediction, batch: Batch, pose: Pose) -> Float[Tensor, " b"]:
-    """Return the log-likelihood ratio of the bearings: explained by pose and assignment, or without correspondence.
+    """Return the log-likelihood ratio of the bearings, nats: explained by pose and assignment, or not.
 
-    L = sum_i log(o + (1 - o) sum_j Q_ij A exp(-d_ij) / (2 pi s^2)), with A = 2 pi times the variance of the bearings,
-    o = `ALONE`, and Q_ij = P(j | i) mixed with a uniform distribution (`TRUST`).
-
-    Args:
-        prediction: Prediction with an assignment.
-        batch: Problems.
-        pose: Poses to rate.
-
-    Returns:
-        L (b,), nats. Above zero the bearings are likelier under the pose and the assignment; -inf without a pose.
+    L = sum_i log(o + (1 - o) sum_j Q_ij A exp(-d_ij) / (2 pi s^2)), with A = 2 pi times the variance of the bearings, o
+    = `ALONE`, and Q_ij = P(j | i) mixed with a uniform distribution (`TRUST`). Above zero the bearings are likelier
+    under the pose and the assignment; -inf without a pose.
     """
     assignment = prediction.assignment
     assert assignment is not None
@@ -130,12 +118,7 @@ def log_support(prediction: Prediction, batch: Batch, pose: Pose) -> Float[Tenso
 
 @contextmanager
 def refinement_enabled(solver: nn.Module, enabled: bool) -> Iterator[None]:
-    """Switch every `Refinement` of a solver off until the block ends, unless `enabled`.
-
-    Args:
-        solver: Solver.
-        enabled: False to switch the refinement off; True changes nothing.
-    """
+    """Switch every `Refinement` of a solver off until the block ends, unless `enabled`."""
     refinements = [module for module in solver.modules() if isinstance(module, Refinement)]
     before = [module.enabled for module in refinements]
     try:

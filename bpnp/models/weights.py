@@ -106,14 +106,10 @@ def pretrained_names() -> list[str]:
 
 
 def checkpoint_path(name: str | Path) -> Path:
-    """Return the file of a checkpoint.
+    """Return the file of a checkpoint, given by its path or the name of packaged weights.
 
-    Args:
-        name: Path of a file, or the name of packaged weights. A string that is such a name is always the packaged
-            weights; a file of that name in the working directory is ``./<name>``.
-
-    Raises:
-        FileNotFoundError: There is no such file.
+    A string that is such a name is always the packaged weights; a file of that name in the working directory is
+    ``./<name>``.
     """
     packaged = str(name) in pretrained_names()
     if Path(name).is_file() and not (packaged and isinstance(name, str)):
@@ -127,15 +123,9 @@ def checkpoint_path(name: str | Path) -> Path:
 
 
 def read_checkpoint(path: str | Path, *, map_location: Any = "cpu") -> dict[str, Any]:
-    """Read a checkpoint that `bpnp fit` wrote, restricted to tensors, numbers and plain containers.
+    """Read a checkpoint of `bpnp fit`, or packaged weights, restricted to tensors, numbers and plain containers.
 
-    Args:
-        path: File, or the name of packaged weights.
-        map_location: As in `torch.load`.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The file is truncated, of another program, or holds code.
+    Raise ValueError if the file is truncated, of another program, or holds code.
     """
     content = read_data(path, map_location=map_location)
     if "state_dict" not in content:
@@ -156,16 +146,7 @@ def _unknown_settings(description: Any) -> Iterator[str]:
 
 
 def read_data(path: str | Path, *, map_location: Any = "cpu") -> dict[str, Any]:
-    """Read a dict of tensors, numbers and plain containers that torch saved.
-
-    Args:
-        path: As in `read_checkpoint`.
-        map_location: As in `torch.load`.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The file cannot be read.
-    """
+    """Read a dict of tensors, numbers and plain containers that torch saved, as in `read_checkpoint`."""
     file = checkpoint_path(path)
     try:
         content = torch.load(file, map_location=map_location, weights_only=True)
@@ -178,15 +159,11 @@ def read_data(path: str | Path, *, map_location: Any = "cpu") -> dict[str, Any]:
 
 
 def pack_weights(checkpoint: str | Path, out: str | Path, *, steps: int | None = None) -> None:
-    """Write the network of a checkpoint and its settings in half precision, the form of the packaged weights.
+    """Write the network of a checkpoint of `bpnp fit` and its settings in half precision, as those of packaged weights.
 
-    Args:
-        checkpoint: file that `bpnp fit` wrote.
-        out: file to write; `TrainedNet.from_checkpoint` and ``bpnp test --ckpt_path`` read it like any checkpoint.
-        steps: optimiser steps of all trainings that led to it (default: those of the checkpoint).
-
-    Raises:
-        ValueError: a weight is beyond the range of float16.
+    `TrainedNet.from_checkpoint` and ``bpnp test --ckpt_path`` read the file like any checkpoint. The optimiser steps
+    are those of all trainings that led to it, by default those of the checkpoint. Raise ValueError if a weight is
+    beyond the range of float16.
     """
     content = read_checkpoint(checkpoint)
     state = {key: value for key, value in content["state_dict"].items() if key.startswith(PREFIX)}
@@ -200,24 +177,15 @@ def pack_weights(checkpoint: str | Path, out: str | Path, *, steps: int | None =
 
 
 def solver_state(content: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Return the weights of the solver in a checkpoint of a `BlindPnPTask`, by their names in the solver.
-
-    Args:
-        content: Content of a checkpoint.
-    """
+    """Return the weights of the solver in a checkpoint of a `BlindPnPTask`, by their names in the solver."""
     state = content["state_dict"]
     return {key.removeprefix(PREFIX): value for key, value in state.items() if key.startswith(PREFIX)}
 
 
 def build_solver(content: Mapping[str, Any], parts: Iterable[type[nn.Module]] = ()) -> nn.Module:
-    """Build the network that a checkpoint describes, without its weights.
+    """Build the network that a checkpoint describes, without its weights, of classes of this package or in `parts`.
 
-    Args:
-        content: Content from `read_checkpoint`.
-        parts: Classes outside this package that the network may be made of.
-
-    Raises:
-        ValueError: The checkpoint describes no network, or a class that is neither of this package nor in `parts`.
+    Raise ValueError if the checkpoint describes no network, or another class.
     """
     return build_module(content.get("solver"), (*networks(), *PARTS, *parts))
 
@@ -232,19 +200,11 @@ def networks(base: type[nn.Module] = TrainedNet) -> Iterator[type[nn.Module]]:
 def fitting_state(
     content: Mapping[str, Any], solver: nn.Module, *, grown: bool = False
 ) -> tuple[dict[str, Tensor], list[str]]:
-    """Check that the weights and settings of a checkpoint fit a solver.
+    """Return the weights of a checkpoint that fit a solver, and what differs on purpose, as `rounds=0 (saved: 8)`.
 
-    Args:
-        content: Content from `read_checkpoint`.
-        solver: Solver that the weights are for.
-        grown: Allow the checkpoint to lack weights that are zero, of parts that add nothing before training, and to
-            differ in the settings that create these parts.
-
-    Returns:
-        The weights of the solver, and the settings that may differ and do, such as `rounds=0 (saved: 8)`.
-
-    Raises:
-        ValueError: The class, another setting, or the shape of a weight differs, or a weight is NaN or infinite.
+    A `grown` solver may have weights that the checkpoint lacks and that are zero, of parts that add nothing before
+    training, and differ in the settings that create these parts. Raise ValueError if the class, another setting, or the
+    shape of a weight differs, or a weight is NaN or infinite.
     """
     saved, wanted = content.get("solver", {}), describe_module(solver)
     state, weights = solver_state(content), solver.state_dict()
@@ -317,15 +277,7 @@ class AnyModule(Protocol):
 
 
 def module_or_default(module: AnyModule | None, default: type[nn.Module]) -> nn.Module:
-    """Return the module, or a default module if it is None.
-
-    Args:
-        module: Module or None.
-        default: Class of the default module, built with its default options.
-
-    Raises:
-        ValueError: `module` is no module.
-    """
+    """Return the module, or one of the default class with its default options if it is None."""
     if module is None:
         return default()
     if not isinstance(module, nn.Module):
@@ -353,14 +305,9 @@ def describe_module(module: nn.Module) -> dict[str, Any]:
 
 
 def build_module(description: Any, classes: Iterable[type[nn.Module]]) -> nn.Module:
-    """Build the module of a description.
+    """Build the module of `describe_module`, which may name these classes.
 
-    Args:
-        description: Result of `describe_module`.
-        classes: Classes that it may name.
-
-    Raises:
-        ValueError: A class is not among `classes`, or its settings are unusable.
+    Raise ValueError for another class, or settings that are unusable.
     """
     if not is_description(description):
         raise ValueError(f"the description of a module has its class and its settings; this one is {description!r:.80}")

@@ -251,15 +251,10 @@ class TrainingMonitor(Callback):
 
 
 def feature_spreads(solver: nn.Module, batch: Batch) -> dict[str, Tensor]:
-    """Return the mean distance of the unit features of each set from their mean.
+    """Return the mean distance of the unit features of each set, from the solver's `features(batch)`, from their mean.
 
-    Args:
-        solver: Solver, whose `features(batch)` returns the features of both sets.
-        batch: Problems.
-
-    Returns:
-        "feature_spread_2d" and "feature_spread_3d": 1 for vectors in all directions, 0 for equal vectors. Empty for a
-        solver without a method `features`.
+    "feature_spread_2d" and "feature_spread_3d" are 1 for vectors in all directions, 0 for equal vectors. They are
+    absent for a solver without a method `features`.
     """
     features = solver.features(batch) if hasattr(solver, "features") else ()  # type: ignore[operator]
     spreads = {}
@@ -272,13 +267,8 @@ def feature_spreads(solver: nn.Module, batch: Batch) -> dict[str, Tensor]:
 def watched_values(prediction: Prediction, batch: Batch) -> dict[str, Tensor]:
     """Return means over the problems: the probability of the true matches, and the iterations of each pose.
 
-    Args:
-        prediction: Prediction of the solver.
-        batch: Problems, with or without true matches.
-
-    Returns:
-        "<estimate>_iterations" of each pose; "true_match_mass", the sum of P over the true matches, if there are an
-        assignment and true matches.
+    They are "<estimate>_iterations" of each pose; "true_match_mass", the sum of P over the true matches, if there are
+    an assignment and true matches.
     """
     values = {f"{name}_iterations": pose.stats.iterations.float().mean() for name, pose in prediction.poses.items()}
     if prediction.assignment is not None and batch.match3d is not None:

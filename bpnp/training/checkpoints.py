@@ -22,14 +22,7 @@ WEIGHTS_ALONE = "weights_alone"
 
 
 def newest_checkpoint(folder: Path) -> Path:
-    """Return the checkpoint that `--ckpt_path last` continues: the last one, or a newer one of an interruption.
-
-    Args:
-        folder: Folder of the checkpoints.
-
-    Raises:
-        ValueError: There is none.
-    """
+    """Return the checkpoint that `--ckpt_path last` continues: the last one, or a newer one of an interruption."""
     files = [*folder.glob("last*.ckpt"), *folder.glob(f"{INTERRUPTED}.ckpt")]
     if not files:
         raise ValueError(f"{folder} has no checkpoint to continue. Leave out --ckpt_path last.")
@@ -100,12 +93,7 @@ class RunCheckpoint(ModelCheckpoint):
 def with_folder(state: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Return the state of a `ModelCheckpoint` whose files are in another folder than before.
 
-    Args:
-        state: State of the callback.
-        folder: Folder of the checkpoints.
-
-    Returns:
-        The state with paths in the folder; unchanged unless the folder has all files that the state names.
+    It is unchanged unless the folder has all files that the state names.
     """
     names = {key: Path(str(path)).name for key, path in state.items() if key.endswith("_path") and path}
     scores = {str(folder / Path(path).name): score for path, score in state.get("best_k_models", {}).items()}

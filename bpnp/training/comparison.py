@@ -39,21 +39,13 @@ ORDER_SEED = 0  # seed of the order in which `--limit` takes problems, equal for
 
 @dataclass(frozen=True)
 class Method:
-    """Method of the table: a solver's class, its settings, and the checkpoint of its weights.
-
-    Attributes:
-        label: Name in the table.
-        class_path: Class of the solver.
-        init_args: Settings.
-        checkpoint: File of the weights.
-        time_limit: Seconds for each problem, for solvers with a limit.
-    """
+    """Method of the table: a solver's class, its settings, and the checkpoint of its weights."""
 
     label: str
     class_path: str
     init_args: dict[str, Any]
     checkpoint: str | None = None
-    time_limit: float | None = None
+    time_limit: float | None = None  # seconds for each problem, for solvers with a limit
 
     @property
     def folder_name(self) -> str:
@@ -76,11 +68,7 @@ class Method:
         return {"class_path": self.class_path, "init_args": init_args}
 
     def build(self) -> nn.Module:
-        """Build the solver in evaluation mode.
-
-        Raises:
-            ValueError: Its class does not have a setting.
-        """
+        """Build the solver in evaluation mode; raise ValueError if its class does not have a setting."""
         if self.class_path in TRAINED and self.checkpoint is not None:
             return TrainedNet.from_checkpoint(self.checkpoint)
         solver: nn.Module = build(nn.Module, "solver", self.settings)
@@ -92,14 +80,9 @@ class Method:
 def parse_methods(texts: Sequence[str], *, time_limit: float | None = None) -> list[Method]:
     """Parse methods from `[LABEL=]WHAT[@CHECKPOINT]`, WHAT a short name, a class path, or a YAML file with a solver.
 
-    Args:
-        texts: Methods.
-        time_limit: Seconds for each problem.
-
-    Raises:
-        ValueError: A text names no method, a setting does not exist, a label cannot name a folder, or two methods have
-            the same folder.
-        FileNotFoundError: A checkpoint or a configuration is missing.
+    The time limit is in seconds for each problem. Raise ValueError if a text names no method, a setting does not exist,
+    a label cannot name a folder, or two methods have the same folder, and FileNotFoundError if a checkpoint or a
+    configuration is missing.
     """
     methods: dict[str, Method] = {}
     for text in texts:
@@ -138,12 +121,7 @@ def _solver(what: str, text: str) -> tuple[str, dict[str, Any]]:
 def read_data(recipe: Path, overrides: Sequence[str]) -> dict[str, Any]:
     """Read `data` of a configuration with `--data.NAME=VALUE` overrides, as class_path and all init_args.
 
-    Args:
-        recipe: YAML file.
-        overrides: Options.
-
-    Raises:
-        ValueError: The file has no `data`, its class cannot be imported, or it does not accept an option.
+    Raise ValueError if the file has no `data`, its class cannot be imported, or it does not accept an option.
     """
     data = _recipe(recipe, "`data`").get("data")
     if not data:
@@ -162,25 +140,17 @@ def _recipe(path: Path, what: str) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class MethodTest:
-    """Test of one method on one data set.
-
-    Attributes:
-        method: Method.
-        data: Class path and arguments of the data.
-        folder: Results folder.
-        limit: Number of problems, None for all.
-    """
+    """Test of one method on one data set."""
 
     method: Method
-    data: dict[str, Any]
+    data: dict[str, Any]  # class path and arguments of the data
     folder: Path
-    limit: int | None = None
+    limit: int | None = None  # number of problems, None for all
 
     def results(self) -> Results | None:
         """Return the existing results of the requested problems, or None unless the test of all of them was finished.
 
-        Raises:
-            ValueError: The folder holds results of another method or of other data.
+        Raise ValueError if the folder holds results of another method or of other data.
         """
         if not (self.folder / SUMMARY).is_file():
             return None
@@ -198,11 +168,8 @@ class MethodTest:
     def run(self, *, progress_bar: bool = False) -> None:
         """Test the problems, each alone in its batch, so that its time is measured; write the results to the folder.
 
-        Args:
-            progress_bar: Show a progress bar instead of lines.
-
-        Raises:
-            ValueError: The data module is not of bpnp, or the method returns no pose.
+        Without a progress bar, lines are printed. Raise ValueError if the data module is not of bpnp, or the method
+        returns no pose.
         """
         module = build(LightningDataModule, "data", self.data)
         module.setup("test")
@@ -246,16 +213,7 @@ def problem_order(size: int) -> list[int]:
 
 
 def build(base: type, name: str, settings: Mapping[str, Any]) -> Any:
-    """Build an instance of a subclass of `base`.
-
-    Args:
-        base: Base class.
-        name: Name of the option, for messages.
-        settings: Class path and arguments.
-
-    Raises:
-        ValueError: The class does not accept the settings.
-    """
+    """Build an instance of a subclass of `base`; raise ValueError, with the option's name, for wrong settings."""
     parser, chosen = _parse_settings(base, name, settings)
     # The name of the method depends on the release of jsonargparse.
     instantiate = parser.instantiate if hasattr(parser, "instantiate") else parser.instantiate_classes

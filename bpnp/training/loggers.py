@@ -15,12 +15,7 @@ SETTINGS = ("data", "ckpt_path")  # settings of a test that the run of its train
 
 
 def record_wandb_run(logger: WandbLogger, folder: Path) -> None:
-    """Write id, project and entity of a W&B run to `wandb.yaml`, which `wandb_run` reads.
-
-    Args:
-        logger: Logger of a training.
-        folder: Numbered log folder of the training.
-    """
+    """Write id, project and entity of a W&B run to `wandb.yaml` in the log folder, which `wandb_run` reads."""
     run = logger.experiment
     if run.disabled:  # WANDB_MODE=disabled
         return

@@ -19,32 +19,21 @@ SMALLEST = 1e-30
 
 @dataclass(frozen=True)
 class Losses:
-    """Terms of L = L_c + gamma_p L_p (paper Eq. 15) of each sample; zero, without a gradient, where undefined.
+    """Terms of L = L_c + gamma_p L_p (paper Eq. 15) of each sample; zero, without a gradient, where undefined."""
 
-    Attributes:
-        matching: L_c, or the matching loss in its place (b,).
-        matched: Samples that have a matching loss (b,).
-        pose: Terms of L_p by name, (b,) each; None without a pose loss.
-        posed: Samples that have a pose loss (b,).
-        pose_weight: gamma_p.
-        counts: Numbers of samples (3,) to divide by: with a matching loss, with a pose loss, and all. None: those of
-            these samples.
-    """
-
-    matching: Float[Tensor, " b"]
-    matched: Bool[Tensor, " b"]
-    pose: dict[str, Float[Tensor, " b"]] | None = None
-    posed: Bool[Tensor, " b"] | None = None
-    pose_weight: float = 0.0
+    matching: Float[Tensor, " b"]  # L_c, or the matching loss in its place
+    matched: Bool[Tensor, " b"]  # samples that have a matching loss
+    pose: dict[str, Float[Tensor, " b"]] | None = None  # terms of L_p by name, (b,) each; None without a pose loss
+    posed: Bool[Tensor, " b"] | None = None  # samples that have a pose loss
+    pose_weight: float = 0.0  # gamma_p
+    # Numbers of samples (3,) to divide by: with a matching loss, with a pose loss, and all. None: those of these
+    # samples.
     counts: Float[Tensor, " 3"] | None = None
 
     def over_processes(self) -> "Losses":
-        """Divide by the mean numbers of samples of all processes; each has a part of the batch.
+        """Return the losses divided by the mean numbers of samples of all processes; each has a part of the batch.
 
         The mean of the processes' totals, and of their gradients, is then that of one process with the whole batch.
-
-        Returns:
-            The same losses with `counts`.
         """
         return replace(self, counts=mean_over_processes(self._counts().float()))
 
@@ -69,11 +58,7 @@ class Losses:
         return self.matching.sum() / self._counts()[0]
 
     def mean(self, values: Tensor) -> Float[Tensor, ""]:
-        """Return the mean of one value per sample.
-
-        Args:
-            values: Values (b,).
-        """
+        """Return the mean of one value per sample (b,)."""
         return values.sum() / self._counts()[2]
 
     def pose_means(self) -> dict[str, Float[Tensor, ""]]:
@@ -95,16 +80,9 @@ def mean_over_processes(values: Tensor) -> Tensor:
 
 
 def matching_losses(prediction: Prediction, batch: Batch, *, kind: MatchingLoss, angle: float | None) -> Losses:
-    """Return the loss of each sample's assignment.
+    """Return `correspondence_losses` or `matching_likelihood_loss` of each sample's assignment.
 
-    Args:
-        prediction: Prediction with an assignment.
-        batch: Problems with the labels that the kind needs.
-        kind: "correspondence" for `correspondence_losses`, "likelihood" for `matching_likelihood_loss`.
-        angle: As in `correspondence_losses`.
-
-    Raises:
-        ValueError: The prediction has no assignment, or the batch no labels.
+    Raise ValueError if the prediction has no assignment, or the batch no labels.
     """
     if prediction.assignment is None:
         raise ValueError("the solver returns no assignment to train; use one that does, such as bpnp.models.BPnPNet")
@@ -121,15 +99,9 @@ def matching_losses(prediction: Prediction, batch: Batch, *, kind: MatchingLoss,
 
 
 def own_losses(loss: nn.Module, prediction: Prediction, batch: Batch) -> Losses:
-    """Return the values of a user's loss; NaN marks a sample without one.
+    """Return the values of a user's loss of (Prediction, Batch), one per problem; NaN marks a sample without one.
 
-    Args:
-        loss: Maps (Prediction, Batch) to one value per problem.
-        prediction: Prediction.
-        batch: Problems.
-
-    Raises:
-        ValueError: The loss does not return one number per problem.
+    Raise ValueError if it does not return one number per problem.
     """
     values = loss(prediction, batch)
     if not isinstance(values, Tensor) or values.shape != (len(batch),):
@@ -140,16 +112,10 @@ def own_losses(loss: nn.Module, prediction: Prediction, batch: Batch) -> Losses:
 
 
 def correspondence_losses(prediction: Prediction, batch: Batch, *, angle: float | None) -> Float[Tensor, " b"] | None:
-    """Return L_c of each sample (paper Eq. 11).
+    """Return L_c of each sample (paper Eq. 11); None without an assignment, or without true matches.
 
-    Args:
-        prediction: Prediction, with or without an assignment.
-        batch: Problems with true matches, or true poses for an `angle`.
-        angle: None for the true matches. Otherwise, in radians, supervision by the pose alone with
-            C_ij = [angle(f_i, R_gt p_j + t_gt) <= angle]; a point may then have several correspondences.
-
-    Returns:
-        L_c (b,); None without an assignment, or without true matches.
+    An angle, in radians, is supervision by the true pose alone with C_ij = [angle(f_i, R_gt p_j + t_gt) <= angle]; a
+    point may then have several correspondences.
     """
     if prediction.assignment is None:
         return None
@@ -160,17 +126,9 @@ def correspondence_losses(prediction: Prediction, batch: Batch, *, angle: float 
 
 
 def pose_losses(pose: Pose, batch: Batch) -> dict[str, Float[Tensor, " b"]]:
-    """Return the terms of L_p as `pose_terms` does, zero and without a gradient where the pose did not converge.
+    """Return "rotation" in radians and "translation" in scene units of L_p, as `pose_terms` does.
 
-    Args:
-        pose: Estimated poses (b) with their stats.
-        batch: Problems with their true poses.
-
-    Returns:
-        "rotation" in radians and "translation" in scene units, (b,) each.
-
-    Raises:
-        ValueError: The batch has no true poses.
+    They are zero and without a gradient where the pose did not converge.
     """
     solved, truth = pose.stats.converged, _true_pose(batch)
     # Replace a missing pose (NaN) by the true one, whose loss has no gradient, and mask it.
@@ -188,31 +146,20 @@ def _true_pose(batch: Batch) -> tuple[Tensor, Tensor]:
 def correspondence_loss(assignment: Float[Tensor, "b m n"], match3d: Int[Tensor, "b n"]) -> Float[Tensor, " b"]:
     """Return L_c = sum_ij P_ij (1 - 2 C_ij) (paper Eq. 11) with C from indices; in [-1, 1] if P sums to one.
 
-    Args:
-        assignment: P (b, m, n).
-        match3d: Index of the 2D point of each 3D point (b, n), -1 for none and for padding.
+    `match3d` is the index of the 2D point of each 3D point, -1 for none and for padding.
     """
     matched = assignment.gather(1, match3d.clamp_min(0).unsqueeze(1)).squeeze(1)
     return assignment.sum((-2, -1)) - 2 * (matched * (match3d >= 0)).sum(-1)
 
 
 def matching_likelihood_loss(prediction: Prediction, batch: Batch) -> Float[Tensor, " b"]:
-    """Return the negative log-likelihood of the true correspondence of each point, -log P(j | i) and -log P(i | j).
+    """Return the negative log-likelihood, nats, of each point's true correspondence, -log P(j | i) and -log P(i | j).
 
-    It is the mean over the true matches, in both directions. With dustbins, the mean of -log P(dustbin | i) over the
-    points without a match is added, so that their numbers do not matter. Unlike that of `correspondence_loss`, the
-    gradient does not vanish where the probability of the true match is small. A probability below 1e-30, such as one
-    that is zero in float32, counts as 1e-30 and has no gradient.
-
-    Args:
-        prediction: Prediction with an assignment; with dustbins, also `unmatched2d` and `unmatched3d`.
-        batch: Problems with `match3d`.
-
-    Returns:
-        Losses (b,), nats.
-
-    Raises:
-        ValueError: There is no assignment or no `match3d`.
+    It is the mean over the true matches, in both directions. With dustbins (`unmatched2d`, `unmatched3d`), the mean of
+    -log P(dustbin | i) over the points without a match is added, so that their numbers do not matter. Unlike that of
+    `correspondence_loss`, the gradient does not vanish where the probability of the true match is small. A probability
+    below 1e-30, such as one that is zero in float32, counts as 1e-30 and has no gradient. Raise ValueError for no
+    assignment or no `match3d`.
     """
     assignment, match3d = prediction.assignment, batch.match3d
     if assignment is None or match3d is None:
@@ -247,18 +194,7 @@ def within_angle(
     translation: Float[Tensor, "b 3"],
     angle: float,
 ) -> Bool[Tensor, "b m n"]:
-    """Return [angle(f_i, R p_j + t) <= angle] (paper Eq. 3), computed from the chord between unit vectors.
-
-    Args:
-        points2d: Normalised image coordinates (b, m, 2).
-        points3d: Scene points (b, n, 3).
-        rotation: R (b, 3, 3).
-        translation: t (b, 3).
-        angle: Angle, radians.
-
-    Returns:
-        Mask (b, m, n).
-    """
+    """Return [angle(f_i, R p_j + t) <= angle] (paper Eq. 3), radians, computed from the chord between unit vectors."""
     return chords(bearings(points2d), points3d, rotation, translation) <= 2 * math.sin(angle / 2)
 
 
@@ -270,15 +206,8 @@ def pose_terms(
 ) -> dict[str, Float[Tensor, " b"]]:
     """Return the two terms of the pose loss L_p = L_r + L_t (paper Eq. 12).
 
-    Args:
-        rotation: Estimated R (b, 3, 3).
-        translation: Estimated t (b, 3), scene units.
-        rotation_gt: True R (b, 3, 3).
-        translation_gt: True t (b, 3), scene units.
-
-    Returns:
-        "rotation", L_r = angle(R, R_gt) in radians (Eq. 13), and "translation", L_t = ||t - t_gt|| in scene units (Eq.
-        14), (b,) each.
+    They are "rotation", L_r = angle(R, R_gt) in radians (Eq. 13), and "translation", L_t = ||t - t_gt|| in scene units
+    (Eq. 14).
     """
     return {
         "rotation": rotation_angle(rotation_gt, rotation),

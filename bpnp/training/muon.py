@@ -27,12 +27,6 @@ def orthogonalise(matrices: Float[Tensor, "k r c"]) -> Float[Tensor, "k r c"]:
 
     Singular vectors are kept; singular values become 0.7 to 1.2, those near zero less. For a matrix U S V^T, the exact
     result is U V^T. The arithmetic is float32 or better: in bfloat16, many CPUs take ten times as long.
-
-    Args:
-        matrices: k matrices of one shape.
-
-    Returns:
-        Matrices (k, r, c) of the same dtype.
     """
     a, b, c = POLYNOMIAL
     tall = matrices.shape[-2] > matrices.shape[-1]

@@ -25,13 +25,8 @@ COLUMNS = ("id", "estimate", "found", "converged", "qw", "qx", "qy", "qz", "tx",
 def in_scene_frame(prediction: Prediction, batch: Batch) -> Prediction:
     """Name the problems of a prediction, and transform the poses to the original coordinates of their scenes.
 
-    Args:
-        prediction: Poses of the problems of the batch.
-        batch: Problems; its `origin` o (b, 3) is None if nothing was subtracted from the coordinates.
-
-    Returns:
-        The prediction with `ids` and `index` of the batch and, with an origin, poses (R, t - R o) in float64, where R
-        is the rotation nearest to that of the solver.
+    With an origin o of the batch, that was subtracted from the coordinates, they are (R, t - R o) in float64, where R
+    is the rotation nearest to that of the solver.
     """
     poses = prediction.poses
     if batch.origin is not None:
@@ -153,11 +148,7 @@ class PredictionWriter(BasePredictionWriter):
 
 
 def gather_objects(value: Any) -> list[Any]:
-    """Return the value of every process, in the order of their ranks.
-
-    Args:
-        value: Object of this process, which can be pickled.
-    """
+    """Return the value of every process, which can be pickled, in the order of their ranks."""
     if not distributed.is_available() or not distributed.is_initialized():
         return [value]
     values = [None] * distributed.get_world_size()

@@ -498,10 +498,7 @@ class BlindPnPTask(LightningModule):
     def _adopt(self, content: Mapping[str, Any], file: str | Path | None, *, grown: bool = False) -> None:
         """Load the solver's weights, and print the settings in which it differs from the checkpoint on purpose.
 
-        Args:
-            content: Content of the checkpoint.
-            file: Its file, for messages; None if it is unknown.
-            grown: As for `fitting_state`.
+        The file is that of the message, None if unknown; `grown` is as for `fitting_state`.
         """
         try:
             state, adjusted = fitting_state(content, self.solver, grown=grown)
@@ -665,14 +662,7 @@ def check_batch(batch: object) -> None:
 
 
 def check_prediction(prediction: object, batch: Batch, estimates: tuple[str, ...], solver: str) -> None:
-    """Raise ValueError unless a solver returns a Prediction with all its estimates, one pose per problem.
-
-    Args:
-        prediction: Output of the solver.
-        batch: Problems.
-        estimates: Names of the estimates.
-        solver: Name of the solver, for messages.
-    """
+    """Raise ValueError unless a solver returns a Prediction with all its estimates, one pose per problem."""
     if not isinstance(prediction, Prediction):
         raise ValueError(
             f"{solver} returned a {type(prediction).__name__}, not a Prediction; use "
@@ -694,15 +684,10 @@ def check_prediction(prediction: object, batch: Batch, estimates: tuple[str, ...
 
 
 def number_globally(batch: Batch, numbers: set[int], *, processes: int) -> None:
-    """Renumber the problems of a batch after all earlier ones if one of its numbers was used before.
+    """Renumber the problems of a batch after all earlier ones, `numbers`, if one of its numbers was used before.
 
-    Args:
-        batch: Problems whose `index`, and `ids` made from it, may be replaced.
-        numbers: Numbers of all earlier problems; those of the batch are added.
-        processes: Number of processes that evaluate together.
-
-    Raises:
-        ValueError: Numbers repeat among several processes, which do not have each other's numbers.
+    Numbers of the batch are added. Raise ValueError if they repeat among several processes that evaluate together,
+    since these do not have each other's numbers.
     """
     index = batch.index.tolist()
     if len(set(index)) < len(index) or not numbers.isdisjoint(index):

@@ -96,11 +96,5 @@ class RandomRansac(SingleSolver):
 
 
 def probability_of_true_triple(matches: int, m: int, n: int) -> float:
-    """Return the probability that three random image points and three random scene points are three one-to-one matches.
-
-    Args:
-        matches: Number of true matches.
-        m: Number of image points.
-        n: Number of scene points.
-    """
+    """Return the probability that three random image points and three random scene points are matches."""
     return math.prod(max(0, matches - i) / ((m - i) * (n - i)) for i in range(3))

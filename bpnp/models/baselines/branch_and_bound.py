@@ -30,19 +30,12 @@ SMALLEST_CENTRE = 1e-3  # half side of the smallest boxes of camera centres, in 
 
 
 class Boxes(NamedTuple):
-    """Boxes of poses: centres and half sides. The cubes of rotation vectors cover the ball of radius pi.
+    """Boxes of poses: centres and half sides. The cubes of rotation vectors cover the ball of radius pi."""
 
-    Attributes:
-        rotvec: Centres of the rotation vectors (b, 3), radians.
-        rotvec_half: Half sides of their cubes (b,), radians.
-        centre: Centres of the camera centres (b, 3).
-        centre_half: Half sides of their cuboids (b, 3).
-    """
-
-    rotvec: Float[Tensor, "b 3"]
-    rotvec_half: Float[Tensor, " b"]
-    centre: Float[Tensor, "b 3"]
-    centre_half: Float[Tensor, "b 3"]
+    rotvec: Float[Tensor, "b 3"]  # centres of the rotation vectors, radians
+    rotvec_half: Float[Tensor, " b"]  # half sides of their cubes, radians
+    centre: Float[Tensor, "b 3"]  # centres of the camera centres
+    centre_half: Float[Tensor, "b 3"]  # half sides of their cuboids
 
     @property
     def rotation(self) -> Float[Tensor, "b 3 3"]:
@@ -55,23 +48,14 @@ class Boxes(NamedTuple):
 
 
 class BestPose(NamedTuple):
-    """Best pose of a search, camera = R (p - c).
+    """Best pose of a search, camera = R (p - c)."""
 
-    Attributes:
-        rotation: R (3, 3), None if there is no pose.
-        centre: c (3,).
-        value: Value of the pose, smaller is better.
-        bound: Lower bound of the value over all poses of the domain.
-        boxes: Number of boxes searched.
-        certified: True if no pose of the domain is better, by more than the allowed gap.
-    """
-
-    rotation: Float[Tensor, "3 3"] | None
+    rotation: Float[Tensor, "3 3"] | None  # R, None if there is no pose
     centre: Float[Tensor, "3"]
-    value: float
-    bound: float
+    value: float  # value of the pose, smaller is better
+    bound: float  # lower bound of the value over all poses of the domain
     boxes: int
-    certified: bool
+    certified: bool  # no pose of the domain is better, by more than the allowed gap
 
 
 class BranchAndBound(SingleSolver):
@@ -139,17 +123,10 @@ def best_first(
 ) -> tuple[float, int]:
     """Expand the boxes of highest bound first, until no box can hold a better value than was found.
 
-    Args:
-        boxes: Boxes to search.
-        bounds: Upper bound of the value in each box (b,).
-        expand: Maps boxes to their children, the bounds of these, and the value that a bound must exceed for its box to
-            be kept.
-        at_once: Number of boxes expanded together.
-        until: Returns True to stop after a number of children.
-        small: Returns which boxes are kept for their bound but not expanded. Default: none.
-
-    Returns:
-        The highest bound of the remaining boxes, -inf if there are none, and the number of children.
+    `bounds` are upper bounds of the value; `expand` maps boxes to their children, the bounds of these, and the value
+    that a bound must exceed for its box to be kept. `until` gets the number of children and returns True to stop;
+    `small` returns which boxes are kept for their bound but not expanded. Return the highest bound of the remaining
+    boxes, -inf if there are none, and the number of children.
     """
     done, final_bounds = 0, bounds.new_tensor([-math.inf])
     while len(bounds) and not until(done):
@@ -313,18 +290,9 @@ def best_rotation(
 ) -> BestPose:
     """Maximise the number of rays f_i with some angle(f_i, R (p_j - c)) <= reach_j over rotations, at one centre c.
 
-    Boxes that cannot have more than `floor` such rays are dropped. Boxes under SMALLEST_ROTATION are not split; they,
-    and those left at the deadline, keep the bound above the count.
-
-    Args:
-        rays: Bearings (m, 3).
-        points: Scene points (n, 3).
-        centre: c (3,).
-        reach: Largest angle for each scene point (n,), radians.
-        domain: Box whose rotations are searched.
-        floor: Number of rays to exceed.
-        first: Stop at the first rotation that exceeds `floor`.
-        deadline: Time limit.
+    The reach is in radians. Boxes that cannot have more than `floor` such rays are dropped; with `first`, the first
+    rotation that exceeds it ends the search. Boxes under SMALLEST_ROTATION are not split; they, and those left at the
+    deadline, keep the bound above the count.
     """
     directions = normalize(points - centre, dim=-1)
     count, rotation = floor, None

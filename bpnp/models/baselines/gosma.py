@@ -189,13 +189,6 @@ def descend(
     """Descend from poses (b, 3, 3), (b, 3), by Adam with steps from a tenth of a unit to a thousandth, or by L-BFGS.
 
     A unit is a radian for rotations, and the mean distance to the scene's clusters for translations.
-
-    Args:
-        scene: Mixture of the scene.
-        rays: Mixture of the image.
-        rotation: Initial R (b, 3, 3).
-        centre: Initial c (b, 3).
-        finely: Use L-BFGS.
     """
     mean_distance = torch.linalg.vector_norm(scene.means - centre.unsqueeze(1), dim=-1).mean(-1, keepdim=True)
     unit = torch.cat([torch.ones_like(centre), mean_distance.expand_as(centre)], -1)

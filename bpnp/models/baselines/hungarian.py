@@ -71,12 +71,7 @@ class Hungarian(nn.Module):
 
 
 def hungarian(cost: Float[Tensor, "b m n"], batch: Batch) -> Float[Tensor, "b m n"]:
-    """Return the least-cost one-to-one matches of the real points as equal probabilities that sum to one.
-
-    Args:
-        cost: Cost (b, m, n).
-        batch: Problems.
-    """
+    """Return the least-cost one-to-one matches of the real points as equal probabilities that sum to one."""
     assignment = torch.zeros_like(cost)
     for i, (real2d, real3d) in enumerate(zip(batch.mask2d.cpu(), batch.mask3d.cpu(), strict=True)):
         indices2d, indices3d = real2d.nonzero()[:, 0], real3d.nonzero()[:, 0]

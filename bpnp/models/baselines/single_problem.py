@@ -17,28 +17,16 @@ CHUNK = 2**22  # distances computed at a time, in float32
 
 
 class SingleProblem(NamedTuple):
-    """Real points of one problem, its `Batch.index`, and its true pose if known.
+    """Real points of one problem, its `Batch.index`, and its true pose if known."""
 
-    Attributes:
-        points2d: Normalised image coordinates (m, 2).
-        points3d: Scene points (n, 3).
-        number: `Batch.index` of the problem.
-        rotation: True R (3, 3), None if unknown.
-        translation: True t (3,), None if unknown.
-    """
-
-    points2d: Float[Tensor, "m 2"]
-    points3d: Float[Tensor, "n 3"]
-    number: int
-    rotation: Float[Tensor, "3 3"] | None
-    translation: Float[Tensor, "3"] | None
+    points2d: Float[Tensor, "m 2"]  # normalised image coordinates
+    points3d: Float[Tensor, "n 3"]  # scene points
+    number: int  # `Batch.index` of the problem
+    rotation: Float[Tensor, "3 3"] | None  # true R, None if unknown
+    translation: Float[Tensor, "3"] | None  # true t, None if unknown
 
     def seed(self, seed: int) -> int:
-        """Return the seed of the problem's random numbers, which does not depend on its batch.
-
-        Args:
-            seed: Seed of the solver.
-        """
+        """Return the seed of the problem's random numbers, which does not depend on its batch."""
         mixed = torch.Generator().manual_seed(seed)
         return int(torch.randint(2**31, (1,), generator=mixed)) * 1_000_003 + self.number
 
@@ -110,14 +98,8 @@ class SingleSolver(nn.Module):
 def weak_perspective_distance(points2d: Tensor, points3d: Tensor) -> float:
     """Return the distance at which the scene looks as large as the image: the ratio of their root mean square radii.
 
-    Averaged over rotations, the image shows two of the scene's three axes; hence the factor sqrt(2/3).
-
-    Args:
-        points2d: Normalised image coordinates (m, 2).
-        points3d: Scene points (n, 3).
-
-    Returns:
-        Distance, scene units.
+    Averaged over rotations, the image shows two of the scene's three axes; hence the factor sqrt(2/3). Image points (m,
+    2) are normalised; the distance is in the unit of the scene points (n, 3).
     """
     image, scene = ((points - points.mean(0)).square().sum(-1).mean().sqrt() for points in (points2d, points3d))
     return float(math.sqrt(2 / 3) * scene / image.clamp_min(1e-12))
@@ -133,18 +115,9 @@ def agreement(
 ) -> Int[Tensor, "2 h"]:
     """Count the points of each side that have a point of the other side within `threshold`, for each pose.
 
-    The smaller count bounds the number of one-to-one matches. A 3D point behind the camera has no such point, and no
-    point has one under a pose that is NaN.
-
-    Args:
-        points2d: Normalised image coordinates (m, 2).
-        points3d: Scene points (n, 3).
-        rotation: Rotations (h, 3, 3).
-        translation: Translations (h, 3).
-        threshold: Distance in the normalised image.
-
-    Returns:
-        Counts (2, h), of image points and of scene points.
+    The threshold is a distance in the normalised image. The smaller count bounds the number of one-to-one matches. A 3D
+    point behind the camera has no such point, and no point has one under a pose that is NaN. The counts are of image
+    points, then of scene points.
     """
     part = max(1, CHUNK // (len(points2d) * len(points3d)))
     x, y = points2d.float().unsqueeze(-1).unbind(1)

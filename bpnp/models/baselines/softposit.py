@@ -115,29 +115,20 @@ class SoftPOSIT(SingleSolver):
 
 
 class Annealed(NamedTuple):
-    """Pose from each initial pose.
-
-    Attributes:
-        rotation: R (s, 3, 3).
-        translation: t (s, 3).
-        residual: Root mean square distance of the matched points (s,), pixels.
-        accepted: True for an acceptable result (s,).
-        steps: Annealing steps.
-        finished: False if the deadline passed.
-    """
+    """Pose from each initial pose."""
 
     rotation: Float[Tensor, "s 3 3"]
     translation: Float[Tensor, "s 3"]
-    residual: Float[Tensor, " s"]
-    accepted: Bool[Tensor, " s"]
+    residual: Float[Tensor, " s"]  # root mean square distance of the matched points, pixels
+    accepted: Bool[Tensor, " s"]  # true for an acceptable result
     steps: int
-    finished: bool
+    finished: bool  # false if the deadline passed
 
 
 def softposit(
     points2d: Tensor, points3d: Tensor, rotation: Tensor, translation: Tensor, max_steps: int | None, deadline: Deadline
 ) -> Annealed:
-    """Anneal every initial pose of one problem.
+    """Anneal every initial pose (s, 3, 3), (s, 3) of one problem.
 
     With S_k = (X_k, 1), Q1 = (R1, Tx)/Tz, Q2 = (R2, Ty)/Tz and w_k = 1 + R3 . X_k / Tz, the distance of image point j
     and scene point k is d^2_jk = FOCAL^2 [(Q1 . S_k - w_k x_j)^2 + (Q2 . S_k - w_k y_j)^2]. A step soft-assigns by
@@ -145,15 +136,7 @@ def softposit(
     beta by BETA_RATE.
 
     A result is accepted if its residual is below sqrt(ALPHA)/2 after 20 steps or more. Where the matched points span no
-    volume, the last pose is returned, not accepted.
-
-    Args:
-        points2d: Normalised image coordinates (m, 2).
-        points3d: Scene points (n, 3).
-        rotation: Initial rotations (s, 3, 3).
-        translation: Initial translations (s, 3).
-        max_steps: Largest number of steps; None for all.
-        deadline: Time limit.
+    volume, the last pose is returned, not accepted. Without a largest number of steps, all are taken.
     """
     image = points2d.double()
     centre = points3d.double().mean(0)
@@ -189,10 +172,6 @@ def slack_scalings(kernel: Float[Tensor, "s m n"], slack: float) -> tuple[Tensor
     Sinkhorn layer. Where K_jk is the largest of its row and of its column and above the slack, both slacks keep their
     initial ratio to it, so that a good match is not lost to them. The iteration stops when the row sums are off by less
     than TOLERANCE.
-
-    Args:
-        kernel: K (s, m, n).
-        slack: Initial slack.
     """
     best3d, best2d = kernel.max(2), kernel.max(1)
     rows = torch.arange(kernel.shape[1], device=kernel.device)
@@ -231,11 +210,7 @@ def _residual(matched: Tensor, rows: Tensor, depth: Tensor) -> Tensor:
 
 
 def _fit(matched: Tensor, scene: Tensor, depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Fit the pose whose first two rows match the assignment best in the least-squares sense.
-
-    Returns:
-        Rotations (s, 3, 3), translations (s, 3), and which poses are determined (s,).
-    """
+    """Fit the poses (s,) whose first two rows match the assignment best by least squares; return which are fixed."""
     mass, targets = matched[..., 0], depth.unsqueeze(-1) * matched[..., 1:3]
     moments = (scene.mT * mass.unsqueeze(1)) @ scene  # L = sum_k m_k S_k S_k^T
     # Equilibrate the matrix, so that its eigenvalues do not depend on the unit of the scene.
