@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import torch
 from lightning import LightningModule
@@ -49,6 +49,7 @@ from bpnp.training.predictions import in_scene_frame
 from bpnp.types import Batch, Prediction
 
 Stage = Literal["val", "test"]
+OptimizerSettings = list[tuple[str, list[dict[str, Any]]]]  # class of each optimizer, and its groups without parameters
 REBUILT = {"solver", "weights"}  # options that are not saved under "task": the checkpoint has their result
 POSED = "pnp"  # estimate of the pose loss, which has a derivative
 DECAYED = 0.02  # factor on the learning rate after the decay
@@ -68,22 +69,6 @@ class Evaluation:
     poses: dict[str, MetricCollection]  # by estimate
     loss: MeanOverProblems
     numbers: set[int] = field(default_factory=set)  # indices of the problems so far
-
-
-class OptimizerSettings(NamedTuple):
-    """Class of an optimiser, and the settings of its parameter groups that a checkpoint can hold."""
-
-    name: str
-    groups: list[dict[str, Any]]
-
-    @classmethod
-    def of(cls, optimizer: Optimizer) -> "OptimizerSettings":
-        """Return the settings of an optimiser."""
-        groups = [
-            {key: value for key, value in group.items() if key != "params" and is_plain(value)}
-            for group in optimizer.param_groups
-        ]
-        return cls(type(optimizer).__name__, groups)
 
 
 class BlindPnPTask(LightningModule):
@@ -175,8 +160,8 @@ class BlindPnPTask(LightningModule):
         self.matching_loss, self.correspondence_angle = matching_loss, correspondence_angle
         self.skipped_steps = 0
         self.consecutive_skipped_steps = 0
-        self.optimizer_settings: list[OptimizerSettings] = []  # as configured
-        self.saved_settings: list[OptimizerSettings] | None = None  # those of the checkpoint that is resumed
+        self.optimizer_settings: OptimizerSettings = []  # as configured
+        self.saved_settings: OptimizerSettings = []  # those of the checkpoint that is resumed
         self.refine_validation = refine_validation
         self.evaluations: list[Evaluation] = []  # of the loaders of this epoch
         self.table_metrics: set[str] = set()  # names of the metrics in the tables of a test
@@ -264,7 +249,7 @@ class BlindPnPTask(LightningModule):
             )
         if stage == "fit":
             self.skipped_steps = self.consecutive_skipped_steps = 0
-            self.saved_settings = None
+            self.saved_settings = []
 
     def on_train_batch_start(self, batch: object, batch_idx: int) -> None:
         """Check the batch."""
@@ -439,23 +424,25 @@ class BlindPnPTask(LightningModule):
         """
         for config in self.trainer.lr_scheduler_configs:
             _scale_schedule(config.scheduler)
-        self.optimizer_settings = [OptimizerSettings.of(optimizer) for optimizer in self.trainer.optimizers]
-        if self.saved_settings is not None:
-            ours, theirs = (
-                ", ".join(each.name for each in settings) for settings in (self.optimizer_settings, self.saved_settings)
+        self.optimizer_settings = [(type(each).__name__, _settings_of(each)) for each in self.trainer.optimizers]
+        ours, theirs = ([name for name, _ in each] for each in (self.optimizer_settings, self.saved_settings))
+        if theirs and theirs != ours:
+            raise ValueError(
+                f"The checkpoint was trained with {', '.join(theirs)}, and this run uses {', '.join(ours)}. Use the "
+                "same optimizer, or start a new training with --model.weights."
             )
-            if ours != theirs:
-                raise ValueError(
-                    f"The checkpoint was trained with {theirs}, and this run uses {ours}. Use the same optimizer, or "
-                    "start a new training with --model.weights."
-                )
 
     def on_train_start(self) -> None:
-        """Change the restored optimisers where this run has other settings than that of the checkpoint."""
-        configured = zip(self.trainer.optimizers, self.optimizer_settings, self.saved_settings or (), strict=False)
-        for optimizer, ours, theirs in configured:
-            for group, own, saved in zip(optimizer.param_groups, ours.groups, theirs.groups, strict=True):
-                _change_group(group, own, saved)
+        """Change the restored optimisers where this run has other settings than that of the checkpoint.
+
+        Another learning rate scales the scheduled one.
+        """
+        configured = zip(self.trainer.optimizers, self.optimizer_settings, self.saved_settings, strict=False)
+        for optimizer, (_, own), (_, saved) in configured:
+            for group, ours, theirs in zip(optimizer.param_groups, own, saved, strict=True):
+                rate = "initial_lr" if "initial_lr" in ours.keys() & theirs.keys() else "lr"
+                scheduled = group["lr"] * (ours[rate] / theirs[rate]) if theirs[rate] else ours[rate]
+                group.update({key: value for key, value in ours.items() if value != theirs.get(key)}, lr=scheduled)
         for config in self.trainer.lr_scheduler_configs:
             if hasattr(config.scheduler, "base_lrs"):
                 groups = zip(config.scheduler.optimizer.param_groups, config.scheduler.base_lrs, strict=True)
@@ -486,14 +473,13 @@ class BlindPnPTask(LightningModule):
             key: value for key, value in saved.items() if key not in REBUILT and (is_plain(value) or key == "loss")
         }
         checkpoint["skipped_steps"] = [self.skipped_steps, self.consecutive_skipped_steps]
-        checkpoint["optimizer_settings"] = [tuple(each) for each in self.optimizer_settings]
+        checkpoint["optimizer_settings"] = self.optimizer_settings
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Load the solver's weights, and restore the counts of skipped steps."""
         self._adopt(checkpoint, None if self._trainer is None else self.trainer.ckpt_path)
         self.skipped_steps, self.consecutive_skipped_steps = checkpoint.get("skipped_steps", (0, 0))
-        if saved := checkpoint.get("optimizer_settings"):  # none yet in the checkpoint of `LearningRateFinder`
-            self.saved_settings = [OptimizerSettings(*each) for each in saved]
+        self.saved_settings = checkpoint.get("optimizer_settings", [])
 
     def _adopt(self, content: Mapping[str, Any], file: str | Path | None, *, grown: bool = False) -> None:
         """Load the solver's weights, and print the settings in which it differs from the checkpoint on purpose.
@@ -628,20 +614,9 @@ def constructor_arguments(cls: type) -> set[str]:
     return names
 
 
-def _change_group(group: dict[str, Any], own: Mapping[str, Any], saved: Mapping[str, Any]) -> None:
-    """Change a restored parameter group where its configuration is another than that of the checkpoint.
-
-    Another learning rate scales the scheduled one, which without a schedule is the learning rate itself.
-    """
-    rates = {"lr", "initial_lr"}
-    group.update({key: value for key, value in own.items() if key not in rates and value != saved.get(key)})
-    rate, before = (settings.get("initial_lr", settings["lr"]) for settings in (own, saved))
-    if "initial_lr" in saved and "initial_lr" not in own:
-        group["lr"] = rate
-    elif rate != before:
-        group["lr"] = group["lr"] * rate / before if before else rate
-    if "initial_lr" in own:
-        group["initial_lr"] = rate
+def _settings_of(optimizer: Optimizer) -> list[dict[str, Any]]:
+    """Return what a checkpoint can hold of the parameter groups, which are not the parameters."""
+    return [{key: value for key, value in group.items() if is_plain(value)} for group in optimizer.param_groups]
 
 
 def _scale_schedule(scheduler: Any) -> None:

@@ -95,13 +95,6 @@ def test_a_resumed_run_has_the_rate_that_its_command_gives_an_optimizer(tmp_path
     assert Observer.trainer.optimizers[0].param_groups[0]["momentum"] == 0.25
 
 
-def test_a_resumed_run_without_its_schedule_has_the_whole_rate(tmp_path: Path) -> None:
-    fit(tmp_path, *SHORT, "--model.learning_rate=1e-4", "--model.warmup_steps=9", "--trainer.max_steps=2")
-    last = f"--ckpt_path={tmp_path}/run/checkpoints/last.ckpt"
-    fit(tmp_path, *SHORT, last, "--trainer.max_steps=4", "--model.warmup_steps=0", "--model.decay_start=null")
-    assert Observer.rates == pytest.approx([1e-4, 1e-4])
-
-
 def test_a_resumed_run_keeps_a_reduced_rate(tmp_path: Path) -> None:
     plateau = ["--lr_scheduler=lightning.pytorch.cli.ReduceLROnPlateau", "--lr_scheduler.monitor=train/loss"]
     plateau += ["--lr_scheduler.patience=0", "--lr_scheduler.threshold=1e9", "--lr_scheduler.factor=0.5"]
