@@ -40,19 +40,12 @@ def thread_count() -> int:
 
 
 def in_threads(work: Callable[[int, int], object], count: int) -> None:
-    """Call work(first, last) on consecutive parts of range(count), one a thread, and wait for all of them.
+    """Call work(first, last) on at most `thread_count` consecutive parts of range(count), and wait for all of them.
 
     Only work that releases the GIL gains, such as numba's `nogil` functions. Each call reads numpy arrays and writes to
-    its own part of one, never to a tensor: a thread starts without the inference mode, grad mode, autocast, default
-    type and default device of its caller. Python's threads are used because numba's pool does not survive the fork of a
-    data loader's workers.
-
-    Args:
-        work: Called with the first index and the index after the last.
-        count: Number of items; at most `thread_count` parts are formed, none of them empty.
-
-    Raises:
-        TypeError: `work` refers to a tensor. It is raised with one thread, too.
+    its own part of one. A tensor is a TypeError, with one thread too: a thread starts without the inference mode, grad
+    mode, autocast, default type and default device of its caller. Python's threads are used because numba's pool does
+    not survive the fork of a data loader's workers.
     """
     if (name := _tensor_of(work)) is not None:
         raise TypeError(f"the tensor {name!r} is used in threads; pass its numpy array")
@@ -164,19 +157,11 @@ class Clock:
 
 @dataclass(frozen=True)
 class Deadline:
-    """Time to stop.
+    """Time to stop: a stage that has begun completes its current item and drops the rest."""
 
-    A stage that has begun completes its current item and drops the rest.
-
-    Attributes:
-        at: Time at which a search stops, seconds of `Clock`; infinite for no deadline.
-        end: Time at which the verdict and the matching after it stop too; None for `at`.
-        unfinished: Stages that were cut short, as in `SolutionStats.unfinished`.
-    """
-
-    at: float = math.inf
-    end: float | None = None
-    unfinished: set[str] = field(default_factory=set, compare=False)
+    at: float = math.inf  # time at which a search stops, seconds of `Clock`; infinite for no deadline
+    end: float | None = None  # time at which the verdict and the matching after it stop too; None for `at`
+    unfinished: set[str] = field(default_factory=set, compare=False)  # as in `SolutionStats.unfinished`
 
     @classmethod
     def after(cls, seconds: float | None) -> "Deadline":
@@ -217,16 +202,9 @@ class Deadline:
 
 
 def in_time(work: Callable[[int, int], None], count: int, deadline: Deadline, at_once: int) -> int:
-    """Run work(first, last) on parts of range(count) in threads until a deadline.
+    """Run `in_threads` on parts of range(count) until a deadline, and return the number of items done.
 
-    Args:
-        work: Called with the first index and the index after the last.
-        count: Number of items.
-        deadline: When to stop.
-        at_once: Items between checks of the deadline; the first `at_once` are always done.
-
-    Returns:
-        The number of items done.
+    The deadline is checked every `at_once` items, of which the first are always done.
     """
     step = count if math.isinf(deadline.at) else at_once
     done = 0
@@ -246,17 +224,10 @@ _SETTINGS: Any = numba.config  # NUMBA_CACHE_DIR and others, as attributes
 
 
 def compiler(*, part: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator that compiles a function with `numba.njit`.
+    """Return a decorator that makes a `Loop` of a function, or numba's function of a `part`, with options of numba.
 
-    Divisions by zero are infinite, as in C, and the GIL is released. A type checker's wrapper around the function is
-    removed.
-
-    Args:
-        part: True for a function that only compiled functions call, and that is cached with them.
-        options: Options of `numba.njit`.
-
-    Returns:
-        A decorator that returns a `Loop`, or for a part numba's function.
+    A part is called by compiled functions only, and cached with them. Divisions by zero are infinite, as in C, and the
+    GIL is released. A type checker's wrapper around the function is removed.
     """
     options |= {"nogil": True, "error_model": "numpy"}
     if part:
@@ -268,10 +239,12 @@ class Loop:
     """Function that numba compiles at its first call, once an installation.
 
     The machine code is kept in ``loops`` in `cache_folder`, or in NUMBA_CACHE_DIR. Each version of the source has its
-    own folder there. The source includes the files of the parts that the function calls and of the named tuples that it
-    takes, and the numbers that its module imports; numba itself only checks the function's file. One process compiles;
-    others that need the same loop wait for it. If the folder is not writable, or the disk is full, each process
-    compiles.
+    own folder there: that of the function, of the parts that it calls and of the named tuples that it takes, and the
+    numbers that its module imports. One process compiles; others that need the same loop wait for it. If the folder is
+    not writable, or the disk is full, each process compiles.
+
+    With numba's `cache=True` alone, old machine code gives wrong results after an update of a part, a named tuple or a
+    number in another file, the import fails where nothing can be written, and a call where the disk is full.
     """
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
