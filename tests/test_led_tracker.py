@@ -1,6 +1,7 @@
 """The tracker of examples/led_tracker.py on planted poses: a prediction, the fallback, and no pose where none is."""
 
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -8,7 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import bpnp
 from bpnp.examples import load
+from bpnp.search.propose import repetitions
+from bpnp.search.verdict import decide, uncertainty
 
 sys.path.append(str(Path(__file__).parents[1] / "examples"))
 led_tracker: Any = __import__("led_tracker")
@@ -80,6 +84,31 @@ def test_a_prediction_goes_on_as_the_device_moved() -> None:
     prior = tracked.prediction()
     np.testing.assert_allclose(prior.rotation, step @ step, atol=1e-12)
     np.testing.assert_allclose(prior.translation, [0.02, 0, 1.04])
+
+
+def test_a_frame_computes_each_test_of_its_pose_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Verdict and covariance share them, and what depends on the device alone is computed in its first frame."""
+    first, second = frame_at(2, 0), frame_at(40, 0.1)
+    options = {"normals3d": RING.normals3d, "time_limit": None}
+    assert bpnp.solve(first.dots, RING.points3d, RING.camera, **options).verdict == "confident"
+    counts: Counter[str] = Counter()
+
+    def count(module: Any, name: str) -> None:
+        function = getattr(module, name)
+
+        def counted(*arguments: Any, **options: Any) -> Any:
+            counts[name] += 1
+            return function(*arguments, **options)
+
+        monkeypatch.setattr(module, name, counted)
+
+    for name in ("linearise", "_of_louis"):
+        count(uncertainty, name)
+    count(decide, "systematic_misfit")
+    for name in ("extent_and_spacing", "self_motions"):
+        count(repetitions, name)
+    assert bpnp.solve(second.dots, RING.points3d, RING.camera, **options).verdict == "confident"
+    assert counts == {"linearise": 1, "_of_louis": 1, "systematic_misfit": 1}
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from bpnp.search.problem import Problem
 from bpnp.search.solution import FOCAL_LENGTH, POSE_PARAMETERS, Candidate, Solution, SolutionStats
 from bpnp.search.verdict.decide import Case, SearchResult, Verdict, decide
 from bpnp.search.verdict.reasons import Objection
-from bpnp.search.verdict.uncertainty import linearised, pose_covariance
+from bpnp.search.verdict.uncertainty import Linearised, linearised, pose_covariance
 
 Array = NDArray[np.float64]
 
@@ -56,6 +56,7 @@ class OneCamera:
     """A single camera."""
 
     problem: Problem
+    case: Case | None = None  # on which the verdict was made; what it has computed is used again
     is_rig = False
 
     @property
@@ -74,12 +75,20 @@ class OneCamera:
         return replace(poses, rotation=rotation, translation=translation)
 
     def covariance_of(self, poses: Hypotheses, residual: float, inliers: int) -> Array | None:
-        linear = linearised(self.problem, *poses.pose(), residual)
+        linear = self._linearised(poses, residual)
         covariance = pose_covariance(self.problem, linear, float(poses.match_count[0]))
         if covariance is None or self.problem.measured.camera is None:
             return covariance
         unit = np.where(np.arange(len(covariance)) < len(POSE_PARAMETERS), 1.0, self.problem.measured.camera.focal)
         return np.asarray(covariance * np.outer(unit, unit))  # of the focal length instead of its logarithm
+
+    def _linearised(self, poses: Hypotheses, residual: float) -> Linearised | None:
+        """Return the best pose with its matches; those of the verdict if it was made on this pose."""
+        case, pose = self.case, poses.pose()
+        known = case is not None and case.problem is self.problem and case.residual == residual
+        if case is not None and known and all(map(np.array_equal, case.pose, pose)):
+            return case.linear
+        return linearised(self.problem, *pose, residual)
 
 
 class Solved(NamedTuple):

@@ -158,7 +158,9 @@ def _solved(
     problem: Problem, case: Case, result: SearchResult, options: Options, deadline: Deadline, seconds: float
 ) -> Solved:
     threshold = options.inlier_threshold
-    solution = assembled(OneCamera(problem), result, seconds=seconds, inlier_threshold=threshold, deadline=deadline)
+    solution = assembled(
+        OneCamera(problem, case), result, seconds=seconds, inlier_threshold=threshold, deadline=deadline
+    )
     return Solved(case, solution)
 
 

@@ -106,10 +106,12 @@ class EnumeratedPoses:
         run = self.run
         if not (run.is_significant and self.has_competitors and margin(self.found, run.problem) >= run.safe_margin):
             return False
-        known = {"local_searches": REFINED, "motions": self._symmetry}
+        known = {"local_searches": REFINED, "is_fitted": True, "motions": self._symmetry}
         case = Case.of(self._candidates(), self.enumerated, **known)
         self.is_certain = case.is_certain
         if self.is_certain:
+            if not len(self.candidates) and self.problem is self.enumerated:
+                self._case = case  # with the tests that were computed for it
             self._keep(case.candidates)
         return self.is_certain
 

@@ -6,6 +6,7 @@ points compete with the pose.
 """
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +28,7 @@ ANGLES = 360  # number of angles of a full turn [angles; cost]
 APART_STEPS = 2  # two angles within this many steps are one, since poses are refined [steps; not tuned]
 MOST_OTHERS = 500  # largest number of points off the line that are rotated, the nearest ones [points; cost]
 KEPT_ANGLES = 6  # largest number of competing poses, those that explain the most points [poses; cost]
+CACHED_LINES = 64  # number of sets of points whose line stays in the cache [sets; cost]
 
 Array = NDArray[np.float64]
 
@@ -54,11 +56,22 @@ def find_line(points: Array) -> Line | None:
     >>> int((line.distances(points) <= line.radius).sum())
     10
     """
-    rng, count = np.random.default_rng(0), len(points)
-    if count < FEWEST_ON_LINE:
+    if len(points) <= LINE_PAIRS:
+        return _line_of_few(np.ascontiguousarray(points, np.float64).tobytes())
+    rng = np.random.default_rng(0)
+    return _line_through(points[rng.choice(len(points), LINE_PAIRS, replace=False)], rng)
+
+
+@lru_cache(maxsize=CACHED_LINES)
+def _line_of_few(content: bytes) -> Line | None:
+    """Return the line through most of the points in a buffer, cached: several tests look for that of one pose."""
+    return _line_through(np.frombuffer(content).reshape(-1, 3), np.random.default_rng(0))
+
+
+def _line_through(points: Array, rng: np.random.Generator) -> Line | None:
+    """Return the line of `find_line` through at most `LINE_PAIRS` points (n, 3)."""
+    if (count := len(points)) < FEWEST_ON_LINE:
         return None
-    if count > LINE_PAIRS:
-        points, count = points[rng.choice(count, LINE_PAIRS, replace=False)], LINE_PAIRS
     pairs = np.stack(np.triu_indices(count, 1), -1)
     if len(pairs) > LINE_PAIRS:
         pairs = pairs[rng.choice(len(pairs), LINE_PAIRS, replace=False)]
@@ -69,7 +82,7 @@ def find_line(points: Array) -> Line | None:
         return None
     offsets = points - points[pairs[:, :1]]
     away = np.linalg.norm(np.cross(offsets, axes[:, None]), axis=-1)
-    radius = THIN_LINE * np.linalg.norm(edges[lengths > 0], axis=-1)
+    radius = THIN_LINE * lengths[lengths > 0]
     held = (away <= radius[:, None]).sum(-1)
     best = int(held.argmax())
     if held[best] < max(FEWEST_ON_LINE, LEAST_ON_LINE * count):

@@ -14,7 +14,15 @@ from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.possible_matches import MATCH_REACH
 from bpnp.search.problem import Problem
 from bpnp.search.propose.collinear import find_line, rotations_about
-from bpnp.search.propose.symmetries import Motions, matching_tolerance, mirror_pose, reflection, self_motions
+from bpnp.search.propose.symmetries import (
+    Motions,
+    extent_and_spacing,
+    matching_tolerance,
+    mirror_pose,
+    reflection,
+    self_motions,
+    tolerance_of,
+)
 from bpnp.search.verdict.false_alarms import SHARES, alarms_of, directions_of, point_evidence
 from bpnp.search.verdict.reasons import Unfinished
 
@@ -39,6 +47,7 @@ BASES_OF_MANY = 8  # number of bases with many points [bases; derived]
 SIZE_RATIO = 4.0  # [factor; not tuned]
 KEPT_REPETITIONS = 6  # largest number of competing poses; those with the fewest false alarms are kept [poses; cost]
 SCORED_AT_ONCE = 100_000  # points, times poses, that are scored between two checks of the deadline [points; cost]
+CACHED_SCENES = 64  # number of scenes whose motions stay in the cache [scenes; cost]
 MOST_MISSING = 1 / 3  # largest fraction of its points that a map may lack [fraction; not tuned]
 
 Array = NDArray[np.float64]
@@ -79,8 +88,8 @@ def _motions_of(
     noise = scale * float(np.median(np.linalg.norm(points[matched] @ rotation.T + translation, axis=-1)))
     labels, normals = problem.labels3d, problem.normals3d if problem.cosines3d is None else None
     if len(points) <= WHOLE_SCENE:
-        tolerance = matching_tolerance(points, np.arange(len(points)), noise)
-        arrays = (_frozen(x) for x in (points, labels, normals))
+        arrays = [_frozen(x) for x in (points, labels, normals)]
+        tolerance = tolerance_of(*_extent_of_scene(arrays[0]), noise)
         motions = _of_scene(*arrays, tolerance, MAPPED_OF_SCENE, BASES_OF_SCENE, SIZE_RATIO, reflected)
         return motions.of(points, matched, tolerance, MAPPED, labels3d=labels, normals3d=normals)
     centre = np.median(points[matched], 0)
@@ -118,7 +127,20 @@ def _frozen(array: NDArray[Any] | None) -> Frozen:
     return None if array is None else (np.ascontiguousarray(array).tobytes(), array.dtype.str, array.shape)
 
 
-@lru_cache(maxsize=64)
+def _thawed(content: Frozen) -> NDArray[Any] | None:
+    """Convert a key of a cache back to an array."""
+    return None if content is None else np.frombuffer(content[0], content[1]).reshape(content[2]).copy()
+
+
+@lru_cache(maxsize=CACHED_SCENES)
+def _extent_of_scene(points: Frozen) -> tuple[float, float]:
+    """Return the extent and the spacing of a whole scene, cached for all problems of it."""
+    array = _thawed(points)
+    assert array is not None
+    return extent_and_spacing(array, np.arange(len(array)))
+
+
+@lru_cache(maxsize=CACHED_SCENES)
 def _of_scene(
     points: Frozen,
     labels: Frozen,
@@ -130,7 +152,7 @@ def _of_scene(
     reflected: bool,
 ) -> Motions:
     """Return the motions of a whole scene, cached for all problems of it."""
-    arrays = [None if x is None else np.frombuffer(x[0], x[1]).reshape(x[2]).copy() for x in (points, labels, normals)]
+    arrays = [_thawed(each) for each in (points, labels, normals)]
     assert arrays[0] is not None
     options: dict[str, Any] = {"labels3d": arrays[1], "normals3d": arrays[2], "reflected": reflected}
     return self_motions(arrays[0], tolerance, least=least, bases=bases, factor=factor, **options)

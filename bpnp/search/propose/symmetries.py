@@ -294,12 +294,21 @@ def matching_tolerance(points3d: Array, sources: Indices, noise: float) -> float
     whichever is larger, rounded up to a power of two of the latter. It is at most `TOLERANCE_SPACINGS` of the median
     distance of a source from its nearest neighbour, beyond which points lie on others by chance.
     """
-    least = NEAR_SYMMETRY * extent(points3d[sources])
+    return tolerance_of(*extent_and_spacing(points3d, sources), noise)
+
+
+def extent_and_spacing(points3d: Array, sources: Indices) -> tuple[float, float]:
+    """Return the extent of some points, and the median distance of one of them from its nearest neighbour."""
+    nearest = cKDTree(points3d).query(points3d[sources], 2)[0][:, 1]
+    return extent(points3d[sources]), float(np.median(nearest[nearest > 0])) if nearest.any() else 0.0
+
+
+def tolerance_of(extent: float, spacing: float, noise: float) -> float:
+    """Return the `matching_tolerance` of points of this extent and spacing."""
+    least = NEAR_SYMMETRY * extent
     if not least > 0:
         return 0.0
     steps = math.ceil(math.log2(max(3 * noise / least, 1.0)))
-    nearest = cKDTree(points3d).query(points3d[sources], 2)[0][:, 1]
-    spacing = float(np.median(nearest[nearest > 0])) if nearest.any() else 0.0
     return min(2.0**steps * least, TOLERANCE_SPACINGS * spacing)
 
 

@@ -38,7 +38,7 @@ from bpnp.search.verdict.false_alarms import alarms_of
 from bpnp.search.verdict.limits import LEAST_MARGIN, MOST_FALSE_ALARMS, MOST_MISSED
 from bpnp.search.verdict.reasons import Objection, Unfinished, focal_length_not_fixed, objection
 from bpnp.search.verdict.rivals.lens import fitted_lens
-from bpnp.search.verdict.uncertainty import linearised, share_bound
+from bpnp.search.verdict.uncertainty import linearised, share_bound, systematic_misfit
 
 BEFORE = 1e9  # score of the poses that were refined before: above the evidence of any pose [nats; derived]
 PROPOSED_POSES = 4000  # number of poses that a camera with few points proposes [poses; cost]
@@ -303,7 +303,7 @@ class RigPoses:
         if self.rig.model.lens is not None:
             return case
         linear = linearised(case.problem, *case.pose, case.residual)
-        return case.against(fitted_lens(linear, case.match_count))
+        return case.against(fitted_lens(linear, systematic_misfit(linear, case.match_count)))
 
     def _unknowns(self, case: Case) -> Case:
         """Return the case against a focal length or a scale that the points do not fix."""

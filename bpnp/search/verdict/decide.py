@@ -35,7 +35,14 @@ from bpnp.search.verdict.completeness import Symmetry, missed
 from bpnp.search.verdict.false_alarms import alarms_of
 from bpnp.search.verdict.limits import LEAST_MARGIN, MOST_FALSE_ALARMS, MOST_MISSED
 from bpnp.search.verdict.reasons import CONFIDENT, NO_POSE, Objection, focal_length_not_fixed, objection
-from bpnp.search.verdict.uncertainty import Linearised, error_bounds, is_redundant, linearised, systematic_misfit
+from bpnp.search.verdict.uncertainty import (
+    Linearised,
+    Misfit,
+    error_bounds,
+    is_redundant,
+    linearised,
+    systematic_misfit,
+)
 
 Verdict = Literal["confident", "ambiguous", "failed"]
 HALF_TURN = 180.0  # a larger bound does not constrain a rotation [degrees; derived]
@@ -142,7 +149,7 @@ class Case:
     @cached_property
     def bounds(self) -> tuple[float, float]:
         """99.9 % bounds of the rotation, degrees, and of the focal length, a fraction; the latter is 0 if given."""
-        turned, share = error_bounds(self.problem, self._linear, self.match_count)
+        turned, share = error_bounds(self.problem, self.linear, self.match_count)
         return math.degrees(turned), share
 
     @cached_property
@@ -170,8 +177,14 @@ class Case:
         return missed(self.candidates, *known, decades_a_match=decades)
 
     @cached_property
-    def _linear(self) -> Linearised | None:
+    def linear(self) -> Linearised | None:
+        """The leader and its possible matches, linearised; None without a match."""
         return linearised(self.problem, *self.pose, self.residual)
+
+    @cached_property
+    def misfit(self) -> Misfit:
+        """Largest change of the leader that its residuals support significantly."""
+        return systematic_misfit(self.linear, self.match_count)
 
     @cached_property
     def _rivals(self) -> list[Objection]:
@@ -195,8 +208,7 @@ class Case:
     @property
     def _doubts(self) -> list[Objection]:
         """Other cameras that the residuals support, and far poses that explain other points."""
-        misfit = systematic_misfit(self._linear, self.match_count)
-        doubts = other_camera(misfit), unrelated_competitor(self._cameras)
+        doubts = other_camera(self.misfit), unrelated_competitor(self._cameras)
         return [one for one in doubts if one is not None and one.margin < LEAST_MARGIN]
 
 

@@ -4,6 +4,8 @@ Also tests for systematic residuals, which another focal length or other proport
 """
 
 import math
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -212,14 +214,7 @@ def local_covariance(linear: "Linearised | None") -> Array | None:
     Returns:
         (6, 6), or (7, 7) with the logarithm of a fitted focal length; None if the points do not fix the pose.
     """
-    if linear is None:
-        return None
-    covariance = _of_louis(linear)
-    if covariance is not None:
-        return covariance
-    sharper = linearise(linear.model, linear.problem, linear.state, linear.scale / math.sqrt(2))
-    covariance = None if sharper is None else _of_louis(sharper)
-    return None if covariance is None else 2 * covariance
+    return None if linear is None else linear.covariance
 
 
 def matches_of(linear: "Linearised") -> Linearisation:
@@ -270,7 +265,8 @@ def _quantile(values: Array, weights: Array) -> Labels:
     return np.minimum(block, BLOCKS - 1).astype(np.int64)
 
 
-class Linearised(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Linearised:
     """A pose and its k possible matches in one camera, linearised in the unknowns.
 
     Attributes:
@@ -294,6 +290,16 @@ class Linearised(NamedTuple):
     residual: Array
     jacobian: Array
     scale: float
+
+    @cached_property
+    def covariance(self) -> Array | None:
+        """Covariance that `local_covariance` describes."""
+        covariance = _of_louis(self)
+        if covariance is not None:
+            return covariance
+        sharper = linearise(self.model, self.problem, self.state, self.scale / math.sqrt(2))
+        covariance = None if sharper is None else _of_louis(sharper)
+        return None if covariance is None else 2 * covariance
 
 
 def linearised(problem: Problem, rotation: Array, translation: Array, scale: float) -> Linearised | None:

@@ -29,7 +29,6 @@ from bpnp.search.verdict.uncertainty import (
     Misfit,
     bends_significantly,
     linearised,
-    systematic_misfit,
 )
 
 # Density-map search around a pose at the next step of the focal length.
@@ -71,8 +70,8 @@ def _other_lens(case: Case, scene_of: SceneOf, deadline: Deadline) -> Objection 
     if deadline.ended(Unfinished.focal_lengths):
         return objection("camera_untested")
     count, (rotation, translation) = case.match_count, case.pose
-    linear = linearised(problem, rotation, translation, case.residual)
-    other = fitted_lens(linear, count)
+    linear = case.linear
+    other = fitted_lens(linear, case.misfit)
     if other is not None or count < FEWEST_MATCHES:
         return other
     if case.residual < problem.image.scales[0]:
@@ -101,14 +100,14 @@ def _other_lens(case: Case, scene_of: SceneOf, deadline: Deadline) -> Objection 
     return better(likeliest)
 
 
-def fitted_lens(linear: Linearised | None, count: float) -> Objection | None:
+def fitted_lens(linear: Linearised | None, misfit: Misfit) -> Objection | None:
     """Return a focal length that the residuals of a pose support significantly, if its pose is a different one.
 
     Args:
         linear: Pose of a given camera from `linearised`, at the standard deviation of its residuals; or None.
-        count: Number of its matches.
+        misfit: Its change by its residuals, from `systematic_misfit`.
     """
-    if linear is None or systematic_misfit(linear, count).zoom == 1:
+    if linear is None or misfit.zoom == 1:
         return None
     rotation, centre = linear.state.rotation, linear.state.centroid
     fit = fit_lens(linear.problem, rotation, centre, linear.scale)
