@@ -228,7 +228,7 @@ def _lbfgs(
 
 
 def _rotation_of(w: Float[Tensor, "b 3"]) -> Rotations:
-    """Return a rotation that equals exp([w]x) up to the third order in w, by the Cayley transform."""
+    """Return the Cayley transform of [w/2]x, a rotation that differs from exp([w]x) in the third order of w."""
     k, eye = hat(w), torch.eye(3, dtype=w.dtype, device=w.device)
     factor = 4 / (4 + w.square().sum(-1))[:, None, None]
     return torch.addcmul(eye, factor, torch.baddbmm(k, k, k, alpha=0.5))
