@@ -161,6 +161,7 @@ def verify(
     camera: str | None = None,
     image: str | None = None,
     matches: Path | None = None,
+    independent: bool = False,
     as_it_is: bool = False,
     output: Path | None = None,
     page: Path | None = None,
@@ -189,6 +190,7 @@ def verify(
         camera: as for bpnp solve.
         image: as for bpnp solve.
         matches: .npy, .csv or .txt with two columns, indices of a 2D and of a 3D point, counted from 0.
+        independent: the pose was not found on these points, but comes from a survey or another sensor.
         as_it_is: do not refine the pose.
         output: write the solution as JSON; for a model, a file that ends in .json or .csv.
         page: for a model, write the table and a drawing of the map as one .html file.
@@ -204,7 +206,12 @@ def verify(
         from bpnp.commands.verifying_maps import verify_images
 
         of_points: dict[str, Any] = {"rotation": rotation, "translation": translation, "camera": camera, "image": image}
-        of_points |= {"matches": matches, "as_it_is": as_it_is or None, "surface": surface}
+        of_points |= {
+            "matches": matches,
+            "as_it_is": as_it_is or None,
+            "independent": independent or None,
+            "surface": surface,
+        }
         of_points |= {"inlier_threshold": inlier_threshold}
         if wrong := [name for name, value in of_points.items() if value is not None]:
             raise ValueError(
@@ -242,6 +249,7 @@ def verify(
             lens,
             **annotations,
             matches=pairs,
+            independent=independent,
             refine=not as_it_is,
             inlier_threshold=inlier_threshold,
             seed=seed,

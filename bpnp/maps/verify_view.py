@@ -38,7 +38,13 @@ def verify_pose(
     problem = photo.problem(region, photo.camera)
     until = deadline.share(1 / 2)
     case, solution = verify_problem(
-        problem, view.rotation, view.translation, seed=photo.seed, time_limit=time_limit, until=until
+        problem,
+        view.rotation,
+        view.translation,
+        independent=True,
+        seed=photo.seed,
+        time_limit=time_limit,
+        until=until,
     )
     solution = with_ids(solution, region)
     if solution.verdict == "failed":

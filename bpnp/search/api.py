@@ -1,6 +1,7 @@
 """Camera pose from unmatched 2D and 3D points: `solve` for one problem, `solve_many` for many."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -274,10 +275,12 @@ def solve_many(
     priors = [checked_prior(each) for each in each_prior(prior, count)]
     pixels = [pixels_from(points, one, image_size) for points, one in zip(images, cameras, strict=True)]
 
+    shared = set[int]()
+
     def problem(i: int, lens: Camera | None, focal: UnknownFocal | None = None) -> Problem:
         arrays = {name: values[i] for name, values in point_options.items()}
         with about(f"problem {i}" if count > 1 else None):
-            return problem_from(
+            whole = problem_from(
                 pixels[i],
                 scenes[i],
                 lens,
@@ -286,12 +289,14 @@ def solve_many(
                 inlier_threshold=options.inlier_threshold,
                 **arrays,
             )
+        return replace(whole, is_shared=i in shared)
 
     if distortion or image_size is not None or focal_error is not None:
         unknown = [unknown_camera(one, image_size, focal_error, distortion) for one in cameras]
         for points in pixels if image_size is not None else ():
             check_inside(points, image_size)
         problems = {i: problem(i, one.reference, one.focal(one.reference)) for i, one in enumerate(unknown)}
+        shared |= set().union(*same_images(problems))
 
         def again(i: int, taken: Labels | None = None) -> Solution:
             def at(lens: Camera, focal: UnknownFocal) -> Problem:
@@ -303,6 +308,7 @@ def solve_many(
         solutions = {i: again(i) for i in problems}
     else:
         problems = {i: problem(i, None if one is None else camera_from(one)) for i, one in enumerate(cameras)}
+        problems |= {i: replace(problems[i], is_shared=True) for group in same_images(problems) for i in group}
 
         def again(i: int, taken: Labels | None = None) -> Solution:
             problem = problems[i] if taken is None else problems[i].without(taken)
@@ -318,6 +324,15 @@ def _axes_of_labels(labels: Any) -> int:
     return 2 if getattr(labels, "ndim", 1) == 2 and "float" in str(labels.dtype) else 1
 
 
+def same_images(problems: Mapping[int, Problem]) -> list[list[int]]:
+    """Return the groups of small problems that have the same image points and camera."""
+    groups: dict[bytes, list[int]] = {}
+    for i, problem in problems.items():
+        if len(problems) > 1 and problem.degenerate is None and is_enumerable(problem):
+            groups.setdefault(problem.measured.points.tobytes() + repr(problem.measured.camera).encode(), []).append(i)
+    return [group for group in groups.values() if len(group) > 1]
+
+
 def share_points(
     problems: Mapping[int, Problem], solutions: dict[int, Solution], again: Callable[[int, Labels], Solution]
 ) -> None:
@@ -331,11 +346,7 @@ def share_points(
         solutions: Solutions by index of the problem; changed in place.
         again: Solves the problem of an index without the 2D points of some indices (k,).
     """
-    groups: dict[bytes, list[int]] = {}
-    for i, problem in problems.items():
-        if len(problems) > 1 and problem.degenerate is None and is_enumerable(problem):
-            groups.setdefault(problem.measured.points.tobytes() + repr(problem.measured.camera).encode(), []).append(i)
-    for members in groups.values():
+    for members in same_images(problems):
         taken: set[int] = set()
         for i in sorted(members, key=lambda i: (solutions[i].log10_false_alarms, i)):
             if taken.intersection(solutions[i].matches[:, 0].tolist()):

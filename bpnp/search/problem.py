@@ -98,6 +98,7 @@ class Problem:
         size: RMS distance of the scene points from it, user's unit.
         measured: The image points as the user measured them; the bearings by default.
         given3d: The scene points in the user's coordinates; None if they are these.
+        is_shared: True if other problems have these image points too: those that this one leaves may be theirs.
         network: Trained network whose pose is tried first.
         baseline: True if other cameras at known distances see the scene too: a copy of another size looks different.
 
@@ -134,6 +135,7 @@ class Problem:
     size: float = 1.0
     measured: Measured = UNMEASURED
     given3d: Array | None = None
+    is_shared: bool = False
     network: Any = None
     baseline: bool = False
 

@@ -17,6 +17,7 @@ from bpnp.search.given_pose import given_pose
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.inputs import problem_from
 from bpnp.search.measured import Measured
+from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem
 from bpnp.search.solution import Solution
 from bpnp.search.solvers import TIME_LIMIT, Options, at_deadline, without_pose
@@ -38,6 +39,7 @@ def verify(
     scores2d: ArrayLike | None = None,
     scores3d: ArrayLike | None = None,
     matches: ArrayLike | None = None,
+    independent: bool = False,
     refine: bool = True,
     inlier_threshold: float | int | None = None,
     seed: int = 0,
@@ -45,10 +47,10 @@ def verify(
 ) -> Solution:
     """Verify a given pose and estimate its uncertainty.
 
-    The pose is "confident" if it is significant and no competing pose is about as likely. Only one pose is tested, so
-    few points are enough: about one match more than the three that determine a pose. The competing poses are the nearby
-    optimum, the mirror image of a flat scene or of a distant mirror-symmetric one, repetitions of the scene, and other
-    focal lengths. No search is run: use `solve` if a better pose may exist far away.
+    The pose is "confident" if it is significant and no competing pose is about as likely. The competing poses are the
+    nearby optimum, the mirror image of a flat scene or of a distant mirror-symmetric one, repetitions of the scene,
+    another body among the points that it leaves, and other focal lengths. No search is run: use `solve` if a better
+    pose may exist far away.
 
     Args:
         points2d: (m, 2) pixels with a `camera`, else normalised image coordinates, or (m, 3) bearings; as for `solve`.
@@ -64,6 +66,11 @@ def verify(
         matches: (k, 2) indices into points2d and points3d; an index out of range, or a point in two matches, raises.
             The pose is judged on these matches alone; some of them may be wrong. A match of a 2D point that cannot be
             undistorted is left out without a message. None if the matches are unknown.
+        independent: True for a pose from elsewhere, such as a survey or another sensor. It is the only pose that was
+            tested, so that few points are enough: about one match more than the three that determine a pose. Default
+            False: it was found on these points, by `solve` or by any other search, and has as many tests as a search;
+            `matches` are then chosen among all points too. Give True with matches that have evidence of their own, such
+            as descriptors.
         refine: True, the default, to return and judge the nearby optimum. The optimum counts as the same pose if it is
             rotated by at most 2 degrees and shifts the centroid of the scene by at most a twentieth of its distance, or
             if it is within the uncertainty of the pose. False to return the given pose. The verdict is then "ambiguous"
@@ -109,6 +116,7 @@ def verify(
     given = None if matches is None else _checked_matches(matches, problem)
     judged = problem if given is None else _of_matches(problem, given)
     limits: dict[str, Any] = {"inlier_threshold": threshold, "seed": checked_seed(seed), "time_limit": limit}
+    limits["independent"] = independent
     solution = verify_problem(judged, *pose, refine=refine, **limits).solution
     if given is None:
         return solution
@@ -128,6 +136,7 @@ def verify_problem(
     rotation: Array,
     translation: Array,
     *,
+    independent: bool = False,
     refine: bool = True,
     inlier_threshold: float | None = None,
     seed: int = 0,
@@ -140,6 +149,7 @@ def verify_problem(
         problem: Points and their measured properties.
         rotation: (3, 3) rotation matrix of the pose.
         translation: (3,) translation of the pose, scene units.
+        independent: The pose was not found on these points, as for `verify`.
         refine: Return and judge the nearby optimum, as for `verify`.
         inlier_threshold: Largest reprojection error of a match, as for `verify`.
         seed: Seed of the refinement, default 0.
@@ -155,7 +165,7 @@ def verify_problem(
     if problem.degenerate is not None:
         return without_pose(problem, problem.degenerate, inlier_threshold)
     claim = problem.from_user(rotation, translation)
-    case, optimum = given_pose(problem, *claim, refine=refine, seed=seed, deadline=deadline)
+    case, optimum = given_pose(problem, *claim, refine=refine, independent=independent, seed=seed, deadline=deadline)
     result = at_deadline(decide(case), options, deadline, time_limit)
     seconds = time.perf_counter() - begun
     camera = OneCamera(problem)
@@ -191,11 +201,19 @@ def _checked_matches(values: Any, problem: Problem) -> Labels:
 
 
 def _of_matches(problem: Problem, matches: Labels) -> Problem:
-    """Return a problem of the matched points alone, with a unique label for each match."""
+    """Return a problem of the matched points alone, with a unique label for each match.
+
+    Its tests are the poses of a search on all points, each with the choices of k matches, C(m, k) n! / (n - k)!.
+    """
     (i, j), own = matches.T, np.arange(len(matches))
     matched = problem.choose(np.searchsorted(problem.measured.indices, i), j)
+    m, n = len(problem.bearings), len(problem.points3d)
+    chosen = [math.lgamma(a + 1) - math.lgamma(a - len(matches) + 1) for a in (m, n)]
+    choices = (sum(chosen) - math.lgamma(len(matches) + 1)) / math.log(10)
     return replace(
         matched,
+        log10_tried=PoseModel.of(problem).log10_tests([problem]),
+        log10_views=problem.log10_views + choices,
         labels2d=own,
         labels3d=own,
         odds2d=None,

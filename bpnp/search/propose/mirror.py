@@ -15,6 +15,12 @@ MIRRORED_HYPOTHESES = 20_000  # [hypotheses; cost]
 MIRROR = np.array([1.0, 1.0, -1.0])
 
 
+def mirrored_scene(problem: Problem) -> Problem:
+    """Return the problem with the mirror image of its scene, of which a mirrored image of the scene has poses."""
+    normals = None if problem.normals3d is None or problem.cosines3d is not None else problem.normals3d * MIRROR
+    return replace(problem, points3d=problem.points3d * MIRROR, normals3d=normals, cosines3d=None)
+
+
 def mirrored_alarms(problem: Problem, deadline: Deadline) -> float:
     """Return log10 of the false alarms of the mirror image of a scene without a significant pose.
 
@@ -29,8 +35,7 @@ def mirrored_alarms(problem: Problem, deadline: Deadline) -> float:
     """
     if problem.prior is not None or not is_enumerable(problem) or deadline.passed():
         return np.inf
-    normals = None if problem.normals3d is None or problem.cosines3d is not None else problem.normals3d * MIRROR
-    mirrored = replace(problem, points3d=problem.points3d * MIRROR, normals3d=normals, cosines3d=None)
+    mirrored = mirrored_scene(problem)
     found = enumerate_poses(mirrored, deadline=deadline.at, most=MIRRORED_HYPOTHESES).poses
     if not len(found):
         return np.inf

@@ -72,6 +72,12 @@ def registered(problem: Problem, rotation: Array, translation: Array, scale: flo
     return _motions_of(problem, rotation, translation, scale, matched_points(problem, rotation, translation, scale))
 
 
+def reflections(problem: Problem, rotation: Array, translation: Array, scale: float) -> Motions:
+    """Return the reflections that map the matched points of a pose onto other scene points; see `registered`."""
+    matched = matched_points(problem, rotation, translation, scale)
+    return _motions_of(problem, rotation, translation, scale, matched, reflected=True)
+
+
 def _motions_of(
     problem: Problem,
     rotation: Array,

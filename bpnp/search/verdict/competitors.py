@@ -189,7 +189,7 @@ def sign_margins(cameras: CandidatesOfCameras) -> Array:
     return margins
 
 
-class _Partners(NamedTuple):
+class Partners(NamedTuple):
     """Nearest scene points of k image points under a pose.
 
     Attributes:
@@ -203,7 +203,7 @@ class _Partners(NamedTuple):
     near: NDArray[np.bool_]
 
 
-def _explained(cameras: CandidatesOfCameras, k: int, scale: float, near: float) -> tuple[Array, _Partners]:
+def _explained(cameras: CandidatesOfCameras, k: int, scale: float, near: float) -> tuple[Array, Partners]:
     """Return the evidence of the image points of all cameras for candidate k, and their correspondences.
 
     Args:
@@ -213,11 +213,11 @@ def _explained(cameras: CandidatesOfCameras, k: int, scale: float, near: float) 
         near: Reach of a correspondence, in scales.
     """
     poses = [(problem, *candidates.pose(k), scale) for candidates, problem in cameras]
-    parts = zip(*(_partners(near, *pose) for pose in poses), strict=True)
-    return np.concatenate([own_evidence(*pose) for pose in poses]), _Partners(*map(np.concatenate, parts))
+    parts = zip(*(partners(near, *pose) for pose in poses), strict=True)
+    return np.concatenate([own_evidence(*pose) for pose in poses]), Partners(*map(np.concatenate, parts))
 
 
-def _with_reversed_depths(first: _Partners, other: _Partners, reach: Array) -> NDArray[np.bool_]:
+def _with_reversed_depths(first: Partners, other: Partners, reach: Array) -> NDArray[np.bool_]:
     """Return which image points (k,) have correspondences that only the order of their depths distinguishes.
 
     The one is then the mirror image of the other in a plane across the line of sight, and differs from it by more than
@@ -232,7 +232,8 @@ def _with_reversed_depths(first: _Partners, other: _Partners, reach: Array) -> N
     return np.asarray((np.abs(one + two) < reach) & (np.abs(one - two) >= reach))
 
 
-def _partners(near: float, problem: Problem, rotation: Array, translation: Array, scale: float) -> _Partners:
+def partners(near: float, problem: Problem, rotation: Array, translation: Array, scale: float) -> Partners:
+    """Return the nearest scene points of the used image points under a pose, at most `near` scales away."""
     directions, chosen = directions_of(problem, rotation, translation), problem.image.chosen
     chord, points = np.full(len(chosen), np.inf), np.full(len(chosen), -1)
     if problem.labelled_pairs is not None:
@@ -243,11 +244,11 @@ def _partners(near: float, problem: Problem, rotation: Array, translation: Array
         rows, first = np.unique(i[order], return_index=True)
         chord[rows] = distance[order][first]
         points[rows] = np.where(np.isfinite(chord[rows]), j[order][first], -1)
-        return _Partners(points, problem.points3d[points] @ rotation.T + translation, np.isfinite(chord))
+        return Partners(points, problem.points3d[points] @ rotation.T + translation, np.isfinite(chord))
     for rows, columns in label_groups(chosen, problem.labels2d, problem.labels3d, len(directions)):
         ahead = columns[np.isfinite(directions[columns, 0])]
         if len(ahead):
             bearings = problem.bearings[chosen[rows]]
             chord[rows], nearest = cKDTree(directions[ahead]).query(bearings, distance_upper_bound=near * scale)
             points[rows] = np.r_[ahead, -1][nearest]
-    return _Partners(points, problem.points3d[points] @ rotation.T + translation, np.isfinite(chord))
+    return Partners(points, problem.points3d[points] @ rotation.T + translation, np.isfinite(chord))

@@ -7,6 +7,9 @@ from bpnp.runtime import NEVER, Deadline
 from bpnp.search.verdict.decide import Case
 from bpnp.search.verdict.rivals import Rival, SceneOf
 from bpnp.search.verdict.rivals.lens import lens
+from bpnp.search.verdict.rivals.mirrored_image import mirrored_image
+from bpnp.search.verdict.rivals.nearby import nearby
+from bpnp.search.verdict.rivals.second_body import second_body
 from bpnp.search.verdict.rivals.symmetries import symmetries
 
 
@@ -20,6 +23,9 @@ def rivals_of(scene_of: SceneOf, deadline: Deadline = NEVER, *, enumerated: bool
     """
     return [
         partial(symmetries, scene_of=scene_of, deadline=deadline, enumerated=enumerated),
+        partial(nearby, scene_of=scene_of, deadline=deadline),
+        partial(second_body, deadline=deadline),
+        partial(mirrored_image, deadline=deadline),
         partial(lens, scene_of=scene_of, deadline=deadline),
     ]
 

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.search.hypotheses import Hypotheses
+from bpnp.search.possible_matches import score_pose
 from bpnp.search.problem import Problem
 from bpnp.search.propose.repetitions import WHOLE_SCENE
 from bpnp.search.verdict import reasons
@@ -32,7 +33,7 @@ from bpnp.search.verdict.competitors import (
     unrelated_competitor,
 )
 from bpnp.search.verdict.completeness import Symmetry, missed
-from bpnp.search.verdict.false_alarms import alarms_of
+from bpnp.search.verdict.false_alarms import alarms_of, likeliest_scale
 from bpnp.search.verdict.limits import LEAST_MARGIN, MOST_FALSE_ALARMS, MOST_MISSED
 from bpnp.search.verdict.reasons import CONFIDENT, NO_POSE, Objection, focal_length_not_fixed, objection
 from bpnp.search.verdict.uncertainty import (
@@ -143,8 +144,10 @@ class Case:
 
     @property
     def objection(self) -> Objection | None:
-        """Reason against the leader; None if it is confident."""
-        return self._shortcoming or next(iter(self.objections), None)
+        """Reason against the leader; None if it is confident. What rivals found is more specific than other tests."""
+        if self.objections and not fits_by_chance(self.log10_false_alarms):
+            return self.objections[0]
+        return self._shortcoming
 
     @cached_property
     def bounds(self) -> tuple[float, float]:
@@ -291,6 +294,20 @@ def add_false_alarms(candidates: Hypotheses, problem: Problem) -> Hypotheses:
     unknown = candidates[new]
     alarms[new], rough[new] = alarms_of(problem, unknown.rotation, unknown.translation, unknown.scale)
     return replace(candidates, log10_false_alarms=alarms, log10_rough=rough)
+
+
+def weighed_pose(problem: Problem, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Hypotheses:
+    """Return a pose (1,) without refinement, at the scale of residuals with the most evidence."""
+    scale = likeliest_scale(problem, rotation, translation)
+    score, count = score_pose(problem, rotation, translation, scale)
+    pose = Hypotheses.from_poses(
+        rotation[None],
+        translation[None],
+        log_likelihood=np.array([score]),
+        match_count=np.array([count]),
+        scale=np.array([scale]),
+    )
+    return add_false_alarms(pose, problem)
 
 
 def rank_poses(candidates: Hypotheses, problem: Problem) -> Hypotheses:

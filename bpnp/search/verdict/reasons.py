@@ -24,6 +24,8 @@ CLAUSES = {
     "better_pose": "a pose {away} away fits better (by {margin:.1f} decades)",
     "better_nearby": "the nearest optimum, {degrees:.2g} deg away, fits better (by {margin:.1f} decades)",
     "other_points": "a pose {away} away explains other points, and the difference may be chance",
+    "second_body": "two bodies: {first} and {second} of {count} image points fit different poses, {away} apart",
+    "mirrored_image": "the image is mirrored: flipped, x = width - x, it fits better (by {better:.1f} decades)",
     "rough_residuals": "the points fit better with residuals far larger than those of the matches",
     "untested": "there was no time to test its competing poses",
     "incomplete": "a better {what} may exist (miss probability up to {probability})",

@@ -2,8 +2,26 @@
 
 from collections.abc import Callable
 
+import numpy as np
+
+from bpnp.search.possible_matches import MATCH_REACH
 from bpnp.search.search_frame import SearchFrame
+from bpnp.search.verdict.competitors import Partners, partners
 from bpnp.search.verdict.decide import Case
 
 SceneOf = Callable[[], SearchFrame]
 Rival = Callable[[Case], Case]  # the case with competing poses or an objection; the same one if there is none
+
+
+def explained(case: Case) -> Partners:
+    """Return the scene points that the leader shows at the image points, within the match radius."""
+    problem = case.problem
+    scale = max(case.residual, problem.match_radius / MATCH_REACH)
+    return partners(MATCH_REACH, problem, *case.pose, scale)
+
+
+def left_by(case: Case) -> tuple[int, int]:
+    """Return the numbers of image points and of scene points that the leader leaves."""
+    seen, problem = explained(case), case.problem
+    shown = np.unique(seen.points[seen.near])
+    return len(problem.image.chosen) - int(seen.near.sum()), len(problem.points3d) - len(shown)

@@ -141,7 +141,7 @@ class AtZoom(NamedTuple):
 
     @property
     def centre3d(self) -> Array:
-        """Scene centroid (3,) in the camera's frame."""
+        """SearchFrame centroid (3,) in the camera's frame."""
         return np.asarray(self.pose.rotation[0] @ self.problem.centre3d + self.pose.translation[0])
 
     @property
@@ -157,7 +157,7 @@ def likeliest_zoom(start: AtZoom, scene: SearchFrame) -> AtZoom:
 
     Args:
         start: Pose at the given focal length.
-        scene: Scene whose settings and deadline are used.
+        scene: SearchFrame whose settings and deadline are used.
     """
     steps = [(step, search_at_zoom(start, step, scene)) for step in (1 / ZOOM_STEP, ZOOM_STEP)]
     step, best = max(steps, key=lambda one: one[1].likelihood)
@@ -177,7 +177,7 @@ def search_at_zoom(found: AtZoom, zoom: float, scene: SearchFrame) -> AtZoom:
     Args:
         found: Pose at its focal length.
         zoom: Factor on this focal length.
-        scene: Scene whose settings and deadline are used.
+        scene: SearchFrame whose settings and deadline are used.
     """
     if scene.deadline.passed():
         return found

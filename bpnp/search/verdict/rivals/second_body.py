@@ -1,0 +1,87 @@
+"""A second body: another pose of the scene that the image points left by the best one show.
+
+Furniture that was moved, a second device, a reflection: several poses are then right, each for some of the image
+points, and the one with the most matches need not be that of the scene. The image points that the best pose leaves are
+enumerated again: with the scene points that it leaves, which are a body of its own, and with all of them, since a
+reflection shows them twice.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bpnp.poses import SAME
+from bpnp.runtime import NEVER, Deadline
+from bpnp.search.enumeration.search import enumerate_poses, is_enumerable
+from bpnp.search.hypotheses import Hypotheses
+from bpnp.search.possible_matches import MATCH_REACH
+from bpnp.search.problem import Problem
+from bpnp.search.verdict.competitors import Partners, distance_between, partners
+from bpnp.search.verdict.decide import Case, fits_by_chance, weighed_pose
+from bpnp.search.verdict.false_alarms import alarms_of
+from bpnp.search.verdict.reasons import Unfinished, objection
+from bpnp.search.verdict.rivals import explained
+
+FEWEST_LEFT = 5  # number of points that can show a significant pose: two more than fix it [points; derived]
+# Largest number of hypotheses of the points that are left, without and with the scene points of the first pose.
+MOST_OF_REST, MOST_OF_ALL = 200_000, 30_000  # [hypotheses; cost]
+FAR_BODY = 3.0  # distance of another body's pose [tolerances of the same pose; not tuned]
+COMPARED_BODIES = 4  # number of poses of the rest whose false alarms are computed [poses; cost]
+# Fraction of the second pose's scene points that are those of the first from which it shows the same points again.
+SHOWN_TWICE = 0.25  # [fraction; not tuned]
+
+
+def second_body(case: Case, *, deadline: Deadline = NEVER) -> Case:
+    """Return a case against which a second pose far away speaks, which is then among its candidates.
+
+    The second pose is the best of one search of unrelated points with an NFA below 1 once in a thousand cases. The
+    first pose is that of most of the scene, whatever the other scene points belong to, if it shows more than half of
+    them; not if the second one shows the same points again.
+    """
+    problem = case.problem
+    if problem.is_shared or problem.cosines3d is not None or not is_enumerable(problem):
+        return case
+    scale = max(case.residual, problem.match_radius / MATCH_REACH)
+    first = explained(case)
+    rest = np.setdiff1d(np.arange(len(problem.bearings)), problem.image.chosen[first.near])
+    if len(rest) < FEWEST_LEFT:
+        return case
+    shown = _points_of(first)
+    others, everything = np.setdiff1d(np.arange(len(problem.points3d)), shown), np.arange(len(problem.points3d))
+    for scene, most in ((others, MOST_OF_REST), (everything, MOST_OF_ALL)):
+        if len(scene) < FEWEST_LEFT:
+            continue
+        if deadline.ended(Unfinished.competing_poses):
+            return case.against(objection("untested"))
+        left = replace(problem.choose(rest, scene), log10_tried=None)
+        pose = _significant(case, left, most, deadline)
+        if not len(pose):
+            continue
+        second = partners(MATCH_REACH, left, *pose.pose(), scale)
+        again = scene[_points_of(second)]
+        if len(np.intersect1d(shown, again)) < SHOWN_TWICE * len(again) and 2 * len(shown) > len(everything):
+            continue
+        counts = {"first": int(first.near.sum()), "second": int(second.near.sum()), "count": len(problem.bearings)}
+        away = distance_between(problem, case.pose, pose.pose())
+        both = case.among(weighed_pose(problem, *pose.pose()))
+        return both.against(objection("second_body", 0.0, away=away, **counts))
+    return case
+
+
+def _significant(case: Case, left: Problem, most: int, deadline: Deadline) -> Hypotheses:
+    """Return the best pose (1,) of the points that are left, (0,) if it is near the first one or fits by chance."""
+    found = enumerate_poses(left, radius=case.problem.match_radius, deadline=deadline.final, most=most).poses
+    far = ~case.problem.same_as(case.pose, found.rotation, found.translation, SAME.times(FAR_BODY))
+    poses = found[np.flatnonzero(far)[:COMPARED_BODIES]]
+    if not len(poses):
+        return poses
+    scales = np.maximum(poses.scale, case.problem.image.scales[0])
+    alarms = alarms_of(left, poses.rotation, poses.translation, scales).own
+    k = int(np.argmin(alarms))
+    return poses[:0] if fits_by_chance(float(alarms[k])) else poses[k : k + 1]
+
+
+def _points_of(seen: Partners) -> NDArray[np.int64]:
+    """Return the scene points that image points show."""
+    return np.unique(seen.points[seen.near])

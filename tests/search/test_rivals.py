@@ -1,0 +1,138 @@
+"""What may contradict a pose that passes every test: a second body, a reflection, a mirrored image, repeated boards."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from planted import degrees_between
+from scipy.spatial.transform import Rotation
+
+from bpnp import PosePrior, solve, verify
+
+Array = NDArray[np.float64]
+K = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])
+AWAY = np.array([0.0, 0, 12])
+
+
+def pixels(points: Array, rotation: Array, translation: Array, rng: np.random.Generator, noise: float = 0.3) -> Array:
+    camera = points @ rotation.T + translation
+    return camera[:, :2] / camera[:, 2:] * 800 + [320, 240] + rng.normal(0, noise, (len(points), 2))
+
+
+def shuffled(rng: np.random.Generator, *parts: Array) -> Array:
+    return rng.permutation(np.concatenate(parts))
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("moved", [True, False])
+def test_furniture_that_was_moved_in_a_room_is_no_confident_pose(seed: int, moved: bool) -> None:
+    """A room of 24 points, 10 seen, with 13 points of a chair that all are: the chair has the most matches."""
+    rng = np.random.default_rng(seed)
+    room, chair = rng.uniform(-3, 3, (24, 3)), rng.normal(0, 0.5, (13, 3))
+    turn, rotation = (
+        Rotation.from_euler("z", 70, degrees=True).as_matrix(),
+        Rotation.random(random_state=seed).as_matrix(),
+    )
+    seen = chair @ turn.T + [0.8, 0.5, 0] if moved else chair
+    image = shuffled(rng, *(pixels(each, rotation, AWAY, rng) for each in (room[:10], seen)))
+    solution = solve(image, np.concatenate([room, chair]), K)
+    if moved:
+        assert solution.verdict != "confident"
+        assert min(degrees_between(one.rotation, rotation) for one in solution.candidates) < 3
+        assert solution.reason_code == "second_body"
+        assert solution.reason.startswith("Two bodies: ")
+    else:
+        assert solution.verdict == "confident"
+        assert degrees_between(solution.rotation, rotation) < 2
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_body_of_more_than_half_of_the_scene_is_confident_beside_another_one(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    large, small = rng.normal(size=(24, 3)), rng.normal(0, 0.5, (10, 3)) + [2, 0, 0]
+    rotation, turn = (Rotation.random(random_state=seed + k).as_matrix() for k in (0, 50))
+    image = shuffled(rng, pixels(large[:22], rotation, AWAY, rng), pixels(small @ turn.T, rotation, AWAY, rng))
+    solution = solve(image, np.concatenate([large, small]), K)
+    assert solution.verdict == "confident"
+    assert degrees_between(solution.rotation, rotation) < 2
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_an_object_and_its_reflection_in_the_floor_are_ambiguous(seed: int) -> None:
+    """A mirror-symmetric object of 16 points, 10 of them seen, and its reflection, of which more are seen."""
+    rng = np.random.default_rng(seed)
+    half = rng.uniform([0.1, -0.5, 0.1], [0.6, 0.5, 1.2], (8, 3))
+    points = np.concatenate([half, half * [-1, 1, 1]])
+    rotation = Rotation.from_euler("xyz", [-110, rng.uniform(-20, 20), 5], degrees=True).as_matrix()
+    image = shuffled(
+        rng, pixels(points[3:13], rotation, AWAY / 2, rng), pixels((points * [1, 1, -1])[1:], rotation, AWAY / 2, rng)
+    )
+    assert solve(image, points, K).verdict != "confident"
+    without = solve(shuffled(rng, pixels(points[3:13], rotation, AWAY / 2, rng)), points, K)
+    assert without.reason_code != "second_body"
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_mirrored_photo_of_a_nearly_symmetric_object_says_so(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    half = rng.uniform([0.1, -1, -0.4], [0.7, 1, 0.4], (11, 3))
+    points = np.concatenate([half, half * [-1, 1, 1], rng.normal(size=(4, 3)) * [0.4, 0.8, 0.4]])
+    rotation = Rotation.from_euler("xyz", rng.uniform(-25, 25, 3), degrees=True).as_matrix()
+    image = pixels(points, rotation, AWAY / 2, rng)
+    flipped = solve(image * [-1, 1] + [640, 0], points, K)
+    assert (flipped.verdict, flipped.reason_code) == ("ambiguous", "mirrored_image")
+    straight = solve(image, points, K)
+    assert straight.verdict == "confident"
+    assert degrees_between(straight.rotation, rotation) < 2
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("degrees", [None, 3.0])
+def test_two_boards_are_not_shifted_by_a_column(seed: int, degrees: float | None) -> None:
+    """Two boards of 4 x 4 corners and ten other points, 30 degrees wide."""
+    rng = np.random.default_rng(seed)
+    grid = np.stack(np.meshgrid(np.arange(4) * 0.1, np.arange(4) * 0.1, [0.0]), -1).reshape(-1, 3)
+    boards = [
+        grid @ Rotation.from_euler("xy", rng.uniform(-20, 20, 2), degrees=True).as_matrix().T + [x, 0.2, 5]
+        for x in (-1.4, 0.6)
+    ]
+    depth = rng.uniform(5, 30, (10, 1))
+    points = np.concatenate([*boards, np.column_stack([rng.uniform(-0.3, 0.3, (10, 2)) * depth, depth])])
+    rotation, translation = Rotation.from_rotvec(rng.normal(0, 0.02, 3)).as_matrix(), rng.normal(0, 0.05, 3)
+    image = shuffled(rng, pixels(points, rotation, translation, rng, noise=1.0))
+    prior = None if degrees is None else PosePrior(np.eye(3), np.zeros(3), degrees, 0.1)
+    solution = solve(image, points, K, prior=prior)
+    assert solution.verdict != "confident" or solution.inlier_count > 35
+    if solution.verdict == "confident":
+        assert degrees_between(solution.rotation, rotation) < 0.5
+
+
+@pytest.mark.parametrize("count", [9, 20])
+@pytest.mark.parametrize("known", [False, True])
+def test_a_pose_that_was_searched_on_unrelated_points_is_not_confirmed(count: int, known: bool) -> None:
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        image, points = rng.uniform([0, 0], [640, 480], (count, 2)), rng.normal(size=(count, 3))
+        found = solve(image, points, K)
+        options: dict[str, Any] = {"matches": found.matches} if known else {}
+        assert verify(image, points, found.rotation, found.translation, K, **options).verdict == "failed"
+
+
+def test_few_points_are_enough_for_a_pose_from_elsewhere() -> None:
+    """Six of six points: a search needs more, one test does not."""
+    rng = np.random.default_rng(1)
+    points = rng.normal(size=(6, 3))
+    image = pixels(points, np.eye(3), AWAY, rng)
+    searched, surveyed = (verify(image, points, np.eye(3), AWAY, K, independent=each) for each in (False, True))
+    assert surveyed.verdict == "confident"
+    assert surveyed.log10_false_alarms < searched.log10_false_alarms - 2
+
+
+def test_a_true_pose_among_clutter_has_no_competitor_of_a_few_matches() -> None:
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        points, rotation = rng.normal(size=(20, 3)), Rotation.random(random_state=seed).as_matrix()
+        image = shuffled(rng, pixels(points, rotation, AWAY, rng), rng.uniform([100, 100], [540, 380], (10, 2)))
+        for independent in (False, True):
+            assert verify(image, points, rotation, AWAY, K, independent=independent).verdict == "confident"
