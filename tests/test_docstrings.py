@@ -40,32 +40,11 @@ PACKAGES = (
 )
 # Folders and files whose docstrings have not been read yet.
 NOT_YET = {
-    "bpnp/search/__init__.py",
-    "bpnp/search/api.py",
-    "bpnp/search/arguments.py",
     "bpnp/search/assemble.py",
-    "bpnp/search/focal_length.py",
-    "bpnp/search/given_pose.py",
-    "bpnp/search/hypotheses.py",
-    "bpnp/search/image_statistics.py",
-    "bpnp/search/inputs.py",
-    "bpnp/search/loop.py",
     "bpnp/search/matching.py",
-    "bpnp/search/measured.py",
-    "bpnp/search/plan.py",
-    "bpnp/search/pool.py",
-    "bpnp/search/pose_model.py",
     "bpnp/search/possible_matches.py",
-    "bpnp/search/problem.py",
     "bpnp/search/rig",
-    "bpnp/search/search.py",
-    "bpnp/search/search_frame.py",
-    "bpnp/search/settings.py",
-    "bpnp/search/solution.py",
-    "bpnp/search/solvers.py",
-    "bpnp/search/starts.py",
     "bpnp/search/verdict",
-    "bpnp/search/verify.py",
 }
 SECTION = re.compile(r"^ *(Args|Attributes|Returns|Raises|Yields):$", re.MULTILINE)
 # What a configuration names.

@@ -339,12 +339,8 @@ def share_points(
     """Assign each image point to at most one of the small problems that have the same image points.
 
     The problem with the fewest false alarms keeps its matches. A later one that used one of their points is solved
-    again without these; its `stats.taken2d` counts them. The points of a failed pose stay free.
-
-    Args:
-        problems: Problems by index.
-        solutions: Solutions by index of the problem; changed in place.
-        again: Solves the problem of an index without the 2D points of some indices (k,).
+    `again` without these, and its entry of `solutions` changes; its `stats.taken2d` counts them. The points of a failed
+    pose stay free.
     """
     for members in same_images(problems):
         taken: set[int] = set()

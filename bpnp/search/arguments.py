@@ -179,10 +179,8 @@ def checked_seed(seed: Any) -> int:
 def pose_of(value: Any, name: str = "prior") -> tuple[Any, Any] | None:
     """Return rotation and translation of an object that holds a pose; None for anything else.
 
-    Args:
-        value: (R, t); [R | t] of shape (3, 4) or (4, 4); an object with `rotation` and `translation`, such as a
-            `Solution`; or a pycolmap.Rigid3d.
-        name: Name of the argument, for messages.
+    It may be (R, t); [R | t] of shape (3, 4) or (4, 4); an object with `rotation` and `translation`, such as a
+    `Solution`; or a pycolmap.Rigid3d. Messages use `name`.
     """
     if callable(getattr(value, "matrix", None)):
         value = value.matrix()
@@ -301,15 +299,7 @@ def checked_size(image_size: Any) -> tuple[int, int]:
 
 
 def check_inside(points2d: Any, size: Any) -> None:
-    """Check that pixels lie in an image.
-
-    Args:
-        points2d: (m, 2) pixels; NaN is ignored.
-        size: (width, height) of the image, pixels.
-
-    Raises:
-        ValueError: The shape is wrong, or `outside_image` finds pixels outside.
-    """
+    """Raise ValueError if pixels (m, 2) have a wrong shape, or if `outside_image` finds some; NaN is ignored."""
     pixels, sides = image_points(points2d), np.array(checked_size(size))
     if pixels.ndim != 2 or pixels.shape[1] != 2:
         raise ValueError(
@@ -428,15 +418,10 @@ def checked_labels(labels2d: Any, labels3d: Any, counts: tuple[int, int]) -> dic
 
 
 def compact_labels(labels2d: Labels, labels3d: Labels) -> tuple[Labels, Labels]:
-    """Number labels by their order in the scene.
+    """Number labels (m,) and (n,), any integers, by their order in the scene, from 0 to the number k of those in it.
 
-    Args:
-        labels2d: (m,) labels, any integers; -1 matches any.
-        labels3d: (n,) labels, any integers; -1 matches any.
-
-    Returns:
-        Labels (m,) and (n,) from 0 to the number k of those in the scene; k for an image point whose label no scene
-            point has. -1 stays. The numbers of scene points do not depend on the image.
+    An image point whose label no scene point has gets k; -1, which matches any, stays. The numbers of scene points do
+    not depend on the image.
 
     >>> [labels.tolist() for labels in compact_labels(np.array([-1, 2**40, 9, 3]), np.array([9, -1, 2**40]))]
     [[-1, 1, 0, 2], [0, -1, 1]]

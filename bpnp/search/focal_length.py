@@ -81,31 +81,19 @@ LEAST_REACH = 1e-3  # smallest distance from the principal point to the image co
 
 
 class UnknownCamera(NamedTuple):
-    """A camera with an unknown focal length, and an unknown distortion if the reference has none.
+    """A camera with an unknown focal length, and an unknown distortion if the reference has none."""
 
-    Attributes:
-        reference: Camera that the others are variants of.
-        smallest: Least focal length, over that of the reference.
-        largest: Largest focal length, over that of the reference.
-        usual: Focal length to try first, over that of the reference.
-        sigma: Standard deviation of the logarithm of the focal length; infinite without a prior.
-        bends: Fit a radial distortion as an alternative. The reference is then a pinhole camera.
-        distorted: Fit a radial coefficient even if it is not significantly better.
-        radial: Radial coefficient to start with; None to start without distortion.
-        alone: Start with the usual focal length only.
-        reach: Distance from the principal point to the image corner, in focal lengths of the reference. Without an
-            image size it is that of the outermost image point.
-    """
-
-    reference: Camera
-    smallest: float
-    largest: float
-    usual: float
-    sigma: float = math.inf
-    bends: bool = False
-    distorted: bool = False
-    radial: float | None = None
-    alone: bool = False
+    reference: Camera  # camera that the others are variants of
+    smallest: float  # least focal length, over that of the reference
+    largest: float  # largest focal length, over that of the reference
+    usual: float  # focal length to try first, over that of the reference
+    sigma: float = math.inf  # standard deviation of the logarithm of the focal length; infinite without a prior
+    bends: bool = False  # fit a radial distortion as an alternative. The reference is then a pinhole camera
+    distorted: bool = False  # fit a radial coefficient even if it is not significantly better
+    radial: float | None = None  # radial coefficient to start with; None to start without distortion
+    alone: bool = False  # start with the usual focal length only
+    # Distance from the principal point to the image corner, in focal lengths of the reference. Without an image size it
+    # is that of the outermost image point.
     reach: float = 0.0
 
     def at(self, zoom: float, radial: float | None = None) -> Camera:
@@ -160,19 +148,11 @@ class UnknownCamera(NamedTuple):
 def unknown_camera(
     camera: Any, image_size: Any, focal_error: float | int | None, distortion: bool = False
 ) -> UnknownCamera:
-    """Return the unknown camera of images of a given size, or one with approximately the focal length of `camera`.
+    """Return the unknown camera of images of a (width, height), or one with about the focal length of a camera.
 
-    Radial distortion is unknown too, unless `camera` has a model with distortion.
-
-    Args:
-        camera: Camera with an approximate focal length; None with `image_size`.
-        image_size: (width, height) of the images, pixels; None with `camera`.
-        focal_error: Relative standard deviation of the focal length of `camera`, between 0 and 1.
-        distortion: Always fit a radial coefficient. Default False.
-
-    Raises:
-        ValueError: The size is invalid, there are both a camera and a size, an error without a camera, or `distortion`
-            for a known lens.
+    The relative standard deviation `focal_error` of this focal length is between 0 and 1. Radial distortion is unknown
+    too, unless the camera has a model with distortion; with `distortion` a coefficient is always fitted. ValueError if
+    the size is invalid, for both a camera and a size, an error without a camera, or `distortion` for a known lens.
     """
     if distortion and image_size is None and focal_error is None:
         raise ValueError(
@@ -217,13 +197,7 @@ def unknown_camera(
 
 @one_blas_thread
 def solve_with_focal_length(problem_at: ProblemAt, unknown: UnknownCamera, options: Options) -> Solved:
-    """Return the solution with the fewest false alarms over pose and focal length.
-
-    Args:
-        problem_at: Returns the problem of a camera.
-        unknown: Unknown camera.
-        options: Options of the search.
-    """
+    """Return the solution with the fewest false alarms over pose and focal length."""
     problem = problem_at(unknown.reference, unknown.focal(unknown.reference))
     if problem.degenerate is not None:
         return solve_problems({0: problem}, options)[0]
@@ -404,21 +378,12 @@ def fit_camera(
     *,
     deadline: Deadline = NEVER,
 ) -> FittedCamera:
-    """Fit focal length, distortion and pose to the points, starting from a pose and a camera.
+    """Fit focal length, distortion and pose to the points, starting from a pose in the user's frame and a camera.
 
-    The camera with radial distortion competes with the one without. It is used if its NFA, which counts the additional
-    unknown, is smaller by the factor `FOCAL_CHANCE`.
-
-    Args:
-        problem_at: Returns the problem of a camera.
-        unknown: Prior of the camera.
-        camera: Initial camera.
-        pose: Initial rotation (3, 3) and translation (3,), in the user's frame.
-        scale: Scale of the residuals, radians.
-        seed: Seed of the refinement.
-        zooms: Factors of the focal length and of the distance to start from; the fit with the fewest false alarms is
-            used.
-        deadline: Deadline, after which no fit begins and no step is taken.
+    The residuals have the scale `scale`, radians. Of several factors of the focal length and of the distance to start
+    from, `zooms`, the fit with the fewest false alarms is used. The camera with radial distortion competes with the one
+    without. It is used if its NFA, which counts the additional unknown, is smaller by the factor `FOCAL_CHANCE`. After
+    the deadline no fit begins and no step is taken.
     """
     zoom, radial = unknown.parts(camera)
 
@@ -452,17 +417,10 @@ def _fit_track(
     farther: float,
     deadline: Deadline,
 ) -> FittedCamera:
-    """Alternate fits of the lens and annealing of the pose, with or without a radial coefficient.
+    """Alternate fits of the lens and annealing of the pose, from a zoom and a radial coefficient.
 
-    Args:
-        problem_at: Returns the problem of a camera.
-        unknown: Prior of the camera.
-        start: Initial zoom and radial coefficient; None for a fit without distortion.
-        pose: Initial rotation (3, 3) and translation (3,), in the user's frame.
-        scale: Scale of the residuals, radians.
-        seed: Seed of the annealing.
-        farther: Factor of the initial distance of the scene.
-        deadline: Deadline, after which no step is taken.
+    None for no distortion. The scene is `farther` times as far away as in the pose, which is in the user's frame with
+    residuals of `scale` radians.
     """
     first, radial = start
     zoom, camera = first, unknown.at(*start)

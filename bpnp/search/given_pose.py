@@ -51,21 +51,11 @@ def given_pose(
     seed: int = 0,
     deadline: Deadline = NEVER,
 ) -> tuple[Case, Hypotheses]:
-    """Return what is known of a given pose, or of the optimum near it.
+    """Return what is known of a given pose, as the claim of a case, and the optimum (1,) or (0,) near it.
 
-    Args:
-        problem: Points of the problem.
-        rotation: (3, 3) of the pose.
-        translation: (3,) of the pose, scene units.
-        refine: Judge the optimum near the pose instead. It differs by less than the tolerance of the verdict, or by
-            less than the uncertainty of the pose.
-        independent: The pose was not found on these points.
-        seed: Random seed of the perturbed copies of the pose.
-        deadline: When to stop proposing poses.
-
-    Returns:
-        The verdict, with the judged pose as the first candidate; and the optimum (1,) near the given pose, or (0,)
-        if there is none.
+    With `refine` the optimum is judged instead. It differs by less than the tolerance of the verdict, or by less than
+    the uncertainty of the pose. An `independent` pose was not found on these points. The seed is that of the perturbed
+    copies of the pose; the deadline ends proposals.
     """
     one = replace(problem, log10_tried=0.0, log10_views=0.0) if independent else problem
     claim = weighed_pose(one, rotation, translation)

@@ -23,47 +23,29 @@ class Hypotheses:
     """Poses of one problem, camera = R p + t, one per row, with the measures of how well they explain its points.
 
     A stage fills the columns that it computes; the others have the values of `from_poses`.
-
-    Attributes:
-        rotation: (c, 3, 3). Float32 in the frame of a `SearchFrame`, float64 in that of a `Problem`.
-        translation: (c, 3), in the same frame; (c, 4) homogeneous for a rig.
-        log_likelihood: (c,) mean over the bearings, nats; -inf for a pose that was not scored.
-        match_count: (c,) expected number of matches.
-        scale: (c,) standard deviation of the residuals per axis, radians, at which the two previous columns are
-            computed.
-        basin_count: (c,) number of independent starts that ended at this pose.
-        log10_false_alarms: (c,) log10 NFA at the scale of the residuals (`bpnp.search.verdict.false_alarms`); NaN
-            before it is computed.
-        log10_rough: (c,) log10 NFA at scales far beyond those of the residuals; NaN likewise.
-        evidence: (c,) of a proposer, nats by which the matches exceed chance; None where it computes none.
-        matches: (c, m) index of the scene point of each image point, -1 for none; None where no matches are fixed.
-        residual: (c, m) angle of each match, radians, infinite for none; None likewise.
     """
 
-    rotation: NDArray[Any]
-    translation: NDArray[Any]
-    log_likelihood: NDArray[Any]
-    match_count: NDArray[Any]
+    rotation: NDArray[Any]  # (c, 3, 3). Float32 in the frame of a `SearchFrame`, float64 in that of a `Problem`
+    translation: NDArray[Any]  # (c, 3), in the same frame; (c, 4) homogeneous for a rig
+    log_likelihood: NDArray[Any]  # (c,) mean over the bearings, nats; -inf for a pose that was not scored
+    match_count: NDArray[Any]  # (c,) expected number of matches
+    # (c,) standard deviation of the residuals per axis, radians, at which the two previous columns are computed.
     scale: NDArray[Any]
-    basin_count: NDArray[np.int64]
+    basin_count: NDArray[np.int64]  # (c,) number of independent starts that ended at this pose
+    # (c,) log10 NFA at the scale of the residuals (`bpnp.search.verdict.false_alarms`); NaN before it is computed.
     log10_false_alarms: NDArray[np.float64]
-    log10_rough: NDArray[np.float64]
+    log10_rough: NDArray[np.float64]  # (c,) log10 NFA at scales far beyond those of the residuals; NaN likewise
+    # (c,) of a proposer, nats by which the matches exceed chance; None where it computes none.
     evidence: NDArray[np.float64] | None = None
+    # (c, m) index of the scene point of each image point, -1 for none; None where no matches are fixed.
     matches: NDArray[np.int64] | None = None
-    residual: NDArray[np.float64] | None = None
+    residual: NDArray[np.float64] | None = None  # (c, m) angle of each match, radians, infinite for none; None likewise
 
     @classmethod
     def from_poses(
         cls, rotation: NDArray[Any], translation: NDArray[Any], *, basin_count: int | NDArray[Any] = 0, **columns: Any
     ) -> "Hypotheses":
-        """Return hypotheses with these poses.
-
-        Args:
-            rotation: (c, 3, 3).
-            translation: (c, 3).
-            basin_count: One for all, or (c,).
-            columns: Other columns (c, ...) by name.
-        """
+        """Return hypotheses with these poses (c, 3, 3), (c, 3), one basin count or (c,), and other columns by name."""
         c = len(rotation)
         none, zero, unknown = np.full(c, -math.inf, np.float32), np.zeros(c, np.float32), np.full(c, math.nan)
         poses = cls(rotation, translation, none, zero, zero, np.full(c, basin_count, np.int64), unknown, unknown)
@@ -116,17 +98,10 @@ class Hypotheses:
 
 
 def select_distinct(poses: Hypotheses, scene: SearchFrame, count: int, apart_deg: float | None = None) -> Hypotheses:
-    """Return the best hypotheses of a scene, best first, no two of them equal.
+    """Return the best hypotheses of a scene, at most `count`, best first, no two of them equal.
 
-    Args:
-        poses: Hypotheses in the frame of the scene.
-        scene: Scene whose settings define equal poses.
-        count: Number of hypotheses, at most.
-        apart_deg: Least angle between their rotations, degrees; replaces the limits of the settings. None for these
-            limits.
-
-    Returns:
-        Hypotheses with the basin counts of all poses equal to them.
+    They have the basin counts of all poses equal to them. Poses are equal within `SAME_DEG` and `SAME_SHIFT`, or if
+    their rotations are within `apart_deg` degrees.
     """
     limits = (SAME_DEG, SAME_SHIFT) if apart_deg is None else (apart_deg, math.inf)
     compared = poses.rotation, poses.translation * scene.shift_weight

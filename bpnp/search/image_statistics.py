@@ -23,60 +23,44 @@ Array = NDArray[np.float64]
 
 
 class ImageStatistics:
-    """Statistics of the bearings of an image.
-
-    Attributes:
-        centre: (3,) mean of the bearings.
-        spread: RMS distance of the bearings from it.
-        axes: (3, 2) principal axes on the tangent plane.
-        half_widths: (2,) half widths of the rectangle with the standard deviations of the bearings.
-        solid_angle: Area of this rectangle, steradians, at most 4 pi.
-        scales: (S,) scales of residuals, radians, from the noise floor to a fraction of the mean distance of the
-            points.
-        chosen: (k,) indices of the image points that are used, at most MOST_IMAGE_POINTS.
-        together: (k, S) number of used points within TOGETHER_SCALES scales of each.
-        weights: (k, S, S) weights of the evidence, see `_weights`.
-    """
+    """Statistics of the bearings of an image."""
 
     def __init__(self, bearings: Array, floor: float | None) -> None:
         m = len(bearings)
-        self.centre = bearings.mean(0)
+        self.centre = bearings.mean(0)  # (3,) mean of the bearings
         centred = bearings - self.centre
-        self.spread = max(float(np.sqrt((centred**2).sum(-1).mean())), 1e-12)
+        self.spread = max(float(np.sqrt((centred**2).sum(-1).mean())), 1e-12)  # RMS distance of the bearings from it
         variance, axes = np.linalg.eigh(centred.T @ centred / max(m - 1, 1))
+        # half_widths: (2,) half widths of the rectangle with the standard deviations of the bearings.
+        # axes: (3, 2) principal axes on the tangent plane.
         self.half_widths, self.axes = np.sqrt(3 * np.maximum(variance[1:], 1e-24)), axes[:, 1:]
         area = 12 * math.sqrt(max(float(variance[1:].prod()), 0.0))
-        self.solid_angle = float(np.clip(area, 1e-24, 4 * math.pi))
+        self.solid_angle = float(np.clip(area, 1e-24, 4 * math.pi))  # area of this rectangle, steradians, at most 4 pi
         smallest = max(floor or 0.0, FLOOR_SCALE * self.spread)
         largest = max(COARSEST_SCALE * math.sqrt(self.solid_angle / m), 2 * smallest)
         steps = max(3, 1 + math.ceil(math.log(largest / smallest) / math.log(SCALE_STEP)))
+        # (S,) scales of residuals, radians, from the noise floor to a fraction of the mean distance of the points.
         self.scales = np.geomspace(smallest, largest, steps)
+        # (k,) indices of the image points that are used, at most `MOST_IMAGE_POINTS`.
         self.chosen = (
             np.arange(m) if m <= MOST_IMAGE_POINTS else np.linspace(0, m - 1, MOST_IMAGE_POINTS).astype(np.int64)
         )
         within = TOGETHER_SCALES * self.scales
         looked_at = bearings[self.chosen]
         together = sums_near(looked_at, looked_at, self.axes, within, np.zeros(steps))
-        self.together = together.astype(np.int64)
+        self.together = together.astype(np.int64)  # (k, S) number of used points within `TOGETHER_SCALES` of each
         expected = 1 + (len(looked_at) - 1) * math.pi * within**2 / self.solid_angle
+        # (k, S, S) weights of the evidence, see `_weights`.
         self.weights = _weights(self.together, expected, CROWDED_SIGMAS)
 
 
 def _weights(together: NDArray[np.int64], expected: Array, crowded_sigmas: float) -> Array:
-    """Return weights of log x_i at the scale s_q in the evidence of image point i at the scale s_r.
+    """Return weights (k, S, S) of log x_i at the scale s_q in the evidence of image point i at the scale s_r: i, r, q.
 
-    log x_i at s_r is a sum of steps, from the largest scale to s_r. A step from 2 s to s counts with the lesser of
-    1 / n_i(s_r) and 1 / c_i(s). n_i(s) is the number of image points within 2 s of i. c_i(s) is n_i(s) over the number
-    for an even spread if the points are a clump, else 1. The position of a clump is then one observation, and the
-    position of each of its points within it is one more.
-
-    Args:
-        together: (k, S) number n_i of image points within TOGETHER_SCALES scales of each.
-        expected: (S,) number for points spread evenly over the view.
-        crowded_sigmas: Standard deviations above `expected` from which points are a clump.
-
-    Returns:
-        (k, S, S) weights, in the order i, r, q.
+    log x_i at s_r is a sum of steps, from the largest scale to s_r. A step from 2 s to s counts with the lesser of 1 /
+    n_i(s_r) and 1 / c_i(s). n_i(s) (k, S) is the number of image points within 2 s of i. c_i(s) is n_i(s) over the
+    number for an even spread (S,) if the points are a clump, else 1. The position of a clump is then one observation,
+    and the position of each of its points within it is one more.
     """
     clump = together > expected + crowded_sigmas * np.sqrt(expected)
     crowded = np.where(clump, together / expected, 1.0)

@@ -46,16 +46,13 @@ def problem_from(
     focal: UnknownFocal | None = None,
     inlier_threshold: float | None = None,
 ) -> Problem:
-    """Check the arrays of one problem, undistort its pixels, and build it.
+    """Check the arrays of one problem, as for `bpnp.solve`, undistort its pixels, and build it.
 
-    The arrays are as for `bpnp.solve`; camera and prior are already checked. `cosines3d` and `focal` are fields of
-    `Problem` and not checked. Pixels that cannot be undistorted are dropped. The `inlier_threshold`, in the unit of the
-    image points, becomes the largest residual of a match in an enumeration.
-
-    Raises:
-        ValueError: The arrays have a wrong or swapped shape, too few points (3 with a known gravity, else 4) or NaN;
-            there are pixels without a camera or the reverse; or normals, labels or scores do not fit the points. The
-            message names the argument.
+    Camera and prior are already checked; `cosines3d` and `focal` are fields of `Problem` and not checked. Pixels that
+    cannot be undistorted are dropped. The `inlier_threshold`, in the unit of the image points, becomes the largest
+    residual of a match in an enumeration. ValueError names the argument: a wrong or swapped shape, too few points (3
+    with a known gravity, else 4) or NaN; pixels without a camera or the reverse; or normals, labels or scores that do
+    not fit the points.
     """
     fewest = MIN_POINTS - isinstance(prior, GravityPrior)
     image, scene = image_points(points2d), scene_points(points3d)
@@ -94,8 +91,7 @@ def problem_from(
 def bearings_of(image: Array, camera: Camera | None) -> tuple[Array, Array]:
     """Return unit bearings (m, 3) of image points and their normalised coordinates (m, 2), NaN for points not in front.
 
-    Raises:
-        ValueError: There are pixels without a camera, or the reverse.
+    ValueError for pixels without a camera, or the reverse.
     """
     if image.shape[1] == 3:
         bearings = unit_bearings(image)

@@ -20,19 +20,12 @@ Progress = Callable[[int, float], None]  # iterations so far, seconds
 
 
 class Step(NamedTuple):
-    """One step of a search.
+    """One step of a search."""
 
-    Attributes:
-        propose: Function that returns new poses.
-        around: Pose (1,) around which a local search runs; None for other steps.
-        camera: Index of the rig camera whose poses they are, default 0.
-        counts: True if the poses count as an iteration of that camera, default True.
-    """
-
-    propose: Callable[[], Hypotheses]
-    around: Hypotheses | None = None
-    camera: int = 0
-    counts: bool = True
+    propose: Callable[[], Hypotheses]  # function that returns new poses
+    around: Hypotheses | None = None  # pose (1,) around which a local search runs; None for other steps
+    camera: int = 0  # index of the rig camera whose poses they are
+    counts: bool = True  # the poses count as an iteration of that camera
 
 
 @runtime_checkable
@@ -66,11 +59,7 @@ class Poses(Protocol):
 
 
 def teller(progress: Progress | None) -> Callable[[int], None]:
-    """Return a function that calls `progress` with a number of iterations and the seconds since now.
-
-    Args:
-        progress: Callback of a search; None for no callback.
-    """
+    """Return a function that calls `progress` with a number of iterations and the seconds since now."""
     begun = Clock.now()
 
     def tell(iterations: int) -> None:
@@ -88,17 +77,10 @@ def run(
     deadline: Deadline,
     tell: Callable[[int], None] = lambda iterations: None,
 ) -> Case:
-    """Run the steps of a plan until its best pose is decided or the budget is spent.
+    """Run the steps of a plan until its best pose is decided or the budget is spent; return what is known of this pose.
 
-    Args:
-        plan: Steps of the search.
-        poses: Poses found so far.
-        most: Largest number of iterations.
-        deadline: Time after which no step begins.
-        tell: Called with the number of iterations after each step.
-
-    Returns:
-        What is known of the best pose, after its rivals were asked.
+    After the deadline no step begins. The numbers of iterations are told after each step. The rivals of the pose were
+    asked.
     """
     while poses.iterations < most and not deadline.passed() and (step := plan.next_step()) is not None:
         poses.add(step, step.propose())

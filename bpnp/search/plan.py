@@ -60,20 +60,13 @@ class GlobalSteps:
     """Batches of starts, and after each the density-map searches over all rotations that take as long.
 
     Every third batch ignores the prior, which may be wrong.
-
-    Attributes:
-        pool: Poses found so far.
-        scene_prior: Prior in the frame of the scene; None for none.
-        batches: Number of batches so far.
-        searches: Number of density-map searches so far.
-        waiting: Number of density-map searches until the next batch.
     """
 
     pool: Pool
-    scene_prior: Prior | None
+    scene_prior: Prior | None  # prior in the frame of the scene
     batches: int = 0
-    searches: int = 0
-    waiting: int = 0
+    searches: int = 0  # number of density-map searches so far
+    waiting: int = 0  # number of density-map searches until the next batch
 
     def next_step(self) -> Step:
         """Return the next batch or density-map search."""
@@ -92,18 +85,12 @@ class LocalSearches:
 
     Poses whose surroundings were searched before are skipped. The searches end after several without a better pose, or
     with a significant pose.
-
-    Attributes:
-        pool: Poses found so far.
-        poses: Poses to search around, best first.
-        fruitless: Number of consecutive searches without a better pose.
-        best: Largest sort key of the pool before the search that runs; None if none runs.
     """
 
     pool: Pool
-    poses: Hypotheses
-    fruitless: int = 0
-    best: float | None = None
+    poses: Hypotheses  # poses to search around, best first
+    fruitless: int = 0  # number of consecutive searches without a better pose
+    best: float | None = None  # largest sort key of the pool before the search that runs; None if none runs
 
     def next_step(self) -> Step | None:
         """Return the next local search; None after the last one."""
@@ -121,31 +108,18 @@ class LocalSearches:
 
 @dataclass
 class Plan:
-    """Order of the steps of a search of one camera.
-
-    Attributes:
-        pool: Poses found so far.
-        guess: Guess of the pose in the frame of the scene, used before all other sources; None for none.
-        proposals: Function that returns poses to start from, called once; None for none.
-        near: Prior near which the search begins, in the frame of the scene; None after it was given up.
-        source: Starts over all rotations; None to start from proposals only.
-        taken: Number of steps that the guess gave.
-        taken_near: Number of steps near the prior.
-        asked_near: True if the proposals were requested near the prior.
-        rounds: Number of rounds over all rotations.
-        local: Local searches that are under way.
-    """
+    """Order of the steps of a search of one camera."""
 
     pool: Pool
-    guess: Prior | None
-    proposals: Proposals | None
-    near: PosePrior | None
-    source: GlobalSteps | None
-    taken: int = 0
-    taken_near: int = 0
-    asked_near: bool = False
-    rounds: int = 0
-    local: LocalSearches | None = None
+    guess: Prior | None  # guess of the pose in the frame of the scene, used before all other sources
+    proposals: Proposals | None  # function that returns poses to start from, called once
+    near: PosePrior | None  # prior near which the search begins, in the frame of the scene; None after it was given up
+    source: GlobalSteps | None  # starts over all rotations; None to start from proposals only
+    taken: int = 0  # number of steps that the guess gave
+    taken_near: int = 0  # number of steps near the prior
+    asked_near: bool = False  # the proposals were requested near the prior
+    rounds: int = 0  # number of rounds over all rotations
+    local: LocalSearches | None = None  # local searches that are under way
     _found: list[Hypotheses] = field(default_factory=list)
 
     @classmethod
@@ -159,11 +133,7 @@ class Plan:
     ) -> "Plan":
         """Return the plan of a search over all poses, or from proposed poses only.
 
-        Args:
-            pool: Poses found so far.
-            around: Guess of the pose in the frame of the problem; None for none.
-            proposals: Function that returns poses to start from; None for none.
-            only_proposals: True for no other starts than the proposals. Default False.
+        The guess `around` is a pose in the frame of the problem.
         """
         if only_proposals:
             return cls(pool, None, proposals, None, None)
@@ -276,15 +246,7 @@ def _dependent_batch(pool: Pool, number: int, guess: Prior) -> Hypotheses:
 def search_proposed(pool: Pool, proposals: Proposals) -> Hypotheses:
     """Run a density-map search from proposed poses that the prior of the problem admits.
 
-    Args:
-        pool: Poses found so far.
-        proposals: Function that returns poses in the frame of the problem.
-
-    Returns:
-        Distinct poses in the frame of the scene. Their basin counts are 0, since proposals are dependent.
-
-    Raises:
-        ValueError: The proposals have wrong shapes.
+    Basin counts are 0, since proposals are dependent. ValueError for wrong shapes of the proposals.
     """
     rotation, translation = (np.asarray(values, np.float64) for values in proposals())
     if rotation.shape[1:] != (3, 3) or translation.shape != (len(rotation), 3):

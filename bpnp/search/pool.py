@@ -30,45 +30,31 @@ from bpnp.search.verdict.rivals import Rival
 
 
 class Pool:
-    """Distinct poses of a scene, best first, from all iterations of a search.
-
-    Attributes:
-        scene: Points in the frame of the search.
-        problem: Points in the frame of the problem.
-        enumerated: Case of the enumeration of few points, whose poses are the first candidates.
-        candidates: Best poses in the frame of the scene, at most `KEPT_CANDIDATES`.
-        iterations: Number of iterations so far.
-        missed: log10 of the probability that the search missed a better optimum.
-        surrounded: Significant poses whose local search found nothing better.
-        searched: Other poses whose surroundings were searched.
-        symmetry: Motions of the scene that were registered with matched points.
-    """
+    """Distinct poses of a scene, best first, from all iterations of a search."""
 
     def __init__(self, scene: SearchFrame, problem: Problem, enumerated: Case) -> None:
+        # enumerated: case of the enumeration of few points, whose poses are the first candidates.
         self.scene, self.problem, self.enumerated = scene, problem, enumerated
         self.iterations, self._judged_alarms = 0, 0.0
         self._is_thinned = len(problem.bearings) > FINE_BEARINGS
         self._tests = PoseModel.of(problem).log10_tests([problem])
-        self.symmetry = Symmetry(problem)
+        self.symmetry = Symmetry(problem)  # motions of the scene that were registered with matched points
         self.forget()
         if len(enumerated.candidates):
             self.candidates = to_scene_frame(enumerated.candidates, scene)
 
     def forget(self) -> None:
         """Drop all poses."""
+        # surrounded: significant poses whose local search found nothing better.
         self.candidates = self.surrounded = Hypotheses.empty(dtype=np.float32)
-        self.searched: list[Hypotheses] = []
-        self.missed = 0.0
+        self.searched: list[Hypotheses] = []  # other poses whose surroundings were searched
+        self.missed = 0.0  # log10 of the probability that the search missed a better optimum
 
     def add(self, step: Step, found: Hypotheses) -> None:
-        """Add the poses of an iteration.
+        """Add the poses of an iteration, in the frame of the scene.
 
         Their NFA is computed first: a significant pose may be close to a likelier one that is not significant. A local
         search was unsuccessful if the best NFA does not fall by `LEAST_MARGIN` decades.
-
-        Args:
-            step: Step that found them.
-            found: Poses in the frame of the scene.
         """
         before = self.alarms
         self.iterations += 1
@@ -126,11 +112,7 @@ class Pool:
         return float(np.nanmin(self.candidates.log10_false_alarms, initial=np.inf))
 
     def local_searches(self, leaders: Hypotheses) -> int:
-        """Return the number of local searches around the first of these poses that found nothing better.
-
-        Args:
-            leaders: Poses in the frame of the problem, best first.
-        """
+        """Return the number of local searches around the first of these poses that found nothing better."""
         if not len(leaders) or not len(self.surrounded):
             return 0
         around = to_problem_frame(self.surrounded, self.scene)
@@ -164,9 +146,8 @@ class Pool:
     def case(self, *, ended: bool = True) -> Case:
         """Return what is known of the best candidates, or the case of the enumeration if it has fewer false alarms.
 
-        Args:
-            ended: True after the last iteration, where the `FINISHED_POSES` best candidates are annealed on all
-                points; False to anneal only the best one.
+        After the last iteration the `FINISHED_POSES` best candidates are annealed on all points, before only the best
+        one.
         """
         scene, problem = self.scene, self.problem
         self._judged_alarms = min(self._judged_alarms, self.alarms)

@@ -49,39 +49,23 @@ Extrinsics = tuple[Array, Array]
 
 
 class PoseState(NamedTuple):
-    """Values of the unknowns of a pose, or of several poses (...).
+    """Values of the unknowns of a pose, or of several poses (...)."""
 
-    Attributes:
-        rotation: (..., 3, 3) from the scene to the camera or the rig.
-        centroid: (..., 3) of the scene, in the frame of the camera or the rig.
-        zoom: Focal length over that of the bearings.
-        radial: Radial coefficient.
-        unit: Length of 1 of the rig, in units of the scene.
-    """
-
-    rotation: Array
-    centroid: Array
-    zoom: Any = 1.0
+    rotation: Array  # (..., 3, 3) from the scene to the camera or the rig
+    centroid: Array  # (..., 3) of the scene, in the frame of the camera or the rig
+    zoom: Any = 1.0  # focal length over that of the bearings
     radial: Any = 0.0
-    unit: Any = 1.0
+    unit: Any = 1.0  # length of 1 of the rig, in units of the scene
 
 
 class Sight(NamedTuple):
-    """Scene points (..., n) as one camera sees them.
+    """Scene points (..., n) as one camera sees them."""
 
-    Attributes:
-        turned: (..., n, 3) from the centroid of the scene, in the axes of the camera.
-        camera: (..., n, 3) in the frame of the camera.
-        directions: (..., n, 3) unit directions; NaN for points beyond the largest radius of the camera model.
-        length: (..., n) length of the camera's points, with X and Y times `stretch`.
-        stretch: (..., n) |x'| / |x|; None if it is 1 for all.
-    """
-
-    turned: Array
-    camera: Array
-    directions: Array
-    length: Array
-    stretch: Array | None
+    turned: Array  # (..., n, 3) from the centroid of the scene, in the axes of the camera
+    camera: Array  # (..., n, 3) in the frame of the camera
+    directions: Array  # (..., n, 3) unit directions; NaN for points beyond the largest radius of the camera model
+    length: Array  # (..., n) length of the camera's points, with X and Y times `stretch`
+    stretch: Array | None  # (..., n) |x'| / |x|; None if it is 1 for all
 
     def choose(self, chosen: Any) -> "Sight":
         """Return some of the points, by indices or a mask."""
@@ -92,14 +76,6 @@ class Sight(NamedTuple):
 class PoseModel:
     """The unknowns of a pose.
 
-    Attributes:
-        centre: (3,) point of the scene about which it rotates, its centroid.
-        lens: Prior of an unknown focal length. A radial coefficient is unknown if its `radial_sigma` is not 0. None for
-            a given camera.
-        scale: True if the scale of a rig's scene is unknown. Default False.
-        mounts: Extrinsics (C_k, c_k) of the cameras of a rig; None for a single camera.
-        prior: Prior of the pose of the camera or the rig.
-
     >>> model = PoseModel(np.zeros(3), UnknownFocal(2.0, sigma=0.1))
     >>> model.columns
     {'rotation': slice(0, 3, None), 'shift': slice(3, 6, None), 'log_focal': slice(6, 7, None)}
@@ -107,11 +83,14 @@ class PoseModel:
     (7, 4)
     """
 
-    centre: Array
+    centre: Array  # (3,) point of the scene about which it rotates, its centroid
+    # Prior of an unknown focal length. A radial coefficient is unknown if its `radial_sigma` is not 0. None for a given
+    # camera.
     lens: UnknownFocal | None = None
-    scale: bool = False
+    scale: bool = False  # the scale of a rig's scene is unknown
+    # Extrinsics (C_k, c_k) of the cameras of a rig; None for a single camera.
     mounts: Sequence[Extrinsics] | None = None
-    prior: Prior | None = None
+    prior: Prior | None = None  # prior of the pose of the camera or the rig
 
     @classmethod
     def of(cls, problem: Problem) -> "PoseModel":
@@ -151,12 +130,7 @@ class PoseModel:
         return -(-(self.size - self.scale - known) // 2)
 
     def state(self, rotation: Array, translation: Array) -> PoseState:
-        """Return the state of poses with the given camera.
-
-        Args:
-            rotation: (..., 3, 3).
-            translation: (..., 3), or homogeneous (..., 4) for a rig.
-        """
+        """Return the state of poses (..., 3, 3), (..., 3), homogeneous (..., 4) for a rig, with the given camera."""
         radial = 0.0 if self.lens is None else self.lens.radial
         centroid = rotation @ self.centre + translation[..., :3]
         unit = 1.0 if self.mounts is None else translation[..., 3]
@@ -212,15 +186,9 @@ class PoseModel:
         return np.concatenate(columns, -1) if len(columns) > 1 else columns[0]
 
     def by_pose(self, sight: Sight, by_point: Array, k: int = 0) -> Array:
-        """Convert derivatives by points in the frame of camera k to those by the rotation and the shift.
+        """Convert derivatives (..., n, d, 3) by points in the frame of camera k to those by rotation and shift.
 
-        Args:
-            sight: The points.
-            by_point: (..., n, d, 3) derivatives of any function of each point.
-            k: Index of the camera.
-
-        Returns:
-            (..., n, d, 6).
+        They are (..., n, d, 6).
         """
         (x, y, z), (u, v, w) = (np.moveaxis(each, -1, 0) for each in (sight.turned[..., None, :], by_point))
         columns = [np.stack([y * w - z * v, z * u - x * w, x * v - y * u], -1), by_point]
@@ -312,18 +280,12 @@ class PoseModel:
     def log10_cells(self, spread: float, scales: Array, solid_angle: float = 4 * math.pi) -> Array:
         """Return log10 (S,) of the number of distinguishable states, cells of width s, at each scale s of an image.
 
-        With the RMS angular radius h of the image points, it is the number of:
-
+        With the RMS angular radius h of the image points and the solid angle A of the view, it is the number of:
         - 8 pi^2 (h / s)^3 rotations about the scene centroid, which move points at h from it by s,
         - A / s^2 positions of the centroid in the view,
         - log(30) h / s distances of it, up to a factor of 30.
 
         Each is multiplied by the number of distinguishable lenses (`log10_lenses`).
-
-        Args:
-            spread: RMS angular radius h, radians.
-            scales: (S,) scales s, radians.
-            solid_angle: Solid angle A of the view, steradians.
         """
         relative = spread / scales
         cells = 8 * math.pi**2 * relative**4 * (solid_angle / scales**2) * math.log(30)
@@ -332,9 +294,7 @@ class PoseModel:
     def fixing_ways(self, cameras: int = 1, apart: Iterable[tuple[int, int]] = ()) -> list[list[int]]:
         """Return the ways to choose matches that fix the unknowns, each as their number in each camera.
 
-        Args:
-            cameras: Number of cameras.
-            apart: Pairs of cameras with a non-zero baseline. One of a pair has the match that fixes the scale.
+        One camera of a pair with a non-zero baseline, `apart`, has the match that fixes the scale.
         """
         one = np.eye(cameras, dtype=np.int64)
         if not self.scale:
@@ -372,37 +332,25 @@ def crossed(vector: Array) -> Array:
 
 
 def lens_columns(seen: Array, radial: float) -> Array:
-    """Return the derivatives of directions by the camera model with which their bearings were undistorted.
+    """Return the derivatives (..., 3, 2) of directions (..., 3) by log focal length and radial coefficient k.
 
-    With y = (1 + k |x|^2) x fixed by the image, dx = x (1 + k |x|^2) / (1 + 3 k |x|^2) d log f, and
-    dx = x |x|^2 / (1 + 3 k |x|^2) dk.
-
-    Args:
-        seen: (..., 3) unit directions.
-        radial: Radial coefficient k of the camera.
-
-    Returns:
-        (..., 3, 2) derivatives by the logarithm of the focal length and by k.
+    With y = (1 + k |x|^2) x fixed by the image, dx = x (1 + k |x|^2) / (1 + 3 k |x|^2) d log f, and dx = x |x|^2 / (1 +
+    3 k |x|^2) dk. The camera model is the one with which the bearings were undistorted.
     """
     return _lens_columns(seen, radial, None, radial)
 
 
 def lens_error_columns(seen: Array, radial: float) -> Array:
-    """Return the derivatives of directions by parameters of the camera model that are not fitted.
+    """Return the derivatives (..., 3, 5) of directions by parameters of the camera model that are not fitted.
 
-    These are the principal point, the tangential coefficients p1 and p2 (Brown 1966) and the second radial coefficient
-    k2, as in OpenCV's camera model. A step of them moves the image y = (1 + k r^2) x of x = (X, Y), Z = 1, r = |x|, by
+    These are the principal point, in focal lengths, the tangential coefficients p1 and p2 (Brown 1966) and the second
+    radial coefficient k2, as in OpenCV's camera model. A step of them moves the image y = (1 + k r^2) x of x = (X, Y),
+    Z = 1, r = |x|, by
 
         (1, 0), (0, 1), (2 X Y, r^2 + 2 Y^2), (r^2 + 2 X^2, 2 X Y), r^4 x.
 
-    A motion dy of the image moves x by (dy - 2 k x (x^T dy) / (1 + 3 k r^2)) / (1 + k r^2).
-
-    Args:
-        seen: (..., 3) unit directions.
-        radial: Radial coefficient k of the camera with which their bearings were undistorted.
-
-    Returns:
-        (..., 3, 5) derivatives, 0 behind the camera; the principal point is in focal lengths.
+    A motion dy of the image moves x by (dy - 2 k x (x^T dy) / (1 + 3 k r^2)) / (1 + k r^2), k the radial coefficient
+    with which the bearings were undistorted. The derivatives are 0 behind the camera.
 
     Source: D. C. Brown, Decentering distortion of lenses, Photogrammetric Engineering 1966.
     """
@@ -436,14 +384,9 @@ def undistort(bearings: Array, zoom: float, radial: float) -> Array:
 
 
 def true_radius(radius: Array, radial: float) -> Array:
-    """Solve r (1 + k r^2) = radius by Newton steps.
+    """Solve r (1 + k r^2) = radius, in focal lengths, by Newton steps; NaN stays NaN.
 
-    Args:
-        radius: (...) radii in the image, in focal lengths; NaN stays NaN.
-        radial: Radial coefficient k.
-
-    Returns:
-        (...) r, at most the largest radius of the camera model.
+    r is at most the largest radius of the camera model.
     """
     most = math.sqrt((1 - LEAST_SLOPE) / (-3 * radial)) if radial < 0 else math.inf
     true = np.minimum(radius, most)
@@ -469,12 +412,8 @@ def _outwards(seen: Array) -> Array:
 def _lens_columns(seen: Array, reference: float, squared: Array | None, radial: float, *, bends: bool = True) -> Array:
     """Return the derivatives (..., 3, 2) of directions by log focal length and by radial coefficient.
 
-    Args:
-        seen: (..., 3) unit directions.
-        reference: Radial coefficient k_0 with which the bearings were undistorted.
-        squared: (...) |x|^2 of the points; None for |x'|^2 of the directions.
-        radial: Radial coefficient k.
-        bends: Return the derivatives by the radial coefficient too; else (..., 3, 1).
+    The bearings were undistorted with the radial coefficient `reference`; `squared` is |x|^2 of the points, None for
+    |x'|^2 of the directions. Unless it `bends`, the result is (..., 3, 1), without those by the coefficient.
     """
     outwards = _outwards(seen)[..., None]
     if not (bends or reference):
@@ -488,14 +427,10 @@ def _lens_columns(seen: Array, reference: float, squared: Array | None, radial: 
 
 
 def log10_lenses(lens: UnknownFocal | None, spread: float, scales: Array) -> Array:
-    """Return log10 (S,) of the number of distinguishable lenses at each scale s of an image, 0 for a given lens.
+    """Return log10 (S,) of the number of distinguishable lenses at each scale s of an image, radians.
 
-    A focal length moves points at the RMS angular radius h by h d log f, a radial coefficient by h^3 dk.
-
-    Args:
-        lens: Prior of the lens; None for a given one.
-        spread: RMS angular radius h, radians.
-        scales: (S,) scales s, radians.
+    It is 0 for a given lens. A focal length moves points at the RMS angular radius h by h d log f, a radial coefficient
+    by h^3 dk.
     """
     if lens is None:
         return np.zeros(len(scales))

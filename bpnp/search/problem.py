@@ -41,29 +41,17 @@ OF_SCENE = "points3d", "normals3d", "labels3d", "cosines3d", "scores3d", "classe
 
 
 class UnknownFocal(NamedTuple):
-    """Prior of a camera model whose focal length is fitted with the pose.
+    """Prior of a camera model whose focal length is fitted with the pose."""
 
-    Attributes:
-        log_range: Logarithm of the largest over the smallest possible focal length.
-        sigma: Standard deviation of the logarithm of the focal length; infinite without a prior.
-        offset: Logarithm of the focal length of these bearings over the expected one.
-        radial: Radial coefficient k of the camera model with which the bearings were undistorted.
-        radial_sigma: Standard deviation of k; 0 if the distortion is given, infinite if k is fitted.
-        radial_range: Range of possible k; 0 if k is not fitted.
-        centre_sigma: Standard deviation of the principal point, in focal lengths. It is not fitted.
-        tangential_sigma: Standard deviation of the tangential coefficients. They are not fitted.
-        quartic_sigma: Standard deviation of the second radial coefficient, of r^4. It is not fitted.
-    """
-
-    log_range: float
-    sigma: float = math.inf
-    offset: float = 0.0
-    radial: float = 0.0
-    radial_sigma: float = 0.0
-    radial_range: float = 0.0
-    centre_sigma: float = 0.0
-    tangential_sigma: float = 0.0
-    quartic_sigma: float = 0.0
+    log_range: float  # logarithm of the largest over the smallest possible focal length
+    sigma: float = math.inf  # standard deviation of the logarithm of the focal length; infinite without a prior
+    offset: float = 0.0  # logarithm of the focal length of these bearings over the expected one
+    radial: float = 0.0  # radial coefficient k of the camera model with which the bearings were undistorted
+    radial_sigma: float = 0.0  # standard deviation of k; 0 if the distortion is given, infinite if k is fitted
+    radial_range: float = 0.0  # range of possible k; 0 if k is not fitted
+    centre_sigma: float = 0.0  # standard deviation of the principal point, in focal lengths. It is not fitted
+    tangential_sigma: float = 0.0  # standard deviation of the tangential coefficients. They are not fitted
+    quartic_sigma: float = 0.0  # standard deviation of the second radial coefficient, of r^4. It is not fitted
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,35 +60,6 @@ class Problem:
 
     `Problem.of` makes one from the user's coordinates. Poses are those of the scene in unit size, camera = R p + t;
     `from_user` and `to_user` convert them.
-
-    Attributes:
-        bearings: (m, 3) unit vectors of the image points, in the camera's frame.
-        points3d: (n, 3) scene points, (x - origin) / size of the user's points x.
-        normals3d: (n, 3) outward unit normals; a point that faces away from the camera is not seen.
-        labels2d: (m,) labels of the image points; only points with equal labels match, -1 fits any.
-        labels3d: (n,) labels of the scene points.
-        cosines3d: (n,) least cosine between a normal and the direction to a camera that sees the point; None for 0.
-            With them the enumeration ignores the normals.
-        scores2d: (m,) probability in (0, 1] that an image point has a match; None for equal ones.
-        scores3d: (n,) probability in (0, 1] that a scene point has a match; None for equal ones.
-        floor: Smallest scale of the residuals, radians; None for a fraction of the RMS radius of the bearings.
-        radius: Largest residual of a match in an enumeration, radians; None for that of its settings.
-        clutter: Fraction of the image points without a match; None if it is unknown.
-        prior: Prior of the pose, in unit size.
-        log10_tried: Logarithm of the number of poses that were tried; None for the number that triples of matches give.
-        odds2d: (m, c) with `classes3d`: their scalar product is how much likelier a match is by its classes than a
-            mean one. The labels are then those of points whose class is certain.
-        classes3d: (n, c) probabilities of the classes.
-        focal: Prior of the focal length with which the bearings were computed; None if it is given.
-        log10_views: Logarithm of the number of sets of scene points, such as the views of a map, that are tried with
-            these bearings.
-        origin: (3,) of the user's coordinates that is the origin here.
-        size: RMS distance of the scene points from it, user's unit.
-        measured: The image points as the user measured them; the bearings by default.
-        given3d: The scene points in the user's coordinates; None if they are these.
-        is_shared: True if other problems have these image points too: those that this one leaves may be theirs.
-        network: Trained network whose pose is tried first.
-        baseline: True if other cameras at known distances see the scene too: a copy of another size looks different.
 
     Examples:
         >>> rng = np.random.default_rng(0)
@@ -114,30 +73,38 @@ class Problem:
         [-5000.0, 0.0, 4000.0]
     """
 
-    bearings: Array
-    points3d: Array
-    normals3d: Array | None = None
-    labels2d: Labels | None = None
-    labels3d: Labels | None = None
+    bearings: Array  # (m, 3) unit vectors of the image points, in the camera's frame
+    points3d: Array  # (n, 3) scene points, (x - origin) / size of the user's points x
+    normals3d: Array | None = None  # (n, 3) outward unit normals; a point that faces away from the camera is not seen
+    labels2d: Labels | None = None  # (m,) labels of the image points; only points with equal labels match, -1 fits any
+    labels3d: Labels | None = None  # (n,) labels of the scene points
+    # (n,) least cosine between a normal and the direction to a camera that sees the point; None for 0. With them the
+    # enumeration ignores the normals.
     cosines3d: Array | None = None
-    scores2d: Array | None = None
-    scores3d: Array | None = None
+    scores2d: Array | None = None  # (m,) probability in (0, 1] that an image point has a match; None for equal ones
+    scores3d: Array | None = None  # (n,) probability in (0, 1] that a scene point has a match; None for equal ones
+    # Smallest scale of the residuals, radians; None for a fraction of the RMS radius of the bearings.
     floor: float | None = None
-    radius: float | None = None
-    clutter: float | None = None
-    prior: Prior | None = None
+    radius: float | None = None  # largest residual of a match in an enumeration, radians; None for that of its settings
+    clutter: float | None = None  # fraction of the image points without a match; None if it is unknown
+    prior: Prior | None = None  # prior of the pose, in unit size
+    # Logarithm of the number of poses that were tried; None for the number that triples of matches give.
     log10_tried: float | None = None
+    # (m, c) with `classes3d`: their scalar product is how much likelier a match is by its classes than a mean one. The
+    # labels are then those of points whose class is certain.
     odds2d: Array | None = None
-    classes3d: Array | None = None
+    classes3d: Array | None = None  # (n, c) probabilities of the classes
+    # Prior of the focal length with which the bearings were computed; None if it is given.
     focal: UnknownFocal | None = None
+    # Logarithm of the number of sets of scene points, such as the views of a map, that are tried with these bearings.
     log10_views: float = 0.0
-    origin: Array | None = None
-    size: float = 1.0
-    measured: Measured = UNMEASURED
-    given3d: Array | None = None
-    is_shared: bool = False
-    network: Any = None
-    baseline: bool = False
+    origin: Array | None = None  # (3,) of the user's coordinates that is the origin here
+    size: float = 1.0  # RMS distance of the scene points from it, user's unit
+    measured: Measured = UNMEASURED  # the image points as the user measured them; the bearings by default
+    given3d: Array | None = None  # the scene points in the user's coordinates; None if they are these
+    is_shared: bool = False  # other problems have these image points too: those that this one leaves may be theirs
+    network: Any = None  # trained network whose pose is tried first
+    baseline: bool = False  # other cameras at known distances see the scene too: a copy of another size looks different
 
     def __post_init__(self) -> None:
         if self.measured is UNMEASURED:
@@ -145,14 +112,7 @@ class Problem:
 
     @classmethod
     def of(cls, bearings: Array, points3d: Array, *, prior: Prior | None = None, **attributes: Any) -> "Problem":
-        """Make a problem from points and a prior in the user's coordinates.
-
-        Args:
-            bearings: (m, 3) unit vectors.
-            points3d: (n, 3) scene points, in any unit.
-            prior: Prior of the pose, in the user's coordinates.
-            **attributes: The other attributes.
-        """
+        """Make a problem from bearings, and points and a prior in the user's coordinates and unit."""
         bulk = points3d[in_bulk(points3d)]
         bulk = bulk if np.ptp(bulk, axis=0).any() else points3d
         origin = bulk.mean(0)
@@ -191,12 +151,7 @@ class Problem:
         return prior._replace(rotation=rotation, translation=translation, translation_sigma=sigma)
 
     def choose(self, image: Labels | slice = slice(None), scene: Labels | slice = slice(None)) -> "Problem":
-        """Return the problem restricted to these image points and scene points.
-
-        Args:
-            image: Indices or slice of the image points; all by default.
-            scene: Indices or slice of the scene points; all by default.
-        """
+        """Return the problem restricted to the image points and scene points of these indices or slices."""
         rows = dict.fromkeys(OF_IMAGE, image) | dict.fromkeys(OF_SCENE, scene)
         selected = {name: values[rows[name]] for name in rows if (values := getattr(self, name)) is not None}
         given3d = None if self.given3d is None else self.given3d[scene]
@@ -254,11 +209,10 @@ class Problem:
 
     @cached_property
     def labelled_pairs(self) -> tuple[Labels, Labels] | None:
-        """Every pair of points whose labels are equal or include -1.
+        """Indices among `image.chosen` and of scene points (k,) of every pair whose labels are equal or include -1.
 
-        Returns:
-            Indices (k,) among `image.chosen` and (k,) of scene points. None with too many pairs, for which sums over
-            neighbours are faster, and with class probabilities or without labels.
+        None with too many pairs, for which sums over neighbours are faster, and with class probabilities or without
+        labels.
         """
         if self.labels2d is None or self.labels3d is None or self.odds2d is not None:
             return None
@@ -339,19 +293,12 @@ class Problem:
     def log10_prior_fraction(self, rotation: Array, translation: Array) -> float:
         """Return log10 of the fraction F of all poses that are at least as near to the prior as this one.
 
-        The nearness is the larger of the deviations of rotation and position from the prior, in standard deviations.
-        Poses within `EQUALLY_NEAR_SIGMAS` of them are equally near. The poses are those that fit matches of these
-        points: their rotations fill SO(3) evenly, the directions to the median scene point fill the view, and the
-        logarithms of its distance a factor of 30. For poses of unrelated points, F exceeds a uniform variable in
-        [0, 1]: it is a p-value of the prior, and the NFA is the number of tests times F over the likelihood ratio of
-        the points.
-
-        Args:
-            rotation: (3, 3) of the pose.
-            translation: (3,) of the pose.
-
-        Returns:
-            log10 F; 0 without a prior.
+        It is 0 without a prior. The nearness is the larger of the deviations of rotation and position from the prior,
+        in standard deviations. Poses within `EQUALLY_NEAR_SIGMAS` of them are equally near. The poses are those that
+        fit matches of these points: their rotations fill SO(3) evenly, the directions to the median scene point fill
+        the view, and the logarithms of its distance a factor of 30. For poses of unrelated points, F exceeds a uniform
+        variable in [0, 1]: it is a p-value of the prior, and the NFA is the number of tests times F over the likelihood
+        ratio of the points.
         """
         prior, sigmas = self.prior, EQUALLY_NEAR_SIGMAS
         if prior is None:
@@ -380,11 +327,7 @@ class Problem:
 def faces(normals3d: Array, cosines3d: Array | None, camera: Array, rotation: Array) -> NDArray[np.bool_]:
     """Return a mask (n,) of points that face the camera: n . c > cosine, c the unit vector to its centre.
 
-    Args:
-        normals3d: (n, 3) unit normals in the scene.
-        cosines3d: (n,) least cosines; None for 0.
-        camera: (n, 3) points in the camera's frame.
-        rotation: (3, 3) from the scene to the camera.
+    The points are in the camera's frame, the unit normals in the scene, and the least cosines 0 if not given.
     """
     towards = -((normals3d @ rotation.T) * camera).sum(-1)
     if cosines3d is None:
@@ -395,16 +338,9 @@ def faces(normals3d: Array, cosines3d: Array | None, camera: Array, rotation: Ar
 def label_groups(
     chosen: Labels, labels2d: Labels | None, labels3d: Labels | None, n: int
 ) -> list[tuple[Labels, Labels]]:
-    """Group the points that may match by label.
+    """Return indices into `chosen` image points and of the n scene points that may match, for each label in the image.
 
-    Args:
-        chosen: (k,) indices of image points.
-        labels2d: (m,) labels of all image points, -1 for any; None for no labels.
-        labels3d: (n,) labels of the scene points, -1 for any; None for no labels.
-        n: Number of scene points.
-
-    Returns:
-        For each label in the image, indices into `chosen` and indices of scene points.
+    Labels are -1 for any, None for no labels.
     """
     if labels2d is None or labels3d is None:
         return [(np.arange(len(chosen)), np.arange(n))]
@@ -427,13 +363,7 @@ def in_bulk(points3d: Array) -> NDArray[np.bool_]:
 
 
 def why_degenerate(bearings: Array, points3d: Array, fewest: int = MIN_POINTS) -> str | None:
-    """Return the reason why points fix no pose; None if they may.
-
-    Args:
-        bearings: (m, 3) unit vectors.
-        points3d: (n, 3) scene points.
-        fewest: Number of different points that fix a pose.
-    """
+    """Return the reason why points fix no pose; None if they may: at least `fewest` different ones do."""
     for name, points in (("2D", bearings), ("3D", points3d)):
         count, others = 0, points
         while len(others) and count < fewest:

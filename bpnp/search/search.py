@@ -58,36 +58,22 @@ def find_case(
 ) -> Case:
     """Search for distinct poses (R, t) that explain the bearings f_i by the points p_j, in no known order.
 
-    Maximises the likelihood of the bearings under the mixture
+    The search maximises the likelihood of the bearings under the mixture
     p(f_i) = (1 - w)/n sum_j exp((f_i . g(R p_j + t) - 1)/s^2) / 2 pi s^2 + w/A, g(y) = y/|y|, over pose and scale s,
     A the solid angle of the view, by annealing s from starts over all rotations, or around `problem.prior`.
 
     Few points (`bpnp.search.enumeration`) are enumerated first, and annealed only if the result is not conclusive.
+    There are no candidates with fewer than 4 points of a side, or if all bearings or all points coincide or lie on one
+    line.
 
-    Args:
-        problem: Points with priors of the points and of the pose.
-        around: Guess of the pose from the same points, such as that of a network. The first `Schedule.around` batches
-            start there; their basin counts are 0, since they are dependent. None for no guess.
-        proposals: Function that returns poses to start from, such as the likeliest ones of a network; basin counts are
-            0. It is called once, after `Schedule.unaided` rounds without a significant pose (near a prior after two),
-            and only with too many points to enumerate.
-        only_proposals: True to start from the proposals only: known matches, the enumeration and `around` are not used.
-            Default False.
-        clutter: Expected fraction of the points without a correspondence, from 0 to below 1
-            (`SearchSettings.expecting`). None for the fraction of the settings, and several at the end.
-        seed: Seed of all random numbers.
-        deadline: Time after which no batch begins. A running batch continues with the poses that it has. The result
-            then depends on the machine.
-        settings: Constants of the search.
-        progress: Callback with the number of batches and the seconds, after each batch. It gets 0 after the enumeration
-            of few points. None for no callback.
-
-    Returns:
-        What is known of the best of distinct poses. There are no candidates with fewer than 4 points of a side, or if
-        all bearings or all points coincide or lie on one line.
-
-    Raises:
-        ValueError: If `clutter` is out of range.
+    The first `GUESSED_BATCHES` batches start `around` a guess from the same points, such as that of a network; their
+    basin counts are 0, since they are dependent. Those of `proposals`, such as the likeliest poses of a network, are 0
+    too. They are called once, after `UNAIDED_ROUNDS` rounds without a significant pose (near a prior after two), and
+    only with too many points to enumerate; with `only_proposals`, known matches, the enumeration and the guess are not
+    used. `clutter` is the expected outlier fraction, in [0, 1) (`SearchSettings.expecting`). After the deadline no
+    batch begins; a running batch continues with the poses that it has, and the result depends on the machine.
+    `progress` gets the numbers of batches and of seconds after each batch, and 0 batches after the enumeration of few
+    points.
     """
     if clutter is not None:
         settings, problem = settings.expecting(clutter), replace(problem, clutter=clutter)

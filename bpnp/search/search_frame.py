@@ -36,62 +36,45 @@ Sides = tuple[WeightedBearings, WeightedPoints]
 
 
 class Companion(NamedTuple):
-    """Other rig camera that sees the same points, rigidly attached to the camera of a scene.
-
-    Attributes:
-        scene: Its scene.
-        turn: (3, 3) rotation; x' = turn x + shift maps the frame of the first camera to that of this one.
-        shift: (3,) translation, in the unit of both scenes.
-    """
+    """Other rig camera that sees the same points, rigidly attached to the camera of a scene."""
 
     scene: "SearchFrame"
-    turn: Array
-    shift: Array
+    turn: Array  # (3, 3) rotation; x' = turn x + shift maps the frame of the first camera to that of this one
+    shift: Array  # (3,) translation, in the unit of both scenes
 
 
 class SearchFrame:
-    """Problem in float32 and in random order, with the camera turned to the mean bearing.
-
-    Attributes:
-        offsets: (m, 3) unit bearings minus (0, 0, 1), their mean direction after `frame` has turned the camera. In this
-            form float32 keeps the digits of a narrow view.
-        frame: (3, 3) rotation from the camera of the problem to that of the scene.
-        points3d: (n, 3) scene points.
-        bulk3d: (b, 3) scene points that determine the origin and the unit of the problem.
-        spread: RMS distance of the bearings from their mean; radians for a narrow view.
-        shift_weight: (3,) weights of the axes in comparisons of translations. A narrow image hardly shows a shift along
-            the view.
-        solid_angle: Solid angle that the bearings fill, steradians.
-        image: Image points with their annotations.
-        seen: Scene points with their annotations.
-        smallest_scale: Smallest scale of the residuals, radians.
-        rng: Generator of all random numbers.
-        settings: Settings of the search.
-        deadline: Deadline of the search.
-        companions: Other rig cameras with the same points.
-        density_maps: Density maps of the bearings that were computed so far.
-    """
+    """Problem in float32 and in random order, with the camera turned to the mean bearing."""
 
     def __init__(self, problem: Problem, seed: int, settings: SearchSettings, deadline: Deadline = NEVER) -> None:
         bearings, points3d = problem.bearings, problem.points3d
         self.settings, self.deadline = settings, deadline
+        # Density maps of the bearings that were computed so far.
         self.density_maps: dict[tuple[DensityShape, float], DensityMap] = {}
-        self.companions: list[Companion] = []
+        self.companions: list[Companion] = []  # other rig cameras with the same points
         self._tiles: dict[int, tuple[Tiles, WeightedPoints]] = {}
         self._points: dict[int, WeightedPoints] = {}
-        self.rng = np.random.default_rng(seed)
-        self.frame = turned_to(bearings.mean(0))
+        self.rng = np.random.default_rng(seed)  # generator of all random numbers
+        self.frame = turned_to(bearings.mean(0))  # (3, 3) rotation from the camera of the problem to that of the scene
         order2d = self.rng.permutation(len(bearings))
+        # (m, 3) unit bearings minus (0, 0, 1), their mean direction after `frame` has turned the camera. In this form
+        # float32 keeps the digits of a narrow view.
         self.offsets = (bearings @ self.frame.T - FORWARD)[order2d].astype(np.float32)
         order = self.rng.permutation(len(points3d))
-        self.points3d = points3d[order].astype(np.float32)
+        self.points3d = points3d[order].astype(np.float32)  # (n, 3) scene points
+        # (b, 3) scene points that determine the origin and the unit of the problem.
         self.bulk3d = self.points3d[in_bulk(points3d)[order]]
+        # Image and scene points with their annotations.
         self.image = side_of(self.offsets, problem.scores2d, problem.labels2d, None, order2d)
         self.seen = side_of(self.points3d, problem.scores3d, problem.labels3d, problem.cones3d, order)
         self.image, self.seen = with_partners(self.image, self.seen), with_partners(self.seen, self.image)
+        # solid_angle: solid angle that the bearings fill, steradians.
+        # spread: RMS distance of the bearings from their mean; radians for a narrow view.
         self.spread, self.solid_angle = problem.image.spread, problem.image.solid_angle
+        # (3,) weights of the axes in comparisons of translations. A narrow image hardly shows a shift along the view.
         self.shift_weight = np.array([1, 1, min(1, SHIFT_ALONG * self.spread)], np.float32)
         floor = math.inf if problem.floor is None else problem.floor
+        # Smallest scale of the residuals, radians.
         self.smallest_scale = min(SMALLEST_ANNEALED, SMALLEST_RELATIVE * self.spread, floor)
 
     def outlier_density(self, share: float) -> np.float32:
@@ -102,13 +85,7 @@ class SearchFrame:
         return np.float32(2 * math.pi * share / ((1 - share) * self.solid_angle))
 
     def join(self, other: "SearchFrame", turn: NDArray[np.float64], shift: NDArray[np.float64]) -> None:
-        """Add a rig camera with the same points.
-
-        Args:
-            other: Scene of the camera.
-            turn: (3, 3) rotation of x' = turn x + shift, in the coordinates of the problem.
-            shift: (3,) translation.
-        """
+        """Add a rig camera with the same points, x' = turn x + shift in the coordinates of the problem."""
         turned, moved = other.frame @ turn @ self.frame.T, other.frame @ shift
         self.companions.append(Companion(other, turned.astype(np.float32), moved.astype(np.float32)))
 
@@ -135,13 +112,9 @@ class SearchFrame:
         return turn, translation.astype(np.float64) @ self.frame
 
     def clusters(self, counts: Sequence[int]) -> list[Sides]:
-        """Cluster both point sets.
+        """Return clusters of both point sets, ordered by label, for each approximate number of them.
 
-        Args:
-            counts: Approximate numbers of clusters.
-
-        Returns:
-            Clusters of both sides for each count, ordered by label. Smaller sets are clusters of the next larger one.
+        Smaller sets are clusters of the next larger one.
         """
         sides, image, seen = {}, self.image, self.seen
         for count in sorted(set(counts), reverse=True):

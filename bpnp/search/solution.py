@@ -30,24 +30,15 @@ FORMAT = 3  # version of the JSON file; raised when the meaning of a field chang
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A distinct pose that the search found, camera = R p + t.
+    """A distinct pose that the search found, camera = R p + t."""
 
-    Attributes:
-        rotation: (3, 3) rotation matrix.
-        translation: (3,) translation, in the unit of `Solution.translation`.
-        score: Mean log-likelihood of the bearings, nats; larger is better. For a rig it is -log10 of the
-            false alarms.
-        inlier_count: Number of one-to-one inliers (paper Eq. 1) within `Solution.inlier_threshold`, over all cameras.
-        log10_false_alarms: Expected number of equally good poses for unrelated points, log10; see `Solution`.
-        scale: Scale of the scene, rig = scale R p + t; 1 unless it was estimated.
-    """
-
-    rotation: Array
-    translation: Array
+    rotation: Array  # (3, 3) rotation matrix
+    translation: Array  # (3,) translation, in the unit of `Solution.translation`
+    # Mean log-likelihood of the bearings, nats; larger is better. For a rig it is -log10 of the false alarms.
     score: float
-    inlier_count: int
-    log10_false_alarms: float
-    scale: float = 1.0
+    inlier_count: int  # number of one-to-one inliers (paper Eq. 1) within `Solution.inlier_threshold`, over all cameras
+    log10_false_alarms: float  # expected number of equally good poses for unrelated points, log10; see `Solution`
+    scale: float = 1.0  # scale of the scene, rig = scale R p + t; 1 unless it was estimated
 
     @property
     def centre(self) -> Array:
@@ -57,24 +48,17 @@ class Candidate:
 
 @dataclass(frozen=True)
 class SolutionStats:
-    """Statistics of the search.
+    """Statistics of the search."""
 
-    Attributes:
-        iterations: Number of batches of initial poses; 0 if an enumeration or known matches decided. For a
-            network as `solver` the number of its poses.
-        residual: Scale of the residuals, radians.
-        converged: True if the verdict is "confident".
-        dropped2d: Number of 2D points that could not be undistorted and were dropped.
-        taken2d: Number of 2D points that other problems of the same image use (`solve_many`).
-        unfinished: Stages that the time limit cut short: "search", "matcher" (it was not asked), "refinement",
-            "focal lengths", "competing poses", "views", "matches" (some points have none, or their nearest one).
-    """
-
+    # Number of batches of initial poses; 0 if an enumeration or known matches decided. For a network as `solver` the
+    # number of its poses.
     iterations: int = 0
-    residual: float = math.nan
+    residual: float = math.nan  # scale of the residuals, radians
     converged: bool = False
-    dropped2d: int = 0
-    taken2d: int = 0
+    dropped2d: int = 0  # number of 2D points that could not be undistorted and were dropped
+    taken2d: int = 0  # number of 2D points that other problems of the same image use (`solve_many`)
+    # Stages that the time limit cut short: "search", "matcher" (it was not asked), "refinement", "focal lengths",
+    # "competing poses", "views", "matches" (some points have none, or their nearest one).
     unfinished: tuple[str, ...] = ()
 
 

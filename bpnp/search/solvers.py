@@ -45,31 +45,18 @@ VIEW_MATCHER, SCENE_MATCHER = "matcher-maps", "matcher-sfm"  # packaged weights 
 
 
 class Options(NamedTuple):
-    """Options for all problems; see `bpnp.solve`.
+    """Options for all problems; see `bpnp.solve`."""
 
-    Attributes:
-        solver: Module that solves the problems; None for the search.
-        asks: Let an undecided search start from poses of the packaged matchers.
-        inlier_threshold: Largest reprojection error of a match; None for the default.
-        clutter: Expected outlier fraction; None if it is unknown.
-        seed: Seed of the search, default 0.
-        time_limit: Seconds per problem, which the reasons state; None for no limit.
-        device: Device of the modules; None for that of each module.
-        progress: Callback with (problem index, batches of initial poses, seconds).
-        settings: Settings of the search.
-        until: Deadline for all searches together.
-    """
-
-    solver: "torch.nn.Module | None" = None
-    asks: bool = True
-    inlier_threshold: float | None = None
-    clutter: float | None = None
+    solver: "torch.nn.Module | None" = None  # module that solves the problems; None for the search
+    asks: bool = True  # let an undecided search start from poses of the packaged matchers
+    inlier_threshold: float | None = None  # largest reprojection error of a match; None for the default
+    clutter: float | None = None  # expected outlier fraction; None if it is unknown
     seed: int = 0
-    time_limit: float | None = None
-    device: "torch.device | None" = None
-    progress: Progress | None = None
+    time_limit: float | None = None  # seconds per problem, which the reasons state; None for no limit
+    device: "torch.device | None" = None  # device of the modules; None for that of each module
+    progress: Progress | None = None  # callback with (problem index, batches of initial poses, seconds)
     settings: SearchSettings = DEFAULT
-    until: Deadline = Deadline()
+    until: Deadline = Deadline()  # deadline for all searches together
 
     def progress_of(self, i: int) -> Callable[[int, float], None] | None:
         """Return the callback of problem i, with (batches of initial poses, seconds); None without one."""
@@ -132,11 +119,7 @@ def solve_problems(problems: Mapping[int, Problem], options: Options) -> dict[in
 def at_deadline(result: SearchResult, options: Options, deadline: Deadline, seconds: float) -> SearchResult:
     """Return the result of a search, which its deadline may have cut short; the reason and the deadline then note it.
 
-    Args:
-        result: Result of the search.
-        options: Options of the search.
-        deadline: Its deadline.
-        seconds: Time that it took, which the reason states without a time limit.
+    Without a time limit the reason states the seconds that the search took.
     """
     may_be_decided = result.verdict != "confident" and (not result.is_settled or result.code in reasons.UNTESTED)
     if not (may_be_decided and deadline.passed()):

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 # RMS angular radius above which bearings fill about 220 degrees or more, so that the camera is among the points.
 ALL_AROUND_SPREAD = 0.95  # [radians; derived]
-# Step of the spiral of positions at which searches aim, with radii of `aim_step` times the square root of the number;
+# Step of the spiral of positions at which searches aim, with radii of `AIM_STEP` times the square root of the number;
 # it leaves no gaps.
 AIM_STEP = 0.16  # [RMS angular radii; not tuned]
 
@@ -92,16 +92,7 @@ def super_fibonacci(count: int) -> NDArray[np.float64]:
 
 
 def draw_rotations(count: int, prior: Prior | None, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw rotations from a prior, or spread them evenly over SO(3) from a random rotation.
-
-    Args:
-        count: Number of rotations.
-        prior: Prior; the first rotation is its mean. None for all of SO(3).
-        rng: Generator.
-
-    Returns:
-        (count, 3, 3) rotations.
-    """
+    """Draw rotations (count, 3, 3) from a prior, its mean first, or spread them evenly over SO(3)."""
     if prior is None:
         return super_fibonacci(count) @ Rotation.from_quat(rng.standard_normal(4)).as_matrix()
     if isinstance(prior, PosePrior):
@@ -127,23 +118,11 @@ def draw_poses(
     rng: np.random.Generator,
     aim: NDArray[np.float64] | None = None,
 ) -> tuple[Array, Array]:
-    """Draw initial poses for a camera that looks along (0, 0, 1).
+    """Draw initial poses, float32, for a camera that looks along (0, 0, 1), with rotations of a prior or all of them.
 
-    The weak-perspective translation puts a scene point on this axis. At its depth, the extent of the points across the
-    axis is seen under the angle `spread`.
-
-    Args:
-        spread: RMS angular radius of the bearings.
-        points3d: (n, 3) scene points.
-        count: Number of poses.
-        recipe: Sampling of the point and of the depth.
-        prior: Prior of the rotation; None for all rotations.
-        rng: Generator.
-        aim: (2,) position in the view, in units of `spread`; the scene point is seen within `AIM_STEP` of it.
-            None for the axis.
-
-    Returns:
-        Rotations (count, 3, 3) and translations (count, 3), float32.
+    The weak-perspective translation puts a scene point on this axis, or within `AIM_STEP` of an `aim` (2,) in the view;
+    both are in units of `spread`, the RMS angular radius of the bearings. At its depth, the extent of the points across
+    the axis is seen under this angle.
     """
     rotation = draw_rotations(count, prior, rng)
     centroid = points3d.mean(0)
@@ -168,11 +147,8 @@ def draw_poses(
 def aim_of(number: int) -> NDArray[np.float64]:
     """Return the position (2,) in the view at which a search aims, in RMS angular radii from its centre.
 
-    Even searches aim at the centre. Odd ones follow a spiral that covers the view evenly and restarts after 4, 16, 64,
-    64, ... positions.
-
-    Args:
-        number: Index of the search, from 0.
+    Searches are numbered from 0. Even ones aim at the centre. Odd ones follow a spiral that covers the view evenly and
+    restarts after 4, 16, 64, 64, ... positions.
 
     >>> aim_of(0), aim_of(1)
     (array([0., 0.]), array([0.16, 0.  ]))

@@ -143,21 +143,9 @@ def verify_problem(
     time_limit: float = TIME_LIMIT,
     until: Deadline = NEVER,
 ) -> Solved:
-    """Verify a pose of a problem whose points have been checked; see `verify`.
+    """Verify a pose of a problem whose points have been checked, in scene units; see `verify`.
 
-    Args:
-        problem: Points and their measured properties.
-        rotation: (3, 3) rotation matrix of the pose.
-        translation: (3,) translation of the pose, scene units.
-        independent: The pose was not found on these points, as for `verify`.
-        refine: Return and judge the nearby optimum, as for `verify`.
-        inlier_threshold: Largest reprojection error of a match, as for `verify`.
-        seed: Seed of the refinement, default 0.
-        time_limit: Seconds, 10 by default; math.inf for no limit.
-        until: Deadline of a longer task with this time limit.
-
-    Returns:
-        Solution with this pose, as of `verify`.
+    `until` is the deadline of a longer task with this time limit, in seconds.
     """
     begun = time.perf_counter()
     options = Options(time_limit=time_limit, until=until)
