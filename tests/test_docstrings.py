@@ -43,8 +43,7 @@ NOT_YET = {
     "bpnp/search/assemble.py",
     "bpnp/search/matching.py",
     "bpnp/search/possible_matches.py",
-    "bpnp/search/rig",
-    "bpnp/search/verdict",
+    "bpnp/search/verdict/reasons.py",
 }
 SECTION = re.compile(r"^ *(Args|Attributes|Returns|Raises|Yields):$", re.MULTILINE)
 # What a configuration names.

@@ -37,18 +37,8 @@ def prepare(
 ) -> Callable[[], Solved]:
     """Check the arguments of one problem with a rig, and return the function that solves it.
 
-    Args:
-        points2d: List with the image points of each camera.
-        points3d: (n, 3) scene points.
-        camera: One for all, or a list.
-        point_options: `normals3d`, `labels2d`, `labels3d`, `scores2d`, `scores3d`; those of the image points are lists
-            with one array per camera.
-        options: Options of the search.
-        chosen: Arguments that are common to all problems.
-        prior: As for `bpnp.solve`.
-
-    Raises:
-        ValueError: An argument is invalid, or has no meaning with a rig.
+    The image points and their options are lists with one array per camera; `chosen` are the arguments that are common
+    to all problems. ValueError for an argument that is invalid, or has no meaning with a rig.
     """
     mounts = [mount_from(f"rig[{k}]", mount) for k, mount in enumerate(chosen.rig)]
     _refuse(chosen, prior)

@@ -54,15 +54,10 @@ class Rig:
     """Rig cameras with their points of one scene. Translations of the rig are homogeneous.
 
     c_k and the translations are in sizes of the scene: a rig and a scene with the same unit are divided by one number.
-
-    Args:
-        problems: Points of each camera.
-        mounts: Extrinsics (C_k, c_k) of each camera, camera_k = C_k rig + c_k.
-        is_metric: True if the last component of the translations is 1; else it is unknown. Default True.
-        prior: Prior of the pose of the rig, in sizes of the scene; None for none. Without a metric scene its
-            translation does not restrict a camera.
-        lens: Prior of the focal length of all cameras, which has one unknown factor; None if it is known. Poses are
-            refined with the given cameras; the number of tests and the covariance count the unknowns.
+    If the scene is metric, the last component of the translations is 1, else it is unknown, and the translation of a
+    prior, in sizes of the scene, does not restrict a camera. A lens prior is that of the focal length of all cameras,
+    which has one unknown factor: poses are refined with the given cameras; the number of tests and the covariance count
+    the unknowns.
     """
 
     is_rig = True
@@ -82,6 +77,7 @@ class Rig:
         least = SAME_CENTRE * np.abs(centres).max()
         pairs = combinations(range(len(mounts)), 2)
         self.apart = [(k, other) for k, other in pairs if np.linalg.norm(centres[k] - centres[other]) > least]
+        # Extrinsics (C_k, c_k) of each camera, camera_k = C_k rig + c_k.
         self.mounts = [(turn, shift / problem.size) for problem, (turn, shift) in zip(problems, mounts, strict=True)]
         baseline = is_metric and bool(self.apart)
         self.problems: Sequence[Problem] = [
@@ -104,14 +100,8 @@ class Rig:
     def rig_of(self, k: int, rotation: Array, translation: Array, unit: Array | float = 1.0) -> Pose:
         """Return the poses of the rig for poses of camera k.
 
-        Args:
-            k: Index of the camera.
-            rotation: (..., 3, 3) of the camera.
-            translation: (..., 3) of the camera.
-            unit: Length of a rig unit in scene units, default 1.
-
-        Returns:
-            Rotations (..., 3, 3) and homogeneous translations (..., 4).
+        The poses of a camera become rotations (..., 3, 3) and homogeneous translations (..., 4); `unit` is the length
+        of a rig unit in scene units.
         """
         turn, shift = self.mounts[k]
         units = np.broadcast_to(unit, (*translation.shape[:-1], 1))
@@ -131,8 +121,7 @@ class Rig:
     def refined(self, rotation: Array, translation: Array) -> Iterator[tuple[Array, Array, float, float]]:
         """Refine a pose at decreasing scales.
 
-        Yields:
-            Rotation, translation, scale (radians) and expected number of matches after each step.
+        Yield rotation, translation, scale (radians) and expected number of matches after each step.
         """
         scales = (np.geomspace(WIDE_SCALES, 1.0, REFINEMENT_SCALES).repeat(STEPS_A_SCALE) * self.floor).tolist()
         model = replace(self.model, lens=None)
@@ -145,13 +134,8 @@ class Rig:
     def fit_lens(self, rotation: Array, translation: Array, scale: float) -> tuple[float, float]:
         """Fit the focal length of all cameras, and a radial coefficient if it is unknown, together with a pose.
 
-        Args:
-            rotation: (3, 3) of the rig.
-            translation: (4,) of the rig, homogeneous.
-            scale: Scale of the residuals, radians.
-
-        Returns:
-            Factor of the focal length, and the radial coefficient.
+        Return the factor of the focal length, and the radial coefficient. The pose of the rig is homogeneous, the scale
+        of its residuals in radians.
         """
         linearise = soft_equations(self.model, self.problems, fewest=self.model.size - 3)
         scales = (
@@ -233,14 +217,8 @@ class Rig:
     ) -> Array:
         """Return the width (cameras,), radians, over which the depths of the scene spread a bearing of camera k.
 
-        It is that of uniform numbers with the same standard deviation; 0 for cameras with the same centre.
-
-        Args:
-            k: Index of the camera.
-            seen: Indices of the scene points that it sees.
-            directions: Directions (n, 3) of the scene points in each camera.
-            rotation: (3, 3) of the rig.
-            translation: (4,) of the rig, homogeneous.
+        It is that of uniform numbers with the same standard deviation; 0 for cameras with the same centre. `seen` are
+        the scene points that it sees, `directions` (n, 3) those of all scene points in each camera.
         """
         turn, shift = self.pose_of(k, rotation, translation)
         depths = np.linalg.norm(self.problems[k].points3d[seen] @ turn.T + shift, axis=1)
@@ -258,12 +236,8 @@ class Rig:
     def evidence(self, rotation: Array, translation: Array, scale: float | None = None) -> Array:
         """Return the log likelihood ratio (cameras,) of the bearings of each camera under a pose and by chance.
 
-        A scene point that several cameras see counts in each of them.
-
-        Args:
-            rotation: (3, 3) of the rig.
-            translation: (4,) of the rig, homogeneous.
-            scale: Scale of the residuals, radians; None takes the mean over all scales.
+        A scene point that several cameras see counts in each of them. The scale of the residuals is in radians; None
+        takes the mean over all scales.
         """
         terms = self._terms(self._directions(rotation, translation), scale)
         return np.array([0.0 if one is None else one.evidence(0)[0] for one in terms])
@@ -271,14 +245,8 @@ class Rig:
     def covariance(self, rotation: Array, translation: Array, scale: float) -> Array | None:
         """Return the covariance of the pose in the axes of the rig, or None if the points do not fix it.
 
-        Args:
-            rotation: (3, 3) of the rig.
-            translation: (4,) of the rig, homogeneous.
-            scale: Standard deviation of the residuals, radians.
-
-        Returns:
-            (6, 6) of the rotation and the shift of the scene centroid; then the logarithms of an unknown focal length
-            and of an unknown scale.
+        It is (6, 6) of the rotation and the shift of the scene centroid; then the logarithms of an unknown focal length
+        and of an unknown scale follow. `scale` is the standard deviation of the residuals, radians.
         """
         state = self.model.state(rotation, translation)
         for sharper in (1.0, 1 / math.sqrt(2)):  # as `local_covariance`

@@ -65,17 +65,8 @@ def search_rig(
 ) -> Case:
     """Search for the pose of a rig.
 
-    Args:
-        rig: Cameras with their points.
-        clutter: Expected outlier fraction; None if it is unknown.
-        seed: Random seed.
-        deadline: When to stop.
-        settings: Constants of the search.
-        progress: Callback with the number of iterations and the seconds, after the cameras with few points (0) and
-            after each iteration. None for no callback.
-
-    Returns:
-        What is known of the best of distinct poses of the rig.
+    The progress is told after the cameras with few points (0) and after each iteration; `clutter` is the expected
+    outlier fraction, None if it is unknown.
     """
     settings = settings if clutter is None else settings.expecting(clutter)
     poses, tell = RigPoses(rig, deadline), teller(progress)
@@ -117,11 +108,7 @@ def _of_few_points(
 
 
 class RigPlan:
-    """Steps of the cameras of a rig that search, one of each in turn; a local search for all of them ends a round.
-
-    Args:
-        poses: Poses found so far.
-    """
+    """Steps of the cameras of a rig that search, one of each in turn; a local search for all of them ends a round."""
 
     def __init__(self, poses: "RigPoses") -> None:
         self._poses, self._plans = poses, {k: Plan.of(pool) for k, pool in poses.pools.items()}
@@ -142,23 +129,16 @@ class RigPlan:
 
 
 class RigPoses:
-    """Proposals of the cameras of a rig, and the best of them refined on all cameras.
-
-    Attributes:
-        found: All poses of each camera, in the frame of its problem.
-        pools: Pool of each camera that searches, by index.
-        starts: Initial poses of the rig that were refined, with their evidence.
-        searched: Initial poses that had a local search.
-        best: Distinct refined poses, best first.
-        exhaustive: True if every pose was tried.
-        deadline: Deadline of the search.
-    """
+    """Proposals of the cameras of a rig, and the best of them refined on all cameras."""
 
     def __init__(self, rig: Rig, deadline: Deadline = NEVER) -> None:
         self.deadline = deadline
         self.rig, self.exhaustive = rig, True
-        self.found = [Hypotheses.empty() for _ in rig.problems]
-        self.starts = Hypotheses.empty(4)
+        self.found = [Hypotheses.empty() for _ in rig.problems]  # all poses of each camera, in the frame of its problem
+        self.starts = Hypotheses.empty(4)  # initial poses of the rig that were refined, with their evidence
+        # best: distinct refined poses, best first.
+        # searched: initial poses that had a local search.
+        # pools: pool of each camera that searches, by index.
         self.best, self.searched, self.pools = self.starts, self.starts, dict[int, Pool]()
         self._symmetries = [Symmetry(problem) for problem in rig.problems]
 
@@ -176,9 +156,7 @@ class RigPoses:
     def take(self, new: Mapping[int, Hypotheses], most: int) -> None:
         """Refine those proposals of the cameras that have the most evidence in all cameras.
 
-        Args:
-            new: Poses of each camera, by index, in the frame of its problem.
-            most: Largest number of poses that are refined.
+        At most `most` poses are refined. The new ones are in the frame of the problem of each camera, by index.
         """
         rotation, translation = _proposals(self.rig, new, self.found)
         for k, poses in new.items():
@@ -376,14 +354,7 @@ def _proposals(rig: Rig, new: Mapping[int, Hypotheses], found: Sequence[Hypothes
 
 
 def _agreeing_poses(rig: Rig, pair: tuple[int, int], first: Hypotheses, second: Hypotheses) -> Pose:
-    """Return the poses of the rig in which two cameras agree; the scene centroid is at its least-squares position.
-
-    Args:
-        rig: Cameras.
-        pair: Indices of the two cameras.
-        first: Poses of the first camera.
-        second: Poses of the second camera.
-    """
+    """Return the poses of the rig in which two cameras agree; the scene centroid is at its least-squares position."""
     (turn, shift), (other, moved) = (rig.mounts[k] for k in pair)
     centre = rig.problems[0].centre3d
     first_rotations, others = (turn.T @ first.rotation).reshape(-1, 9), (other.T @ second.rotation).reshape(-1, 9)

@@ -39,17 +39,9 @@ def prepare_rig(
 ) -> Callable[[], Solved]:
     """Check the problem of a rig, and return the function that estimates its pose rig_from_world; see `bpnp.solve`.
 
-    Args:
-        points2d: Points of each camera.
-        points3d: (n, 3) scene points.
-        cameras: Camera of each of them; None for normalised coordinates and bearings.
-        unknown: Cameras with an unknown focal length; None if it is known.
-        mounts: Extrinsics cam_from_rig of each camera.
-        point_options: Lists of `labels2d` and `scores2d`, one array or None per camera; `normals3d`, `labels3d` and
-            `scores3d`.
-        options: Options of the search.
-        prior: Prior of the pose of the rig.
-        scale: Estimate the scale of the scene too. Default False.
+    The pose is rig_from_world; `mounts` are the extrinsics cam_from_rig, `unknown` the cameras whose focal length is to
+    be fitted. A camera is None for normalised coordinates and bearings. `labels2d` and `scores2d` are lists with one
+    array or None per camera. With `scale` that of the scene is estimated too.
     """
     placed = isinstance(prior, PosePrior) and prior.translation is not None and math.isfinite(prior.translation_sigma)
     if scale and placed:
@@ -112,13 +104,7 @@ class RigPoints:
 
 
 class _RigSweep(FocalSweep):
-    """Focal lengths of the cameras of a rig, which have one factor of those of their references.
-
-    Args:
-        unknown: Cameras with an unknown focal length.
-        points: Points of the cameras.
-        options: Options of the search.
-    """
+    """Focal lengths of the cameras of a rig, which have one factor of those of their references."""
 
     def __init__(self, unknown: list[UnknownCamera], points: RigPoints, options: Options) -> None:
         self.points, self.every = points, unknown

@@ -43,12 +43,7 @@ CandidatesOfCameras = Sequence[tuple[Hypotheses, Problem]]
 
 
 def other_pose(candidates: Hypotheses, problem: Problem) -> Objection | None:
-    """Return the competing pose with the fewest false alarms, or None.
-
-    Args:
-        candidates: Poses, best first.
-        problem: Points of the problem.
-    """
+    """Return the competing pose with the fewest false alarms, or None."""
     same = problem.same_as(candidates.pose(), candidates.rotation, candidates.translation, SAME)
     others = np.flatnonzero(~same)
     if not len(others):
@@ -61,11 +56,7 @@ def other_pose(candidates: Hypotheses, problem: Problem) -> Objection | None:
 def competing_pose(problem: Problem, best: Pose, other: Pose, decades: float) -> Objection:
     """Return a different pose as an objection.
 
-    Args:
-        problem: Points of the problem.
-        best: Rotation (3, 3) and translation (3,) of the best pose, in the frame of the problem.
-        other: Likewise of the competing pose.
-        decades: log10 of the ratio of their false alarms.
+    `decades` is log10 of the ratio of their false alarms.
     """
     return objection("competing_pose", decades, away=distance_between(problem, best, other))
 
@@ -73,13 +64,7 @@ def competing_pose(problem: Problem, best: Pose, other: Pose, decades: float) ->
 def distance_between(problem: Problem, first: Pose, second: Pose) -> str:
     """Return the angle between two poses in words, or for equal rotations the shift of the scene centroid.
 
-    Args:
-        problem: Points of the problem.
-        first: Rotation (3, 3) and translation (3,) of a pose, in the frame of the problem.
-        second: Likewise of the other pose.
-
-    Returns:
-        Such as "12 deg" or "15 % of the distance", that of the scene centroid from the camera of the first pose.
+    Such as "12 deg" or "15 % of the distance", that of the scene centroid from the camera of the first pose.
     """
     degrees = math.degrees(rotation_angle(first[0], second[0]))
     if degrees >= SHOWN_DEGREES:
@@ -101,11 +86,7 @@ def rough_residuals(candidates: Hypotheses) -> Objection | None:
 
 
 def other_camera(off: Misfit) -> Objection | None:
-    """Return another camera or other proportions of the scene as an objection, or None if their pose is the same.
-
-    Args:
-        off: Difference between a pose and the pose fitted with them.
-    """
+    """Return another camera or other proportions of the scene as an objection, or None if their pose is the same."""
     limits = (BEND_DEG, BEND_SHIFT) if off.radial else (SAME.degrees, SAME.shift)
     if math.degrees(off.turn) <= limits[0] and off.shift <= limits[1]:
         return None
@@ -117,11 +98,7 @@ def other_camera(off: Misfit) -> Objection | None:
 
 
 def unrelated_competitor(cameras: CandidatesOfCameras) -> Objection | None:
-    """Return a far candidate whose likelihood is not significantly below that of the first one, or None.
-
-    Args:
-        cameras: Candidates, best first, and points of each camera of a rig.
-    """
+    """Return a far candidate whose likelihood is not significantly below that of the first one, or None."""
     margins = sign_margins(cameras)
     weaker = np.flatnonzero(margins < LEAST_MARGIN)
     if not len(weaker):
@@ -147,13 +124,8 @@ def sign_margins(cameras: CandidatesOfCameras) -> Array:
     It is then that pose, its mirror image, or a repetition of it. Of a mirror image from afar, they coincide up to the
     order of their depths. The exception is a pose that explains other points as well, at least half as many as it
     leaves unexplained: both poses then slide along a curve, or see two places, and the scene lacks other points of
-    each.
-
-    Args:
-        cameras: Candidates, best first, and points of each camera of a rig; cameras with too few points are left out.
-
-    Returns:
-        Margins (c,) in decades, negative if the other candidate explains more; infinite where there is no such test.
+    each. The margins (c,) are in decades, negative if the other candidate explains more; infinite where there is no
+    such test. Cameras with too few points are left out.
 
     Source: W. Hoeffding, Probability inequalities for sums of bounded random variables, JASA 1963.
     """
@@ -190,27 +162,17 @@ def sign_margins(cameras: CandidatesOfCameras) -> Array:
 
 
 class Partners(NamedTuple):
-    """Nearest scene points of k image points under a pose.
+    """Nearest scene points of k image points under a pose."""
 
-    Attributes:
-        points: (k,) indices of the scene points, -1 if none is near.
-        places: (k, 3) these points in the camera's frame.
-        near: (k,) True if the point is near enough to be the correspondence.
-    """
-
-    points: NDArray[np.int64]
-    places: Array
-    near: NDArray[np.bool_]
+    points: NDArray[np.int64]  # (k,) indices of the scene points, -1 if none is near
+    places: Array  # (k, 3) these points in the camera's frame
+    near: NDArray[np.bool_]  # (k,) True if the point is near enough to be the correspondence
 
 
 def _explained(cameras: CandidatesOfCameras, k: int, scale: float, near: float) -> tuple[Array, Partners]:
     """Return the evidence of the image points of all cameras for candidate k, and their correspondences.
 
-    Args:
-        cameras: Candidates and points of each camera.
-        k: Index of the candidate.
-        scale: Scale of the residuals, radians.
-        near: Reach of a correspondence, in scales.
+    A correspondence is within `near` scales, radians, of its image point.
     """
     poses = [(problem, *candidates.pose(k), scale) for candidates, problem in cameras]
     parts = zip(*(partners(near, *pose) for pose in poses), strict=True)

@@ -51,16 +51,12 @@ def log10_missed(
       others must be independent coincidences: 10^-3e.
 
     mu1 is `LOOK_FAILS`, mu2 is `AGAIN_FAILS`, q is `ANOTHER`. The term 2^-k is the posterior of unseen optima of
-    Boender and Rinnooy Kan for two optima.
+    Boender and Rinnooy Kan for two optima. In P the number of independent coincidences is 3. e is 0 if matches do not
+    confirm each other, as in repeated structures. If the motions of a symmetric scene were tried, q of a far optimum is
+    `UNCOMPARED`.
+
     Source: C. G. E. Boender, A. H. G. Rinnooy Kan, Bayesian stopping rules for multistart global optimization methods,
     Math. Programming 1987.
-
-    Args:
-        basin_count: Number k of independent initial poses that ended at the best pose or at one that is not different.
-        decades_a_match: Evidence e of a match; 0 if matches do not confirm each other, as in repeated structures.
-        local_searches: Number L of local searches around the best pose that found no better one.
-        independent: Number of matches that are independent coincidences, 3 in P.
-        symmetric: Use `UNCOMPARED` as q of a far optimum, since the scene's motions were tried.
 
     >>> [round(log10_missed(*basins), 2) for basins in ((0, 0.0, 0), (7, 0.0, 0), (7, 0.0, 1), (1, 1.0, 0))]
     [0.0, -2.0, -3.24, -3.3]

@@ -16,10 +16,8 @@ from bpnp.search.verdict.rivals.symmetries import symmetries
 def rivals_of(scene_of: SceneOf, deadline: Deadline = NEVER, *, enumerated: bool = False) -> list[Rival]:
     """Return the rivals of a pose of one camera, in the order in which they are asked.
 
-    Args:
-        scene_of: Function that returns the scene for refinements; it is called only if one is needed.
-        deadline: Deadline of the scene, after whose end nothing more is tested.
-        enumerated: True if the candidates are those of an enumeration.
+    The scene is made only if a refinement needs it, and nothing is tested after the end of the deadline; `enumerated`
+    candidates are those of an enumeration.
     """
     return [
         partial(symmetries, scene_of=scene_of, deadline=deadline, enumerated=enumerated),

@@ -24,23 +24,14 @@ LEAST_EIGENVALUE = 1e-9  # [1; numerics]
 
 
 class Linearisation(NamedTuple):
-    """k possible matches, linearised in p fitted parameters.
+    """k possible matches, linearised in p fitted parameters."""
 
-    Attributes:
-        residual: (k, d) of each match, in standard deviations.
-        jacobian: (k, d, p) derivative of the predicted image point, in the same unit.
-        probability: (k,) of the match.
-        point: (k,) index of its image point.
-        weight: (g,) number of image points that each image point stands for.
-        known: (p, p) information from elsewhere, such as a prior.
-    """
-
-    residual: Array
-    jacobian: Array
-    probability: Array
-    point: Labels
-    weight: Array
-    known: Array
+    residual: Array  # (k, d) of each match, in standard deviations
+    jacobian: Array  # (k, d, p) derivative of the predicted image point, in the same unit
+    probability: Array  # (k,) of the match
+    point: Labels  # (k,) index of its image point
+    weight: Array  # (g,) number of image points that each image point stands for
+    known: Array  # (p, p) information from elsewhere, such as a prior
 
 
 def join(parts: list[Linearisation]) -> Linearisation:
@@ -57,12 +48,7 @@ def join(parts: list[Linearisation]) -> Linearisation:
 
 
 def of_sure_matches(residual: Array, jacobian: Array) -> Linearisation:
-    """Return the linearisation of k certain matches, one per image point.
-
-    Args:
-        residual: (k, d), in standard deviations.
-        jacobian: (k, d, p), in the same unit.
-    """
+    """Return the linearisation of k certain matches, one per image point, in standard deviations."""
     count, size = len(residual), jacobian.shape[-1]
     return Linearisation(residual, jacobian, np.ones(count), np.arange(count), np.ones(count), np.zeros((size, size)))
 
@@ -80,23 +66,21 @@ def covariance_of(
     with g_i the gradient and H_i the information of image point i. d_i is the step to the optimum without it. See
     `bpnp.search.verdict.uncertainty.local_covariance`.
 
-    Args:
-        matches: Linearised about the optimum.
-        fitted: Number of parameters that the matches have to fix. The jackknife leaves a point out only if they stay
-            overdetermined without it.
-        blocks: (g,) block of each image point; the jackknife leaves out one block at a time. None: one point.
-        considered: (k, d, c) derivative of the predicted image points by parameters that are not fitted, times their
-            standard deviations. `_add_considered` adds what their errors move.
-
-    Returns:
-        (p, p), or None where the information is not positive definite.
-
-    Examples:
         >>> rng = np.random.default_rng(0)
         >>> jacobian = rng.normal(size=(400, 1, 2))
         >>> covariance = covariance_of(of_sure_matches(rng.normal(size=(400, 1)), jacobian), fitted=2)
         >>> bool(np.allclose(400 * covariance, np.eye(2), atol=0.3))
         True
+
+    The jackknife leaves a point, or one of the `blocks` (g,), out only if the `fitted` parameters stay overdetermined
+    without it. `considered` (k, d, c) are derivatives by parameters that are not fitted, times their standard
+    deviations: `_add_considered` adds what their errors move. None where the information is not positive definite.
+
+    >>> rng = np.random.default_rng(0)
+    >>> jacobian = rng.normal(size=(400, 1, 2))
+    >>> covariance = covariance_of(of_sure_matches(rng.normal(size=(400, 1)), jacobian), fitted=2)
+    >>> bool(np.allclose(400 * covariance, np.eye(2), atol=0.3))
+    True
     """
     score = np.einsum("kab,ka->kb", matches.jacobian, matches.residual)
     count, size = score.shape
@@ -144,13 +128,8 @@ def _add_considered(covariance: Array, matches: Linearisation, counted: Array, c
 
     Its mean over all residuals is S S^T, that of a parameter of which the residuals tell nothing (Schmidt 1966).
     Matches tell less than independent certain ones. J^T J, K^T K and J^T K are divided by the largest factor by which
-    the covariance exceeds A^-1.
-
-    Args:
-        covariance: (p, p) of the fitted parameters with q = 0.
-        matches: Linearised about the estimate.
-        counted: (k,) weight of each match.
-        considered: (k, d, c) derivatives by the parameters q, in their standard deviations.
+    the covariance exceeds A^-1. `counted` (k,) are the weights of the matches, `considered` the derivatives by q in
+    their standard deviations.
 
     Source: S. F. Schmidt, Application of state-space methods to navigation problems, 1966.
     """

@@ -72,23 +72,14 @@ SHARES = np.array(INLIER_FRACTIONS)  # w
 
 
 class Terms(NamedTuple):
-    """Evidence of the k image points of one camera for a pose, at S scales and W fractions.
+    """Evidence of the k image points of one camera for a pose, at S scales and W fractions."""
 
-    Attributes:
-        logs: (k, S, W) log x_i / c_i, clumps weighted.
-        together: (k, S) c_i.
-        own: (S,) True at the scales of the residuals of the pose.
-        rough: (S,) True at far larger scales.
-        pairs: Number of pairs (s, w) over which the mean is taken, including those of omitted finer scales.
-        fewer: (S,) log of the number of tests at each scale, over the number of all.
-    """
-
-    logs: Array
-    together: NDArray[Any]
-    own: NDArray[np.bool_]
-    rough: NDArray[np.bool_]
-    pairs: int
-    fewer: Array
+    logs: Array  # (k, S, W) log x_i / c_i, clumps weighted
+    together: NDArray[Any]  # (k, S) c_i
+    own: NDArray[np.bool_]  # (S,) True at the scales of the residuals of the pose
+    rough: NDArray[np.bool_]  # (S,) True at far larger scales
+    pairs: int  # number of pairs (s, w) over which the mean is taken, including those of omitted finer scales
+    fewer: Array  # (S,) log of the number of tests at each scale, over the number of all
 
     def by_scale(self, left_out: int) -> Array:
         """Return log of sum_w prod_i x_i^(1 / c_i) / pairs at each scale (S,), without the `left_out` largest x_i."""
@@ -114,16 +105,9 @@ def log10_nfa(
         NFA = T / prod_cameras mean_{s, w} prod_i x_i^(1 / c_i)
 
     The formula holds for a rotation, a pose, a pose with a focal length and a rig. They differ in the number T of tests
-    and in the number of matches that fix them, which are no evidence.
-
-    Args:
-        cameras: Evidence of each camera; their logs add up. None for a camera without evidence.
-        log10_tests: log10 of the number T of tests.
-        fixing: Ways to choose the matches that fix the pose, each as their number in each camera. The way that leaves
-            the least evidence counts.
-
-    Returns:
-        log10 NFA at the scales of the residuals, and at rougher ones.
+    and in the number of matches that fix them, which are no evidence. Of the ways to choose the matches that fix the
+    pose, each as their number in each camera, the one that leaves the least evidence counts. The logarithms are those
+    at the scales of the residuals, and at rougher ones; a camera may have no evidence.
     """
     counts = {count for way in fixing for count in way}
     none = np.zeros(2)
@@ -144,13 +128,8 @@ def alarms_of(problem: Problem, rotations: Array, translations: Array, scales: A
     """Compute log10 NFA of poses.
 
     A pose that sees at most as many points as fix it has no evidence: its NFA is the number of tests. Several sets of
-    scene points multiply the number of tests (`Problem.log10_views`).
-
-    Args:
-        problem: Points of the problem.
-        rotations: (c, 3, 3) of the poses.
-        translations: (c, 3) of the poses.
-        scales: (c,) scales of the residuals, radians; None counts all scales as a pose's own.
+    scene points multiply the number of tests (`Problem.log10_views`). Without `scales` (c,) of the residuals, radians,
+    all scales count as a pose's own.
 
     >>> import numpy as np
     >>> points = np.random.default_rng(0).uniform(-1, 1, (12, 3))
@@ -192,14 +171,9 @@ def camera_terms(
 ) -> Terms | None:
     """Return the evidence of one camera.
 
-    Args:
-        problem: Points of the problem.
-        directions: (n, 3) unit directions of the scene points, NaN for those that are not seen.
-        scale: Scale of the residuals, radians; None counts all scales as the pose's own.
-        fewer: (S,) log of the number of tests at each scale of the image, over the number of all.
-
-    Returns:
-        Terms from the finest own scale on; None if no more points are seen than fix the pose.
+    They begin at the finest own scale; all scales are own ones if that of the residuals, radians, is None. Directions
+    (n, 3) are NaN for points that are not seen; None if no more points are seen than fix the pose. `fewer` (S,) is the
+    log of the number of tests at each scale of the image, over the number of all.
     """
     if min(len(problem.bearings), int(np.isfinite(directions[:, 0]).sum())) <= PoseModel.of(problem).fixing:
         return None
@@ -214,16 +188,8 @@ def camera_terms(
 def own_evidence(problem: Problem, rotation: Array, translation: Array, scale: float) -> Array:
     """Return log x_i / c_i (k,) of each chosen image point under a pose, clumps weighted.
 
-    It is taken at the fraction w and the scale s with the largest sum.
-
-    Args:
-        problem: Points of the problem, with k chosen image points.
-        rotation: (3, 3) of the pose.
-        translation: (3,) of the pose.
-        scale: Scale of its residuals, radians; s is within a factor of two of it.
-
-    Returns:
-        (k,) natural logs; 0 if too few points are seen.
+    It is taken at the fraction w and the scale s with the largest sum. s is within a factor of two of the scale of the
+    residuals, radians; 0 if too few points are seen.
     """
     terms = camera_terms(problem, directions_of(problem, rotation, translation), scale)
     return np.zeros(len(problem.image.chosen)) if terms is None else terms.of_points()
@@ -247,9 +213,8 @@ def _is_own(ratio: Array) -> NDArray[np.bool_]:
 def match_shares(problem: Problem) -> Array:
     """Return the fractions w of image points with a correspondence that are tried.
 
-    Returns:
-        (W,), or with scores (k, 1, W), in proportion to the score of each chosen point and of the scene points that
-            its label admits.
+    They are (W,), or with scores (k, 1, W), in proportion to the score of each chosen point and of the scene points
+    that its label admits.
     """
     shares = SHARES if problem.clutter is None else np.array([1 - problem.clutter])
     if problem.scores2d is not None:
@@ -286,12 +251,9 @@ def sum_of_largest(values: Array, count: int) -> Array:
 def point_evidence(problem: Problem, directions: Array, scales: Array, shares: Array, *, even: bool = False) -> Array:
     """Return log x_i (k, S, W) of each chosen image point.
 
-    Args:
-        problem: Points of the problem.
-        directions: (n, 3) unit directions of the scene points, NaN for those that are not seen.
-        scales: (S,) scales s of the residuals, radians.
-        shares: (W,) fractions w of image points with a correspondence, or (k, 1, W).
-        even: Assume that unrelated image points fall evenly over the view instead of with the density of `directions`.
+    Directions (n, 3) are NaN for points that are not seen, the scales (S,) s in radians, the shares w (W,) or (k, 1,
+    W). If `even`, unrelated image points are assumed to fall evenly over the view instead of with the density of the
+    directions.
     """
     image = problem.image
     predicted, smooth, inside, every = _sums(problem, directions, scales, even)
@@ -304,14 +266,8 @@ def point_evidence(problem: Problem, directions: Array, scales: Array, shares: A
 def _sums(problem: Problem, directions: Array, scales: Array, even: bool) -> tuple[Array, Array, Array, Array]:
     """Sum kernels and counts over the possible correspondences of each chosen image point.
 
-    Args:
-        problem: Points of the problem, with k chosen image points.
-        directions: (n, 3) directions in which the scene points are seen; NaN for those that are not.
-        scales: (S,) standard deviations of the kernels, radians.
-        even: Leave the outline out.
-
-    Returns:
-        Kernels (k, S); density of the outline (k,), 0 if `even`; number in view (k,) and of all (k,).
+    Return kernels (k, S) of the standard deviations `scales` (S,), radians; the density (k,) of the outline, 0 if
+    `even`; and the numbers (k,) in view and of all. Directions (n, 3) are NaN for points that are not seen.
     """
     image, count = problem.image, len(problem.image.chosen)
     weight = np.ones(len(directions)) if problem.scores3d is None else problem.scores3d / problem.scores3d.mean()
@@ -360,9 +316,8 @@ def _sums_of_pairs(
 def _partners(problem: Problem, weight: Array) -> Iterator[tuple[Labels, Labels, Array, Array]]:
     """Iterate over groups of possible correspondences: one per label, or all points once per class.
 
-    Yields:
-        Indices (k,) of chosen image points and (n,) of scene points. Probabilities of the class for the image points
-        (k,), and for the scene points times their weight (n,); they are 1 without classes.
+    Yield indices (k,) of chosen image points and (n,) of scene points, and probabilities of the class for the image
+    points (k,), and for the scene points times their weight (n,); they are 1 without classes.
     """
     chosen, n = problem.image.chosen, len(weight)
     if problem.odds2d is None or problem.classes3d is None:

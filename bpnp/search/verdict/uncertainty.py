@@ -43,13 +43,8 @@ FOCAL_CHANCE = 0.01  # significance level of a test for another focal length [pr
 def error_bounds(problem: Problem, linear: "Linearised | None", count: float) -> tuple[float, float]:
     """Return the 99.9 % bounds of the rotation error and of the relative error of the focal length.
 
-    Args:
-        problem: Points of the problem.
-        linear: Pose from `linearised` with the standard deviation of the residuals; None gives infinite bounds.
-        count: Number of matches that the standard deviation was estimated from.
-
-    Returns:
-        Bound of the rotation in radians, see `exceeded_once`; bound of the focal length as a fraction, 0 if given.
+    The rotation's is in radians (`exceeded_once`), the focal length's a fraction, 0 if given; infinite without a
+    linearised pose. The scale of the residuals was estimated from `count` matches.
 
     >>> import numpy as np
     >>> rng = np.random.default_rng(0)
@@ -72,9 +67,7 @@ def error_bounds(problem: Problem, linear: "Linearised | None", count: float) ->
 def is_redundant(problem: Problem, count: float) -> bool:
     """Return whether a pose stays overdetermined without one of its matches.
 
-    Args:
-        problem: Points of the problem; `problem.fitted` is the number of unknowns.
-        count: Expected number of matches. Each one gives two equations.
+    Each match gives two equations for the unknowns, `problem.fitted`.
 
     >>> problem = Problem(np.eye(3), np.eye(3))
     >>> [is_redundant(problem, count) for count in (4.0, 4.9)]
@@ -86,12 +79,8 @@ def is_redundant(problem: Problem, count: float) -> bool:
 def share_bound(covariance: Array, free: float) -> float:
     """Return the 99.9 % bound of the relative error of a positive number.
 
-    Args:
-        covariance: (1, 1) variance of the logarithm of the number.
-        free: Degrees of freedom with which the scale of the residuals was estimated.
-
-    Returns:
-        Bound as a fraction; infinite if the number is not determined.
+    It is a fraction, from the variance (1, 1) of the logarithm of the number; infinite if the number is not determined.
+    `free` are the degrees of freedom with which the scale of the residuals was estimated.
     """
     with np.errstate(over="ignore"):
         return float(np.expm1(exceeded_once(covariance, free)))
@@ -100,14 +89,11 @@ def share_bound(covariance: Array, free: float) -> float:
 def exceeded_once(covariance: Array, free: float) -> float:
     """Return the length that a vector of this covariance exceeds once in a thousand.
 
-    Args:
-        covariance: (3, 3), or (1, 1) for a number.
-        free: Degrees of freedom with which the scale of the residuals was estimated; infinite length if none.
-
-    The square of its length has the cumulants tr C, 2 tr C^2 and 8 tr C^3. The variable a + (b / d) x has the same:
-    x is chi-squared with d = (tr C^2)^3 / (tr C^3)^2 degrees of freedom, b^2 = d tr C^2 and a = tr C - b (Buckley and
+    The square of its length has the cumulants tr C, 2 tr C^2 and 8 tr C^3. The variable a + (b / d) x has the same: x
+    is chi-squared with d = (tr C^2)^3 / (tr C^3)^2 degrees of freedom, b^2 = d tr C^2 and a = tr C - b (Buckley and
     Eagleson 1988). A single loose axis gives d = 1, equal ones d = 3. As the scale of the residuals was estimated with
-    `free` degrees of freedom, the bound of the square is a and b times the quantiles of F with them.
+    `free` degrees of freedom, the bound of the square is a and b times the quantiles of F with them. It is infinite
+    without a degree of freedom.
 
     Source: M. J. Buckley, G. K. Eagleson, An approximation to the distribution of quadratic forms in normal random
     variables, Australian J. Statistics 1988.
@@ -125,10 +111,8 @@ def exceeded_once(covariance: Array, free: float) -> float:
 def is_within(error: Array, covariance: Array, free: float | int) -> bool:
     """Return whether an error lies in the 99.9 % region of a covariance.
 
-    Args:
-        error: (d,) error of some of the fitted parameters.
-        covariance: (d, d) of `pose_covariance`, widened for few residuals. The widening is undone: F allows for it.
-        free: Degrees of freedom with which the scale of the residuals was estimated.
+    The covariance (d, d) is that of `pose_covariance`, widened for few residuals. The widening is undone: F allows for
+    it.
 
     >>> is_within(np.array([3.0]), np.eye(1), MANY), is_within(np.array([3.4]), np.eye(1), MANY)
     (True, False)
@@ -145,14 +129,8 @@ def pose_covariance(problem: Problem, linear: "Linearised | None", count: float)
 
     It is the covariance of (w, v). The true pose is R' = exp([w]x) R, t' = t + v, with w in radians in the camera's
     axes and v in the user's unit. It is `local_covariance`, widened by `student_factor` because the scale is estimated.
-
-    Args:
-        problem: Points of the problem.
-        linear: Pose from `linearised`, or None.
-        count: Number of matches that the scale of the residuals was estimated from.
-
-    Returns:
-        (6, 6), or (7, 7) with the logarithm of a fitted focal length; None if the points do not fix the pose.
+    It is (6, 6), or (7, 7) with the logarithm of a fitted focal length; None if the points do not fix the pose. The
+    scale was estimated from `count` matches.
     """
     covariance = local_covariance(linear)
     if covariance is None or linear is None:
@@ -167,10 +145,8 @@ def pose_covariance(problem: Problem, linear: "Linearised | None", count: float)
 def centre_covariance(covariance: Array, translation: Array, scale: float | None = None) -> Array:
     """Return the covariance (3, 3) of the camera centre in the camera's axes: of v + t x w for a pose's (w, v).
 
-    Args:
-        covariance: Covariance of the pose; parameters beyond those used here are ignored.
-        translation: (3,) of the point about which the pose rotates: t for the scene's origin.
-        scale: Scale of a centre -R^T t / scale; `covariance` has its error as the seventh parameter. None: no scale.
+    t is the translation (3,) of the point about which the pose rotates, the scene's origin. If the centre is -R^T t /
+    scale, the seventh parameter of the covariance is the error of the scale.
     """
     moved = np.concatenate([crossed(translation), np.eye(3)], 1)
     if scale is not None:
@@ -182,14 +158,14 @@ def centre_covariance(covariance: Array, translation: Array, scale: float | None
 def local_covariance(linear: "Linearised | None") -> Array | None:
     """Return the covariance of the rotation w and the shift of the scene centroid, for noise of `linear.scale`.
 
-    Image point i corresponds to scene point j with the probability p_ij. J_ij is the derivative of the direction u_j
-    by the rotation and the shift. With the scores g_ij = J_ij^T (f_i - u_j) / s^2 and g_i = sum_j p_ij g_ij, the
-    observed information is (Louis 1982)
+    Image point i corresponds to scene point j with the probability p_ij. J_ij is the derivative of the direction u_j by
+    the rotation and the shift. With the scores g_ij = J_ij^T (f_i - u_j) / s^2 and g_i = sum_j p_ij g_ij, the observed
+    information is (Louis 1982)
 
         H = sum_ij p_ij (J_ij^T J_ij / s^2 - g_ij g_ij^T) + sum_i g_i g_i^T + that of the prior:
 
-    where scene points lie as close as the residuals, the information lost to uncertain correspondences is subtracted.
-    A prior of the pose counts as a further measurement. The jackknife
+    where scene points lie as close as the residuals, the information lost to uncertain correspondences is subtracted. A
+    prior of the pose counts as a further measurement. The jackknife
 
         sum_i d_i d_i^T,  d_i = (H - H_i)^-1 g_i,  H_i the part of image point i in H,
 
@@ -197,22 +173,20 @@ def local_covariance(linear: "Linearised | None") -> Array | None:
     without image point i. Let H^-1 = L L^T. The larger of both matrices is taken along each of the common axes, the
     eigenvectors of L^-1 (sum_i d_i d_i^T) L^-T.
 
-    H is not positive definite if image points between two correspondences outweigh the others. Half the variance s^2
-    is then used, at which fewer points have two, and the result is doubled.
+    H is not positive definite if image points between two correspondences outweigh the others. Half the variance s^2 is
+    then used, at which fewer points have two, and the result is doubled.
 
     Sources: T. A. Louis, Finding the observed information matrix when using the EM algorithm, J. R. Stat. Soc. B 1982;
     J. G. MacKinnon, H. White, Some heteroskedasticity-consistent covariance matrix estimators with improved finite
     sample properties, J. Econometrics 1985; B. Efron, C. Stein, The jackknife estimate of variance, Annals of
     Statistics 1981.
 
-    With an unknown focal length, the jackknife leaves out blocks of neighbouring image points. Errors of the lens
-    model and of the map are similar for neighbours, and they add up in the focal length. The radial coefficient
-    is eliminated. Its expected standard deviation counts as a prior unless it was fitted. The principal point,
-    tangential distortion and the second radial coefficient are not fitted. What their errors move is added, as far as
-    the residuals leave them open (`bpnp.search.verdict.covariance`).
-
-    Returns:
-        (6, 6), or (7, 7) with the logarithm of a fitted focal length; None if the points do not fix the pose.
+    With an unknown focal length, the jackknife leaves out blocks of neighbouring image points. Errors of the lens model
+    and of the map are similar for neighbours, and they add up in the focal length. The radial coefficient is
+    eliminated. Its expected standard deviation counts as a prior unless it was fitted. The principal point, tangential
+    distortion and the second radial coefficient are not fitted. What their errors move is added, as far as the
+    residuals leave them open (`bpnp.search.verdict.covariance`). It is (6, 6), or (7, 7) with the logarithm of a fitted
+    focal length; None if the points do not fix the pose.
     """
     return None if linear is None else linear.covariance
 
@@ -244,10 +218,6 @@ def _blocks(problem: Problem, matched: Array) -> Labels:
     """Return the block (k,) of each chosen image point; the blocks have equal expected matches.
 
     There are at most `BLOCKS`^2.
-
-    Args:
-        problem: Points.
-        matched: (k,) probability that an image point has a match.
     """
     x, y = ((problem.bearings[problem.image.chosen] - problem.image.centre) @ problem.image.axes).T
     column, row = _quantile(x, matched), np.zeros(len(x), np.int64)
@@ -267,29 +237,17 @@ def _quantile(values: Array, weights: Array) -> Labels:
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """A pose and its k possible matches in one camera, linearised in the unknowns.
-
-    Attributes:
-        problem: Points of the camera.
-        model: The p unknowns.
-        state: The pose.
-        image: (k,) indices into the chosen image points.
-        probability: (k,) of each match.
-        sight: The k scene points as the camera sees them.
-        residual: (k, 3) of the image points, in units of `scale`.
-        jacobian: (k, 3, p) derivatives of the directions by the unknowns, in units of `scale`.
-        scale: Standard deviation of the residuals, radians.
-    """
+    """A pose and its k possible matches in one camera, linearised in the unknowns."""
 
     problem: Problem
     model: PoseModel
     state: PoseState
-    image: Labels
-    probability: Array
-    sight: Sight
-    residual: Array
-    jacobian: Array
-    scale: float
+    image: Labels  # (k,) indices into the chosen image points
+    probability: Array  # (k,) of each match
+    sight: Sight  # the k scene points as the camera sees them
+    residual: Array  # (k, 3) of the image points, in units of `scale`
+    jacobian: Array  # (k, 3, p) derivatives of the directions by the unknowns, in units of `scale`
+    scale: float  # standard deviation of the residuals, radians
 
     @cached_property
     def covariance(self) -> Array | None:
@@ -305,14 +263,7 @@ class Linearised:
 def linearised(problem: Problem, rotation: Array, translation: Array, scale: float) -> Linearised | None:
     """Linearise a pose of one camera and its possible matches.
 
-    Args:
-        problem: Points of the problem.
-        rotation: (3, 3) of the pose.
-        translation: (3,) of the pose.
-        scale: Standard deviation of the residuals, radians; the points of a match are within a few of it.
-
-    Returns:
-        The linearised pose, or None if there is no match.
+    The points of a match are within a few standard deviations `scale`, radians; None without a match.
     """
     model = PoseModel.of(problem)
     return linearise(model, problem, model.state(rotation, translation), scale)
@@ -321,15 +272,7 @@ def linearised(problem: Problem, rotation: Array, translation: Array, scale: flo
 def linearise(model: PoseModel, problem: Problem, state: PoseState, scale: float, camera: int = 0) -> Linearised | None:
     """Linearise the possible matches of one camera in the unknowns of a model.
 
-    Args:
-        model: Unknowns.
-        problem: Points of the camera.
-        state: The pose.
-        scale: Standard deviation of the residuals, radians.
-        camera: Index of the camera in a rig.
-
-    Returns:
-        The linearised pose, or None if there is no match.
+    The residuals have the standard deviation `scale`, radians; None without a match.
     """
     found = soft_matches(model, problem, state, scale, camera=camera)
     if found is None:
@@ -341,19 +284,12 @@ def linearise(model: PoseModel, problem: Problem, state: PoseState, scale: float
 
 
 class Misfit(NamedTuple):
-    """Change of a pose when parameters of the camera or the scene are fitted with it.
+    """Change of a pose when parameters of the camera or the scene are fitted with it."""
 
-    Attributes:
-        turn: Rotation of the pose, radians.
-        shift: Shift of the scene centroid, in distances from the camera.
-        zoom: Fitted focal length over the given one; 1 if the given one fits.
-        radial: Radial coefficient; 0 without radial distortion.
-    """
-
-    turn: float
-    shift: float
-    zoom: float = 1.0
-    radial: float = 0.0
+    turn: float  # rotation of the pose, radians
+    shift: float  # shift of the scene centroid, in distances from the camera
+    zoom: float = 1.0  # fitted focal length over the given one; 1 if the given one fits
+    radial: float = 0.0  # radial coefficient; 0 without radial distortion
 
 
 def systematic_misfit(linear: Linearised | None, count: float) -> Misfit:
@@ -365,10 +301,6 @@ def systematic_misfit(linear: Linearised | None, count: float) -> Misfit:
     - The log of the focal length is fitted and tested likewise (level `FOCAL_CHANCE`, 0.01). The
       correspondences of the pose bias it towards the given one; `bpnp.search.verdict.rivals.lens` fits a
       significant one with new ones.
-
-    Args:
-        linear: Pose from `linearised`, or None for no change.
-        count: Number of matches.
 
     >>> import numpy as np
     >>> rng = np.random.default_rng(0)
@@ -405,11 +337,7 @@ def systematic_misfit(linear: Linearised | None, count: float) -> Misfit:
 def bends_significantly(linear: Linearised | None, count: float) -> bool:
     """Return whether radial distortion explains the residuals of a pose significantly better than a focal length.
 
-    An F test of the radial coefficient at the level `focal_chance`, with pose and focal length eliminated.
-
-    Args:
-        linear: The pose and its possible matches.
-        count: Number of matches.
+    An F test of the radial coefficient at the level `FOCAL_CHANCE`, with pose and focal length eliminated.
     """
     if linear is None or not (linear.problem.bearings[:, 2] > 0).all():
         return False
@@ -426,15 +354,9 @@ def bends_significantly(linear: Linearised | None, count: float) -> bool:
 def _moved(products: Array, pose: Array, fitted: slice, free: float, chance: float) -> tuple[Array, Array]:
     """Fit parameters to the residuals together with the pose, and keep the significant directions.
 
-    Args:
-        products: Inner products of the columns; the first six are the pose's, the last one holds the residuals.
-        pose: (6, 6) inverse of the products of the pose.
-        fitted: Columns of the fitted parameters.
-        free: Number of measurements less the six of the pose.
-        chance: Significance level.
-
-    Returns:
-        Step (6,) of the pose and step of the fitted parameters.
+    The first six columns of the inner products are the pose's, the last one holds the residuals. `pose` (6, 6) is the
+    inverse of the products of the pose, `free` the number of measurements less the six of the pose. Return the step
+    (6,) of the pose and that of the fitted parameters.
     """
     across = pose @ products[:POSE, fitted]
     values, directions = np.linalg.eigh(products[fitted, fitted] - products[fitted, :POSE] @ across)

@@ -50,15 +50,10 @@ Array = NDArray[np.float64]
 def lens(case: Case, *, scene_of: SceneOf, deadline: Deadline = NEVER) -> Case:
     """Return a case, with the objection of another lens with which a different pose fits better than the best one.
 
-    The given camera is accepted unless another lens has fewer false alarms by the factor `focal_chance`, with focal
+    The given camera is accepted unless another lens has fewer false alarms by the factor `FOCAL_CHANCE`, with focal
     length and radial coefficient counted as unknowns. The lens is fitted from the best pose. If three matches may be
     coincidences, it is also fitted from the likeliest pose at other focal lengths. If the time limit prevents this, the
-    objection reports it.
-
-    Args:
-        case: Case whose leader has no objection.
-        scene_of: Function that returns the scene, whose settings and deadline are used.
-        deadline: Deadline of the scene.
+    objection reports it. The leader of the case has no objection.
     """
     return case.against(_other_lens(case, scene_of, deadline))
 
@@ -103,9 +98,7 @@ def _other_lens(case: Case, scene_of: SceneOf, deadline: Deadline) -> Objection 
 def fitted_lens(linear: Linearised | None, misfit: Misfit) -> Objection | None:
     """Return a focal length that the residuals of a pose support significantly, if its pose is a different one.
 
-    Args:
-        linear: Pose of a given camera from `linearised`, at the standard deviation of its residuals; or None.
-        misfit: Its change by its residuals, from `systematic_misfit`.
+    The pose of the given camera is linearised at the standard deviation of its residuals.
     """
     if linear is None or misfit.zoom == 1:
         return None
@@ -117,26 +110,17 @@ def fitted_lens(linear: Linearised | None, misfit: Misfit) -> Objection | None:
 def misfit_of(rotation: Array, centre: Array, other: LensFit) -> Misfit:
     """Return the difference between a pose and the pose of another lens.
 
-    Args:
-        rotation: (3, 3) of the pose.
-        centre: (3,) scene centroid in its camera's frame.
-        other: Fitted lens with its pose.
+    `centre` (3,) is the scene centroid in the camera's frame of the pose.
     """
     shift = float(np.linalg.norm(other.centre3d - centre)) / max(float(np.linalg.norm(centre)), 1e-300)
     return Misfit(rotation_angle(rotation, other.rotation), shift, other.zoom, other.radial or 0.0)
 
 
 class AtZoom(NamedTuple):
-    """A hypothesis at another focal length.
+    """A hypothesis at another focal length."""
 
-    Attributes:
-        zoom: Focal length over the given one.
-        problem: Points of the problem at this focal length.
-        pose: One hypothesis.
-    """
-
-    zoom: float
-    problem: Problem
+    zoom: float  # focal length over the given one
+    problem: Problem  # points of the problem at this focal length
     pose: Hypotheses
 
     @property
@@ -154,10 +138,6 @@ def likeliest_zoom(start: AtZoom, scene: SearchFrame) -> AtZoom:
     """Return the likeliest pose at other focal lengths.
 
     One step is tried to either side. The likelier side is followed while the likelihood grows.
-
-    Args:
-        start: Pose at the given focal length.
-        scene: SearchFrame whose settings and deadline are used.
     """
     steps = [(step, search_at_zoom(start, step, scene)) for step in (1 / ZOOM_STEP, ZOOM_STEP)]
     step, best = max(steps, key=lambda one: one[1].likelihood)
@@ -173,11 +153,6 @@ def search_at_zoom(found: AtZoom, zoom: float, scene: SearchFrame) -> AtZoom:
     """Return the likeliest pose at `zoom` times the focal length of a given one, or the given one after the deadline.
 
     The search starts from the pose that shows the scene at the same size.
-
-    Args:
-        found: Pose at its focal length.
-        zoom: Factor on this focal length.
-        scene: SearchFrame whose settings and deadline are used.
     """
     if scene.deadline.passed():
         return found

@@ -22,13 +22,9 @@ HIDING = 0.8  # [fraction; calibration]
 def symmetries(case: Case, *, scene_of: SceneOf, deadline: Deadline = NEVER, enumerated: bool = False) -> Case:
     """Return a case with the competing poses of a repeated structure.
 
-    If the deadline passes before all of them are refined, this is the objection.
-
-    Args:
-        case: Case whose leader has no objection.
-        scene_of: Function that returns the scene for refinements; it is called only if one is needed.
-        deadline: Deadline of the scene, after whose end nothing more is tested.
-        enumerated: True if the poses are among the candidates already.
+    If the deadline passes before all of them are refined, this is the objection. The leader has no objection. The scene
+    is made only if a refinement needs it, and nothing is tested after the end of the deadline. Poses of an enumeration
+    are among the candidates already.
     """
     if deadline.ended(Unfinished.competing_poses):
         return case.against(objection("untested"))
