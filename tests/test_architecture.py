@@ -11,6 +11,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 GROUND = {
     "argument_types",
     "arrays",
+    "matching",
     "types",
     "geometry",
     "poses",

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from bpnp.arrays import Array, PoseArrays
 from bpnp.maps.photo_problem import Photo
 from bpnp.maps.viewed_points import Region
+from bpnp.matching import count_one_to_one
 from bpnp.poses import SAME, rotation_angle, same_pose
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
 from bpnp.search.assemble import Solved, candidates_of
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
 from bpnp.search.kernels.density_map import DensityMap
-from bpnp.search.matching import count_one_to_one
 from bpnp.search.problem import Problem
 from bpnp.search.propose.density_map import LOCAL, search_around, search_near
 from bpnp.search.propose.repetitions import repeated_poses, repetition_margins

@@ -8,9 +8,9 @@ from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from bpnp.cameras import check_single_camera, in_front
+from bpnp.matching import mutual_nearest
 from bpnp.report.figures import plot_matches
 from bpnp.report.points import ProblemPoints
 from bpnp.report.terminal import VERDICTS
@@ -68,15 +68,10 @@ def competing_points(solution: Solution, points: ProblemPoints) -> ProblemPoints
     other = solution.candidates[1]
     pose = other.rotation, other.translation / other.scale
     projected, seen = in_front(points.points3d @ pose[0].T + pose[1])[:, :2], points.points2d
-    ahead, known = (np.flatnonzero(np.isfinite(side).all(-1)) for side in (projected, seen))
-    assigned = np.full(len(projected), -1, np.int32)
-    if len(ahead) and len(known):
-        reach = solution.inlier_threshold / (1.0 if solution.camera is None else solution.camera.focal)
-        distance, nearest = cKDTree(seen[known]).query(projected[ahead], distance_upper_bound=reach)
-        back = cKDTree(projected[ahead]).query(seen[known])[1]
-        mutual = np.flatnonzero(np.isfinite(distance))
-        mutual = mutual[back[nearest[mutual]] == mutual]
-        assigned[ahead[mutual]] = known[nearest[mutual]]
+    known, assigned = np.flatnonzero(np.isfinite(seen).all(-1)), np.full(len(projected), -1, np.int32)
+    reach = solution.inlier_threshold / (1.0 if solution.camera is None else solution.camera.focal)
+    i, j = mutual_nearest(seen[known], projected, reach).T
+    assigned[j] = known[i]
     title = f"next candidate: {other.inlier_count} matches"
     return replace(points, id=title, assigned3d=assigned, estimates={"next candidate": pose})
 

@@ -9,10 +9,11 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.matching import DENSE_MATCHES, count_one_to_one, one_to_one
 from bpnp.runtime import NEVER, Deadline
 from bpnp.search.hypotheses import Hypotheses
-from bpnp.search.matching import count_one_to_one, fit_to_matches, one_to_one
-from bpnp.search.possible_matches import DENSE_MATCHES, MATCH_REACH
+from bpnp.search.match_fit import fit_to_matches
+from bpnp.search.possible_matches import MATCH_REACH
 from bpnp.search.problem import Problem
 from bpnp.search.solution import FOCAL_LENGTH, POSE_PARAMETERS, Candidate, Solution, SolutionStats
 from bpnp.search.verdict.decide import Case, SearchResult, Verdict, decide

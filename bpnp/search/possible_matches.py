@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bpnp.matching import DENSE_MATCHES, FEW_NEIGHBOURS
 from bpnp.search.problem import Problem, faces
 from bpnp.search.settings import OUTLIERS
 
@@ -16,9 +17,7 @@ MATCH_REACH = 3.0  # [scales of the residuals; convention]
 # Distance within which a scene point counts as a possible correspondence in a weighted fit, where each counts by its
 # likelihood; beyond, it is below e^-8.
 FARTHEST_MATCH = 4.0  # [scales of the residuals; derived]
-FEW_NEIGHBOURS = 8  # number of nearest scene points of an image point that are tried first [points; cost]
 MOST_NEIGHBOURS = 64  # number that is tried if all of the few are in reach [points; cost]
-DENSE_MATCHES = 4096  # number of possible matches up to which all distances are computed [matches; cost]
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]

@@ -12,12 +12,11 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
-from bpnp import Solution, solve, solve_many, verify
+from bpnp import Solution, matching, solve, solve_many, verify
+from bpnp.matching import POINTS_A_CHECK, count_one_to_one, one_to_one
 from bpnp.runtime import Clock, Deadline
-from bpnp.search import matching
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.inputs import problem_from
-from bpnp.search.matching import POINTS_A_CHECK, count_one_to_one, one_to_one
 from bpnp.search.problem import Problem
 from bpnp.search.refine import annealing
 from bpnp.search.search_frame import SearchFrame
@@ -77,9 +76,9 @@ def test_matching_stops_at_the_limit(clock: MovedClock, monkeypatch: pytest.Monk
     monkeypatch.setattr(matching, "cKDTree", CountedTree)
     monkeypatch.setattr(CountedTree, "looked_up", 0)
     clock.stop_at("search.plan.multistart", after=True)
-    assignments = clock.count_late("search.matching.min_weight_full_bipartite_matching")
-    maxima = clock.count_late("search.matching.maximum_bipartite_matching")
-    fits = clock.count_late("search.matching.fit_pose")
+    assignments = clock.count_late("matching.min_weight_full_bipartite_matching")
+    maxima = clock.count_late("matching.maximum_bipartite_matching")
+    fits = clock.count_late("search.match_fit.fit_pose")
     solution = solve(rng.uniform(-0.5, 0.5, (8000, 2)), rng.normal(size=(8000, 3)), solver="search", time_limit=5)
     assert solution.found
     assert not assignments
@@ -200,7 +199,7 @@ def test_a_rig_compares_no_pose_after_the_limit(clock: MovedClock) -> None:
     rig = [(np.eye(3), np.zeros(3)), (np.eye(3), np.array([0.5, 0, 0]))]
     clock.stop_at("search.loop.contest")
     proposals = clock.count_late("search.rig.search.repeated_poses")
-    assignments = clock.count_late("search.matching.min_weight_full_bipartite_matching")
+    assignments = clock.count_late("matching.min_weight_full_bipartite_matching")
     solution = solve([pixels, second], points, K, rig=rig)
     assert not proposals
     assert not assignments

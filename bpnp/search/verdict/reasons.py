@@ -3,6 +3,8 @@
 import math
 from typing import NamedTuple
 
+from bpnp import matching
+
 SHOWN_DECADES = 0.05  # logarithm of a number of false alarms below which 0.0 is shown [decades; convention]
 
 MIRRORED = "the mirror image of the scene has a significant pose: check the directions of its axes"
@@ -52,7 +54,7 @@ class Unfinished:
     focal_lengths = "focal lengths"
     competing_poses = "competing poses"
     views = "views"
-    matches = "matches"
+    matches = matching.UNFINISHED
 
 
 TESTS = {Unfinished.competing_poses, Unfinished.focal_lengths}  # stages without which no pose is confident

@@ -1,4 +1,4 @@
-"""One-to-one matches of two point sets in the image, and the pose that fits them best."""
+"""One-to-one matches of two sets of points in the image, and their mutual nearest neighbours."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -13,75 +13,34 @@ from scipy.sparse.csgraph import (
 )
 from scipy.spatial import cKDTree
 
-from bpnp.poses import MIN_POINTS
+from bpnp.arrays import Array, Integers
 from bpnp.runtime import NEVER, Clock, Deadline
-from bpnp.search.arguments import Array, Labels
-from bpnp.search.pose_model import PoseModel
-from bpnp.search.possible_matches import DENSE_MATCHES, FEW_NEIGHBOURS
-from bpnp.search.problem import Problem
-from bpnp.search.refine.gauss_newton import FIRST_DAMPING, Iteration, image_equations, refine
-from bpnp.search.verdict.covariance import FAR_SQUARED
-from bpnp.search.verdict.reasons import Unfinished
 
+FEW_NEIGHBOURS = 8  # number of nearest neighbours of a point that are tried first [points; cost]
+DENSE_MATCHES = 4096  # number of possible matches up to which all distances are computed [matches; cost]
 # Number of points whose neighbours are looked up, or that are assigned, between two checks of the deadline.
 POINTS_A_CHECK = 5000  # [points; cost]
 # Time of an optimal assignment, over the product of its numbers of points and of possible matches. With less time left,
 # points get their mutual nearest neighbours.
 ASSIGNMENT_SECONDS = 1e-9  # [seconds; cost]
 COUNTING_SECONDS = 2e-6  # time of a maximum matching, over its number of possible matches [seconds; cost]
-FIT_ROUNDS = 5  # rounds of the last fit, each with new matches [rounds; not tuned]
-MOST_STEPS = 50  # largest number of steps of Levenberg and Marquardt [steps; numerics]
-EXACT_CHANGE = 1e-12  # relative change of a pose, and of the sum of squares, that ends the steps [ratio; numerics]
+UNFINISHED = "matches"  # stage that a deadline notes if it cuts the matching short
 
-Allowed = Callable[[Labels, Labels], NDArray[np.bool_]]
-
-
-def fit_to_matches(
-    problem: Problem, rotation: Array, translation: Array, threshold: float, deadline: Deadline
-) -> tuple[Array, Array]:
-    """Fit the pose to mutual nearest neighbours by least squares; keep the search's pose unless the fit is better.
-
-    The difference must be significant. The search weights all matches by their probability. This is the better estimate
-    unless its float32 steps were too coarse for the data. At an optimum of the same precision n log(S / S_min), S the
-    sum of n squared residuals, is distributed as chi-squared with 6 degrees of freedom.
-    """
-    image = problem.measured.points
-    for _ in range(FIT_ROUNDS):
-        if deadline.ended(Unfinished.refinement):
-            break
-        projected = problem.project_scene(rotation, translation)
-        i, j = mutual_nearest(image, projected, threshold, problem.may_match, deadline).T
-        if len(i) < MIN_POINTS:
-            break
-        target, points = image[i], problem.points3d[j]
-        trial = fit_pose(problem.measured.project, points, target, rotation, translation, scale=threshold)
-        after = problem.measured.project(points @ trial[0].T + trial[1])
-        squares = [float(((each - target) ** 2).sum()) for each in (projected[j], after)]
-        if not squares[0] > squares[1] * math.exp(FAR_SQUARED / target.size):
-            break
-        rotation, translation = trial
-    return rotation, translation
+Allowed = Callable[[Integers, Integers], NDArray[np.bool_]]
 
 
 def one_to_one(
     image: Array, projected: Array, radius: float, allowed: Allowed | None = None, deadline: Deadline = NEVER
-) -> Labels:
+) -> Integers:
     """Return a maximum one-to-one matching of image points and projected points within a radius (paper Eq. 1).
 
-    The matches (i, j) satisfy |image_i - projected_j| <= radius, and no point is in two of them. Among the maximum
-    matchings it has the least sum of squared distances. It is a minimum-weight matching in which an unmatched image
-    point costs more than all distances together. Points that share no possible match are assigned separately. With many
-    points only the `FEW_NEIGHBOURS` nearest neighbours of each are edges.
+    The matches (i, j), indices (k, 2) ordered by i, satisfy |image_i - projected_j| <= radius, and no point is in two
+    of them. Among the maximum matchings it has the least sum of squared distances. It is a minimum-weight matching in
+    which an unmatched image point costs more than all distances together. Points that share no possible match are
+    assigned separately. With many points only the `FEW_NEIGHBOURS` nearest neighbours of each are edges.
 
-    Args:
-        image: (m, 2) image points.
-        projected: (n, 2) projected points; a NaN point has no match.
-        radius: Largest distance of a match.
-        allowed: Returns which indices i and j may match; None for all.
-        deadline: Deadline; points for whose assignment no time is left get their mutual nearest neighbours.
-
-    Returns:
-        Indices (k, 2), ordered by i.
+    A projected NaN has no match; `allowed` tells which indices i and j may match. Points for whose assignment no time
+    is left get their mutual nearest neighbours.
     """
     matches, distance = _near(image, projected, radius, allowed, deadline)
     chosen = [matches[:0]]
@@ -95,7 +54,7 @@ def count_one_to_one(
     image: Array, projected: Array, radius: float, allowed: Allowed | None = None, deadline: Deadline = NEVER
 ) -> int:
     """Return the number of matches of `one_to_one`, by a maximum matching, which is faster than one of least cost."""
-    if deadline.ended(Unfinished.matches):
+    if deadline.ended(UNFINISHED):
         return 0
     matches, distance = _near(image, projected, radius, allowed, deadline)
     if all(np.bincount(side).max(initial=0) <= 1 for side in matches.T):
@@ -106,14 +65,11 @@ def count_one_to_one(
     return int((maximum_bipartite_matching(graph, perm_type="column") >= 0).sum())
 
 
-def _components(matches: Labels, count: int) -> Iterator[Labels | slice]:
+def _components(matches: Integers, count: int) -> Iterator[Integers | slice]:
     """Yield the indices of the possible matches (e, 2) of points that share none with others, in groups.
 
-    A group has one component, or several with together at most `POINTS_A_CHECK` matches.
-
-    Args:
-        matches: Indices of `count` image points and of scene points.
-        count: Number of image points.
+    A group has one component, or several with together at most `POINTS_A_CHECK` matches. `count` is the number of image
+    points.
     """
     if len(matches) <= POINTS_A_CHECK:
         yield slice(None)
@@ -133,7 +89,7 @@ def _components(matches: Labels, count: int) -> Iterator[Labels | slice]:
         first = last
 
 
-def _assigned(matches: Labels, distance: Array, radius: float, deadline: Deadline) -> Labels:
+def _assigned(matches: Integers, distance: Array, radius: float, deadline: Deadline) -> Integers:
     """Return the maximum matching with the least squared distances among possible matches (e, 2), in any order."""
     alone = np.logical_and(*(np.bincount(side)[side] == 1 for side in matches.T)) if len(matches) else np.ones(0, bool)
     if alone.all():
@@ -157,18 +113,18 @@ def _is_too_long(seconds: float, deadline: Deadline) -> bool:
     """Return whether an assignment, which cannot be interrupted, would end after the end of a deadline; note this."""
     if Clock.now() + seconds < deadline.final:
         return False
-    deadline.unfinished.add(Unfinished.matches)
+    deadline.unfinished.add(UNFINISHED)
     return True
 
 
 def mutual_nearest(
     image: Array, projected: Array, radius: float, allowed: Allowed | None = None, deadline: Deadline = NEVER
-) -> Labels:
+) -> Integers:
     """Return the mutual nearest neighbours within `radius`: fewer matches than `one_to_one`, and fewer wrong ones."""
     return _mutual(*_near(image, projected, radius, allowed, deadline))
 
 
-def _mutual(matches: Labels, distance: Array) -> Labels:
+def _mutual(matches: Integers, distance: Array) -> Integers:
     """Return those of possible matches (e, 2) that are the nearest ones of both points."""
     nearest = np.ones(len(matches), np.bool_)
     for side in matches.T:
@@ -178,48 +134,9 @@ def _mutual(matches: Labels, distance: Array) -> Labels:
     return matches[nearest]
 
 
-def fit_pose(
-    project: Callable[[Array], Array],
-    points: Array,
-    target: Array,
-    rotation: Array,
-    translation: Array,
-    *,
-    scale: float,
-) -> tuple[Array, Array]:
-    """Fit a pose to matches by least squares, with Levenberg-Marquardt steps from a pose nearby.
-
-    Residuals are those of the image, so that any camera model can be used.
-
-    Args:
-        project: Returns the image points (k, d) of points (k, 3) in the camera's frame.
-        points: (k, 3) scene points.
-        target: (k, d) their image points.
-        rotation: (3, 3) initial rotation.
-        translation: (3,) initial translation.
-        scale: Scale of the residuals; a point that leaves the view has a residual of a thousand times the scale.
-
-    Returns:
-        Rotation (3, 3) and translation (3,).
-    """
-    model = PoseModel(points.mean(0))
-    state = model.state(rotation, translation)
-    relative = np.r_[np.ones(3), np.full(3, max(float(np.linalg.norm(state.centroid)), 1e-12))]
-
-    def settled(last: Iteration) -> bool:
-        return bool(
-            (np.abs(last.step) <= EXACT_CHANGE * relative).all()
-            or np.abs(last.gain) <= EXACT_CHANGE * np.asarray(last.before.cost)
-        )
-
-    linearise = image_equations(model, project, points, target, lost=1e3 * scale)
-    end = refine(model, state, linearise, [scale] * MOST_STEPS, settled=settled, damping=FIRST_DAMPING, adaptive=True)
-    return model.pose(end.state)
-
-
 def _near(
     image: Array, projected: Array, radius: float, allowed: Allowed | None, deadline: Deadline
-) -> tuple[Labels, Array]:
+) -> tuple[Integers, Array]:
     """Return the allowed matches (e, 2) within `radius`, ordered, and their distances; nearest neighbours if many."""
     seen = np.flatnonzero(np.isfinite(projected).all(-1))
     if len(image) * len(seen) <= DENSE_MATCHES:
@@ -236,15 +153,15 @@ def _near(
     return matches, np.linalg.norm(image[matches[:, 0]] - projected[matches[:, 1]], axis=-1)
 
 
-def _neighbours(points: Array, others: Array, radius: float, deadline: Deadline) -> Labels:
+def _neighbours(points: Array, others: Array, radius: float, deadline: Deadline) -> Integers:
     """Return the indices (e, 2) of each point and of its nearest neighbours within `radius`.
 
     Points that are not looked up before the end of a deadline have none.
     """
-    count, tree, found = min(FEW_NEIGHBOURS, len(others)), cKDTree(others), list[Labels]()
+    count, tree, found = min(FEW_NEIGHBOURS, len(others)), cKDTree(others), list[Integers]()
     step = len(points) if math.isinf(deadline.final) else POINTS_A_CHECK
     for first in range(0, len(points), step):
-        if first and deadline.ended(Unfinished.matches):
+        if first and deadline.ended(UNFINISHED):
             break
         distance, index = tree.query(points[first : first + step], range(1, count + 1), distance_upper_bound=radius)
         point, nth = np.nonzero(np.isfinite(distance))
