@@ -38,12 +38,6 @@ PACKAGES = (
     "bpnp",
     *(f"bpnp.{name}" for name in ("datamodules", "layers", "models", "models.baselines", "report", "training")),
 )
-# Folders and files whose docstrings have not been read yet.
-NOT_YET = {
-    "bpnp/search/assemble.py",
-    "bpnp/search/possible_matches.py",
-    "bpnp/search/verdict/reasons.py",
-}
 SECTION = re.compile(r"^ *(Args|Attributes|Returns|Raises|Yields):$", re.MULTILINE)
 # What a configuration names.
 CONFIGURABLE = (
@@ -218,18 +212,10 @@ def sources() -> Iterator[Path]:
         yield from sorted((ROOT / folder).rglob("*.py"))
 
 
-def read_sources() -> Iterator[Path]:
-    """Yield the files that are not in `NOT_YET`."""
-    for file in sources():
-        path = file.relative_to(ROOT)
-        if not {str(each) for each in (path, *path.parents)} & NOT_YET:
-            yield file
-
-
 def test_only_what_a_user_reads_has_sections() -> None:
     """The docstring of anything else is a sentence: an argument is described where the name and type do not."""
     described = described_places()
-    documented = [node for file in read_sources() for node in documented_nodes(file)]
+    documented = [node for file in sources() for node in documented_nodes(file)]
     wrong = [where for where, text in documented if SECTION.search(text) and where not in described]
     assert [where for where in wrong if not where.startswith("tests.commands.test_parser.")] == []  # commands
 
@@ -254,7 +240,7 @@ def test_docstrings_and_comments_name_only_what_exists() -> None:
     """A name in backticks, such as `layers.sinkhorn` or `Pose.stats`, is a name in the code of the package."""
     known = {name for file in sources() for name in identifiers(file)} | FOREIGN
     wrong = []
-    for file in read_sources():
+    for file in sources():
         text = file.read_text(encoding="utf-8")
         tokens = tokenize.generate_tokens(io.StringIO(text).readline)
         prose = [each.string for each in tokens if each.type == tokenize.COMMENT]

@@ -114,15 +114,10 @@ def assembled(
     inlier_threshold: float | None = None,
     deadline: Deadline = NEVER,
 ) -> Solution:
-    """Build the `Solution` of a search.
+    """Build the `Solution` of a search by one camera or those of a rig, whose own run time is added to `seconds`.
 
-    Args:
-        cameras: The camera, or those of a rig.
-        result: Result of the search.
-        seconds: Run time of the search; the run time of this function is added.
-        inlier_threshold: Largest error of an inlier, in the unit of the problem; None for three times the residual
-            scale.
-        deadline: Deadline; after its end, points get their mutual nearest neighbours, and candidates no inliers.
+    The largest error of an inlier is in the unit of the problem, None for three times the residual scale. After the end
+    of the deadline, points get their mutual nearest neighbours, and candidates no inliers.
     """
     start, found, problems = time.perf_counter(), result.candidates, cameras.problems
     solution = _without_pose(cameras, result, inlier_threshold)
@@ -221,11 +216,10 @@ def _with_best(poses: Hypotheses, rotation: Array, translation: Array) -> Hypoth
 def _match(
     cameras: Cameras, found: Hypotheses, thresholds: Sequence[float], deadline: Deadline
 ) -> tuple[NDArray[np.int64], Array, Array, NDArray[np.int64]]:
-    """Match the points of all cameras under the first pose, and count the inliers of each pose.
+    """Match the points of all cameras under the first pose, and count the inliers (c,) of each pose.
 
-    Returns:
-        Indices (k, 2) of the user's points, those of the images over all cameras; errors (k,) in the unit of the
-        problem; angles (k,), radians; and inliers (c,).
+    Matches are indices (k, 2) of the user's points, those of the images over all cameras; with errors (k,) in the unit
+    of the problem and angles (k,), radians.
     """
     matches, errors, angles, before = [], [], [], 0
     counts = np.zeros(len(found), np.int64)

@@ -24,13 +24,7 @@ Labels = NDArray[np.int64]
 
 
 def facing(problem: Problem, camera: Array, rotation: Array) -> Labels:
-    """Return the indices of the scene points that the camera may see.
-
-    Args:
-        problem: Points of the problem, with normals if they are given.
-        camera: (n, 3) scene points in the camera's frame.
-        rotation: (3, 3) of the pose.
-    """
+    """Return the indices of the scene points, (n, 3) in the camera's frame, that the camera may see."""
     used = np.einsum("ki,ki->k", camera, camera) > 0
     if problem.normals3d is not None:
         used &= faces(problem.normals3d, problem.cosines3d, camera, rotation)
@@ -40,21 +34,11 @@ def facing(problem: Problem, camera: Array, rotation: Array) -> Labels:
 def possible_matches(
     problem: Problem, directions: Array, indices: Labels, chosen: Labels, scale: float, most: int = MOST_NEIGHBOURS
 ) -> tuple[Any, Any, Array, Array]:
-    """Return the possible matches of chosen image points and scene points near them.
+    """Return the possible matches of chosen image points (m,) and scene points near them, of fitting labels.
 
-    Points of different labels do not match.
-
-    Args:
-        problem: Points of the problem.
-        directions: (n, 3) unit directions of the scene points.
-        indices: (n,) indices of these scene points.
-        chosen: (m,) indices of the image points.
-        scale: Standard deviation of the residuals, radians.
-        most: Largest number of neighbours of an image point.
-
-    Returns:
-        Index (k,) into `chosen`, index (k,) into `directions` and density (k,) of each match; and the total density
-        (m,) of each image point, which includes that of no correspondence.
+    They are index (k,) into `chosen`, index (k,) into `directions` (n, 3), of the scene points `indices` (n,), and
+    density (k,) of each match; and the total density (m,) of each image point, which includes that of no
+    correspondence. An image point has at most `most` neighbours.
     """
     bearings, reach = problem.bearings[chosen], FARTHEST_MATCH * scale
     if len(bearings) * len(directions) <= DENSE_MATCHES:
@@ -85,17 +69,10 @@ def possible_matches(
 
 
 def score_pose(problem: Problem, rotation: Array, translation: Array, scale: float) -> tuple[float, float]:
-    """Return the mean log-likelihood of the bearings under a pose and the expected number of matches.
+    """Return the mean log-likelihood of the bearings under a pose, nats, and the expected number of matches.
 
-    Args:
-        problem: Points of the problem.
-        rotation: (3, 3) of the pose.
-        translation: (3,) of the pose.
-        scale: Standard deviation s of the residuals, radians.
-
-    Returns:
-        Log-likelihood in nats, in the units of the annealing: the maximum of a kernel is 1 / s^2; -inf if no scene
-        point is seen. Number of matches, at most that of the image points or scene points.
+    It is in the units of the annealing: the maximum of a kernel is 1 / s^2; -inf if no scene point is seen. The number
+    of matches is at most that of the image points or scene points.
     """
     camera, chosen = problem.points3d @ rotation.T + translation, problem.image.chosen
     indices = facing(problem, camera, rotation)

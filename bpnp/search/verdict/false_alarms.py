@@ -1,42 +1,27 @@
 """A-contrario number of false alarms (NFA) of a pose, for 4 points or 10,000.
 
-The NFA is the expected number of poses that fit as well as this one if the image points are unrelated to the scene. It
-counts all poses that could have been tried. Unrelated means: at scales finer than h, half the RMS angular radius of the
-bearings, image point i falls with the density l_i of the projected points around it. A pose that explains it predicts
-the mixture
+docs/verdict.md derives it and defines its letters; lambda is the inlier fraction:
 
-    x_i = 1 - w + w g_i / l_i,    g_i = sum_j N(f_i - u_j; s^2),    l_i = max(sum_j N(f_i - u_j; h^2), n / A)
+    log10 NFA = log10 T - log10 mean_{s, lambda} prod_i x_i^(1 / c_i)
 
-The pose sees scene point j in the direction u_j. N is the normal density on the tangent plane, s the scale of the
-residuals and w the fraction of image points that have a correspondence. The view has n projected points and the solid
-angle A. For unrelated points x_i has the mean 1. The product of the x_i therefore exceeds a bound b with
-a probability of at most 1 / b (Markov), so that
+What that page leaves out:
 
-    log10 NFA = log10 T - log10 mean_{s, w} prod_i x_i^(1 / c_i),
-
-T = 2 (m)_3 (n)_3 / 6 is the number of poses that fit three matches exactly, (m)_3 = m (m - 1) (m - 2). At a scale s
-with fewer distinguishable poses, T is their number (`PoseModel.log10_cells`). The three largest x_i are left out, for
-any c_i: three matches fix the six degrees of freedom and are no evidence. c_i is the number of image points within 2 s
-of point i: keypoints that lie together are one observation.
-
-The location of a clump is one observation as well. A clump has more points within 2 s' than an even spread explains.
-There, the gain of log x_i from one scale to the next finer one s' counts with 1 / c_i(s'), over its expected value
-(`ImageStatistics.weights`). The mean over a fixed set of (s, w) accounts for the tested values.
-
-A prior multiplies the NFA by the fraction F of all poses that are at least as near to the prior as the pose. T is the
-same for all poses. For unrelated points F exceeds a uniform variable, and does not depend on the x_i. With x their
-product, P(F / x <= a) <= E[a x] <= a, so that the NFA keeps its bound.
-
-If the focal length is fitted too, four matches fix the seven unknowns, and an eighth, a radial coefficient. Then
-T = 2 (m)_4 (n)_4 / 4!, or T of a pose times the number of distinguishable lenses if that is smaller. The four largest
-x_i are left out.
-
-If the scale of the residuals of a pose is given, only the s within a factor of two of it count. The terms from four
-times it on measure how well a rougher alignment explains the image.
+- The three largest x_i are left out for any c_i.
+- At a scale s with fewer distinguishable poses, T is their number (`PoseModel.log10_cells`). If the focal length is
+  fitted too, four matches fix the seven unknowns, and an eighth, a radial coefficient; T is also limited to that of a
+  pose times the number of distinguishable lenses.
+- A clump has more points within 2 s' than an even spread explains, and its location is one observation. There, the gain
+  of log x_i from one scale to the next finer one s' counts with 1 / c_i(s'), over its expected value
+  (`ImageStatistics.weights`).
+- With a prior the NFA keeps its bound. For unrelated points the fraction F of poses that are as near to the prior
+  exceeds a uniform variable, and does not depend on the x_i. With x their product, P(F / x <= a) <= E[a x] <= a.
+- If the scale of the residuals of a pose is given, only the s within a factor of two of it count. The terms from four
+  times it on measure how well a rougher alignment explains the image.
+- The likelihood ratio replaces the binomial tail of the sources, which loses the evidence of dense points, whose
+  neighbours lie as close as their residuals.
 
 Sources: A. Desolneux, L. Moisan, J.-M. Morel, Meaningful alignments, IJCV 2000; L. Moisan, B. Stival, A probabilistic
-criterion to detect rigid point matches, IJCV 2004. The likelihood ratio replaces their binomial tail, which loses the
-evidence of dense points, whose neighbours lie as close as their residuals.
+criterion to detect rigid point matches, IJCV 2004.
 """
 
 import math
@@ -51,10 +36,11 @@ from bpnp.search.kernels.neighbours import sums_near
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem, faces, label_groups
 
-# Inlier fractions w over which the likelihood ratio is averaged; finer steps give the same evidence in twice the time.
+# Inlier fractions lambda over which the likelihood ratio is averaged. Finer steps give the same evidence in twice the
+# time.
 INLIER_FRACTIONS = (0.15, 0.4, 0.75)  # [fractions; measured, the problems are not recorded]
-LEAST_INLIERS = 0.02  # smallest w if clutter or scores are given [fraction; convention]
-MOST_INLIERS = 0.98  # largest w if clutter or scores are given [fraction; convention]
+LEAST_INLIERS = 0.02  # smallest lambda if clutter or scores are given [fraction; convention]
+MOST_INLIERS = 0.98  # largest lambda if clutter or scores are given [fraction; convention]
 # Smoothing width of the density of unrelated points; the outline beyond it is no evidence.
 OUTLINE_WIDTH = 0.5  # [RMS angular radii; not tuned]
 SMOOTHED_POINTS = 256  # largest number of projected points from which that density is estimated [points; cost]
@@ -68,7 +54,7 @@ ROUGH_SCALES = 4.0  # [factor; convention]
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
 
-SHARES = np.array(INLIER_FRACTIONS)  # w
+SHARES = np.array(INLIER_FRACTIONS)  # lambda
 
 
 class Terms(NamedTuple):
@@ -78,7 +64,7 @@ class Terms(NamedTuple):
     together: NDArray[Any]  # (k, S) c_i
     own: NDArray[np.bool_]  # (S,) True at the scales of the residuals of the pose
     rough: NDArray[np.bool_]  # (S,) True at far larger scales
-    pairs: int  # number of pairs (s, w) over which the mean is taken, including those of omitted finer scales
+    pairs: int  # number of pairs (s, lambda) over which the mean is taken, including those of omitted finer scales
     fewer: Array  # (S,) log of the number of tests at each scale, over the number of all
 
     def by_scale(self, left_out: int) -> Array:
@@ -100,14 +86,13 @@ class Terms(NamedTuple):
 def log10_nfa(
     cameras: Sequence[Terms | None], log10_tests: float, fixing: Sequence[Sequence[int]]
 ) -> tuple[float, float]:
-    """Compute the logarithm of the number of false alarms of a pose.
+    """Compute log10 NFA of a pose at the scales of the residuals, and at rougher ones.
 
-        NFA = T / prod_cameras mean_{s, w} prod_i x_i^(1 / c_i)
+        NFA = T / prod_cameras mean_{s, lambda} prod_i x_i^(1 / c_i)
 
     The formula holds for a rotation, a pose, a pose with a focal length and a rig. They differ in the number T of tests
-    and in the number of matches that fix them, which are no evidence. Of the ways to choose the matches that fix the
-    pose, each as their number in each camera, the one that leaves the least evidence counts. The logarithms are those
-    at the scales of the residuals, and at rougher ones; a camera may have no evidence.
+    and in the number of matches that fix them, which are no evidence. `fixing` has the ways to choose these, each as
+    their number in each camera; the way that leaves the least evidence counts. The logs of the cameras add up.
     """
     counts = {count for way in fixing for count in way}
     none = np.zeros(2)
@@ -186,10 +171,10 @@ def camera_terms(
 
 
 def own_evidence(problem: Problem, rotation: Array, translation: Array, scale: float) -> Array:
-    """Return log x_i / c_i (k,) of each chosen image point under a pose, clumps weighted.
+    """Return log x_i / c_i (k,) of each chosen image point under a pose, clumps weighted; natural logs.
 
-    It is taken at the fraction w and the scale s with the largest sum. s is within a factor of two of the scale of the
-    residuals, radians; 0 if too few points are seen.
+    It is taken at the inlier fraction lambda and the scale s with the largest sum, s within a factor of two of the
+    given one. It is 0 if too few points are seen.
     """
     terms = camera_terms(problem, directions_of(problem, rotation, translation), scale)
     return np.zeros(len(problem.image.chosen)) if terms is None else terms.of_points()
@@ -211,10 +196,10 @@ def _is_own(ratio: Array) -> NDArray[np.bool_]:
 
 
 def match_shares(problem: Problem) -> Array:
-    """Return the fractions w of image points with a correspondence that are tried.
+    """Return the inlier fractions lambda (W,) that are tried.
 
-    They are (W,), or with scores (k, 1, W), in proportion to the score of each chosen point and of the scene points
-    that its label admits.
+    With scores they are (k, 1, W), in proportion to the score of each chosen point and of the scene points that its
+    label admits.
     """
     shares = SHARES if problem.clutter is None else np.array([1 - problem.clutter])
     if problem.scores2d is not None:
@@ -249,11 +234,10 @@ def sum_of_largest(values: Array, count: int) -> Array:
 
 
 def point_evidence(problem: Problem, directions: Array, scales: Array, shares: Array, *, even: bool = False) -> Array:
-    """Return log x_i (k, S, W) of each chosen image point.
+    """Return log x_i (k, S, W) of each chosen image point, at scales s (S,) and fractions lambda (W,) or (k, 1, W).
 
-    Directions (n, 3) are NaN for points that are not seen, the scales (S,) s in radians, the shares w (W,) or (k, 1,
-    W). If `even`, unrelated image points are assumed to fall evenly over the view instead of with the density of the
-    directions.
+    Directions (n, 3) of scene points that are not seen are NaN. With `even`, unrelated image points are assumed to fall
+    evenly over the view instead of with the density of `directions`.
     """
     image = problem.image
     predicted, smooth, inside, every = _sums(problem, directions, scales, even)

@@ -61,17 +61,12 @@ TESTS = {Unfinished.competing_poses, Unfinished.focal_lengths}  # stages without
 
 
 class Objection(NamedTuple):
-    """Reason against a pose.
+    """Reason against a pose."""
 
-    Attributes:
-        margin: Decades by which the pose is likelier than what contradicts it, negative if it is less likely; -inf if
-            nothing was compared.
-        code: Kind of the reason, a key of `CLAUSES`.
-        clause: The reason in words.
-    """
-
+    # Decades by which the pose is likelier than what contradicts it, negative if it is less likely; -inf if nothing was
+    # compared.
     margin: float
-    code: str
+    code: str  # kind of the reason, a key of `CLAUSES`
     clause: str
 
     def sentence(self, log10_false_alarms: float) -> str:
@@ -81,16 +76,10 @@ class Objection(NamedTuple):
 
 
 def objection(code: str, margin: float = -math.inf, **values: object) -> Objection:
-    """Return a reason against a pose.
+    """Return a reason against a pose from a key of `CLAUSES`, the values of the clause and a margin, as in `Objection`.
 
-    Args:
-        code: Key of `CLAUSES`.
-        margin: Margin by which the pose is likelier (log10); -inf without a comparison.
-        **values: Values of the clause.
-
-    Examples:
-        >>> objection("rotation_not_fixed", count=4, what="the rotation").sentence(-5.02)
-        'Its 4 matches do not fix the rotation; log10 NFA -5.0'
+    >>> objection("rotation_not_fixed", count=4, what="the rotation").sentence(-5.02)
+    'Its 4 matches do not fix the rotation; log10 NFA -5.0'
     """
     return Objection(margin, code, CLAUSES[code].format(margin=margin, **values))
 
@@ -104,19 +93,14 @@ def focal_length_not_fixed(bound: float) -> Objection:
 
 
 def confident(log10_false_alarms: float, margin: float, bound_deg: float, focal: float = 0.0) -> str:
-    """Return the reason of a confident pose.
+    """Return the reason of a confident pose, which has no competing pose within `margin` decades.
 
-    Args:
-        log10_false_alarms: of the pose.
-        margin: decades within which no competing pose lies.
-        bound_deg: 99.9 % bound of the rotation, degrees.
-        focal: 99.9 % bound of the focal length, as a fraction; 0 if it is given.
+    The 99.9 % bounds are those of the rotation in degrees, and of the focal length as a fraction, 0 if it is given.
 
-    Examples:
-        >>> confident(-69.1, 3.0, 0.213)
-        'No competing pose within 3 decades; log10 NFA -69.1; rotation known to 0.2 deg (99.9 %)'
-        >>> confident(-9.1, 3.0, 5.2, 0.634)
-        'No competing pose within 3 decades; log10 NFA -9.1; rotation known to 5 deg, focal length to 63 % (99.9 %)'
+    >>> confident(-69.1, 3.0, 0.213)
+    'No competing pose within 3 decades; log10 NFA -69.1; rotation known to 0.2 deg (99.9 %)'
+    >>> confident(-9.1, 3.0, 5.2, 0.634)
+    'No competing pose within 3 decades; log10 NFA -9.1; rotation known to 5 deg, focal length to 63 % (99.9 %)'
     """
     precision = f"rotation known to {rounded(bound_deg)} deg"
     if focal:
@@ -137,15 +121,8 @@ def undecided(reason: str, seconds: float) -> str:
 def unfinished(reason: str, seconds: float, tried: int, views: int) -> str:
     """Return the reason of a photo whose views were not all tried, or not all long enough, within the time limit.
 
-    Args:
-        reason: Reason of the best pose so far.
-        seconds: Time limit.
-        tried: Number of views that were tried.
-        views: Number of views.
-
-    Examples:
-        >>> unfinished("no pose was found", 60.0, 213, 10000)
-        'Not decided in 60 s, with 213 of 10,000 views tried. Best pose: no pose was found'
+    >>> unfinished("no pose was found", 60.0, 213, 10000)
+    'Not decided in 60 s, with 213 of 10,000 views tried. Best pose: no pose was found'
     """
     return f"Not decided in {seconds:.3g} s, with {tried:,} of {views:,} views tried. Best pose: {reason}"
 

@@ -156,37 +156,30 @@ def centre_covariance(covariance: Array, translation: Array, scale: float | None
 
 
 def local_covariance(linear: "Linearised | None") -> Array | None:
-    """Return the covariance of the rotation w and the shift of the scene centroid, for noise of `linear.scale`.
+    """Return the covariance (6, 6) of the rotation w and the shift of the scene centroid, for noise of `linear.scale`.
 
-    Image point i corresponds to scene point j with the probability p_ij. J_ij is the derivative of the direction u_j by
-    the rotation and the shift. With the scores g_ij = J_ij^T (f_i - u_j) / s^2 and g_i = sum_j p_ij g_ij, the observed
-    information is (Louis 1982)
+    With a fitted focal length it is (7, 7) with its logarithm; None if the points do not fix the pose.
 
-        H = sum_ij p_ij (J_ij^T J_ij / s^2 - g_ij g_ij^T) + sum_i g_i g_i^T + that of the prior:
-
-    where scene points lie as close as the residuals, the information lost to uncertain correspondences is subtracted. A
-    prior of the pose counts as a further measurement. The jackknife
-
-        sum_i d_i d_i^T,  d_i = (H - H_i)^-1 g_i,  H_i the part of image point i in H,
-
-    allows for residuals that deviate from the model, and for false correspondences: d_i is the step to the optimum
-    without image point i. Let H^-1 = L L^T. The larger of both matrices is taken along each of the common axes, the
-    eigenvectors of L^-1 (sum_i d_i d_i^T) L^-T.
+    docs/verdict.md (Precision of the pose) defines the observed information H and the jackknife covariance sum_i d_i
+    d_i^T, d_i the step to the optimum without image point i. H leaves out the information that is lost to uncertain
+    correspondences, where scene points lie as close as the residuals. The jackknife allows for residuals that deviate
+    from the model, and for false correspondences. Let H^-1 = L L^T. The larger of both matrices is taken along each of
+    the common axes, the eigenvectors of L^-1 (sum_i d_i d_i^T) L^-T. A prior of the pose counts as a further
+    measurement.
 
     H is not positive definite if image points between two correspondences outweigh the others. Half the variance s^2 is
     then used, at which fewer points have two, and the result is doubled.
-
-    Sources: T. A. Louis, Finding the observed information matrix when using the EM algorithm, J. R. Stat. Soc. B 1982;
-    J. G. MacKinnon, H. White, Some heteroskedasticity-consistent covariance matrix estimators with improved finite
-    sample properties, J. Econometrics 1985; B. Efron, C. Stein, The jackknife estimate of variance, Annals of
-    Statistics 1981.
 
     With an unknown focal length, the jackknife leaves out blocks of neighbouring image points. Errors of the lens model
     and of the map are similar for neighbours, and they add up in the focal length. The radial coefficient is
     eliminated. Its expected standard deviation counts as a prior unless it was fitted. The principal point, tangential
     distortion and the second radial coefficient are not fitted. What their errors move is added, as far as the
-    residuals leave them open (`bpnp.search.verdict.covariance`). It is (6, 6), or (7, 7) with the logarithm of a fitted
-    focal length; None if the points do not fix the pose.
+    residuals leave them open (`bpnp.search.verdict.covariance`).
+
+    Sources: T. A. Louis, Finding the observed information matrix when using the EM algorithm, J. R. Stat. Soc. B 1982;
+    J. G. MacKinnon, H. White, Some heteroskedasticity-consistent covariance matrix estimators with improved finite
+    sample properties, J. Econometrics 1985; B. Efron, C. Stein, The jackknife estimate of variance, Annals of
+    Statistics 1981.
     """
     return None if linear is None else linear.covariance
 

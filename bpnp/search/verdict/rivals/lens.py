@@ -125,7 +125,7 @@ class AtZoom(NamedTuple):
 
     @property
     def centre3d(self) -> Array:
-        """SearchFrame centroid (3,) in the camera's frame."""
+        """Scene centroid (3,) in the camera's frame."""
         return np.asarray(self.pose.rotation[0] @ self.problem.centre3d + self.pose.translation[0])
 
     @property
