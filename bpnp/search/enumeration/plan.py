@@ -14,7 +14,7 @@ import numpy as np
 
 from bpnp.runtime import Deadline
 from bpnp.search.enumeration.points import predicted_pose
-from bpnp.search.enumeration.search import PATIENCE, STAGES, Enumeration, enumerate_poses, margin
+from bpnp.search.enumeration.search import STAGES, Enumeration, margin
 from bpnp.search.hypotheses import KEPT_CANDIDATES, Hypotheses
 from bpnp.search.loop import Step
 from bpnp.search.possible_matches import score_pose
@@ -74,32 +74,16 @@ class EnumeratedPoses:
         self.run.advance(deadline)
         return self.run.poses()
 
-    def propose_competitors(self, deadline: float) -> Hypotheses:
+    def propose_competitors(self) -> Hypotheses:
         """Refine the competing poses of the best pose, and return all poses."""
         leader = self.found[:1]
         self._leaders.append(leader)
         pose = leader.pose()
         scale = max(float(leader.scale[0]), self.problem.floor or SMALLEST_SCALE)
         rotations, translations, *_ = competing_poses(self.problem, *pose, scale)
-        rest = self._poses_of_rest(leader, deadline)
-        rotations = np.concatenate([rotations, rest.rotation])
-        translations = np.concatenate([translations, rest.translation])
         for one in zip(rotations, translations, strict=True):
             self.run.propose(*one, self.run.reach)
         return self.run.poses()
-
-    def _poses_of_rest(self, leader: Hypotheses, deadline: float) -> Hypotheses:
-        """Return the poses of a short enumeration of the points without a match, if there may be as many matches.
-
-        If the image shows two bodies that move on their own, the leader may be the pose of the smaller one.
-        """
-        problem, matches = self.run.problem, np.asarray(leader.matches)[0]
-        image = np.flatnonzero(matches < 0)
-        scene = np.setdiff1d(np.arange(len(problem.points3d)), matches)
-        if min(len(image), len(scene)) < leader.match_count[0]:
-            return Hypotheses.empty()
-        rest = problem.choose(image, scene)
-        return enumerate_poses(rest, radius=problem.match_radius, deadline=deadline, most=PATIENCE).poses
 
     def may_be_decided(self) -> bool:
         """Return True if the best pose leads by a safe margin and passes the cheap tests of the verdict."""
@@ -186,7 +170,7 @@ class EnumerationPlan:
         if poses.is_certain:
             return None
         if run.is_significant and not poses.has_competitors and run.ended is None:
-            return Step(partial(poses.propose_competitors, self._deadline.at))
+            return Step(poses.propose_competitors)
         if run.ended is None and run.is_significant and run.is_long:
             run.ended = "most"
         if run.ended is None:

@@ -25,8 +25,10 @@ from bpnp.search.verdict.rivals import explained
 
 FEWEST_LEFT = 5  # number of points that can show a significant pose: two more than fix it [points; derived]
 # Largest number of hypotheses of the points that are left, without and with the scene points of the first pose.
-MOST_OF_REST, MOST_OF_ALL = 200_000, 30_000  # [hypotheses; cost]
+MOST_OF_REST, MOST_OF_ALL = 100_000, 50_000  # [hypotheses; cost]
 FAR_BODY = 3.0  # distance of another body's pose [tolerances of the same pose; not tuned]
+# Decades by which a candidate may be behind a second body that leads; in an enumeration these are `NEAR_NATS`.
+NEAR_DECADES = 10.0  # [decades; calibration]
 COMPARED_BODIES = 4  # number of poses of the rest whose false alarms are computed [poses; cost]
 # Fraction of the second pose's scene points that are those of the first from which it shows the same points again.
 SHOWN_TWICE = 0.25  # [fraction; not tuned]
@@ -65,6 +67,9 @@ def second_body(case: Case, *, deadline: Deadline = NEVER) -> Case:
         counts = {"first": int(first.near.sum()), "second": int(second.near.sum()), "count": len(problem.bearings)}
         away = distance_between(problem, case.pose, pose.pose())
         both = case.among(weighed_pose(problem, *pose.pose()))
+        if not both.has_leader_of(case):  # it has more matches, and is asked in turn
+            near = both.candidates.log10_false_alarms <= both.log10_false_alarms + NEAR_DECADES
+            return replace(both, candidates=both.candidates[near])
         return both.against(objection("second_body", 0.0, away=away, **counts))
     return case
 
