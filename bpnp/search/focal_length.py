@@ -148,7 +148,7 @@ class UnknownCamera(NamedTuple):
 def unknown_camera(
     camera: Any, image_size: Any, focal_error: float | int | None, distortion: bool = False
 ) -> UnknownCamera:
-    """Return the unknown camera of images of a (width, height), or one with about the focal length of a camera.
+    """Return the unknown camera of images of a size in pixels, or one with about the focal length of a camera.
 
     The relative standard deviation `focal_error` of this focal length is between 0 and 1. Radial distortion is unknown
     too, unless the camera has a model with distortion; with `distortion` a coefficient is always fitted. ValueError if

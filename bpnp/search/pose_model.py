@@ -280,7 +280,8 @@ class PoseModel:
     def log10_cells(self, spread: float, scales: Array, solid_angle: float = 4 * math.pi) -> Array:
         """Return log10 (S,) of the number of distinguishable states, cells of width s, at each scale s of an image.
 
-        With the RMS angular radius h of the image points and the solid angle A of the view, it is the number of:
+        With h the RMS angular radius of the image points, radians, and A the solid angle of the view, steradians, it is
+        the number of:
         - 8 pi^2 (h / s)^3 rotations about the scene centroid, which move points at h from it by s,
         - A / s^2 positions of the centroid in the view,
         - log(30) h / s distances of it, up to a factor of 30.

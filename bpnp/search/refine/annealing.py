@@ -70,7 +70,7 @@ def kept_by(stage: ClusterStage, starts: int) -> int:
 
 
 def multistart(scene: SearchFrame, number: int, prior: Prior | None) -> Hypotheses:
-    """Run one batch of starts over all rotations, or over those that a prior in the frame of the scene allows."""
+    """Run batch `number`, from 0, of starts over all rotations, or those that a prior of the scene allows."""
     recipe = RECIPES[number % len(RECIPES)]
     drawn = draw_poses(scene.spread, scene.bulk3d, batch_size(number), recipe, prior, scene.rng)
     return run_batch(scene, Hypotheses.from_poses(*drawn, basin_count=1))
