@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import (
 )
 from scipy.spatial import cKDTree
 
-from bpnp.arrays import Array, Integers
+from bpnp.arrays import Array, Indices
 from bpnp.runtime import NEVER, Clock, Deadline
 
 FEW_NEIGHBOURS = 8  # number of nearest neighbours of a point that are tried first [points; cost]
@@ -26,12 +26,12 @@ ASSIGNMENT_SECONDS = 1e-9  # [seconds; cost]
 COUNTING_SECONDS = 2e-6  # time of a maximum matching, over its number of possible matches [seconds; cost]
 UNFINISHED = "matches"  # stage that a deadline notes if it cuts the matching short
 
-Allowed = Callable[[Integers, Integers], NDArray[np.bool_]]
+Allowed = Callable[[Indices, Indices], NDArray[np.bool_]]
 
 
 def one_to_one(
     image: Array, projected: Array, radius: float, allowed: Allowed | None = None, deadline: Deadline = NEVER
-) -> Integers:
+) -> Indices:
     """Return a maximum one-to-one matching of image points and projected points within a radius (paper Eq. 1).
 
     The matches (i, j), indices (k, 2) ordered by i, satisfy |image_i - projected_j| <= radius, and no point is in two
@@ -65,7 +65,7 @@ def count_one_to_one(
     return int((maximum_bipartite_matching(graph, perm_type="column") >= 0).sum())
 
 
-def _components(matches: Integers, count: int) -> Iterator[Integers | slice]:
+def _components(matches: Indices, count: int) -> Iterator[Indices | slice]:
     """Yield the indices of the possible matches (e, 2) of points that share none with others, in groups.
 
     A group has one component, or several with together at most `POINTS_A_CHECK` matches. `count` is the number of image
@@ -89,7 +89,7 @@ def _components(matches: Integers, count: int) -> Iterator[Integers | slice]:
         first = last
 
 
-def _assigned(matches: Integers, distance: Array, radius: float, deadline: Deadline) -> Integers:
+def _assigned(matches: Indices, distance: Array, radius: float, deadline: Deadline) -> Indices:
     """Return the maximum matching with the least squared distances among possible matches (e, 2), in any order."""
     alone = np.logical_and(*(np.bincount(side)[side] == 1 for side in matches.T)) if len(matches) else np.ones(0, bool)
     if alone.all():
@@ -119,12 +119,12 @@ def _is_too_long(seconds: float, deadline: Deadline) -> bool:
 
 def mutual_nearest(
     image: Array, projected: Array, radius: float, allowed: Allowed | None = None, deadline: Deadline = NEVER
-) -> Integers:
+) -> Indices:
     """Return the mutual nearest neighbours within `radius`: fewer matches than `one_to_one`, and fewer wrong ones."""
     return _mutual(*_near(image, projected, radius, allowed, deadline))
 
 
-def _mutual(matches: Integers, distance: Array) -> Integers:
+def _mutual(matches: Indices, distance: Array) -> Indices:
     """Return those of possible matches (e, 2) that are the nearest ones of both points."""
     nearest = np.ones(len(matches), np.bool_)
     for side in matches.T:
@@ -136,7 +136,7 @@ def _mutual(matches: Integers, distance: Array) -> Integers:
 
 def _near(
     image: Array, projected: Array, radius: float, allowed: Allowed | None, deadline: Deadline
-) -> tuple[Integers, Array]:
+) -> tuple[Indices, Array]:
     """Return the allowed matches (e, 2) within `radius`, ordered, and their distances; nearest neighbours if many."""
     seen = np.flatnonzero(np.isfinite(projected).all(-1))
     if len(image) * len(seen) <= DENSE_MATCHES:
@@ -153,12 +153,12 @@ def _near(
     return matches, np.linalg.norm(image[matches[:, 0]] - projected[matches[:, 1]], axis=-1)
 
 
-def _neighbours(points: Array, others: Array, radius: float, deadline: Deadline) -> Integers:
+def _neighbours(points: Array, others: Array, radius: float, deadline: Deadline) -> Indices:
     """Return the indices (e, 2) of each point and of its nearest neighbours within `radius`.
 
     Points that are not looked up before the end of a deadline have none.
     """
-    count, tree, found = min(FEW_NEIGHBOURS, len(others)), cKDTree(others), list[Integers]()
+    count, tree, found = min(FEW_NEIGHBOURS, len(others)), cKDTree(others), list[Indices]()
     step = len(points) if math.isinf(deadline.final) else POINTS_A_CHECK
     for first in range(0, len(points), step):
         if first and deadline.ended(UNFINISHED):

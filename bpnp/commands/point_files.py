@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from bpnp.argument_types import short_repr
-from bpnp.arrays import Array, Integers
+from bpnp.arrays import Array, Labels
 from bpnp.bounded_files import MOST_BINARY, MOST_TEXT, parse_json, parse_npy, read_bytes, read_stream
 from bpnp.commands.calibration_files import is_calibration, parse_calibration
 
@@ -29,7 +29,7 @@ FEW_ROWS = 3  # least number of rows of an index column
 LARGEST_LABEL = 2**53  # larger integers are not exact in float64
 
 
-def read_points2d(path: Path) -> tuple[Array, Integers | None]:
+def read_points2d(path: Path) -> tuple[Array, Labels | None]:
     """Read image points (m, 2) or unit bearings (m, 3), and labels (m,) of a column named label, else None.
 
     The file is .npy or text as for `read_points3d`. Named columns x and y are read, and z if there is one, or u and v;
@@ -58,7 +58,7 @@ def read_points2d(path: Path) -> tuple[Array, Integers | None]:
 
 def read_points3d(
     path: Path, *, surface: int | None = None, seed: int = 0
-) -> tuple[Array, Array | None, Integers | None]:
+) -> tuple[Array, Array | None, Labels | None]:
     """Read scene points (n, 3), their outward normals (n, 3) and labels (n,), None if the file has none.
 
     The path is one of:
@@ -201,7 +201,7 @@ def _check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
 
 def _read_annotation(
     path: Path, values: Array, names: list[str], coordinates: tuple[str, ...], *, hint: str = ""
-) -> tuple[Array, Array | None, Integers | None]:
+) -> tuple[Array, Array | None, Labels | None]:
     """Take points, normals and labels from columns (k, c), whose names are empty if the file has none.
 
     `hint` follows the coordinates in the message that they are missing.
@@ -222,7 +222,7 @@ def _read_annotation(
 
 def _normals_and_labels(
     path: Path, column: Callable[[str], Array], names: Collection[str]
-) -> tuple[Array | None, Integers | None]:
+) -> tuple[Array | None, Labels | None]:
     """Return normals (n, 3) and labels (n,) of a file with columns of these names, None without them."""
     normals = np.stack([column(name) for name in NORMAL], -1) if set(NORMAL) <= set(names) else None
     if LABEL not in names:

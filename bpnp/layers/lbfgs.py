@@ -5,12 +5,10 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from numpy.typing import NDArray
 from torch import Tensor
 
+from bpnp.arrays import Array
 from bpnp.geometry import retract
-
-Array = NDArray[np.float64]
 
 HISTORY = 10  # pairs of steps and gradients that estimate the curvature
 EVALUATIONS = 25  # largest number of objective evaluations per iteration

@@ -12,9 +12,9 @@ import numpy as np
 import poselib
 import torch
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
 from torch import Tensor
 
+from bpnp.arrays import Array
 from bpnp.geometry import bearings, retract
 from bpnp.poses import MIN_POINTS
 from bpnp.robust.matches import Matches, distinct_triples, residuals, truncated_scores
@@ -34,7 +34,6 @@ DAMPING = 1e-9  # damping, a fraction of the Hessian's mean diagonal [fraction; 
 FEWEST_HYPOTHESES = 25  # least number of hypotheses of PoseLib [hypotheses; not tuned]
 LEAST_KEPT = 0.9  # fraction of its inliers that OpenCV's refit must keep [fraction; not tuned]
 
-Array = NDArray[np.float64]
 # points2d (k, 2), points3d (k, 3), threshold, most hypotheses, seed -> pose [R | t] and hypotheses, None for no pose
 SingleEstimator = Callable[[Array, Array, float, int, int], tuple[Array, int] | None]
 Estimator = Callable[[Matches, float, int, int], tuple[Float[Tensor, "b 3 4"], Int[Tensor, " b"]]]

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bpnp.argument_types import ArrayLike, ImageSize, ManyArrays, ManyPoints, PointsLike, PoseLike
+from bpnp.arrays import Labels
 from bpnp.cameras import Camera, ManyCameras, camera_from
 from bpnp.runtime import Clock, Deadline, default_float_errors
 from bpnp.search.arguments import (
-    Labels,
     ManyPriors,
     PriorLike,
     about,

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from bpnp.argument_types import PoseObject, check_unmasked, short_repr
+from bpnp.arrays import Array, Labels
 from bpnp.cameras import CENTRE, Camera, check_normalised, is_opencv, outside_image
 from bpnp.search.starts import GravityPrior, PosePrior
 
@@ -36,8 +37,6 @@ if TYPE_CHECKING:
 else:
     PriorLike = ManyPriors = Any
 
-Array = npt.NDArray[np.float64]
-Labels = npt.NDArray[np.int64]
 Prior = Union[PosePrior, GravityPrior, "torch.nn.Module"]  # a TrainedNet
 
 

@@ -9,6 +9,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.arrays import Array
 from bpnp.matching import DENSE_MATCHES, count_one_to_one, one_to_one
 from bpnp.runtime import NEVER, Deadline
 from bpnp.search.hypotheses import Hypotheses
@@ -19,8 +20,6 @@ from bpnp.search.solution import FOCAL_LENGTH, POSE_PARAMETERS, Candidate, Solut
 from bpnp.search.verdict.decide import Case, SearchResult, Verdict, decide
 from bpnp.search.verdict.reasons import Objection
 from bpnp.search.verdict.uncertainty import Linearised, linearised, pose_covariance
-
-Array = NDArray[np.float64]
 
 
 class Cameras(Protocol):

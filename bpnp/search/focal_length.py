@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from bpnp.arrays import Array
 from bpnp.cameras import (
     Camera,
     Lens,
@@ -28,7 +29,7 @@ from bpnp.cameras import (
 )
 from bpnp.poses import SAME, close_poses, polar_coordinates, rotation_angle
 from bpnp.runtime import NEVER, Clock, Deadline, one_blas_thread
-from bpnp.search.arguments import Array, checked_size
+from bpnp.search.arguments import checked_size
 from bpnp.search.assemble import Solved, with_unfinished
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.hypotheses import Hypotheses

@@ -17,6 +17,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.arrays import Array
 from bpnp.poses import SAME, rotation_angle
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
 from bpnp.search.enumeration.search import is_enumerable
@@ -36,7 +37,6 @@ from bpnp.search.verdict.reasons import Unfinished, objection
 from bpnp.search.verdict.rivals.nearby import annealed_around
 from bpnp.search.verdict.uncertainty import linearised, local_covariance
 
-Array = NDArray[np.float64]
 ONE_POSE = "only this pose and its competitors were tested, no better one was searched for"
 
 

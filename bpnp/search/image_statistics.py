@@ -5,6 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.arrays import Array
 from bpnp.search.kernels.neighbours import sums_near
 
 # Factor from one scale of the residuals to the next.
@@ -18,8 +19,6 @@ TOGETHER_SCALES = 2.0  # distance, in scales, below which points count as one ob
 CROWDED_SIGMAS = 2.0  # [standard deviations; not tuned]
 # Largest number of image points that are used, evenly spaced among the given ones.
 MOST_IMAGE_POINTS = 2000  # [points; cost]
-
-Array = NDArray[np.float64]
 
 
 class ImageStatistics:

@@ -5,11 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from bpnp.arrays import Array, Labels
 from bpnp.cameras import Camera, in_front, is_pinhole
 from bpnp.poses import MIN_POINTS
 from bpnp.search.arguments import (
-    Array,
-    Labels,
     Prior,
     check_points,
     check_unit,

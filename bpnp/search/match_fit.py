@@ -5,10 +5,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from bpnp.arrays import Array
 from bpnp.matching import mutual_nearest
 from bpnp.poses import MIN_POINTS
 from bpnp.runtime import Deadline
-from bpnp.search.arguments import Array
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import Problem
 from bpnp.search.refine.gauss_newton import FIRST_DAMPING, Iteration, image_equations, refine

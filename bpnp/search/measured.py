@@ -5,12 +5,10 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bpnp.arrays import Array, Labels
 from bpnp.cameras import Camera, in_front
 
-Array = NDArray[np.float64]
-Labels = NDArray[np.int64]
 Unit = Literal["px", "normalised", "rad"]
 
 

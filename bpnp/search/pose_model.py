@@ -33,9 +33,9 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bpnp.arrays import Array
 from bpnp.search.problem import Problem, UnknownFocal, label_groups
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
 
@@ -43,8 +43,6 @@ from bpnp.search.starts import GravityPrior, PosePrior, Prior
 LEAST_SLOPE = 0.2  # [1; not tuned]
 UNDISTORTING_STEPS = 20  # Newton steps that undistort a radius [steps; numerics]
 
-Array = NDArray[np.float64]
-Labels = NDArray[np.int64]
 Extrinsics = tuple[Array, Array]
 
 

@@ -4,9 +4,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bpnp.arrays import Array, Labels
 from bpnp.matching import DENSE_MATCHES, FEW_NEIGHBOURS
 from bpnp.search.problem import Problem, faces
 from bpnp.search.settings import OUTLIERS
@@ -18,9 +18,6 @@ MATCH_REACH = 3.0  # [scales of the residuals; convention]
 # likelihood; beyond, it is below e^-8.
 FARTHEST_MATCH = 4.0  # [scales of the residuals; derived]
 MOST_NEIGHBOURS = 64  # number that is tried if all of the few are in reach [points; cost]
-
-Array = NDArray[np.float64]
-Labels = NDArray[np.int64]
 
 
 def facing(problem: Problem, camera: Array, rotation: Array) -> Labels:

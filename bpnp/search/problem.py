@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.arrays import Array, Labels
 from bpnp.poses import MIN_POINTS, SAME, Tolerance, rotation_angle, same_pose
 from bpnp.search.image_statistics import ImageStatistics
-from bpnp.search.measured import UNMEASURED, Array, Labels, Measured
+from bpnp.search.measured import UNMEASURED, Measured
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
 
 # Distance from the median beyond which scene points do not affect the origin and the unit.

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bpnp.arrays import Array32
 from bpnp.poses import MIN_POINTS
 from bpnp.runtime import NEVER, Deadline
 from bpnp.search.kernels.density_map import DensityMap
@@ -23,7 +24,7 @@ from bpnp.search.kernels.sides import (
 from bpnp.search.kernels.sparse import Tiles, build_tiles
 from bpnp.search.problem import LINE_RATIO, Problem, in_bulk
 from bpnp.search.settings import DensityShape, SearchSettings
-from bpnp.search.starts import Array, GravityPrior, Prior, turned_to
+from bpnp.search.starts import GravityPrior, Prior, turned_to
 
 # Weight of a shift along the view over one across it, for an RMS angular radius of one radian; at most 1.
 SHIFT_ALONG = 5.0  # [per radian; not tuned]
@@ -39,8 +40,8 @@ class Companion(NamedTuple):
     """Other rig camera that sees the same points, rigidly attached to the camera of a scene."""
 
     scene: "SearchFrame"
-    turn: Array  # (3, 3) rotation; x' = turn x + shift maps the frame of the first camera to that of this one
-    shift: Array  # (3,) translation, in the unit of both scenes
+    turn: Array32  # (3, 3) rotation; x' = turn x + shift maps the frame of the first camera to that of this one
+    shift: Array32  # (3,) translation, in the unit of both scenes
 
 
 class SearchFrame:
@@ -99,11 +100,11 @@ class SearchFrame:
         turned, moved = self.enter(rotation, np.asarray(prior.translation, np.float64))
         return prior._replace(rotation=turned, translation=moved)
 
-    def enter(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> tuple[Array, Array]:
+    def enter(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> tuple[Array32, Array32]:
         """Return poses (k, 3, 3), (k, 3) of the problem in the frame of the scene, float32."""
         return (self.frame @ rotation).astype(np.float32), (translation @ self.frame.T).astype(np.float32)
 
-    def leave(self, rotation: Array, translation: Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def leave(self, rotation: Array32, translation: Array32) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return poses of the scene in the frame of the problem, in float64.
 
         The rotations are orthogonal to float64 precision.

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bpnp.argument_types import short_repr
+from bpnp.arrays import Array
 from bpnp.bounded_files import parse_json, read_json
 from bpnp.cameras import Camera, CameraLike, camera_from, camera_to_json, check_single_camera
 from bpnp.search.measured import Unit
@@ -21,7 +22,6 @@ from bpnp.search.verdict.uncertainty import centre_covariance
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = npt.NDArray[np.float64]
 ROTATION_PARAMETERS = ("rotation_x", "rotation_y", "rotation_z")  # rotation vector in the camera axes, radians
 POSE_PARAMETERS = (*ROTATION_PARAMETERS, "translation_x", "translation_y", "translation_z")
 FOCAL_LENGTH, SCALE = "focal_length", "scale"

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from bpnp.arrays import Array
 from bpnp.runtime import Clock, Deadline
-from bpnp.search.arguments import Array
 from bpnp.search.assemble import OneCamera, Solved, assembled
 from bpnp.search.enumeration.search import exceeds_enumeration
 from bpnp.search.plan import Proposals

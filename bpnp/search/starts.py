@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from bpnp.arrays import Array32
+
 # RMS angular radius above which bearings fill about 220 degrees or more, so that the camera is among the points.
 ALL_AROUND_SPREAD = 0.95  # [radians; derived]
 # Step of the spiral of positions at which searches aim, with radii of `AIM_STEP` times the square root of the number;
 # it leaves no gaps.
 AIM_STEP = 0.16  # [RMS angular radii; not tuned]
-
-Array = NDArray[np.float32]
 
 
 class StartSampling(NamedTuple):
@@ -111,13 +111,13 @@ def draw_rotations(count: int, prior: Prior | None, rng: np.random.Generator) ->
 
 def draw_poses(
     spread: float,
-    points3d: Array,
+    points3d: Array32,
     count: int,
     recipe: StartSampling,
     prior: Prior | None,
     rng: np.random.Generator,
     aim: NDArray[np.float64] | None = None,
-) -> tuple[Array, Array]:
+) -> tuple[Array32, Array32]:
     """Draw initial poses, float32, for a camera that looks along (0, 0, 1), with rotations of a prior or all of them.
 
     The weak-perspective translation puts a scene point on this axis, or within `AIM_STEP` of an `aim` (2,) in the view;

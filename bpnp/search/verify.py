@@ -9,9 +9,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bpnp.argument_types import ArrayLike, PointsLike
+from bpnp.arrays import Array, Labels
 from bpnp.cameras import CameraLike, camera_from
 from bpnp.runtime import NEVER, Deadline, default_float_errors
-from bpnp.search.arguments import Array, Labels, checked_pose, checked_seed, numbers, positive, seconds_from
+from bpnp.search.arguments import checked_pose, checked_seed, numbers, positive, seconds_from
 from bpnp.search.assemble import OneCamera, Solved, assembled
 from bpnp.search.given_pose import given_pose
 from bpnp.search.hypotheses import Hypotheses

@@ -3,6 +3,7 @@
 import math
 from typing import Any, NamedTuple
 
+from bpnp.arrays import Array, Indices
 from bpnp.poses import SAME
 from bpnp.search.enumeration.matching import (
     MATCHED_COSINE,
@@ -15,7 +16,6 @@ from bpnp.search.enumeration.matching import (
     sight,
     step,
 )
-from bpnp.search.enumeration.points import Array, Places
 from bpnp.search.kernels.vectors import copy_pose, rotated
 from bpnp.search.propose.minimal_solvers import Triangles, chords_between, compiled, part, solve_p2p, solve_p3p
 
@@ -41,18 +41,18 @@ class Block(NamedTuple):
     """
 
     size: int  # matches that fix a pose, 3 or 2
-    sets: Places  # (t, 3) image points; with size 2 the last index repeats the second
-    orders: Places  # (6, 3) or (2, 3) orders of a set
+    sets: Indices  # (t, 3) image points; with size 2 the last index repeats the second
+    orders: Indices  # (6, 3) or (2, 3) orders of a set
     triangles: Triangles  # triangles of the scene; with size 2 the last point repeats the second
-    by_label: Places  # (t,) indices of the triangles in the order of the label of their first point, -1 first
+    by_label: Indices  # (t,) indices of the triangles in the order of the label of their first point, -1 first
     # (m,) index in `by_label` of the first triangle whose first point has the label of an image point, or has a label
     # if that is -1.
-    low: Places
-    high: Places  # (m,) index behind the last one
+    low: Indices
+    high: Indices  # (m,) index behind the last one
     free: int  # number of triangles whose first point has the label -1
     old_image: int  # number of sets of an earlier block
     old_scene: int  # number of triangles of an earlier block
-    witnesses: Places  # (n, w) preverification points near each scene point
+    witnesses: Indices  # (n, w) preverification points near each scene point
     need: int  # preverification points that must be matched
     reach: float  # radius of their matches, in match radii
 
@@ -179,14 +179,14 @@ class Kept(NamedTuple):
 
     poses: Array  # (c, 4, 3)
     evidence: Array  # (c,) nats; -inf for an empty slot
-    counts: Places  # (c,) numbers of matches
-    point: Places  # (c, m) scene point of each image point, or -1
+    counts: Indices  # (c,) numbers of matches
+    point: Indices  # (c, m) scene point of each image point, or -1
     distance2: Array  # (c, m) squared distances, in match radii
-    best: Places  # (1,) index of the best pose
+    best: Indices  # (1,) index of the best pose
     most: Array  # (1,) largest number of matches of a hypothesis in this stage, less `LACKING` for each missing point
-    basin_count: Places  # (c,) number of image sets with a hypothesis that ended at the pose
-    last: Places  # (c,) image set that was counted last
-    at: Places  # (1,) current image set; -1 for a pose from elsewhere
+    basin_count: Indices  # (c,) number of image sets with a hypothesis that ended at the pose
+    last: Indices  # (c,) image set that was counted last
+    at: Indices  # (1,) current image set; -1 for a pose from elsewhere
 
 
 class Work(NamedTuple):

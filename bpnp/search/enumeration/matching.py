@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bpnp.search.enumeration.points import IMAGE_CELLS, Array, Heading, ImageArrays, Places, PriorArrays, SceneArrays
+from bpnp.arrays import Array, Indices
+from bpnp.search.enumeration.points import IMAGE_CELLS, Heading, ImageArrays, PriorArrays, SceneArrays
 from bpnp.search.kernels.dense import solve_normal_equations
 from bpnp.search.kernels.vectors import rotated, turn
 from bpnp.search.propose.minimal_solvers import part
@@ -36,7 +37,7 @@ class EnumerationTables(NamedTuple):
 class Matches(NamedTuple):
     """One-to-one matches of the image points."""
 
-    point: Places  # (m,) scene point of each image point, or -1
+    point: Indices  # (m,) scene point of each image point, or -1
     distance2: Array  # (m,) squared residuals, in match radii
 
 

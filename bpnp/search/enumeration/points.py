@@ -5,9 +5,9 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bpnp.arrays import Array, Indices
 from bpnp.search.problem import Problem
 from bpnp.search.propose.minimal_solvers import Triangles, triangles_of
 from bpnp.search.starts import GravityPrior, PosePrior, Prior, turned_to
@@ -27,16 +27,13 @@ AWAY_COSINE = math.cos(math.radians(95.0))  # [1; not tuned]
 EDGE_ON_SINE = 0.15  # sine of an angle to a triangle's plane below which either orientation is possible [1; not tuned]
 TESTED_DIRECTIONS = 192  # number of directions with which the orientations of a triangle are tested [directions; cost]
 
-Array = NDArray[np.float64]
-Places = NDArray[np.int64]
-
 
 class SceneArrays(NamedTuple):
     """Scene points as arrays."""
 
     points: Array  # (n, 3) in unit size
     normals: Array  # (n, 3); (0, 3) if every point can be seen
-    labels: Places  # (n,); -1 fits any label
+    labels: Indices  # (n,); -1 fits any label
 
 
 class Grid(NamedTuple):
@@ -44,13 +41,13 @@ class Grid(NamedTuple):
 
     flat: Array  # (m, 2) stereographic coordinates
     gain: Array  # (m,) radii a unit of the coordinates (`ImageArrays`)
-    labels: Places  # (m,); -1 fits any label
+    labels: Indices  # (m,); -1 fits any label
     low_u: float  # first coordinate of the lower corner
     low_v: float  # second coordinate of the lower corner
     per_cell: float  # cells a unit of the coordinates
     # (cells^2 + 1,) index in `items` of the first item of each cell; the second coordinate varies fastest.
-    starts: Places
-    items: Places
+    starts: Indices
+    items: Indices
 
 
 class ImageArrays(NamedTuple):
@@ -90,13 +87,13 @@ class Heading(NamedTuple):
 class SceneSide:
     """Scene of one problem, or of many, as when a device is tracked."""
 
-    def __init__(self, points3d: Array, normals3d: Array | None, labels3d: Places | None) -> None:
+    def __init__(self, points3d: Array, normals3d: Array | None, labels3d: Indices | None) -> None:
         normals = np.empty((0, 3)) if normals3d is None else np.array(normals3d, np.float64, order="C")
         labels = np.full(len(points3d), -1) if labels3d is None else np.array(labels3d, np.int64)
         self.arrays = SceneArrays(np.array(points3d, np.float64, order="C"), normals, labels)
         self.nearest = nearest_of(self.arrays.points, normals)  # (n, k) nearest points of each point
         self.tables: dict[tuple[int, int], Triangles] = {}  # triangles by (size, near) that were built so far
-        self.orders: dict[tuple[int, int], tuple[Places, Places]] = {}
+        self.orders: dict[tuple[int, int], tuple[Indices, Indices]] = {}
 
     def triangles(self, size: int, near: int) -> Triangles:
         """Return the triangles of a point and two of its `near` nearest, or with size 2 the `pairs` with one of them.
@@ -111,7 +108,7 @@ class SceneSide:
             )
         return self.tables[size, near]
 
-    def by_label(self, size: int, near: int) -> tuple[Places, Places]:
+    def by_label(self, size: int, near: int) -> tuple[Indices, Indices]:
         """Return the stable order of the `triangles` by the label of their first point, and the sorted labels."""
         near = min(near, self.nearest.shape[1])
         if (size, near) not in self.orders:
@@ -124,7 +121,7 @@ class SceneSide:
 class ImageSide:
     """Image points of one problem, with what the enumeration looks up about them."""
 
-    def __init__(self, bearings: Array, radius: float, labels2d: Places | None, reach: float) -> None:
+    def __init__(self, bearings: Array, radius: float, labels2d: Indices | None, reach: float) -> None:
         self.turn = turned_to(axis_of(bearings))  # R, which maps a bearing f to R f in the frame of the arrays
         rays = bearings @ self.turn.T
         per_radian = 1 / float(radius)
@@ -135,7 +132,7 @@ class ImageSide:
         self.density = float(math.pi * (1 / gain**2).mean() / _area(flat, float(1 / gain.mean())))
 
     @functools.cached_property
-    def nearest(self) -> Places:
+    def nearest(self) -> Indices:
         """Nearest points (m, k) of each image point."""
         return nearest_of(self.arrays.rays, np.empty((0, 3)))
 
@@ -156,7 +153,7 @@ def axis_of(bearings: Array) -> Array:
     return np.asarray(DIRECTIONS[(bearings @ DIRECTIONS.T).min(0).argmax()])
 
 
-def scene_side(points3d: Array, normals3d: Array | None, labels3d: Places | None) -> SceneSide:
+def scene_side(points3d: Array, normals3d: Array | None, labels3d: Indices | None) -> SceneSide:
     """Return the scene, from a cache of the last few."""
     return _remembered(
         *(None if x is None else np.ascontiguousarray(x).tobytes() for x in (points3d, normals3d, labels3d))
@@ -173,7 +170,7 @@ def _remembered(points3d: bytes, normals3d: bytes | None, labels3d: bytes | None
     )
 
 
-def nearest_of(points: Array, normals: Array) -> Places:
+def nearest_of(points: Array, normals: Array) -> Indices:
     """Return the nearest points (n, k) of each point, without the point itself.
 
     Points whose normals, (n, 3) or (0, 3), no camera can face at once come last.
@@ -192,7 +189,7 @@ def nearest_of(points: Array, normals: Array) -> Places:
     return np.ascontiguousarray(order, np.int64)
 
 
-def sets_within(nearest: Places, near: int, size: int) -> Places:
+def sets_within(nearest: Indices, near: int, size: int) -> Indices:
     """Return sets (t, size) of a point and one or two of its `near` nearest, each set once, nearest in rank first.
 
     >>> sets_within(np.array([[1, 2], [0, 2], [1, 0]]), 2, 2).tolist()
@@ -206,7 +203,7 @@ def sets_within(nearest: Places, near: int, size: int) -> Places:
     return np.ascontiguousarray(sets[np.sort(np.unique(key, return_index=True)[1])])
 
 
-def visible_triangles(points: Array, normals: Array, triples: Places) -> Triangles:
+def visible_triangles(points: Array, normals: Array, triples: Indices) -> Triangles:
     """Return the triangles of scene triples (t, 3) that a camera can see; normals are (n, 3) or (0, 3)."""
     triangles = triangles_of(points, triples)
     orientation = triangles.orientation
@@ -219,7 +216,7 @@ def visible_triangles(points: Array, normals: Array, triples: Places) -> Triangl
     return Triangles(*tables)
 
 
-def pairs(sets: Places) -> Triangles:
+def pairs(sets: Indices) -> Triangles:
     """Return pairs (t, 2) in the record of triangles: the second point is repeated as the third."""
     everything = np.full(len(sets), 3)
     return Triangles(
@@ -238,7 +235,7 @@ def sphere(count: int) -> Array:
 DIRECTIONS = sphere(TESTED_DIRECTIONS)
 
 
-def grid_of(flat: Array, gain: Array, labels: Places, reach: float) -> Grid:
+def grid_of(flat: Array, gain: Array, labels: Indices, reach: float) -> Grid:
     """Build the grid of image points (m, 2), each in all cells within `reach` radii."""
     cells, around = IMAGE_CELLS, reach / gain[:, None]
     low, high = (flat - around).min(0), (flat + around).max(0)

@@ -20,7 +20,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bpnp.search.kernels.sides import Array, visible_weights
+from bpnp.arrays import Array32
+from bpnp.search.kernels.sides import visible_weights
 from bpnp.search.kernels.vectors import F, compiled, cross, direction, part, rotated, sum_of, turn
 
 # Alternating expectation and maximisation takes short steps.
@@ -132,14 +133,14 @@ def see(p: Any, rotation: Any, translation: Any, u: Any) -> None:
 class DenseScratch(NamedTuple):
     """Buffers of `descend`, for m bearings and n points."""
 
-    kernel: Array  # (n, m)
-    base: Array  # (m,)
-    row: Array  # (m,)
-    u: Array  # (3, n)
-    column: Array  # (n,)
-    weight: Array  # (n,) of the points under the pose at hand
-    q: Array  # (4, n)
-    system: Array  # (8, 6)
+    kernel: Array32  # (n, m)
+    base: Array32  # (m,)
+    row: Array32  # (m,)
+    u: Array32  # (3, n)
+    column: Array32  # (n,)
+    weight: Array32  # (n,) of the points under the pose at hand
+    q: Array32  # (4, n)
+    system: Array32  # (8, 6)
 
 
 def dense_scratch(m: int, n: int) -> DenseScratch:

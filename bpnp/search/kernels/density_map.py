@@ -9,14 +9,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bpnp.search.kernels.sides import Array, visible_weights
+from bpnp.arrays import Array32
+from bpnp.search.kernels.sides import visible_weights
 from bpnp.search.kernels.vectors import F, compiled, part, rotated
 
 
 class DensityMap(NamedTuple):
     """Density map: the score that a point adds by its location in the view."""
 
-    values: Array  # (g, g), rows are y; the outermost cells are 0
+    values: Array32  # (g, g), rows are y; the outermost cells are 0
     half: np.float32  # the first cell begins at -half in both coordinates
     per_cell: np.float32  # cells a unit
 

@@ -6,11 +6,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.arrays import Array
 from bpnp.search.kernels.vectors import compiled, part
 
 NEIGHBOUR_CELLS = 64  # largest number of cells along a side of the grid of neighbours [cells; cost]
-
-Array = NDArray[np.float64]
 
 
 def sums_near(

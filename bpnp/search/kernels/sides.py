@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.arrays import Array32
 from bpnp.search.kernels.vectors import F, part
 
 # Difference of the cosine between the edge of the viewing cone and full or least visibility. Poses during the annealing
@@ -27,32 +28,31 @@ NORMAL_EXTENT = 0.5  # [extents of the scene; calibration]
 CLUSTERED_POINTS = 8  # number of points per cluster from which the cluster centres are computed [points; cost]
 LLOYD_ITERATIONS = 5  # number of iterations of the clustering [iterations; cost]
 
-Array = NDArray[np.float32]
 FORWARD = np.array([0.0, 0.0, 1.0])
 
 
 class WeightedBearings(NamedTuple):
     """Bearings with weights."""
 
-    f: Array  # (3, m) offsets (`kernels.dense`)
-    a: Array  # (m,) weights
-    odds: Array  # (m,) fraction of the points with a fitting label; it multiplies the density of outliers
+    f: Array32  # (3, m) offsets (`kernels.dense`)
+    a: Array32  # (m,) weights
+    odds: Array32  # (m,) fraction of the points with a fitting label; it multiplies the density of outliers
     label: NDArray[np.int32]  # (m,); -1 fits any label
 
 
 class WeightedPoints(NamedTuple):
     """Scene points with weights."""
 
-    p: Array  # (3, n)
-    b: Array  # (n,) weights
-    odds: Array  # (n,) fraction of the bearings with a fitting label
+    p: Array32  # (3, n)
+    b: Array32  # (n,) weights
+    odds: Array32  # (n,) fraction of the bearings with a fitting label
     label: NDArray[np.int32]  # (n,); -1 fits any label
     # (k, 4) of clusters in the order of their labels. The bearings from blocks[:, 0] to [:, 1] fit the points from
     # [:, 2] to [:, 3].
     blocks: NDArray[np.uintp]
     # (6, n) coefficients of the visibility, (6, 0) if all points are seen from everywhere:
     # v_j = min(max((cones[:3, j] . C + cones[3, j]) / |C - p_j| + cones[4, j], cones[5, j]), 1), C the camera's centre.
-    cones: Array
+    cones: Array32
 
 
 @part
@@ -76,12 +76,12 @@ def visible_weights(points: Any, rotation: Any, translation: Any, weight: Any) -
 class Side(NamedTuple):
     """One side of a problem in random order."""
 
-    points: Array  # (k, 3) offsets of bearings, or points
-    weights: Array  # (k,) probability of a correspondence; 1 without annotations
+    points: Array32  # (k, 3) offsets of bearings, or points
+    weights: Array32  # (k,) probability of a correspondence; 1 without annotations
     labels: NDArray[np.int32]  # (k,); -1 fits any label
     # (k, 4) unit normals and the cosine at which a point is half visible. (k, 0) for bearings, and for points that are
     # seen from everywhere.
-    cones: Array
+    cones: Array32
 
     def at(self, chosen: slice | NDArray[np.int64]) -> "Side":
         """Return a subset of the points."""
@@ -100,7 +100,7 @@ class Side(NamedTuple):
         return Side(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
 
-def side_of(points: Array, scores: Any, labels: Any, cones: Any, order: NDArray[np.int64]) -> Side:
+def side_of(points: Array32, scores: Any, labels: Any, cones: Any, order: NDArray[np.int64]) -> Side:
     """Return a side of points (k, 3) that are in the given order (k,) of the user's indices already.
 
     The annotations are in the user's order: None for scores of 1, no labels, no cones.
@@ -148,7 +148,7 @@ def _clusters(side: Side, count: int, rng: np.random.Generator) -> Side:
     )
 
 
-def lloyd(points: Array, centres: Array, iterations: int, weights: Array) -> tuple[Array, NDArray[np.float64]]:
+def lloyd(points: Array32, centres: Array32, iterations: int, weights: Array32) -> tuple[Array32, NDArray[np.float64]]:
     """Run k-means (Lloyd) from initial centres (k, d); return the centres, and the weights (k,) of the points of each.
 
     A centre without points keeps its last value.
@@ -195,7 +195,7 @@ def blocks_of(labels2d: NDArray[np.int32], labels3d: NDArray[np.int32]) -> NDArr
     return np.array(blocks, np.uintp).reshape(-1, 4)
 
 
-def _fitting(side: Side, other: Side) -> Array:
+def _fitting(side: Side, other: Side) -> Array32:
     """Return the fraction of the other side, by weight, with a fitting label; at least 1e-6, and 1 if it is empty."""
     if (side.labels < 0).all() or not len(other.labels):
         return np.ones(len(side.labels), np.float32)
@@ -207,7 +207,7 @@ def _fitting(side: Side, other: Side) -> Array:
     return np.maximum(np.where(side.labels < 0, total, fitting) / total, 1e-6).astype(np.float32)
 
 
-def _cones(points: Side) -> Array:
+def _cones(points: Side) -> Array32:
     """Return the coefficients (6, n) of the visibility of `WeightedPoints`."""
     if not points.cones.shape[1]:
         return np.empty((6, 0), np.float32)

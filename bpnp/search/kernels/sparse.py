@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.arrays import Array32
 from bpnp.search.kernels.dense import move, see
-from bpnp.search.kernels.sides import Array, WeightedBearings, visible_weights
+from bpnp.search.kernels.sides import WeightedBearings, visible_weights
 from bpnp.search.kernels.vectors import F, compiled, copy_pose, part, sum_of
 
 SWEEPS = 2  # alternating normalisations of the assignment on all points, of rows and columns [sweeps; not tuned]
@@ -34,12 +35,12 @@ class Tiles(NamedTuple):
     Cell (i, j) of the grid is number 1 + i * shape[1] + j; number 0 is outside.
     """
 
-    f: Array  # (c, 3, lanes) offsets
-    a: Array  # (c, lanes) weights; the last tile is filled up with bearings of weight 0
-    odds: Array  # (c, lanes), as in `WeightedBearings`
+    f: Array32  # (c, 3, lanes) offsets
+    a: Array32  # (c, lanes) weights; the last tile is filled up with bearings of weight 0
+    odds: Array32  # (c, lanes), as in `WeightedBearings`
     label: NDArray[np.int32]  # (c, lanes), as in `WeightedBearings`
-    box: Array  # (c, 4) least x and y of a tile, and largest
-    low: Array  # (2,) corner of the grid
+    box: Array32  # (c, 4) least x and y of a tile, and largest
+    low: Array32  # (2,) corner of the grid
     cell: np.float32
     shape: NDArray[np.int32]  # (2,) cells along x and y
 
@@ -55,7 +56,7 @@ class Near(NamedTuple):
     """Pairs e of a tile and a point near it, in the order of the tiles: those of tile t from end[t] to end[t + 1]."""
 
     point: NDArray[np.int32]  # (e,) indices of points
-    kernel: Array  # (e, lanes) kernel of the tile's bearings and this point
+    kernel: Array32  # (e, lanes) kernel of the tile's bearings and this point
     end: NDArray[np.int32]  # (c + 1,)
 
 

@@ -10,10 +10,10 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from bpnp.arrays import Array
 from bpnp.search.possible_matches import MATCH_REACH
 from bpnp.search.problem import Problem
 
@@ -29,8 +29,6 @@ APART_STEPS = 2  # two angles within this many steps are one, since poses are re
 MOST_OTHERS = 500  # largest number of points off the line that are rotated, the nearest ones [points; cost]
 KEPT_ANGLES = 6  # largest number of competing poses, those that explain the most points [poses; cost]
 CACHED_LINES = 64  # number of sets of points whose line stays in the cache [sets; cost]
-
-Array = NDArray[np.float64]
 
 
 class Line(NamedTuple):

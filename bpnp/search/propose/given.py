@@ -3,9 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bpnp.arrays import Array
 from bpnp.runtime import one_blas_thread
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame
 from bpnp.search.kernels.sides import FORWARD
@@ -15,8 +15,6 @@ from bpnp.search.search_frame import SearchFrame
 
 REFINED_DIRECTLY = 8  # largest number of given poses that need no clusters [poses; cost]
 COPIED_POSES = 4  # number of poses from other sources, the best first, that are also copied [poses; calibration]
-
-Array = NDArray[np.float64]
 
 
 @one_blas_thread

@@ -8,8 +8,8 @@ may have any size: a search for matches within a radius would miss large ones.
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bpnp.arrays import Array, Labels
 from bpnp.poses import SAME, distinct, polar_coordinates
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.pose_model import PoseModel
@@ -18,8 +18,6 @@ from bpnp.search.problem import Problem
 from bpnp.search.propose.minimal_solvers import p3p_poses
 from bpnp.search.refine.gauss_newton import FIRST_DAMPING, match_equations, refine
 
-Array = NDArray[np.float64]
-Labels = NDArray[np.int64]
 FIXING = 3  # matches that fix a pose [matches; derived]
 # With a fifth of the matches correct, all of them miss a correct triple 3 times in 10,000.
 MOST_TRIPLES = 1000  # largest number of triples of given matches [triples; derived]

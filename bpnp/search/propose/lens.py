@@ -7,8 +7,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bpnp.arrays import Array
 from bpnp.search.pose_model import PoseModel, PoseState
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.refine.gauss_newton import refine, soft_equations
@@ -26,8 +26,6 @@ FIRST_WIDTHS = (4.0,)  # scales of the steps before the first round [scales of t
 ROUND_WIDTHS = (4.0, 2.0, 2.0, 1.0, 1.0)  # scales of the steps of each round [scales of the residuals; not tuned]
 LENS_DAMPING = 1e-6  # damping, a fraction of the diagonal of the normal equations [fraction; numerics]
 FITTED_BEARINGS = 400  # largest number of bearings that most steps are fitted to [bearings; cost]
-
-Array = NDArray[np.float64]
 
 
 class LensFit(NamedTuple):

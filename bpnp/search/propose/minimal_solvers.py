@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.arrays import Array
 from bpnp.runtime import compiler, in_threads
 from bpnp.search.kernels.vectors import cross, rotated
 
@@ -24,7 +25,6 @@ UPRIGHT_FRACTION = 1e-3  # [fraction; numerics]
 
 compiled = compiler()
 part = compiler(part=True, forceinline=True)  # called by compiled functions alone
-Array = NDArray[np.float64]
 
 
 class Triangles(NamedTuple):

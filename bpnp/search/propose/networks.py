@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from bpnp.arrays import Array
 from bpnp.runtime import Deadline
-from bpnp.search.arguments import Array
 from bpnp.search.problem import Problem
 from bpnp.search.propose.given import score_given
 from bpnp.search.search_frame import SearchFrame

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
+from bpnp.arrays import Array, PoseArrays
 from bpnp.poses import SAME
 from bpnp.runtime import NEVER, Deadline
 from bpnp.search.hypotheses import Hypotheses
@@ -49,9 +50,6 @@ KEPT_REPETITIONS = 6  # largest number of competing poses; those with the fewest
 SCORED_AT_ONCE = 100_000  # points, times poses, that are scored between two checks of the deadline [points; cost]
 CACHED_SCENES = 64  # number of scenes whose motions stay in the cache [scenes; cost]
 MOST_MISSING = 1 / 3  # largest fraction of its points that a map may lack [fraction; not tuned]
-
-Array = NDArray[np.float64]
-Pose = tuple[Array, Array]
 
 
 class Repeated(NamedTuple):
@@ -248,9 +246,9 @@ def repeated_poses(
 
 def repetition_margins(
     problem: Problem,
-    best: Pose,
-    repeated: Pose,
-    competitors: Pose,
+    best: PoseArrays,
+    repeated: PoseArrays,
+    competitors: PoseArrays,
     scale: float,
     most_missing: float = MOST_MISSING,
     *,
@@ -277,7 +275,7 @@ def repetition_margins(
     return np.asarray(np.where(counted, np.clip(logs[0] - logs[1:], -most, most), 0).sum(-1) / math.log(10))
 
 
-def _is_repeated(problem: Problem, best: Pose, repeated: Pose, reach: float) -> NDArray[np.bool_]:
+def _is_repeated(problem: Problem, best: PoseArrays, repeated: PoseArrays, reach: float) -> NDArray[np.bool_]:
     """Return for each chosen image point (k,) if a motion, or its inverse, maps its scene point onto another one.
 
     A motion is p -> Q p + d. A repeated pose sees the point Q p + d where the best pose sees p.

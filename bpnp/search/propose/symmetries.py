@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bpnp.arrays import Array, Indices
 from bpnp.poses import distinct
 from bpnp.search.kernels.neighbours import HashedPoints, hashed, lies_on
 from bpnp.search.kernels.vectors import compiled, part
@@ -61,9 +62,6 @@ REFINEMENT_ROUNDS = 3  # rounds of the refinement: nearest points, rigid fit [ro
 # Angle between the rotations of two motions below which they can be one; their shifts must be within four tolerances
 # too.
 SAME_MOTION_DEG = 3.0  # [degrees; not tuned]
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 
 class Motions(NamedTuple):

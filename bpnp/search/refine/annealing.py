@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bpnp.arrays import Array32
 from bpnp.runtime import Clock, in_time, thread_count
 from bpnp.search.hypotheses import KEPT_CANDIDATES, Hypotheses, select_distinct, to_problem_frame
 from bpnp.search.kernels.dense import dense_scratch, descend
 from bpnp.search.kernels.sparse import descend_sparse, sparse_scratch
 from bpnp.search.search_frame import SearchFrame, Sides
-from bpnp.search.starts import Array, Prior, StartSampling, draw_poses
+from bpnp.search.starts import Prior, StartSampling, draw_poses
 
 # Pairs of bearings and points from which the first step of an annealing on all of them is timed.
 TIMED_PAIRS = 3e8  # [count; cost]
@@ -102,7 +103,7 @@ def anneal_on_clusters(
     return poses
 
 
-def _annealed(scene: SearchFrame, starts: Hypotheses, sides: Sides, scales: Array, outlier: np.float32) -> Hypotheses:
+def _annealed(scene: SearchFrame, starts: Hypotheses, sides: Sides, scales: Array32, outlier: np.float32) -> Hypotheses:
     """Take one step at each scale (k,), radians; return the poses that were annealed before the deadline."""
     rotation, translation, score = starts.rotation.copy(), starts.translation.copy(), starts.log_likelihood.copy()
 
@@ -159,7 +160,13 @@ def anneal_on_points(
 
 
 def perturb_about_centroid(
-    scene: SearchFrame, rotation: Array, translation: Array, vectors: Array, shifts: Array, *, basin_count: int = 0
+    scene: SearchFrame,
+    rotation: Array32,
+    translation: Array32,
+    vectors: Array32,
+    shifts: Array32,
+    *,
+    basin_count: int = 0,
 ) -> Hypotheses:
     """Return copies of k poses, adjacent for each, rotated by vectors (s, 3) about the centroid and shifted (s, 3).
 

@@ -16,6 +16,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.arrays import Array, Labels
 from bpnp.search.pose_model import PoseModel, PoseState, Sight
 from bpnp.search.possible_matches import MOST_NEIGHBOURS, facing, possible_matches
 from bpnp.search.problem import Problem
@@ -25,9 +26,6 @@ DIFFERENCE_STEP = 6e-6  # step of central differences, the cube root of the mach
 DAMPING_IF_TAKEN = 0.1  # factor on the damping after a step that is taken [factor; convention]
 DAMPING_IF_NOT = 10.0  # factor on the damping after a step that is not [factor; convention]
 FIRST_DAMPING = 1e-3  # first damping of Levenberg and Marquardt, a fraction of the diagonal [fraction; convention]
-
-Array = NDArray[np.float64]
-Labels = NDArray[np.int64]
 
 
 class Equations(NamedTuple):

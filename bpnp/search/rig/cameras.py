@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from bpnp.arrays import Array, PoseArrays
 from bpnp.runtime import NEVER, Deadline
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.pose_model import PoseModel, crossed
@@ -46,9 +47,6 @@ WEIGHED_SCALES = 7  # number of the last scales at which the false alarms of pos
 # Distance below which camera centres coincide, as a fraction of their largest coordinate in the rig.
 SAME_CENTRE = 1e-6  # [fraction; numerics]
 
-Array = NDArray[np.float64]
-Pose = tuple[Array, Array]
-
 
 class Rig:
     """Rig cameras with their points of one scene. Translations of the rig are homogeneous.
@@ -65,7 +63,7 @@ class Rig:
     def __init__(
         self,
         problems: Sequence[Problem],
-        mounts: Sequence[Pose],
+        mounts: Sequence[PoseArrays],
         *,
         is_metric: bool = True,
         prior: Prior | None = None,
@@ -92,12 +90,12 @@ class Rig:
     def _images(self) -> list[KDTree]:
         return [KDTree(problem.bearings) for problem in self.problems]
 
-    def pose_of(self, k: int, rotation: Array, translation: Array) -> Pose:
+    def pose_of(self, k: int, rotation: Array, translation: Array) -> PoseArrays:
         """Return the poses of camera k for poses (..., 3, 3), (..., 4) of the rig."""
         turn, shift = self.mounts[k]
         return turn @ rotation, translation[..., :3] @ turn.T + translation[..., 3:] * shift
 
-    def rig_of(self, k: int, rotation: Array, translation: Array, unit: Array | float = 1.0) -> Pose:
+    def rig_of(self, k: int, rotation: Array, translation: Array, unit: Array | float = 1.0) -> PoseArrays:
         """Return the poses of the rig for poses of camera k.
 
         The poses of a camera become rotations (..., 3, 3) and homogeneous translations (..., 4); `unit` is the length
@@ -330,7 +328,7 @@ def _distances(image: KDTree, directions: Array) -> Array:
     return result
 
 
-def _prior_of(mount: Pose, prior: Prior | None) -> Prior | None:
+def _prior_of(mount: PoseArrays, prior: Prior | None) -> Prior | None:
     """Return the prior of the pose of a rig as one of the pose of a camera with these extrinsics."""
     turn, shift = mount
     if isinstance(prior, GravityPrior):

@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.arrays import Array, PoseArrays
 from bpnp.poses import SAME, distinct, polar_coordinates
 from bpnp.runtime import NEVER, Clock, Deadline, one_blas_thread
 from bpnp.search.enumeration.points import predicted_pose
@@ -26,7 +27,7 @@ from bpnp.search.problem import Problem
 from bpnp.search.propose.density_map import LOCAL, search_around
 from bpnp.search.propose.known_matches import known_matches, poses_of_matches
 from bpnp.search.propose.repetitions import repeated_poses
-from bpnp.search.rig.cameras import WIDE_SCALES, Array, Pose, Rig
+from bpnp.search.rig.cameras import WIDE_SCALES, Rig
 from bpnp.search.search import lacks_partners
 from bpnp.search.search_frame import SearchFrame
 from bpnp.search.settings import DEFAULT, SearchSettings
@@ -332,7 +333,7 @@ class RigPoses:
         return self.rig.distinct_fraction(self.best.rotation[0], self.best.translation[0], float(self.best.scale[0]))
 
 
-def _proposals(rig: Rig, new: Mapping[int, Hypotheses], found: Sequence[Hypotheses]) -> Pose:
+def _proposals(rig: Rig, new: Mapping[int, Hypotheses], found: Sequence[Hypotheses]) -> PoseArrays:
     """Return the poses of the rig that new poses of the cameras give.
 
     If the scale is unknown, they are those in which two cameras with a non-zero baseline agree. The poses of the second
@@ -353,7 +354,7 @@ def _proposals(rig: Rig, new: Mapping[int, Hypotheses], found: Sequence[Hypothes
     return rotation, translation
 
 
-def _agreeing_poses(rig: Rig, pair: tuple[int, int], first: Hypotheses, second: Hypotheses) -> Pose:
+def _agreeing_poses(rig: Rig, pair: tuple[int, int], first: Hypotheses, second: Hypotheses) -> PoseArrays:
     """Return the poses of the rig in which two cameras agree; the scene centroid is at its least-squares position."""
     (turn, shift), (other, moved) = (rig.mounts[k] for k in pair)
     centre = rig.problems[0].centre3d

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from bpnp.arrays import PoseArrays
 from bpnp.cameras import Camera, camera_from
 from bpnp.runtime import NEVER, Clock
 from bpnp.search.arguments import about, checked_pose, pose_of
@@ -16,7 +17,7 @@ from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.focal_length import FocalSweep, UnknownCamera
 from bpnp.search.inputs import problem_from
 from bpnp.search.problem import UnknownFocal
-from bpnp.search.rig.cameras import Pose, Rig
+from bpnp.search.rig.cameras import Rig
 from bpnp.search.rig.search import search_rig
 from bpnp.search.solution import Solution
 from bpnp.search.solvers import Options, at_deadline, ending_seconds
@@ -30,7 +31,7 @@ def prepare_rig(
     points3d: Any,
     cameras: Sequence[Any],
     unknown: Sequence[UnknownCamera] | None,
-    mounts: Sequence[Pose],
+    mounts: Sequence[PoseArrays],
     point_options: Mapping[str, Any],
     options: Options,
     *,
@@ -75,7 +76,7 @@ class RigPoints:
 
     points2d: list[Any]
     points3d: Any
-    mounts: list[Pose]
+    mounts: list[PoseArrays]
     point_options: dict[str, Any]
     inlier_threshold: float | None
     clutter: float | None
@@ -154,7 +155,7 @@ def _solve(rig: Rig, options: Options) -> Solved:
     return Solved(case, replace(solution, seconds=Clock.now() - begun))
 
 
-def mount_from(name: str, value: Any) -> Pose:
+def mount_from(name: str, value: Any) -> PoseArrays:
     """Return rotation and translation of extrinsics cam_from_rig; see `pose_of` for the forms."""
     pose = pose_of(value, name)
     if pose is None or pose[1] is None:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bpnp.arrays import Array, PoseArrays
 from bpnp.poses import SAME, rotation_angle
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.possible_matches import MATCH_REACH
@@ -37,8 +38,6 @@ BEND_DEG = 1.0  # rotation, degrees, from which poses with radial distortion are
 # Shift, in distances of the scene, from which poses with radial distortion are different.
 BEND_SHIFT = 0.02  # [fraction; convention]
 
-Array = NDArray[np.float64]
-Pose = tuple[Array, Array]
 CandidatesOfCameras = Sequence[tuple[Hypotheses, Problem]]
 
 
@@ -53,7 +52,7 @@ def other_pose(candidates: Hypotheses, problem: Problem) -> Objection | None:
     return competing_pose(problem, candidates.pose(), candidates.pose(k), decades)
 
 
-def competing_pose(problem: Problem, best: Pose, other: Pose, decades: float) -> Objection:
+def competing_pose(problem: Problem, best: PoseArrays, other: PoseArrays, decades: float) -> Objection:
     """Return a different pose as an objection.
 
     `decades` is log10 of the ratio of their false alarms.
@@ -61,7 +60,7 @@ def competing_pose(problem: Problem, best: Pose, other: Pose, decades: float) ->
     return objection("competing_pose", decades, away=distance_between(problem, best, other))
 
 
-def distance_between(problem: Problem, first: Pose, second: Pose) -> str:
+def distance_between(problem: Problem, first: PoseArrays, second: PoseArrays) -> str:
     """Return the angle between two poses in words, or for equal rotations the shift of the scene centroid.
 
     Such as "12 deg" or "15 % of the distance", that of the scene centroid from the camera of the first pose.

@@ -7,12 +7,11 @@ linearised about the estimate, in standard deviations of their residuals.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.special import stdtrit
 
-Array = NDArray[np.float64]
-Labels = NDArray[np.int64]
+from bpnp.arrays import Array, Labels
+
 ONE_SIGMA = 0.8413447460685429  # of a normal variable below one standard deviation [probability; derived]
 # Squared distance of a pose from its optimum, in its covariance, from which on they differ: the quantile of chi-squared
 # with 6 degrees of freedom at 1 - `EXCEEDED`.

@@ -31,6 +31,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.arrays import Array, Labels
 from bpnp.search.image_statistics import ImageStatistics
 from bpnp.search.kernels.neighbours import sums_near
 from bpnp.search.pose_model import PoseModel
@@ -51,8 +52,6 @@ OWN_SCALES = 2.0  # [factor; convention]
 # Smallest factor between the scales at which residuals are rougher (`rough_residuals`).
 ROUGH_SCALES = 4.0  # [factor; convention]
 
-Array = NDArray[np.float64]
-Labels = NDArray[np.int64]
 
 SHARES = np.array(INLIER_FRACTIONS)  # lambda
 

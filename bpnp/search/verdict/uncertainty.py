@@ -9,16 +9,14 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import fdtrc, fdtri
 
+from bpnp.arrays import Array, Labels
 from bpnp.search.pose_model import PoseModel, PoseState, Sight, crossed, lens_columns, lens_error_columns
 from bpnp.search.problem import Problem
 from bpnp.search.refine.gauss_newton import soft_matches
 from bpnp.search.verdict.covariance import Linearisation, covariance_of, student_factor
 
-Array = NDArray[np.float64]
-Labels = NDArray[np.int64]
 MANY = 1e9  # degrees of freedom of a number that does not vary [1; numerics]
 
 # Basis of the strains that preserve the volume; the sixth is the unit of length, which no image shows.

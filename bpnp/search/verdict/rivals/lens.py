@@ -5,8 +5,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from bpnp.arrays import Array
 from bpnp.poses import rotation_angle
 from bpnp.runtime import NEVER, Deadline
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame
@@ -43,8 +43,6 @@ WIDEST_ZOOM = 1.6  # largest factor on the given focal length; its inverse is th
 FEWEST_MATCHES = 24  # smallest number of matches; with fewer, a seventh unknown fits their noise [matches; calibration]
 # Largest radial distortion, as a fraction of the distance of the outermost image point from the axis.
 MOST_BEND = 0.5  # [fraction; convention]
-
-Array = NDArray[np.float64]
 
 
 def lens(case: Case, *, scene_of: SceneOf, deadline: Deadline = NEVER) -> Case:
