@@ -291,6 +291,23 @@ class Problem:
         lens = 0 if self.focal is None else 1 + (self.focal.radial_range > 0)
         return 2 * self.fixing_matches + lens
 
+    def prior_sigmas(self, rotation: Array, translation: Array) -> float:
+        """Return the larger deviation of rotation and position from the prior, in standard deviations; 0 without."""
+        prior = self.prior
+        if prior is None:
+            return 0.0
+        if isinstance(prior, GravityPrior):
+            up, camera = rotation @ prior.directions()[1], np.asarray(prior.up_camera, np.float64)
+            off = math.atan2(float(np.linalg.norm(np.cross(up, camera))), float(up @ camera))
+            return math.degrees(off) / prior.sigma_deg
+        prior_rotation = np.asarray(prior.rotation, np.float64)
+        far = math.degrees(rotation_angle(rotation, prior_rotation)) / prior.rotation_sigma_deg
+        if prior.translation is None or not math.isfinite(prior.translation_sigma):
+            return far
+        expected = prior_rotation @ self.centre3d + np.asarray(prior.translation)
+        shift = float(np.linalg.norm(rotation @ self.centre3d + translation - expected))
+        return max(far, shift / prior.translation_sigma)
+
     def log10_prior_fraction(self, rotation: Array, translation: Array) -> float:
         """Return log10 of the fraction F of all poses that are at least as near to the prior as this one.
 
@@ -301,24 +318,17 @@ class Problem:
         variable in [0, 1]: it is a p-value of the prior, and the NFA is the number of tests times F over the likelihood
         ratio of the points.
         """
-        prior, sigmas = self.prior, EQUALLY_NEAR_SIGMAS
+        prior = self.prior
         if prior is None:
             return 0.0
+        far = max(self.prior_sigmas(rotation, translation), EQUALLY_NEAR_SIGMAS)
         if isinstance(prior, GravityPrior):
-            up = rotation @ prior.directions()[1]
-            camera = np.asarray(prior.up_camera, np.float64)
-            off = math.atan2(float(np.linalg.norm(np.cross(up, camera))), float(up @ camera))
-            off = min(max(off, math.radians(sigmas * prior.sigma_deg)), math.pi)
+            off = min(far * math.radians(prior.sigma_deg), math.pi)
             return math.log10(max((1 - math.cos(off)) / 2, 1e-12))
-        prior_rotation, sigma = np.asarray(prior.rotation, np.float64), math.radians(prior.rotation_sigma_deg)
-        far, has_position = max(rotation_angle(rotation, prior_rotation) / sigma, sigmas), False
-        if prior.translation is not None and math.isfinite(prior.translation_sigma):
-            expected, has_position = prior_rotation @ self.centre3d + np.asarray(prior.translation), True
-            shift = float(np.linalg.norm(rotation @ self.centre3d + translation - expected))
-            far = max(far, shift / prior.translation_sigma)
-        off = min(far * sigma, math.pi)
+        off = min(far * math.radians(prior.rotation_sigma_deg), math.pi)
         fraction = max((off - math.sin(off)) / math.pi, 1e-15)
-        if has_position:
+        if prior.translation is not None and math.isfinite(prior.translation_sigma):
+            expected = np.asarray(prior.rotation) @ self.centre3d + np.asarray(prior.translation)
             relative = far * prior.translation_sigma / max(float(np.linalg.norm(expected)), 1e-12)
             fraction *= min(1.0, math.pi * relative**2 / self.image.solid_angle)
             fraction *= min(1.0, 2 * math.atanh(relative) / LOG_DEPTHS) if relative < 1 else 1.0
@@ -371,7 +381,12 @@ def why_degenerate(bearings: Array, points3d: Array, fewest: int = MIN_POINTS) -
             count, others = count + 1, others[(others != others[0]).any(-1)]
         if count < fewest:
             return f"only {count} different {name} point{'' if count == 1 else 's'}: {fewest} or more fix a pose"
-    extents = np.linalg.svd(points3d - points3d.mean(0), compute_uv=False)
-    if extents[1] <= LINE_RATIO * extents[0]:
+    # One point far away hides the extent of all others, and one beside a line the line.
+    if all(_are_on_a_line(some) for some in (points3d, points3d[in_bulk(points3d)])):
         return "the 3D points lie on one line: the camera can turn about it"
     return None
+
+
+def _are_on_a_line(points: Array) -> bool:
+    extents = np.linalg.svd(points - points.mean(0), compute_uv=False)
+    return len(extents) < 2 or bool(extents[1] <= LINE_RATIO * extents[0])

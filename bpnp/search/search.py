@@ -33,6 +33,7 @@ from bpnp.search.verdict.rivals import SceneOf
 
 # Clusters keep every one of so small a set, and further iterations end at the same poses.
 ENUMERATED_ITERATIONS = 12  # iterations, at most, for points few enough to be enumerated [iterations; calibration]
+WIDER_RADIUS = 8 / 3  # second match radius, where the residuals of the first are rough [match radii; calibration]
 # Fewer points have no smooth optimum and are only enumerated.
 LEAST_ANNEALED = 12  # least number of points of the smaller set for annealing [points; calibration]
 WARMING_POINTS = 8  # number of points of the problem that compiles the loops [points; convention]
@@ -85,13 +86,20 @@ def find_case(
 
     many = exceeds_enumeration(problem)
     matches = None if only_proposals else known_matches(problem)
-    if matches is not None and (problem.prior is None or not is_enumerable(problem)):
-        return _of_known_matches(problem, *matches, scene_of, seed, deadline)
+    if matches is not None:
+        case = _of_known_matches(problem, *matches, scene_of, seed, deadline)
+        if problem.prior is None or not is_enumerable(problem) or case.objection is None:
+            return case
     if not many:
         settings = settings.limited(min(settings.iterations, ENUMERATED_ITERATIONS))
     if not only_proposals and is_enumerable(problem) and not deadline.passed():
         poses = EnumeratedPoses(problem, scene_of)
         enumerated = run(EnumerationPlan(poses, deadline), poses, most=1, deadline=NEVER)
+        if enumerated.is_rough and problem.radius is None:
+            wider = EnumeratedPoses(replace(problem, radius=WIDER_RADIUS * problem.match_radius), scene_of)
+            again = run(EnumerationPlan(wider, deadline), wider, most=1, deadline=NEVER)
+            if again.log10_false_alarms < enumerated.log10_false_alarms:
+                poses, enumerated = wider, again
         by_chance = fits_by_chance(enumerated.log10_false_alarms)
         if matches is not None and by_chance:  # residuals may exceed its match radius
             return _of_known_matches(problem, *matches, scene_of, seed, deadline)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from planted import degrees_between
 from scipy.spatial.transform import Rotation
 
-from bpnp import PosePrior, solve, verify
+from bpnp import GravityPrior, PosePrior, solve, verify
 
 Array = NDArray[np.float64]
 K = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])
@@ -136,3 +136,54 @@ def test_a_true_pose_among_clutter_has_no_competitor_of_a_few_matches() -> None:
         image = shuffled(rng, pixels(points, rotation, AWAY, rng), rng.uniform([100, 100], [540, 380], (10, 2)))
         for independent in (False, True):
             assert verify(image, points, rotation, AWAY, K, independent=independent).verdict == "confident"
+
+
+def test_a_pose_far_from_its_prior_says_so_and_is_not_confident() -> None:
+    rng = np.random.default_rng(3)
+    points, rotation = rng.normal(size=(20, 3)), Rotation.random(random_state=3).as_matrix()
+    image = pixels(points, rotation, AWAY, rng)
+    near, far = (solve(image, points, K, prior=PosePrior(rotation, AWAY + [x, 0, 0], 5.0, 0.1)) for x in (0.2, 2.0))
+    assert near.verdict == "confident"
+    assert (far.verdict, far.reason_code) == ("ambiguous", "contradicts_prior")
+    assert "It is 20 standard deviations from the given prior" in far.reason
+    assert degrees_between(far.rotation, rotation) < 1
+
+
+def test_gravity_weighs_the_mirror_pose_of_a_flat_scene_too() -> None:
+    """Six corners of a court whose matches are known, seen from 30 metres: upside down, they fit nearly as well."""
+    rng = np.random.default_rng(0)
+    court = np.array([[x, y, 0.0] for x in (-3, 3) for y in (-6.7, 0, 6.7)])
+    rotation = Rotation.from_euler("x", 100, degrees=True).as_matrix()
+    image = pixels(court, rotation, np.array([0, 1.5, 30.0]), rng, noise=2.0)
+    up = rotation @ [0, 0, 1]
+    ids = np.arange(6)
+    plain, upright = (
+        solve(image, court, K, labels2d=ids, labels3d=ids, prior=prior)
+        for prior in (None, GravityPrior(up, [0, 0, 1], 3))
+    )
+    margins = [one.candidates[1].log10_false_alarms - one.log10_false_alarms for one in (plain, upright)]
+    assert upright.inlier_count == plain.inlier_count == 6
+    assert upright.log10_false_alarms < plain.log10_false_alarms
+    assert margins[1] > margins[0] + 1
+
+
+def test_residuals_above_the_match_radius_are_tried_with_a_larger_one() -> None:
+    """40 corners, clicked to 4 pixels; with a given radius the reason names a larger one."""
+    rng = np.random.default_rng(5)
+    points, rotation = rng.normal(size=(40, 3)), Rotation.random(random_state=5).as_matrix()
+    image = rng.permutation(pixels(points, rotation, AWAY, rng, noise=3.5))
+    solution = solve(image, points, K)
+    assert solution.verdict == "confident"
+    assert solution.inlier_count > 34
+    assert degrees_between(solution.rotation, rotation) < 2
+
+
+@pytest.mark.parametrize("far", [1e3, 1e9])
+def test_one_point_far_away_changes_nothing(far: float) -> None:
+    rng = np.random.default_rng(4)
+    points, rotation = rng.normal(size=(30, 3)), Rotation.random(random_state=4).as_matrix()
+    image = pixels(points[1:], rotation, AWAY, rng)
+    points[0] = far
+    for solution in (solve(image, points, K), verify(image, points, rotation, AWAY, K)):
+        assert solution.verdict == "confident"
+        assert degrees_between(solution.rotation, rotation) < 1

@@ -38,6 +38,8 @@ BEND_DEG = 1.0  # rotation, degrees, from which poses with radial distortion are
 # Shift, in distances of the scene, from which poses with radial distortion are different.
 BEND_SHIFT = 0.02  # [fraction; convention]
 
+WIDER = 8 / 3  # threshold that is suggested where residuals are rough [match radii; calibration]
+
 CandidatesOfCameras = Sequence[tuple[Hypotheses, Problem]]
 
 
@@ -73,7 +75,7 @@ def distance_between(problem: Problem, first: PoseArrays, second: PoseArrays) ->
     return f"{100 * shift:.0f} % of the distance"
 
 
-def rough_residuals(candidates: Hypotheses) -> Objection | None:
+def rough_residuals(candidates: Hypotheses, problem: Problem) -> Objection | None:
     """Return the best pose at far larger residuals, or None if the points agree better at its own scale.
 
     If the rough alignment has fewer false alarms, the matches add nothing significant to it.
@@ -81,7 +83,7 @@ def rough_residuals(candidates: Hypotheses) -> Objection | None:
     decades = float(candidates.log10_rough[0] - candidates.log10_false_alarms[0])
     if decades >= 0:
         return None
-    return objection("rough_residuals", decades)
+    return objection("rough_residuals", decades, threshold=WIDER * problem.match_radius * problem.measured.per_radian)
 
 
 def other_camera(off: Misfit) -> Objection | None:

@@ -6,6 +6,7 @@ from functools import partial
 from bpnp.runtime import NEVER, Deadline
 from bpnp.search.verdict.decide import Case
 from bpnp.search.verdict.rivals import Rival, SceneOf
+from bpnp.search.verdict.rivals.given import given
 from bpnp.search.verdict.rivals.lens import lens
 from bpnp.search.verdict.rivals.mirrored_image import mirrored_image
 from bpnp.search.verdict.rivals.nearby import nearby
@@ -20,6 +21,7 @@ def rivals_of(scene_of: SceneOf, deadline: Deadline = NEVER, *, enumerated: bool
     candidates are those of an enumeration.
     """
     return [
+        given,
         partial(symmetries, scene_of=scene_of, deadline=deadline, enumerated=enumerated),
         partial(nearby, scene_of=scene_of, deadline=deadline),
         partial(second_body, deadline=deadline),

@@ -143,6 +143,11 @@ class Case:
         return all(one.margin >= LEAST_MARGIN for one in self._rivals) and self.missed <= MOST_MISSED
 
     @property
+    def is_rough(self) -> bool:
+        """True if the points fit better with residuals larger than those of the leader."""
+        return self.objection is not None and self.objection.code == "rough_residuals"
+
+    @property
     def objection(self) -> Objection | None:
         """Reason against the leader; None if it is confident. What rivals found is more specific than other tests."""
         if self.objections and not fits_by_chance(self.log10_false_alarms):
@@ -193,7 +198,7 @@ class Case:
     def _rivals(self) -> list[Objection]:
         """Best other pose in each camera, and the pose itself at rough residuals."""
         others = [other_pose(*each) for each in self._cameras]
-        return [one for one in (*others, rough_residuals(self.candidates)) if one is not None]
+        return [one for one in (*others, rough_residuals(self.candidates, self.problem)) if one is not None]
 
     @property
     def _cameras(self) -> CandidatesOfCameras:

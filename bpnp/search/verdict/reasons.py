@@ -26,9 +26,11 @@ CLAUSES = {
     "better_pose": "a pose {away} away fits better (by {margin:.1f} decades)",
     "better_nearby": "the nearest optimum, {degrees:.2g} deg away, fits better (by {margin:.1f} decades)",
     "other_points": "a pose {away} away explains other points, and the difference may be chance",
+    "contradicts_prior": "it is {sigmas:.0f} standard deviations from the given prior",
     "second_body": "two bodies: {first} and {second} of {count} image points fit different poses, {away} apart",
     "mirrored_image": "the image is mirrored: flipped, x = width - x, it fits better (by {better:.1f} decades)",
-    "rough_residuals": "the points fit better with residuals far larger than those of the matches",
+    "rough_residuals": "the points fit better with residuals far larger than those of the matches: try "
+    "inlier_threshold={threshold:.2g}",
     "untested": "there was no time to test its competing poses",
     "incomplete": "a better {what} may exist (miss probability up to {probability})",
     # Another camera, or another scene, may be the right one.

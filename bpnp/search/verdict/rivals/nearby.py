@@ -23,10 +23,11 @@ FEWEST_LEFT = 4  # [points; not tuned]
 def nearby(case: Case, *, scene_of: SceneOf, deadline: Deadline = NEVER) -> Case:
     """Return a case with the poses that annealing reaches from the leader of an enumeration, and from copies of it.
 
-    A search with annealing has looked near its leader before (`Case.missed`), and so has the test of a given pose.
+    A search with annealing has looked near its leader before (`Case.missed`), and so has the test of a given pose;
+    an enumeration to the end, or known matches, leave nothing better.
     """
     problem = case.problem
-    if not case.is_fitted or case.claim is not None:
+    if not case.is_fitted or case.exhaustive or case.claim is not None:
         return case
     if min(left_by(case)) < FEWEST_LEFT:
         return case

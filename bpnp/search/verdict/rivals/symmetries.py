@@ -66,6 +66,8 @@ def _repeated(case: Case, scene_of: SceneOf, deadline: Deadline, *, enumerated: 
     behind = repetition_margins(problem, best, shifted, others, scale, most_missing, fraction=fraction)
     # If the pose is wrong, a motion maps nearly all of its matches; of a lattice it may not be among these.
     behind = np.maximum(behind, 0) if motions.left_out < HIDING else np.zeros(len(refined))
+    fractions = np.array([problem.log10_prior_fraction(*pose) for pose in zip(*others, strict=True)])
+    behind = behind + fractions - problem.log10_prior_fraction(*best)
     if enumerated and (behind >= LEAST_MARGIN).all():
         return Hypotheses.empty()
     alarms = np.minimum(refined.log10_false_alarms, case.log10_false_alarms + behind)
