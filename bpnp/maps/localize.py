@@ -37,10 +37,8 @@ MOST_KEYPOINTS = 2048  # largest number of keypoints that are used [keypoints; m
 ITERATIONS = 1  # iterations of a search near a view [iterations; not tuned]
 LONGER_ITERATIONS = 16  # iterations of a longer search near a promising view [iterations; not tuned]
 PROMISING_VIEWS = 3  # number of views that get a longer search if none is confident [views; not tuned]
-# Largest log10 NFA with which a view gets a longer search before the next view.
-LIKELY_ALARMS = -20.0  # [decades; not tuned]
-# Time to judge the pose of a photo on all points of a map after the searches; at most half of a limit is kept for it.
-JUDGING_SECONDS = 1.5  # [seconds; cost]
+LIKELY_ALARMS = -20.0  # largest log10 NFA with which a view is searched longer before the next one [decades; not tuned]
+JUDGING_SECONDS = 1.5  # time to judge a photo's pose on all points of a map, at most half of a limit [seconds; cost]
 
 # The search stays near the view's pose, not near the best pose of an unsuccessful earlier search.
 # A search in a fourth of the time finds four fifths as many poses, so that short searches near many views pay.

@@ -37,11 +37,11 @@ from bpnp.search.focal_length import UnknownCamera, unknown_camera
 from bpnp.search.solution import Solution
 from bpnp.search.solvers import TIME_LIMIT, Options
 
-# Smallest number of points of a map that gets an index; smaller maps open in two seconds without one.
-INDEXED_POINTS = 200_000  # [points; cost]
+# Smaller maps open in two seconds without one.
+INDEXED_POINTS = 200_000  # least number of points of a map that gets an index [points; cost]
 SAME_FOCAL = 1.05  # largest ratio of the focal lengths of views whose camera a photo can get [ratio; not tuned]
-# Default time limit of a photo; the photos of cities are measured with it (docs/maps.md).
-PHOTO_TIME_LIMIT = 60.0  # [seconds; convention]
+# The photos of cities are measured with it (docs/maps.md).
+PHOTO_TIME_LIMIT = 60.0  # default time limit of a photo [seconds; convention]
 
 if TYPE_CHECKING:
     import torch

@@ -15,8 +15,8 @@ from bpnp.maps.views import View
 
 UPRIGHT_DEG = 30.0  # largest angle between the upward directions of upright views [degrees; not tuned]
 LEAST_UPRIGHT = 0.5  # smallest fraction of the views that agree on the direction up [fraction; not tuned]
-# Least length of the direction up in the image plane: a steeper view has no upright side.
-LEAST_IN_PLANE = 0.5  # [1; not tuned]
+# A steeper view has no upright side.
+LEAST_IN_PLANE = 0.5  # least length of the direction up in the image plane [1; not tuned]
 
 
 def up_of_views(views: Sequence[View]) -> Array | None:

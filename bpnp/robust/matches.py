@@ -12,8 +12,8 @@ from torch import Tensor
 
 from bpnp.geometry import transform
 
-# Number of residuals scored at a time: 1 MiB in float32, which stays in the cache of a core.
-RESIDUALS_AT_ONCE = 2**18  # [residuals; cost]
+# 1 MiB in float32 stays in the cache of a core.
+RESIDUALS_AT_ONCE = 2**18  # number of residuals scored at a time [residuals; cost]
 
 
 def distinct_triples(pool: Float[Tensor, "b d"], seed: int, *, skip: int = 0) -> Int[Tensor, "b d 3"]:

@@ -21,8 +21,7 @@ from bpnp.robust.matches import Matches, distinct_triples, residuals, truncated_
 from bpnp.robust.minimal_solvers import poses_of_triples, take
 from bpnp.runtime import in_threads
 
-# Number of matches of largest weight from which the first triples of a growing pool are drawn.
-SMALLEST_POOL = 16  # [matches; not tuned]
+SMALLEST_POOL = 16  # matches of largest weight that the first triples of a growing pool are from [matches; not tuned]
 # Number of matches of largest weight on which all hypotheses are scored. With 256, poses are lost at 10 % inliers.
 SUBSET = 512  # [matches; measured, the problems are not recorded]
 SHORTLIST = 256  # number of hypotheses that are then scored on all matches [hypotheses; cost]

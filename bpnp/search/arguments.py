@@ -21,10 +21,8 @@ UNIT_TOLERANCE = 1e-3  # largest error of a unit length, of a rotation, and of a
 SURE_CLASS = 0.97  # probability of a class from which on points match only within the class [probability; not tuned]
 PRIOR_DEG = 10.0  # default standard deviation of a given rotation about each axis [degrees; convention]
 LEAST_SIGMA_DEG = 1e-6  # least standard deviation of an angle of a prior [degrees; numerics, float64]
-# Largest coordinate of image points that are refused as normalised coordinates if a camera in pixels is given.
-ONE_PIXEL = 3.0  # [pixels; convention]
-# Largest number of columns of an array of keypoints whose first two columns are positions.
-WIDEST_ROW = 8  # [columns; convention]
+ONE_PIXEL = 3.0  # largest coordinate that is refused as normalised if a camera in pixels is given [pixels; convention]
+WIDEST_ROW = 8  # largest number of columns of keypoints whose first two columns are positions [columns; convention]
 
 if TYPE_CHECKING:
     import torch

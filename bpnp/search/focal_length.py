@@ -54,10 +54,9 @@ AROUND = (1.0, ZOOM_STEP, 1 / ZOOM_STEP)  # focal lengths around one that has co
 SMALLEST_FOCAL = 0.5  # least focal length that is tried: a field of view of 90 degrees [image sides; convention]
 LARGEST_FOCAL = 3.0  # largest focal length that is tried: a field of view of 19 degrees [image sides; convention]
 USUAL_FOCAL = 1.0  # focal length that is tried first [image sides; convention]
-# Factor between successive focal lengths, for many points; four steps lead from the smallest to the largest.
-FOCAL_STEP = 1.57  # [factor; not tuned]
-# Factor between successive focal lengths, for few points and for photos in maps.
-FOCAL_STEP_FEW = 1.25  # [factor; not tuned]
+# Four steps lead from the smallest to the largest.
+FOCAL_STEP = 1.57  # factor between successive focal lengths, for many points [factor; not tuned]
+FOCAL_STEP_FEW = 1.25  # factor between focal lengths, for few points and for photos in maps [factor; not tuned]
 FOCAL_SIGMAS = 3.0  # half width of the range of an approximate focal length [standard deviations; convention]
 FIRST_ITERATIONS = 8  # iterations of the first search with each focal length [iterations; not tuned]
 ALTERNATIONS = 3  # largest number of alternations of search and refinement from each focal length [rounds; not tuned]

@@ -10,15 +10,12 @@ from bpnp.search.kernels.neighbours import sums_near
 
 # Factor from one scale of the residuals to the next.
 SCALE_STEP = 2.0  # [factor; measured, coarser steps give the same evidence in half the time]
-# Largest scale, in spacings sqrt(A / m) of the points; beyond it only the outline fits.
-COARSEST_SCALE = 0.5  # [spacings of the points; not tuned]
-# Smallest scale, in RMS angular radii of the bearings: some hundredths of a pixel of an ordinary camera.
-FLOOR_SCALE = 2e-4  # [RMS angular radii; convention]
+# In spacings sqrt(A / m).
+COARSEST_SCALE = 0.5  # largest scale; beyond it only the outline fits [spacings of the points; not tuned]
+FLOOR_SCALE = 2e-4  # smallest scale: some hundredths of a pixel of an ordinary camera [RMS angular radii; convention]
 TOGETHER_SCALES = 2.0  # distance, in scales, below which points count as one observation [scales; convention]
-# Standard deviations above the count of an even spread from which neighbours form a clump.
-CROWDED_SIGMAS = 2.0  # [standard deviations; not tuned]
-# Largest number of image points that are used, evenly spaced among the given ones.
-MOST_IMAGE_POINTS = 2000  # [points; cost]
+CROWDED_SIGMAS = 2.0  # excess over an even spread from which neighbours are a clump [standard deviations; not tuned]
+MOST_IMAGE_POINTS = 2000  # largest number of image points that are used, evenly spaced [points; cost]
 
 
 class ImageStatistics:

@@ -42,12 +42,10 @@ from bpnp.search.verdict.limits import MOST_FALSE_ALARMS
 GUESSED_BATCHES = 4  # number of batches around a guess of the pose, before all others [batches; calibration]
 NEAR_STEPS = 12  # steps near a rough prior before the search treats the prior as possibly wrong [steps; calibration]
 UNAIDED_ROUNDS = 10  # number of rounds without a significant pose before proposals are requested [rounds; calibration]
-# Starts in a batch that take as long as one density-map search over all rotations.
-STARTS_A_SEARCH = 96  # [starts; measured, CPU time of both]
+STARTS_A_SEARCH = 96  # starts that take as long as a search over all rotations [starts; measured, CPU time of both]
 SURROUNDED_POSES = 6  # poses of a source that density-map searches are made around, at most [poses; calibration]
 SURROUNDED_APART_DEG = 10.0  # least angle between the rotations of these poses, degrees [degrees; calibration]
-# Number of consecutive searches without a better pose after which the other poses of the source are skipped.
-MOST_FRUITLESS = 3  # [searches; calibration]
+MOST_FRUITLESS = 3  # consecutive searches without a better pose that end those of a source [searches; calibration]
 LOCAL_SEARCHES = 3  # local searches around a significant pose that find nothing better, at most [searches; calibration]
 PROPOSED_AFTER = 4  # number of steps near a prior after which proposals are requested [steps; not tuned]
 PROPOSED = DensitySearch()  # density-map search from proposed poses [`DensitySearch`; calibration]

@@ -39,8 +39,7 @@ from bpnp.arrays import Array
 from bpnp.search.problem import Problem, UnknownFocal, label_groups
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
 
-# Smallest derivative of the distorted by the undistorted radius at which a point is visible.
-LEAST_SLOPE = 0.2  # [1; not tuned]
+LEAST_SLOPE = 0.2  # least derivative of the distorted by the undistorted radius of a visible point [1; not tuned]
 UNDISTORTING_STEPS = 20  # Newton steps that undistort a radius [steps; numerics]
 
 Extrinsics = tuple[Array, Array]

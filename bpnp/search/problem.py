@@ -18,19 +18,14 @@ from bpnp.search.image_statistics import ImageStatistics
 from bpnp.search.measured import UNMEASURED, Measured
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
 
-# Distance from the median beyond which scene points do not affect the origin and the unit.
-BULK = 20.0  # [median distances; not tuned]
-# Largest standard deviation of a rotation prior with which two matches fix a pose.
-TWO_MATCH_DEG = 5.0  # [degrees; not tuned]
+BULK = 20.0  # distance beyond which scene points do not affect origin and unit [median distances; not tuned]
+TWO_MATCH_DEG = 5.0  # largest deviation of a rotation prior with which two matches fix a pose [degrees; not tuned]
 # Largest motion of the image points by the tilt with which two matches fix a pose.
 TWO_MATCH_TILT = 2.0  # [match radii; not tuned]
 MATCH_RADIUS = 3e-3  # radius of a match if the pixel size is unknown [radians; not tuned]
-# Radius of a match if it is known: 3 pixels if the floor is a tenth of a pixel.
-MATCH_FLOORS = 30.0  # [noise floors; convention]
-# Width of a prior within which all poses count as equally near.
-EQUALLY_NEAR_SIGMAS = 2.0  # [standard deviations; convention]
-# Logarithm of the farthest over the nearest possible distance of a scene.
-LOG_DEPTHS = math.log(30.0)  # [nats; convention]
+MATCH_FLOORS = 30.0  # radius of a match if it is known: 3 pixels for a floor of a tenth [noise floors; convention]
+EQUALLY_NEAR_SIGMAS = 2.0  # width of a prior within which all poses are equally near [standard deviations; convention]
+LOG_DEPTHS = math.log(30.0)  # log of the farthest over the nearest possible distance of a scene [nats; convention]
 PAIRS_A_POINT = 32  # largest number of pairs per point for which every pair is computed [pairs; cost]
 LIKELY_CLASS = 0.1  # least likelihood of a possible match by its classes, relative to a mean match [ratio; not tuned]
 LINE_RATIO = 1e-6  # second extent of points over the first, below which they lie on a line [ratio; numerics, float32]

@@ -30,8 +30,7 @@ from bpnp.search.starts import GravityPrior, Prior, turned_to
 SHIFT_ALONG = 5.0  # [per radian; not tuned]
 # An annealing ends at the least of the next two scales and of `Problem.floor`.
 SMALLEST_ANNEALED = 2e-4  # a tenth of a pixel at a focal length of 500 pixels [radians; convention]
-# Smallest scale of the annealing in units of the RMS angular radius of the bearings, for narrow views.
-SMALLEST_RELATIVE = 1e-3  # [RMS angular radii; convention]
+SMALLEST_RELATIVE = 1e-3  # smallest scale of the annealing, for narrow views [RMS angular radii; convention]
 
 Sides = tuple[WeightedBearings, WeightedPoints]
 

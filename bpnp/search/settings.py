@@ -4,10 +4,9 @@ from dataclasses import dataclass, replace
 
 MOST_ITERATIONS = 400  # largest number of iterations of a search [iterations; convention]
 OUTLIERS = 0.3  # outlier fraction of the annealing if the caller gives none [fraction; calibration]
-# Other outlier fractions with which the last stage anneals the best poses; the likelihood chooses.
-END_OUTLIERS = (0.03, 0.6)  # [fractions; calibration]
-# Lower bound of the caller's outlier fraction. Without it, a single outlier would be forced into a match.
-LEAST_OUTLIERS = 0.02  # [fraction; convention]
+END_OUTLIERS = (0.03, 0.6)  # other outlier fractions of the last stage; the likelihood chooses [fractions; calibration]
+# Without it, a single outlier would be forced into a match.
+LEAST_OUTLIERS = 0.02  # least outlier fraction [fraction; convention]
 
 
 @dataclass(frozen=True)

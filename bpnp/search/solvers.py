@@ -31,11 +31,9 @@ MATCHER_ENTRIES = 2**22  # largest assignment matrix of a packaged matcher; larg
 MATCHER_SECONDS = 2e-7  # [seconds; cost]
 LOADING_SECONDS = 2.0  # time to import torch and to load the weights [seconds; cost]
 TIME_LIMIT = 10.0  # default time limit of `solve`, and of `verify` [seconds; convention]
-# Time of the verdict and of the matching after a search; at most half of a limit is kept for it.
-ENDING_SECONDS = 4e-3  # [seconds; cost]
+ENDING_SECONDS = 4e-3  # time of verdict and matching after a search, at most half of a limit [seconds; cost]
 ENDING_SECONDS_A_POINT = 1.2e-5  # time that each 2D or 3D point adds to it [seconds per point; cost]
-# Time by which verdict and matching may exceed a limit, before what is left of them is cut off.
-GRACE_SECONDS = 0.3  # [seconds; convention]
+GRACE_SECONDS = 0.3  # time by which they may exceed a limit before the rest is cut off [seconds; convention]
 
 if TYPE_CHECKING:
     import torch

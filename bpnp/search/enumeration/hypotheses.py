@@ -23,8 +23,7 @@ LACKING = 0.25  # matches subtracted from a hypothesis for each expected but mis
 # Pairs of an image set and a scene set that a sweep may visit per hypothesis of its budget. Those whose labels differ
 # are no hypothesis; this many take about as long as one.
 VISITED_PAIRS = 256  # [pairs; cost]
-# Matches that a hypothesis may lack against the best one of its stage and still be refined.
-BEHIND = 1.0  # [matches; calibration]
+BEHIND = 1.0  # matches that a hypothesis may lack against the best of its stage to be refined [matches; calibration]
 SKIPPED_MATCHES = 5  # matches of the best pose from which its own triples are not solved again [matches; calibration]
 SKIPPED_BASIN_COUNT = 12  # basin count of the best pose that skipping requires too [hypotheses; calibration]
 TIGHTER = 0.55  # factor of the radius from one step of a refinement to the next [factor; calibration]

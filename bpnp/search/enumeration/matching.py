@@ -15,10 +15,8 @@ from bpnp.search.kernels.dense import solve_normal_equations
 from bpnp.search.kernels.vectors import rotated, turn
 from bpnp.search.propose.minimal_solvers import part
 
-# Smallest cosine between a normal and the line of sight at which a point can have a match.
-MATCHED_COSINE = math.cos(math.radians(87.0))  # [1; calibration]
-# Smallest cosine at which a point with a normal is expected to be seen.
-EXPECTED_COSINE = math.cos(math.radians(72.0))  # [1; calibration]
+MATCHED_COSINE = math.cos(math.radians(87.0))  # least cosine, normal to line of sight, of a match [1; calibration]
+EXPECTED_COSINE = math.cos(math.radians(72.0))  # least such cosine of a point expected to be seen [1; calibration]
 TESTED_RADII = 5  # number of radii 1, 1/2, 1/4 ... at which matches are counted [radii; calibration]
 MISSED_NATS = 1.5  # nats subtracted for each expected but missing point; one in five is missed [nats; calibration]
 

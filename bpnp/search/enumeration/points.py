@@ -16,8 +16,7 @@ IMAGE_CELLS = 48  # cells along a side of the grid of the image points [cells; c
 PRIOR_SIGMAS = 4.0  # standard deviations of a prior beyond which no pose is tried [standard deviations; convention]
 # Noise is a tenth to a third of a radius.
 PRIOR_WEIGHT = 0.1  # match radii that weigh as much as one standard deviation of a prior [match radii; calibration]
-# Cosine from the mean bearing; a camera with a bearing below it sees all around.
-ALL_AROUND_COSINE = -0.5  # [1; not tuned]
+ALL_AROUND_COSINE = -0.5  # cosine from the mean bearing; a camera with one below it sees all around [1; not tuned]
 RANKED_NEIGHBOURS = 64  # points up to which all neighbours are ranked; beyond, only this many of each [points; cost]
 CACHED_SCENES = 8  # number of scenes whose tables stay in the cache [scenes; cost]
 OPPOSITE_COSINE = -0.8  # cosine of two normals below which no camera faces both [1; not tuned]

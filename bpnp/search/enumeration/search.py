@@ -25,17 +25,14 @@ from bpnp.search.starts import PosePrior
 MOST_PRODUCTS = 4000  # largest number of image points times scene points that are enumerated: 63 x 63 [products; cost]
 MOST_PRODUCTS_KNOWN = 250_000  # the limit where a prior lets two matches fix a pose [products; cost]
 KEPT_POSES = 16  # distinct poses that are kept [poses; cost]
-# Margin in nats, over chance and over any other pose, at which the search ends at once.
-SAFE_NATS = math.log(1e6)  # [nats; calibration]
+SAFE_NATS = math.log(1e6)  # margin over chance and any other pose that ends the search at once [nats; calibration]
 # After twice as many the search ends with any significant pose.
 PATIENCE = 25_000  # hypotheses after which the required margin has fallen linearly to 0 [hypotheses; calibration]
 HYPOTHESES_A_LOOK = 3_000  # hypotheses between checks of the best pose once it is significant [hypotheses; cost]
 HYPOTHESES_A_SWEEP = 20_000  # hypotheses between checks before [hypotheses; cost]
 MOST_HYPOTHESES = 200_000  # largest number of hypotheses [hypotheses; cost]
-# Largest radius within which points are matched to a predicted pose, in match radii.
-WIDEST_REACH = 12.0  # [match radii; calibration]
-# Preverification points that are seen, if the image points are spread evenly over the scene.
-SEEN_WITNESSES = 3.0  # [points; calibration]
+WIDEST_REACH = 12.0  # largest radius within which points are matched to a predicted pose [match radii; calibration]
+SEEN_WITNESSES = 3.0  # preverification points that are seen if the image covers the scene evenly [points; calibration]
 FEWEST_WITNESSES = 10  # fewest preverification points of a hypothesis [points; calibration]
 MOST_WITNESSES = 32  # most preverification points of a hypothesis [points; cost]
 # Expected chance matches of these points from which two, and three, matches are required.

@@ -19,12 +19,9 @@ from bpnp.search.kernels.sides import WeightedBearings, visible_weights
 from bpnp.search.kernels.vectors import F, compiled, copy_pose, part, sum_of
 
 SWEEPS = 2  # alternating normalisations of the assignment on all points, of rows and columns [sweeps; not tuned]
-# Mean number of tiles near a point that the first buffer holds; a larger one is made where needed.
-FIRST_TILES = 12  # [tiles; cost]
-# Smallest weight of the points that face the camera, as a fraction of all weights.
-LEAST_SEEN = 0.25  # [fraction; not tuned]
-# Distance beyond which the kernel on all points is 0; it is below 0.012 there.
-KERNEL_REACH = 3.0  # [scales of the annealing; cost]
+FIRST_TILES = 12  # mean number of tiles near a point in the first buffer; a larger one is made if needed [tiles; cost]
+LEAST_SEEN = 0.25  # least weight of the points that face the camera, a fraction of all weights [fraction; not tuned]
+KERNEL_REACH = 3.0  # distance beyond which the kernel on all points, below 0.012, is 0 [scales of the annealing; cost]
 LANES = 16  # bearings of a tile [bearings; cost]
 SCENE_CELLS = 64  # cells along the longer side of the grid of scene points [cells; cost]
 

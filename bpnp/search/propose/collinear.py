@@ -20,8 +20,7 @@ from bpnp.search.problem import Problem
 FEWEST_ON_LINE = 5  # smallest number of matched points on the line [points; not tuned]
 # A wrong pose explains at least half of its matches by independent coincidences, unless this fraction lies on a line.
 LEAST_ON_LINE = 0.5  # smallest fraction of the matched points on the line [fraction; derived]
-# Largest distance from the line through two points of a point that lies on it, in distances between the two.
-THIN_LINE = 0.05  # [1; not tuned]
+THIN_LINE = 0.05  # largest distance of a point on the line, in distances of the two that it is through [1; not tuned]
 # All pairs miss a line of half of the points with a probability of (1 - 1/4)^256.
 LINE_PAIRS = 256  # number of pairs of points whose lines are tried [pairs; derived]
 ANGLES = 360  # number of angles of a full turn [angles; cost]

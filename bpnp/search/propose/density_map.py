@@ -39,8 +39,8 @@ NARROW_CELLS = 4.0  # standard deviation below which a smoothing is computed cel
 # Largest volume of a prior that counts as near, in multiples of the widest one with a full number of starts; the prior
 # of a map view has 9.
 MOST_VOLUMES = 100.0  # [volumes; calibration]
-# Standard deviations of a prior within which proposed poses are used; 94 % of the poses drawn from it.
-ADMITTED_SIGMAS = 3.5  # [standard deviations; derived]
+# 94 % of the poses drawn from it are.
+ADMITTED_SIGMAS = 3.5  # deviation from a prior within which proposals are used [standard deviations; derived]
 COPIES = 6  # number of copies of each pose from another source [poses; calibration]
 # Angular distance of the points of a copy from those of its pose, in units of the RMS angular radius of the bearings.
 # Optima of one basin are about as far apart.

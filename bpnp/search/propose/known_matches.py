@@ -26,8 +26,7 @@ REFINED_TRIPLES = 6  # number of poses of triples that are refined [poses; not t
 REFINEMENT_STEPS = 10  # steps of a refinement to given matches [steps; numerics]
 REWEIGHTINGS = 3  # number of reweightings of the given matches [rounds; not tuned]
 WRONG_FRACTION = 0.1  # expected fraction of wrong given matches [fraction; not tuned]
-# Difference within which refined poses are one optimum, in tolerances of equal poses.
-SAME_OPTIMUM = 0.05  # [fraction; not tuned]
+SAME_OPTIMUM = 0.05  # difference within which refined poses are one optimum, in tolerances [fraction; not tuned]
 SETTLED_CHANGE = 1e-6  # relative change of a sum of squares that ends the steps [ratio; numerics]
 NEGLIGIBLE_SUM = 1e-24  # sum of squares that ends the steps [radians squared; numerics]
 

@@ -16,11 +16,9 @@ from bpnp.search.refine.gauss_newton import refine, soft_equations
 CORRESPONDENCES = 2  # number of scene points that may correspond to each image point [points; not tuned]
 MOST_ZOOM_STEP = 0.2  # largest step of the logarithm of the scale factor [nats; not tuned]
 MOST_BEND_STEP = 0.1  # largest step of the relative shift of the outermost point [fraction; not tuned]
-# Change of the logarithm of the scale factor below which no other round of steps is taken.
-SAME_ZOOM = 0.01  # [nats; not tuned]
+SAME_ZOOM = 0.01  # change of the log scale factor below which no other round of steps is taken [nats; not tuned]
 MOST_ROUNDS = 4  # largest number of rounds [rounds; not tuned]
-# Change of the logarithm of the scale factor that ends the last steps, with all points.
-SETTLED_ZOOM = 2e-5  # [nats; numerics]
+SETTLED_ZOOM = 2e-5  # change of the log scale factor that ends the last steps, with all points [nats; numerics]
 MOST_LAST_STEPS = 40  # largest number of last steps [steps; numerics]
 FIRST_WIDTHS = (4.0,)  # scales of the steps before the first round [scales of the residuals; not tuned]
 ROUND_WIDTHS = (4.0, 2.0, 2.0, 1.0, 1.0)  # scales of the steps of each round [scales of the residuals; not tuned]

@@ -14,14 +14,11 @@ from bpnp.arrays import Array
 from bpnp.runtime import compiler, in_threads
 from bpnp.search.kernels.vectors import cross, rotated
 
-# Squared height of a triangle over its squared longest side, at which it is a line.
-FLAT_TRIANGLE = 1e-12  # [ratio; numerics]
+FLAT_TRIANGLE = 1e-12  # squared height over squared longest side at which a triangle is a line [ratio; numerics]
 SIDE_TOLERANCE = 1e-6  # largest error of the squared sides, in units of the longest [ratio; numerics]
 ROUNDING = 1e-12  # relative size of a discriminant that counts as zero [ratio; numerics]
-# Sine of both rays' height below which a prior vertical does not determine their depths.
-LEVEL_SINE = 1e-6  # [1; numerics]
-# Horizontal fraction of the vector between two points below which it does not determine the heading.
-UPRIGHT_FRACTION = 1e-3  # [fraction; numerics]
+LEVEL_SINE = 1e-6  # sine of both rays' height below which a vertical does not determine their depths [1; numerics]
+UPRIGHT_FRACTION = 1e-3  # horizontal part of the vector of two points that determines the heading [fraction; numerics]
 
 compiled = compiler()
 part = compiler(part=True, forceinline=True)  # called by compiled functions alone

@@ -27,25 +27,20 @@ from bpnp.search.propose.symmetries import (
 from bpnp.search.verdict.false_alarms import SHARES, alarms_of, directions_of, point_evidence
 from bpnp.search.verdict.reasons import Unfinished
 
-# Smallest number of matched points; with fewer, the three that fix a pose are too large a part.
-FEWEST_MATCHED = 6  # [points; derived]
+# With fewer, the three that fix a pose are too large a part.
+FEWEST_MATCHED = 6  # smallest number of matched points [points; derived]
 MAPPED = 0.3  # smallest fraction of the matched points that a motion maps [fraction; calibration]
 MAPPED_OF_SCENE = 0.2  # smallest fraction of all points that a motion of a whole scene maps [fraction; calibration]
-# Fraction of the matched points from which a motion could by itself explain a better pose.
-SYMMETRIC = 0.5  # [fraction; calibration]
-# Largest number of points of a scene that is registered as a whole, once for all problems of it.
-WHOLE_SCENE = 64  # [points; cost]
+SYMMETRIC = 0.5  # fraction of the matched points of a motion that could explain a better pose [fraction; calibration]
+WHOLE_SCENE = 64  # largest scene that is registered as a whole, once for all its problems [points; cost]
 # A motion of a third of the points is missed by at most (1 - 1/27)^128 = 0.8 % of the registrations.
 BASES_OF_SCENE = 128  # number of bases of that registration [bases; derived]
-# Number of points nearest to the matched ones that these are registered with, in a larger scene.
-AROUND_MATCHED = 4096  # [points; cost]
-# Number of points up to which such a registration has `BASES_OF_FEW` bases; with more, `BASES_OF_MANY`.
-MANY_AROUND = 500  # [points; cost]
+AROUND_MATCHED = 4096  # points nearest to the matched ones that are registered, in a larger scene [points; cost]
+MANY_AROUND = 500  # points up to which such a registration has `BASES_OF_FEW`, else `BASES_OF_MANY` [points; cost]
 BASES_OF_FEW = 16  # number of bases with few points [bases; cost]
 # A motion of nine tenths of the matches is missed by (1 - 0.9^3)^8 = 3e-5 of the registrations.
 BASES_OF_MANY = 8  # number of bases with many points [bases; derived]
-# Largest ratio of the sizes of a part and its copy, in a registration of at most `MANY_AROUND` points.
-SIZE_RATIO = 4.0  # [factor; not tuned]
+SIZE_RATIO = 4.0  # largest ratio of the sizes of a part and its copy, up to `MANY_AROUND` points [factor; not tuned]
 KEPT_REPETITIONS = 6  # largest number of competing poses; those with the fewest false alarms are kept [poses; cost]
 SCORED_AT_ONCE = 100_000  # points, times poses, that are scored between two checks of the deadline [points; cost]
 CACHED_SCENES = 64  # number of scenes whose motions stay in the cache [scenes; cost]

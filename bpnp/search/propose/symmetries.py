@@ -40,21 +40,18 @@ COMPACT = 4  # every other base is drawn from this fraction (1 / `COMPACT`) of a
 DRAWN_TRIANGLES = 4  # number of triangles drawn for a base; the largest is taken [triangles; not tuned]
 # Three fix a motion and are no evidence of it.
 FEWEST_MOVED = 5  # smallest number of moved points that lie on others [points; derived]
-# Smallest number of moved points that lie on others, for motions of another scale.
-FEWEST_MOVED_SCALED = 8  # [points; calibration]
+FEWEST_MOVED_SCALED = 8  # least number of moved points on others, at another scale [points; calibration]
 # One of 17 motions of a third of the points fails.
 FIRST_SAMPLED = 7  # number of sampled points; at least one must confirm a motion [points; derived]
 BASES_SCALED = 16  # largest number of bases that are matched at other scales, at most a third of all [bases; cost]
 MOST_SCALED_WORK = 2000  # largest number of these bases times points [bases * points; cost]
 CHECKED_POINTS = 32  # number of sampled points that confirm a motion before all points do [points; cost]
-# Largest number of pairs of points that are compared for all bases together, some 0.1 s; the rest is left out.
-MOST_WORK = 30_000_000  # [pairs; cost]
+MOST_WORK = 30_000_000  # pairs compared for all bases together, some 0.1 s; the rest is left out [pairs; cost]
 PAIRS_A_SAMPLE = 8  # number of pairs that take as long as a sampled point [pairs; cost]
 MOST_FOUND = 4096  # number of motions of all bases together that are ranked [motions; cost]
 REFINED_MOTIONS = 48  # number of motions, those of the largest fraction first, that are refined [motions; cost]
 REFINED_MOTIONS_SCALED = 8  # number of motions of another scale that are refined [motions; cost]
-# Largest error of a point under a near symmetry, as a fraction of the extent.
-NEAR_SYMMETRY = 0.02  # [fraction; convention]
+NEAR_SYMMETRY = 0.02  # largest error of a point under a near symmetry, in extents [fraction; convention]
 # Largest error in spacings of the points: at a quarter of the spacing 1 to 6 % of the points lie on others by chance.
 TOLERANCE_SPACINGS = 0.25  # [spacings; derived]
 FLAT_SCENE = 0.1  # largest third extent of a flat scene, as a fraction of its second extent [fraction; not tuned]

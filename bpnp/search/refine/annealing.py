@@ -17,8 +17,7 @@ from bpnp.search.kernels.sparse import descend_sparse, sparse_scratch
 from bpnp.search.search_frame import SearchFrame, Sides
 from bpnp.search.starts import Prior, StartSampling, draw_poses
 
-# Pairs of bearings and points from which the first step of an annealing on all of them is timed.
-TIMED_PAIRS = 3e8  # [count; cost]
+TIMED_PAIRS = 3e8  # bearings times points from which the first step on all of them is timed [count; cost]
 # More cost time and rarely change the best pose.
 FINE_BEARINGS = 1000  # number of bearings before the last stage, which uses all [bearings; cost]
 COOLING = 0.82  # factor from one scale to the next [factor; calibration]
@@ -28,10 +27,8 @@ STARTS = 1200  # number of starts of a full batch; 1200 leave no gap of 25 degre
 FIRST_STARTS = 48  # number of starts of the first batch, enough for easy problems [starts; calibration]
 # A small batch keeps the square root of its fraction of a full one.
 LEAST_KEPT = 3  # least number of poses that a stage keeps [poses; calibration]
-# Number of candidates whose NFA each batch computes and that are annealed on all bearings at the end.
-FINISHED_POSES = 3  # [poses; cost]
-# Scale at which the last stage begins, in multiples of the scale of the pose, so that other points can enter.
-END_SCALE = 2.0  # [factor; calibration]
+FINISHED_POSES = 3  # candidates whose NFA each batch computes, annealed on all bearings at the end [poses; cost]
+END_SCALE = 2.0  # first scale of the last stage, in scales of the pose, so that points can enter [factor; calibration]
 STARTS_A_CHECK = 32  # number of starts annealed on clusters between two checks of the deadline [starts; cost]
 
 

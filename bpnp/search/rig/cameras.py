@@ -36,16 +36,14 @@ from bpnp.search.verdict.covariance import covariance_of, join, student_factor
 from bpnp.search.verdict.false_alarms import FARTHEST_PAIR, Terms, camera_terms, directions_of, log10_nfa, match_shares
 from bpnp.search.verdict.uncertainty import linearise, matches_of
 
-# Scale at which proposals are compared: a pose of one camera is inaccurate in another.
-WIDE_SCALES = 60.0  # [smallest scales; not tuned]
+WIDE_SCALES = 60.0  # scale to compare proposals: a camera's pose is inaccurate in another [smallest scales; not tuned]
 REFINEMENT_SCALES = 9  # number of decreasing scales of a refinement [scales; not tuned]
 STEPS_A_SCALE = 2  # number of Gauss-Newton steps at each scale [steps; not tuned]
 MOST_SCALE_STEP = 1.0  # largest step of the logarithm of the scale of the scene [nats; not tuned]
 LENS_FIRST_SCALE = 8.0  # first scale of a fit of the lens [scales of the residuals; not tuned]
 MOST_LENS_STEP = 0.1  # largest step of a lens, of its focal length or its distortion [nats; not tuned]
 WEIGHED_SCALES = 7  # number of the last scales at which the false alarms of poses are computed [scales; cost]
-# Distance below which camera centres coincide, as a fraction of their largest coordinate in the rig.
-SAME_CENTRE = 1e-6  # [fraction; numerics]
+SAME_CENTRE = 1e-6  # distance at which centres coincide, over their largest coordinate in the rig [fraction; numerics]
 
 
 class Rig:

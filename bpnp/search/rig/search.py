@@ -49,8 +49,7 @@ COMPARED_POSES = 64  # largest number of proposals whose evidence is computed [p
 AGREE_DEG = 6.0  # angle between the poses of two cameras below which they agree [degrees; not tuned]
 AGREE_SHIFT = 0.2  # distance below which they agree, in distances of the scene [fraction; not tuned]
 COMPARED_PAIRS = 50_000  # largest number of pairs of poses that are compared [pairs; cost]
-# Smallest baseline of two cameras that determines the scale, in distances of the scene.
-LEAST_BASELINE = 0.01  # [fraction; not tuned]
+LEAST_BASELINE = 0.01  # least baseline that determines the scale, in distances of the scene [fraction; not tuned]
 SCALE_BOUND = 0.2  # largest 99.9 % bound of the scale of a rig's scene, as a fraction [fraction; convention]
 
 

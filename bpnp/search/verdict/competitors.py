@@ -27,16 +27,14 @@ SHOWN_DEGREES = 0.5  # rotation below which the shift of a pose is shown instead
 SHOWN_ZOOM = 0.005  # relative change of the focal length that is omitted [fraction; convention]
 # Smallest distance of a far pose, in multiples of `SAME`; nearer poses slide along the same lines and surfaces.
 FAR_TOLERANCES = 5.0  # [multiples of `SAME`; calibration]
-# Largest evidence of an image point, nats: that of a match among 100 scene points at the finest scale.
-MOST_POINT_NATS = 13.0  # [nats; derived]
+# That of a match among 100 scene points at the finest scale.
+MOST_POINT_NATS = 13.0  # largest evidence of an image point [nats; derived]
 # A pose is no repetition of the best one from this ratio on: points that only it explains, over points that only the
 # best one explains.
 ALONE_RATIO = 0.5  # [ratio; calibration]
-# Fraction of the matches of a pose that coincide with those of the best one; from it on, they agree.
-AGREEING_MATCHES = 0.5  # [fraction; calibration]
+AGREEING_MATCHES = 0.5  # fraction of a pose's matches in common with the best one's: they agree [fraction; calibration]
 BEND_DEG = 1.0  # rotation, degrees, from which poses with radial distortion are different [degrees; convention]
-# Shift, in distances of the scene, from which poses with radial distortion are different.
-BEND_SHIFT = 0.02  # [fraction; convention]
+BEND_SHIFT = 0.02  # shift from which poses with radial distortion differ, in scene distances [fraction; convention]
 
 WIDER = 8 / 3  # threshold that is suggested where residuals are rough [match radii; calibration]
 

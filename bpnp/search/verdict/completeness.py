@@ -13,14 +13,11 @@ from bpnp.search.propose.repetitions import SYMMETRIC, matched_points, registere
 from bpnp.search.propose.symmetries import Motions
 from bpnp.search.verdict.limits import MOST_MISSED
 
-# Number of matches that must be coincidences for a better optimum to exist, as many as fix a pose.
-INDEPENDENT_MATCHES = 3  # [matches; derived]
-# Probability of a better optimum although several initial poses ended at a significant one.
-ANOTHER = 0.01  # [probability; calibration]
+INDEPENDENT_MATCHES = 3  # coincidences that a better optimum needs, as many as fix a pose [matches; derived]
+ANOTHER = 0.01  # a better optimum exists although several starts ended at a significant one [probability; calibration]
 # Probability that a better pose of a symmetric scene is not among those of its motions.
 UNCOMPARED = 1e-3  # [probability; measured, symmetric objects of `benchmarks completeness`]
-# Probability that a local search around a wrong pose misses a better one near it: 40 of 922 did.
-LOOK_FAILS = 1 / 20  # [probability; calibration]
+LOOK_FAILS = 1 / 20  # a local search around a wrong pose misses a better one: 40 of 922 did [probability; calibration]
 AGAIN_FAILS = 1 / 3  # probability that a further local search misses it as well: 8 of 29 did [probability; calibration]
 
 

@@ -16,10 +16,8 @@ ONE_SIGMA = 0.8413447460685429  # of a normal variable below one standard deviat
 # Squared distance of a pose from its optimum, in its covariance, from which on they differ: the quantile of chi-squared
 # with 6 degrees of freedom at 1 - `EXCEEDED`.
 FAR_SQUARED = 22.5  # [1; derived]
-# Fraction of the information below which an image point hardly moves the estimate.
-SLIGHT_INFORMATION = 0.01  # [fraction; numerics]
-# Smallest eigenvalue of the normalised information of points that fix the estimate.
-LEAST_EIGENVALUE = 1e-9  # [1; numerics]
+SLIGHT_INFORMATION = 0.01  # information below which an image point hardly moves the estimate [fraction; numerics]
+LEAST_EIGENVALUE = 1e-9  # least eigenvalue of normalised information that fixes the estimate [1; numerics]
 
 
 class Linearisation(NamedTuple):

@@ -42,15 +42,12 @@ from bpnp.search.problem import Problem, faces, label_groups
 INLIER_FRACTIONS = (0.15, 0.4, 0.75)  # [fractions; measured, the problems are not recorded]
 LEAST_INLIERS = 0.02  # smallest lambda if clutter or scores are given [fraction; convention]
 MOST_INLIERS = 0.98  # largest lambda if clutter or scores are given [fraction; convention]
-# Smoothing width of the density of unrelated points; the outline beyond it is no evidence.
-OUTLINE_WIDTH = 0.5  # [RMS angular radii; not tuned]
+# The outline beyond it is no evidence.
+OUTLINE_WIDTH = 0.5  # smoothing width of unrelated points [RMS angular radii; not tuned]
 SMOOTHED_POINTS = 256  # largest number of projected points from which that density is estimated [points; cost]
-# Distance beyond which a pair does not contribute to the density of a match: e^-9.
-FARTHEST_PAIR = math.sqrt(18.0)  # [scales; numerics]
-# Largest factor between a scale and that of the residuals at which it is a pose's own.
-OWN_SCALES = 2.0  # [factor; convention]
-# Smallest factor between the scales at which residuals are rougher (`rough_residuals`).
-ROUGH_SCALES = 4.0  # [factor; convention]
+FARTHEST_PAIR = math.sqrt(18.0)  # distance beyond which a pair adds nothing to a density: e^-9 [scales; numerics]
+OWN_SCALES = 2.0  # largest factor of a scale to that of the residuals that is a pose's own [factor; convention]
+ROUGH_SCALES = 4.0  # least factor between scales at which residuals are rougher [factor; convention]
 
 
 SHARES = np.array(INLIER_FRACTIONS)  # lambda

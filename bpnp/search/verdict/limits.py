@@ -5,5 +5,4 @@
 MOST_FALSE_ALARMS = -2.0  # largest log of the number of false alarms (NFA) [decades; derived]
 # Smallest margin to every competing pose; by chance a wrong pose has it once in a thousand cases.
 LEAST_MARGIN = 3.0  # [decades; convention]
-# Largest log of the miss probability of a better optimum (`bpnp.search.verdict.completeness`).
-MOST_MISSED = -3.0  # [decades; convention]
+MOST_MISSED = -3.0  # largest log probability that a better optimum was missed [decades; convention]

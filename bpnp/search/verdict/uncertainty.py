@@ -31,8 +31,7 @@ STRAINS = np.array(
     np.float64,
 )
 POSE = 6  # parameters of a pose [parameters; derived]
-# Probability that an error exceeds its bound, and significance level of a test.
-EXCEEDED = 1e-3  # [probability; convention]
+EXCEEDED = 1e-3  # that an error exceeds its bound, and level of a test [probability; convention]
 BLOCKS = 4  # number of blocks of image points along each axis of the image [blocks; not tuned]
 # With 0.001, cameras with a focal length off by a tenth are accepted 1.5 times as often.
 FOCAL_CHANCE = 0.01  # significance level of a test for another focal length [probability; calibration]

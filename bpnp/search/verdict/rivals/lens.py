@@ -31,8 +31,7 @@ from bpnp.search.verdict.uncertainty import (
     linearised,
 )
 
-# Density-map search around a pose at the next step of the focal length.
-AT_FOCAL_STEP = DensitySearch(  # [`DensitySearch`; calibration]
+AT_FOCAL_STEP = DensitySearch(  # search around a pose at the next focal length [`DensitySearch`; calibration]
     Draws(2**10, 3.0, 0.04, 2**10),
     Preselection((300,), (2**5,)),
     Narrowing(0.04, 0.015, steps=3, points=600),
