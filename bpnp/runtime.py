@@ -315,9 +315,9 @@ def _flatten(values: tuple[Any, ...]) -> Iterator[Any]:
 
 
 @cache
-def _sources_of(function: Callable[..., Any]) -> tuple[frozenset[str], frozenset[tuple[str, float]]]:
+def _sources_of(function: Callable[..., Any]) -> tuple[frozenset[str], frozenset[tuple[str, float | int]]]:
     """Return the files, and the numbers by name, of a function and, recursively, of the parts in its module."""
-    files, modules, waiting, numbers = set[str](), set[str](), [function], set[tuple[str, float]]()
+    files, modules, waiting, numbers = set[str](), set[str](), [function], set[tuple[str, float | int]]()
     while waiting:
         part = waiting.pop()
         files.add(inspect.getfile(part))

@@ -4,7 +4,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from bpnp.search.verdict.reasons import Objection
 from bpnp.search.verdict.uncertainty import Linearised, linearised, pose_covariance
 
 
+@runtime_checkable
 class Cameras(Protocol):
     """What a `Solution` needs of the cameras that see its points."""
 
