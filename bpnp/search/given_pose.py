@@ -57,7 +57,7 @@ def given_pose(
     the uncertainty of the pose. An `independent` pose was not found on these points. The seed is that of the perturbed
     copies of the pose; the deadline ends proposals.
     """
-    one = replace(problem, log10_tried=0.0, log10_views=0.0) if independent else problem
+    one = replace(problem, log10_tried=0.0) if independent else problem
     claim = weighed_pose(one, rotation, translation)
     scene, few = SearchFrame(one, seed, DEFAULT, deadline), is_enumerable(problem)
     others = add_false_alarms(annealed_around(problem, claim, scene), problem)

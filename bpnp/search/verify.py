@@ -115,7 +115,7 @@ def verify(
         scores3d=scores3d,
     )
     given = None if matches is None else _checked_matches(matches, problem)
-    judged = problem if given is None else _of_matches(problem, given)
+    judged = problem if given is None else _of_matches(problem, given, independent=independent)
     limits: dict[str, Any] = {"inlier_threshold": threshold, "seed": checked_seed(seed), "time_limit": limit}
     limits["independent"] = independent
     solution = verify_problem(judged, *pose, refine=refine, **limits).solution
@@ -189,20 +189,22 @@ def _checked_matches(values: Any, problem: Problem) -> Labels:
     return np.asarray(places[np.isin(places[:, 0], problem.measured.indices)])
 
 
-def _of_matches(problem: Problem, matches: Labels) -> Problem:
+def _of_matches(problem: Problem, matches: Labels, *, independent: bool) -> Problem:
     """Return a problem of the matched points alone, with a unique label for each match.
 
-    Its tests are the poses of a search on all points, each with the choices of k matches, C(m, k) n! / (n - k)!.
+    Unless they are independent, its tests are the poses of a search on all points, each with the choices of k matches,
+    C(m, k) n! / (n - k)!.
     """
     (i, j), own = matches.T, np.arange(len(matches))
     matched = problem.choose(np.searchsorted(problem.measured.indices, i), j)
-    m, n = len(problem.bearings), len(problem.points3d)
-    chosen = [math.lgamma(a + 1) - math.lgamma(a - len(matches) + 1) for a in (m, n)]
-    choices = (sum(chosen) - math.lgamma(len(matches) + 1)) / math.log(10)
+    if not independent:
+        sides = len(problem.bearings), len(problem.points3d)
+        chosen = [math.lgamma(a + 1) - math.lgamma(a - len(matches) + 1) for a in sides]
+        choices = (sum(chosen) - math.lgamma(len(matches) + 1)) / math.log(10)
+        tests = PoseModel.of(problem).log10_tests([problem])
+        matched = replace(matched, log10_tried=tests, log10_views=problem.log10_views + choices)
     return replace(
         matched,
-        log10_tried=PoseModel.of(problem).log10_tests([problem]),
-        log10_views=problem.log10_views + choices,
         labels2d=own,
         labels3d=own,
         odds2d=None,

@@ -8,6 +8,7 @@ from bpnp.search.possible_matches import MATCH_REACH
 from bpnp.search.search_frame import SearchFrame
 from bpnp.search.verdict.competitors import Partners, partners
 from bpnp.search.verdict.decide import Case
+from bpnp.search.verdict.false_alarms import directions_of
 
 SceneOf = Callable[[], SearchFrame]
 Rival = Callable[[Case], Case]  # the case with competing poses or an objection; the same one if there is none
@@ -21,7 +22,8 @@ def explained(case: Case) -> Partners:
 
 
 def left_by(case: Case) -> tuple[int, int]:
-    """Return the numbers of image points and of scene points that the leader leaves."""
+    """Return the numbers of image points, and of scene points that face the camera, that the leader leaves."""
     seen, problem = explained(case), case.problem
-    shown = np.unique(seen.points[seen.near])
-    return len(problem.image.chosen) - int(seen.near.sum()), len(problem.points3d) - len(shown)
+    facing = np.isfinite(directions_of(problem, *case.pose)[:, 0])
+    facing[seen.points[seen.near]] = False
+    return len(problem.image.chosen) - int(seen.near.sum()), int(facing.sum())

@@ -17,7 +17,7 @@ from bpnp.search.verdict.reasons import Unfinished, objection
 from bpnp.search.verdict.rivals import SceneOf, left_by
 
 # Number of image points and of scene points that the best pose leaves from which a better one may exist nearby.
-FEWEST_LEFT = 4  # [points; not tuned]
+FEWEST_LEFT = 6  # [points; not tuned]
 
 
 def nearby(case: Case, *, scene_of: SceneOf, deadline: Deadline = NEVER) -> Case:

@@ -2,14 +2,13 @@
 
 Furniture that was moved, a second device, a reflection: several poses are then right, each for some of the image
 points, and the one with the most matches need not be that of the scene. The image points that the best pose leaves are
-enumerated again: with the scene points that it leaves, which are a body of its own, and with all of them, since a
+enumerated again: with the scene points that it leaves, which may be a body of its own, and with all of them, since a
 reflection shows them twice.
 """
 
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bpnp.poses import SAME
 from bpnp.runtime import NEVER, Deadline
@@ -17,41 +16,44 @@ from bpnp.search.enumeration.search import enumerate_poses, is_enumerable
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.possible_matches import MATCH_REACH
 from bpnp.search.problem import Problem
-from bpnp.search.verdict.competitors import Partners, distance_between, partners
+from bpnp.search.verdict.competitors import distance_between, partners
 from bpnp.search.verdict.decide import Case, fits_by_chance, weighed_pose
-from bpnp.search.verdict.false_alarms import alarms_of
+from bpnp.search.verdict.false_alarms import alarms_of, directions_of
 from bpnp.search.verdict.reasons import Unfinished, objection
 from bpnp.search.verdict.rivals import explained
 
 FEWEST_LEFT = 5  # number of points that can show a significant pose: two more than fix it [points; derived]
-# Largest number of hypotheses of the points that are left, without and with the scene points of the first pose.
-MOST_OF_REST, MOST_OF_ALL = 100_000, 50_000  # [hypotheses; cost]
+# Largest number of hypotheses of the points that are left: for a body of its own; for an image of the same points; and
+# for one of points with normals, of which fewer are seen.
+MOST_OF_OTHERS, MOST_AGAIN, MOST_FACING = 100_000, 40_000, 2_000  # [hypotheses; cost]
 FAR_BODY = 3.0  # distance of another body's pose [tolerances of the same pose; not tuned]
 # Decades by which a candidate may be behind a second body that leads; in an enumeration these are `NEAR_NATS`.
 NEAR_DECADES = 10.0  # [decades; calibration]
-COMPARED_BODIES = 4  # number of poses of the rest whose false alarms are computed [poses; cost]
-# Fraction of the second pose's scene points that are those of the first from which it shows the same points again.
+# Fraction of the second pose's matches with scene points of the first from which it shows the same points again.
 SHOWN_TWICE = 0.25  # [fraction; not tuned]
+COMPARED_BODIES = 4  # number of poses of the rest whose false alarms are computed [poses; cost]
 
 
 def second_body(case: Case, *, deadline: Deadline = NEVER) -> Case:
     """Return a case against which a second pose far away speaks, which is then among its candidates.
 
     The second pose is the best of one search of unrelated points with an NFA below 1 once in a thousand cases. The
-    first pose is that of most of the scene, whatever the other scene points belong to, if it shows more than half of
-    them; not if the second one shows the same points again.
+    first pose is that of most of the scene, whatever its other points belong to, if it shows more than half of those
+    that face the camera. It has no such lead over an image of the same points.
     """
     problem = case.problem
     if problem.is_shared or problem.cosines3d is not None or not is_enumerable(problem):
         return case
-    scale = max(case.residual, problem.match_radius / MATCH_REACH)
     first = explained(case)
     rest = np.setdiff1d(np.arange(len(problem.bearings)), problem.image.chosen[first.near])
     if len(rest) < FEWEST_LEFT:
         return case
-    shown = _points_of(first)
-    others, everything = np.setdiff1d(np.arange(len(problem.points3d)), shown), np.arange(len(problem.points3d))
-    for scene, most in ((others, MOST_OF_REST), (everything, MOST_OF_ALL)):
+    shown, every = np.unique(first.points[first.near]), np.arange(len(problem.points3d))
+    facing = np.isfinite(directions_of(problem, *case.pose)[:, 0])
+    searches = [(every, MOST_AGAIN) if problem.normals3d is None else (shown, MOST_FACING)]
+    if 2 * len(shown) <= facing.sum():
+        searches.insert(0, (np.setdiff1d(every, shown), MOST_OF_OTHERS))
+    for scene, most in searches:
         if len(scene) < FEWEST_LEFT:
             continue
         if deadline.ended(Unfinished.competing_poses):
@@ -60,9 +62,10 @@ def second_body(case: Case, *, deadline: Deadline = NEVER) -> Case:
         pose = _significant(case, left, most, deadline)
         if not len(pose):
             continue
+        scale = max(case.residual, problem.match_radius / MATCH_REACH)
         second = partners(MATCH_REACH, left, *pose.pose(), scale)
-        again = scene[_points_of(second)]
-        if len(np.intersect1d(shown, again)) < SHOWN_TWICE * len(again) and 2 * len(shown) > len(everything):
+        again = np.intersect1d(scene[second.points[second.near]], shown)
+        if 2 * len(shown) > facing.sum() and len(again) < SHOWN_TWICE * second.near.sum():
             continue
         counts = {"first": int(first.near.sum()), "second": int(second.near.sum()), "count": len(problem.bearings)}
         away = distance_between(problem, case.pose, pose.pose())
@@ -85,8 +88,3 @@ def _significant(case: Case, left: Problem, most: int, deadline: Deadline) -> Hy
     alarms = alarms_of(left, poses.rotation, poses.translation, scales).own
     k = int(np.argmin(alarms))
     return poses[:0] if fits_by_chance(float(alarms[k])) else poses[k : k + 1]
-
-
-def _points_of(seen: Partners) -> NDArray[np.int64]:
-    """Return the scene points that image points show."""
-    return np.unique(seen.points[seen.near])
