@@ -50,7 +50,7 @@ test: lint
 nightly: install
 	$(PROOFS) $(EVERYWHERE) -m "nightly"
 	$(AS_USER) -m "nightly"
-	$(PROOFS) $(EVERYWHERE) -m "not slow and not nightly" tests/search tests/maps tests/robust tests/report tests/datamodules
+	$(PROOFS) $(EVERYWHERE) -m "not slow and not nightly" tests/search tests/maps tests/report tests/datamodules
 
 coverage: lint
 	$(PROOFS) --cov --cov-report=term --cov-fail-under=$(FLOOR)

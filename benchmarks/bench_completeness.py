@@ -23,9 +23,9 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.poses import Tolerance
 from bpnp.search.inputs import problem_from
-from bpnp.search.plan import Plan
 from bpnp.search.pool import Pool
 from bpnp.search.propose.repetitions import competing_poses
+from bpnp.search.schedule import Plan
 from bpnp.search.search_frame import SearchFrame
 from bpnp.search.settings import DEFAULT
 from bpnp.search.verdict.decide import Case

@@ -3,7 +3,7 @@ from .models.bpnpnet import BPnPNet as BPnPNet
 from .models.matcher import Matcher as Matcher
 from .search.api import solve as solve
 from .search.api import solve_many as solve_many
-from .search.search import warm_up as warm_up
+from .search.find import warm_up as warm_up
 from .search.solution import Solution as Solution
 from .search.starts import GravityPrior as GravityPrior
 from .search.starts import PosePrior as PosePrior

@@ -27,13 +27,12 @@ GROUND = {
 MAY_IMPORT = {
     **dict.fromkeys(GROUND, set()),
     "search": set(),
-    "robust": {"search"},
-    "layers": {"robust"},
-    "models": {"robust", "layers", "search"},
+    "layers": {"search"},
+    "models": {"layers", "search"},
     "datamodules": set(),
-    "maps": {"search", "models", "robust", "layers", "datamodules", "report"},
+    "maps": {"search", "models", "layers", "datamodules", "report"},
     "report": set(),
-    "training": {"robust", "layers", "models", "report"},
+    "training": {"layers", "models", "report"},
     "commands": {"maps", "models", "search", "training", "datamodules", "report"},
     "cli": {"commands"},
     "examples": {"datamodules"},
@@ -44,7 +43,7 @@ MAY_IMPORT = {
 BRIDGES = {
     "bpnp/search/arguments.py": {"models"},
     "bpnp/search/solvers.py": {"models"},
-    "bpnp/search/propose/networks.py": {"models", "robust"},
+    "bpnp/search/propose/networks.py": {"models", "layers"},
     "bpnp/search/solution.py": {"report", "datamodules"},
 }
 LIGHTNING = {"training", "datamodules", "cli", "commands"}

@@ -146,7 +146,7 @@ import sys
 import numpy as np
 from bpnp.runtime import Loop
 from bpnp import GravityPrior, PosePrior, solve
-from bpnp.search.search import warm_up
+from bpnp.search.find import warm_up
 def signatures():
     loops = {loop for name in list(sys.modules) if name.startswith("bpnp.search.")
              for loop in vars(sys.modules[name]).values()

@@ -334,7 +334,7 @@ def _numbers(values: Any) -> str:
 
 def warm_up() -> None:
     """Compile the loops of the search, once after an installation, so that no later call waits for it."""
-    from bpnp.search.search import warm_up as compile_all
+    from bpnp.search.find import warm_up as compile_all
 
     start = time.perf_counter()
     compile_all()

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bpnp.layers.implicit import BackwardStats, first_derivative, record
-from bpnp.layers.plan import Plan, cached_parts, divide, times, transpose_times
+from bpnp.layers.scaled_plan import Plan, cached_parts, divide, times, transpose_times
 
 ITERATIONS = 150  # limit of conjugate gradients; slower systems are factorised
 BETWEEN_TESTS = 8  # iterations on a GPU between two tests for convergence, for which the host waits

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bpnp.layers.laplacian import solve_laplacian
-from bpnp.layers.plan import Plan, cached_parts, divide
+from bpnp.layers.scaled_plan import Plan, cached_parts, divide
 from bpnp.types import SolveStats
 
 SWEEPS = 4  # before the first Newton step

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from bpnp.checks import check_positive
 from bpnp.geometry import bearings
 from bpnp.runtime import Deadline, default_float_errors
+from bpnp.search.find import search_poses
 from bpnp.search.problem import Problem
-from bpnp.search.search import search_poses
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.verdict.decide import SearchResult
 from bpnp.types import Batch, Pose, Prediction, SolveStats

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from bpnp.layers.assignment import Sinkhorn
 from bpnp.layers.implicit import first_derivative
 from bpnp.layers.pnp import WeightedPnP
-from bpnp.layers.ransac import Backend, RansacPnP
+from bpnp.layers.ransac.layer import Backend, RansacPnP
 from bpnp.models.nets import ImageFeatures, SceneFeatures
 from bpnp.models.pose_stages import StageClock, match_again, pnp_pose, ransac_pose, round_widths
 from bpnp.models.refinement import Refinement

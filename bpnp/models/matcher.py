@@ -12,7 +12,7 @@ from bpnp.geometry import masked_median
 from bpnp.layers.assignment import check_mu, dustbin_marginals, sinkhorn, uniform_marginal
 from bpnp.layers.implicit import BackwardStats
 from bpnp.layers.pnp import WeightedPnP
-from bpnp.layers.ransac import RansacPnP
+from bpnp.layers.ransac.layer import RansacPnP
 from bpnp.models.bpnpnet import pairwise_distance
 from bpnp.models.nets import ExchangeBlock, Neighbourhood, subtract_mean
 from bpnp.models.pose_stages import StageClock, pnp_pose, ransac_pose

@@ -13,13 +13,13 @@ from torch import Tensor, nn
 
 from bpnp.checks import check_within
 from bpnp.geometry import bearings, choose
+from bpnp.layers.ransac.proposals import pose_hypotheses
 from bpnp.models.batch_search import best_poses, on_host, problems_of
 from bpnp.models.pose_stages import residual_energy
-from bpnp.robust.proposals import pose_hypotheses
 from bpnp.runtime import default_float_errors
+from bpnp.search.find import fixing_no_pose
 from bpnp.search.problem import Problem
 from bpnp.search.propose.given import anneal_given
-from bpnp.search.search import fixing_no_pose
 from bpnp.search.search_frame import SearchFrame, degenerate
 from bpnp.search.settings import DEFAULT
 from bpnp.search.verdict.decide import Case, SearchResult, decide

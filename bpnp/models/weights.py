@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from bpnp.files import write_atomically
 from bpnp.layers.assignment import Sinkhorn
 from bpnp.layers.pnp import WeightedPnP
-from bpnp.layers.ransac import RansacPnP
+from bpnp.layers.ransac.layer import RansacPnP
 from bpnp.models.nets import ImageFeatures, PointFeatures, SceneFeatures
 from bpnp.models.refinement import Refinement
 

@@ -28,7 +28,7 @@ from bpnp.search.arguments import (
     seconds_from,
     source_from,
 )
-from bpnp.search.enumeration.search import is_enumerable
+from bpnp.search.few_points.enumeration import is_enumerable
 from bpnp.search.focal_length import solve_with_focal_length, unknown_camera
 from bpnp.search.inputs import problem_from
 from bpnp.search.problem import Problem, UnknownFocal

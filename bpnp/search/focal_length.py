@@ -31,7 +31,7 @@ from bpnp.poses import SAME, close_poses, polar_coordinates, rotation_angle
 from bpnp.runtime import NEVER, Clock, Deadline, one_blas_thread
 from bpnp.search.arguments import checked_size
 from bpnp.search.assemble import Solved, with_unfinished
-from bpnp.search.enumeration.search import is_enumerable
+from bpnp.search.few_points.enumeration import is_enumerable
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.problem import Problem, UnknownFocal
 from bpnp.search.propose.lens import fit_lens

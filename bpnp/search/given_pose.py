@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from bpnp.arrays import Array
 from bpnp.poses import SAME, rotation_angle
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
-from bpnp.search.enumeration.search import is_enumerable
+from bpnp.search.few_points.enumeration import is_enumerable
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.pose_model import PoseModel
 from bpnp.search.problem import EQUALLY_NEAR_SIGMAS, Problem

@@ -3,8 +3,8 @@
 A plan gives one step after the other, a step proposes refined poses, and a pool scores and keeps them. Once the best
 pose may be confident, its rivals are asked (`bpnp.search.verdict.contest`). The loop ends when nothing speaks against
 it, when more search would not help, when the plan has no step left, or when the budget or the time is spent.
-Searches differ in their plan and pool only: one camera (`bpnp.search.plan`), a rig (`bpnp.search.rig`), and few points
-(`bpnp.search.enumeration`).
+Searches differ in their plan and pool only: one camera (`bpnp.search.schedule`), a rig (`bpnp.search.rig`), and few
+points (`bpnp.search.few_points`).
 """
 
 from collections.abc import Callable, Sequence

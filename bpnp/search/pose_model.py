@@ -21,9 +21,9 @@ functions are pure functions of arrays, in float64.
 
 Two compiled loops of proposers have steps of their own. A search spends most of its time in them, and each fixes its
 unknowns, its data types and its way to match: `bpnp.search.kernels.dense.move` (a pose in float32, to all points at
-once) and `bpnp.search.enumeration.matching.step` (a pose of few one-to-one matches on the stereographic plane).
-`bpnp.robust.ransac.refine_locally` is the refinement of RANSAC in the paper's half, in torch: a batch of samples and
-poses at once, on its device.
+once) and `bpnp.search.few_points.matching.step` (a pose of few one-to-one matches on the stereographic plane).
+`bpnp.layers.ransac.consensus.refine_locally` is the refinement of RANSAC in the paper's half, in torch: a batch of
+samples and poses at once, on its device.
 """
 
 import math

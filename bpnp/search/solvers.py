@@ -13,11 +13,11 @@ import numpy as np
 from bpnp.arrays import Array
 from bpnp.runtime import Clock, Deadline
 from bpnp.search.assemble import OneCamera, Solved, assembled
-from bpnp.search.enumeration.search import exceeds_enumeration
-from bpnp.search.plan import Proposals
+from bpnp.search.few_points.enumeration import exceeds_enumeration
+from bpnp.search.find import find_case
 from bpnp.search.problem import Problem
 from bpnp.search.propose.mirror import mirrored_alarms
-from bpnp.search.search import find_case
+from bpnp.search.schedule import Proposals
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import reasons

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from bpnp.geometry import project, rotation_angle, transform
 from bpnp.layers import ransac_pnp
-from bpnp.layers.ransac import top_matches
+from bpnp.layers.ransac.layer import top_matches
 
 THRESHOLD = 0.01
 

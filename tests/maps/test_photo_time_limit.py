@@ -70,8 +70,8 @@ def test_no_view_is_tried_after_the_limit_with_an_unknown_focal_length(
     """The searches with several focal lengths share the limit of the photo with all views."""
     scene, truth = planted
     rng = np.random.default_rng(0)
-    clock.stop_at("search.plan.search_near", after=True)
-    late = [clock.count_late(f"search.plan.{name}") for name in ("search_near", "multistart", "search_around")]
+    clock.stop_at("search.schedule.search_near", after=True)
+    late = [clock.count_late(f"search.schedule.{name}") for name in ("search_near", "multistart", "search_around")]
     pixels = rng.uniform(0, [WIDTH, HEIGHT], (60, 2))
     views = [view.name for view in scene.views]
     solution = scene.localize(pixels, image_size=(WIDTH, HEIGHT), views=views, time_limit=60)

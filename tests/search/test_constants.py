@@ -19,7 +19,7 @@ from bpnp.search.verdict.false_alarms import FARTHEST_PAIR
 from bpnp.search.verdict.uncertainty import EXCEEDED
 
 PACKAGE = Path(bpnp.__file__).parent
-FILES = [file for folder in ("search", "maps", "robust") for file in sorted((PACKAGE / folder).rglob("*.py"))]
+FILES = [file for folder in ("search", "maps", "layers/ransac") for file in sorted((PACKAGE / folder).rglob("*.py"))]
 ORIGINS = ("calibration", "chosen on ", "measured, ", "derived", "convention", "cost", "numerics", "not tuned")
 
 

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import kstest, truncnorm
 
 from bpnp.arrays import Array
+from bpnp.search.find import search_poses
 from bpnp.search.problem import Problem
 from bpnp.search.propose.density_map import draw_around, search_near
-from bpnp.search.search import search_poses
 from bpnp.search.search_frame import SearchFrame
 from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import PosePrior

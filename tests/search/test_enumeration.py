@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 
 import bpnp
 from bpnp.arrays import Array
-from bpnp.robust.minimal_solvers import p3p
+from bpnp.layers.ransac.minimal_solvers import p3p
 from bpnp.runtime import Clock
-from bpnp.search.enumeration import search
-from bpnp.search.enumeration.hypotheses import VISITED_PAIRS
-from bpnp.search.enumeration.points import ImageSide
-from bpnp.search.enumeration.search import Enumerated, Enumeration, Stage, enumerate_poses
+from bpnp.search.few_points import search
+from bpnp.search.few_points.enumeration import Enumerated, Enumeration, Stage, enumerate_poses
+from bpnp.search.few_points.hypotheses import VISITED_PAIRS
+from bpnp.search.few_points.points import ImageSide
 from bpnp.search.problem import Problem
 from bpnp.search.starts import PosePrior
 

@@ -123,7 +123,7 @@ def test_an_undecided_search_asks_the_matcher_and_a_confident_one_does_not(
     rng = np.random.default_rng(0)
     noise2d, noise3d = rng.uniform(-0.5, 0.5, (150, 2)), rng.normal(size=(150, 3))
     problem = problem_from(noise2d, noise3d, None, prior=prior)
-    monkeypatch.setattr("bpnp.search.plan.UNAIDED_ROUNDS", 4)
+    monkeypatch.setattr("bpnp.search.schedule.UNAIDED_ROUNDS", 4)
     brief = DEFAULT.limited(24)
     alone, helped = (
         solve_problems({0: problem}, Options(asks=asks, seed=3, settings=brief))[0].solution for asks in (False, True)

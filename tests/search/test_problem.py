@@ -7,8 +7,8 @@ import pytest
 from planted import directions
 from scipy.spatial.transform import Rotation
 
+from bpnp.search.find import search_poses
 from bpnp.search.problem import Problem
-from bpnp.search.search import search_poses
 from bpnp.search.starts import GravityPrior, PosePrior
 
 UNITS = 2.0**-30, 1.0, 2.0**30  # powers of two scale without rounding

@@ -18,7 +18,7 @@ from bpnp.cameras import camera_from
 from bpnp.search.problem import Problem
 from bpnp.search.propose.symmetries import Motions
 from bpnp.search.rig.cameras import Rig
-from bpnp.search.rig.solve import RigPoints
+from bpnp.search.rig.points import RigPoints
 
 CAMERA = ("SIMPLE_PINHOLE", [500.0, 320.0, 240.0])
 

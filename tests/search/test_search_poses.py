@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from bpnp.metrics import rotation_error
 from bpnp.models import Search
 from bpnp.models.batch_search import best_poses
-from bpnp.search.plan import GUESSED_BATCHES
+from bpnp.search.find import search_poses
 from bpnp.search.problem import Problem
-from bpnp.search.search import search_poses
+from bpnp.search.schedule import GUESSED_BATCHES
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.starts import PosePrior
 

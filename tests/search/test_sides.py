@@ -7,9 +7,9 @@ from planted import degrees_between, directions, seen
 from scipy.spatial.transform import Rotation
 
 from bpnp.arrays import Array
+from bpnp.search.find import search_poses
 from bpnp.search.kernels.sides import kernel_sides, side_of
 from bpnp.search.problem import Problem, faces
-from bpnp.search.search import search_poses
 from bpnp.search.settings import DEFAULT
 
 TRANSLATION = np.array([0.1, -0.1, 5.0])

@@ -15,8 +15,8 @@ from bpnp.examples import load
 from bpnp.models import Search
 from bpnp.runtime import Deadline
 from bpnp.search import solvers
+from bpnp.search.find import find_case
 from bpnp.search.inputs import problem_from
-from bpnp.search.search import find_case
 from bpnp.search.verdict.decide import Case
 from bpnp.search.verdict.reasons import objection
 

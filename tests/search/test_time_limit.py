@@ -75,7 +75,7 @@ def test_matching_stops_at_the_limit(clock: MovedClock, monkeypatch: pytest.Monk
     monkeypatch.setattr(matching, "scipy_tree", matching.cKDTree, raising=False)
     monkeypatch.setattr(matching, "cKDTree", CountedTree)
     monkeypatch.setattr(CountedTree, "looked_up", 0)
-    clock.stop_at("search.plan.multistart", after=True)
+    clock.stop_at("search.schedule.multistart", after=True)
     assignments = clock.count_late("matching.min_weight_full_bipartite_matching")
     maxima = clock.count_late("matching.maximum_bipartite_matching")
     fits = clock.count_late("search.match_fit.fit_pose")
@@ -145,7 +145,7 @@ def test_a_part_of_the_time_is_not_the_limit_of_the_sentence(clock: MovedClock) 
     """Each of five focal lengths has two of ten seconds."""
     rng = np.random.default_rng(1)
     pixels = rng.uniform(0, 480, (100, 2))
-    clock.stop_at("search.plan.multistart", after=True)
+    clock.stop_at("search.schedule.multistart", after=True)
     solution = solve(pixels, rng.normal(size=(100, 3)), image_size=(640, 480), solver="search", time_limit=10)
     assert "not decided in 10 s" in solution.reason
 
@@ -198,7 +198,7 @@ def test_a_rig_compares_no_pose_after_the_limit(clock: MovedClock) -> None:
     second = aside @ K[:2, :2].T + K[:2, 2]
     rig = [(np.eye(3), np.zeros(3)), (np.eye(3), np.array([0.5, 0, 0]))]
     clock.stop_at("search.loop.contest")
-    proposals = clock.count_late("search.rig.search.repeated_poses")
+    proposals = clock.count_late("search.rig.poses.repeated_poses")
     assignments = clock.count_late("matching.min_weight_full_bipartite_matching")
     solution = solve([pixels, second], points, K, rig=rig)
     assert not proposals

@@ -22,8 +22,8 @@ import bpnp
 from bpnp.examples import load
 from bpnp.geometry import rotation_angle
 from bpnp.layers import ransac_pnp
+from bpnp.layers.ransac.consensus import BACKENDS
 from bpnp.metrics import rotation_error
-from bpnp.robust.ransac import BACKENDS
 
 MESHES = [load("mesh", seed=seed) for seed in (0, 1)]
 COUNT = 64  # points of a problem

@@ -3,10 +3,10 @@
 import math
 
 from bpnp.geometry import bearings
+from bpnp.layers.ransac.matches import distinct_triples
+from bpnp.layers.ransac.minimal_solvers import p3p
 from bpnp.models.baselines.single_problem import Answer, SingleProblem, SingleSolver, agreement
 from bpnp.poses import MIN_POINTS
-from bpnp.robust.matches import distinct_triples
-from bpnp.robust.minimal_solvers import p3p
 from bpnp.runtime import Deadline
 
 TRIPLES = 256  # random triples solved at a time

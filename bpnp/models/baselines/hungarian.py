@@ -5,7 +5,7 @@ from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor, nn
 
-from bpnp.layers.ransac import Backend, RansacPnP
+from bpnp.layers.ransac.layer import Backend, RansacPnP
 from bpnp.models.bpnpnet import BPnPNet
 from bpnp.models.pose_stages import pnp_pose, ransac_pose
 from bpnp.types import Batch, Prediction

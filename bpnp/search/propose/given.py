@@ -21,7 +21,7 @@ COPIED_POSES = 4  # number of poses from other sources, the best first, that are
 def anneal_given(scene: SearchFrame, rotation: Array, translation: Array) -> Hypotheses:
     """Anneal poses of a problem, with perturbed copies of the first few; the poses that result have no NFA.
 
-    The objective is that of `bpnp.search.search.search_poses`. An initial pose may be about 10 degrees off, and more if
+    The objective is that of `bpnp.search.find.search_poses`. An initial pose may be about 10 degrees off, and more if
     there are many; NaN for a missing one. If there are more than `REFINED_DIRECTLY`, all are first annealed on
     clusters, as in the search, and the likeliest go on.
     """

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from bpnp.runtime import Deadline
-from bpnp.search.enumeration.search import enumerate_poses, is_enumerable
+from bpnp.search.few_points.enumeration import enumerate_poses, is_enumerable
 from bpnp.search.problem import Problem
 from bpnp.search.verdict.false_alarms import alarms_of
 

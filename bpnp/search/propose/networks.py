@@ -89,7 +89,7 @@ def proposed(net: "Matcher", problem: Problem, seed: int) -> tuple[Array, Array]
 
     Sampled in proportion to the assignment itself, they are too similar where it is wrong.
     """
-    from bpnp.robust.proposals import drawn_poses  # imports torch modules only if needed
+    from bpnp.layers.ransac.proposals import drawn_poses  # imports torch modules only if needed
 
     (view,), batch = _given(net, [problem])
     with torch.no_grad():

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from bpnp.search.arguments import check_inside, checked_prior, each_camera, each_set, is_network, pixels_from
 from bpnp.search.assemble import Solved
 from bpnp.search.focal_length import unknown_camera
-from bpnp.search.rig.solve import mount_from, prepare_rig
+from bpnp.search.rig.points import mount_from, prepare_rig
 from bpnp.search.solvers import Options
 from bpnp.search.starts import GravityPrior, PosePrior
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from bpnp.poses import SAME
 from bpnp.runtime import NEVER, Deadline
-from bpnp.search.enumeration.search import enumerate_poses, is_enumerable
+from bpnp.search.few_points.enumeration import enumerate_poses, is_enumerable
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.possible_matches import MATCH_REACH
 from bpnp.search.problem import Problem

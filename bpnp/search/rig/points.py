@@ -13,12 +13,12 @@ from bpnp.cameras import Camera, camera_from
 from bpnp.runtime import NEVER, Clock
 from bpnp.search.arguments import about, checked_pose, pose_of
 from bpnp.search.assemble import Solved, assembled
-from bpnp.search.enumeration.search import is_enumerable
+from bpnp.search.few_points.enumeration import is_enumerable
 from bpnp.search.focal_length import FocalSweep, UnknownCamera
 from bpnp.search.inputs import problem_from
 from bpnp.search.problem import UnknownFocal
 from bpnp.search.rig.cameras import Rig
-from bpnp.search.rig.search import search_rig
+from bpnp.search.rig.poses import search_rig
 from bpnp.search.solution import Solution
 from bpnp.search.solvers import Options, at_deadline, ending_seconds
 from bpnp.search.starts import GravityPrior, PosePrior, Prior

@@ -13,8 +13,8 @@ from functools import partial
 import numpy as np
 
 from bpnp.runtime import Deadline
-from bpnp.search.enumeration.points import predicted_pose
-from bpnp.search.enumeration.search import STAGES, Enumeration, margin
+from bpnp.search.few_points.enumeration import STAGES, Enumeration, margin
+from bpnp.search.few_points.points import predicted_pose
 from bpnp.search.hypotheses import KEPT_CANDIDATES, Hypotheses
 from bpnp.search.loop import Step
 from bpnp.search.possible_matches import score_pose

@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.runtime import NEVER, Deadline, one_blas_thread
-from bpnp.search.enumeration.plan import EnumeratedPoses, EnumerationPlan
-from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
+from bpnp.search.few_points.enumeration import enumerate_poses, exceeds_enumeration, is_enumerable
+from bpnp.search.few_points.steps import EnumeratedPoses, EnumerationPlan
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.loop import Progress, run, teller
-from bpnp.search.plan import Plan, Proposals
 from bpnp.search.pool import Pool
 from bpnp.search.problem import Problem
 from bpnp.search.propose.density_map import LOCAL, preselect
@@ -23,6 +22,7 @@ from bpnp.search.propose.known_matches import known_matches, poses_of_matches
 from bpnp.search.propose.minimal_solvers import p3p_poses
 from bpnp.search.propose.symmetries import self_motions
 from bpnp.search.refine.annealing import run_batch
+from bpnp.search.schedule import Plan, Proposals
 from bpnp.search.search_frame import SearchFrame, degenerate
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.starts import Prior
@@ -63,7 +63,7 @@ def find_case(
     p(f_i) = (1 - w)/n sum_j exp((f_i . g(R p_j + t) - 1)/s^2) / 2 pi s^2 + w/A, g(y) = y/|y|, over pose and scale s,
     A the solid angle of the view, by annealing s from starts over all rotations, or around `problem.prior`.
 
-    Few points (`bpnp.search.enumeration`) are enumerated first, and annealed only if the result is not conclusive.
+    Few points (`bpnp.search.few_points`) are enumerated first, and annealed only if the result is not conclusive.
     There are no candidates with fewer than 4 points of a side, or if all bearings or all points coincide or lie on one
     line.
 

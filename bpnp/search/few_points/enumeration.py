@@ -14,9 +14,9 @@ import numpy as np
 
 from bpnp.arrays import Array
 from bpnp.runtime import Clock
-from bpnp.search.enumeration.hypotheses import VISITED_PAIRS, Block, Kept, Work, explore
-from bpnp.search.enumeration.matching import TESTED_RADII, EnumerationTables, Matches
-from bpnp.search.enumeration.points import ImageSide, pairs, predicted_pose, prior_arrays, scene_side, sets_within
+from bpnp.search.few_points.hypotheses import VISITED_PAIRS, Block, Kept, Work, explore
+from bpnp.search.few_points.matching import TESTED_RADII, EnumerationTables, Matches
+from bpnp.search.few_points.points import ImageSide, pairs, predicted_pose, prior_arrays, scene_side, sets_within
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.kernels.sides import fit_any
 from bpnp.search.problem import Problem

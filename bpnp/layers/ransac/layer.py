@@ -7,11 +7,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from bpnp.checks import check_positive, check_shapes
+from bpnp.layers.ransac.consensus import BACKENDS
+from bpnp.layers.ransac.matches import Matches, in_scene, normalise_matches, residuals
+from bpnp.layers.ransac.minimal_solvers import take
 from bpnp.poses import MIN_POINTS
 from bpnp.precision import full_precision
-from bpnp.robust.matches import Matches, in_scene, normalise_matches, residuals
-from bpnp.robust.minimal_solvers import take
-from bpnp.robust.ransac import BACKENDS
 from bpnp.types import SolveStats
 
 Backend = Literal["auto", "poselib", "opencv", "torch"]

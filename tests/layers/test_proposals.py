@@ -9,9 +9,9 @@ from planted import Planted, plant
 from torch import Tensor
 
 from bpnp.geometry import bearings, retract, rotation_angle, transform
-from bpnp.robust.matches import Matches, distinct_triples, truncated_scores, weighted_draws
-from bpnp.robust.minimal_solvers import p3p
-from bpnp.robust.proposals import drawn_poses, pose_hypotheses
+from bpnp.layers.ransac.matches import Matches, distinct_triples, truncated_scores, weighted_draws
+from bpnp.layers.ransac.minimal_solvers import p3p
+from bpnp.layers.ransac.proposals import drawn_poses, pose_hypotheses
 
 
 def test_draws_are_in_proportion_to_the_weights() -> None:

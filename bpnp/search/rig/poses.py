@@ -17,18 +17,18 @@ from numpy.typing import NDArray
 from bpnp.arrays import Array, PoseArrays
 from bpnp.poses import SAME, distinct, polar_coordinates
 from bpnp.runtime import NEVER, Clock, Deadline, one_blas_thread
-from bpnp.search.enumeration.points import predicted_pose
-from bpnp.search.enumeration.search import enumerate_poses, exceeds_enumeration, is_enumerable
+from bpnp.search.few_points.enumeration import enumerate_poses, exceeds_enumeration, is_enumerable
+from bpnp.search.few_points.points import predicted_pose
+from bpnp.search.find import lacks_partners
 from bpnp.search.hypotheses import Hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.loop import Progress, Step, run, teller
-from bpnp.search.plan import SURROUNDED_APART_DEG, Plan
 from bpnp.search.pool import Pool
 from bpnp.search.problem import Problem
 from bpnp.search.propose.density_map import LOCAL, search_around
 from bpnp.search.propose.known_matches import known_matches, poses_of_matches
 from bpnp.search.propose.repetitions import repeated_poses
 from bpnp.search.rig.cameras import WIDE_SCALES, Rig
-from bpnp.search.search import lacks_partners
+from bpnp.search.schedule import SURROUNDED_APART_DEG, Plan
 from bpnp.search.search_frame import SearchFrame
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.verdict.competitors import distance_between

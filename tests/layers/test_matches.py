@@ -7,7 +7,7 @@ from planted import plant
 
 from bpnp.geometry import rotation_angle
 from bpnp.layers import ransac_pnp
-from bpnp.robust.matches import distinct_triples, hashed_uniform
+from bpnp.layers.ransac.matches import distinct_triples, hashed_uniform
 
 THRESHOLD = 0.01
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.geometry import rotation_angle
 from bpnp.layers import ransac_pnp
-from bpnp.robust.matches import Matches, residuals, truncated_scores
+from bpnp.layers.ransac.matches import Matches, residuals, truncated_scores
 
 THRESHOLD, MATCHES = 0.01, 600
 

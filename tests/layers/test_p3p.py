@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from bpnp.geometry import random_rotations, rotation_angle
-from bpnp.robust.minimal_solvers import p3p
+from bpnp.layers.ransac.minimal_solvers import p3p
 
 
 def planted(size: int, *, seed: int = 0, field: float = 0.8) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from bpnp.arrays import Array
 from bpnp.geometry import bearings, retract
+from bpnp.layers.ransac.matches import Matches, distinct_triples, residuals, truncated_scores
+from bpnp.layers.ransac.minimal_solvers import poses_of_triples, take
 from bpnp.poses import MIN_POINTS
-from bpnp.robust.matches import Matches, distinct_triples, residuals, truncated_scores
-from bpnp.robust.minimal_solvers import poses_of_triples, take
 from bpnp.runtime import in_threads
 
 SMALLEST_POOL = 16  # matches of largest weight that the first triples of a growing pool are from [matches; not tuned]
@@ -177,7 +177,7 @@ def _count_inliers(pose: Array, x: Array, p: Array, threshold: float) -> int:
     return int((np.square(errors).sum(-1) < threshold**2).sum())
 
 
-# Matches of `bpnp.robust.matches.normalise_matches`, most probable first, threshold, most hypotheses, seed ->
+# Matches of `bpnp.layers.ransac.matches.normalise_matches`, most probable first, threshold, most hypotheses, seed ->
 # poses [R | t], NaN for none, and hypotheses; their bound where the library does not report the number.
 BACKENDS: dict[str, Estimator] = {
     "poselib": partial(_each, _poselib),

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from bpnp.arrays import Array, Indices
 from bpnp.poses import SAME
-from bpnp.search.enumeration.matching import (
+from bpnp.search.few_points.matching import (
     MATCHED_COSINE,
     Matches,
     cell_of,

@@ -24,7 +24,7 @@ def p3p(bearings: Float[Tensor, "*b 3 3"], points3d: Float[Tensor, "*b 3 3"]) ->
     computed in float64 on the CPU. The four slots have no order.
 
     >>> import torch
-    >>> from bpnp.robust.minimal_solvers import p3p
+    >>> from bpnp.layers.ransac.minimal_solvers import p3p
     >>> points3d = torch.eye(3)
     >>> camera = points3d + torch.tensor([0.0, 0.0, 5.0])
     >>> solution = p3p(camera, points3d)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bpnp.arrays import Array, Indices
-from bpnp.search.enumeration.points import IMAGE_CELLS, Heading, ImageArrays, PriorArrays, SceneArrays
+from bpnp.search.few_points.points import IMAGE_CELLS, Heading, ImageArrays, PriorArrays, SceneArrays
 from bpnp.search.kernels.dense import solve_normal_equations
 from bpnp.search.kernels.vectors import rotated, turn
 from bpnp.search.propose.minimal_solvers import part

@@ -10,10 +10,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bpnp.geometry import bearings
+from bpnp.layers.ransac.matches import Matches, in_scene, normalise_matches, truncated_scores, weighted_draws
+from bpnp.layers.ransac.minimal_solvers import poses_of_triples, take
 from bpnp.poses import distinct
 from bpnp.precision import full_precision
-from bpnp.robust.matches import Matches, in_scene, normalise_matches, truncated_scores, weighted_draws
-from bpnp.robust.minimal_solvers import poses_of_triples, take
 
 SOLVED_TRIPLES = 1024  # number of triples of an assignment that are solved, for each sample of a batch [triples; cost]
 DRAWN_EACH = 4  # number of triples drawn for each that is solved; the widest triangles are solved [triples; not tuned]
