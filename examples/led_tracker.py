@@ -86,9 +86,9 @@ class LedTracker:
         return bpnp.PosePrior(rotation @ before.T @ rotation, 2 * translation - place, degrees, metres)
 
     def _solved(self, dots: Array, prior: bpnp.PosePrior | None) -> bpnp.Solution | None:
-        """Return a pose that is confident; with a prior also one that is near it and better than chance."""
+        """Return a pose that is confident, or would be without its prior; with one also a likely pose near it."""
         solution = bpnp.solve(dots, **self.device, prior=prior, time_limit=self.time_limit)
-        if solution.verdict == "confident":
+        if solution.reason_code in ("confident", "contradicts_prior"):  # the device has jumped
             return solution
         if prior is None or solution.verdict == "failed" or prior.translation is None:
             return None

@@ -13,7 +13,7 @@ import bpnp
 from bpnp.arrays import Array
 from bpnp.layers.ransac.minimal_solvers import p3p
 from bpnp.runtime import Clock
-from bpnp.search.few_points import search
+from bpnp.search.few_points import enumeration
 from bpnp.search.few_points.enumeration import Enumerated, Enumeration, Stage, enumerate_poses
 from bpnp.search.few_points.hypotheses import VISITED_PAIRS
 from bpnp.search.few_points.points import ImageSide
@@ -108,8 +108,8 @@ def test_a_camera_that_sees_all_around_has_chance_matches_in_the_whole_sphere(co
 @pytest.fixture
 def short_sweeps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ten hypotheses between checks of the best pose."""
-    monkeypatch.setattr(search, "HYPOTHESES_A_SWEEP", 10)
-    monkeypatch.setattr(search, "HYPOTHESES_A_LOOK", 10)
+    monkeypatch.setattr(enumeration, "HYPOTHESES_A_SWEEP", 10)
+    monkeypatch.setattr(enumeration, "HYPOTHESES_A_LOOK", 10)
 
 
 class Sweeps:
@@ -117,8 +117,8 @@ class Sweeps:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.calls: list[tuple[Any, Any]] = []
-        self.explore = search.explore
-        monkeypatch.setattr(search, "explore", self)
+        self.explore = enumeration.explore
+        monkeypatch.setattr(enumeration, "explore", self)
 
     def __call__(self, *arguments: Any) -> Any:
         self.calls.append((arguments, self.explore(*arguments)))

@@ -21,12 +21,12 @@ def rivals_of(scene_of: SceneOf, deadline: Deadline = NEVER, *, enumerated: bool
     candidates are those of an enumeration.
     """
     return [
-        given,
         partial(symmetries, scene_of=scene_of, deadline=deadline, enumerated=enumerated),
         partial(nearby, scene_of=scene_of, deadline=deadline),
         partial(second_body, deadline=deadline),
         partial(mirrored_image, deadline=deadline),
         partial(lens, scene_of=scene_of, deadline=deadline),
+        given,
     ]
 
 
