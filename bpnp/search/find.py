@@ -93,10 +93,11 @@ def find_case(
     if not many:
         settings = settings.limited(min(settings.iterations, ENUMERATED_ITERATIONS))
     if not only_proposals and is_enumerable(problem) and not deadline.passed():
-        poses = EnumeratedPoses(problem, scene_of)
+        poses = EnumeratedPoses(problem, scene_of, deadline)
         enumerated = run(EnumerationPlan(poses, deadline), poses, most=1, deadline=NEVER)
         if enumerated.is_rough and problem.radius is None:
-            wider = EnumeratedPoses(replace(problem, radius=WIDER_RADIUS * problem.match_radius), scene_of)
+            wide = replace(problem, radius=WIDER_RADIUS * problem.match_radius)
+            wider = EnumeratedPoses(wide, scene_of, deadline)
             again = run(EnumerationPlan(wider, deadline), wider, most=1, deadline=NEVER)
             if again.log10_false_alarms < enumerated.log10_false_alarms:
                 poses, enumerated = wider, again

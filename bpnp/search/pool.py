@@ -140,7 +140,7 @@ class Pool:
 
     @property
     def rivals(self) -> Sequence[Rival]:
-        """Poses that the scene's motions confuse with the best one, and other lenses."""
+        """What to ask about the best pose, in order."""
         return rivals_of(lambda: self.scene, self.scene.deadline)
 
     def case(self, *, ended: bool = True) -> Case:

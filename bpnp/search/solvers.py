@@ -119,8 +119,8 @@ def at_deadline(result: SearchResult, options: Options, deadline: Deadline, seco
 
     Without a time limit the reason states the seconds that the search took.
     """
-    may_be_decided = result.verdict != "confident" and (not result.is_settled or result.code in reasons.UNTESTED)
-    if not (may_be_decided and deadline.passed()):
+    is_open = result.verdict != "confident" and (not result.is_settled or result.code in reasons.UNTESTED)
+    if not (is_open and deadline.passed()):
         return result
     if not result.is_settled:
         deadline.unfinished.add(reasons.Unfinished.search)

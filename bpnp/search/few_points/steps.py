@@ -36,8 +36,8 @@ class EnumeratedPoses:
 
     iterations = 0
 
-    def __init__(self, problem: Problem, scene_of: SceneOf) -> None:
-        self.problem, self._scene_of = problem, scene_of
+    def __init__(self, problem: Problem, scene_of: SceneOf, deadline: Deadline) -> None:
+        self.problem, self._scene_of, self._deadline = problem, scene_of, deadline
         # candidates: poses of the earlier enumerations, and of the current one once it has ended or is certain.
         # found: poses of the current enumeration, likeliest first.
         self.found = self.candidates = Hypotheses.empty()
@@ -140,8 +140,8 @@ class EnumeratedPoses:
 
     @property
     def rivals(self) -> Sequence[Rival]:
-        """Poses that the scene's motions confuse with the best one, and other lenses."""
-        return rivals_of(self._scene_of, enumerated=True)
+        """What to ask about the best pose, in order."""
+        return rivals_of(self._scene_of, self._deadline, enumerated=True)
 
     def case(self, *, ended: bool = True) -> Case:
         """Return what is known of the best pose."""

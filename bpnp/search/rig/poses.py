@@ -38,6 +38,7 @@ from bpnp.search.verdict.decide import FOCAL_BOUND, FOCAL_BOUND_OF_OBJECT, Case,
 from bpnp.search.verdict.false_alarms import alarms_of
 from bpnp.search.verdict.limits import LEAST_MARGIN, MOST_FALSE_ALARMS, MOST_MISSED
 from bpnp.search.verdict.reasons import Objection, Unfinished, focal_length_not_fixed, objection
+from bpnp.search.verdict.rivals.given import given
 from bpnp.search.verdict.rivals.lens import fitted_lens
 from bpnp.search.verdict.uncertainty import linearised, share_bound, systematic_misfit
 
@@ -234,8 +235,8 @@ class RigPoses:
 
     @property
     def rivals(self) -> Sequence[Rival]:
-        """What may contradict the best pose, the cheapest last."""
-        return self._copies, self._extrinsics, self._lens, self._unknowns
+        """What to ask about the best pose, in order."""
+        return self._copies, self._extrinsics, self._lens, self._unknowns, given
 
     def case(self, *, ended: bool = True) -> Case:
         """Return what is known of the best pose, as seen by the camera with the most evidence for it."""

@@ -1,4 +1,4 @@
-"""Rivals of the best pose: each is asked while nothing else speaks against it; all are asked about a better one too."""
+"""Rivals of the best pose: the next is asked while nothing speaks against it, and a better pose starts them again."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -31,7 +31,7 @@ def rivals_of(scene_of: SceneOf, deadline: Deadline = NEVER, *, enumerated: bool
 
 
 def contest(case: Case, rivals: Sequence[Rival]) -> Case:
-    """Return a case after its rivals were asked."""
+    """Return a case after its rivals were asked, up to the first objection; a new leader is asked from the start."""
     asked = 0
     while asked < len(rivals) and case.objection is None:
         answer = rivals[asked](case)

@@ -140,7 +140,7 @@ class Case:
         """True if the leader passes the cheap tests: the NFA, the miss probability, other poses, rough residuals."""
         if self.log10_false_alarms > MOST_FALSE_ALARMS:
             return False
-        return all(one.margin >= LEAST_MARGIN for one in self._rivals) and self.missed <= MOST_MISSED
+        return all(one.margin >= LEAST_MARGIN for one in self._competitors) and self.missed <= MOST_MISSED
 
     @property
     def is_rough(self) -> bool:
@@ -170,7 +170,7 @@ class Case:
             return objection("chance", what="no pose fits")
         if self.is_certain:
             return self._not_fixed or min(self._doubts, default=None)
-        if near := [one for one in self._rivals if one.margin < LEAST_MARGIN]:
+        if near := [one for one in self._competitors if one.margin < LEAST_MARGIN]:
             return min(near)
         if alarms > MOST_FALSE_ALARMS:
             return objection("insignificant", alarms=reasons.nfa(alarms), most=MOST_FALSE_ALARMS)
@@ -195,7 +195,7 @@ class Case:
         return systematic_misfit(self.linear, self.match_count)
 
     @cached_property
-    def _rivals(self) -> list[Objection]:
+    def _competitors(self) -> list[Objection]:
         """Best other pose in each camera, and the pose itself at rough residuals."""
         others = [other_pose(*each) for each in self._cameras]
         return [one for one in (*others, rough_residuals(self.candidates, self.problem)) if one is not None]
