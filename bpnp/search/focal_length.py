@@ -229,7 +229,7 @@ class FocalSweep(ABC):
         """Return the camera that fits best near a pose, from some factors of the focal length of a camera."""
 
     def preselect(self, camera: Camera) -> Camera:
-        """Return the camera to search with at a focal length of the sweep; a cheap search may find a better one."""
+        """Return the camera to search with at a focal length of the sweep, by default this one."""
         return camera
 
     def sweep(self, *, few: bool = False) -> Solved:

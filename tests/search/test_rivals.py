@@ -60,7 +60,7 @@ def test_the_body_of_more_than_half_of_the_scene_is_confident_beside_another_one
 
 @pytest.mark.parametrize("seed", range(4))
 def test_an_object_and_its_reflection_in_the_floor_are_ambiguous(seed: int) -> None:
-    """A mirror-symmetric object of 16 points, 10 of them seen, and its reflection, of which more are seen."""
+    """A mirror-symmetric object of 16 points, 10 of them seen, and its reflection, which shows more."""
     rng = np.random.default_rng(seed)
     half = rng.uniform([0.1, -0.5, 0.1], [0.6, 0.5, 1.2], (8, 3))
     points = np.concatenate([half, half * [-1, 1, 1]])

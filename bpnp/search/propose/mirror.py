@@ -16,7 +16,7 @@ MIRROR = np.array([1.0, 1.0, -1.0])
 
 
 def mirrored_scene(problem: Problem) -> Problem:
-    """Return the problem with the mirror image of its scene, of which a mirrored image of the scene has poses."""
+    """Return the problem of the mirror image of its scene: a mirrored photo has a pose of it."""
     normals = None if problem.normals3d is None or problem.cosines3d is not None else problem.normals3d * MIRROR
     return replace(problem, points3d=problem.points3d * MIRROR, normals3d=normals, cosines3d=None)
 

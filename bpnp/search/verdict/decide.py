@@ -251,7 +251,7 @@ class SearchResult:
 
 
 def decide(case: Case) -> SearchResult:
-    """Return the verdict on the leader of a case, or on the pose that it claims.
+    """Return the verdict on the leader of a case, or on its claim.
 
     A claim is "failed" if the leader is another pose without an objection, or if an objection is a pose that is more
     likely by `LEAST_MARGIN`; it is "ambiguous" if the leader is another pose.

@@ -24,7 +24,7 @@ from bpnp.search.verdict.rivals import explained
 
 FEWEST_LEFT = 5  # number of points that can show a significant pose: two more than fix it [points; derived]
 # Largest number of hypotheses of the points that are left: for a body of its own; for an image of the same points; and
-# for one of points with normals, of which fewer are seen.
+# for one of points with normals: fewer are seen.
 MOST_OF_OTHERS, MOST_AGAIN, MOST_FACING = 100_000, 40_000, 2_000  # [hypotheses; cost]
 FAR_BODY = 3.0  # distance of another body's pose [tolerances of the same pose; not tuned]
 # Decades by which a candidate may be behind a second body that leads; in an enumeration these are `NEAR_NATS`.
@@ -38,8 +38,8 @@ def second_body(case: Case, *, deadline: Deadline = NEVER) -> Case:
     """Return a case against which a second pose far away speaks, which is then among its candidates.
 
     The second pose is the best of one search of unrelated points with an NFA below 1 once in a thousand cases. The
-    first pose is that of most of the scene, whatever its other points belong to, if it shows more than half of those
-    that face the camera. It has no such lead over an image of the same points.
+    first pose is that of most of the scene if it shows more than half of the points that face the camera. It has no
+    such lead over an image of the same points.
     """
     problem = case.problem
     if problem.is_shared or problem.cosines3d is not None or not is_enumerable(problem):
