@@ -204,7 +204,7 @@ class Deadline:
 def in_time(work: Callable[[int, int], None], count: int, deadline: Deadline, at_once: int) -> int:
     """Run `in_threads` on parts of range(count) until a deadline, and return the number of items done.
 
-    The deadline is checked every `at_once` items, of which the first are always done.
+    The deadline is checked every `at_once` items; the first ones are always done.
     """
     step = count if math.isinf(deadline.at) else at_once
     done = 0

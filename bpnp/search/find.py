@@ -26,6 +26,7 @@ from bpnp.search.schedule import Plan, Proposals
 from bpnp.search.search_frame import SearchFrame, degenerate
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.starts import Prior
+from bpnp.search.verdict.competitors import WIDER_RADIUS
 from bpnp.search.verdict.contest import contest, rivals_of
 from bpnp.search.verdict.decide import Case, SearchResult, decide, fits_by_chance
 from bpnp.search.verdict.reasons import objection
@@ -33,7 +34,6 @@ from bpnp.search.verdict.rivals import SceneOf
 
 # Clusters keep every one of so small a set, and further iterations end at the same poses.
 ENUMERATED_ITERATIONS = 12  # iterations, at most, for points few enough to be enumerated [iterations; calibration]
-WIDER_RADIUS = 8 / 3  # second match radius, where the residuals of the first are rough [match radii; calibration]
 # Fewer points have no smooth optimum and are only enumerated.
 LEAST_ANNEALED = 12  # least number of points of the smaller set for annealing [points; calibration]
 WARMING_POINTS = 8  # number of points of the problem that compiles the loops [points; convention]
@@ -86,10 +86,9 @@ def find_case(
 
     many = exceeds_enumeration(problem)
     matches = None if only_proposals else known_matches(problem)
-    if matches is not None:
-        case = _of_known_matches(problem, *matches, scene_of, seed, deadline)
-        if problem.prior is None or not is_enumerable(problem) or case.objection is None:
-            return case
+    known = None if matches is None else _of_known_matches(problem, *matches, scene_of, seed, deadline)
+    if known is not None and (problem.prior is None or not is_enumerable(problem) or known.objection is None):
+        return known
     if not many:
         settings = settings.limited(min(settings.iterations, ENUMERATED_ITERATIONS))
     if not only_proposals and is_enumerable(problem) and not deadline.passed():
@@ -102,8 +101,8 @@ def find_case(
             if again.log10_false_alarms < enumerated.log10_false_alarms:
                 poses, enumerated = wider, again
         by_chance = fits_by_chance(enumerated.log10_false_alarms)
-        if matches is not None and by_chance:  # residuals may exceed its match radius
-            return _of_known_matches(problem, *matches, scene_of, seed, deadline)
+        if known is not None and by_chance:  # residuals may exceed its match radius
+            return known
         tell(0)
         # More search helps only if no pose is significant yet, and there are enough points to anneal.
         small = min(len(problem.bearings), len(problem.points3d)) < LEAST_ANNEALED

@@ -376,7 +376,7 @@ def why_degenerate(bearings: Array, points3d: Array, fewest: int = MIN_POINTS) -
             count, others = count + 1, others[(others != others[0]).any(-1)]
         if count < fewest:
             return f"only {count} different {name} point{'' if count == 1 else 's'}: {fewest} or more fix a pose"
-    # One point far away hides the extent of all others, and one beside a line the line.
+    # One point far away hides the extent of all others, and one off a line hides the line.
     if all(_are_on_a_line(some) for some in (points3d, points3d[in_bulk(points3d)])):
         return "the 3D points lie on one line: the camera can turn about it"
     return None

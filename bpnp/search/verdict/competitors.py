@@ -36,7 +36,7 @@ AGREEING_MATCHES = 0.5  # fraction of a pose's matches in common with the best o
 BEND_DEG = 1.0  # rotation, degrees, from which poses with radial distortion are different [degrees; convention]
 BEND_SHIFT = 0.02  # shift from which poses with radial distortion differ, in scene distances [fraction; convention]
 
-WIDER = 8 / 3  # threshold that is suggested where residuals are rough [match radii; calibration]
+WIDER_RADIUS = 8 / 3  # radius that is tried, and suggested, where residuals are rough [match radii; calibration]
 
 CandidatesOfCameras = Sequence[tuple[Hypotheses, Problem]]
 
@@ -81,7 +81,8 @@ def rough_residuals(candidates: Hypotheses, problem: Problem) -> Objection | Non
     decades = float(candidates.log10_rough[0] - candidates.log10_false_alarms[0])
     if decades >= 0:
         return None
-    return objection("rough_residuals", decades, threshold=WIDER * problem.match_radius * problem.measured.per_radian)
+    threshold = WIDER_RADIUS * problem.match_radius * problem.measured.per_radian
+    return objection("rough_residuals", decades, threshold=threshold)
 
 
 def other_camera(off: Misfit) -> Objection | None:

@@ -20,15 +20,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.search.hypotheses import Hypotheses
-from bpnp.search.possible_matches import score_pose
+from bpnp.search.possible_matches import MATCH_REACH, score_pose
 from bpnp.search.problem import Problem
 from bpnp.search.propose.repetitions import WHOLE_SCENE
 from bpnp.search.verdict import reasons
 from bpnp.search.verdict.competitors import (
     CandidatesOfCameras,
+    Partners,
     distance_between,
     other_camera,
     other_pose,
+    partners,
     rough_residuals,
     unrelated_competitor,
 )
@@ -55,8 +57,24 @@ FOCAL_BOUND_OF_OBJECT = 1.0  # [fraction; convention]
 REFINED = math.inf  # number of local searches that the exact refinement of an enumeration replaces
 
 
+class _Led:
+    """Candidates; the first one is the leader."""
+
+    candidates: Hypotheses
+
+    @property
+    def residual(self) -> float:
+        """Scale of the residuals of the leader, radians; infinite without one."""
+        return float(self.candidates.scale[0]) if len(self.candidates) else math.inf
+
+    @property
+    def log10_false_alarms(self) -> float:
+        """log10 NFA of the leader; infinite without one."""
+        return float(self.candidates.log10_false_alarms[0]) if len(self.candidates) else math.inf
+
+
 @dataclass(frozen=True, eq=False)
-class Case:
+class Case(_Led):
     """What is known of the best pose of a search, the leader: its rivals, and how complete the search was."""
 
     candidates: Hypotheses  # in the frame of the problem; `Case.of` moves the leader to the front
@@ -103,15 +121,15 @@ class Case:
         """Rotation (3, 3) and translation (3,) of the leader."""
         return self.candidates.pose()
 
-    @property
-    def residual(self) -> float:
-        """Scale of the residuals of the leader, radians; infinite without one."""
-        return float(self.candidates.scale[0]) if len(self.candidates) else math.inf
+    @cached_property
+    def match_scale(self) -> float:
+        """Scale of the residuals at which points match within `Problem.match_radius`, radians."""
+        return max(self.residual, self.problem.match_radius / MATCH_REACH)
 
-    @property
-    def log10_false_alarms(self) -> float:
-        """log10 NFA of the leader; infinite without one."""
-        return float(self.candidates.log10_false_alarms[0]) if len(self.candidates) else math.inf
+    @cached_property
+    def explained(self) -> Partners:
+        """Scene points that the leader shows at the image points."""
+        return partners(MATCH_REACH, self.problem, *self.pose, self.match_scale)
 
     @property
     def match_count(self) -> float:
@@ -221,7 +239,7 @@ class Case:
 
 
 @dataclass(frozen=True, eq=False)
-class SearchResult:
+class SearchResult(_Led):
     """Result of the search for the pose of one problem."""
 
     candidates: Hypotheses  # distinct poses, best first, in the frame of the problem, or of the rig
@@ -238,16 +256,6 @@ class SearchResult:
         if not len(self.candidates):
             return np.full((3, 3), math.nan), np.full(3, math.nan)
         return self.candidates.pose()
-
-    @property
-    def residual(self) -> float:
-        """Scale of the residuals of the best pose, radians; infinite if there is none."""
-        return float(self.candidates.scale[0]) if len(self.candidates) else math.inf
-
-    @property
-    def log10_false_alarms(self) -> float:
-        """log10 NFA of the best pose; infinite if there is none."""
-        return float(self.candidates.log10_false_alarms[0]) if len(self.candidates) else math.inf
 
 
 def decide(case: Case) -> SearchResult:

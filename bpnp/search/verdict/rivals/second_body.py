@@ -20,7 +20,6 @@ from bpnp.search.verdict.competitors import distance_between, partners
 from bpnp.search.verdict.decide import Case, fits_by_chance, weighed_pose
 from bpnp.search.verdict.false_alarms import alarms_of, directions_of
 from bpnp.search.verdict.reasons import Unfinished, objection
-from bpnp.search.verdict.rivals import explained
 
 FEWEST_LEFT = 5  # number of points that can show a significant pose: two more than fix it [points; derived]
 # Largest number of hypotheses of the points that are left: for a body of its own; for an image of the same points; and
@@ -44,7 +43,7 @@ def second_body(case: Case, *, deadline: Deadline = NEVER) -> Case:
     problem = case.problem
     if problem.is_shared or problem.cosines3d is not None or not is_enumerable(problem):
         return case
-    first = explained(case)
+    first = case.explained
     rest = np.setdiff1d(np.arange(len(problem.bearings)), problem.image.chosen[first.near])
     if len(rest) < FEWEST_LEFT:
         return case
@@ -62,8 +61,7 @@ def second_body(case: Case, *, deadline: Deadline = NEVER) -> Case:
         pose = _significant(case, left, most, deadline)
         if not len(pose):
             continue
-        scale = max(case.residual, problem.match_radius / MATCH_REACH)
-        second = partners(MATCH_REACH, left, *pose.pose(), scale)
+        second = partners(MATCH_REACH, left, *pose.pose(), case.match_scale)
         again = np.intersect1d(scene[second.points[second.near]], shown)
         if 2 * len(shown) > facing.sum() and len(again) < SHOWN_TWICE * second.near.sum():
             continue
