@@ -170,8 +170,8 @@ def number(value: float | None, *, short: bool = False) -> str:
     Below 0.01 there are two digits, and with `short`, for a narrow column, below 1. None gives "-".
 
     >>> from bpnp.report.terminal import number
-    >>> [number(value) for value in (12.34, 0.00126, 12345.6, None)]
-    ['12.3', '0.0013', '12346', '-']
+    >>> [number(value) for value in (12.34, 0.00126, 0.00998, 12345.6, None)]
+    ['12.3', '0.0013', '0.010', '12346', '-']
     >>> [number(value, short=True) for value in (12.34, 0.0126)]
     ['12.3', '0.013']
     """
@@ -183,7 +183,7 @@ def number(value: float | None, *, short: bool = False) -> str:
     if 0.01 <= size < 999.5:
         return f"{value:#.{2 if short and size < 0.995 else 3}g}".rstrip(".")
     if 0.001 <= size < 0.01:
-        return f"{value:.4f}"
+        return f"{value:.{4 if size < 0.00995 else 3}f}"
     if 999.5 <= size < 99_999.5:
         return f"{value:.0f}"
     mantissa, exponent = f"{value:.{0 if size < 1e-9 else 1}e}".split("e")
