@@ -3,6 +3,8 @@
 A pose is world to camera: camera = R p + t. Functions take any number of leading axes unless they say otherwise.
 """
 
+import math
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -134,6 +136,17 @@ def chords(
     """
     directions = torch.nn.functional.normalize(transform(rotation, translation, points3d), dim=-1)
     return torch.cdist(bearings, directions, compute_mode="donot_use_mm_for_euclid_dist")
+
+
+def within_angle(
+    points2d: Float[Tensor, "b m 2"],
+    points3d: Float[Tensor, "b n 3"],
+    rotation: Float[Tensor, "b 3 3"],
+    translation: Float[Tensor, "b 3"],
+    angle: float,
+) -> Bool[Tensor, "b m n"]:
+    """Return [angle(f_i, R p_j + t) <= angle] (paper Eq. 3), radians, computed from the chord between unit vectors."""
+    return chords(bearings(points2d), points3d, rotation, translation) <= 2 * math.sin(angle / 2)
 
 
 def rotation_angle(a: Float[Tensor, "*b 3 3"], b: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:

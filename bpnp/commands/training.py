@@ -48,7 +48,7 @@ from bpnp.training.checkpoints import (
 )
 from bpnp.training.loggers import TrainingRunLogger, record_wandb_run
 from bpnp.training.predictions import PredictionWriter
-from bpnp.training.task import BlindPnPTask
+from bpnp.training.task import PACKAGED_LOSSES, BlindPnPTask
 
 DEFAULT_ROOT = "runs/default"
 YAML_VALUE = get_loader("yaml")  # jsonargparse's own
@@ -353,7 +353,7 @@ def _model_options(path: str, content: Mapping[str, Any], task: Mapping[str, Any
     Classes are those of this package and those that the options of the model name; the checkpoint imports nothing.
     """
     named = [_find_class(name) for name in _class_paths(model.as_dict())]
-    classes = {class_name(cls): cls for cls in (*networks(), *PARTS, *named)}
+    classes = {class_name(cls): cls for cls in (*networks(), *PARTS, *PACKAGED_LOSSES, *named)}
 
     def options_of(value: Any) -> Any:
         if not is_description(value):

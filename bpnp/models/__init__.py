@@ -2,8 +2,9 @@
 
 from bpnp.models.batch_search import Search
 from bpnp.models.bpnpnet import BPnPNet
+from bpnp.models.least_squares import LeastSquares
 from bpnp.models.matcher import Matcher
 from bpnp.models.refinement import Refinement
 from bpnp.models.weights import TrainedNet
 
-__all__ = ["BPnPNet", "Matcher", "Refinement", "Search", "TrainedNet"]
+__all__ = ["BPnPNet", "LeastSquares", "Matcher", "Refinement", "Search", "TrainedNet"]

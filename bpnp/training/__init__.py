@@ -3,6 +3,7 @@
 from bpnp.training.callbacks import PoseLossWarmup, ResultsWriter, TrainingMonitor
 from bpnp.training.checkpoints import BestCheckpoint, SafeCheckpointIO
 from bpnp.training.muon import Muon
+from bpnp.training.pose_loss import PoseLoss
 from bpnp.training.predictions import PredictionWriter
 from bpnp.training.reprojection import ReprojectionLoss
 from bpnp.training.task import BlindPnPTask
@@ -11,6 +12,7 @@ __all__ = [
     "BestCheckpoint",
     "BlindPnPTask",
     "Muon",
+    "PoseLoss",
     "PoseLossWarmup",
     "PredictionWriter",
     "ReprojectionLoss",

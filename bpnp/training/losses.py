@@ -1,6 +1,5 @@
 """Losses of an assignment and of a pose (paper Eqs. 11 to 15), one value per sample."""
 
-import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -8,8 +7,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, distributed, nn
 
-from bpnp.geometry import bearings, chords, rotation_angle
-from bpnp.types import Batch, Pose, Prediction
+from bpnp.geometry import rotation_angle, within_angle
+from bpnp.types import Batch, Prediction
 
 MatchingLoss = Literal["correspondence", "likelihood"]
 # Least probability, which keeps the logarithm of a padded point finite. Float32 ends at 1e-38; the gradient 1 / P has
@@ -121,26 +120,31 @@ def correspondence_losses(prediction: Prediction, batch: Batch, *, angle: float 
         return None
     if angle is None:
         return None if batch.match3d is None else correspondence_loss(prediction.assignment, batch.match3d)
-    true = within_angle(batch.points2d, batch.points3d, *_true_pose(batch), angle)
+    true = within_angle(batch.points2d, batch.points3d, *true_pose(batch), angle)
     return (prediction.assignment * (1.0 - 2.0 * true)).sum((-2, -1))
 
 
-def pose_losses(pose: Pose, batch: Batch) -> dict[str, Float[Tensor, " b"]]:
-    """Return "rotation" in radians and "translation" in scene units of L_p, as `pose_terms` does.
-
-    They are zero and without a gradient where the pose did not converge.
-    """
-    solved, truth = pose.stats.converged, _true_pose(batch)
-    # Replace a missing pose (NaN) by the true one, whose loss has no gradient, and mask it.
-    rotation = torch.where(solved[:, None, None], pose.rotation, truth[0])
-    translation = torch.where(solved[:, None], pose.translation, truth[1])
-    return {name: values * solved for name, values in pose_terms(rotation, translation, *truth).items()}
-
-
-def _true_pose(batch: Batch) -> tuple[Tensor, Tensor]:
+def true_pose(batch: Batch) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"]]:
+    """Return the true rotations and translations; raise ValueError if the batch has none."""
     if batch.rotation is None or batch.translation is None:
         raise ValueError("the batch has no true `rotation` and `translation`; give them to Batch.from_arrays")
     return batch.rotation, batch.translation
+
+
+def pose_losses(loss: nn.Module, prediction: Prediction, batch: Batch) -> tuple[dict[str, Tensor], Bool[Tensor, " b"]]:
+    """Return the terms of a pose loss, zero and without a gradient where one is NaN, and which samples have all terms.
+
+    Raise ValueError if it does not return one number per problem and term.
+    """
+    terms = loss(prediction, batch)
+    shapes = {name: tuple(values.shape) for name, values in terms.items()} if isinstance(terms, dict) else {}
+    if not shapes or set(shapes.values()) != {(len(batch),)}:
+        raise ValueError(
+            f"{type(loss).__name__} returned {shapes or type(terms).__name__}; a dict of tensors of shape "
+            f"({len(batch)},) is needed"
+        )
+    posed = ~torch.stack(list(terms.values())).isnan().any(0)
+    return {name: torch.where(posed, values, 0) for name, values in terms.items()}, posed
 
 
 def correspondence_loss(assignment: Float[Tensor, "b m n"], match3d: Int[Tensor, "b n"]) -> Float[Tensor, " b"]:
@@ -185,17 +189,6 @@ def matching_likelihood_loss(prediction: Prediction, batch: Batch) -> Float[Tens
 
 def _log(probability: Tensor) -> Tensor:
     return probability.clamp_min(SMALLEST).log()
-
-
-def within_angle(
-    points2d: Float[Tensor, "b m 2"],
-    points3d: Float[Tensor, "b n 3"],
-    rotation: Float[Tensor, "b 3 3"],
-    translation: Float[Tensor, "b 3"],
-    angle: float,
-) -> Bool[Tensor, "b m n"]:
-    """Return [angle(f_i, R p_j + t) <= angle] (paper Eq. 3), radians, computed from the chord between unit vectors."""
-    return chords(bearings(points2d), points3d, rotation, translation) <= 2 * math.sin(angle / 2)
 
 
 def pose_terms(

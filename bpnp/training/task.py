@@ -45,12 +45,16 @@ from bpnp.training.losses import (
     own_losses,
     pose_losses,
 )
+from bpnp.training.pose_loss import PoseLoss
 from bpnp.training.predictions import in_scene_frame
+from bpnp.training.reprojection import ReprojectionLoss
 from bpnp.types import Batch, Prediction
 
 Stage = Literal["val", "test"]
 OptimizerSettings = list[tuple[str, list[dict[str, Any]]]]  # class of each optimizer, and its groups without parameters
 REBUILT = {"solver", "weights"}  # options that are not saved under "task": the checkpoint has their result
+LOSSES = ("loss", "pose_loss")  # options that are saved as descriptions of modules
+PACKAGED_LOSSES = (PoseLoss, ReprojectionLoss)
 POSED = "pnp"  # estimate of the pose loss, which has a derivative
 DECAYED = 0.02  # factor on the learning rate after the decay
 WIDEST_MATCH = 0.5  # largest `correspondence_angle`, radians; larger values are probably degrees
@@ -89,9 +93,11 @@ class BlindPnPTask(LightningModule):
         warmup_steps: Number of optimiser steps in which the learning rate rises from zero, default 0.
         decay_start: First step of the decay, a half cosine to a fiftieth of the learning rate; None for no decay.
         decay_steps: Number of steps of the decay, default 1000.
-        pose_weight: gamma_p of Eq. 15, the weight of the pose loss of the estimate "pnp". While it is 0, the default,
-            training computes no pose, unless the solver has no `match` or `loss` needs a pose. `PoseLossWarmup` sets it
-            from an epoch on.
+        pose_weight: gamma_p of Eq. 15, the weight of `pose_loss`. While it is 0, the default, training computes no
+            pose, unless the solver has no `match` or `loss` needs a pose. `PoseLossWarmup` sets it from an epoch on.
+        pose_loss: Module from (Prediction, Batch) to the terms of the pose loss by name, one value per problem each
+            (b,), NaN for a problem without one, such as one whose pose "pnp" did not converge. None for `PoseLoss()`,
+            the paper's L_r and L_t.
         matching_loss: Loss of the assignment: "correspondence", the default, for the paper's L_c (Eq. 11), or
             "likelihood" for the negative log-likelihood of each point's correspondence (`matching_likelihood_loss`).
         correspondence_angle: With L_c: an image point and a scene point correspond if the true pose projects the scene
@@ -114,6 +120,7 @@ class BlindPnPTask(LightningModule):
         decay_start: int | None = None,
         decay_steps: int = 1000,
         pose_weight: float = 0.0,
+        pose_loss: PoseLoss | AnyModule | None = None,
         matching_loss: MatchingLoss = "correspondence",
         correspondence_angle: float | None = None,
         loss: AnyModule | None = None,
@@ -127,6 +134,7 @@ class BlindPnPTask(LightningModule):
             self.solver = build_solver(content) if solver is None else module_or_default(solver, BPnPNet)
             self._adopt(content, weights, grown=True)
         self.loss = None if loss is None else module_or_default(loss, nn.Module)
+        self.pose_loss = module_or_default(pose_loss, PoseLoss)
         self.save_hyperparameters(
             {
                 "solver": describe_module(self.solver),
@@ -137,6 +145,7 @@ class BlindPnPTask(LightningModule):
                 "decay_start": decay_start,
                 "decay_steps": decay_steps,
                 "pose_weight": pose_weight,
+                "pose_loss": None if pose_loss is None else describe_module(self.pose_loss),
                 "matching_loss": matching_loss,
                 "correspondence_angle": correspondence_angle,
                 "loss": None if self.loss is None else describe_module(self.loss),
@@ -217,8 +226,9 @@ class BlindPnPTask(LightningModule):
         accepted = constructor_arguments(cls)
         options = {key: value for key, value in content.get("task", {}).items() if key in accepted} | kwargs
         try:
-            if is_description(options.get("loss")):
-                options["loss"] = build_module(options["loss"], parts)
+            for name in LOSSES:
+                if is_description(options.get(name)):
+                    options[name] = build_module(options[name], (*PACKAGED_LOSSES, *parts))
             if options.get("solver") is None:
                 options["solver"] = build_solver(content, parts)
             task = cls(**options)
@@ -316,7 +326,7 @@ class BlindPnPTask(LightningModule):
             self._log_metrics("test", dataloader_idx)
 
     def losses(self, prediction: Prediction, batch: Batch) -> Losses:
-        """Return the matching loss and, with a `pose_weight`, the pose loss of the samples whose pose converged.
+        """Return the matching loss and, with a `pose_weight`, the pose loss of the samples that have one.
 
         Args:
             prediction: Prediction of the solver.
@@ -335,9 +345,8 @@ class BlindPnPTask(LightningModule):
         if self.pose_weight == 0:
             return losses
         self.check_pose_loss(tuple(prediction.poses))
-        pose = prediction.poses[POSED]
-        values = pose_losses(pose, batch)
-        return replace(losses, pose=values, posed=pose.stats.converged, pose_weight=self.pose_weight)
+        terms, posed = pose_losses(self.pose_loss, prediction, batch)
+        return replace(losses, pose=terms, posed=posed, pose_weight=self.pose_weight)
 
     def check_pose_loss(self, estimates: tuple[str, ...]) -> None:
         """Raise ValueError if the pose of the pose loss, "pnp", is not among the estimates of the solver.
@@ -470,7 +479,7 @@ class BlindPnPTask(LightningModule):
         saved = checkpoint.pop(self.CHECKPOINT_HYPER_PARAMS_KEY, {})
         checkpoint.pop(self.CHECKPOINT_HYPER_PARAMS_NAME, None)
         checkpoint["task"] = {
-            key: value for key, value in saved.items() if key not in REBUILT and (is_plain(value) or key == "loss")
+            key: value for key, value in saved.items() if key not in REBUILT and (is_plain(value) or key in LOSSES)
         }
         checkpoint["skipped_steps"] = [self.skipped_steps, self.consecutive_skipped_steps]
         checkpoint["optimizer_settings"] = self.optimizer_settings

@@ -1,3 +1,4 @@
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,9 @@ RECIPES = sorted(
     for folder in (".", "paper")
     for path in CONFIGS.glob(f"{folder}/*.yaml")
 )
-DAILY = {"quickstart", "matcher", "paper/modelnet40", "paper/megadepth"}  # in `make test` too
+DAILY = {"quickstart", "matcher"} | {  # in `make test` too
+    f"paper/{name}{kind}" for name in ("modelnet40", "megadepth") for kind in ("", "_code")
+}
 
 
 def data_for(recipe: str, folder: Path) -> list[str]:
@@ -119,6 +122,29 @@ def test_the_experiments_of_the_paper_have_none_of_our_additions(name: str, caps
     net = BPnPNet()
     assert not net.features2d.centre
     assert not net.features3d.centre
+
+
+@pytest.mark.parametrize(("name", "rate"), [("modelnet40", 1e-4), ("megadepth", 1e-3)])
+def test_the_recipes_of_the_authors_code_differ_in_what_their_heads_list(
+    name: str, rate: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    paper, code = printed(f"paper/{name}", capsys), printed(f"paper/{name}_code", capsys)
+    changed = {key: code[key] for key in code if code[key] != paper.get(key)}
+    changed.pop("trainer.default_root_dir")
+    assert {key: float(value) for key, value in changed.items() if value[0].isdigit()} == pytest.approx({
+        "model.learning_rate": rate,
+        "model.weight_decay": 1e-3,
+        "model.pose_loss.max_rotation": math.pi / 2,
+        "model.pose_loss.max_translation": 1.0,
+        "model.solver.ransac.min_matches": 10,
+        "model.solver.ransac.max_matches": 1000,
+        "model.solver.refinement.angle": math.radians(1),
+    })  # fmt: skip
+    assert {key: value for key, value in changed.items() if not value[0].isdigit()} == {
+        "model.pose_loss.class_path": "bpnp.training.PoseLoss",
+        "model.solver.refinement.class_path": "bpnp.models.LeastSquares",
+        "model.solver.refinement.enabled": "True",
+    }
 
 
 def test_the_preset_has_the_loss_and_the_ransac_of_the_paper(capsys: pytest.CaptureFixture[str]) -> None:

@@ -158,3 +158,20 @@ def test_the_number_of_matches_is_exact(default: torch.dtype) -> None:
     finally:
         torch.set_default_dtype(before)
     assert counts == [math.floor(1.4 * 45)] * 2 == [62, 62]
+
+
+@pytest.mark.parametrize(("real", "count"), [(3, 9), (5, 10), (8, 12), (30, 40)])
+def test_the_number_of_matches_is_within_its_limits(real: int, count: int) -> None:
+    """1.5 a point, at least 10, but no more than the pairs that there are, and at most 40."""
+    assignment = torch.rand(1, 30, 30, generator=torch.Generator().manual_seed(0))
+    mask = (torch.arange(30) < real)[None]
+    index2d, index3d, chosen = top_matches(assignment, mask, mask, 1.5, 10, 40)
+    assert int(chosen.sum()) == count
+    pairs = assignment[0, :real, :real].flatten().sort(descending=True).values[:count]
+    assert torch.equal(assignment[0, index2d[0], index3d[0]][chosen[0]], pairs)
+
+
+def test_limits_that_contradict_each_other_are_refused() -> None:
+    planted = plant(1, 6)
+    with pytest.raises(ValueError, match="`max_matches` is 5; .* 10"):
+        ransac_pnp(planted.permutation(), planted.points2d, planted.points3d, min_matches=10, max_matches=5)

@@ -207,8 +207,8 @@ def test_the_names_in_a_checkpoint_are_kept(tmp_path: Path) -> None:
     assert {"state_dict", "solver", "task", "skipped_steps"} <= content.keys()
     assert "PoseLossWarmup" in content["callbacks"]
     assert content["task"].keys() == {
-        "learning_rate", "weight_decay", "warmup_steps", "decay_start", "decay_steps", "pose_weight", "matching_loss",
-        "correspondence_angle", "loss", "refine_validation",
+        "learning_rate", "weight_decay", "warmup_steps", "decay_start", "decay_steps", "pose_weight", "pose_loss",
+        "matching_loss", "correspondence_angle", "loss", "refine_validation",
     }  # fmt: skip
     solver = content["solver"]
     assert solver["class"] == "BPnPNet"
@@ -220,7 +220,10 @@ def test_the_names_in_a_checkpoint_are_kept(tmp_path: Path) -> None:
         "features2d": ("ImageFeatures", features | {"scale"}),
         "features3d": ("SceneFeatures", features | {"normalise"}),
         "transport": ("Sinkhorn", {"mu", "learn_mu", "dustbin", "tolerance", "max_iterations"}),
-        "ransac": ("RansacPnP", {"backend", "matches_factor", "threshold", "max_iterations", "seed"}),
+        "ransac": (
+            "RansacPnP",
+            {"backend", "matches_factor", "min_matches", "max_matches", "threshold", "max_iterations", "seed"},
+        ),
         "pnp": ("WeightedPnP", {"tolerance", "max_iterations", "solver", "clip_columns"}),
         "refinement": ("Refinement", {"hypotheses", "enabled"}),
     }

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from bpnp import Batch, Prediction
-from bpnp.geometry import bearings
+from bpnp.geometry import bearings, within_angle
 from bpnp.training.losses import (
     Losses,
     correspondence_loss,
@@ -20,7 +20,6 @@ from bpnp.training.losses import (
     matching_losses,
     own_losses,
     pose_terms,
-    within_angle,
 )
 from bpnp.training.task import BlindPnPTask
 

@@ -1,12 +1,13 @@
 """RANSAC on the most probable matches: a robust initial pose from a soft assignment (paper section 3.3)."""
 
+import math
 from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from bpnp.checks import check_positive, check_shapes
+from bpnp.checks import check_positive, check_shapes, check_within
 from bpnp.layers.ransac.consensus import BACKENDS
 from bpnp.layers.ransac.matches import Matches, in_scene, normalise_matches, residuals
 from bpnp.layers.ransac.minimal_solvers import take
@@ -22,21 +23,24 @@ def top_matches(
     mask2d: Bool[Tensor, "b m"] | None,
     mask3d: Bool[Tensor, "b n"] | None,
     matches_factor: float,
+    min_matches: int = 1,
+    max_matches: int | None = None,
 ) -> tuple[Int[Tensor, "b k"], Int[Tensor, "b k"], Bool[Tensor, "b k"]]:
     """Select the most probable matches of each sample: indices of 2D points and of 3D points, and which are no padding.
 
-    A sample with m' and n' real points has floor(matches_factor * min(m', n')) matches, at most m' n', the most
-    probable first. The width k of the result is the same of the padded sizes m and n, and at least 1. Matches of equal
-    probability are in the order of their 2D points, then of their 3D points, so that the result does not depend on
-    padding. Without a mask all points are real.
+    A sample with m' and n' real points has floor(matches_factor * min(m', n')) matches, at least `min_matches`, at most
+    `max_matches` and m' n', the most probable first. The width k of the result is the same of the padded sizes m and n,
+    and at least 1. Matches of equal probability are in the order of their 2D points, then of their 3D points, so that
+    the result does not depend on padding. Without a mask all points are real.
     """
     b, m, n = assignment.shape
     real2d = assignment.new_ones(b, m, dtype=torch.bool) if mask2d is None else mask2d
     real3d = assignment.new_ones(b, n, dtype=torch.bool) if mask3d is None else mask3d
     count2d, count3d = real2d.sum(-1), real3d.sum(-1)
-    count = torch.minimum((matches_factor * torch.minimum(count2d, count3d).double()).long(), count2d * count3d)
+    wanted = (matches_factor * torch.minimum(count2d, count3d).double()).long().clamp(min_matches, max_matches)
+    count = torch.minimum(wanted, count2d * count3d)
     scores = assignment.masked_fill(~(real2d.unsqueeze(-1) & real3d.unsqueeze(-2)), -1)
-    k = min(max(1, int(matches_factor * min(m, n))), m * n)
+    k = min(max(min_matches, int(matches_factor * min(m, n))), max_matches or m * n, m * n)
     flat = _stable_top(scores.flatten(1), k)
     return flat // n, flat % n, torch.arange(k, device=flat.device) < count.unsqueeze(-1)
 
@@ -68,14 +72,16 @@ def ransac_pnp(
     mask3d: Bool[Tensor, "b n"] | None = None,
     backend: Backend = "auto",
     matches_factor: float = 1.5,
+    min_matches: int = 1,
+    max_matches: int | None = None,
     threshold: float = 0.01,
     max_iterations: int = 1000,
     seed: int = 0,
 ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], SolveStats]:
     """Estimate a pose from the most probable matches by RANSAC with a P3P solver.
 
-    With m and n real points the floor(matches_factor * min(m, n)) most probable matches are used. The pose has no
-    gradient: it is the initial pose of a layer that has one.
+    With m and n real points the floor(matches_factor * min(m, n)) most probable matches are used, within the limits.
+    The pose has no gradient: it is the initial pose of a layer that has one.
 
     Args:
         assignment: P (b, m, n); only the order of its entries matters.
@@ -88,6 +94,9 @@ def ransac_pnp(
             "torch" samples in the order of P too and solves the whole batch at once on its device. "auto", the default,
             is "torch" on cuda, else "poselib".
         matches_factor: Number of matches per point of the smaller side, default 1.5.
+        min_matches: Smallest number of matches, default 1; 10 in the authors' code.
+        max_matches: Largest number of matches, at least `min_matches`; 1000 in the authors' code. Default: None, no
+            limit.
         threshold: Largest reprojection error of an inlier, normalised units, default 0.01 (8 px at a focal length of
             800).
         max_iterations: Largest number of hypotheses, 1000 by default and in the paper.
@@ -115,9 +124,12 @@ def ransac_pnp(
     if backend not in ("auto", *BACKENDS):
         raise ValueError(f"`backend` is {backend!r}; it is one of auto, {', '.join(BACKENDS)}")
     check_positive(matches_factor=matches_factor, threshold=threshold, max_iterations=max_iterations)
+    check_within(1, math.inf, min_matches=min_matches)
+    if max_matches is not None:
+        check_within(min_matches, math.inf, max_matches=max_matches)
     if backend == "auto":
         backend = "torch" if assignment.device.type == "cuda" else "poselib"
-    index2d, index3d, real = top_matches(assignment, mask2d, mask3d, matches_factor)
+    index2d, index3d, real = top_matches(assignment, mask2d, mask3d, matches_factor, min_matches, max_matches)
     matches = Matches(take(points2d, index2d).double(), take(points3d, index3d).double(), real)
     local, centre, scale = normalise_matches(matches)
     poses, iterations = BACKENDS[backend](local, threshold, max_iterations, seed)
@@ -141,6 +153,8 @@ class RansacPnP(nn.Module):
             batch on its device), or "auto", the default ("torch" on cuda, else "poselib").
         matches_factor: Number of matches per point of the smaller side, default 1.5; RANSAC uses the most probable
             ones.
+        min_matches: Smallest number of matches, default 1; 10 in the authors' code.
+        max_matches: Largest number of matches; 1000 in the authors' code. Default: None, no limit.
         threshold: Largest reprojection error of an inlier, normalised image coordinates, default 0.01.
         max_iterations: Largest number of hypotheses, 1000 by default and in the paper.
         seed: Seed of the sampling, default 0.
@@ -151,12 +165,15 @@ class RansacPnP(nn.Module):
         *,
         backend: Backend = "auto",
         matches_factor: float = 1.5,
+        min_matches: int = 1,
+        max_matches: int | None = None,
         threshold: float = 0.01,
         max_iterations: int = 1000,
         seed: int = 0,
     ) -> None:
         super().__init__()
         self.backend, self.matches_factor, self.threshold = backend, matches_factor, threshold
+        self.min_matches, self.max_matches = min_matches, max_matches
         self.max_iterations, self.seed = max_iterations, seed
 
     def forward(
@@ -185,6 +202,8 @@ class RansacPnP(nn.Module):
             backend=self.backend,
             seed=self.seed,
             matches_factor=self.matches_factor,
+            min_matches=self.min_matches,
+            max_matches=self.max_matches,
             threshold=self.threshold,
             max_iterations=self.max_iterations,
         )
