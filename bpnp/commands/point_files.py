@@ -136,7 +136,7 @@ def read_prior(path: Path, degrees: float, distance: float | None) -> Any:
     """Read a rough pose from JSON with `rotation` and `translation`, or a pipe with it, as a prior.
 
     Standard deviations are in degrees and scene units, None if unknown. Another path, of a checkpoint, is returned
-    unchanged.
+    unchanged. Raise ValueError if the JSON has no pose.
     """
     from bpnp.search.starts import PosePrior
 

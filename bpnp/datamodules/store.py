@@ -141,8 +141,8 @@ class StoreWriter:
     def __init__(self, files: Mapping[str, BinaryIO], widths: Mapping[str, int]) -> None:
         self._files, self._widths = files, widths
         self._columns: dict[str, list[Any]] = defaultdict(list, {f"{name}_start": [0] for name in widths}, name=[])
-        self.parameters: dict[str, Any] = {}
-        self.skipped: dict[str, str] = {}
+        self.parameters: dict[str, Any] = {}  # JSON content for the manifest
+        self.skipped: dict[str, str] = {}  # reason for each item that is left out
         for name, width in widths.items():
             _write_header(files[name], BULK, (0, width))
 

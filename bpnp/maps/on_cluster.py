@@ -28,8 +28,8 @@ def attempts_on_cluster(scene: SceneMap, tasks: Iterable[PhotoTask], cluster: st
     """Yield the results of photos in the order in which they finish.
 
     `cluster` is the address of a scheduler, such as tcp://10.0.0.1:8786, or the number of processes to start on this
-    machine. The workers need bpnp, and photos and keypoints under the same paths as here. If a worker is lost, its
-    photos are reassigned.
+    machine; raise ValueError without a scheduler there. The workers need bpnp, and photos and keypoints under the same
+    paths as here. If a worker is lost, its photos are reassigned.
     """
     plugin = MapOfWorker(scene)
     with connect_client(cluster) as client:

@@ -96,7 +96,8 @@ def focal_from_exif(photo: Path) -> float | None:
     The 35 mm equivalent has priority, since it is unchanged if a photo is scaled. Otherwise the focal length in
     millimetres is multiplied by the sensor resolution and scaled by the ratio of the stored size to the original size.
     A photo whose aspect ratio differs from the original was cropped at an unknown position, and the result is None.
-    (pycolmap's `infer_camera_from_image` does not correct the sensor resolution of a scaled photo.)
+    (pycolmap's `infer_camera_from_image` does not correct the sensor resolution of a scaled photo.) Raise ValueError if
+    the photo cannot be read.
     """
     size, tags = _read_size_and_tags(photo)
     taken = int(_number_of(tags, PIXELS_X)), int(_number_of(tags, PIXELS_Y))
@@ -115,7 +116,8 @@ def focal_from_exif(photo: Path) -> float | None:
 def up_from_exif(photo: Path) -> tuple[float, float, float] | None:
     """Return the direction up in the camera frame of a stored photo, to a quarter turn, from the EXIF orientation.
 
-    It is a unit vector; None if there is no orientation, or a mirrored one.
+    It is a unit vector; None if there is no orientation, or a mirrored one. Raise ValueError if the photo cannot be
+    read.
     """
     return UP_OF_ORIENTATION.get(_read_size_and_tags(photo)[1].get(ORIENTATION, 0))
 

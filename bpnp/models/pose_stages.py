@@ -109,7 +109,7 @@ def match_again(
 def cost_under_pose(
     cost: Float[Tensor, "b m n"], batch: Batch, pose: Pose, *, width: float, mu: float | Tensor
 ) -> Float[Tensor, "b m n"]:
-    """Combine feature distances M and residuals under a pose of width s, radians: w M_ij + mu min(d_ij, L).
+    """Combine feature distances M and residuals d under a pose, of width s in radians: w M_ij + mu min(d_ij, L).
 
     The entropic transport of this cost assigns in proportion to exp(-w M_ij / mu) times a normal density of the
     residual with a floor. No gradient reaches the pose. A sample without a pose keeps its M.

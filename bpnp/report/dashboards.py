@@ -46,7 +46,7 @@ def log_results(
 
     The folder `wandb` is made in `directory`, by default the parent of `folder`. `photos` finds the photos under the
     points of the pictures. The estimates are compared with those of the results folder `compare_with`, by default with
-    the first estimate of `folder`.
+    the first estimate of `folder`. Raise ValueError if a folder cannot be read.
     """
     import wandb
 

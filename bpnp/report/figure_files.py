@@ -12,7 +12,7 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".svg", ".pdf")
 
 
 def save_figure(figure: "Figure", path: Path | str, *, dpi: int = 110) -> Path:
-    """Write a figure atomically, to a name that ends in .png, .jpg, .svg or .pdf, and return its path."""
+    """Write a figure atomically, and return its path; raise ValueError for a name without one of the `SUFFIXES`."""
     path = Path(path)
     check_picture_name(path)
     with write_atomically(path) as temporary, delay_interrupts():  # matplotlib reports Ctrl-C as an input error

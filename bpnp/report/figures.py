@@ -128,10 +128,10 @@ def plot_problem(problem: ProblemPoints, *, estimate: str | None = None, lines: 
 
 
 def plot_photo(problem: ProblemPoints, photo: AnyArray, *, estimates: Sequence[str] | None = None) -> "Figure":
-    """Draw the 3D points over a photo (h, w, 3), uint8, as each pose projects them, an image per estimate (Fig. 4).
+    """Draw the 3D points over a photo (h, w, 3), uint8, as each pose projects them, an image per estimate.
 
-    Rings are the image points. The titles have the errors of the poses, if the true pose is known. Raise ValueError if
-    the camera is missing or of another image shape, or an estimate is unknown.
+    As in Fig. 4 of the paper, rings are the image points. The titles have the errors of the poses, if the true pose is
+    known. Raise ValueError if the camera is missing or of another image shape, or an estimate is unknown.
     """
     from matplotlib.figure import Figure
 

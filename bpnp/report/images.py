@@ -33,7 +33,7 @@ def open_photo(path: Path | str) -> "Iterator[Image]":
 
 
 def read_photo(path: Path | str) -> AnyArray:
-    """Read the pixels (h, w, 3) of a photo, uint8."""
+    """Read the pixels (h, w, 3) of a photo, uint8; raise ValueError as `open_photo` does."""
     with open_photo(path) as photo:
         return np.asarray(photo.convert("RGB"))
 

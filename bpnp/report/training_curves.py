@@ -57,7 +57,7 @@ def switch_step(curves: "DataFrame") -> int | None:
 def training_curves(run: Path | str) -> "Figure":
     """Draw the losses of a training and the median errors of its validation.
 
-    A line marks the switch of the pose loss.
+    A line marks the switch of the pose loss. Raise ValueError as `read_curves` does.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, NullFormatter

@@ -169,7 +169,7 @@ def with_unfinished(solution: Solution, deadline: Deadline) -> Solution:
 
 
 def candidates_of(poses: Hypotheses, counts: Sequence[int]) -> tuple[Candidate, ...]:
-    """Return poses in the user's frame (`Cameras.to_user`) with their numbers of inliers."""
+    """Return poses in the user's frame (`Cameras.to_user`), homogeneous for a rig, with their numbers of inliers."""
     unit = poses.translation[:, 3:] if poses.translation.shape[1] == 4 else np.ones((len(poses), 1))
     return tuple(
         Candidate(rotation, translation, score, count, alarms, scale)

@@ -35,7 +35,8 @@ def possible_matches(
 
     They are index (k,) into `chosen`, index (k,) into `directions` (n, 3), of the scene points `indices` (n,), and
     density (k,) of each match; and the total density (m,) of each image point, which includes that of no
-    correspondence. An image point has at most `most` neighbours.
+    correspondence. An image point has at most `most` neighbours. The standard deviation of the residuals, `scale`, is
+    in radians.
     """
     bearings, reach = problem.bearings[chosen], FARTHEST_MATCH * scale
     if len(bearings) * len(directions) <= DENSE_MATCHES:
@@ -68,8 +69,8 @@ def possible_matches(
 def score_pose(problem: Problem, rotation: Array, translation: Array, scale: float) -> tuple[float, float]:
     """Return the mean log-likelihood of the bearings under a pose, nats, and the expected number of matches.
 
-    It is in the units of the annealing: the maximum of a kernel is 1 / s^2; -inf if no scene point is seen. The number
-    of matches is at most that of the image points or scene points.
+    It is in the units of the annealing: the maximum of a kernel is 1 / s^2, s the scale in radians; -inf if no scene
+    point is seen. The number of matches is at most that of the image points or scene points.
     """
     camera, chosen = problem.points3d @ rotation.T + translation, problem.image.chosen
     indices = facing(problem, camera, rotation)

@@ -44,7 +44,11 @@ class Companion(NamedTuple):
 
 
 class SearchFrame:
-    """Problem in float32 and in random order, with the camera turned to the mean bearing."""
+    """Problem in float32 and in random order, with the camera turned to the mean bearing.
+
+    A function that takes a `SearchFrame` takes and returns poses and priors in its frame, the frame of the scene,
+    unless its docstring says that they are of a problem.
+    """
 
     def __init__(self, problem: Problem, seed: int, settings: SearchSettings, deadline: Deadline = NEVER) -> None:
         bearings, points3d = problem.bearings, problem.points3d

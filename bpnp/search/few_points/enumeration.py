@@ -308,9 +308,9 @@ def enumerate_poses(
 ) -> Enumerated:
     """Enumerate poses under which image points see scene points, one-to-one within a radius in radians.
 
-    With prior gravity, or a rotation within a few degrees, two matches fix a pose. A predicted pose is tried first.
-    Unless it runs `to_the_end`, the enumeration stops once the best pose is significant and leads every other pose by a
-    safe margin.
+    The default radius is the match radius of the problem. With prior gravity, or a rotation within a few degrees, two
+    matches fix a pose. A predicted pose is tried first. Unless it runs `to_the_end`, the enumeration stops once the
+    best pose is significant and leads every other pose by a safe margin.
 
     >>> import numpy as np
     >>> rng = np.random.default_rng(0)

@@ -7,6 +7,7 @@ from bpnp.arrays import Array, Indices
 from bpnp.poses import SAME
 from bpnp.search.few_points.matching import (
     MATCHED_COSINE,
+    EnumerationTables,
     Matches,
     cell_of,
     evidence,
@@ -16,6 +17,7 @@ from bpnp.search.few_points.matching import (
     sight,
     step,
 )
+from bpnp.search.few_points.points import PriorArrays
 from bpnp.search.kernels.vectors import copy_pose, rotated
 from bpnp.search.propose.minimal_solvers import Triangles, chords_between, compiled, part, solve_p2p, solve_p3p
 
@@ -58,7 +60,15 @@ class Block(NamedTuple):
 
 @compiled
 def explore(
-    row: int, first: int, budget: int, stop: float, reach: float, block: Any, problem: Any, kept: Any, work: Any
+    row: int,
+    first: int,
+    budget: int,
+    stop: float,
+    reach: float,
+    block: Block,
+    problem: EnumerationTables,
+    kept: "Kept",
+    work: "Work",
 ) -> Any:
     """Call `sweep`, or `settle` the first pose in `work` if the budget is 0.
 
@@ -72,7 +82,9 @@ def explore(
 
 
 @part
-def sweep(row: int, first: int, budget: int, stop: float, block: Any, problem: Any, kept: Any, work: Any) -> Any:
+def sweep(
+    row: int, first: int, budget: int, stop: float, block: Block, problem: EnumerationTables, kept: "Kept", work: "Work"
+) -> Any:
     """Solve up to `budget` hypotheses from a row and one of its triangles on, and keep the refined poses.
 
     A row is an image set in one order, paired with the triangles whose first point fits the label of its first point.
@@ -139,7 +151,7 @@ def _determinant(f: Any, g: Any, h: Any) -> float:
 
 
 @part
-def facing(pose: Any, normals: Any, a: int, rays: Any, i: int) -> bool:
+def facing(pose: Array, normals: Array, a: int, rays: Array, i: int) -> bool:
     """Return whether point a faces the camera along ray i; always True without normals."""
     if not len(normals):
         return True
@@ -148,7 +160,7 @@ def facing(pose: Any, normals: Any, a: int, rays: Any, i: int) -> bool:
 
 
 @part
-def witnessed(pose: Any, points: Any, seen: Any, block: Any, problem: Any) -> bool:
+def witnessed(pose: Array, points: Any, seen: Any, block: Block, problem: EnumerationTables) -> bool:
     """Return whether enough preverification points near the first of three points are seen near image points.
 
     The three points of the hypothesis, and its own image points `seen`, do not count.
@@ -204,7 +216,7 @@ def copy(values: Any, to: Any) -> None:
 
 
 @part
-def consider(pose: Any, reach: float, problem: Any, kept: Any, work: Any) -> None:
+def consider(pose: Array, reach: float, problem: EnumerationTables, kept: "Kept", work: "Work") -> None:
     """Refine a pose with about as many matches as the best hypothesis of the stage."""
     count, _, expected = match(pose, reach, problem.scene, problem.image.grid, work.matches)
     value = count - LACKING * (expected - count if expected > count else 0)
@@ -214,7 +226,7 @@ def consider(pose: Any, reach: float, problem: Any, kept: Any, work: Any) -> Non
 
 
 @part
-def settle(pose: Any, reach: float, problem: Any, kept: Any, work: Any) -> None:
+def settle(pose: Array, reach: float, problem: EnumerationTables, kept: "Kept", work: "Work") -> None:
     """Refine a pose (4, 3) in place and keep it, at radius 1 and then at its most significant radius.
 
     The matches are those within a radius that shrinks from `reach` match radii to 1; 0 for a pose that is refined
@@ -235,7 +247,9 @@ def settle(pose: Any, reach: float, problem: Any, kept: Any, work: Any) -> None:
 
 
 @part
-def tightened(pose: Any, reach: float, last: float, problem: Any, matches: Any, system: Any) -> bool:
+def tightened(
+    pose: Array, reach: float, last: float, problem: EnumerationTables, matches: Matches, system: Any
+) -> bool:
     """Refine a pose in place by Gauss-Newton steps on matches within a shrinking radius.
 
     The radius shrinks from `reach` to `last`, in match radii; `FINAL_STEPS` steps follow there. Return False for too
@@ -254,7 +268,7 @@ def tightened(pose: Any, reach: float, last: float, problem: Any, matches: Any, 
 
 
 @part
-def allowed(pose: Any, prior: Any) -> bool:
+def allowed(pose: Array, prior: PriorArrays) -> bool:
     """Return whether a pose agrees with the prior translation and directions."""
     in_scene, in_camera, shift2, off2 = prior.in_scene, prior.in_camera, 0.0, 0.0
     for k in range(3):
@@ -269,7 +283,7 @@ def allowed(pose: Any, prior: Any) -> bool:
 
 
 @part
-def keep(pose: Any, value: float, count: int, matches: Any, kept: Any) -> None:
+def keep(pose: Array, value: float, count: int, matches: Matches, kept: "Kept") -> None:
     """Store a pose in the slot of the same pose, of an empty one, or of the worst; count its basin."""
     values, best, place, is_new = kept.evidence, kept.best, -1, False
     for c in range(len(values)):
@@ -302,7 +316,7 @@ def keep(pose: Any, value: float, count: int, matches: Any, kept: Any) -> None:
 
 
 @part
-def _same(pose: Any, other: Any) -> bool:
+def _same(pose: Array, other: Array) -> bool:
     """Return whether two poses (4, 3) are the same within the tolerances of `SAME`."""
     shift2 = depth2 = trace = 0.0  # trace of the rotation between them: 1 + 2 cos
     for k in range(3):

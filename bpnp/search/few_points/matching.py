@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bpnp.arrays import Array, Indices
-from bpnp.search.few_points.points import IMAGE_CELLS, Heading, ImageArrays, PriorArrays, SceneArrays
+from bpnp.search.few_points.points import IMAGE_CELLS, Grid, Heading, ImageArrays, PriorArrays, SceneArrays
 from bpnp.search.kernels.dense import solve_normal_equations
 from bpnp.search.kernels.vectors import rotated, turn
 from bpnp.search.propose.minimal_solvers import part
@@ -40,7 +40,7 @@ class Matches(NamedTuple):
 
 
 @part
-def sight(pose: Any, scene: Any, j: int) -> tuple[float, float, float]:
+def sight(pose: Array, scene: SceneArrays, j: int) -> tuple[float, float, float]:
     """Return both stereographic coordinates of point j, and the cosine between its normal and the line of sight.
 
     The cosine is 1 without normals.
@@ -64,14 +64,14 @@ def fits(label: int, other: int) -> bool:
 
 
 @part
-def cell_of(u: float, v: float, grid: Any) -> Any:
+def cell_of(u: float, v: float, grid: Grid) -> Any:
     """Return the cell of the grid that contains (u, v), or -1 outside."""
     a, b = (u - grid.low_u) * grid.per_cell, (v - grid.low_v) * grid.per_cell
     return np.int64(a) * IMAGE_CELLS + np.int64(b) if a >= 0 and b >= 0 and a < IMAGE_CELLS and b < IMAGE_CELLS else -1
 
 
 @part
-def nearest(u: float, v: float, cell: int, label: int, reach2: float, grid: Any) -> tuple[int, float]:
+def nearest(u: float, v: float, cell: int, label: int, reach2: float, grid: Grid) -> tuple[int, float]:
     """Return the nearest image point with a fitting label, and its squared distance in radii.
 
     The index is -1 if there is none within the square root of `reach2`.
@@ -88,7 +88,7 @@ def nearest(u: float, v: float, cell: int, label: int, reach2: float, grid: Any)
 
 
 @part
-def match(pose: Any, reach: float, scene: Any, grid: Any, matches: Any) -> tuple[int, int, int]:
+def match(pose: Array, reach: float, scene: SceneArrays, grid: Grid, matches: Matches) -> tuple[int, int, int]:
     """Match image and scene points one-to-one within `reach` match radii under a pose (4, 3).
 
     A scene point proposes its nearest image point, and an image point accepts the nearest proposal. Return the numbers
@@ -112,7 +112,9 @@ def match(pose: Any, reach: float, scene: Any, grid: Any, matches: Any) -> tuple
 
 
 @part
-def evidence(count: int, visible: int, expected: int, matches: Any, fixing: int, density: float) -> tuple[float, float]:
+def evidence(
+    count: int, visible: int, expected: int, matches: Matches, fixing: int, density: float
+) -> tuple[float, float]:
     """Return the largest evidence, nats, of matches at the radii 1, 1/2, 1/4 ... match radii, and its radius.
 
     The evidence is -log of C(m - f, k - f) p^(k - f), with p the probability of a chance match
@@ -139,7 +141,7 @@ def _log_choose(n: int, k: int) -> float:
 
 
 @part
-def step(pose: Any, matched: Any, problem: Any, system: Any) -> bool:
+def step(pose: Array, matched: Indices, problem: EnumerationTables, system: Array) -> bool:
     """Take one Gauss-Newton step of a pose (4, 3), in place, on its matches and the prior directions.
 
     The cost is sum_i w_i^2 |f_i - g(R p + t)|^2 with g(y) = y/|y| and w_i one over a radius. The step (w, s) moves y =

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bpnp.arrays import Array32
-from bpnp.search.kernels.sides import visible_weights
+from bpnp.search.kernels.sides import WeightedBearings, WeightedPoints, visible_weights
 from bpnp.search.kernels.vectors import F, compiled, cross, direction, part, rotated, sum_of, turn
 
 # Alternating expectation and maximisation takes short steps.
@@ -149,7 +149,15 @@ def dense_scratch(m: int, n: int) -> DenseScratch:
 
 
 @part
-def assign(bearings: Any, points: Any, rotation: Any, translation: Any, scale: Any, outlier: Any, scratch: Any) -> Any:
+def assign(
+    bearings: WeightedBearings,
+    points: WeightedPoints,
+    rotation: Any,
+    translation: Any,
+    scale: Any,
+    outlier: Any,
+    scratch: DenseScratch,
+) -> Any:
     """Fill q with the soft assignment in product form; return the mean log-likelihood of the bearings.
 
     The kernel is (1 + z/256)^256, z = -|f - u|^2 / 2 s^2, s the scale in radians. It is within 3 % of exp(z) where that
@@ -213,7 +221,14 @@ def assign(bearings: Any, points: Any, rotation: Any, translation: Any, scale: A
 
 @compiled
 def descend(
-    bearings: Any, points: Any, rotation: Any, translation: Any, scales: Any, outlier: Any, score: Any, scratch: Any
+    bearings: WeightedBearings,
+    points: WeightedPoints,
+    rotation: Any,
+    translation: Any,
+    scales: Any,
+    outlier: Any,
+    score: Any,
+    scratch: DenseScratch,
 ) -> None:
     """Anneal poses (S, 3, 3), (S, 3) in place through decreasing scales (k,), radians.
 

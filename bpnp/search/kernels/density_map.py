@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bpnp.arrays import Array32
-from bpnp.search.kernels.sides import visible_weights
+from bpnp.search.kernels.sides import WeightedPoints, visible_weights
 from bpnp.search.kernels.vectors import F, compiled, part, rotated
 
 
@@ -32,10 +32,12 @@ def place(half: Any, per_cell: Any, p: Any, j: Any, turn: Any, t: Any) -> Any:
 
 
 @compiled
-def add_up(density_map: Any, points: Any, rotation: Any, translation: Any, score: Any, weight: Any, cell: Any) -> None:
+def add_up(
+    density_map: DensityMap, points: WeightedPoints, rotation: Any, translation: Any, score: Any, weight: Any, cell: Any
+) -> None:
     """Score poses (S, 3, 3), (S, 3) by the sum of the map's weighted values where they see the points, 0 outside.
 
-    Labels are ignored; weight (n,) and cell (n,) are buffers.
+    The result is `score` (S,). Labels are ignored; weight (n,) and cell (n,) int32 are buffers.
     """
     cells, values = np.int32(len(density_map.values)), density_map.values.reshape(-1)
     half, per_cell = density_map.half, density_map.per_cell

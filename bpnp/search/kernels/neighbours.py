@@ -92,7 +92,7 @@ def entry(heads: Any, x: Any, y: Any, z: Any, cell: Any) -> Any:
 
 
 @compiled
-def _enter(table: Any) -> None:
+def _enter(table: HashedPoints) -> None:
     """Fill the links, and the heads, which are -1 before."""
     points, tolerance, heads, links = table
     for e in range(len(links)):
@@ -103,7 +103,7 @@ def _enter(table: Any) -> None:
 
 
 @part
-def lies_on(table: Any, x: Any, y: Any, z: Any, reach: Any) -> Any:
+def lies_on(table: HashedPoints, x: Any, y: Any, z: Any, reach: Any) -> Any:
     """Return whether (x, y, z) is within `reach`, at most the tolerance, of a point of the table."""
     points, tolerance, heads, links = table
     e = heads[entry(heads, x, y, z, 2 * tolerance)]

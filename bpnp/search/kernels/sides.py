@@ -56,7 +56,7 @@ class WeightedPoints(NamedTuple):
 
 
 @part
-def visible_weights(points: Any, rotation: Any, translation: Any, weight: Any) -> None:
+def visible_weights(points: WeightedPoints, rotation: Any, translation: Any, weight: Any) -> None:
     """Fill weight (n,) with b_j v_j of points, a `WeightedPoints`, under a pose (3, 3), (3,)."""
     p, b, cones = points.p, points.b, points.cones
     if cones.shape[1] == 0:

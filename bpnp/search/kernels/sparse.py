@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bpnp.arrays import Array32
 from bpnp.search.kernels.dense import move, see
-from bpnp.search.kernels.sides import WeightedBearings, visible_weights
+from bpnp.search.kernels.sides import WeightedBearings, WeightedPoints, visible_weights
 from bpnp.search.kernels.vectors import F, compiled, copy_pose, part, sum_of
 
 SWEEPS = 2  # alternating normalisations of the assignment on all points, of rows and columns [sweeps; not tuned]
@@ -74,7 +74,7 @@ def build_tiles(bearings: WeightedBearings) -> Tiles:
 
 
 @part
-def sort_points(tiles: Any, u: Any, cells: Any, start: Any, order: Any) -> None:
+def sort_points(tiles: Tiles, u: Any, cells: Any, start: Any, order: Any) -> None:
     """Fill order (n,) with the points, seen in directions u (3, n), by their cells; those of cell c end at start[c]."""
     low, shape = tiles.low, tiles.shape
     inverse = F(1) / tiles.cell
@@ -104,7 +104,7 @@ def cells_between(first: Any, last: Any, low: Any, cell: Any, size: Any) -> tupl
 
 
 @part
-def meet(tiles: Any, labels: Any, u: Any, scale: Any, start: Any, order: Any, near: Any) -> bool:
+def meet(tiles: Tiles, labels: Any, u: Any, scale: Any, start: Any, order: Any, near: Near) -> bool:
     """Fill `near` with the pairs of a tile and a point within reach, and their kernels; False if it is too small.
 
     The kernel is (1 + y + y^2/2 + y^3/6)^64, y = -|f - u|^2 / 128 s^2, within 1e-4 of exp(64 y), and 0 beyond
@@ -147,7 +147,7 @@ def meet(tiles: Any, labels: Any, u: Any, scale: Any, start: Any, order: Any, ne
 
 
 @part
-def add_to_bearings(values: Any, near: Any, sums: Any) -> None:
+def add_to_bearings(values: Any, near: Near, sums: Any) -> None:
     """Fill sums (c, lanes) with sum_j K_ij values_j."""
     point, kernel, end = near
     for t in range(len(sums)):
@@ -160,7 +160,7 @@ def add_to_bearings(values: Any, near: Any, sums: Any) -> None:
 
 
 @part
-def add_to_points(values: Any, near: Any, sums: Any) -> None:
+def add_to_points(values: Any, near: Near, sums: Any) -> None:
     """Fill sums (n,) with sum_i K_ij values_i, of values (c, lanes)."""
     point, kernel, end = near
     for j in range(len(sums)):
@@ -174,7 +174,7 @@ def add_to_points(values: Any, near: Any, sums: Any) -> None:
 
 
 @part
-def add_moments(f: Any, u: Any, row: Any, column: Any, near: Any, q: Any) -> None:
+def add_moments(f: Any, u: Any, row: Any, column: Any, near: Near, q: Any) -> None:
     """Fill q (4, n) with sum_i W_ij (f_i - u_j) and sum_i W_ij, W_ij = row_i K_ij column_j."""
     point, kernel, end = near
     for j in range(len(column)):
@@ -227,7 +227,13 @@ def sparse_scratch(tiles: Tiles, n: int, pairs: int = 0) -> SparseScratch:
 
 @part
 def assign_sparse(
-    tiles: Any, points: Any, rotation: Any, translation: Any, scale: Any, outlier: Any, scratch: Any
+    tiles: Tiles,
+    points: WeightedPoints,
+    rotation: Any,
+    translation: Any,
+    scale: Any,
+    outlier: Any,
+    scratch: "SparseScratch",
 ) -> Any:
     """Fill q by Sinkhorn iterations with slack at a scale in radians.
 
@@ -270,15 +276,15 @@ def assign_sparse(
 
 @compiled
 def descend_sparse(
-    tiles: Any,
-    points: Any,
+    tiles: Tiles,
+    points: WeightedPoints,
     rotation: Any,
     translation: Any,
     scales: Any,
     outlier: Any,
     patience: int,
     result: Any,
-    scratch: Any,
+    scratch: "SparseScratch",
 ) -> int:
     """Anneal poses (S, 3, 3), (S, 3) in place to the scale that explains the bearings best.
 

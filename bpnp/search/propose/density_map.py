@@ -95,7 +95,7 @@ def search_density(scene: SearchFrame, poses: Hypotheses, density: DensitySearch
 
 
 def search_everywhere(scene: SearchFrame, number: int, prior: Prior | None) -> Hypotheses:
-    """Run a density-map search over all rotations, or those of a prior, aimed at one position in the view.
+    """Run a density-map search over all rotations, or those of a prior of the scene, aimed at a position in the view.
 
     The position is that of the search's number, from 0. Near one position the correct pose has fewer competitors: if it
     is correct, few searches miss the pose.
@@ -151,7 +151,7 @@ def reach_across(scene: SearchFrame, prior: PosePrior, density: DensitySearch) -
 
 
 def draw_around(scene: SearchFrame, prior: PosePrior, count: int, reach: float = math.inf) -> Hypotheses:
-    """Draw poses with basin counts of 1 from a prior with a translation; the first is its mean.
+    """Draw poses with basin counts of 1 from a prior of the scene with a translation; the first is its mean.
 
     The centroid of the points is at most `reach` scene units from the centre of the view along each axis; the bound is
     extended to the mean of the prior.
@@ -214,7 +214,7 @@ def perturb_each(scene: SearchFrame, poses: Hypotheses) -> Hypotheses:
 def preselect(
     scene: SearchFrame, poses: Hypotheses, shape: DensityShape, scale: float, points: int, kept: int
 ) -> tuple[Hypotheses, NDArray[np.int64]]:
-    """Return the best poses on the density maps of all rig cameras, at most `kept`, and their indices.
+    """Return the at most `kept` best poses on the density maps of all rig cameras, best first, and their indices.
 
     The bearings are smoothed by `scale` of their RMS angular radii, and `points` 3D points are scored. Fewer poses are
     scored after the deadline.

@@ -19,7 +19,7 @@ COPIED_POSES = 4  # number of poses from other sources, the best first, that are
 
 @one_blas_thread
 def anneal_given(scene: SearchFrame, rotation: Array, translation: Array) -> Hypotheses:
-    """Anneal poses of a problem, with perturbed copies of the first few; the poses that result have no NFA.
+    """Anneal poses of a problem, with perturbed copies of the first few; return them in its frame, without NFA.
 
     The objective is that of `bpnp.search.find.search_poses`. An initial pose may be about 10 degrees off, and more if
     there are many; NaN for a missing one. If there are more than `REFINED_DIRECTLY`, all are first annealed on
@@ -41,11 +41,11 @@ def anneal_given(scene: SearchFrame, rotation: Array, translation: Array) -> Hyp
 
 @one_blas_thread
 def score_given(scene: SearchFrame, rotation: Array, translation: Array) -> Hypotheses:
-    """Anneal poses of a problem a little, to score them like those of a search; NaN for a missing one.
+    """Anneal poses of a problem a little, to score them like those of a search; return them in its frame.
 
-    The residuals are assumed to have the median distance of a point to the nearest bearing. Basin counts are 0, since
-    no other starts were tried: only overwhelming evidence makes the best pose confident. After the deadline the
-    remaining poses are not annealed.
+    NaN is a missing pose. The residuals are assumed to have the median distance of a point to the nearest bearing.
+    Basin counts are 0, since no other starts were tried: only overwhelming evidence makes the best pose confident.
+    After the deadline the remaining poses are not annealed.
     """
     starts = enter_given(scene, rotation, translation)
     if not len(starts):

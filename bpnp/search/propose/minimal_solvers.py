@@ -79,7 +79,7 @@ def p3p_poses(rays: Array, points: Array) -> Array:
 
 
 @compiled
-def _solve_each(rays: Any, triangles: Any, poses: Any, scratch: Any) -> None:
+def _solve_each(rays: Any, triangles: Triangles, poses: Any, scratch: Any) -> None:
     """Fill `poses` (t, 4, 4, 3), NaN before, with the solutions of each triangle; scratch (4, 4, 3) is overwritten."""
     for t in range(len(poses)):
         i, j, k = triangles.triples[t, 0], triangles.triples[t, 1], triangles.triples[t, 2]
@@ -91,8 +91,11 @@ def _solve_each(rays: Any, triangles: Any, poses: Any, scratch: Any) -> None:
 
 
 @part
-def solve_p3p(rays: Any, seen: Any, chords: Any, triangles: Any, t: int, poses: Any) -> int:
-    """Fill `poses` with those under which triangle t is seen along three of the unit rays; return their number."""
+def solve_p3p(rays: Any, seen: Any, chords: Any, triangles: Triangles, t: int, poses: Any) -> int:
+    """Fill `poses` (4, 4, 3) with those under which triangle t is seen along unit rays; return their number.
+
+    The rays are those of the three indices `seen`, with the `chords_between` them.
+    """
     i, j, k = seen
     sides, frame, centroid = triangles.sides[t], triangles.frames[t], triangles.centroids[t]
     count = 0
@@ -140,7 +143,7 @@ def p3p_depths(chords: Any, a: float, b: float, poses: Any) -> int:
     """Solve |d_i f_i - d_j f_j| = |p_i - p_j| for the depths d_i > 0 of three rays; return the number of solutions.
 
     a is |p_0 - p_1|^2 and b |p_2 - p_0|^2, over |p_1 - p_2|^2. The 0 to 4 depths are written to poses[:, 3], in units
-    of |p_1 - p_2|. `p3p_poses` defines the conics and lines.
+    of |p_1 - p_2|. `chords` are the `chords_between` the rays; `p3p_poses` defines the conics and lines.
     """
     m01, m12, m20 = 1 - 0.5 * chords[0], 1 - 0.5 * chords[1], 1 - 0.5 * chords[2]
     # Symmetric matrices by their components xx, xy, xw, yy, yw, ww.
@@ -296,12 +299,12 @@ def polish_depths(d0: float, d1: float, d2: float, chords: Any, a: float, b: flo
 
 @part
 def solve_p2p(i: int, j: int, a: int, b: int, heading: Any, rays: Any, points: Any, poses: Any) -> int:
-    """Fill `poses` with those under which points a and b are seen along the rays i and j, with a prior direction.
+    """Fill `poses` (4, 4, 3) with those under which points a and b are seen along rays i and j, with a prior direction.
 
-    f, g: the unit rays, p, q: the points, in frames whose z axis is the direction. With d g - c f = R (q - p), its z
-    component is linear in the depths c and d, and the length of its horizontal part quadratic (Kukelova, Bujnak,
-    Pajdla: Closed-form solutions to minimal absolute pose problems with known vertical direction, ACCV 2010). Return
-    the number of poses, up to two.
+    f, g: the unit rays, p, q: the points, in the frames of `heading`, a `Heading`, whose z axis is the direction. With
+    d g - c f = R (q - p), its z component is linear in the depths c and d, and the length of its horizontal part
+    quadratic (Kukelova, Bujnak, Pajdla: Closed-form solutions to minimal absolute pose problems with known vertical
+    direction, ACCV 2010). Return the number of poses, up to two.
     """
     f, g, p, q = heading.rays[i], heading.rays[j], heading.points[a], heading.points[b]
     if max(abs(f[2]), abs(g[2])) < LEVEL_SINE:

@@ -160,11 +160,11 @@ def _of_scene(
 def competing_poses(
     problem: Problem, rotation: Array, translation: Array, scale: float, *, least: float = 0.0
 ) -> tuple[Array, Array, Array, Motions]:
-    """Return the competing poses of a pose, the scales (c,) of their motions, and all motions.
+    """Return the competing poses of a pose, with the scales (c,) of their motions, and all motions.
 
-    They differ from the pose by over `SAME`. They are images by motions of its matched points, about a line of these,
-    and from afar by reflections of these or the mirror image of a flat scene. A motion maps at least the fraction
-    `least` of the matched points.
+    They differ from the pose, whose residuals have the `scale` in radians, by over `SAME`. They are images by motions
+    of its matched points, about a line of these, and from afar by reflections of these or the mirror image of a flat
+    scene. A motion maps at least the fraction `least` of the matched points.
     """
     matched = matched_points(problem, rotation, translation, scale)
     motions = _motions_of(problem, rotation, translation, scale, matched).mapping(least)
@@ -208,7 +208,7 @@ def repeated_poses(
     least: float = 0.0,
     deadline: Deadline = NEVER,
 ) -> Repeated:
-    """Return the competing poses of a pose due to the motions of the scene, and these motions.
+    """Return the competing poses of a pose with residuals of `scale` radians due to motions of the scene, and these.
 
     The unrefined poses differ from the given one by over `SAME`; there are at most `KEPT_REPETITIONS`, the fewest false
     alarms first. A flat scene adds the mirror image. Poses that are not scored at the end of the deadline are left out.

@@ -426,7 +426,7 @@ def _moves(motion: Motions, own: Array, least: float) -> bool:
 
 @compiled
 def _register(
-    scene: Any,
+    scene: SceneIndex,
     bases: Any,
     sample: Any,
     tolerance: float,
@@ -434,15 +434,16 @@ def _register(
     factor: float,
     hand: float,
     most: int,
-    found: Any,
+    found: Found,
     work: Any,
 ) -> Any:
     """Find the motions that map a base (3,) onto a congruent or similar one and that enough sampled points confirm.
 
     Two similar bases differ in size by more than the tolerance, and by at most the ratio `factor`, 1 for congruent
-    bases. With the `hand` -1 a base is reflected in its plane before it is mapped. `found` keeps the motions that the
-    most points confirm. Return the number of motions, which may exceed its slots; and False if a base took more than
-    the largest work, so that the rest of the scene was left out for it.
+    bases. With the `hand` -1 a base is reflected in its plane before it is mapped. A moved point lies on a scene point
+    within the tolerance; `least` sampled points must. `work` (4, 3, 3) is overwritten. `found` keeps the motions that
+    the most points confirm. Return the number of motions, which may exceed its slots; and False if a base took more
+    than the largest work, so that the rest of the scene was left out for it.
     """
     points, count, complete = scene.points, 0, True
     frame, target, linear, shift = work[0], work[1], work[2], work[3, 0]
@@ -517,7 +518,7 @@ def _register(
 
 
 @part
-def _keep(found: Any, count: int, score: int, linear: Any, shift: Any) -> None:
+def _keep(found: Found, count: int, score: int, linear: Any, shift: Any) -> None:
     """Write the next motion, after `count` others, into a free slot of `found`, or over the worst if it is better."""
     slot = count
     if count >= len(found.score):
@@ -535,7 +536,7 @@ def _keep(found: Any, count: int, score: int, linear: Any, shift: Any) -> None:
 
 
 @part
-def _fits(scene: Any, a: int, i: int) -> Any:
+def _fits(scene: SceneIndex, a: int, i: int) -> Any:
     """Return whether the labels of two points are compatible."""
     one, other = scene.labels[a], scene.labels[i]
     return one < 0 or other < 0 or one == other
@@ -578,7 +579,7 @@ def _frame(points: Any, a: int, b: int, c: int, frame: Any) -> Any:
 
 
 @part
-def _on(scene: Any, linear: Any, shift: Any, k: int, reach: Any) -> Any:
+def _on(scene: SceneIndex, linear: Any, shift: Any, k: int, reach: Any) -> Any:
     """Return whether a moved point lies near a scene point."""
     points = scene.points
     x, y, z = points[k, 0], points[k, 1], points[k, 2]

@@ -178,9 +178,10 @@ def perturb_about_centroid(
 
 
 def finish(scene: SearchFrame, poses: Hypotheses, annealed: int | None = None) -> Hypotheses:
-    """Anneal the best `annealed` poses, None for all, again on every bearing; the others are kept.
+    """Anneal the first `annealed` poses, None for all, again on every bearing; the others are kept.
 
-    The best two are also annealed with each of `settings.end_outliers`.
+    Poses are distinct and best first, before and after. The best two are also annealed with each of
+    `settings.end_outliers`.
     """
     settings, count = scene.settings, len(poses) if annealed is None else min(annealed, len(poses))
     runs = [(i, settings.outliers) for i in range(count)]
@@ -202,7 +203,7 @@ def anneal_to_end(
 ) -> Hypotheses:
     """Anneal poses (c, 3, 3), (c, 3) of a problem to the end on all points, from residuals of `scale` radians.
 
-    After the deadline they are returned unchanged.
+    The result is in the frame of the problem. After the deadline the poses are returned unchanged.
     """
     starts = Hypotheses.from_poses(*scene.enter(rotations, translations))
     starts = replace(starts, scale=np.full(len(starts), scale, np.float32))

@@ -120,7 +120,7 @@ def refine(
     adaptive: bool = False,
     largest: Array | None = None,
 ) -> Refined:
-    """Refine a pose, or several, until `settled` is true of a step, at most for one step a scale; as for `steps`.
+    """Refine a pose, or several, until `settled` is true of a step, at most one step a scale, radians; as for `steps`.
 
     >>> rng = np.random.default_rng(0)
     >>> points = rng.uniform(-1, 1, (20, 3))

@@ -66,7 +66,7 @@ def search_rig(
 ) -> Case:
     """Search for the pose of a rig.
 
-    The progress is told after the cameras with few points (0) and after each iteration; `clutter` is the expected
+    `progress` is called after the cameras with few points (0) and after each iteration; `clutter` is the expected
     outlier fraction, None if it is unknown.
     """
     settings = settings if clutter is None else settings.expecting(clutter)

@@ -169,8 +169,8 @@ def camera_terms(
 def own_evidence(problem: Problem, rotation: Array, translation: Array, scale: float) -> Array:
     """Return log x_i / c_i (k,) of each chosen image point under a pose, clumps weighted; natural logs.
 
-    It is taken at the inlier fraction lambda and the scale s with the largest sum, s within a factor of two of the
-    given one. It is 0 if too few points are seen.
+    It is taken at the inlier fraction lambda and the scale s, radians, with the largest sum, s within a factor of two
+    of the given one. It is 0 if too few points are seen.
     """
     terms = camera_terms(problem, directions_of(problem, rotation, translation), scale)
     return np.zeros(len(problem.image.chosen)) if terms is None else terms.of_points()
@@ -232,8 +232,8 @@ def sum_of_largest(values: Array, count: int) -> Array:
 def point_evidence(problem: Problem, directions: Array, scales: Array, shares: Array, *, even: bool = False) -> Array:
     """Return log x_i (k, S, W) of each chosen image point, at scales s (S,) and fractions lambda (W,) or (k, 1, W).
 
-    Directions (n, 3) of scene points that are not seen are NaN. With `even`, unrelated image points are assumed to fall
-    evenly over the view instead of with the density of `directions`.
+    Scales are in radians. Directions (n, 3) of scene points that are not seen are NaN. With `even`, unrelated image
+    points are assumed to fall evenly over the view instead of with the density of `directions`.
     """
     image = problem.image
     predicted, smooth, inside, every = _sums(problem, directions, scales, even)
