@@ -28,7 +28,10 @@ from bpnp.commands import COMMANDS
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[1]
-REFERENCE = re.findall(r"^::: (\S+)", (ROOT / "docs" / "api.md").read_text(encoding="utf-8"), re.MULTILINE)
+REFERENCE = {
+    page.name: re.findall(r"^::: (\S+)", page.read_text(encoding="utf-8"), re.MULTILINE)
+    for page in sorted((ROOT / "docs" / "api").glob("*.md"))
+}
 MODULES = sorted(
     ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
     for file in (ROOT / "bpnp").rglob("*.py")
@@ -62,19 +65,19 @@ INTERNAL = "bpnp.search."  # modules whose names are imported from `bpnp`, or ar
 
 
 def is_pasted(example: doctest.DocTest, public: set[str]) -> bool:
-    """Return True for an example that a reader copies: of a name in docs/api.md, or outside of the internals."""
+    """Return True for an example that a reader copies: of a name in docs/api, or outside of the internals."""
     name = example.name
     return not name.startswith(INTERNAL) or any(name == each or name.startswith(f"{each}.") for each in public)
 
 
 def public_objects() -> list[Any]:
-    objects = [pydoc.locate(name) for name in REFERENCE]
+    objects = [pydoc.locate(name) for names in REFERENCE.values() for name in names]
     assert None not in objects
     return objects
 
 
 def public_names() -> set[str]:
-    """Return the names in docs/api.md as "module.name", where they are defined."""
+    """Return the names in docs/api as "module.name", where they are defined."""
     return {f"{each.__module__}.{each.__qualname__}" for each in public_objects()}
 
 
@@ -115,6 +118,13 @@ def test_the_reference_has_every_exported_name() -> None:
     exported = [getattr(module, name) for module in modules for name in module.__all__]
     listed = public_objects()
     assert [each for each in exported if each not in listed] == []
+
+
+def test_the_overview_of_the_reference_has_the_names_of_each_page() -> None:
+    overview = (ROOT / "docs" / "api" / "index.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| \[[^\]]+\]\((\w+\.md)\) \| ([^|]+) \|$", overview, re.MULTILINE)
+    listed = {page: [f"bpnp.{name}" for name in re.findall(r"`([\w.]+)`", names)] for page, names in rows}
+    assert listed | {"index.md": []} == REFERENCE
 
 
 def test_every_argument_of_a_public_name_is_described() -> None:
