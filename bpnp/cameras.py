@@ -79,7 +79,7 @@ class _Fisheye(NamedTuple):
 class Lens:
     """Camera of any COLMAP model, with its distortion."""
 
-    camera: Any
+    camera: Any  # `pycolmap.Camera`
 
     @property
     def focal(self) -> float:

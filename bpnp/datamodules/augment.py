@@ -99,8 +99,8 @@ class SideCounts(NamedTuple):
 
     matched: Tensor  # points of the chosen matches that remain on this side
     hidden: Tensor  # chosen matches whose point on this side is hidden
-    extra: Tensor
-    outliers: Tensor
+    extra: Tensor  # clutter: points without a correspondence that are kept
+    outliers: Tensor  # synthetic
 
 
 def augment(batch: Batch, how: Augmentation, keys: Sequence[Key]) -> Batch:

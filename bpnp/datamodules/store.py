@@ -206,8 +206,8 @@ def _write_header(file: BinaryIO, dtype: np.dtype[Any], shape: tuple[int, ...]) 
 class Recipe(Dataset[JobResult]):
     """Jobs that make a store; `work(*job)` returns rows."""
 
-    kind: str
-    widths: Mapping[str, int]
+    kind: str  # of the rows, as for `new_store`
+    widths: Mapping[str, int]  # of the columns of points, as for `new_store`
     parameters: Mapping[str, Any]  # saved in the store; other parameters make another store
     jobs: Sequence[tuple[Any, ...]]  # arguments of `work`; picklable for several processes
     work: Callable[..., JobResult]  # function that does a job; picklable for several processes

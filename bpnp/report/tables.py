@@ -64,8 +64,8 @@ class Line(NamedTuple):
     run: str
     estimate: str
     label: str
-    colour: int
-    dashes: int
+    colour: int  # index of the palette
+    dashes: int  # index of the dash patterns
 
 
 def lines_of(runs: Mapping[str, Results]) -> list[Line]:
@@ -113,8 +113,8 @@ def _results_in(folder: Path) -> list[Path]:
 class Column:
     """Column of a table."""
 
-    key: str
-    header: str
+    key: str  # of its number
+    header: str  # text above it
     percent: bool = False  # a fraction, shown in %; larger is better
     count: bool = False  # a count; in other columns, errors and times, smaller is better
 

@@ -46,7 +46,7 @@ class Grid(NamedTuple):
     per_cell: float  # cells a unit of the coordinates
     # (cells^2 + 1,) index in `items` of the first item of each cell; the second coordinate varies fastest.
     starts: Indices
-    items: Indices
+    items: Indices  # of image points
 
 
 class ImageArrays(NamedTuple):

@@ -34,7 +34,7 @@ SMALLEST_SCALE = 1e-5  # smallest scale of the residuals if the pixel size is un
 class EnumeratedPoses:
     """Poses of few points that enumerations have found so far."""
 
-    iterations = 0
+    iterations = 0  # an enumeration does not count as one
 
     def __init__(self, problem: Problem, scene_of: SceneOf, deadline: Deadline) -> None:
         self.problem, self._scene_of, self._deadline = problem, scene_of, deadline

@@ -38,7 +38,7 @@ class Tiles(NamedTuple):
     label: NDArray[np.int32]  # (c, lanes), as in `WeightedBearings`
     box: Array32  # (c, 4) least x and y of a tile, and largest
     low: Array32  # (2,) corner of the grid
-    cell: np.float32
+    cell: np.float32  # width of a cell
     shape: NDArray[np.int32]  # (2,) cells along x and y
 
     def with_margin(self, scale: float) -> "Tiles":

@@ -53,7 +53,7 @@ class Iteration(NamedTuple):
     """One step of a refinement."""
 
     state: PoseState  # state after the step; before it where the step was not taken
-    scale: float
+    scale: float  # of the residuals, radians or the unit of the image
     step: Array  # (..., p) step that was tried
     before: Equations  # normal equations of the step
     # (...) reduction of the cost by the step; NaN without the damping of Levenberg and Marquardt.
