@@ -15,7 +15,7 @@ from bpnp.files import lock_folder
 from bpnp.report.terminal import console, count_items, say
 
 if TYPE_CHECKING:
-    from bpnp.maps.many_photos import Outcome, SolutionFolder
+    from bpnp.maps.many_photos import RunSummary, SolutionFolder
     from bpnp.maps.scene_map import SceneMap
 
 CAPTION = (
@@ -137,7 +137,7 @@ def _report(
     files: Mapping[str, Path],
     records: Mapping[str, Any],
     folder: "SolutionFolder",
-    outcome: "Outcome",
+    outcome: "RunSummary",
     out: Console,
 ) -> None:
     """Print the source of the cameras, and what was kept and written."""

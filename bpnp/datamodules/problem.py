@@ -19,7 +19,7 @@ class Problem:
     """Image points and scene points of one problem; see `bpnp.types` for the conventions.
 
     The first `matched` points of both sides are the matches, in the same order. The other points have no
-    correspondence.
+    correspondence. `bpnp.search.problem.Problem` is one to search, without true matches and pose.
 
     Attributes:
         name: Name.

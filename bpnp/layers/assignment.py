@@ -131,8 +131,8 @@ class Sinkhorn(nn.Module):
     `backward_stats.unconverged` at the end of an epoch, then call `backward_stats.reset()`.
 
     Args:
-        mu: Entropy weight of the transport, default 0.1.
-        learn_mu: Learn the entropy weight, starting from `mu`. Default False.
+        mu: Weight of the entropy in the objective (paper Eq. 9), default 0.1. `entropy` is its current value.
+        learn_mu: Learn the weight, starting from `mu`. Default False.
         dustbin: Cost of leaving a point unmatched. Default: None, every point is matched.
         tolerance: L1 error of the marginals at which a sample stops, default 1e-6.
         max_iterations: Largest number of sweeps over rows and columns, default 1000.
@@ -184,5 +184,5 @@ class Sinkhorn(nn.Module):
 
     @property
     def entropy(self) -> float | Tensor:
-        """Current entropy weight mu."""
+        """Weight mu of the entropy in the objective (paper Eq. 9), learned or fixed; not the entropy of a plan."""
         return self.mu if self.log_mu is None else self.log_mu.exp()

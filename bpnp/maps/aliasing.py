@@ -59,7 +59,7 @@ class Competitor:
 @one_blas_thread
 def best_competitor(
     photo: Photo,
-    place: Region,
+    region: Region,
     solution: Solution,
     earlier: Sequence[Candidate],
     regions: Iterable[Region],
@@ -68,11 +68,11 @@ def best_competitor(
     """Return the pose elsewhere in a map with the smallest margin to a confident solution, or None if there is none.
 
     Proposals are `earlier` (significant poses of other views) and those found near `regions`, ranked for the explained
-    image points; all are compared on the points of `place`. After the deadline the rest is left out, and its
-    `unfinished` names the competing poses.
+    image points; all are compared on the points of `region`, where the solution was found. After the deadline the rest
+    is left out, and its `unfinished` names the competing poses.
     """
-    problem = replace(photo, view_count=1).problem(place, solution.camera, photo.prior)
-    proposals = propose_elsewhere(photo, problem, place, solution, earlier, regions, deadline)
+    problem = replace(photo, view_count=1).problem(region, solution.camera, photo.prior)
+    proposals = propose_elsewhere(photo, problem, region, solution, earlier, regions, deadline)
     competing = refine_elsewhere(problem, solution, proposals, photo.seed, deadline)
     if not len(competing):
         return None
@@ -102,7 +102,7 @@ def margins_elsewhere(problem: Problem, solution: Solution, competing: Hypothese
 def propose_elsewhere(
     photo: Photo,
     problem: Problem,
-    place: Region,
+    region: Region,
     solution: Solution,
     earlier: Sequence[Candidate],
     regions: Iterable[Region],
@@ -110,7 +110,7 @@ def propose_elsewhere(
 ) -> list[PoseArrays]:
     """Return unrefined poses elsewhere in the map that may explain the image points of a solution.
 
-    `problem` has the points of `place`. Of the `regions`, ranked for the explained image points, the first ones with
+    `problem` has the points of `region`. Of the `regions`, ranked for the explained image points, the first ones with
     other points are searched until the deadline.
     """
     scale = _scale_of(problem, solution)
@@ -119,7 +119,7 @@ def propose_elsewhere(
     return [
         *(_pose_of(problem, one) for one in earlier),
         *zip(repeated.rotation, repeated.translation, strict=True),
-        *_find_poses_in(_other_regions(regions, place, problem, solution), photo, problem, solution, deadline),
+        *_find_poses_in(_other_regions(regions, region, problem, solution), photo, problem, solution, deadline),
     ]
 
 
@@ -192,13 +192,13 @@ def _candidate(problem: Problem, solution: Solution, pose: Hypotheses, margin: f
     )[0]
 
 
-def _other_regions(regions: Iterable[Region], place: Region, problem: Problem, solution: Solution) -> Iterator[Region]:
+def _other_regions(regions: Iterable[Region], own: Region, problem: Problem, solution: Solution) -> Iterator[Region]:
     """Yield the first regions with mostly points that are not visible from the pose of a solution."""
     if len(solution.matches) < FEWEST_OTHER_POINTS:
         return
     assert problem.measured.camera is not None
     pose = solution.rotation, solution.translation
-    seen, count = place.point_ids[place.in_view(*pose, problem.measured.camera, problem.measured.points)], 0
+    seen, count = own.point_ids[own.in_view(*pose, problem.measured.camera, problem.measured.points)], 0
     for region in regions:
         other = ~np.isin(region.point_ids, seen)
         if other.sum() >= FEWEST_OTHER_POINTS and other.mean() >= LEAST_OTHER:

@@ -65,14 +65,16 @@ class ViewSolution(NamedTuple):
 
 
 @dataclass(frozen=True)
-class LoopResult:
+class MapSolution:
+    """Solution of a photo near the views of a map."""
+
     solution: Solution
     is_complete: bool  # false if the time limit ended the loop without a confident pose
 
 
 def localize(
     maps: Sequence[ViewedPoints], photo: Photo, views: Sequence[str] | None, options: Options, time_limit: float
-) -> LoopResult:
+) -> MapSolution:
     """Estimate the pose of a photo in a map; see `SceneMap.localize`.
 
     The last of `maps` is the map; those before it have rotated views and are tried first, each in half of the time that
@@ -80,7 +82,7 @@ def localize(
     no limit. Raise ValueError if no view sees 4 or more points.
     """
     start, deadline, tried = Clock.now(), Deadline.after(time_limit).before(JUDGING_SECONDS), set[str]()
-    results = list[LoopResult]()
+    results = list[MapSolution]()
     for k, scene in enumerate(maps):
         until = deadline if k + 1 == len(maps) else replace(deadline.share(1 / 2), unfinished=set())
         results.append(_localize_in(scene, photo, views, options._replace(time_limit=time_limit, until=until), tried))
@@ -93,12 +95,12 @@ def localize(
         deadline.unfinished.add(reasons.Unfinished.views)
         solution = replace(solution, reason=reasons.unfinished(solution.reason, time_limit, len(tried), count))
         solution = with_unfinished(solution, deadline)
-    return LoopResult(replace(solution, seconds=Clock.now() - start), is_complete)
+    return MapSolution(replace(solution, seconds=Clock.now() - start), is_complete)
 
 
 def _localize_in(
     scene: ViewedPoints, photo: Photo, views: Sequence[str] | None, options: Options, tried: set[str]
-) -> LoopResult:
+) -> MapSolution:
     """Search near the views of a map until a pose is confident, the queue is empty, or time is over.
 
     Each view is tried briefly, then once more. A view with a likely pose, and in the end the most promising views, get
@@ -118,7 +120,7 @@ def _localize_in(
         if own.case.objection is None or own.solution.log10_false_alarms < 0:
             found = judge_in_map(scene, photo, found, earlier, options.until)
         if None in (own.case.objection, found.solved.case.objection):
-            return LoopResult(found.solution, found.solution.reason_code not in reasons.UNTESTED)
+            return MapSolution(found.solution, found.solution.reason_code not in reasons.UNTESTED)
         earlier += significant(found.solution)
         best = sorted([*best, found], key=lambda one: one.rank, reverse=True)[:PROMISING_VIEWS]
         again = [found] if found.solution.log10_false_alarms < LIKELY_ALARMS and len(longer) < PROMISING_VIEWS else []
@@ -126,15 +128,15 @@ def _localize_in(
             best = [judge_in_map(scene, photo, one, earlier, options.until) for one in best]
             best.sort(key=lambda one: one.rank, reverse=True)
             if best[0].solution.verdict == "confident":
-                return LoopResult(best[0].solution, True)
+                return MapSolution(best[0].solution, True)
             again = best
         for one in reversed(again):
             if one.place.view.name not in longer:
                 longer.add(one.place.view.name)
                 queue.appendleft((one.place._replace(camera=_camera_near(photo.camera, one.solution)), LONGER))
     if not queue:
-        return LoopResult(best[0].solution, True)
-    return LoopResult(judge_in_map(scene, photo, best[0], earlier, options.until).solution, False)
+        return MapSolution(best[0].solution, True)
+    return MapSolution(judge_in_map(scene, photo, best[0], earlier, options.until).solution, False)
 
 
 def search_near(

@@ -45,7 +45,7 @@ Record = dict[str, Any]  # entry of a photo in results.json
 
 @dataclass(frozen=True)
 class PhotoTask:
-    """A photo to localise."""
+    """File of one photo in a run of many, with all that its solution depends on; a `Photo` has the keypoints."""
 
     name: str
     photo: Path
@@ -121,8 +121,8 @@ def attempts(scene: SceneMap, tasks: Iterable[PhotoTask]) -> Iterator[Attempt]:
 
 
 @dataclass
-class Outcome:
-    """Result of a run."""
+class RunSummary:
+    """What a run of `localize_photos` did with each photo; the solutions are in the `SolutionFolder`."""
 
     kept: list[str] = field(default_factory=list)  # names of photos whose earlier solution is still valid
     again: dict[str, str] = field(default_factory=dict)  # reasons why photos were solved again, by name
@@ -140,14 +140,14 @@ def localize_photos(
     pictures: bool = True,
     done: Callable[[str], None] = lambda name: None,
     **options: Any,
-) -> Outcome:
+) -> RunSummary:
     """Localise photos into a folder; solutions there with the same inputs and options (`photo_task`) are kept.
 
     A solution is written before its picture is drawn. A kept solution without a picture is drawn. Each task is built
     just before it runs, since a photo may be replaced in the meantime. `done` gets a short message for each photo.
     Raise ValueError if a picture in the folder would replace a photo.
     """
-    outcome = Outcome()
+    outcome = RunSummary()
     places = {folder.picture(name).resolve() for name in files}
     if replaced := next((photo for photo in files.values() if photo.resolve() in places), None):
         raise ValueError(f"{replaced} would be replaced by the picture of a result; use another folder for the results")

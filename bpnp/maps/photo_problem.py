@@ -15,7 +15,7 @@ from bpnp.search.solution import Solution
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """A photo to localise."""
+    """Keypoints and camera of a photo to localise, with the prior, seed and ranking of its search."""
 
     keypoints: Array  # (m, 2) pixels
     camera: Camera | UnknownCamera  # camera model, or its prior if the focal length is unknown

@@ -18,9 +18,9 @@ from bpnp.search.verify import verify_problem
 
 
 def verify_pose(
-    photo: Photo, view: View, place: Region, regions: Callable[[Array], Iterable[Region]], *, time_limit: float
+    photo: Photo, view: View, region: Region, regions: Callable[[Array], Iterable[Region]], *, time_limit: float
 ) -> Solution:
-    """Verify the pose of a view with the points of a map that was built without it (`place`).
+    """Verify the pose of a view with the points of a map that was built without it (`region`).
 
     The pose is judged on the points in view (`verify_problem`), in at most half of the time limit in seconds. It is
     then compared with poses elsewhere in the map, in `regions` ranked for keypoints (k, 2), that explain the same image
@@ -29,13 +29,13 @@ def verify_pose(
     deadline = Deadline.after(time_limit)
     if len(photo.keypoints) < MIN_POINTS:
         raise ValueError(f"{view.name} has {len(photo.keypoints)} keypoints; at least {MIN_POINTS} are needed")
-    seen = place.in_view(view.rotation, view.translation, camera_from(photo.camera), photo.keypoints)
+    seen = region.in_view(view.rotation, view.translation, camera_from(photo.camera), photo.keypoints)
     if len(seen) < MIN_POINTS:
         raise ValueError(
             f"{view.name} can see {len(seen)} points that two other views see; at least {MIN_POINTS} are needed"
         )
-    region = place.part(seen)
-    problem = photo.problem(region, photo.camera)
+    in_view = region.part(seen)
+    problem = photo.problem(in_view, photo.camera)
     until = deadline.share(1 / 2)
     case, solution = verify_problem(
         problem,
@@ -46,11 +46,11 @@ def verify_pose(
         time_limit=time_limit,
         until=until,
     )
-    solution = with_ids(solution, region)
+    solution = with_ids(solution, in_view)
     if solution.verdict == "failed":
         return solution
     explained = regions(explained_keypoints(photo, solution))
-    competitor = None if deadline.passed() else best_competitor(photo, place, solution, [], explained, deadline)
+    competitor = None if deadline.passed() else best_competitor(photo, region, solution, [], explained, deadline)
     compared = judge_against(Solved(case, solution), competitor)
     if compared.solution.verdict != "confident" or not deadline.passed(Unfinished.competing_poses):
         return with_unfinished(compared.solution, deadline)

@@ -70,7 +70,7 @@ class BPnPNet(TrainedNet):
         rounds: Number of times that the points are matched again under the last pose in evaluation, starting from that
             of RANSAC (`bpnp.models.pose_stages.match_again`). Default 0. A round adds the squared residuals, in units
             of a width, to the cost; the width decreases from round to round, to `ransac.threshold` in the last one.
-            Rounds need a `ransac` with that attribute and a `transport` with the attribute `entropy`.
+            Rounds need a `ransac` with that attribute and a `transport` whose attribute `entropy` is the weight mu.
 
     >>> import torch
     >>> from bpnp import Batch, BPnPNet

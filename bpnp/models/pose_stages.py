@@ -94,7 +94,7 @@ def match_again(
 
     The first round matches the points under the pose "ransac", each later one under the pose of the round before. The
     assignment of the last round becomes `rematched`; `assignment` stays. `cost` is that of the network's own
-    assignment; `entropy` of the transport is its mu. Without widths the prediction is unchanged.
+    assignment; `transport.entropy` is mu, the weight of its entropy. Without widths the prediction is unchanged.
     """
     pose, assignment = prediction.poses["ransac"], None
     for width in widths:

@@ -199,19 +199,19 @@ def networks(base: type[nn.Module] = TrainedNet) -> Iterator[type[nn.Module]]:
 
 
 def fitting_state(
-    content: Mapping[str, Any], solver: nn.Module, *, grown: bool = False
+    content: Mapping[str, Any], solver: nn.Module, *, allow_added: bool = False
 ) -> tuple[dict[str, Tensor], list[str]]:
     """Return the weights of a checkpoint that fit a solver, and what differs on purpose, as `rounds=0 (saved: 8)`.
 
-    A `grown` solver may have weights that the checkpoint lacks and that are zero, of parts that add nothing before
-    training, and differ in the settings that create these parts. Raise ValueError if the class, another setting, or the
-    shape of a weight differs, or a weight is NaN or infinite.
+    With `allow_added` the solver may have weights that the checkpoint lacks and that are zero, of parts that add
+    nothing before training, and differ in the settings that create these parts. Raise ValueError if the class, another
+    setting, or the shape of a weight differs, or a weight is NaN or infinite.
     """
     saved, wanted = content.get("solver", {}), describe_module(solver)
     state, weights = solver_state(content), solver.state_dict()
     if saved.get("class") != wanted["class"]:
         raise ValueError(f"this is a checkpoint of {saved.get('class', 'another program')}, not of {wanted['class']}")
-    added = {key: value for key, value in weights.items() if grown and key not in state and not value.any()}
+    added = {key: value for key, value in weights.items() if allow_added and key not in state and not value.any()}
     misfits = [
         key for key in state.keys() | weights.keys() if _shape((state | added).get(key)) != _shape(weights.get(key))
     ]

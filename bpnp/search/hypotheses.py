@@ -1,4 +1,7 @@
-"""Pose hypotheses of one problem, one record with a column per quantity, and how equal ones are merged."""
+"""Poses that any source has proposed, one record with a column per quantity, and how equal ones are merged.
+
+The hypotheses of minimal problems that the enumeration tests are in `bpnp.search.few_points.hypotheses`.
+"""
 
 import math
 from collections.abc import Sequence

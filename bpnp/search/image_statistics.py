@@ -1,4 +1,4 @@
-"""Statistics of image points: extent, scales of the residuals, and local density."""
+"""Extent and density of image points, and the scales at which their residuals are examined."""
 
 import math
 
@@ -19,7 +19,7 @@ MOST_IMAGE_POINTS = 2000  # largest number of image points that are used, evenly
 
 
 class ImageStatistics:
-    """Statistics of the bearings of an image."""
+    """Extent of the bearings of an image, scales of their residuals, and weights of bearings that lie together."""
 
     def __init__(self, bearings: Array, floor: float | None) -> None:
         m = len(bearings)

@@ -14,7 +14,7 @@ Unit = Literal["px", "normalised", "rad"]
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Image points in which residuals are measured: all of the user's points, or some."""
+    """Image points in the user's unit, pixels for example, in which residuals are measured: all of them, or some."""
 
     points: Array  # (m, 2) pixels with a camera, else normalised; (m, 3) bearings
     indices: Labels  # (m,) of each point among the user's

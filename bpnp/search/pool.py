@@ -45,9 +45,9 @@ class Pool:
 
     def forget(self) -> None:
         """Drop all poses."""
-        # surrounded: significant poses whose local search found nothing better.
-        self.candidates = self.surrounded = Hypotheses.empty(dtype=np.float32)
-        self.searched: list[Hypotheses] = []  # other poses whose surroundings were searched
+        # locally_best: significant poses whose local search found nothing better.
+        self.candidates = self.locally_best = Hypotheses.empty(dtype=np.float32)
+        self.searched_around: list[Hypotheses] = []  # other poses whose surroundings were searched
         self.missed = 0.0  # log10 of the probability that the search missed a better optimum
 
     def add(self, step: Step, found: Hypotheses) -> None:
@@ -56,13 +56,17 @@ class Pool:
         Their NFA is computed first: a significant pose may be close to a likelier one that is not significant. A local
         search was unsuccessful if the best NFA does not fall by `LEAST_MARGIN` decades.
         """
-        before = self.alarms
+        before = self.log10_false_alarms
         self.iterations += 1
         self.candidates = self._with_false_alarms(
             merge_hypotheses([self.candidates, self._with_false_alarms(found)], self.scene), 1
         )
-        if step.around is not None and self.alarms > before - LEAST_MARGIN and not self.scene.deadline.passed():
-            self.surrounded = Hypotheses.concatenate([self.surrounded, step.around])
+        if (
+            step.around is not None
+            and self.log10_false_alarms > before - LEAST_MARGIN
+            and not self.scene.deadline.passed()
+        ):
+            self.locally_best = Hypotheses.concatenate([self.locally_best, step.around])
         self.missed = self._missed()
         if self.missed > MOST_MISSED:  # otherwise `case` computes the NFA of the others
             self.candidates = self._with_false_alarms(self.candidates)
@@ -71,7 +75,7 @@ class Pool:
 
     def may_be_decided(self) -> bool:
         """Return True if the best pose may be confident, or match more points than before."""
-        bettered = self._is_thinned and self.alarms < self._judged_alarms - LEAST_MARGIN
+        bettered = self._is_thinned and self.log10_false_alarms < self._judged_alarms - LEAST_MARGIN
         return bettered or self.missed <= MOST_MISSED
 
     def _with_false_alarms(self, candidates: Hypotheses, count: int | None = None) -> Hypotheses:
@@ -107,21 +111,21 @@ class Pool:
         return float(self.candidates.sort_key.max(initial=-math.inf))
 
     @property
-    def alarms(self) -> float:
+    def log10_false_alarms(self) -> float:
         """log10 of the smallest NFA of the candidates; infinite if none has one."""
         return float(np.nanmin(self.candidates.log10_false_alarms, initial=np.inf))
 
     def local_searches(self, leaders: Hypotheses) -> int:
         """Return the number of local searches around the first of these poses that found nothing better."""
-        if not len(leaders) or not len(self.surrounded):
+        if not len(leaders) or not len(self.locally_best):
             return 0
-        around = to_problem_frame(self.surrounded, self.scene)
+        around = to_problem_frame(self.locally_best, self.scene)
         same = self.problem.same_as(leaders.pose(), around.rotation, around.translation, SAME)
         return int(same.sum())
 
     def is_searched(self, pose: Hypotheses) -> bool:
         """Return True if the surroundings of a pose (1,), or of one equal to it, were searched before."""
-        together = Hypotheses.concatenate([pose, *self.searched])
+        together = Hypotheses.concatenate([pose, *self.searched_around])
         poses = together.rotation, together.translation * self.scene.shift_weight
         return bool(close_poses(*poses, 0, SAME_DEG, SAME_SHIFT)[1:].any())
 
@@ -150,7 +154,7 @@ class Pool:
         one.
         """
         scene, problem = self.scene, self.problem
-        self._judged_alarms = min(self._judged_alarms, self.alarms)
+        self._judged_alarms = min(self._judged_alarms, self.log10_false_alarms)
         annealed = FINISHED_POSES if ended else 1
         ends = finish(scene, self.candidates, annealed) if len(self.candidates) else self.candidates
         if len(ends) and problem.prior is not None:  # keep the version of each pose with the smaller NFA

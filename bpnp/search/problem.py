@@ -52,10 +52,10 @@ class UnknownFocal(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Unmatched image points and scene points, with their annotations and the priors of the pose.
+    """Unmatched image points and scene points of a search, with their annotations and the priors of the pose.
 
     `Problem.of` makes one from the user's coordinates. Poses are those of the scene in unit size, camera = R p + t;
-    `from_user` and `to_user` convert them.
+    `from_user` and `to_user` convert them. `bpnp.datamodules.Problem` is one of a data set, with matches and true pose.
 
     Examples:
         >>> rng = np.random.default_rng(0)

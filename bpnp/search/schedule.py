@@ -95,11 +95,11 @@ class LocalSearches:
         pool = self.pool
         if self.best is not None:
             self.fruitless = 0 if pool.best_key > self.best else self.fruitless + 1
-        while len(self.poses) and self.fruitless < MOST_FRUITLESS and pool.alarms >= 0:
+        while len(self.poses) and self.fruitless < MOST_FRUITLESS and pool.log10_false_alarms >= 0:
             pose, self.poses = self.poses[:1], self.poses[1:]
             if not pool.is_searched(pose):
                 self.best = pool.best_key
-                pool.searched.append(pose)
+                pool.searched_around.append(pose)
                 return Step(partial(search_around, pool.scene, pose, LOCAL))
         return None
 
@@ -149,7 +149,7 @@ class Plan:
         if self.near is not None:
             if self.taken_near < NEAR_STEPS:
                 return self._next_near(self.near)
-            if self.pool.alarms < 0:
+            if self.pool.log10_false_alarms < 0:
                 return self._next_of_significant(partial(self._next_near, self.near))
             # The prior may be wrong: poses found near it would only displace others.
             self.pool.forget()
@@ -159,7 +159,7 @@ class Plan:
     def _next_near(self, prior: PosePrior) -> Step:
         """Return a step near the prior: in turn near it and over all rotations, and the proposals once."""
         scene, number = self.pool.scene, self.taken_near - self.asked_near
-        undecided = self.pool.alarms > MOST_FALSE_ALARMS
+        undecided = self.pool.log10_false_alarms > MOST_FALSE_ALARMS
         self.taken_near += 1
         if number == PROPOSED_AFTER and self.proposals is not None and undecided:
             self.asked_near = True
@@ -175,11 +175,11 @@ class Plan:
         while True:
             if (step := self._next_local()) is not None:
                 return step
-            unaided = self.rounds > UNAIDED_ROUNDS and self.pool.alarms >= 0
+            unaided = self.rounds > UNAIDED_ROUNDS and self.pool.log10_false_alarms >= 0
             if unaided and self.proposals is not None:
                 return self._with_local_searches(Step(self._take_proposals()))
             self.rounds += 1
-            if self.pool.alarms < 0:
+            if self.pool.log10_false_alarms < 0:
                 return self._next_of_significant(source.next_step)
             return self._with_local_searches(source.next_step())
 
@@ -190,7 +190,7 @@ class Plan:
         if (step := self._next_local()) is not None:
             return step
         pool = self.pool
-        enough = pool.alarms >= 0 or pool.local_searches(pool.leaders()) >= LOCAL_SEARCHES
+        enough = pool.log10_false_alarms >= 0 or pool.local_searches(pool.leaders()) >= LOCAL_SEARCHES
         return None if enough else self._local_search()
 
     def _take_proposals(self) -> Callable[[], Hypotheses]:

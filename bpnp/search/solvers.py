@@ -1,4 +1,4 @@
-"""Solutions of problems: by the search, or by a trained module."""
+"""Options for all problems of a call, and their solutions: each by the search, or by a trained module."""
 
 import math
 import sys

@@ -1,4 +1,4 @@
-"""Initial poses of a search: spread over all rotations, or drawn from a prior."""
+"""Priors of a pose, `PosePrior` and `GravityPrior`; and initial poses, drawn from a prior or over all rotations."""
 
 import math
 from typing import NamedTuple

@@ -132,7 +132,7 @@ class BlindPnPTask(LightningModule):
         else:
             content = read_checkpoint(weights)
             self.solver = build_solver(content) if solver is None else module_or_default(solver, BPnPNet)
-            self._adopt(content, weights, grown=True)
+            self._adopt(content, weights, allow_added=True)
         self.loss = None if loss is None else module_or_default(loss, nn.Module)
         self.pose_loss = module_or_default(pose_loss, PoseLoss)
         self.save_hyperparameters(
@@ -490,13 +490,13 @@ class BlindPnPTask(LightningModule):
         self.skipped_steps, self.consecutive_skipped_steps = checkpoint.get("skipped_steps", (0, 0))
         self.saved_settings = checkpoint.get("optimizer_settings", [])
 
-    def _adopt(self, content: Mapping[str, Any], file: str | Path | None, *, grown: bool = False) -> None:
+    def _adopt(self, content: Mapping[str, Any], file: str | Path | None, *, allow_added: bool = False) -> None:
         """Load the solver's weights, and print the settings in which it differs from the checkpoint on purpose.
 
-        The file is that of the message, None if unknown; `grown` is as for `fitting_state`.
+        The file is that of the message, None if unknown; `allow_added` is as for `fitting_state`.
         """
         try:
-            state, adjusted = fitting_state(content, self.solver, grown=grown)
+            state, adjusted = fitting_state(content, self.solver, allow_added=allow_added)
         except ValueError as error:
             raise ValueError(error if file is None else f"{file}: {error}") from error
         self.solver.load_state_dict(state)

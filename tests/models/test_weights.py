@@ -132,13 +132,13 @@ def test_a_checkpoint_of_another_shape_is_refused_with_what_differs() -> None:
 def test_weights_without_a_part_may_differ_only_in_the_setting_that_creates_it() -> None:
     saved = content(Matcher(channels=16, depth=1, heads=2))
     view = Matcher(channels=16, depth=1, heads=2, frame="view")
-    state, adjusted = fitting_state(saved, view, grown=True)
+    state, adjusted = fitting_state(saved, view, allow_added=True)
     assert adjusted == ["frame=view (saved: any)"]
     assert state.keys() == view.state_dict().keys()
     for option, other in (("heads", 4), ("neighbours", 5)):
         changed = Matcher(channels=16, depth=1, **({"heads": 2} | {option: other}), frame="view")
         with pytest.raises(ValueError, match=rf"another Matcher: {option}={other} \(saved: \d\)\. Leave"):
-            fitting_state(saved, changed, grown=True)
+            fitting_state(saved, changed, allow_added=True)
 
 
 def test_a_name_of_packaged_weights_is_never_a_file_of_the_working_directory(

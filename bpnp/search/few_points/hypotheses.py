@@ -1,4 +1,7 @@
-"""Hypotheses: solve a minimal problem, preverify it on nearby points, refine it on its matches, and keep the pose."""
+"""Hypotheses of the enumeration: solve a minimal problem, preverify, refine the pose on its matches, and keep it.
+
+Compiled; the poses that are kept become `bpnp.search.hypotheses.Hypotheses`.
+"""
 
 import math
 from typing import Any, NamedTuple

@@ -210,7 +210,8 @@ class RigPoses:
     def _local_searches(self) -> int:
         """Return the number of local searches around the best pose that found no better one."""
         return sum(
-            int(self._as_best(k, to_problem_frame(pool.surrounded, pool.scene)).sum()) for k, pool in self.pools.items()
+            int(self._as_best(k, to_problem_frame(pool.locally_best, pool.scene)).sum())
+            for k, pool in self.pools.items()
         )
 
     def _as_best(self, k: int, poses: Hypotheses) -> NDArray[np.bool_]:
