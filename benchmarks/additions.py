@@ -12,6 +12,7 @@ import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -19,18 +20,18 @@ import torch
 from pages import markdown, publish
 from paper_tables import (
     ESTIMATES,
+    MEASURES,
     NEVER,
+    Row,
     Training,
     digest,
     effect,
-    effect_cells,
-    effect_head,
     figures,
-    head,
     network,
     provenance,
     read_record,
-    row_cells,
+    recall_name,
+    sheet,
     solve_problems,
     trained_steps,
 )
@@ -126,18 +127,24 @@ def measure(options: argparse.Namespace, record: dict[str, Any]) -> None:
 
 
 def tables(record: Mapping[str, Any]) -> dict[str, str]:
-    """Return the tables of the rows, and of their differences from the row without an addition."""
-    order = [(name, estimate) for estimate in TESTED for name in ADDITIONS]
+    """Return the table of the medians of both estimates with each addition."""
     seeds = sorted({int(key.split("|")[0]) for key in record["rows"]})
-    result = {}
-    for title, first, cells in (("rows", head, row_cells), ("effects", effect_head, effect_cells)):
-        result[title] = markdown(first(TABLE.recall), [
-            cells(f"{name}{ESTIMATES[estimate]}" + (f", seed {seed}" if len(seeds) > 1 else ""), record[title][key])
-            for name, estimate in order
-            for seed in seeds
-            if (key := f"{seed}|{name}|{estimate}") in record[title]
-        ])  # fmt: skip
-    return result
+    lines = []
+    for name, seed in product(ADDITIONS, seeds):
+        found = [record["rows"].get(f"{seed}|{name}|{estimate}") for estimate in TESTED]
+        if None not in found:
+            rows = [Row(place, seed, name, figures) for place, figures in enumerate(found)]
+            cells = [row.cell(error) for error in ("rotation", "recall") for row in rows]
+            label = name + (f", seed {seed}" if len(seeds) > 1 else "")
+            lines.append([label, f"{rows[0].figures['steps']:,}", *cells])
+    heads = [f"{measure}{ESTIMATES[one]}" for measure in (MEASURES[0], recall_name(TABLE)) for one in TESTED]
+    return {"rows": markdown(("", "steps", *heads), lines)}
+
+
+def sheets(record: Mapping[str, Any]) -> dict[str, str]:
+    """Return the rows, and their differences from the row without an addition, in CSV."""
+    keys = ("seed", "row", "estimate")
+    return {"": sheet(keys, record["rows"]), "-effects": sheet(keys, record["effects"])}
 
 
 def main() -> None:

@@ -23,16 +23,17 @@ import torch
 from lightning import LightningDataModule
 from pages import is_default, markdown, publish
 from paper_tables import (
+    MEASURES,
     PICTURES,
+    Row,
     check_beginning,
     digest,
     draw_recall,
     figures,
     finish_recall,
-    head,
     network,
     provenance,
-    row_cells,
+    sheet,
     solve_problems,
     trained_steps,
 )
@@ -146,12 +147,22 @@ def measure(options: argparse.Namespace, record: dict[str, Any]) -> dict[str, li
 
 
 def tables(record: dict[str, Any]) -> dict[str, str]:
-    """Return the table of the rows of all data, before and after."""
-    rows = []
-    for key, found in record["rows"].items():
+    """Return the table of the medians of all data, before and after."""
+    lines = []
+    for key in record["rows"]:
         name, part, when, estimate = key.split("|")
-        rows.append(row_cells(f"{name}, {part}, `{estimate}`, {when}", found))
-    return {"data": markdown(head(RECALL), rows)}
+        if when == "before":
+            keys = (f"{name}|{part}|{when}|{estimate}" for when in ("before", "after"))
+            rows = [Row(0, 0, key, record["rows"][key]) for key in keys]
+            cells = [row.cell(error) for error in ("rotation", "recall") for row in rows]
+            lines.append([f"{name}, {part}, `{estimate}`", str(rows[0].figures["problems"]), *cells])
+    measures = (MEASURES[0], f"% within {RECALL[0]:g} deg, {RECALL[1]:g}")
+    heads = [head for measure in measures for head in (f"{measure}, before", "after")]
+    return {"data": markdown(("", "problems", *heads), lines)}
+
+
+def sheets(record: dict[str, Any]) -> dict[str, str]:
+    return {"": sheet(("data", "part", "when", "estimate"), record["rows"])}
 
 
 def recall_picture(rows: Rows) -> "Figure":

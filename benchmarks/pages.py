@@ -4,11 +4,14 @@
     python -m benchmarks pages --check    # exit with status 1 if a page has another table
 
 A table stands between `<!-- BENCHMARK: TABLE -->` and `<!-- end of BENCHMARK -->`. The benchmark has `FILE`, its record
-in JSON, and `tables`, which makes the tables of a record. Each of them ends with `publish`.
+in JSON, and `tables`, which makes the tables of a record. A link to `BENCHMARK.csv` or `BENCHMARK-PART.csv` is a file
+beside the page, which its `sheets` makes. Each benchmark ends with `publish`.
 """
 
 import argparse
+import csv
 import importlib
+import io
 import json
 import re
 import sys
@@ -23,10 +26,21 @@ from bpnp.files import write_text
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
 TABLE = re.compile(r"<!-- (\w+): ([a-z0-9-]+) -->\n(.*?)<!-- end of \1 -->", re.DOTALL)
 
+SHEET = re.compile(r"\]\((\w+?)((?:-\w+)?)\.csv\)")
+
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a table in Markdown."""
     return "".join(f"| {' | '.join(cells)} |\n" for cells in (head, ["---"] * len(head), *rows))
+
+
+def comma_separated(names: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
+    """Return rows in CSV, a column for each name."""
+    out = io.StringIO()
+    writer = csv.DictWriter(out, names, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return out.getvalue()
 
 
 def benchmark(name: str) -> Any:
@@ -49,8 +63,11 @@ def write_pages(*, check: bool = False) -> None:
     """Write the tables of all records into the pages; with `check`, exit if that would change one."""
     texts = {page: page.read_text(encoding="utf-8") for page in PAGES}
     shown = {page: [found.groups()[:2] for found in TABLE.finditer(text)] for page, text in texts.items()}
-    modules = {name: benchmark(name) for name in sorted({name for found in shown.values() for name, _ in found})}
-    tables = {name: module.tables(json.loads(module.FILE.read_text())) for name, module in modules.items()}
+    linked = {(page.parent, found[1], found[2]) for page, text in texts.items() for found in SHEET.finditer(text)}
+    names = {name for found in shown.values() for name, _ in found} | {name for _, name, _ in linked}
+    modules = {name: benchmark(name) for name in sorted(names)}
+    records = {name: json.loads(module.FILE.read_text()) for name, module in modules.items()}
+    tables = {name: module.tables(records[name]) for name, module in modules.items()}
     wrong = []
     for page, text in texts.items():
         unknown = [f"{name}: {title}" for name, title in shown[page] if title not in tables[name]]
@@ -59,6 +76,12 @@ def write_pages(*, check: bool = False) -> None:
             wrong.append(f"{page.name} has other tables than the records; try `python -m benchmarks pages`")
             if not check:
                 write_text(page, new)
+    for folder, name, part in sorted(linked):
+        file, new = folder / f"{name}{part}.csv", modules[name].sheets(records[name])[part]
+        if not file.is_file() or file.read_text(encoding="utf-8") != new:
+            wrong.append(f"{file.name} has other figures than the record; try `python -m benchmarks pages`")
+            if not check:
+                write_text(file, new)
     if check and wrong:
         sys.exit("\n".join(wrong))
 

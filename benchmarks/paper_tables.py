@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import torch
 from lightning import LightningDataModule
-from pages import is_default, markdown, publish
+from pages import comma_separated, is_default, markdown, publish
 from record import DATA, ROOT, measured_today, write_json
 from torch import nn
 
@@ -66,6 +66,13 @@ ESTIMATES = {"pnp": "", "ransac": " R", "refined": ", refined"}
 BRANCHES = ("Lc", "Lc Lp")
 Inference = Literal["paper", "ransac", "ours"]
 INFERENCES: dict[Inference, str] = {"paper": "", "ransac": ", our RANSAC", "ours": ", our inference"}
+TITLES = {  # of the parts of the table of medians
+    "training": "our training, the paper's inference",
+    "paper, our RANSAC": "the paper's training, our RANSAC",
+    "training, our RANSAC": "our training, our RANSAC",
+    "paper, our inference": "the paper's training, our inference",
+    "training, our inference": "our training, our inference",
+}
 LONGER = "paper-lc, as many steps of L_c"  # a name for `--weights`
 PAIRS = {  # of a group, the rows without and with L_p
     "paper": (BRANCHES,),
@@ -475,38 +482,124 @@ def finish_recall(figure: "Figure") -> "Figure":
 def tables(table: Table, record: Mapping[str, Any]) -> dict[str, str]:
     """Return the tables of a record by name.
 
-    These are the rows of a set and a group (of several seeds, the lowest), the rows of all seeds, the effects of L_p,
-    the trainings, and the commands.
+    These are the rows of a set beside the paper's (of several seeds, the lowest), their medians, those of all seeds,
+    those of the other trainings and inferences, the effects of L_p, the trainings, and the commands.
     """
-    groups: dict[str, list[tuple[int, list[str]]]] = {}
-    spreads: dict[str, list[tuple[int, str, int, list[str]]]] = {}
-    split = {key: key.split("|") for key in record["rows"]}
-    lowest: dict[tuple[str, str], int] = {}
-    for name, seed, group, _, _ in split.values():
-        lowest[name, group] = min(int(seed), lowest.get((name, group), int(seed)))
+    rows: dict[tuple[str, str], list[Row]] = {}
     for key, found in record["rows"].items():
-        name, seed, group, label, estimate = split[key]
+        name, seed, group, label, estimate = key.split("|")
         place = list(ESTIMATES).index(estimate) if estimate in ESTIMATES else 0
-        title = f"{name}-{group}".replace(", ", "-").replace(" ", "-").lower()
-        label += ESTIMATES.get(estimate, "")
-        if int(seed) == lowest[name, group]:
-            groups.setdefault(title, []).append((place, row_cells(label, found)))
-        if group == "paper":
-            row = (place, label, int(seed), row_cells(f"{label}, seed {seed}", found))
-            spreads.setdefault(f"{name}-spread", []).append(row)
+        row = Row(place, int(seed), label + ESTIMATES.get(estimate, ""), found)
+        rows.setdefault((name, group), []).append(row)
     result = {"commands": "```\n" + "".join(f"{line}\n" for line in commands(table, record)) + "```\n"}
-    printed = printed_rows(table.paper)
-    for title, rows in groups.items():
-        local = printed[3:] if title.endswith("-paper") else printed[:3] if title.endswith("-baselines") else []
-        ours = [cells for _, cells in sorted(rows, key=lambda row: row[0])]
-        result[title] = markdown(head(table.recall), [*ours, *local])
-    for title, several in spreads.items():
-        many = len({seed for _, _, seed, _ in several}) > 1
-        rows_of_seeds = markdown(head(table.recall), [cells for *_, cells in sorted(several)])
-        result[title] = rows_of_seeds if many else "Measured with one seed.\n"
+    for (name, group), several in rows.items():
+        if group == "paper":
+            result[f"{name}-paper"] = compared(table, several)
+            result[f"{name}-summary"] = summary(table, several)
+            result[f"{name}-spread"] = spread(table, several)
+        if group == "baselines":
+            result[f"{name}-baselines"] = summary(table, several)
+    if others := {key: several for key, several in rows.items() if key[1] not in ("paper", "baselines")}:
+        result["medians"] = medians(table, others)
     for title, effects in effect_rows(record["effects"]).items():
         result[title] = markdown(effect_head(table.recall), effects)
     return result | training_table(record)
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of a record: an estimate of a network, or another method."""
+
+    place: int  # of the estimate
+    seed: int
+    label: str
+    figures: Mapping[str, Any]
+
+    @property
+    def order(self) -> tuple[int, int]:
+        return self.seed, self.place
+
+    def cell(self, error: str) -> str:
+        """Return the median of an error, or the percentage within the limits, with its 95 % interval."""
+        if error == "recall":
+            value, low, high = (100 * x for x in self.figures[error])
+            return f"{value:.0f} [{low:.0f}, {high:.0f}]"
+        value, low, high = self.figures[error][1]
+        return f"{_short(value)} [{_short(low)}, {_short(high)}]"
+
+
+def lowest(rows: Iterable[Row]) -> list[Row]:
+    """Return the rows of the lowest seed, in the order of the estimates."""
+    ordered = sorted(rows, key=lambda row: row.order)
+    return [row for row in ordered if row.seed == ordered[0].seed]
+
+
+def recall_name(table: Table) -> str:
+    return f"% within {table.recall[0]:g} deg, {table.recall[1]:g}"
+
+
+def compared(table: Table, rows: Iterable[Row]) -> str:
+    """Return a table with our rows beside the paper's: quartiles of each error, recall and seconds."""
+    lines = []
+    for column, measure in enumerate((*MEASURES, recall_name(table), "seconds"), start=3):
+        lines.append([f"**{measure}**", "", ""])
+        lines += [
+            [row.label, row_cells(row.label, row.figures)[column], printed_row(table, row.label)[column]]
+            for row in lowest(rows)
+        ]
+    return markdown(("", "ours", "paper"), lines)
+
+
+def summary(table: Table, rows: Iterable[Row]) -> str:
+    """Return a table with our medians of rotation and translation and our recall, each beside the paper's."""
+    measures = {"rotation": MEASURES[0], "translation": MEASURES[1], "recall": recall_name(table)}
+    lines = []
+    for row in lowest(rows):
+        *_, rotation, translation, _, recall, _ = printed_row(table, row.label)
+        paper = [cell.split(" / ")[1] if cell else "" for cell in (rotation, translation)] + [recall]
+        cells = zip((row.cell(error) for error in measures), paper, strict=True)
+        lines.append([row.label, *(cell for pair in cells for cell in pair)])
+    return markdown(("", *(head for measure in measures.values() for head in (measure, "paper"))), lines)
+
+
+def spread(table: Table, rows: Iterable[Row]) -> str:
+    """Return a table with the medians of all seeds, or a sentence if there is one seed."""
+    seeds = sorted({row.seed for row in rows})
+    if len(seeds) == 1:
+        return "Measured with one seed.\n"
+    by_label: dict[str, list[Row]] = {}
+    for row in sorted(rows, key=lambda row: row.order):
+        by_label.setdefault(row.label, []).append(row)
+    errors = (*ERRORS, "recall")
+    lines = [
+        [label, *(", ".join(row.cell(error).split(" [")[0] for row in several) for error in errors)]
+        for label, several in by_label.items()
+    ]
+    return markdown((f"seeds {', '.join(map(str, seeds))}", *MEASURES, recall_name(table)), lines)
+
+
+def medians(table: Table, rows: Mapping[tuple[str, str], Iterable[Row]]) -> str:
+    """Return a table with the median rotation errors and the recalls of all sets, a part for each group."""
+    groups = [f"{first}{suffix}" for suffix in INFERENCES.values() for first in PAIRS]
+    names = list(dict.fromkeys(name for name, _ in rows))
+    names.sort(key=table.sets.index)
+    lines = []
+    for group in (one for one in groups if any(key[1] == one for key in rows)):
+        found = {name: {row.label: row for row in lowest(rows.get((name, group), []))} for name in names}
+        kept = dict.fromkeys(label for cells in found.values() for label in cells if is_changed(group, label))
+        lines.append([f"**{TITLES[group]}**", *[""] * (2 * len(names))])
+        lines += [
+            [label, *(found[name][label].cell(error) if label in found[name] else "" for name in names
+                      for error in ("rotation", "recall"))]
+            for label in kept
+        ]  # fmt: skip
+    heads = [f"{name}: {measure}" for name in names for measure in (MEASURES[0], recall_name(table))]
+    return markdown(("", *heads), lines)
+
+
+def is_changed(group: str, label: str) -> bool:
+    """Return whether an inference of ours changes the estimate: our RANSAC that of RANSAC, all of ours the others."""
+    return label.endswith(" R") == ("RANSAC" in group) or group in PAIRS
 
 
 def training_table(record: Mapping[str, Any]) -> dict[str, str]:
@@ -676,6 +769,42 @@ def printed_rows(paper: Paper) -> list[list[str]]:
 
 def _lines(paper: Paper) -> list[str]:
     return PRINTED[paper][2].strip().splitlines()
+
+
+def printed_row(table: Table, label: str) -> list[str]:
+    """Return the row of the paper's table with this label, or empty cells."""
+    name = label.removesuffix(" near the truth")  # as in the paper's table 2
+    return next((row for row in printed_rows(table.paper) if row[0] == f"*paper: {name}*"), [""] * 8)
+
+
+def sheets(record: Mapping[str, Any]) -> dict[str, str]:
+    """Return the rows and the effects of a table of the paper in CSV, by name of the file without that of the table."""
+    pair = ("set", "seed", "group", "before", "after", "estimate")
+    rows = sheet(("set", "seed", "group", "row", "estimate"), record["rows"])
+    return {"": rows, "-effects": sheet(pair, record["effects"])}
+
+
+def sheet(keys: Sequence[str], found: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the figures of a record in CSV: a line for each key, whose parts are its first cells."""
+    rows = [dict(zip(keys, key.split("|"), strict=True)) | dict(flat(figures)) for key, figures in found.items()]
+    return comma_separated(list(dict.fromkeys(name for row in rows for name in row)), rows)
+
+
+def flat(figures: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield a name for each figure of a row; an interval is the value and its two limits."""
+    for name, value in figures.items():
+        if name == "measured":
+            yield from value.items()
+        elif name == "settings":
+            yield name, json.dumps(value)
+        elif name == "steps" and isinstance(value, list):
+            yield from zip(("steps_before", "steps_after"), value, strict=True)
+        elif isinstance(value, list):
+            quartiles = {f"{name}_q{i}": one for i, one in enumerate(value, start=1)}
+            for title, one in quartiles.items() if isinstance(value[0], list) else [(name, value)]:
+                yield from zip((title, f"{title}_low", f"{title}_high"), one, strict=True)
+        else:
+            yield name.replace(" ", "_"), value
 
 
 def head(recall: tuple[float, float]) -> list[str]:

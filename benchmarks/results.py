@@ -29,7 +29,7 @@ import shapes
 import symmetric
 import torch
 from hard_scenes import SCENES
-from pages import is_default, markdown, write_pages
+from pages import comma_separated, is_default, markdown, write_pages
 from paper_tables import network
 from record import ROOT, TIME_LIMIT, Outcome, Problem, measure_rows, measured_today, parser, select, write
 from torch import nn
@@ -47,7 +47,6 @@ COLUMNS = ("data", "problems", "rotation, deg (quartiles)", "success", "confiden
 # What may differ between two runs of a row, on another machine and with other libraries: problems that are right or
 # confident, and the ratio of the median errors where one exceeds FLOOR_DEG.
 PROBLEMS, MEDIAN, FLOOR_DEG = 1, 1.5, 0.05
-NAMED = {"maps": "photo ", "leds": "LEDs: "}  # what the README's rows of a table begin with
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,6 @@ class Row:
     right_deg: float
     right_shift: float = float("inf")
     data: str = ""  # folder in that of the data that it needs
-    in_readme: bool = False
     seed: int = SEED  # of all problems
     right_moved: float = float("inf")
 
@@ -165,15 +163,13 @@ METHODS: tuple[tuple[str, str, Callable[[], nn.Module]], ...] = (
     ("softposit", "softposit", partial(SoftPOSIT, start="random", time_limit=None)),
     ("search", "search", partial(Search, time_limit=None)),
 )
-IN_README = ("ring, 3 lights", "headset, 3 lights", "drone, 3 lights")
 ROWS = (
     *(
         Row("search", f"shapes, any rotation, {ratio:g} outliers a match",
-            partial(shapes.problems, "shapes", ratio), (48, 4), 2.0, in_readme=ratio == 0.25)
+            partial(shapes.problems, "shapes", ratio), (48, 4), 2.0)
         for ratio in (0, 0.25, 0.5)
     ),
-    Row("search", "PSB meshes, the paper's protocol", partial(shapes.problems, "psb", 0), (100, 3), *PAPER, "psb",
-        in_readme=True),
+    Row("search", "PSB meshes, the paper's protocol", partial(shapes.problems, "psb", 0), (100, 3), *PAPER, "psb"),
     Row("search", "PSB meshes, any rotation", partial(shapes.problems, "psb-so3", 0), (100, 3), *PAPER, "psb"),
     Row("search", "PSB meshes, 0.5 outliers a match", partial(shapes.problems, "psb", 0.5), (100, 3), *PAPER, "psb"),
     *(
@@ -183,16 +179,16 @@ ROWS = (
     Row("maps", "left out of its map, view given", partial(photos, "best view", 1.0, time_limit=TIME_LIMIT), (48, 5),
         1.0, data="colmap"),
     Row("maps", "left out of its map, no view given", partial(photos, "map", 1.0, time_limit=TIME_LIMIT), (58, 5), 1.0,
-        data="colmap", in_readme=True),
+        data="colmap"),
     *(
         Row("maps", f"points of one view, no prior, {outliers:.0%} outliers a side",
             partial(photos, "view", outliers, in_map=False), (48, 5), 1.0, data="colmap")
         for outliers in (0.5, 0.75, 1.0)
     ),
     Row("maps", "of another place", partial(photos, "view", 1.0, apart=True, time_limit=TIME_LIMIT), (18, 4),
-        0.0, data="colmap", in_readme=True),
+        0.0, data="colmap"),
     *(
-        Row("leds", name, partial(lights, name), (300, 20), 3.0, in_readme=name in IN_README)
+        Row("leds", name, partial(lights, name), (300, 20), 3.0)
         for name in ("ring, 3 lights", "ring, 8 lights, 20 % missing", "headset, 3 lights",
                      "headset, 8 lights, 20 % missing", "ring, no normals, 3 lights", "drone, 3 lights")
     ),
@@ -278,17 +274,12 @@ def differences(new: dict[str, Any], old: dict[str, Any]) -> list[str]:
 
 
 def table(name: str, results: dict[str, Any]) -> str | None:
-    """Return the Markdown of a table with its command and seeds, or of the README's rows.
-
-    None unless all its rows are measured.
-    """
+    """Return the Markdown of a table with its command and seeds; None unless all its rows are measured."""
     rows = [row for row in ROWS if in_table(row, name)]
     if not rows or any(key(row) not in results for row in rows):
         return None
     lines = {"reliability": reliability_table, "sigmas": sigmas_table}.get(name, partial(rows_table, name))(results)
     text = markdown(lines[0], lines[1:])
-    if name == "readme":
-        return text
     parts = " ".join(dict.fromkeys(f"{row.table}:" for row in rows))
     seeds = ", ".join(sorted({str(results[key(row)]["seed"]) for row in rows}))
     return f"{text}\n`python -m benchmarks results --only {parts}`, seed {seeds}.\n"
@@ -297,7 +288,7 @@ def table(name: str, results: dict[str, Any]) -> str | None:
 def in_table(row: Row, name: str) -> bool:
     if name == "sigmas":
         return any(key(row).startswith(starts) for starts in SIGMAS.values())
-    return row.in_readme if name == "readme" else row.table == name
+    return row.table == name
 
 
 def rows_table(name: str, results: dict[str, Any]) -> list[tuple[str, ...]]:
@@ -309,8 +300,7 @@ def rows_table(name: str, results: dict[str, Any]) -> list[tuple[str, ...]]:
         right = f"{result['right']:.1%} ({where})" if row.right_deg else "n/a"
         sure = "" if result["confident"] is None else f"{result['confident']:.1%}"
         wrong = "" if result["confident"] is None else str(result["confident_and_wrong"])
-        of = NAMED.get(row.table, "") if name == "readme" else ""
-        lines.append((of + row.name, str(result["problems"]), quartiles if row.right_deg else "", right, sure, wrong,
+        lines.append((row.name, str(result["problems"]), quartiles if row.right_deg else "", right, sure, wrong,
                       f"{result['cpu_seconds']:.2g}"))  # fmt: skip
     return lines
 
@@ -340,8 +330,19 @@ def sigmas_table(results: dict[str, Any]) -> list[tuple[str, ...]]:
 
 def tables(record: dict[str, Any]) -> dict[str, str]:
     """Return the tables whose rows are all measured."""
-    names = dict.fromkeys([*(row.table for row in ROWS), "readme", "sigmas"])
+    names = dict.fromkeys([*(row.table for row in ROWS), "sigmas"])
     return {name: text for name in names if (text := table(name, record["full"])) is not None}
+
+
+def sheets(record: dict[str, Any]) -> dict[str, str]:
+    """Return all rows in CSV."""
+    rows = []
+    for name, found in record["full"].items():
+        table, _, row = name.partition(": ")
+        rows.append({"table": table, "row": row} | {
+            key: " / ".join(map(str, value)) if isinstance(value, list) else value for key, value in found.items()
+        })  # fmt: skip
+    return {"": comma_separated(list(dict.fromkeys(key for row in rows for key in row)), rows)}
 
 
 def main() -> None:

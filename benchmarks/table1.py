@@ -81,6 +81,10 @@ def tables(record: dict[str, Any]) -> dict[str, str]:
     return paper_tables.tables(TABLE, record)
 
 
+def sheets(record: dict[str, Any]) -> dict[str, str]:
+    return paper_tables.sheets(record)
+
+
 def main() -> None:
     run = ROOT / "runs" / "table1"
     parser = paper_tables.options(__doc__, file=FILE, run=run, sets=TABLE.sets, steps=3000, pose_steps=600, epoch=100)

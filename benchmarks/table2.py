@@ -96,6 +96,10 @@ def tables(record: dict[str, Any]) -> dict[str, str]:
     return paper_tables.tables(TABLE, record)
 
 
+def sheets(record: dict[str, Any]) -> dict[str, str]:
+    return paper_tables.sheets(record)
+
+
 def main() -> None:
     run = ROOT / "runs" / "table2"
     parser = paper_tables.options(__doc__, file=FILE, run=run, sets=TABLE.sets, steps=1980, pose_steps=396, epoch=EPOCH)

@@ -27,7 +27,8 @@ def test_each_addition_is_trained_with_as_many_points_and_compared(
     """2 steps of 2 problems with 16 points are 4 of 8 points and one of 16, and 4 of one problem."""
     write_mesh_tree(tmp_path / "modelnet10")
     page = tmp_path / "table1.md"
-    page.write_text("".join(f"<!-- additions: {name} -->\n<!-- end of additions -->\n" for name in ("rows", "effects")))
+    links = "[rows](additions.csv) and [effects](additions-effects.csv)\n"
+    page.write_text(f"<!-- additions: rows -->\n<!-- end of additions -->\n{links}")
     monkeypatch.setattr(pages, "PAGES", (page,))
     few = Addition(parts=((8, 0.5), (16, 0.5)))
     tried = {
@@ -66,7 +67,9 @@ def test_each_addition_is_trained_with_as_many_points_and_compared(
     for name in list(tried)[1:]:
         difference = median[name] - median[additions.NONE]
         assert record["effects"][f"0|{name}|pnp"]["rotation"][0] == pytest.approx(difference, rel=2e-3, abs=1e-3)
-    assert "| few first R | 3 | 2 |" in page.read_text()
+    assert "| few first | 3 |" in page.read_text()
+    assert "0,few first,ransac,2," in (tmp_path / "additions.csv").read_text()
+    assert "0,one,pnp,2," in (tmp_path / "additions-effects.csv").read_text()
     pages.write_pages(check=True)
     additions.main()
     assert len(commands) == len(lengths), "what is there is not trained again"

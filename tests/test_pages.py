@@ -36,6 +36,19 @@ def test_a_page_that_differs_and_a_table_without_a_record_are_found(page: Path) 
     pages.write_pages(check=True)
 
 
+def test_a_linked_sheet_is_written_beside_its_page(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = SimpleNamespace(
+        FILE=page.parent / "t.json", tables=lambda record: record, sheets=lambda _: {"-b": "x,y\n"}
+    )
+    monkeypatch.setattr(pages, "benchmark", lambda name: {"t": module}[name])
+    page.write_text("[all](t-b.csv)\n<!-- t: one -->\nnew\n<!-- end of t -->\n")
+    with pytest.raises(SystemExit, match="t-b.csv has other figures than the record"):
+        pages.write_pages(check=True)
+    pages.write_pages()
+    assert (page.parent / "t-b.csv").read_text() == "x,y\n"
+    pages.write_pages(check=True)
+
+
 def test_a_record_of_its_own_is_printed_and_leaves_the_pages_alone(
     page: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

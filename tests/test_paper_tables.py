@@ -1,5 +1,7 @@
 """The benchmarks of the paper's tables: what was stopped goes on, figures are those of the rows, pages are filled."""
 
+import csv
+import io
 import shlex
 import shutil
 from argparse import Namespace
@@ -336,12 +338,20 @@ def test_a_record_becomes_the_tables_of_the_page() -> None:
     }
     tables = paper_tables.tables(table1.TABLE, record)
     lines = tables["modelnet10-paper"].splitlines()
-    assert [line.split(" | ")[0] for line in lines[2:]] == [
-        "| Lc", "| Lc R", "| *paper: Lc*", "| *paper: Lc Lp*", "| *paper: Lc R*", "| *paper: Lc Lp R*",
+    measures = ["rotation, deg", "translation", "reprojection, deg", "% within 15 deg, 0.5", "seconds"]
+    expected = [name for measure in measures for name in (f"| **{measure}**", "| Lc", "| Lc R")]
+    assert [line.split(" | ")[0] for line in lines[2:]] == expected
+    assert lines[3].endswith("| 6.08 / 11.3 / 18.3 |")
+    assert lines[4].endswith("| 5.49 / 11.7 / 20.0 |")
+    (short,) = (line for line in tables["modelnet10-summary"].splitlines() if line.startswith("| Lc |"))
+    assert short.startswith(f"| Lc | {one['rotation'][1][0]:.2g} [")
+    assert " | 11.3 | " in short
+    parts = [line.split(" | ")[0] for line in tables["medians"].splitlines()[2:]]
+    assert parts == [
+        "| **the paper's training, our RANSAC**", "| Lc R",
+        "| **the paper's training, our inference**", "| Lc, refined",
     ]  # fmt: skip
-    assert "| Lc R |" in tables["modelnet10-paper-our-ransac"]
-    assert "| Lc, refined |" in tables["modelnet10-paper-our-inference"]
-    assert "| *paper: GOSMA* |" in tables["modelnet10-baselines"]
+    assert "| search |" in tables["modelnet10-baselines"]
     assert "| seed 0 | 400 | 500 |  | 0.0001 |" in tables["training"]
     row_of_effect = "| Lc Lp (400 steps) minus Lc (500 steps), unequal training | 10 | +0 [+0, +0]"
     assert row_of_effect in tables["modelnet10-effect"]
@@ -350,6 +360,21 @@ def test_a_record_becomes_the_tables_of_the_page() -> None:
     row_of_effect = f"| paper-lclp (500 steps) minus {paper_tables.LONGER} (500 steps) |"
     assert row_of_effect in tables["modelnet10-training-effect"]
     assert tables["modelnet10-spread"] == "Measured with one seed.\n"
+
+
+def test_a_sheet_has_a_column_for_each_figure_and_a_line_for_each_row() -> None:
+    rows = [row(i, rotation_error_deg=float(i)) for i in range(9)]
+    one, other = figures(rows, (3.5, 1.0)) | {"steps": 5}, effect(rows, rows, (3.5, 1.0)) | {"steps": [4, 5]}
+    measured = {"settings": {"seed": 3}, "measured": {"commit": "abc", "date": "2026-01-01"}}
+    record = {"rows": {"psb|3|paper|Lc|pnp": one | measured}, "effects": {"psb|3|paper|Lc|Lc Lp|pnp": other}}
+    sheets = paper_tables.sheets(record)
+    ((found,), (difference,)) = (list(csv.DictReader(io.StringIO(sheets[part]))) for part in ("", "-effects"))
+    assert (found["set"], found["row"], found["steps"], found["settings"]) == ("psb", "Lc", "5", '{"seed": 3}')
+    assert [float(found[f"rotation_q{i}"]) for i in (1, 2, 3)] == [2.0, 4.0, 6.0]
+    assert [float(found[f"recall{end}"]) for end in ("", "_low", "_high")] == one["recall"]
+    assert (found["commit"], found["date"]) == ("abc", "2026-01-01")
+    assert (difference["before"], difference["after"]) == ("Lc", "Lc Lp")
+    assert (difference["steps_before"], difference["steps_after"], difference["rotation"]) == ("4", "5", "0.0")
 
 
 def test_the_page_has_the_commands_of_its_rows_and_a_line_for_each_seed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -367,10 +392,14 @@ def test_the_page_has_the_commands_of_its_rows_and_a_line_for_each_seed(monkeypa
     longer = one | {"steps": 9, "settings": {"weights": paper_tables.LONGER, "problems": 500, "test_seed": 0}}
     record["rows"][f"psb|0|training|{paper_tables.LONGER}|pnp"] = longer
     tables = paper_tables.tables(table1.TABLE, record)
-    assert [line.split(" | ")[0] for line in tables["psb-spread"].splitlines()[2:]] == [
-        "| Lc, seed 0", "| Lc, seed 1", "| Lc Lp, seed 0", "| Lc Lp, seed 1",
-    ]  # fmt: skip
-    assert len(tables["psb-paper"].splitlines()) == 2 + 2 + 4  # the lowest seed and the paper's rows
+    title, _, *lines = tables["psb-spread"].splitlines()
+    assert title.startswith("| seeds 0, 1 | rotation, deg |")
+    value = f"{one['rotation'][1][0]:.2g}"
+    assert [line.split(" | ")[:2] for line in lines] == [
+        [f"| {label}", f"{value}, {value}"] for label in ("Lc", "Lc Lp")
+    ]
+    assert "| GOSMA |" in tables["psb-baselines"]
+    assert len(tables["psb-summary"].splitlines()) == 2 + 2  # the lowest seed
     parsed = []
     monkeypatch.setattr(table1, "measure", lambda options: parsed.append(options) or record)
     monkeypatch.setattr(paper_tables, "publish", lambda *_: None)

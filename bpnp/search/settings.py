@@ -74,7 +74,7 @@ class DensitySearch:
     annealed: int = 40  # number of poses that are annealed at the end [poses; calibration]
 
 
-NEAR = tuple(  # [`DensitySearch`; chosen on photos of south_building, which docs/results.md reports too]
+NEAR = tuple(  # [`DensitySearch`; chosen on photos of south_building, which docs/measured.md reports too]
     DensitySearch(preselection=Preselection((100, 1000), kept), narrowing=Narrowing(first, points=600), annealed=12)
     # The finer one is for dense keypoints and few visible points; in its narrower basins, ranks are less certain.
     for first, kept in ((0.06, (2**13, 2**10)), (0.03, (2**13, 2**11)))

@@ -47,7 +47,7 @@ def test_a_pose_depends_neither_on_neighbours_nor_on_padding_nor_on_the_modules_
 
 @pytest.mark.parametrize("baseline", [GOPAC, GOSMA, Hungarian, RandomRansac, SoftPOSIT])
 def test_the_reference_lists_what_differs_from_the_paper(baseline: type) -> None:
-    """docs/results.md and docs/paper.md refer to it."""
+    """docs/measured.md and docs/paper.md refer to it."""
     assert re.search(r"^Differences from the paper[^:]*:\n\n- ", inspect.getdoc(baseline) or "", re.MULTILINE)
 
 
