@@ -147,13 +147,12 @@ def test_the_code_of_the_readme_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    search, network = blocks(ROOT / "README.md", "python")
+    (code,) = blocks(ROOT / "README.md", "python")
     names: dict[str, Any] = {}
-    exec(search, names)
-    exec(network, {})
+    exec(code, names)
     assert names["example"].rotation_error_deg(names["solution"].rotation) < 0.5  # the map is off by depth noise
     assert (tmp_path / "pose.png").stat().st_size > 5000
-    expected = [line.split("# ")[-1] for code in (search, network) for line in code.splitlines() if "print(" in line]
+    expected = [line.split("# ")[-1] for line in code.splitlines() if "print(" in line]
     assert capsys.readouterr().out.split() == expected
 
 
