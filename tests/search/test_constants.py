@@ -47,9 +47,25 @@ def test_constants_are_found_in_every_form() -> None:
 @pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(PACKAGE)))
 def test_constants_have_a_unit_and_an_origin(file: Path) -> None:
     for name, comment in constants(file.read_text()).items():
-        tag = re.search(r"\[([^\[\];]+); ([^\[\];]+)\]$", comment, re.MULTILINE)
-        assert tag is not None, f"{name} has no [unit; origin]"
-        assert tag[2].startswith(ORIGINS), f"{name} has the origin {tag[2]!r}"
+        assert mistake_in(name, comment) is None
+
+
+def mistake_in(name: str, comment: str) -> str | None:
+    """Return what the comment of a constant lacks, None if nothing."""
+    tag = re.search(r"\[([^\[\];]+); ([^\[\];]+)\]$", comment, re.MULTILINE)
+    if tag is not None and tag[2].startswith(ORIGINS):
+        return None
+    found = "no [unit; origin]" if tag is None else f"the origin {tag[2]!r}"
+    allowed = ", ".join(origin.strip(" ,") for origin in ORIGINS)
+    return f"the comment of {name} has {found}; an origin is one of {allowed}, which CONTRIBUTING.md explains"
+
+
+def test_a_mistake_in_a_comment_names_the_origins() -> None:
+    origins = "calibration, chosen on, measured, derived, convention, cost, numerics, not tuned"
+    for comment, found in (("a number", "no [unit; origin]"), ("a [m; guess]", "the origin 'guess'")):
+        text = f"the comment of A has {found}; an origin is one of {origins}, which CONTRIBUTING.md explains"
+        assert mistake_in("A", comment) == text
+    assert mistake_in("A", "a [m; chosen on walk_2]") is None
 
 
 def test_fields_of_density_map_searches_have_a_unit_and_an_origin() -> None:
