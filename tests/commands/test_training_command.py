@@ -1,5 +1,6 @@
 """Short help with groups on request, and a user's own task, loss and weights by name."""
 
+import importlib
 import os
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from typing import Any, ClassVar
 import pytest
 import torch
 from lightning import Callback, LightningModule, Trainer
+from planted import plant
 from small_data import MESHES, SMALL_NET, small_meshes
 from torch import Tensor, nn
 
@@ -20,6 +22,7 @@ from bpnp.files import CONFIGS
 from bpnp.models.weights import TrainedNet
 from bpnp.search.arguments import checked_prior, source_from
 from bpnp.training import PoseLossWarmup
+from bpnp.types import Prediction
 
 pytestmark = pytest.mark.slow
 
@@ -102,13 +105,29 @@ def test_a_task_whose_test_step_returns_nothing_is_tested(tmp_path: Path, caplog
     assert not (tmp_path / "run" / "test").exists()
 
 
+def write_examples(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Write the examples of the contributing guide as the module `of_the_guide`."""
+    guide = (Path(__file__).parents[2] / "CONTRIBUTING.md").read_text()
+    (folder / "of_the_guide.py").write_text("".join(part.split("```")[0] for part in guide.split("```python\n")[1:]))
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.delitem(sys.modules, "of_the_guide", raising=False)
+
+
+def test_loss_of_the_contributing_guide(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its value for a planted permutation and an even assignment, and a training with it."""
+    write_examples(tmp_path, monkeypatch)
+    loss, planted = importlib.import_module("of_the_guide").MissedMass(), plant(2, 5)
+    for assignment, value in ((planted.permutation(), 0.0), (torch.full((2, 5, 5), 1 / 25), (1 - 5 / 25) ** 2)):
+        assert loss(Prediction(assignment), planted.batch()).tolist() == pytest.approx([value] * 2, abs=1e-6)
+    main(["fit", "--model.loss=of_the_guide.MissedMass", *MESHES, *SMALL_NET, *SHORT, *folders(tmp_path)])
+    assert (tmp_path / "run" / "checkpoints" / "last.ckpt").exists()
+
+
 def test_solver_and_metric_of_the_contributing_guide(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO")
-    guide = (Path(__file__).parents[2] / "CONTRIBUTING.md").read_text()
-    (tmp_path / "of_the_guide.py").write_text("".join(part.split("```")[0] for part in guide.split("```python\n")[1:]))
-    monkeypatch.syspath_prepend(tmp_path)
+    write_examples(tmp_path, monkeypatch)
     config = tmp_path / "metric.yaml"
     config.write_text("trainer:\n  callbacks:\n  - class_path: of_the_guide.DistanceError\n")
     main(["test", f"--config={config}", "--model.solver=of_the_guide.InFront", *MESHES, *folders(tmp_path)])
