@@ -97,6 +97,21 @@ def check_unmasked(name: str, values: object) -> None:
         )
 
 
+def array_shape(values: Any) -> tuple[int, ...]:
+    """Return the shape of an array, or of a list or tuple that NumPy can convert; () for anything else.
+
+    >>> from bpnp.argument_types import array_shape
+    >>> array_shape([[1, 2, 3]]), array_shape([[1, 2], 3]), array_shape("abc")
+    ((1, 3), (), ())
+    """
+    if not isinstance(values, (list, tuple)):
+        return tuple(getattr(values, "shape", ()))
+    try:
+        return np.shape(values)
+    except (TypeError, ValueError, RuntimeError):  # rows of different lengths, or tensors that NumPy cannot read
+        return ()
+
+
 def short_repr(value: object) -> str:
     """Return the representation of a value in one line of at most 80 characters, for an error message.
 

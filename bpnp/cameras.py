@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, SupportsFloat, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from bpnp.argument_types import ArrayLike, HasArray, HasCameraModel, Numbers, short_repr
+from bpnp.argument_types import ArrayLike, HasArray, HasCameraModel, Numbers, array_shape, short_repr
 from bpnp.arrays import Array
 
 ROUND_TRIP = 0.01  # largest error of a pixel that is undistorted and distorted again, pixels
@@ -147,14 +147,15 @@ if TYPE_CHECKING:  # what `camera_from` converts, which checks it at run time
     CameraObject: TypeAlias = (
         HasArray
         | tuple[ArrayLike, ArrayLike | None]
+        | tuple[SupportsFloat, SupportsFloat, SupportsFloat, SupportsFloat]
         | tuple[str, Numbers]
         | tuple[str, int, int, Numbers]
         | Mapping[str, Any]
         | HasCameraModel
         | Camera
     )
-    CameraLike: TypeAlias = CameraObject | Sequence[Sequence[SupportsFloat]]
-    ManyCameras: TypeAlias = CameraObject | Sequence[CameraLike | Sequence[SupportsFloat] | None]
+    CameraLike: TypeAlias = CameraObject | Sequence[SupportsFloat | Sequence[SupportsFloat]]
+    ManyCameras: TypeAlias = CameraObject | Sequence[CameraLike | SupportsFloat | None]
 else:
     CameraLike = ManyCameras = Any
 
@@ -196,10 +197,10 @@ def in_front(points: Array) -> Array:
 def camera_from(camera: Any) -> Camera:
     """Convert a description of a camera to a `Pinhole` for K without distortion, else to a `Lens`.
 
-    It is one of: a 3x3 matrix K; OpenCV's (K, distortion); (COLMAP model name, parameters); (name, width, height,
-    parameters); a mapping with `model` and `params`, and optionally `width` and `height`; a `pycolmap.Camera`; a
-    `Camera`, which is returned unchanged. Raise ValueError if K is singular or not finite, the model is unknown, the
-    number of parameters is wrong, or the focal length is not positive.
+    It is one of: a 3x3 matrix K; its numbers (fx, fy, cx, cy); OpenCV's (K, distortion); (COLMAP model name,
+    parameters); (name, width, height, parameters); a mapping with `model` and `params`, and optionally `width` and
+    `height`; a `pycolmap.Camera`; a `Camera`, which is returned unchanged. Raise ValueError if K is singular or not
+    finite, the model is unknown, the number of parameters is wrong, or the focal length is not positive.
 
     >>> from bpnp.cameras import camera_from
     >>> camera_from(("PINHOLE", 640, 480, [800, 800, 320, 240])).focal
@@ -224,7 +225,12 @@ def camera_from(camera: Any) -> Camera:
 
 def is_opencv(camera: Any) -> bool:
     """Return True for OpenCV's (K, distortion), whose pixel (0, 0) is the centre of the first pixel."""
-    return isinstance(camera, tuple) and len(camera) == 2 and np.shape(camera[0]) == (3, 3)
+    return isinstance(camera, tuple) and len(camera) == 2 and is_calibration_matrix(camera[0])
+
+
+def is_calibration_matrix(camera: Any) -> bool:
+    """Return True for a 3x3 matrix K, or its numbers (fx, fy, cx, cy)."""
+    return array_shape(camera) in ((3, 3), (4,))
 
 
 def image_size(camera: Camera) -> tuple[int, int] | None:
@@ -440,10 +446,17 @@ def _pinhole(values: Any) -> Pinhole:
         matrix = np.asarray(values.detach().cpu() if hasattr(values, "detach") else values, dtype=np.float64)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(
-            f"`camera` is a 3x3 matrix, (COLMAP model, parameters) or a pycolmap.Camera, not {short_repr(values)}"
+            f"`camera` is a 3x3 matrix, [fx, fy, cx, cy], (COLMAP model, parameters) or a pycolmap.Camera, not "
+            f"{short_repr(values)}"
         ) from error
+    if matrix.shape == (4,):
+        fx, fy, cx, cy = matrix.tolist()
+        matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     if matrix.shape != (3, 3):
-        raise ValueError(f"the `camera` matrix needs the shape (3, 3), not {matrix.shape}; or give (model, parameters)")
+        raise ValueError(
+            f"the `camera` matrix needs the shape (3, 3), not {matrix.shape}; or give [fx, fy, cx, cy], or (COLMAP "
+            "model, parameters)"
+        )
     if not np.isfinite(matrix).all():
         raise ValueError(f"the `camera` matrix holds NaN or infinity: {matrix.tolist()}")
     if np.any(matrix[2, :2] != 0) or matrix[2, 2] == 0:

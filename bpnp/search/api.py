@@ -27,6 +27,7 @@ from bpnp.search.arguments import (
     positive,
     seconds_from,
     source_from,
+    split_distortion,
 )
 from bpnp.search.few_points.enumeration import is_enumerable
 from bpnp.search.focal_length import solve_with_focal_length, unknown_camera
@@ -49,10 +50,10 @@ def solve(
     points2d: ManyPoints,
     points3d: PointsLike,
     camera: ManyCameras | None = None,
+    distortion: ArrayLike | bool | None = False,
     *,
     image_size: ImageSize | None = None,
     focal_error: float | int | None = None,
-    distortion: bool = False,
     normals3d: ArrayLike | None = None,
     labels2d: ManyArrays | None = None,
     labels3d: ArrayLike | None = None,
@@ -77,17 +78,19 @@ def solve(
             x and y are accepted. The centre of the first pixel is (0.5, 0.5), as in COLMAP. A list of cv2.KeyPoint is
             shifted by half a pixel, except with OpenCV's (K, distortion).
         points3d: (n, 3) scene points in any unit; also a point cloud or mesh of trimesh or Open3D.
-        camera: 3x3 matrix K; OpenCV's (K, distortion); (COLMAP model, parameters); (model, width, height, parameters);
-            or a pycolmap.Camera. Points are undistorted. Pixels that cannot be undistorted are dropped and counted in
-            `stats.dropped2d`. None for normalised coordinates and bearings.
+        camera: 3x3 matrix K; [fx, fy, cx, cy]; OpenCV's (K, distortion); (COLMAP model, parameters); (model, width,
+            height, parameters); or a pycolmap.Camera. Points are undistorted. Pixels that cannot be undistorted are
+            dropped and counted in `stats.dropped2d`. None for normalised coordinates and bearings.
+        distortion: OpenCV's coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]] of a `camera` that is K or [fx, fy, cx,
+            cy]: `solve(points2d, points3d, K, coefficients)` is the same as the camera (K, coefficients). Or True to
+            fit a radial coefficient in any case. It needs an `image_size`, or a `focal_error` with a camera that has
+            no distortion. Default False: a coefficient is fitted with an unknown focal length and kept only if it is
+            significantly better; with a `rig` none is fitted. None is the same as False.
         image_size: (width, height) of the image, pixels, if there is no `camera`. The focal length is then estimated
             with the pose and returned in `Solution.camera`, and the principal point is the image centre. An error with
             a `camera`. None if there is a camera, or no pixels.
         focal_error: Standard deviation of the focal length of `camera`, as a fraction of it between 0 and 1, such as
             0.1. The focal length is then estimated too. An error without a `camera`. None if the focal length is exact.
-        distortion: True to fit a radial distortion coefficient in any case. It needs an `image_size`, or a
-            `focal_error` with a camera that has no distortion. Default False: a coefficient is fitted with the focal
-            length and kept only if it is significantly better; with a `rig` none is fitted.
         normals3d: (n, 3) outward unit normals. A point that faces away from the camera is not visible. None: all points
             are visible from all sides.
         labels2d: (m,) integers, such as colours, classes or identities; only points with equal labels match, and -1
@@ -104,9 +107,9 @@ def solve(
             module from `Batch` to `Prediction`, or a checkpoint of a BPnPNet or a Matcher or the name of packaged
             weights: the pose is then that of the module. With a Matcher and a problem that is not small, the search
             starts only from P3P poses of match triples sampled from the assignment.
-        prior: A `PosePrior`; a pose with an uncertainty of 10 degrees, as a `Solution`, (R, t), [R | t] of shape (3, 4)
-            or (4, 4), or a pycolmap.Rigid3d; a `GravityPrior`; or a BPnPNet or Matcher, its checkpoint, or "learned"
-            for the weights "procedural-so3", whose pose is tried first. None for no prior.
+        prior: A `PosePrior`; a pose with an uncertainty of 10 degrees, as a `Solution`, (R, t), OpenCV's (rvec, tvec),
+            [R | t] of shape (3, 4) or (4, 4), or a pycolmap.Rigid3d; a `GravityPrior`; or a BPnPNet or Matcher, its
+            checkpoint, or "learned" for the weights "procedural-so3", whose pose is tried first. None for no prior.
         inlier_threshold: Largest reprojection error of a match, in pixels with a camera, else in normalised image units
             (radians for bearings). Default: three times the scale of the residuals. Small problems, those whose matches
             are enumerated (m n at most 4,000, or 250,000 where a prior lets two matches fix a pose), also use it as
@@ -114,7 +117,7 @@ def solve(
             with one other.
         clutter: Expected fraction of the image points without a correspondence, 0 or more and below 1. None if it is
             unknown: several fractions are tried.
-        rig: Extrinsics cam_from_rig of each camera of a rig, as (R, t), (3, 4), (4, 4) or a pycolmap.Rigid3d.
+        rig: Extrinsics cam_from_rig of each camera of a rig, each a pose as for `prior`.
             `points2d`, `labels2d` and `scores2d` are then lists with one array per camera; `camera` is one for all or a
             list without None. The returned pose is rig_from_world, in the unit of the rig and of the scene, and a
             `prior` is one of this pose. `matches` index the 2D points of all cameras, concatenated. An unknown focal
@@ -165,10 +168,10 @@ def solve_many(
     points2d: ManyPoints,
     points3d: ManyPoints,
     camera: ManyCameras | None = None,
+    distortion: ArrayLike | bool | None = False,
     *,
     image_size: ImageSize | None = None,
     focal_error: float | int | None = None,
-    distortion: bool = False,
     normals3d: ManyArrays | None = None,
     labels2d: ManyArrays | None = None,
     labels3d: ManyArrays | None = None,
@@ -196,9 +199,9 @@ def solve_many(
         points2d: Sequence of k arrays (m_i, 2) or (m_i, 3), one per problem.
         points3d: Sequence of k arrays (n_i, 3), or one array for all problems.
         camera: One camera for all problems, or a list of k cameras. None for normalised coordinates and bearings.
+        distortion: OpenCV's coefficients of the one `camera`, or True to always fit a radial one; as for `solve`.
         image_size: (width, height) of the images, pixels, for all problems; as for `solve`.
         focal_error: Relative standard deviation of the focal length, for all problems; as for `solve`.
-        distortion: Always fit a radial distortion coefficient; as for `solve`.
         normals3d: Sequence of k arrays (n_i, 3), or one array for all problems.
         labels2d: Sequence of k arrays (m_i,) or (m_i, c), or one array for all problems.
         labels3d: Sequence of k arrays (n_i,) or (n_i, c), or one array for all problems.
@@ -231,6 +234,7 @@ def solve_many(
     [0.0, 1.0]
     """
     begun = Clock.now()
+    camera, fits_distortion = split_distortion(camera, distortion)
     images = each_set("points2d", points2d, None)
     count = len(images)
     seconds = seconds_from(time_limit, TIME_LIMIT_OF_MANY)
@@ -261,7 +265,7 @@ def solve_many(
             scale=scale,
             image_size=image_size,
             focal_error=focal_error,
-            distortion=distortion,
+            distortion=fits_distortion,
             solver=solver,
             device=device,
         )
@@ -291,8 +295,8 @@ def solve_many(
             )
         return replace(whole, is_shared=i in shared)
 
-    if distortion or image_size is not None or focal_error is not None:
-        unknown = [unknown_camera(one, image_size, focal_error, distortion) for one in cameras]
+    if fits_distortion or image_size is not None or focal_error is not None:
+        unknown = [unknown_camera(one, image_size, focal_error, fits_distortion) for one in cameras]
         for points in pixels if image_size is not None else ():
             check_inside(points, image_size)
         problems = {i: problem(i, one.reference, one.focal(one.reference)) for i, one in enumerate(unknown)}

@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from bpnp.argument_types import PoseObject, check_unmasked, short_repr
+from bpnp.argument_types import PoseObject, array_shape, check_unmasked, short_repr
 from bpnp.arrays import Array, Labels
-from bpnp.cameras import CENTRE, Camera, check_normalised, is_opencv, outside_image
+from bpnp.cameras import CENTRE, Camera, check_normalised, is_calibration_matrix, is_opencv, outside_image
 from bpnp.search.starts import GravityPrior, PosePrior
 
 ROTATION_ROUNDING = 1e-12  # largest error of R R^T of a rotation; others are made orthonormal [1; numerics, float64]
@@ -22,6 +22,7 @@ SURE_CLASS = 0.97  # probability of a class from which on points match only with
 PRIOR_DEG = 10.0  # default standard deviation of a given rotation about each axis [degrees; convention]
 LEAST_SIGMA_DEG = 1e-6  # least standard deviation of an angle of a prior [degrees; numerics, float64]
 ONE_PIXEL = 3.0  # largest coordinate that is refused as normalised if a camera in pixels is given [pixels; convention]
+VECTORS = ((3,), (3, 1), (1, 3))  # shapes of a vector; OpenCV's is a column
 WIDEST_ROW = 8  # largest number of columns of keypoints whose first two columns are positions [columns; convention]
 
 if TYPE_CHECKING:
@@ -114,14 +115,46 @@ def each_of(name: str, value: Any, count: int) -> list[Any]:
 def each_camera(value: Any, count: int) -> list[Any]:
     """Return the cameras of `count` problems, unchanged, from one camera or a list or stack of cameras.
 
-    A list of lists of numbers is one 3x3 matrix.
+    A list of lists of numbers is one 3x3 matrix, and a list of numbers one [fx, fy, cx, cy].
     """
-    if getattr(value, "ndim", 2) == 3:
-        value = list(value)
-    elif isinstance(value, list) and value and not isinstance(value[0], tuple):
-        rows = isinstance(value[0], str) or np.ndim(value[0]) == 1  # (model, parameters), or the rows of one matrix
-        value = tuple(value) if rows else value
-    return each_of("camera", value, count)
+    return each_of("camera", cameras_from(value, count), count)
+
+
+def cameras_from(value: Any, count: int) -> Any:
+    """Return a list for several cameras, and anything else for one.
+
+    Rows of four numbers are cameras (fx, fy, cx, cy) if there are `count` of them.
+    """
+    shape = array_shape(value)
+    if not isinstance(value, tuple) and (len(shape) == 3 or shape == (count, 4)):
+        return list(value)
+    if not isinstance(value, list) or not value:
+        return value
+    first, row = value[0], array_shape(value[0])
+    is_matrix = shape == (3, 3) or (len(row) == 1 and not isinstance(first, tuple))
+    is_matrix = is_matrix and (row != (4,) or len(value) != count)
+    is_parameters = isinstance(first, str) or (isinstance(first, SupportsFloat) and row == ())
+    is_one_of_opencv = count == 1 and len(value) == 2 and is_opencv(tuple(value))  # [K, distortion]
+    return tuple(value) if is_matrix or is_parameters or is_one_of_opencv else value
+
+
+def split_distortion(camera: Any, distortion: Any) -> tuple[Any, bool]:
+    """Return the camera, with OpenCV's coefficients if `distortion` holds them, and True if a coefficient is fitted."""
+    if distortion is None or isinstance(distortion, (bool, np.bool_)):
+        return camera, bool(distortion)
+    if array_shape(distortion) == () and not isinstance(distortion, (list, tuple)):
+        raise ValueError(
+            f"`distortion` is {short_repr(distortion)}; it is True, False, or OpenCV's coefficients k1, k2, p1, p2[, "
+            "k3[, k4, k5, k6]]"
+        )
+    coefficients = numbers("distortion", distortion)
+    if not is_calibration_matrix(camera):
+        shown = "missing" if camera is None else short_repr(camera)
+        raise ValueError(
+            f"the coefficients in `distortion` need a 3x3 matrix K as `camera`, which is {shown}; for several cameras "
+            "give each as (K, distortion)"
+        )
+    return (tuple(camera) if isinstance(camera, list) else camera, coefficients), False
 
 
 def each_prior(value: Any, count: int) -> list[Any]:
@@ -131,7 +164,7 @@ def each_prior(value: Any, count: int) -> list[Any]:
     """
     size = len(value) if isinstance(value, list) else 0
     is_matrix = size in (3, 4) and all(_are_numbers(row, 4) for row in value)
-    is_pose = size == 2 and _are_numbers(value[1], 3)
+    is_pose = size == 2 and array_shape(value[1]) in VECTORS
     return [value] * count if is_matrix or is_pose else each_of("prior", value, count)
 
 
@@ -176,8 +209,8 @@ def checked_seed(seed: Any) -> int:
 def pose_of(value: Any, name: str = "prior") -> tuple[Any, Any] | None:
     """Return rotation and translation of an object that holds a pose; None for anything else.
 
-    It may be (R, t); [R | t] of shape (3, 4) or (4, 4); an object with `rotation` and `translation`, such as a
-    `Solution`; or a pycolmap.Rigid3d. Messages use `name`.
+    It may be (R, t) or OpenCV's (rvec, tvec); [R | t] of shape (3, 4) or (4, 4); an object with `rotation` and
+    `translation`, such as a `Solution`; or a pycolmap.Rigid3d. Messages use `name`.
     """
     if callable(getattr(value, "matrix", None)):
         value = value.matrix()
@@ -185,8 +218,7 @@ def pose_of(value: Any, name: str = "prior") -> tuple[Any, Any] | None:
         return value.rotation, value.translation
     if isinstance(value, (tuple, list)) and len(value) == 2:
         return value[0], value[1]
-    shape = np.shape(value) if isinstance(value, (list, tuple)) else getattr(value, "shape", ())
-    if tuple(shape) not in ((3, 4), (4, 4)):
+    if array_shape(value) not in ((3, 4), (4, 4)):
         return None
     matrix = numbers(name, value)
     if len(matrix) == 4 and not np.array_equal(matrix[3], [0, 0, 0, 1]):
@@ -234,13 +266,38 @@ def _sigma(prior: PosePrior | GravityPrior, name: str) -> float:
 
 
 def checked_pose(prefix: str, rotation: Any, translation: Any) -> tuple[Array, Any]:
-    """Return an orthonormal rotation (3, 3) and a translation (3,) or None; messages name them with `prefix`."""
-    matrix = _finite(f"{prefix}rotation", rotation, (3, 3))
+    """Return an orthonormal rotation (3, 3) and a translation (3,) or None; messages name them with `prefix`.
+
+    The rotation is a matrix, a rotation vector, or an object of SciPy or pycolmap.
+    """
+    matrix = _rotation_matrix(f"{prefix}rotation", rotation)
     off = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
     if off > UNIT_TOLERANCE or np.linalg.det(matrix) < 0:
         raise ValueError(f"`{prefix}rotation` is no rotation matrix, R R^T = I and det R = 1: {matrix.tolist()}")
-    shift = None if translation is None else _finite(f"{prefix}translation", translation, (3,))
+    shift = None if translation is None else _vector(f"{prefix}translation", translation)
     return Rotation.from_matrix(matrix).as_matrix() if off > ROTATION_ROUNDING else matrix, shift
+
+
+def _rotation_matrix(name: str, value: Any) -> Array:
+    """Return the rotation as a matrix (3, 3), which may not be orthonormal."""
+    for method in ("as_matrix", "matrix"):  # SciPy's Rotation, pycolmap's Rotation3d
+        if callable(getattr(value, method, None)):
+            value = getattr(value, method)()
+    if array_shape(value) in VECTORS:
+        return Rotation.from_rotvec(_vector(name, value)).as_matrix()
+    matrix = numbers(name, value)
+    if matrix.shape == (4,):
+        raise ValueError(
+            f"`{name}` is {matrix.tolist()}; of a quaternion (x, y, z, w) give "
+            "scipy.spatial.transform.Rotation.from_quat(...)"
+        )
+    return _finite(name, matrix, (3, 3))
+
+
+def _vector(name: str, values: Any) -> Array:
+    """Return finite numbers (3,), also of OpenCV's column (3, 1)."""
+    array = numbers(name, values)
+    return _finite(name, array.ravel() if array.shape in VECTORS else array, (3,))
 
 
 def numbers(name: str, values: Any) -> Array:

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from bpnp.argument_types import short_repr
 from bpnp.arrays import Array
 from bpnp.bounded_files import parse_json, read_json
-from bpnp.cameras import Camera, CameraLike, camera_from, camera_to_json, check_single_camera
+from bpnp.cameras import Camera, CameraLike, camera_from, camera_to_json, check_single_camera, import_pycolmap
 from bpnp.search.measured import Unit
 from bpnp.search.verdict.decide import Verdict
 from bpnp.search.verdict.uncertainty import centre_covariance
@@ -148,6 +149,26 @@ class Solution:
         return -self.rotation.T @ self.translation / self.scale
 
     @property
+    def pose(self) -> Array:
+        """(4, 4) matrix that maps scene points (x, y, z, 1) to the camera, [scale R | t]; NaN without a pose."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = self.scale * self.rotation, self.translation
+        return pose
+
+    @property
+    def quaternion(self) -> Array:
+        """(4,) unit quaternion x, y, z, w of `rotation`, w >= 0, as in SciPy and pycolmap; NaN without a pose."""
+        if not self.found:
+            return np.full(4, math.nan)
+        return np.asarray(Rotation.from_matrix(self.rotation).as_quat(canonical=True))
+
+    @property
+    def cam_from_world(self) -> Any:
+        """The pose as a pycolmap.Rigid3d; None without a pose. With a `rig`, whose pose is `pose`, it is an error."""
+        check_single_camera(self.points_per_camera, "cam_from_world")
+        return import_pycolmap().Rigid3d(self.pose[:3]) if self.found else None
+
+    @property
     def rotation_std_deg(self) -> float:
         """Standard deviation of the rotation about its least certain axis, degrees."""
         return math.degrees(_largest(self.covariance[:3, :3]))
@@ -184,12 +205,12 @@ class Solution:
 
     @property
     def found(self) -> bool:
-        """True if there is a pose, which is a guess if the verdict is "failed". `bool(solution)` is the same."""
+        """True if there is a pose, which is a guess if the verdict is "failed"."""
         return bool(np.isfinite(self.rotation).all() and np.isfinite(self.translation).all())
 
     def __bool__(self) -> bool:
-        """Return `found`."""
-        return self.found
+        """Return False if the verdict is "failed"; a pose that is returned is then a guess."""
+        return self.verdict != "failed"
 
     def __repr__(self) -> str:
         from bpnp.report.terminal import format_fixed

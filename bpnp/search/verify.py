@@ -8,11 +8,20 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bpnp.argument_types import ArrayLike, PointsLike
+from bpnp.argument_types import ArrayLike, PointsLike, PoseLike
 from bpnp.arrays import Array, Labels
 from bpnp.cameras import CameraLike, camera_from
 from bpnp.runtime import NEVER, Deadline, default_float_errors
-from bpnp.search.arguments import checked_pose, checked_seed, numbers, positive, seconds_from
+from bpnp.search.arguments import (
+    cameras_from,
+    checked_pose,
+    checked_seed,
+    numbers,
+    pose_of,
+    positive,
+    seconds_from,
+    split_distortion,
+)
 from bpnp.search.assemble import OneCamera, Solved, assembled
 from bpnp.search.given_pose import given_pose
 from bpnp.search.hypotheses import Hypotheses
@@ -30,9 +39,10 @@ from bpnp.search.verdict.uncertainty import linearised, pose_covariance
 def verify(
     points2d: PointsLike,
     points3d: PointsLike,
-    rotation: ArrayLike,
-    translation: ArrayLike,
+    rotation: PoseLike | ArrayLike,
+    translation: ArrayLike | None = None,
     camera: CameraLike | None = None,
+    distortion: ArrayLike | None = None,
     *,
     normals3d: ArrayLike | None = None,
     labels2d: ArrayLike | None = None,
@@ -56,9 +66,12 @@ def verify(
     Args:
         points2d: (m, 2) pixels with a `camera`, else normalised image coordinates, or (m, 3) bearings; as for `solve`.
         points3d: (n, 3) scene points in any unit; as for `solve`.
-        rotation: (3, 3) rotation matrix of the pose, camera = R p + t.
-        translation: (3,) translation of the pose, in the unit of the scene.
+        rotation: (3, 3) rotation matrix or OpenCV's rotation vector of the pose, camera = R p + t. Or the whole pose,
+            without a `translation`: a `Solution`, (R, t), (rvec, tvec), [R | t] of shape (3, 4) or (4, 4), or a
+            pycolmap.Rigid3d.
+        translation: (3,) or (3, 1) translation of the pose, in the unit of the scene. None if `rotation` is a pose.
         camera: Camera of the pixels, as for `solve`; None for normalised coordinates and bearings.
+        distortion: OpenCV's coefficients of a `camera` that is K or [fx, fy, cx, cy]; None without.
         normals3d: (n, 3) outward unit normals; None if all points are visible from all sides.
         labels2d: (m,) integers or (m, c) class probabilities, as for `solve`.
         labels3d: (n,) integers or (n, c) class probabilities, as for `solve`.
@@ -87,8 +100,8 @@ def verify(
             significant, or if a competing pose is more likely by a factor of 1,000; `matches` may then be empty.
 
     Raises:
-        ValueError: The input is invalid, as for `solve`, `rotation` is not a rotation matrix, or `matches` are not
-            pairs of indices.
+        ValueError: The input is invalid, as for `solve`, `rotation` is not a rotation, there is no `translation`, or
+            `matches` are not pairs of indices.
 
     >>> import numpy as np
     >>> import bpnp
@@ -103,7 +116,10 @@ def verify(
     """
     limit = seconds_from(time_limit, TIME_LIMIT)
     threshold = positive("inlier_threshold", inlier_threshold, finite=True)
-    pose = checked_pose("", rotation, translation)
+    pose = checked_pose("", *_parts_of(rotation, translation))
+    camera, fits_distortion = split_distortion(cameras_from(camera, 1), distortion)
+    if fits_distortion:
+        raise ValueError("`distortion` is True, but `verify` fits none; give OpenCV's coefficients, or leave it out")
     problem = problem_from(
         points2d,
         points3d,
@@ -130,6 +146,21 @@ def verify(
         points3d=problem.all3d,
         normals3d=problem.normals3d,
     )
+
+
+def _parts_of(rotation: Any, translation: Any) -> tuple[Any, Any]:
+    """Return rotation and translation, which are given one by one or as a pose."""
+    pose = pose_of(rotation, "rotation")
+    if translation is None:
+        if pose is None or pose[1] is None:
+            raise ValueError(
+                "`translation` is missing; give rotation and translation, or one pose: a Solution, (R, t), [R | t] or "
+                "a pycolmap.Rigid3d"
+            )
+        return pose
+    if pose is not None:
+        raise ValueError("`rotation` is a whole pose; leave out `translation`, and give the camera as camera=...")
+    return rotation, translation
 
 
 def verify_problem(

@@ -192,7 +192,7 @@ CALLS: dict[str, Any] = {
         # A pose to verify.
         ("verify", {"rotation": 2 * np.eye(3)}, r"`rotation` is no rotation matrix, R R\^T = I and det R = 1"),
         ("verify", {"rotation": np.diag([1, 1, -1.0])}, "`rotation` is no rotation matrix"),
-        ("verify", {"rotation": np.eye(4)}, r"`rotation` is .*; finite numbers of shape \(3, 3\)"),
+        ("verify", {"rotation": np.eye(2)}, r"`rotation` is .*; finite numbers of shape \(3, 3\)"),
         ("verify", {"translation": [0, 0, np.nan]}, "`translation` is .*nan.*; finite numbers"),
         ("verify", {"matches": [[0, 0], [0, 1]]}, "2D point 0 is in 2 of the `matches`; a point has one at most"),
         (

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from bpnp.search.arguments import check_inside, checked_prior, each_camera, each_set, is_network, pixels_from
+from bpnp.search.arguments import cameras_from, check_inside, checked_prior, each_of, each_set, is_network, pixels_from
 from bpnp.search.assemble import Solved
 from bpnp.search.focal_length import unknown_camera
 from bpnp.search.rig.points import mount_from, prepare_rig
@@ -43,9 +43,10 @@ def prepare(
     mounts = [mount_from(f"rig[{k}]", mount) for k, mount in enumerate(chosen.rig)]
     _refuse(chosen, prior)
     count, images = len(mounts), each_set("points2d", points2d, None)
+    cameras = cameras_from(camera, count)
     for name, values in (
         ("points2d", images),
-        ("camera", camera),
+        ("camera", cameras),
         *((name, point_options[name]) for name in PER_CAMERA),
     ):
         if isinstance(values, list) and len(values) != count:
@@ -53,7 +54,7 @@ def prepare(
                 f"`{name}` has the length {len(values)}, but the `rig` has {count} cameras; give one per camera"
             )
     arrays = dict(point_options) | {name: each_set(name, point_options[name], count, 1) for name in PER_CAMERA}
-    cameras = each_camera(camera, count)
+    cameras = each_of("camera", cameras, count)
     lacking = [k for k, one in enumerate(cameras) if one is None]
     if 0 < len(lacking) < count:
         raise ValueError(
