@@ -109,8 +109,8 @@ def photo_task(
 def attempt(scene: SceneMap, task: PhotoTask) -> Solution | str:
     """Return the solution of a photo, or the error message."""
     try:
-        place = scene.without([task.name]) if task.made_with["leave_one_out"] else scene
-        return place.localize_photo(task.photo, **task.arguments)
+        searched = scene.without([task.name]) if task.made_with["leave_one_out"] else scene
+        return searched.localize_photo(task.photo, **task.arguments)
     except (ValueError, OSError) as error:
         return str(error)
 

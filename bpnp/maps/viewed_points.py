@@ -31,7 +31,10 @@ RankViews = Callable[[Array, Sequence[View]], ArrayLike]  # normalised keypoints
 
 
 class Place(NamedTuple):
-    """A view to search near, the indices (k,) of the points to use, and the camera model or its prior."""
+    """A view to search near, the indices (k,) of the points to use, and the camera model or its prior.
+
+    `ViewedPoints.region` makes the `Region` with the points themselves.
+    """
 
     view: View
     points: NDArray[np.integer]

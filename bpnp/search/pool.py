@@ -35,7 +35,7 @@ class Pool:
     def __init__(self, scene: SearchFrame, problem: Problem, enumerated: Case) -> None:
         # enumerated: case of the enumeration of few points, whose poses are the first candidates.
         self.scene, self.problem, self.enumerated = scene, problem, enumerated
-        self.iterations, self._judged_alarms = 0, 0.0
+        self.iterations, self._judged_log10 = 0, 0.0
         self._is_thinned = len(problem.bearings) > FINE_BEARINGS
         self._tests = PoseModel.of(problem).log10_tests([problem])
         self.symmetry = Symmetry(problem)  # motions of the scene that were registered with matched points
@@ -75,7 +75,7 @@ class Pool:
 
     def may_be_decided(self) -> bool:
         """Return True if the best pose may be confident, or match more points than before."""
-        bettered = self._is_thinned and self.log10_false_alarms < self._judged_alarms - LEAST_MARGIN
+        bettered = self._is_thinned and self.log10_false_alarms < self._judged_log10 - LEAST_MARGIN
         return bettered or self.missed <= MOST_MISSED
 
     def _with_false_alarms(self, candidates: Hypotheses, count: int | None = None) -> Hypotheses:
@@ -154,7 +154,7 @@ class Pool:
         one.
         """
         scene, problem = self.scene, self.problem
-        self._judged_alarms = min(self._judged_alarms, self.log10_false_alarms)
+        self._judged_log10 = min(self._judged_log10, self.log10_false_alarms)
         annealed = FINISHED_POSES if ended else 1
         ends = finish(scene, self.candidates, annealed) if len(self.candidates) else self.candidates
         if len(ends) and problem.prior is not None:  # keep the version of each pose with the smaller NFA

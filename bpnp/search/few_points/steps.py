@@ -42,7 +42,7 @@ class EnumeratedPoses:
         # found: poses of the current enumeration, likeliest first.
         self.found = self.candidates = Hypotheses.empty()
         # is_exhausted: the last enumeration tried every hypothesis.
-        # is_certain: the best pose passes the cheap tests of the verdict.
+        # is_certain: as `Case.is_certain`, for the best pose; `Case.is_settled` is about the search.
         self.is_certain = self.is_exhausted = False
         # Without viewing cones, which an enumeration ignores.
         has_cones = problem.cosines3d is not None
