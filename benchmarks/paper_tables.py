@@ -629,7 +629,11 @@ def effect_rows(effects: Mapping[str, Any]) -> dict[str, list[list[str]]]:
     for key in sorted(effects, key=lambda key: (*key.split("|")[:2], list(ESTIMATES).index(key.split("|")[-1]))):
         name, seed, group, first, second, estimate = key.split("|")
         before, after = effects[key]["steps"]
-        label = f"{second}{ESTIMATES[estimate]} ({after:,} steps) minus {first}{ESTIMATES[estimate]} ({before:,} steps)"
+        names = f"{second}{ESTIMATES[estimate]}", f"{first}{ESTIMATES[estimate]}"
+        if before == after:
+            label = f"{' minus '.join(names)}, {after:,} steps"
+        else:
+            label = f"{names[0]} ({after:,} steps) minus {names[1]} ({before:,} steps)"
         label += f", seed {seed}" if len(seeds) > 1 and group == "paper" else ""
         label += ", unequal training" if before != after else ""
         title = f"{name}-effect" if group == "paper" else f"{name}-{group}-effect"

@@ -357,7 +357,7 @@ def test_a_record_becomes_the_tables_of_the_page() -> None:
     assert row_of_effect in tables["modelnet10-effect"]
     row_of_effect = "| paper-lclp (400 steps) minus paper-lc (500 steps), unequal training |"
     assert row_of_effect in tables["modelnet10-training-effect"]
-    row_of_effect = f"| paper-lclp (500 steps) minus {paper_tables.LONGER} (500 steps) |"
+    row_of_effect = f"| paper-lclp minus {paper_tables.LONGER}, 500 steps |"
     assert row_of_effect in tables["modelnet10-training-effect"]
     assert tables["modelnet10-spread"] == "Measured with one seed.\n"
 
