@@ -52,27 +52,30 @@ def report(
     from bpnp.report.groups import differences, group_table, training_configs
     from bpnp.report.intervals import interval_table
     from bpnp.report.page import write_page
-    from bpnp.report.results import SUMMARY
+    from bpnp.report.results import SUMMARY, read_results
     from bpnp.report.tables import named_runs, read_runs, results_table
 
     for picture in (curves, recall):
         if picture is not None:
             check_picture_name(picture)
     check_outputs([html, recall, curves])
+    named = named_runs(runs)
+    results = {name: read_results(path) for name, path in named.items() if (path / SUMMARY).is_file()}
     if curves is not None:
-        from bpnp.report.training_curves import training_curves
+        from bpnp.report.training_curves import lines_of_training, training_curves
         from bpnp.report.training_run import training_folder
 
         folder = training_folder(runs[0])
         if folder is None:
             raise ValueError(f"{runs[0]} and the folder above it have no logs of a training; give the folder of a run")
-        say(f"wrote {save_figure(training_curves(folder), curves)}")
-    named = named_runs(runs)
-    if curves is not None and not (html or recall or any((path / SUMMARY).is_file() for path in named.values())):
+        figure = training_curves(folder, lines_of_training(folder, named, results))
+        say(f"wrote {save_figure(figure, curves)}")
+    if curves is not None and not (html or recall or results):
         say("the run has no test yet, so there are no tables")
         return
     paths = list(named.values())
-    results = read_runs(paths)
+    if len(results) < len(paths):
+        results = read_runs(paths)  # names the folder without results
     intervals = interval_table(results)
     grouped = group_table(results) if groups else None
     if html is not None:

@@ -1,5 +1,6 @@
 """`bpnp solve` and `bpnp verify`: the camera pose from a file of image points and a file of scene points."""
 
+import math
 import re
 import time
 from collections.abc import Mapping
@@ -284,6 +285,7 @@ def _print_solution(
 
 def solution_table(solution: "Solution", annotations: Mapping[str, Any] | None = None) -> Table:
     """Return a table of verdict, points with their annotations, pose, matches and next candidates."""
+    from bpnp.poses import rotation_angle
     from bpnp.report.terminal import VERDICTS
 
     table = Table(box=box.SIMPLE, show_header=False, padding=(0, 1))
@@ -312,7 +314,11 @@ def solution_table(solution: "Solution", annotations: Mapping[str, Any] | None =
             f"{solution.reprojection_error:.3g} {solution.unit} ({solution.reprojection_error_deg:.3g} deg), "
             f"inliers up to {solution.inlier_threshold:.3g} {solution.unit}",
         )
-        others = [f"{c.inlier_count} inliers, score {c.score:.3f}" for c in solution.candidates[1:4]]
+        others = [
+            f"{math.degrees(rotation_angle(solution.rotation, other.rotation)):.3g} deg away: "
+            f"{other.inlier_count} inliers, log10 NFA {other.log10_false_alarms:.1f}"
+            for other in solution.candidates[1:4]
+        ]
         table.add_row("next candidates", "; ".join(others) or "none")
     if solution.stats.dropped2d:
         table.add_row("left out", f"{solution.stats.dropped2d} 2D points that could not be undistorted")

@@ -193,6 +193,9 @@ def plot_scene(axes: Any, problem: ProblemPoints) -> Any:
     axes.set_aspect("equal")
     axes.view_init(elev=25, azim=-60)
     axes.tick_params(labelsize=7)
+    axes.set_xlabel("right, scene units", fontsize=8)
+    axes.set_ylabel("forward", fontsize=8)
+    axes.set_zlabel("up", fontsize=8)
     for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
         axis.get_major_locator().set_params(nbins=4)
     axes.legend(loc="upper left", fontsize=8)

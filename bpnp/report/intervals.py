@@ -142,6 +142,7 @@ class IntervalTable:
     columns: tuple[Column, ...]  # with the keys of `summarise`
     # Rows of all problems, or of each group of problems, by the title of the group.
     groups: Mapping[str, Sequence[IntervalRow]]
+    note: str = ""  # runs without differences, and why
 
     def cells(self, row: IntervalRow) -> list[str]:
         """Return the texts of a row: the number and, below it, its interval."""
@@ -157,7 +158,9 @@ class IntervalTable:
             head = [(Text(name, "bold"), [Text("")] * len(self.columns))] if name else []
             shown = [(Text(row.label, "" if row.minus is None else "dim"), row) for row in rows]
             groups.append([*head, *((label, list(map(Text, self.cells(row)))) for label, row in shown)])
-        return SplitTable(self.title, [column.header for column in self.columns], groups, CAPTION)
+        return SplitTable(
+            self.title, [column.header for column in self.columns], groups, f"{CAPTION} {self.note}".strip()
+        )
 
     def frame(self) -> "DataFrame":
         """Return the numbers, fractions from 0 to 1.
@@ -185,7 +188,15 @@ class IntervalTable:
 def interval_table(runs: Mapping[str, Results]) -> IntervalTable:
     """Return medians, recall and seconds of each estimate, with intervals, and the differences to `baseline_of`."""
     title = "Medians and recall with 95 % intervals"
-    return IntervalTable(title, interval_columns(runs), {"": interval_rows(runs, runs)})
+    return IntervalTable(title, interval_columns(runs), {"": interval_rows(runs, runs)}, unpaired_note(runs))
+
+
+def unpaired_note(runs: Mapping[str, Results]) -> str:
+    """Return a sentence on the runs that have no differences, since the first run has other problems; or no text."""
+    first, *others = runs
+    problems = tested_problems(runs[first])
+    names = [name for name in others if tested_problems(runs[name]) != problems]
+    return f"No differences for {', '.join(names)}: {first} was tested on other problems." if names else ""
 
 
 def interval_columns(runs: Mapping[str, Results]) -> tuple[Column, ...]:

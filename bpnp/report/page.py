@@ -10,6 +10,7 @@ import gzip
 import io
 import json
 import math
+import re
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from functools import cache
 from importlib.resources import files
@@ -54,7 +55,7 @@ from bpnp.report.tables import (
 )
 from bpnp.report.templates import render_page
 from bpnp.report.terminal import DASHES, INKS, Paper
-from bpnp.report.training_curves import training_curves
+from bpnp.report.training_curves import lines_of_training, training_curves
 from bpnp.report.training_run import training_of
 
 FACTS = ("written", "bpnp_version", "correspondence_loss", "settings")  # facts of a run that the page shows
@@ -184,10 +185,18 @@ def training_pictures(folders: Mapping[str, Path], runs: Mapping[str, Results]) 
             tests.setdefault(run, []).append(name)
     pictures = {}
     for run, names in tests.items():
-        drawing = io.BytesIO()
-        training_curves(run).savefig(drawing, format="svg", metadata={"Date": None})
-        pictures[", ".join(names)] = base64.b64encode(drawing.getvalue()).decode()
+        drawing = io.StringIO()
+        figure = training_curves(run, lines_of_training(run, folders, runs))
+        figure.savefig(drawing, format="svg", metadata={"Date": None}, transparent=True)
+        pictures[", ".join(names)] = base64.b64encode(in_both_schemes(drawing.getvalue()).encode()).decode()
     return pictures
+
+
+def in_both_schemes(svg: str) -> str:
+    """Return a picture whose colours of `INKS` follow the scheme of the page."""
+    dark = dict(INKS.values())
+    themed = re.sub("|".join(dark), lambda ink: f"light-dark({ink[0]}, {dark[ink[0]]})", svg)
+    return themed.replace("<svg ", '<svg style="color-scheme: light dark" ', 1)
 
 
 def quartile_rows(runs: Mapping[str, Results], paper: Paper | None) -> list[TableRow]:

@@ -1,13 +1,16 @@
 """Curves of a training: losses and validation errors over the steps, with the switch of the pose loss."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bpnp.report.figures import line_style, shown_text
-from bpnp.report.terminal import QUIET
-from bpnp.report.training_run import METRICS, training_logs
+from bpnp.report.results import Results
+from bpnp.report.tables import Line, lines_of
+from bpnp.report.terminal import INKS, QUIET
+from bpnp.report.training_run import METRICS, training_logs, training_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -23,6 +26,9 @@ LOSSES = {
 }
 SWITCH = "train/pose_loss"
 SMOOTH = 0.05  # fraction of the steps in a moving average
+ESTIMATES = ("ransac", "pnp", "refined")  # order in which networks return them, that of their colours without a test
+INK = INKS["text"][0]
+INKED = ("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color")  # options of matplotlib
 
 
 def read_curves(run: Path | str) -> "DataFrame":
@@ -54,21 +60,37 @@ def switch_step(curves: "DataFrame") -> int | None:
     return int(posed.min()) if len(posed) and posed.min() > trained.min() else None
 
 
-def training_curves(run: Path | str) -> "Figure":
+def lines_of_training(run: Path, folders: Mapping[str, Path], runs: Mapping[str, Results]) -> list[Line]:
+    """Return the estimates of the first test of a training, with the colours that they have in the tables."""
+    tests = [name for name, folder in folders.items() if name in runs and training_of(folder, runs[name]) == run]
+    return [line for line in lines_of(runs) if line.run in tests[:1]]
+
+
+def training_curves(run: Path | str, lines: Sequence[Line] = ()) -> "Figure":
     """Draw the losses of a training and the median errors of its validation.
 
-    A line marks the switch of the pose loss. Raise ValueError as `read_curves` does.
+    A line marks the switch of the pose loss. Estimates have the colours of `lines`, those of a test of the network.
+    Raise ValueError as `read_curves` does.
     """
+    from matplotlib import rc_context
+
+    with rc_context(dict.fromkeys(INKED, INK)):
+        return _draw_curves(read_curves(run), lines)
+
+
+def _draw_curves(curves: "DataFrame", lines: Sequence[Line]) -> "Figure":
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, NullFormatter
 
-    curves, figure = read_curves(run), Figure(figsize=(11, 3.4), layout="constrained")
+    figure = Figure(figsize=(11, 3.6), layout="constrained")
     losses, rotation, translation = figure.subplots(1, 3)
+    styles = {line.estimate: line_style(line.colour, line.dashes) for line in lines}
     for i, (key, label) in enumerate(LOSSES.items()):
-        _draw(losses, curves, key, label, i, smooth=key.startswith("train/"))
+        _draw(losses, curves, key, label, smooth=key.startswith("train/"), **line_style(i, i))
     for i, estimate in enumerate(_estimates(curves)):
+        style = styles.get(estimate, line_style(len(styles) + i, len(styles) + i))
         for axes, error in ((rotation, "rotation_q2_deg"), (translation, "translation_q2")):
-            _draw(axes, curves, f"val/{estimate}/{error}", shown_text(estimate), i, marker="o", ms=3)
+            _draw(axes, curves, f"val/{estimate}/{error}", shown_text(estimate), marker="o", ms=3, **style)
     losses.set(ylabel="loss")
     rotation.set(ylabel="median rotation error, degrees", yscale="log")
     translation.set(ylabel="median translation error", yscale="log")
@@ -83,7 +105,7 @@ def training_curves(run: Path | str) -> "Figure":
         if switch is not None:
             axes.axvline(switch, color=QUIET, lw=1, ls=":", label="pose loss joins")
         if axes.get_legend_handles_labels()[0]:
-            axes.legend(fontsize=8, frameon=False)
+            axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, fontsize=8, frameon=False)
     return figure
 
 
@@ -93,17 +115,17 @@ def _plain(value: float, _: int) -> str:
 
 
 def _estimates(curves: "DataFrame") -> list[str]:
+    """Return the estimates of the validation, those of `ESTIMATES` first; the log has them in alphabetical order."""
     parts = [str(name).split("/") for name in curves.columns]
-    return [part[1] for part in parts if len(part) == 3 and part[0] == "val" and part[2] == "rotation_q2_deg"]
+    found = [part[1] for part in parts if len(part) == 3 and part[0] == "val" and part[2] == "rotation_q2_deg"]
+    return [*(name for name in ESTIMATES if name in found), *(name for name in found if name not in ESTIMATES)]
 
 
-def _draw(
-    axes: Any, curves: "DataFrame", key: str, label: str, index: int, *, smooth: bool = False, **style: Any
-) -> None:
+def _draw(axes: Any, curves: "DataFrame", key: str, label: str, *, smooth: bool = False, **style: Any) -> None:
     if key not in curves or not curves[key].notna().any():
         return
     finite = curves[curves[key].notna() & np.isfinite(curves[key])]
     values = finite[key]
     if smooth:
         values = values.rolling(max(1, int(SMOOTH * len(values))), min_periods=1).mean()
-    axes.plot(finite["step"], values, label=label, **line_style(index, index), **style)
+    axes.plot(finite["step"], values, label=label, **style)

@@ -1,5 +1,6 @@
 """`bpnp solve` on planted problems: files in, JSON, table and picture out; a mistake is one line."""
 
+import io
 import json
 import math
 import shutil
@@ -223,3 +224,16 @@ def test_two_outputs_in_one_file_are_refused(
     same = str(tmp_path / "a.png")
     message = fails("solve", *write(tmp_path), "--output", same, "--picture", str(tmp_path / "." / "a.png"))
     assert f"{same} is the file of two outputs; name another file for one of them" in message
+
+
+def test_the_next_candidate_has_its_angle_and_its_false_alarms() -> None:
+    """Two equal halves: turned by 180 degrees, the object looks the same."""
+    half = np.random.default_rng(1).normal(size=(8, 3))
+    scene = np.concatenate([half, half * [-1, -1, 1]])
+    seen = scene @ PLANTED.rotation[0].numpy().T + [0, 0, 6]
+    solution = bpnp.solve(seen[:, :2] / seen[:, 2:], scene, solver="search")
+    text = io.StringIO()
+    Console(file=text, width=120).print(solution_table(solution))
+    other = solution.candidates[1]
+    line = f"180 deg away: 16 inliers, log10 NFA {other.log10_false_alarms:.1f}"
+    assert line in text.getvalue()

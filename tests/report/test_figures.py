@@ -88,6 +88,13 @@ def test_the_eighth_camera_of_a_scene_is_not_the_true_one() -> None:
     assert apart.min() >= 27
 
 
+def test_each_axis_of_a_drawn_problem_has_a_label() -> None:
+    scene, image = plot_problem(drawn_problem(3, "labels")).axes
+    labels = (scene.get_xlabel(), scene.get_ylabel(), scene.get_zlabel())  # type: ignore[attr-defined]
+    assert labels == ("right, scene units", "forward", "up")
+    assert (image.get_xlabel(), image.get_ylabel()) == ("normalised coordinates", "normalised coordinates")
+
+
 def test_the_true_pose_reprojects_each_point_onto_its_match() -> None:
     planted = drawn_problem(3, "<b>$x_1$</b>")
     figure = plot_problem(planted)

@@ -216,6 +216,18 @@ def test_reprojection_errors_of_different_problems_are_not_paired() -> None:
     assert cells["none: pnp", "all: pnp"][0] == "0\n0 to 0"
 
 
+def test_runs_on_other_problems_are_named() -> None:
+    """They have no rows "minus": what is missing is said below the table."""
+    own, other = results(rows_of({"pnp": 0.0})), results(rows_of({"pnp": 0.0})[:-1])
+    table = interval_table({"a": own, "b": other, "c": own})
+    assert [row.label for row in table.groups[""]] == ["a: pnp", "b: pnp", "c: pnp", "minus a: pnp"]
+    assert table.note == "No differences for b: a was tested on other problems."
+    text = io.StringIO()
+    Console(file=text, width=80).print(table.split_table())
+    assert table.note in " ".join(text.getvalue().split())
+    assert interval_table({"a": own, "c": own}).note == interval_table({"b": other}).note == ""
+
+
 def test_the_terminal_shows_each_interval_below_its_number_within_80_columns() -> None:
     estimates = {"ransac": 3.0, "pnp": 0.0}
     runs = {"Lc": results(rows_of(estimates)), "test": results(rows_of(estimates, rotation=-1))}

@@ -1,5 +1,7 @@
 """Training curves from logs whose values are known: the switch, a run that was resumed, what is drawn."""
 
+import base64
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,9 @@ from report_data import rows
 from bpnp.cli import main
 from bpnp.report import write_results
 from bpnp.report.page import page_html
-from bpnp.report.training_curves import read_curves, switch_step, training_curves
+from bpnp.report.tables import lines_of, named_runs, read_runs
+from bpnp.report.terminal import DARK, INKS, LIGHT
+from bpnp.report.training_curves import lines_of_training, read_curves, switch_step, training_curves
 from bpnp.report.training_run import training_folder
 
 HEAD = "epoch,step,train/loss,train/correspondence_loss,train/rotation_loss,train/translation_loss,train/pose_loss"
@@ -62,6 +66,52 @@ def test_the_figure_shows_the_losses_the_validation_and_the_switch(run: Path) ->
     assert losses.lines[-1].get_xdata() == [80, 80]
     assert rotation.lines[0].get_ydata().tolist() == [100 / step for step in range(10, 101, 10)]
     assert translation.lines[0].get_ydata().tolist() == [1 / step for step in range(10, 101, 10)]
+
+
+def log_of_two(run: Path) -> None:
+    """Log in which the PnP layer stands before RANSAC, in alphabetical order as Lightning writes it."""
+    names = [f"val/{name}/{error}" for name in ("pnp", "ransac") for error in ("rotation_q2_deg", "translation_q2")]
+    lines = [f"step,train/loss,{','.join(names)}", *(f"{step},0.5,9,0.9,1,0.1" for step in (1, 2, 3))]
+    (run / "logs" / "version_0").mkdir(parents=True)
+    (run / "logs" / "version_0" / "metrics.csv").write_text("\n".join(lines))
+
+
+def test_an_estimate_has_one_colour_in_the_training_and_in_the_tables(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        log_of_two(tmp_path / name)
+        write_results(tmp_path / name / "test", rows(12, seed=1))
+    folders, runs = named_runs([tmp_path / "a", tmp_path / "b"]), read_runs([tmp_path / "a", tmp_path / "b"])
+    colours = {(line.run, line.estimate): LIGHT[line.colour] for line in lines_of(runs)}
+    for name in ("a", "b"):
+        lines = lines_of_training((tmp_path / name).absolute(), folders, runs)
+        for axes in training_curves(tmp_path / name, lines).axes[1:]:
+            drawn = {(name, str(line.get_label())): line.get_color() for line in axes.lines}
+            assert drawn == {(name, estimate): colours[name, estimate] for estimate in ("ransac", "pnp")}
+    alone = training_curves(tmp_path / "a").axes[1]
+    assert {str(line.get_label()): line.get_color() for line in alone.lines} == dict(
+        zip(("ransac", "pnp"), LIGHT, strict=False)
+    )
+
+
+def test_the_legends_of_the_training_are_above_its_curves(run: Path) -> None:
+    figure = training_curves(run)
+    figure.draw_without_rendering()
+    for axes in figure.axes:
+        legend = axes.get_legend()
+        assert legend is not None
+        assert legend.get_window_extent().y0 >= axes.get_window_extent().y1
+
+
+def test_the_picture_of_the_training_has_the_colours_of_both_schemes(run: Path) -> None:
+    """Each colour of the light scheme is followed by that of the dark one, and nothing is white."""
+    write_results(run / "test", rows(12, seed=1))
+    (encoded,) = re.findall(r'src="data:image/svg\+xml;base64,([^"]+)"', page_html([run]))
+    svg = base64.b64decode(encoded).decode()
+    pairs = set(re.findall(r"light-dark\((#\w+), (#\w+)\)", svg))
+    assert {(LIGHT[0], DARK[0]), INKS["text"], INKS["quiet"]} <= pairs <= set(INKS.values())
+    rest = re.sub(r"light-dark\([^)]*\)", "", svg)
+    assert not [ink for ink in ("#ffffff", "#000000", *LIGHT) if ink in rest]
+    assert 'style="color-scheme: light dark"' in svg
 
 
 @pytest.mark.slow
