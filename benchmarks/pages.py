@@ -4,7 +4,7 @@
     python -m benchmarks pages --check    # exit with status 1 if a page has another table
 
 A table stands between `<!-- BENCHMARK: TABLE -->` and `<!-- end of BENCHMARK -->`. The benchmark has `FILE`, its record
-in JSON, and `tables`, which makes the tables of a record. A link to `BENCHMARK.csv` or `BENCHMARK-PART.csv` is a file
+in JSON, and `tables`, which makes the tables of a record. A link to <BENCHMARK>.csv or <BENCHMARK-PART>.csv is a file
 beside the page, which its `sheets` makes. Each benchmark ends with `publish`.
 """
 
