@@ -220,7 +220,7 @@ ROWS = (
         for line in RELIABILITY for name in line.rows
     ),
     *(
-        Row("assignments", f"{name}, `{estimate}`", partial(estimates, build, estimate, {"root": "psb"}), (12, 2),
+        Row("assignments", f"{name}, `{estimate}`", partial(estimates, build, estimate, {"root": "psb"}), (100, 2),
             *PAPER, "psb")
         for name, build in (("Sinkhorn", sinkhorn), ("Hungarian", hungarian)) for estimate in ("ransac", "pnp")
     ),

@@ -78,7 +78,7 @@ def prepare_authors(source: Path, *, output: Path = Path("data/authors"), datase
     """Pack the pickles that the authors of BPnPNet published.
 
     Args:
-        source: folder with <dataset>_train and <dataset>_test.
+        source: folder with <dataset>_train and <dataset>_test, or those of Liu et al. (2020), _train and _valid.
         output: new folder.
         dataset: name of the data set if there are several, such as data61_2d3d.
     """

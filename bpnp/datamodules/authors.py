@@ -3,8 +3,13 @@
 The files are ``<dataset>_{train,test}/preprocessed/{p2d,p3d,R_gt,t_gt,W_gt,num_points_2d,num_points_3d}.pkl``, each a
 dict or a list indexed by sample; or the form before that, ``<dataset>_{train,test}[/<scene>]/{matches,R,t}.pkl``, where
 a row of `matches` (k, 5) is a 2D point and its 3D point. Points are normalised, camera = R p + t.
+
+In the form of Liu et al. (2020), ``<dataset>_{train,valid}/``, these rows are not matched: a row of `inlier_matches`
+(i, 2) is the index of a 3D point and that of its 2D point, and `focal` has the focal lengths. A file
+``<dataset>_split_SIFT.pkl`` beside these folders names the scenes of each split, and others are left out.
 """
 
+import logging
 import math
 import pickle
 from collections.abc import Mapping, Sequence
@@ -24,8 +29,12 @@ from bpnp.poses import MIN_POINTS
 
 PREPROCESSED = ("p2d", "p3d", "R_gt", "t_gt", "W_gt", "num_points_2d", "num_points_3d")
 MATCHES = ("matches", "R", "t")
+MATCHES_OF_LIU = (*MATCHES, "inlier_matches", "focal")
+SPLITS = {"train": ("train",), "test": ("test", "valid")}  # names of the folders of each split
+SPLIT_KEYS = {"train": "train", "test": "val"}  # in <dataset>_split_SIFT.pkl
 FOCAL = {"modelnet40": 800.0}  # pixels; unknown for the other data sets
 PROBED = 50  # number of samples that decide which side indexes W_gt
+logger = logging.getLogger(__name__)
 AGREEMENT = 0.1  # largest median distance of a projected 3D point to its 2D point, normalised
 
 
@@ -35,8 +44,8 @@ class AuthorsDataModule(StoredDataModule):
     Works without a Trainer: `setup()`, then the loaders.
 
     Args:
-        root: Folder that `bpnp prepare authors` made, or the authors' folder that holds <dataset>_{train,test}, which
-            is converted once into cache_dir.
+        root: Folder that `bpnp prepare authors` made, or the authors' folder that holds <dataset>_{train,test} (those
+            of Liu et al. 2020: _{train,valid}), which is converted once into cache_dir.
         dataset: "modelnet40", "megadepth" or "data61_2d3d"; None if the folder holds only one data set.
         val_fraction: Fraction of the training problems held out for validation, at random.
         cache_dir: Folder for the converted files; None for BPNP_CACHE, else the user's cache folder.
@@ -109,7 +118,8 @@ def _find_parts(root: Path, dataset: str | None) -> tuple[str, list[tuple[str, l
     """Return the name of the data set below `root`, and the scenes with their pickles."""
     if not root.is_dir():
         raise ValueError(f"{root} is no folder; give one that holds <dataset>_train and <dataset>_test")
-    names = sorted({path.name.rpartition("_")[0] for split in ("train", "test") for path in root.glob(f"*_{split}")})
+    endings = [ending for endings in SPLITS.values() for ending in endings]
+    names = sorted({path.name.rpartition("_")[0] for ending in endings for path in root.glob(f"*_{ending}/")})
     if dataset is None and len(names) > 1:
         raise ValueError(
             f"{root} holds several data sets: {', '.join(names)}; choose one, such as --dataset {names[0]}"
@@ -120,20 +130,49 @@ def _find_parts(root: Path, dataset: str | None) -> tuple[str, list[tuple[str, l
             f"{root} has no {dataset or '<dataset>'}_train and _test; its data sets: {', '.join(names) or 'none'}"
         )
     parts = []
-    for split in ("train", "test"):
-        top = root / f"{chosen}_{split}"
-        if (top / "preprocessed").is_dir():
-            parts.append((split, [top / "preprocessed" / f"{name}.pkl" for name in PREPROCESSED]))
-            continue
-        for first in sorted([*top.glob("matches.pkl"), *top.glob("*/matches.pkl")]):
-            scene = "/".join((split, *first.parent.relative_to(top).parts))
-            parts.append((scene, [first.with_name(f"{name}.pkl") for name in MATCHES]))
+    for split, endings in SPLITS.items():
+        tops = [top for ending in endings if (top := root / f"{chosen}_{ending}").is_dir()]
+        if len(tops) > 1:
+            raise ValueError(f"{tops[0]} and {tops[1]} both have test problems; move one of them elsewhere")
+        for top in tops:
+            parts += (
+                [(split, [top / "preprocessed" / f"{name}.pkl" for name in PREPROCESSED])]
+                if (top / "preprocessed").is_dir()
+                else _scenes(split, top, _listed_scenes(root, chosen, split))
+            )
     if not parts:
         raise ValueError(f"{root / chosen}_train and _test have neither preprocessed/*.pkl nor matches.pkl")
     missing = [str(file) for _, files in parts for file in files if not file.is_file()]
     if missing:
         raise ValueError(f"pickles of {chosen} are missing: {', '.join(missing[:4])}; download the data set again")
     return chosen, parts
+
+
+def _scenes(split: str, top: Path, listed: set[str] | None) -> list[tuple[str, list[Path]]]:
+    """Return the scenes of a split's folder with their pickles; with a list, only those that it names."""
+    found = {first.parent.relative_to(top): first for first in [*top.glob("matches.pkl"), *top.glob("*/matches.pkl")]}
+    if listed is not None:
+        if absent := listed - {folder.name for folder in found}:
+            logger.warning("%d of the %s scenes that the split lists have no pickles in %s", len(absent), split, top)
+        found = {folder: first for folder, first in found.items() if folder.name in listed}
+    parts = []
+    for folder, first in sorted(found.items()):
+        names = MATCHES_OF_LIU if first.with_name("inlier_matches.pkl").is_file() else MATCHES
+        parts.append(("/".join((split, *folder.parts)), [first.with_name(f"{name}.pkl") for name in names]))
+    return parts
+
+
+def _listed_scenes(root: Path, dataset: str, split: str) -> set[str] | None:
+    """Return the scenes of a split by the file of the data set, whose names end in .pkl; None without this file."""
+    file = root / f"{dataset}_split_SIFT.pkl"
+    if not file.is_file():
+        return None
+    content = load_pickle(file)
+    key = SPLIT_KEYS[split]
+    names = content.get(key, content.get(key.encode())) if isinstance(content, dict) else None  # bytes of Python 2
+    if not isinstance(names, (list, tuple, np.ndarray)):
+        raise PickleError(f"{file} has no list of names under {key!r}")
+    return {Path(name.decode() if isinstance(name, bytes) else str(name)).stem for name in names}
 
 
 def _convert(scene: str, files: Sequence[Path], focal: float) -> JobResult:
@@ -201,6 +240,10 @@ def _problem(name: str, sample: Mapping[str, Any], *, by_2d: bool, focal: float)
     if "matches" in sample:
         matches = _numbers(sample["matches"], "matches", 5)
         points2d, points3d, match3d = matches[:, :2], matches[:, 2:], np.arange(len(matches))
+        if "inlier_matches" in sample:
+            match3d = _match3d_of_pairs(sample["inlier_matches"], len(matches))
+        if "focal" in sample:
+            focal = float(np.asarray(sample["focal"], np.float64).reshape(-1)[0])
         rotation, translation = sample["R"], sample["t"]
     else:
         m, n = (int(np.asarray(sample[f"num_points_{d}d"]).reshape(-1)[0]) for d in (2, 3))
@@ -242,6 +285,19 @@ def _match3d(value: Any, m: int, n: int, *, by_2d: bool) -> NDArray[np.int64]:
         return index
     match3d = np.full(n, -1)
     match3d[index[index >= 0]] = np.flatnonzero(index >= 0)
+    return match3d
+
+
+def _match3d_of_pairs(value: Any, size: int) -> NDArray[np.int64]:
+    """Return the 2D point of each 3D point, -1 for none, from rows of a 3D and a 2D index."""
+    pairs = np.asarray(value)
+    whole = pairs.ndim == 2 and pairs.shape[1] == 2 and np.issubdtype(pairs.dtype, np.number)
+    if not whole or not ((pairs >= 0) & (pairs < size) & (pairs % 1 == 0)).all():
+        raise ValueError(
+            f"inlier_matches of shape {pairs.shape} is unusable; rows of two indices below {size} are needed"
+        )
+    match3d = np.full(size, -1)
+    match3d[pairs[:, 0].astype(np.int64)] = pairs[:, 1].astype(np.int64)
     return match3d
 
 

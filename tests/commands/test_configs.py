@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 import yaml
+from authors_pickles import sample, write
 from planted_model import plant_model
 from small_data import SMALL_NET, write_mesh_tree
 from torch import Tensor, nn
@@ -33,6 +34,9 @@ def data_for(recipe: str, folder: Path) -> list[str]:
         for i in range(5):
             plant_model(folder / "scenes" / f"scene{i}" / "sparse" / "0", seed=i)
         return [*small, f"--data.root={folder / 'scenes'}"]
+    if recipe == "data61":
+        return [*small, f"--data.root={write(folder / 'authors', [sample(i) for i in range(6)], 'data61_2d3d')}",
+                f"--data.cache_dir={folder}", "--data.val_fraction=0.3"]  # fmt: skip
     if recipe.startswith("synthetic_maps"):
         few = {"num_points": 30, "train_problems": 4, "val_problems": 2, "test_problems": 2}
         return [*small, *(f"--data.{name}={count}" for name, count in few.items())]

@@ -70,6 +70,76 @@ def test_pickles_before_preprocessing_become_a_store_by_scene(tmp_path: Path) ->
     check(store, samples)
 
 
+def write_pairs(folder: Path, samples: list[Sample], outliers: int = 0) -> None:
+    """Write samples as Liu et al. do: the rows of `matches` are not matched, those of `inlier_matches` are (3D, 2D)."""
+    folder.mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    columns: dict[str, list[object]] = {name: [] for name in ("matches", "inlier_matches", "focal", "R", "t")}
+    for s in samples:
+        count = s["num_points_2d"][0]
+        points2d = np.vstack([s["p2d"][:count], rng.normal(size=(outliers, 2))])
+        points3d = np.vstack([s["p3d"][:count], rng.normal(size=(outliers, 3))])
+        columns["matches"].append(np.hstack([points2d, points3d]))
+        columns["inlier_matches"].append(np.column_stack([np.arange(count), s["W_gt"][:count]]))
+        columns["focal"].append(np.array([612.5]))
+        columns["R"].append(s["R_gt"])
+        columns["t"].append(s["t_gt"])
+    for name, values in columns.items():
+        (folder / f"{name}.pkl").write_bytes(pickle.dumps(values, 2))
+
+
+def test_the_folders_of_liu_et_al_are_train_and_test(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The planted matches come back, two points of each side stay without one, and the focal length is theirs."""
+    samples = [sample(i) for i in range(6)]
+    for split in ("train", "valid"):
+        write_pairs(tmp_path / "data" / f"nyu_{split}", samples, outliers=2)
+    main(["prepare", "authors", str(tmp_path / "data"), "--output", str(tmp_path / "store")])
+    assert "6 train, 6 test" in capsys.readouterr().out
+    store = open_store(tmp_path / "store", PROBLEMS)
+    for i in range(12):
+        problem, count = stored_problem(store, i), samples[i % 6]["num_points_2d"][0]
+        assert (problem.matched, len(problem.points2d), len(problem.points3d)) == (count, count + 2, count + 2)
+        projected = seen(problem.points3d, problem.rotation, problem.translation)
+        assert problem.points2d[:count] == pytest.approx(projected[:count], abs=1e-5)
+        assert problem.focal == 612.5
+
+
+def test_two_folders_of_test_problems_are_refused(tmp_path: Path) -> None:
+    for split in ("train", "valid", "test"):
+        write_pairs(tmp_path / f"nyu_{split}", [sample(0)])
+    with pytest.raises(ValueError, match="nyu_test and .*nyu_valid both have test problems"):
+        authors_recipe(tmp_path, None)
+
+
+def test_pairs_beyond_the_points_are_left_out(tmp_path: Path) -> None:
+    write_pairs(tmp_path / "nyu_train", [sample(i) for i in range(5)])
+    file = tmp_path / "nyu_train" / "inlier_matches.pkl"
+    pairs = pickle.loads(file.read_bytes())
+    pairs[1][0, 1] = 1000
+    pairs[2] = pairs[2][:, 0]
+    file.write_bytes(pickle.dumps(pairs))
+    store = prepare_authors(tmp_path, tmp_path / "store")
+    assert (len(store), len(store.skipped)) == (3, 2)
+    assert "inlier_matches of shape" in next(iter(store.skipped.values()))
+
+
+@pytest.mark.parametrize("protocol", [0, 2])
+def test_only_the_scenes_of_the_split_file_are_taken(
+    protocol: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for split in ("train", "test"):
+        for scene in ("0001", "0002", "0003"):
+            write_pairs(tmp_path / f"megadepth_{split}" / scene, [sample(int(scene))])
+    listed = {"train": ["0001.pkl", "0003.pkl"], "val": ["0002.pkl", "0099.pkl"]}
+    (tmp_path / "megadepth_split_SIFT.pkl").write_bytes(pickle.dumps(listed, protocol))
+    store = prepare_authors(tmp_path, tmp_path / "store")
+    assert tuple(scene_rows(store)) == ("train/0001", "train/0003", "test/0002")
+    assert "1 of the test scenes that the split lists have no pickles" in caplog.text
+    (tmp_path / "megadepth_split_SIFT.pkl").write_bytes(pickle.dumps({"train": []}))
+    with pytest.raises(PickleError, match="has no list of names under 'val'"):
+        authors_recipe(tmp_path, None)
+
+
 BAD = {
     "rotation": {"R_gt": np.ones((3, 3))},
     "reflection": {"R_gt": -np.eye(3)},
