@@ -157,9 +157,9 @@ LATEX_COLUMNS = {
     (r"Recall (\%)", r"$10^\circ\!, 1$"): RECALLS[1],
 }
 
-# Campbell, Liu, Gould, ECCV 2020, tables 1 and 2. Recalls are from the text, where that of Lc is 25 below that of Lc Lp.
-# R: the RANSAC estimate. SoftPOSIT, RANSAC and GOSMA were stopped after 30 s; SoftPOSIT started from the mean pose
-# (table 1) or near the true one (table 2).
+# Campbell, Liu, Gould, ECCV 2020, tables 1 and 2. Recalls are from the text; that of Lc is 25 below that of Lc Lp. R:
+# the RANSAC estimate. SoftPOSIT, RANSAC and GOSMA were stopped after 30 s; SoftPOSIT started from the mean pose (table
+# 1) or near the true one (table 2).
 # Each line is a row: label | nine quartiles, seconds and, for some, the recall in %. Other data, another machine.
 PRINTED: Mapping[Paper, tuple[str, Column, str]] = {
     "modelnet40": ("ModelNet40", RECALLS[0], """
