@@ -28,7 +28,6 @@ SWITCH = "train/pose_loss"
 SMOOTH = 0.05  # fraction of the steps in a moving average
 ESTIMATES = ("ransac", "pnp", "refined")  # order in which networks return them, that of their colours without a test
 INK = INKS["text"][0]
-INKED = ("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color")  # options of matplotlib
 
 
 def read_curves(run: Path | str) -> "DataFrame":
@@ -74,7 +73,9 @@ def training_curves(run: Path | str, lines: Sequence[Line] = ()) -> "Figure":
     """
     from matplotlib import rc_context
 
-    with rc_context(dict.fromkeys(INKED, INK)):
+    with rc_context(
+        {"text.color": INK, "axes.edgecolor": INK, "axes.labelcolor": INK, "xtick.color": INK, "ytick.color": INK}
+    ):
         return _draw_curves(read_curves(run), lines)
 
 
