@@ -10,6 +10,8 @@ from bpnp.arrays import Floats
 
 AT_ONCE = 16  # poses compared with all others in one matrix product
 MIN_POINTS = 4  # matches that fix a pose; three fit up to four poses exactly
+UPRIGHT_DEG = 30.0  # largest angle between the upward directions of upright photos [degrees; not tuned]
+LEAST_UPRIGHT = 0.5  # smallest fraction of the photos that agree on the direction up [fraction; not tuned]
 
 
 def rotation_angle(one: Floats, other: Floats) -> float:
@@ -90,3 +92,18 @@ def distinct(
                 kept.append(i)
                 free &= ~same
     return np.array(kept, dtype=np.int64)
+
+
+def common_up(rotations: Floats) -> Floats | None:
+    """Return the direction up (3,) of a map, a unit vector, on which most photos with rotations (v, 3, 3) agree.
+
+    The y axis of an upright photo points down. Photos stored on their side are outvoted. None if too few agree.
+    """
+    ups = -rotations[:, 1]
+    cosines = ups @ ups[:: -(-len(ups) // 200)].T  # compared with at most 200 photos
+    agree = cosines > math.cos(math.radians(UPRIGHT_DEG))
+    best = agree[:, int(agree.sum(0).argmax())]
+    if best.mean() < LEAST_UPRIGHT:
+        return None
+    mean = ups[best].mean(0)
+    return np.asarray(mean / np.linalg.norm(mean))

@@ -12,26 +12,10 @@ from numpy.typing import NDArray
 
 from bpnp.arrays import Array
 from bpnp.maps.views import View
+from bpnp.poses import common_up
 
-UPRIGHT_DEG = 30.0  # largest angle between the upward directions of upright views [degrees; not tuned]
-LEAST_UPRIGHT = 0.5  # smallest fraction of the views that agree on the direction up [fraction; not tuned]
 # A steeper view has no upright side.
 LEAST_IN_PLANE = 0.5  # least length of the direction up in the image plane [1; not tuned]
-
-
-def up_of_views(views: Sequence[View]) -> Array | None:
-    """Return the direction up (3,) in the map, a unit vector, on which most views agree; None if too few agree.
-
-    The y axis of an upright photo points down. Photos stored on their side are outvoted.
-    """
-    ups = -np.array([view.rotation[1] for view in views])
-    cosines = ups @ ups[:: -(-len(ups) // 200)].T  # compared with at most 200 views
-    agree = cosines > np.cos(np.radians(UPRIGHT_DEG))
-    best = agree[:, int(agree.sum(0).argmax())]
-    if best.mean() < LEAST_UPRIGHT:
-        return None
-    mean = ups[best].mean(0)
-    return np.asarray(mean / np.linalg.norm(mean))
 
 
 def count_quarter_turns(views: Sequence[View], up_camera: Array) -> NDArray[np.int64]:
@@ -40,7 +24,7 @@ def count_quarter_turns(views: Sequence[View], up_camera: Array) -> NDArray[np.i
     Turns are about the optical axis, from x towards y; `up_camera` (3,) is the direction up in the photo's camera
     frame. It is 0 for views that point steeply up or down, and for all views if the direction up in the map is unknown.
     """
-    up = up_of_views(views)
+    up = common_up(np.array([view.rotation for view in views]))
     if up is None or np.hypot(*up_camera[:2]) < LEAST_IN_PLANE * np.linalg.norm(up_camera):
         return np.zeros(len(views), np.int64)
     ups = np.array([view.rotation @ up for view in views])

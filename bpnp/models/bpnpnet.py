@@ -4,6 +4,7 @@ Source: Campbell, Liu, Gould, "Solving the Blind Perspective-n-Point Problem End
 Geometric Optimization", ECCV 2020. The names and shapes of the 185 tensors are those of its public code.
 """
 
+import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,12 +15,24 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from bpnp.checks import check_within
 from bpnp.layers.assignment import Sinkhorn
 from bpnp.layers.implicit import first_derivative
 from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac.layer import Backend, RansacPnP
 from bpnp.models.nets import ImageFeatures, SceneFeatures
-from bpnp.models.pose_stages import StageClock, match_again, pnp_pose, ransac_pose, round_widths
+from bpnp.models.pose_stages import (
+    Axis,
+    InitialMatch,
+    StageClock,
+    choose_tensors,
+    match_again,
+    pnp_pose,
+    pose_support,
+    ransac_pose,
+    round_widths,
+    turn_scene,
+)
 from bpnp.models.refinement import Refinement
 from bpnp.models.weights import AnyModule, TrainedNet, module_or_default
 from bpnp.precision import full_precision
@@ -71,6 +84,10 @@ class BPnPNet(TrainedNet):
             of RANSAC (`bpnp.models.pose_stages.match_again`). Default 0. A round adds the squared residuals, in units
             of a width, to the cost; the width decreases from round to round, to `ransac.threshold` in the last one.
             Rounds need a `ransac` with that attribute and a `transport` whose attribute `entropy` is the weight mu.
+        headings: Number of headings in evaluation. With k, the scene is rotated about `vertical` by 0, 1, ..., k - 1
+            times 360 / k degrees, and the network and `ransac` run for each; the assignment whose RANSAC pose explains
+            the largest probability is kept. Poses are in the coordinates of the scene. Default 1.
+        vertical: Axis of the scene that is vertical, for `headings`: "x", "y" or "z". Default "y".
 
     >>> import torch
     >>> from bpnp import Batch, BPnPNet
@@ -91,6 +108,8 @@ class BPnPNet(TrainedNet):
         *,
         refinement: Refinement | None = None,
         rounds: int = 0,
+        headings: int = 1,
+        vertical: Axis = "y",
     ) -> None:
         super().__init__()
         self.features2d = module_or_default(features2d, ImageFeatures)
@@ -101,6 +120,8 @@ class BPnPNet(TrainedNet):
         self.refinement = Refinement() if refinement is None else refinement
         self.rounds = rounds
         self.widths = round_widths(rounds, self.ransac)
+        check_within(1, math.inf, headings=headings)
+        self.headings, self.vertical = headings, vertical
 
     def forward(self, batch: Batch) -> Prediction:
         """Return the assignment and the poses "ransac" and "pnp".
@@ -114,17 +135,38 @@ class BPnPNet(TrainedNet):
             Prediction with the assignment P (b, m, n), its stats and the poses.
         """
         clock = StageClock()
-        cost = self.cost(batch)
-        assignment, stats = self.transport(cost, batch.mask2d, batch.mask3d)
-        ransac = ransac_pose(self.ransac, assignment, batch)
+        initial = self._initial_match(batch)
         clock.record("ransac")
-        pnp = pnp_pose(self.pnp, assignment, batch, ransac)
-        prediction = Prediction(assignment, stats, {"ransac": ransac, "pnp": pnp})
+        pnp = pnp_pose(self.pnp, initial.assignment, batch, initial.pose)
+        prediction = Prediction(initial.assignment, initial.stats, {"ransac": initial.pose, "pnp": pnp})
         if self.training:
             return prediction
-        again = match_again(prediction, cost, batch, transport=self.transport, pnp=self.pnp, widths=self.widths)
+        again = match_again(prediction, initial.cost, batch, transport=self.transport, pnp=self.pnp, widths=self.widths)
         clock.record("pnp")
         return clock.add_times(self.refinement(again, batch))
+
+    def _initial_match(self, batch: Batch) -> InitialMatch:
+        """Match the points and run RANSAC; in evaluation, for each heading, and keep the best."""
+        features2d, features3d = self.features(batch)
+        best = self._match_features(features2d, features3d, batch)
+        if self.training or self.headings == 1:
+            return best
+        support = pose_support(best.assignment, batch, best.pose)
+        for i in range(1, self.headings):
+            turned = turn_scene(batch, self.vertical, 2 * math.pi * i / self.headings)
+            features3d = self.features3d(turned.points3d.to(features2d), batch.mask3d)
+            found = self._match_features(features2d, features3d, batch)
+            better = (found_support := pose_support(found.assignment, batch, found.pose)) > support
+            best, support = choose_tensors(better, found, best), torch.maximum(support, found_support)
+        return best
+
+    def _match_features(
+        self, features2d: Float[Tensor, "b m c"], features3d: Float[Tensor, "b n c"], batch: Batch
+    ) -> InitialMatch:
+        """Match the points by their features, and run RANSAC in the coordinates of the scene."""
+        cost = pairwise_distance(features2d, features3d)
+        assignment, stats = self.transport(cost, batch.mask2d, batch.mask3d)
+        return InitialMatch(cost, assignment, stats, ransac_pose(self.ransac, assignment, batch))
 
     def match(self, batch: Batch) -> Prediction:
         """Return the assignment without poses, which is all that training without the pose loss needs.

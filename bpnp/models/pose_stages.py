@@ -7,20 +7,37 @@ R p_j + t, and s the standard deviation of the residuals in radians. d_ij is -lo
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal, TypeVar
 
 import numpy as np
+import roma
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from bpnp.checks import check_within
-from bpnp.geometry import bearings, chords
-from bpnp.types import Batch, Pose, Prediction
+from bpnp.geometry import bearings, choose, chords
+from bpnp.types import Batch, Pose, Prediction, SolveStats, Tensors
 
 FIRST_WIDTH = 5.0  # s of the first round, relative to the last
 FEATURE_WEIGHT = 0.03  # weight of the feature distances in a round; the pose separates matches better than features
 FARTHEST = 12.0  # largest d, nats: that of points five widths apart
+# Residual of a match that supports the RANSAC pose of a heading: the default threshold of RANSAC.
+SUPPORT_WIDTH = 0.01  # [radians; not tuned]
+
+_T = TypeVar("_T", SolveStats, Pose, "InitialMatch")
+Axis = Literal["x", "y", "z"]
+
+
+@dataclass(frozen=True)
+class InitialMatch(Tensors):
+    """Cost and assignment of a network, and the RANSAC pose."""
+
+    cost: Float[Tensor, "b m n"]
+    assignment: Float[Tensor, "b m n"]
+    stats: SolveStats  # of the transport
+    pose: Pose
 
 
 class StageClock:
@@ -55,6 +72,32 @@ def pnp_pose(pnp: nn.Module, assignment: Float[Tensor, "b m n"], batch: Batch, s
     """
     rays = bearings(batch.points2d)
     return Pose(*pnp(assignment, rays, batch.points3d, start.rotation, start.translation))
+
+
+def turn_scene(batch: Batch, vertical: Axis, angle: float) -> Batch:
+    """Rotate the points of each scene by an angle, radians, about a vertical through their mean; nothing else."""
+    mask = batch.mask3d.unsqueeze(-1)
+    points3d = torch.where(mask, batch.points3d, 0)
+    mean = points3d.sum(1, keepdim=True) / mask.sum(1, keepdim=True)
+    axis = torch.zeros(3, dtype=torch.float64)
+    axis["xyz".index(vertical)] = angle
+    rotation = roma.rotvec_to_rotmat(axis).to(mean)
+    return replace(batch, points3d=torch.where(mask, (points3d - mean) @ rotation.mT + mean, 0))
+
+
+def pose_support(assignment: Float[Tensor, "b m n"], batch: Batch, pose: Pose) -> Float[Tensor, " b"]:
+    """Return the sum of P over matches with a residual below `SUPPORT_WIDTH`; 0 without a pose."""
+    rotation, translation = pose.rotation, pose.translation
+    residual = chords(bearings(batch.points2d).to(rotation), batch.points3d.to(rotation), rotation, translation)
+    return torch.where(residual < SUPPORT_WIDTH, assignment.detach(), 0).sum((-2, -1))
+
+
+def choose_tensors(chosen: Bool[Tensor, " b"], first: _T, second: _T) -> _T:
+    """Choose each tensor of `first` for the samples of the mask, else that of `second`, recursively."""
+    parts: list[Any] = []
+    for one, other in ((getattr(first, field.name), getattr(second, field.name)) for field in fields(first)):
+        parts.append((choose if isinstance(one, Tensor) else choose_tensors)(chosen, one, other))
+    return type(first)(*parts)
 
 
 def residual_energy(

@@ -29,8 +29,8 @@ LEARNED = "procedural-so3"  # weights of `solve(prior="learned")`
 PLAIN = (bool, int, float, str, type(None))
 PACKED = ("solver", "epoch", "global_step", "pytorch-lightning_version")  # the last three for `bpnp test --ckpt_path`
 PREFIX = "solver."  # prefix of the weights of BlindPnPTask's solver
-# Settings that do not change the assignment, so that a run may override those of its checkpoint.
-ADJUSTABLE = {"ransac", "pnp", "refinement", "rounds", "tolerance", "max_iterations"}
+# Settings of the inference, so that a run may override those of its checkpoint.
+ADJUSTABLE = {"ransac", "pnp", "refinement", "rounds", "headings", "vertical", "tolerance", "max_iterations"}
 
 Net = TypeVar("Net", bound="TrainedNet")
 

@@ -1,5 +1,6 @@
 """The problems of COLMAP images: exact geometry, clutter that is none, and digits far from the origin."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 import torch
 from planted import seen
 from planted_model import plant_model
+from scipy.spatial.transform import Rotation
 
 from bpnp.datamodules.augment import Augmentation, augment
 from bpnp.datamodules.colmap.module import ColmapSource
@@ -95,3 +97,38 @@ def test_images_with_too_few_points_are_skipped_and_counted(tmp_path: Path) -> N
         ColmapSource(scenes, min_points=7)
     with pytest.raises(ValueError, match="`clutter` is -0.1; it must be 0 or more"):
         ColmapSource(scenes, clutter=-0.1)
+
+
+def test_y_down_turns_a_scene_by_its_other_photos_alone(tmp_path: Path) -> None:
+    """The map is turned; the tested photo, which is on its side, does not change the direction."""
+    plant_model(tmp_path / "m")
+    scene = read_reconstruction(tmp_path / "m", name="castle")
+    turn = Rotation.from_euler("zx", [70, 20], degrees=True).as_matrix()
+    upright = [Rotation.from_euler("yx", [90 * k, 5], degrees=True).as_matrix() for k in range(3)]
+    images = [replace(image, rotation=one @ turn) for image, one in zip(scene.images, upright, strict=True)]
+    on_its_side = replace(
+        images[0], rotation=Rotation.from_euler("z", 90, degrees=True).as_matrix() @ images[0].rotation
+    )
+    found = []
+    for first in (images[0], on_its_side):
+        turned = replace(scene, points3d=scene.points3d @ turn, images=(first, *images[1:]))
+        problem = ColmapSource([turned], y_down=True).problem(0)
+        plain = ColmapSource([turned]).problem(0)
+        in_camera = [p.points3d @ p.rotation.T + p.translation for p in (problem, plain)]
+        np.testing.assert_allclose(*in_camera, atol=1e-5)
+        found.append(problem.points3d)
+    np.testing.assert_allclose(*found, atol=1e-6)
+    vertical = ColmapSource([turned], y_down=True).problem(0).rotation @ [0, 1, 0]
+    down = on_its_side.rotation @ turn.T @ [0, 1, 0]
+    assert np.degrees(np.arccos(vertical @ down)) < 5
+
+
+def test_y_down_leaves_a_map_without_a_common_direction(tmp_path: Path) -> None:
+    plant_model(tmp_path / "m")
+    scene = read_reconstruction(tmp_path / "m", name="castle")
+    images = (*scene.images, scene.images[0])
+    rolled = [Rotation.from_euler("z", 90 * k, degrees=True).as_matrix() for k in range(4)]
+    mixed = replace(scene, images=tuple(replace(i, rotation=r) for i, r in zip(images, rolled, strict=True)))
+    np.testing.assert_array_equal(ColmapSource([mixed], y_down=True).problem(0).rotation, rolled[0])
+    alone = replace(scene, images=scene.images[:1])
+    np.testing.assert_array_equal(ColmapSource([alone], y_down=True).problem(0).rotation, scene.images[0].rotation)

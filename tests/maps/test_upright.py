@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from bpnp import SceneMap
 from bpnp.cameras import camera_from
 from bpnp.maps.photos import UP_OF_ORIENTATION, up_from_exif
-from bpnp.maps.upright import count_quarter_turns, rotate_view, up_of_views
+from bpnp.maps.upright import count_quarter_turns, rotate_view
 from bpnp.maps.views import View
+from bpnp.poses import common_up
 
 TURNED = camera_from(("PINHOLE", HEIGHT, WIDTH, [520.0, 520.0, HEIGHT / 2, WIDTH / 2]))  # of a photo on its side
 
@@ -69,7 +70,7 @@ def test_up_is_what_most_views_agree_on() -> None:
     """One of five views is stored on its side, and is the only one to be turned for an upright photo."""
     scene, _ = street(5)
     views = [*scene.views[:4], rotate_view(scene.views[4], 1)]
-    up = up_of_views(views)
+    up = common_up(np.array([view.rotation for view in views]))
     assert up is not None
     np.testing.assert_allclose(up, [0, -1, 0], atol=0.2)
     assert count_quarter_turns(views, np.array(UP_OF_ORIENTATION[1])).tolist() == [0, 0, 0, 0, 3]
@@ -84,7 +85,7 @@ def test_up_is_what_most_views_agree_on() -> None:
 def test_views_without_a_common_up_direction_are_not_rotated() -> None:
     scene, _ = street(4)
     views = [rotate_view(view, k) for k, view in enumerate(scene.views)]
-    assert up_of_views(views) is None
+    assert common_up(np.array([view.rotation for view in views])) is None
     assert not count_quarter_turns(views, np.array([1.0, 0, 0])).any()
 
 

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bpnp.cameras import camera_to_json
@@ -20,6 +22,7 @@ from bpnp.datamodules.problem import Counts, Problem, ProblemSource, stack_probl
 from bpnp.datamodules.store import JobResult, Recipe, StoreError, StoreRow, is_store
 from bpnp.datamodules.stored import PROBLEMS, WIDTHS, StoredDataModule, has_enough_matches, problem_row
 from bpnp.files import file_states, fingerprint
+from bpnp.poses import common_up
 from bpnp.types import Batch
 
 FAR = 100.0  # distance from the origin, in extents of the points, beyond which float32 resolves only 1e-5 of an extent
@@ -36,13 +39,16 @@ class ColmapDataModule(StoredDataModule):
         root: Folder that `bpnp prepare megadepth` made; or a folder of scenes, <scene>/sparse/0 or
             <scene>/sparse/manhattan/0 with cameras, images and points3D (.bin or .txt) in it; or one scene, one model,
             or a list of any of these.
+        y_down: Rotate the scene of each photo so that its second axis points down, as most of the map's other photos
+            see it. Poses are those in the rotated scene. Default False. Not for a folder of `bpnp prepare`.
         **options: Options of `StoredDataModule`: train_scenes, val_scenes, test_scenes, val_fraction, test_fraction,
             min_points, max_points, fresh_subsets, eval_max_points, clutter, clutter_side and rotate, and those of
             `ProblemDataModule`.
     """
 
-    def __init__(self, root: str | list[str], **options: Any) -> None:
+    def __init__(self, root: str | list[str], *, y_down: bool = False, **options: Any) -> None:
         super().__init__(root, **options)  # type: ignore[arg-type]
+        self.y_down = y_down
         self.models: dict[str, Reconstruction] = {}  # models read so far, by name
 
     def _open(self) -> dict[str, Any]:
@@ -53,9 +59,12 @@ class ColmapDataModule(StoredDataModule):
 
     def _problems(self, scenes: Sequence[Any], seed: tuple[int, int]) -> ProblemSource:
         if self._is_store():
+            if self.y_down:
+                raise ValueError("`y_down` needs the photos of the models; give the folder of the COLMAP models")
             return super()._problems(scenes, seed)
         folders = {name: folder for models in scenes for name, folder in models.items()}
-        return ColmapSource(self._read(folders), min_points=self.min_points, clutter=self.clutter, seed=seed)
+        models = self._read(folders)
+        return ColmapSource(models, min_points=self.min_points, clutter=self.clutter, y_down=self.y_down, seed=seed)
 
     def _read(self, folders: Mapping[str, Path]) -> list[Reconstruction]:
         readable, failures = [], []
@@ -92,6 +101,7 @@ class ColmapSource:
         *,
         min_points: int = 4,
         clutter: float = 0.0,
+        y_down: bool = False,
         seed: Sequence[int] = (0,),
     ) -> None:
         check_clutter(clutter)
@@ -99,7 +109,7 @@ class ColmapSource:
         names = ", ".join(scene.name for scene in reconstructions)
         matched = np.array([len(image.seen) for _, image in images])
         self.images = [images[i] for i in has_enough_matches(matched, min_points, names)]
-        self.clutter, self.seed = clutter, tuple(seed)
+        self.clutter, self.y_down, self.seed = clutter, y_down, tuple(seed)
         self.origins = [_origin(scene.points3d[image.seen]) for scene, image in self.images]
         if moved := sum(bool(origin.any()) for origin in self.origins):
             logger.warning(
@@ -130,12 +140,13 @@ class ColmapSource:
         unseen = np.delete(np.arange(len(scene.points3d)), image.observed) if free3d else image.seen[:0]
         chosen = np.concatenate([image.seen, rng.choice(unseen, free3d, replace=False)])
         origin = self.origins[index]
+        turn = _turn_y_down(scene, image) if self.y_down else np.eye(3)
         return Problem(
             name=f"{scene.name}/{image.name}",
             points2d=np.concatenate([image.points2d, clutter2d]),
-            points3d=(scene.points3d[chosen] - origin).astype(np.float32),
+            points3d=((scene.points3d[chosen] - origin) @ turn.T).astype(np.float32),
             matched=len(image.seen),
-            rotation=image.rotation,
+            rotation=image.rotation @ turn.T,
             translation=image.translation + image.rotation @ origin,
             focal=image.camera.focal,
             origin=origin,
@@ -153,6 +164,22 @@ def _origin(points3d: NDArray[np.float64]) -> NDArray[np.float64]:
     median = np.median(points3d, axis=0)
     extent = np.median(np.linalg.norm(points3d - median, axis=-1))
     return median if np.linalg.norm(median) > FAR * extent else np.zeros(3)
+
+
+def _turn_y_down(scene: Reconstruction, photo: ImagePoints) -> NDArray[np.float64]:
+    """Return the smallest rotation (3, 3) that turns the direction down of the map's other photos to the second axis.
+
+    Identity if they have no common direction.
+    """
+    others = [image.rotation for image in scene.images if image is not photo]
+    up = common_up(np.array(others)) if others else None
+    if up is None:
+        return np.eye(3)
+    axis = np.cross(up, [0.0, -1.0, 0.0])
+    sine, cosine = float(np.linalg.norm(axis)), float(-up[1])
+    if sine == 0:  # a half turn about the first axis, or none
+        return np.diag([1.0, np.copysign(1, cosine), np.copysign(1, cosine)])
+    return Rotation.from_rotvec(math.atan2(sine, cosine) / sine * axis).as_matrix()
 
 
 def colmap_recipe(source: Path, *, min_points: int, clutter: float) -> Recipe:
