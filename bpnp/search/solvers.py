@@ -1,4 +1,7 @@
-"""Options for all problems of a call, and their solutions: each by the search, or by a trained module."""
+"""Options for all problems of a call, and their solutions: each by the search, or by a trained module.
+
+Minimal solvers such as P3P are in `bpnp.search.propose.minimal_solvers`.
+"""
 
 import math
 import sys
