@@ -14,12 +14,9 @@ SAVED_EVERY = 20.0  # seconds between checkpoints, which a run that is killed lo
 
 
 class Clock(Callback):
-    """Mean seconds of a step, without the saves.
+    """Mean seconds of a step, without the saves; the training ends `seconds` after its first step.
 
-    Args:
-        seconds: From the first step on until the training ends.
-        file: JSON file for the steps and their seconds.
-        save: Save last.ckpt in the run's folder.
+    The steps and their seconds are written to the JSON `file`; with `save`, last.ckpt is saved in the run's folder.
     """
 
     def __init__(self, seconds: float, file: str, *, save: bool = True) -> None:
