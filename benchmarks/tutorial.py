@@ -31,6 +31,7 @@ END = "## Change something"
 BEFORE, AFTER, COMPARED = "runs/quickstart/Lc", "runs/quickstart/LcLp", "runs/table"
 DRAWN = ("curves.png", "recall.png")
 RECALL = (15.0, 0.5)  # degrees, scene units
+WIDTH = "88"  # of the terminal: at 80 the width of the seconds decides whether a label of the table is broken
 
 
 def commands(page: str) -> list[str]:
@@ -49,7 +50,7 @@ def run_commands(lines: list[str], folder: Path) -> dict[str, str]:
     same = next((i for i, line in enumerate(lines) if i >= len(known) or known[i] != line), len(lines))
     printed = {line: printed[line] for line in lines[:same]}
     measured = before["measured"] if printed else measured_today()
-    environment = os.environ | {"COLUMNS": "80", "OMP_NUM_THREADS": "1", "PYTHONUTF8": "1"}
+    environment = os.environ | {"COLUMNS": WIDTH, "OMP_NUM_THREADS": "1", "PYTHONUTF8": "1"}
     for line in lines[same:]:
         print(line, flush=True)
         words = [sys.executable, "-m", *shlex.split(line)]

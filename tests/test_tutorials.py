@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import tutorial
 import yaml
 from small_data import SMALL_FEATURES
 
@@ -66,7 +67,7 @@ def test_a_tutorial_runs_and_prints_what_it_shows(
     monkeypatch.chdir(tmp_path)
     if name == "hloc":  # skipped without the photos, which are not part of this project
         (tmp_path / "sacre_coeur").symlink_to(request.getfixturevalue("shared_data") / "photos" / "sacre_coeur")
-    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("COLUMNS", tutorial.WIDTH if name == "train" else "80")
     (tmp_path / "short.yaml").write_text(yaml.safe_dump(SHORT))
     names: dict[str, Any] = {"__name__": "tutorial"}
     blocks = BLOCK.findall((ROOT / "docs" / "tutorials" / f"{name}.md").read_text(encoding="utf-8"))
