@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
 
 from bpnp.arrays import Array
 from bpnp.search.kernels.neighbours import sums_near
@@ -63,3 +64,29 @@ def _weights(together: NDArray[np.int64], expected: Array, crowded_sigmas: float
     steps = np.triu(1 / np.maximum(together[:, :, None], crowded[:, None, :]))
     steps[:, :, 1:] -= steps[:, :, :-1]
     return np.asarray(steps)
+
+
+class Outline:
+    """Convex hull of projected directions (n, 3) on the tangent plane of an image; empty if they are on a line.
+
+    Directions behind the camera, and NaN, are left out.
+    """
+
+    def __init__(self, image: ImageStatistics, directions: Array) -> None:
+        self._image, self._sides, self.area = image, np.empty((0, 3)), 0.0
+        try:
+            hull = ConvexHull(self._on_plane(directions[directions @ image.centre > 0]))
+        except (QhullError, ValueError):  # collinear or too few points
+            return
+        self._sides, self.area = hull.equations, float(hull.volume)  # area: on the plane, about steradians
+
+    def contains(self, directions: Array) -> NDArray[np.bool_]:
+        """Return which directions (..., 3) project into the outline."""
+        sides, in_front = self._sides, directions @ self._image.centre > 0  # those behind project to the other side
+        if not len(sides):
+            return np.zeros(in_front.shape, np.bool_)
+        within = self._on_plane(directions) @ sides[:, :2].T + sides[:, 2] <= 0
+        return np.asarray(within.all(-1) & in_front)
+
+    def _on_plane(self, directions: Array) -> Array:
+        return np.asarray(directions @ self._image.axes / (directions @ self._image.centre)[..., None])

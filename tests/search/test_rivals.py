@@ -187,3 +187,67 @@ def test_one_point_far_away_changes_nothing(far: float) -> None:
     for solution in (solve(image, points, K), verify(image, points, rotation, AWAY, K)):
         assert solution.verdict == "confident"
         assert degrees_between(solution.rotation, rotation) < 1
+
+
+def cells(rng: np.random.Generator) -> Array:
+    """Corners of the black cells of a marker of 7 x 7 cells with a random content, and those of its frame."""
+    black = np.pad(rng.random((7, 7)) < 0.5, 1)
+    touched = black[1:, 1:] + black[1:, :-1] + 0 + black[:-1, 1:] + black[:-1, :-1]
+    whole = touched & ~(black[1:, 1:] & black[1:, :-1] & black[:-1, 1:] & black[:-1, :-1])
+    corners = np.argwhere(whole)
+    frame = np.array([(-1, -1), (-1, 8), (8, -1), (8, 8)])
+    return np.pad(np.concatenate([corners, frame]).astype(np.float64), ((0, 0), (0, 1)))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_marker_with_another_content_is_no_confident_pose(seed: int) -> None:
+    """The marker of the scene is confident, also where a tenth of its corners are not in the scene."""
+    rng = np.random.default_rng(seed)
+    marker, other = cells(rng), cells(rng)
+    rotation = Rotation.from_euler("xyz", [170, rng.uniform(-25, 25), rng.uniform(0, 360)], degrees=True).as_matrix()
+    away = np.array([0, 0, 20.0]) - rotation @ [3.5, 3.5, 0]
+    shown, another = (rng.permutation(pixels(each, rotation, away, rng)) for each in (marker, other))
+    assert solve(another, marker, K).verdict != "confident"
+    for scene in (marker, marker[rng.permutation(len(marker))[: -len(marker) // 10]]):
+        solution = solve(shown, scene, K)
+        assert solution.verdict == "confident"
+        assert degrees_between(solution.rotation, rotation) < 2
+
+
+def test_a_lattice_with_another_content_is_the_reason() -> None:
+    codes = set()
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        marker, other = cells(rng), cells(rng)
+        codes.add(solve(pixels(other, np.diag([1.0, -1, -1]), AWAY * 2, rng), marker, K).reason_code)
+    assert "other_content" in codes
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_points_of_an_ellipse_do_not_slide_along_it(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(0, 2 * np.pi, 16)
+    points = np.stack([np.cos(angle), 0.6 * np.sin(angle), np.zeros(16)], -1)
+    rotation = Rotation.from_euler("xyz", [160, rng.uniform(-40, 40), rng.uniform(0, 360)], degrees=True).as_matrix()
+    clutter = rng.uniform([250, 180], [390, 300], (2, 2))
+    solution = solve(shuffled(rng, pixels(points[:14], rotation, AWAY / 2, rng), clutter), points, K)
+    if solution.verdict == "confident":
+        assert degrees_between(solution.rotation, rotation) < 5
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_pose_of_one_part_of_the_scene_is_not_that_of_the_scene(seed: int) -> None:
+    """Of a room three points are seen, too few for a pose, and all of a chair that was moved."""
+    rng = np.random.default_rng(seed)
+    room, chair = rng.uniform(-3, 3, (30, 3)), rng.normal(0, 0.5, (14, 3))
+    room *= 3 / abs(room).max(1, keepdims=True)  # on its walls
+    turn = Rotation.from_euler("z", 70, degrees=True).as_matrix()
+    rotation, points = Rotation.random(random_state=seed).as_matrix(), np.concatenate([room, chair])
+    image = shuffled(
+        rng,
+        pixels(room[:3], rotation, AWAY, rng),
+        rng.uniform([100, 100], [540, 380], (3, 2)),
+        pixels(chair @ turn.T + [0.8, 0.5, 0], rotation, AWAY, rng),
+    )
+    solution = solve(image, points, K)
+    assert (solution.verdict, solution.reason_code) == ("ambiguous", "one_part")

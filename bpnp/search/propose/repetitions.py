@@ -6,12 +6,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial import cKDTree
 
 from bpnp.arrays import Array, PoseArrays
 from bpnp.poses import SAME
 from bpnp.runtime import NEVER, Deadline
 from bpnp.search.hypotheses import Hypotheses
+from bpnp.search.image_statistics import Outline
 from bpnp.search.possible_matches import MATCH_REACH
 from bpnp.search.problem import Problem
 from bpnp.search.propose.collinear import find_line, rotations_about
@@ -266,7 +267,8 @@ def repetition_margins(
     missing = min(missing, most_missing)
     most = math.log((1 - missing) / missing)
     is_repeated = _is_repeated(problem, best, repeated, MATCH_REACH * scale)
-    counted = np.stack([_among(problem, one) for one in seen[1:]]) | ~is_repeated
+    points = problem.bearings[problem.image.chosen]
+    counted = np.stack([Outline(problem.image, one).contains(points) for one in seen[1:]]) | ~is_repeated
     return np.asarray(np.where(counted, np.clip(logs[0] - logs[1:], -most, most), 0).sum(-1) / math.log(10))
 
 
@@ -287,16 +289,3 @@ def _is_repeated(problem: Problem, best: PoseArrays, repeated: PoseArrays, reach
     ]
     each = np.reshape(moved, (-1, len(own), 3))
     return np.asarray(np.isfinite(cKDTree(points).query(each, distance_upper_bound=reach)[0]).any(0))
-
-
-def _among(problem: Problem, seen: Array) -> NDArray[np.bool_]:
-    """Return which chosen image points lie in the convex hull of the directions (n, 3) of the scene points."""
-    image = problem.image
-    ahead = seen[seen @ image.centre > 0]  # leaves out NaN
-    plane, points = (x @ image.axes / (x @ image.centre)[:, None] for x in (ahead, problem.bearings[image.chosen]))
-    try:
-        sides = ConvexHull(plane).equations
-    except (QhullError, ValueError):  # collinear or too few points
-        return np.zeros(len(points), bool)
-    in_front = problem.bearings[image.chosen] @ image.centre > 0  # those behind project to the opposite side
-    return np.asarray((points @ sides[:, :2].T + sides[:, 2] <= 0).all(-1) & in_front)

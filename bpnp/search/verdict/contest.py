@@ -10,6 +10,7 @@ from bpnp.search.verdict.rivals.given import given
 from bpnp.search.verdict.rivals.lens import lens
 from bpnp.search.verdict.rivals.mirrored_image import mirrored_image
 from bpnp.search.verdict.rivals.nearby import nearby
+from bpnp.search.verdict.rivals.other_content import other_content
 from bpnp.search.verdict.rivals.second_body import second_body
 from bpnp.search.verdict.rivals.symmetries import symmetries
 
@@ -22,6 +23,7 @@ def rivals_of(scene_of: SceneOf, deadline: Deadline = NEVER, *, enumerated: bool
     """
     return [
         partial(symmetries, scene_of=scene_of, deadline=deadline, enumerated=enumerated),
+        other_content,
         partial(nearby, scene_of=scene_of, deadline=deadline),
         partial(second_body, deadline=deadline),
         partial(mirrored_image, deadline=deadline),

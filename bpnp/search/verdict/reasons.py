@@ -28,6 +28,10 @@ CLAUSES = {
     "other_points": "a pose {away} away explains other points, and the difference may be chance",
     "contradicts_prior": "it is {sigmas:.0f} standard deviations from the given prior",
     "second_body": "two bodies: {first} and {second} of {count} image points fit different poses, {away} apart",
+    "one_part": "its {count} matches are all in one part of the scene: {left} image points and {others} scene points "
+    "are left, and another body may be among them",
+    "other_content": "{count} image points lie where the scene would repeat: another content, or another part, of the "
+    "same lattice",
     "mirrored_image": "the image is mirrored: flipped, x = width - x, it fits better (by {better:.1f} decades)",
     "rough_residuals": "the points fit better with residuals far larger than those of the matches: try "
     "inlier_threshold={threshold:.2g}",

@@ -4,6 +4,11 @@ An enumeration refines its poses with the matches that they have. Where parts of
 its points lie on a curve, these matches hold the pose back; annealing gives them up at wide scales.
 """
 
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
 from bpnp.runtime import NEVER, Deadline
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.problem import Problem, in_bulk
@@ -12,12 +17,13 @@ from bpnp.search.propose.symmetries import mirror_pose
 from bpnp.search.refine.annealing import FINISHED_POSES, MIDDLE, anneal_on_points, finish
 from bpnp.search.search_frame import SearchFrame
 from bpnp.search.verdict.decide import Case, add_false_alarms
-from bpnp.search.verdict.limits import LEAST_MARGIN
+from bpnp.search.verdict.limits import LEAST_MARGIN, MOST_MISSED
 from bpnp.search.verdict.reasons import Unfinished, objection
 from bpnp.search.verdict.rivals import SceneOf, left_by
 
 # Number of image points and of scene points that the best pose leaves from which a better one may exist nearby.
 FEWEST_LEFT = 6  # [points; not tuned]
+FEWEST_LEFT_FLAT = 3  # the same for a flat scene, whose points may slide along a curve [points; derived]
 
 
 def nearby(case: Case, *, scene_of: SceneOf, deadline: Deadline = NEVER) -> Case:
@@ -29,7 +35,11 @@ def nearby(case: Case, *, scene_of: SceneOf, deadline: Deadline = NEVER) -> Case
     problem = case.problem
     if not case.is_fitted or case.exhaustive or case.claim is not None:
         return case
-    if min(left_by(case)) < FEWEST_LEFT:
+    is_flat, left = mirror_pose(_bulk(problem), *case.pose) is not None, min(left_by(case))
+    if left < (FEWEST_LEFT_FLAT if is_flat else FEWEST_LEFT):
+        return case
+    is_repeated = len(case.symmetry.of(case.candidates).scale) > 0
+    if not (is_flat or is_repeated) and replace(case, local_searches=0).missed <= MOST_MISSED:
         return case
     if deadline.ended(Unfinished.competing_poses):
         return case.against(objection("untested"))
@@ -50,8 +60,7 @@ def annealed_around(
     """
     start = to_scene_frame(pose, scene)
     wide = MIDDLE[-1].last_scale * scene.spread
-    bulk = problem.points3d[in_bulk(problem.points3d)]
-    mirrored = mirror_pose(bulk, *pose.pose())
+    mirrored = mirror_pose(_bulk(problem), *pose.pose())
     starts = [start, perturb_each(scene, start)]
     if mirrored is not None:
         starts.append(to_scene_frame(Hypotheses.from_poses(mirrored[0][None], mirrored[1][None]), scene))
@@ -61,3 +70,8 @@ def annealed_around(
     parts = [anneal_on_points(scene, start, wide), anneal_on_points(scene, around, wide), finish(scene, start)]
     poses = finish(scene, merge_hypotheses(parts, scene), FINISHED_POSES)
     return to_problem_frame(poses, scene)
+
+
+def _bulk(problem: Problem) -> NDArray[np.float64]:
+    """Return the scene points (k, 3) without far ones."""
+    return problem.points3d[in_bulk(problem.points3d)]

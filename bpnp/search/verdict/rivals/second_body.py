@@ -9,17 +9,20 @@ reflection shows them twice.
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from bpnp.arrays import Indices
 from bpnp.poses import SAME
 from bpnp.runtime import NEVER, Deadline
 from bpnp.search.few_points.enumeration import enumerate_poses, is_enumerable
 from bpnp.search.hypotheses import Hypotheses
+from bpnp.search.image_statistics import Outline
 from bpnp.search.possible_matches import MATCH_REACH
 from bpnp.search.problem import Problem
 from bpnp.search.verdict.competitors import distance_between, partners
 from bpnp.search.verdict.decide import Case, fits_by_chance, weighed_pose
 from bpnp.search.verdict.false_alarms import alarms_of, directions_of
-from bpnp.search.verdict.reasons import Unfinished, objection
+from bpnp.search.verdict.reasons import Objection, Unfinished, objection
 
 FEWEST_LEFT = 5  # number of points that can show a significant pose: two more than fix it [points; derived]
 # Largest number of hypotheses of the points that are left: for a body of its own; for an image of the same points; and
@@ -30,6 +33,9 @@ FAR_BODY = 3.0  # distance of another body's pose [tolerances of the same pose; 
 NEAR_DECADES = 10.0  # [decades; calibration]
 # Fraction of the second pose's matches with scene points of the first from which it shows the same points again.
 SHOWN_TWICE = 0.25  # [fraction; not tuned]
+# A body of its own: largest fraction of the facing scene points that it shows, and largest number of the others in its
+# outline, over that of its points.
+MINORITY, MOST_BETWEEN = 0.4, 0.5  # [fraction; calibration, moved furniture]
 COMPARED_BODIES = 4  # number of poses of the rest whose false alarms are computed [poses; cost]
 
 
@@ -38,7 +44,8 @@ def second_body(case: Case, *, deadline: Deadline = NEVER) -> Case:
 
     The second pose is the best of one search of unrelated points with an NFA below 1 once in a thousand cases. The
     first pose is that of most of the scene if it shows more than half of the points that face the camera. It has no
-    such lead over an image of the same points.
+    such lead over an image of the same points. A pose that shows all of one small part and nothing else leaves too
+    much: the other body may be seen too little to be found.
     """
     problem = case.problem
     if problem.is_shared or problem.cosines3d is not None or not is_enumerable(problem):
@@ -72,7 +79,18 @@ def second_body(case: Case, *, deadline: Deadline = NEVER) -> Case:
             near = both.candidates.log10_false_alarms <= both.log10_false_alarms + NEAR_DECADES
             return replace(both, candidates=both.candidates[near])
         return both.against(objection("second_body", 0.0, away=away, **counts))
-    return case
+    return case if problem.labels3d is not None else case.against(_one_part(case, shown, facing, len(rest)))
+
+
+def _one_part(case: Case, shown: Indices, facing: NDArray[np.bool_], left: int) -> Objection | None:
+    """Return an objection if the shown scene points (k,) are all of a small part of those that face the camera (n,)."""
+    if len(shown) > MINORITY * facing.sum():
+        return None
+    seen, others = directions_of(case.problem, *case.pose), np.setdiff1d(np.flatnonzero(facing), shown)
+    between = Outline(case.problem.image, seen[shown]).contains(seen[others]).sum()
+    if between > MOST_BETWEEN * len(shown):
+        return None
+    return objection("one_part", count=int(case.explained.near.sum()), others=len(others), left=left)
 
 
 def _significant(case: Case, left: Problem, most: int, deadline: Deadline) -> Hypotheses:
