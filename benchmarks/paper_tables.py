@@ -527,6 +527,10 @@ class Row:
         value, low, high = self.figures[error][1]
         return f"{_short(value)} [{_short(low)}, {_short(high)}]"
 
+    def value(self, error: str) -> str:
+        """Return the same without the interval."""
+        return self.cell(error).split(" [")[0]
+
 
 def lowest(rows: Iterable[Row]) -> list[Row]:
     """Return the rows of the lowest seed, in the order of the estimates."""
@@ -572,7 +576,7 @@ def spread(table: Table, rows: Iterable[Row]) -> str:
         by_label.setdefault(row.label, []).append(row)
     errors = (*ERRORS, "recall")
     lines = [
-        [label, *(", ".join(row.cell(error).split(" [")[0] for row in several) for error in errors)]
+        [label, *(", ".join(row.value(error) for row in several) for error in errors)]
         for label, several in by_label.items()
     ]
     return markdown((f"seeds {', '.join(map(str, seeds))}", *MEASURES, recall_name(table)), lines)
@@ -589,7 +593,7 @@ def medians(table: Table, rows: Mapping[tuple[str, str], Iterable[Row]]) -> str:
         kept = dict.fromkeys(label for cells in found.values() for label in cells if is_changed(group, label))
         lines.append([f"**{TITLES[group]}**", *[""] * (2 * len(names))])
         lines += [
-            [label, *(found[name][label].cell(error) if label in found[name] else "" for name in names
+            [label, *(found[name][label].value(error) if label in found[name] else "" for name in names
                       for error in ("rotation", "recall"))]
             for label in kept
         ]  # fmt: skip
