@@ -118,8 +118,8 @@ def _find_parts(root: Path, dataset: str | None) -> tuple[str, list[tuple[str, l
     """Return the name of the data set below `root`, and the scenes with their pickles."""
     if not root.is_dir():
         raise ValueError(f"{root} is no folder; give one that holds <dataset>_train and <dataset>_test")
-    endings = [ending for endings in SPLITS.values() for ending in endings]
-    names = sorted({path.name.rpartition("_")[0] for ending in endings for path in root.glob(f"*_{ending}/")})
+    every = [ending for endings in SPLITS.values() for ending in endings]
+    names = sorted({path.name.rpartition("_")[0] for ending in every for path in root.glob(f"*_{ending}/")})
     if dataset is None and len(names) > 1:
         raise ValueError(
             f"{root} holds several data sets: {', '.join(names)}; choose one, such as --dataset {names[0]}"

@@ -22,7 +22,7 @@ SURE_CLASS = 0.97  # probability of a class from which on points match only with
 PRIOR_DEG = 10.0  # default standard deviation of a given rotation about each axis [degrees; convention]
 LEAST_SIGMA_DEG = 1e-6  # least standard deviation of an angle of a prior [degrees; numerics, float64]
 ONE_PIXEL = 3.0  # largest coordinate that is refused as normalised if a camera in pixels is given [pixels; convention]
-VECTORS = ((3,), (3, 1), (1, 3))  # shapes of a vector; OpenCV's is a column
+VECTORS = ((3,), (3, 1), (1, 3))  # shapes of a vector; that of OpenCV is a column [1; convention, OpenCV]
 WIDEST_ROW = 8  # largest number of columns of keypoints whose first two columns are positions [columns; convention]
 
 if TYPE_CHECKING:
