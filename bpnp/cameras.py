@@ -213,7 +213,8 @@ def camera_from(camera: Any) -> Camera:
     if isinstance(camera, Mapping):
         if not {"model", "params"} <= set(camera):
             raise ValueError(f"`camera` needs the keys `model` and `params`; it has {', '.join(camera) or 'no keys'}")
-        return colmap_camera(str(camera["model"]), camera["params"], (camera.get("width", 0), camera.get("height", 0)))
+        size = (camera.get("width") or 0, camera.get("height") or 0)
+        return colmap_camera(str(camera["model"]), camera["params"], size)
     if isinstance(camera, (tuple, list)) and len(camera) and isinstance(camera[0], str):
         if len(camera) not in (2, 4):
             raise ValueError(
@@ -339,11 +340,12 @@ def with_radial_distortion(camera: Camera, radial: float) -> Lens:
 
 
 def camera_to_json(camera: Camera) -> list[list[float]] | dict[str, Any]:
-    """Return a camera in a form that JSON can hold and `camera_from` reads."""
+    """Return a camera in a form that JSON can hold and `camera_from` reads; an unknown width or height is None."""
     if isinstance(camera, Pinhole):
         return camera.matrix.tolist()
     lens = camera.camera
-    return {"model": lens.model.name, "width": lens.width, "height": lens.height, "params": lens.params.tolist()}
+    size = {"width": lens.width or None, "height": lens.height or None}
+    return {"model": lens.model.name, **size, "params": lens.params.tolist()}
 
 
 def colmap_camera(model: str, params: Any, size: Any = (0, 0)) -> Lens:

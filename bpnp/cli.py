@@ -17,7 +17,7 @@ from importlib.metadata import metadata, version
 from typing import NoReturn
 
 from bpnp.commands import COMMANDS
-from bpnp.commands.parser import LIGHTNING, first_line, parse_arguments, plain, short_help
+from bpnp.commands.parser import LIGHTNING, first_line, parse_arguments, plain, short_help, with_options
 from bpnp.files import config_names, packaged_config
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # options of mallopt, from glibc's malloc.h
@@ -36,16 +36,18 @@ LIGHTNING_MISTAKES = {
     "TrainingDivergedError",
 }  # names instead of classes, since importing Lightning takes seconds
 OTHER_SCRIPT = "lightning-sdk is installed, which has a script named `lightning` too"
+VERBOSE = "--verbose"  # option of every command: print the traceback of a mistake
 WIDTH = 80  # columns of the help
 
 
 def main(args: Sequence[str] | None = None) -> None:
     """Run a command.
 
-    A user's mistake ends in one line on stderr and exit status 2, without a traceback. If the reader of standard output
-    closes it, as `head` does, the command ends silently.
+    A user's mistake ends in one line on stderr and exit status 2, without a traceback unless `--verbose` is given. If
+    the reader of standard output closes it, as `head` does, the command ends silently.
     """
-    arguments = list(sys.argv[1:] if args is None else args)
+    given = list(sys.argv[1:] if args is None else args)
+    verbose, arguments = VERBOSE in given, [text for text in given if text != VERBOSE]
     _quieten()
     if args is None:
         warnings.formatwarning = one_line_warning
@@ -57,8 +59,10 @@ def main(args: Sequence[str] | None = None) -> None:
             let_threads_sleep()
         if not {"", folder := _working_folder()} & set(sys.path):
             sys.path.append(folder)  # for the user's own classes; last, so that they hide no module
-        _run(arguments)
+        status = _run(arguments, verbose=verbose)
         _flush_output()
+        if status:
+            raise SystemExit(status)
     except Exception as error:
         if isinstance(error, BrokenPipeError) and _has_no_reader(sys.stdout):
             _discard_output()
@@ -67,8 +71,12 @@ def main(args: Sequence[str] | None = None) -> None:
             _end_interrupted(arguments)
         if os.environ.get("BPNP_TRACEBACK") or not _is_mistake(error):
             raise
+        if verbose:
+            traceback.print_exception(error)
         # File names that are not UTF-8 contain surrogates, which a terminal cannot show.
         text = plain(str(error)) or "there is too little memory for this command; give it less data"
+        if callable(command := COMMANDS.get(arguments[0])):
+            text = with_options(text, command)
         print(f"bpnp: error: {text}".encode("utf-8", "replace").decode(), file=sys.stderr)
         try:
             _flush_output()
@@ -140,10 +148,14 @@ def _is_mistake(error: Exception) -> bool:
     return (named or of_lightning) and set(modules) <= LIBRARIES
 
 
-def _run(arguments: list[str]) -> None:
-    if not arguments or arguments[0] in ("-h", "--help"):
+def _run(arguments: list[str], *, verbose: bool) -> int | None:
+    """Run a command and return its exit status, None for 0."""
+    if len(arguments) > 1 and arguments[0] == "help":
+        rest = arguments[2:]
+        arguments = [arguments[1], "--help", "all"] if rest == ["all"] else [arguments[1], *rest, "--help"]
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(help_text())
-    elif arguments[0] == "--version":
+    elif arguments[0] in ("-V", "--version"):
         print(f"bpnp {version('bpnp')}")
     elif arguments[0] in LIGHTNING:
         if importlib.util.find_spec("lightning_sdk") is not None:
@@ -152,7 +164,7 @@ def _run(arguments: list[str]) -> None:
             arguments = arguments[:2]
         elif {"-h", "--help"} & set(arguments):
             print(short_help(arguments[0]))
-            return
+            return None
         from bpnp.commands.training import run_training  # imports torch and Lightning: seconds
 
         run_training(_with_packaged_configs(arguments))
@@ -163,10 +175,12 @@ def _run(arguments: list[str]) -> None:
             if not rest or rest[0] in ("-h", "--help"):
                 lines = (_row(f"  {word:<14}", first_line(function)) for word, function in command.items())
                 print("\n".join([f"usage: bpnp {name} WHAT [options]", "", *lines]))
-                return
+                return None
             word, *rest = rest
             name, command = f"{name} {word}", command[_check_name(word, list(command), f"one of bpnp {name}")]
-        command(**parse_arguments(name, command, rest))
+        chosen = parse_arguments(name, command, rest)
+        return command(**chosen | ({"verbose": True} if verbose and "verbose" in chosen else {}))
+    return None
 
 
 def keep_freed_memory() -> None:
@@ -217,6 +231,7 @@ def help_text() -> str:
             *lines,
             "",
             "bpnp COMMAND --help shows the options of a command, bpnp --version the version.",
+            "bpnp COMMAND --verbose also prints the traceback of an error.",
             textwrap.fill(f"Packaged configurations, for --config: {', '.join(config_names())}.", WIDTH),
             *(url.replace(", ", ": ", 1) for url in metadata("bpnp").get_all("Project-URL", [])),
         ]

@@ -7,7 +7,7 @@ from bpnp.commands.preparing import convert_weights, prepare_authors, prepare_me
 from bpnp.commands.reporting import report, table, view, wandb_results
 from bpnp.commands.solving import solve, verify, warm_up
 
-Command = Callable[..., None]
+Command = Callable[..., int | None]  # returns the exit status, None for 0
 
 COMMANDS: Mapping[str, Command | Mapping[str, Command]] = {
     "solve": solve,

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from bpnp.commands.solving import exit_status
 from bpnp.files import lock_folder
 from bpnp.report.terminal import console, count_items, say
 
@@ -43,10 +44,11 @@ def localize(
     no_pictures: bool = False,
     json: bool = False,
     quiet: bool = False,
+    strict: bool = False,
     solver: str = "auto",
     time_limit: float | None = None,
     seed: int = 0,
-) -> None:
+) -> int:
     """Find the poses of photos in a map.
 
     Writes solutions/<photo>.json and pictures/<photo>.png. results.json and poses.txt (confident poses in the frame of
@@ -77,6 +79,7 @@ def localize(
         seed: random seed of the search.
         json: print JSON instead of a table: the entries of results.json for these photos.
         quiet: print only errors, and JSON with --json.
+        strict: exit with status 1 unless the pose of each photo is confident; the status is 0 by default.
     """
     from bpnp.datamodules.colmap.model_files import model_format
     from bpnp.maps.many_photos import SolutionFolder, content_of_map, localize_photos, read_views, results_json
@@ -131,6 +134,7 @@ def localize(
         for other, why in others:
             say(f"{other}: {why}", to=out)
         raise ValueError(f"{len(others) + 1} of {len(files)} photos could not be tried, such as {name}: {reason}")
+    return exit_status([record["verdict"] for record in records.values()], strict=strict)
 
 
 def _report(

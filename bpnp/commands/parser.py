@@ -18,6 +18,27 @@ from docstring_parser import parse as parse_docstring
 from jsonargparse import ArgumentParser
 
 NEGATIVE_NUMBER = re.compile(r"-(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$", re.IGNORECASE)
+WRONG_TYPE = re.compile(
+    r"Parser key \"(\w+)\"(?: element (\d+))?: Expected a (<class '(int|float)'>|typing\.Literal\[(.*?)\])\.? "
+    r"(?:Got|Given) value: (.*)"
+)
+# `name`, `name=value` or name=value in a message; not a part of another option, such as --data.seed=1.
+ARGUMENT = re.compile(r"`([\w.]+)(?:=([^`]+))?`|(?<![\w.`'-])(\w+)=(\([^)]*\)|[\w.]+)")
+NO_VALUES = (None, "True", "K", "(width, height)")  # values in messages that no command line has
+KINDS = {"int": "a whole number", "float": "a number"}
+# What the commands call an argument of `bpnp.solve` and `bpnp.verify` that is no option of the same name.
+OTHER_NAMES = {
+    "labels2d": "the column label of points2d",
+    "labels3d": "the column label of points3d",
+    "scores2d": "the column score of points2d",
+    "scores3d": "the column score of points3d",
+    "normals3d": "the normals of points3d",
+    "prior.rotation": "the rotation of --prior",
+    "prior.translation": "the translation of --prior",
+    "prior.rotation_sigma_deg": "--prior_degrees",
+    "prior.translation_sigma": "--prior_distance",
+    "prior.sigma_deg": "--up_degrees",
+}
 OVERRIDES = "overrides"  # name of the parameter that receives the options `--data.NAME=VALUE`
 
 
@@ -26,7 +47,7 @@ class OneLineParser(ArgumentParser):
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         """Raise ValueError with the message in one line, and a hint."""
-        text = plain(message)
+        text = _of_option(plain(message)) if " " in self.prog else plain(message)
         _, found, unknown = text.rpartition("nrecognized arguments: ")
         option_strings = [name for action in self._actions for name in action.option_strings if name.startswith("-")]
         if required := text.partition("arguments are required: ")[2]:
@@ -46,6 +67,38 @@ class OneLineParser(ArgumentParser):
         if of_no_class:
             hint = ", since there is no class; name one first, such as --model.solver bpnp.models.BPnPNet"
         raise ValueError(text + hint) from ex
+
+
+def _of_option(message: str) -> str:
+    """Return jsonargparse's message on a value of another type as a sentence about the option; others unchanged."""
+    if (found := WRONG_TYPE.match(message)) is None:
+        return message
+    name, element, _, kind, names, value = found.groups()
+    needed = KINDS[kind] if kind else f"one of {names}"
+    where = f"word {element} of --{name}" if element else f"--{name}"
+    return f"{where} is {value!r}; {needed} is needed"
+
+
+def with_options(message: str, command: Callable[..., int | None]) -> str:
+    """Return a message that names arguments of Python functions with the options of a command in their place.
+
+    >>> from bpnp.commands.parser import with_options
+    >>> def solve(*, camera: str, focal_error: float) -> None: ...
+    >>> with_options("`focal_error` needs a `camera`, such as focal_error=0.1", solve)
+    '--focal_error needs a --camera, such as --focal_error 0.1'
+    """
+    parameters = inspect.signature(command).parameters.values()
+    names = {one.name: f"--{one.name}" if one.kind is one.KEYWORD_ONLY else one.name for one in parameters}
+    if "points2d" in names:
+        names |= OTHER_NAMES
+
+    def renamed(found: re.Match[str]) -> str:
+        name, value = found[1] or found[3], found[2] or found[4]
+        if name not in names:
+            return found[0]
+        return names[name] if value in NO_VALUES else f"{names[name]} {value}"
+
+    return ARGUMENT.sub(renamed, message)
 
 
 def closest_option(unknown: str, options: Sequence[str]) -> str | None:
@@ -98,7 +151,7 @@ def plain(message: str) -> str:
     return " ".join(dict.fromkeys(line.removeprefix("- ") for line in lines if line and not line.startswith(NOISE)))
 
 
-def parse_arguments(name: str, command: Callable[..., None], arguments: Sequence[str]) -> dict[str, Any]:
+def parse_arguments(name: str, command: Callable[..., int | None], arguments: Sequence[str]) -> dict[str, Any]:
     """Parse the arguments of a command into values by parameter; raise ValueError if it does not take them.
 
     A hyphen in the name of an option is read as an underscore, and the value `inf` as YAML's `.inf`.
@@ -131,7 +184,7 @@ def _infinity(before: str, text: str, numbers: Sequence[str]) -> str:
     return text.removesuffix("inf") + ".inf"
 
 
-def command_parser(name: str, command: Callable[..., None]) -> OneLineParser:
+def command_parser(name: str, command: Callable[..., int | None]) -> OneLineParser:
     """Build the parser of a function; its help comes from the docstring.
 
     A list takes several words and a tuple as many as it has. A bool is a flag without a value. Anything else is parsed
@@ -171,7 +224,7 @@ def at_least(least: int, **options: float | int | None) -> None:
             raise ValueError(f"--{name} is {value}; it must be {least:g} or more")
 
 
-def first_line(command: Callable[..., None]) -> str:
+def first_line(command: Callable[..., int | None]) -> str:
     """Return the first line of a command's docstring."""
     return (inspect.getdoc(command) or "").splitlines()[0]
 

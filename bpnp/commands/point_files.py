@@ -5,7 +5,7 @@ import re
 import sys
 from collections.abc import Callable, Collection, Set
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,7 +18,7 @@ ARRAYS = (".npy", ".csv", ".txt", ".xyz")
 CLOUD = ".pcd"
 CALIBRATIONS = (".yaml", ".yml", ".json")
 COLMAP_POINTS, COLMAP_CAMERAS = ("points3D.bin", "points3D.txt"), ("cameras.bin", "cameras.txt")
-NORMAL, LABEL = ("nx", "ny", "nz"), "label"
+NORMAL, LABEL, SCORE = ("nx", "ny", "nz"), "label", "score"
 # Columns after x, y, z in a file that does not name them, by the number of columns.
 COLUMNS: dict[int, tuple[str, ...]] = {3: (), 4: (LABEL,), 6: NORMAL, 7: (*NORMAL, LABEL)}
 NAME_COLUMNS = "remove it, or name the columns in the first line, such as"
@@ -29,43 +29,50 @@ FEW_ROWS = 3  # least number of rows of an index column
 LARGEST_LABEL = 2**53  # larger integers are not exact in float64
 
 
-def read_points2d(path: Path) -> tuple[Array, Labels | None]:
-    """Read image points (m, 2) or unit bearings (m, 3), and labels (m,) of a column named label, else None.
+class PointColumns(NamedTuple):
+    """Points of a file, and the columns beside them, None where it has none."""
+
+    points: Array  # (k, 2) image points, (k, 3) unit bearings or scene points
+    normals: Array | None = None  # (k, 3) outward normals of scene points
+    labels: Labels | None = None  # (k,) labels
+    scores: Array | None = None  # (k,) probabilities that a point has a correspondence
+
+
+def read_points2d(path: Path) -> PointColumns:
+    """Read image points (m, 2) or unit bearings (m, 3), and the columns label and score if they are named.
 
     The file is .npy or text as for `read_points3d`. Named columns x and y are read, and z if there is one, or u and v;
     of unnamed columns the first two, since a detector's rows continue with scale and angle; or three, unit bearings, or
     a count of the rows before x and y.
     """
     _check_suffix(path, ARRAYS)
-    values, names = _columns(path, {name for columns in IMAGE_COLUMNS for name in columns} | {LABEL}, needs="x, y")
+    wanted = {LABEL, SCORE}.union(*IMAGE_COLUMNS)
+    values, names = _columns(path, wanted, needs="x, y")
     if names:
         coordinates = next((columns for columns in IMAGE_COLUMNS if set(columns) <= set(names)), ("x", "y"))
-        points, _, labels = _read_annotation(path, values, names, coordinates, hint=", or u, v")
-        return points, labels
+        return _read_annotation(path, values, names, coordinates, hint=", or u, v")._replace(normals=None)
     if values.shape[1] < 2:
         raise ValueError(f"{_name(path)} needs points with 2 or 3 columns; its shape is {values.shape}")
     if values.shape[1] > 2 and _counts_rows(values[:, 0]):
         if values.shape[1] > 3:
             raise ValueError(f"the first column of {_name(path)} counts its rows; {NAME_COLUMNS} `index x y`")
-        return values[:, 1:], None
+        return PointColumns(values[:, 1:])
     if values.shape[1] == 3 and (values[:, 0] == np.round(values[:, 0])).all() and (abs(values) > 2).any():
         raise ValueError(
             f"{_name(path)} has 3 columns, which are read as unit bearings, but the first row is {values[0].tolist()} "
             f"(are the two files swapped?); if the first column is an index, {NAME_COLUMNS} `index x y`"
         )
-    return values if values.shape[1] == 3 else values[:, :2], None
+    return PointColumns(values if values.shape[1] == 3 else values[:, :2])
 
 
-def read_points3d(
-    path: Path, *, surface: int | None = None, seed: int = 0
-) -> tuple[Array, Array | None, Labels | None]:
-    """Read scene points (n, 3), their outward normals (n, 3) and labels (n,), None if the file has none.
+def read_points3d(path: Path, *, surface: int | None = None, seed: int = 0) -> PointColumns:
+    """Read scene points (n, 3), their outward normals, labels and scores.
 
     The path is one of:
 
     - .npy; .csv, .txt or .xyz with columns of numbers separated by commas, semicolons, tabs or spaces (a comma is a
       decimal mark if the separator is a semicolon or a tab). The first line may name the columns; otherwise they are
-      x, y, z, then nx, ny, nz or label or both. # starts a comment.
+      x, y, z, then nx, ny, nz or label or both; scores are read only of a column named score. # starts a comment.
     - .pcd, ASCII or binary.
     - .ply or a mesh (.obj, .off, .stl, .glb): its distinct vertices, or `surface` points drawn from its triangles. The
       normals of a .ply without faces are read unless all of them are zero.
@@ -77,16 +84,16 @@ def read_points3d(
     if path.is_dir() or path.name in COLMAP_POINTS:
         from bpnp.datamodules.colmap.model_files import read_records
 
-        return read_records(path if path.is_dir() else path.parent).points3d, None, None
+        return PointColumns(read_records(path if path.is_dir() else path.parent).points3d)
     if path.suffix.lower() not in (*ARRAYS, CLOUD) and not _is_stream(path):
         from bpnp.datamodules.shapes import SUFFIXES, read_mesh, read_vertices, sample_surface
 
         _check_suffix(path, (*ARRAYS, CLOUD, *SUFFIXES))
         if surface is not None:
-            return sample_surface(read_mesh(path), surface, np.random.default_rng(seed)), None, None
+            return PointColumns(sample_surface(read_mesh(path), surface, np.random.default_rng(seed)))
         points, columns = read_vertices(path)
-        normals, labels = _normals_and_labels(path, columns.__getitem__, [*columns])
-        return points, None if normals is None or not normals.any() else normals, labels
+        read = _annotated(path, points, columns.__getitem__, [*columns])
+        return read if read.normals is None or read.normals.any() else read._replace(normals=None)
     _check_suffix(path, (*ARRAYS, CLOUD))
     if surface is not None:
         raise ValueError(f"--surface draws points from a mesh, and {path} is none; leave it out")
@@ -97,19 +104,20 @@ def read_points3d(
             points, columns = parse_pcd(_content(path))
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
-        return points, *_normals_and_labels(path, columns.__getitem__, [*columns])
-    values, names = _columns(path, {*"xyz", *NORMAL, LABEL}, needs="x, y, z")
+        return _annotated(path, points, columns.__getitem__, [*columns])
+    values, names = _columns(path, {*"xyz", *NORMAL, LABEL, SCORE}, needs="x, y, z")
     return _read_annotation(path, values if names else _without_index(path, values), names, ("x", "y", "z"))
 
 
 def read_camera(text: str, image: str | None = None, *, centre: float = 0.0) -> Any:
     """Read the camera that `--camera` names.
 
-    It is a file with a 3x3 matrix; a YAML file of ROS (camera_info) or OpenCV, see `parse_calibration`; a COLMAP camera
-    model with its parameters, "PINHOLE 500 500 320 240" or "PINHOLE,640,480,500,500,320,240" (with width and height, as
-    in cameras.txt); or a COLMAP model, its folder or its cameras.bin or cameras.txt. `image` names the image of the
-    COLMAP model whose camera is read, by default its only camera. `centre` is the coordinate of the centre of the first
-    pixel in the image points, for the camera of a YAML file: 0 as in OpenCV and ROS, or 0.5 as in COLMAP.
+    It is a file with a 3x3 matrix; a YAML file of ROS (camera_info) or OpenCV, see `parse_calibration`; four numbers,
+    "fx,fy,cx,cy"; a COLMAP camera model with its parameters, "PINHOLE 500 500 320 240" or
+    "PINHOLE,640,480,500,500,320,240" (with width and height, as in cameras.txt); or a COLMAP model, its folder or its
+    cameras.bin or cameras.txt. `image` names the image of the COLMAP model whose camera is read, by default its only
+    camera. `centre` is the coordinate of the centre of the first pixel in the image points, for the camera of a YAML
+    file: 0 as in OpenCV and ROS, or 0.5 as in COLMAP.
     """
     path = Path(text)
     if (text and path.is_dir()) or (path.name in COLMAP_CAMERAS and path.is_file()):
@@ -118,12 +126,16 @@ def read_camera(text: str, image: str | None = None, *, centre: float = 0.0) -> 
         raise ValueError(f"--image needs a COLMAP model as --camera, which is {text!r}")
     if _is_stream(path) or (text and path.exists()):
         return _camera_in(path, centre)
+    if "/" in text or path.suffix.lower() in (*ARRAYS, *CALIBRATIONS, ".bin"):
+        raise ValueError(f"there is no file {text}, which --camera names")
     model, *words = text.replace(",", " ").split() or [""]
     numbers = [_number(word) for word in words]
+    if len(numbers) == 3 and None not in (_number(model), *numbers):
+        return _number(model), *numbers
     if not numbers or None in numbers or not model.replace("_", "").isalnum() or model[0].isdigit():
         raise ValueError(
-            f"--camera {text!r} is neither a file with a 3x3 matrix or ROS's camera_info nor MODEL,PARAMETERS such "
-            "as SIMPLE_PINHOLE,800,320,240"
+            f"--camera {text!r} is neither a file with a 3x3 matrix or ROS's camera_info nor fx,fy,cx,cy nor "
+            "MODEL,PARAMETERS such as SIMPLE_PINHOLE,800,320,240"
         )
     from bpnp.cameras import camera_models
 
@@ -157,7 +169,7 @@ def read_pose(path: Path) -> tuple[Array, Array]:
         if isinstance(error, FileNotFoundError):
             raise ValueError(f"there is no file {path}") from error
         reason = f"{error} is missing" if isinstance(error, KeyError) else error
-        raise ValueError(f"{path} is no JSON with `rotation` and `translation`: {reason}") from error
+        raise ValueError(f'{path} is no JSON with "rotation" and "translation": {reason}') from error
 
 
 def read_pairs(path: Path) -> Array:
@@ -201,8 +213,8 @@ def _check_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
 
 def _read_annotation(
     path: Path, values: Array, names: list[str], coordinates: tuple[str, ...], *, hint: str = ""
-) -> tuple[Array, Array | None, Labels | None]:
-    """Take points, normals and labels from columns (k, c), whose names are empty if the file has none.
+) -> PointColumns:
+    """Take points and the columns beside them from columns (k, c), whose names are empty if the file has none.
 
     `hint` follows the coordinates in the message that they are missing.
     """
@@ -217,23 +229,27 @@ def _read_annotation(
         )
     index = {name: column for column, name in enumerate(names)}
     points = values[:, [index[name] for name in coordinates]]
-    return points, *_normals_and_labels(path, lambda name: values[:, index[name]], names)
+    return _annotated(path, points, lambda name: values[:, index[name]], names)
 
 
-def _normals_and_labels(
-    path: Path, column: Callable[[str], Array], names: Collection[str]
-) -> tuple[Array | None, Labels | None]:
-    """Return normals (n, 3) and labels (n,) of a file with columns of these names, None without them."""
+def _annotated(path: Path, points: Array, column: Callable[[str], Array], names: Collection[str]) -> PointColumns:
+    """Return points with the normals, labels and scores of a file with columns of these names."""
     normals = np.stack([column(name) for name in NORMAL], -1) if set(NORMAL) <= set(names) else None
+    scores = column(SCORE) if SCORE in names else None
+    if scores is not None and len(wrong := scores[~((scores > 0) & (scores <= 1))]):
+        raise ValueError(
+            f"the column score of {_name(path)} holds {wrong[0]:g}; scores are above 0 and at most 1: divide by the "
+            "largest, or give the column another name"
+        )
     if LABEL not in names:
-        return normals, None
+        return PointColumns(points, normals, None, scores)
     labels = column(LABEL)
     if len(wrong := labels[(labels != np.round(labels)) | (abs(labels) > LARGEST_LABEL)]):
         raise ValueError(
             f"the column label of {path} holds {wrong[0]:g}; labels are integers; if a column without a name is an "
             f"index or something else, {NAME_COLUMNS} `x y z`"
         )
-    return normals, labels.astype(np.int64)
+    return PointColumns(points, normals, labels.astype(np.int64), scores)
 
 
 def _camera_of(path: Path, image: str | None) -> tuple[Any, ...]:

@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from bpnp.report.tables import MethodRow
     from bpnp.training.comparison import MethodTest
 
+MOST_FOLDERS = 300  # folders that are searched for results without a question [folders; cost]
 VIEW_SIDE = 1000  # longer side of a photo in a figure, pixels
 LINES: Mapping[str, "Lines | None"] = {"true": "match3d", "assigned": "assigned3d", "none": None}
 
@@ -53,13 +55,13 @@ def report(
     from bpnp.report.intervals import interval_table
     from bpnp.report.page import write_page
     from bpnp.report.results import SUMMARY, read_results
-    from bpnp.report.tables import named_runs, read_runs, results_table
+    from bpnp.report.tables import read_runs, results_table
 
     for picture in (curves, recall):
         if picture is not None:
             check_picture_name(picture)
     check_outputs([html, recall, curves])
-    named = named_runs(runs)
+    named = _runs_in(runs)
     results = {name: read_results(path) for name, path in named.items() if (path / SUMMARY).is_file()}
     if curves is not None:
         from bpnp.report.training_curves import lines_of_training, training_curves
@@ -95,6 +97,24 @@ def report(
         say("The runs differ in:\n" + "\n".join(lines))
 
 
+def _runs_in(folders: Sequence[Path]) -> dict[str, Path]:
+    """Return the results in these folders, as `named_runs`; a large tree is searched only if the user wants it."""
+    from bpnp.report.tables import LargeTree, named_runs
+
+    if missing := [folder for folder in folders if not folder.exists()]:
+        raise ValueError(f"{missing[0]} does not exist; give a folder that `bpnp test` or `bpnp table` wrote")
+    try:
+        return named_runs(folders, MOST_FOLDERS)
+    except LargeTree as error:
+        if not (sys.stdin is not None and sys.stdin.isatty() and sys.stderr.isatty()):
+            raise
+        sys.stderr.write(f"{error}.\nSearch all of them for results? [y/N] ")
+        sys.stderr.flush()
+        if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+            raise
+        return named_runs(folders)
+
+
 def view(
     run: Path,
     problems: list[str] | None = None,
@@ -126,7 +146,6 @@ def view(
     from bpnp.report.figures import plot_photo, plot_problem
     from bpnp.report.images import read_photo
     from bpnp.report.points import read_points
-    from bpnp.report.tables import named_runs
 
     names = problems or []
     if output is not None and len(names) > 1:
@@ -146,7 +165,7 @@ def view(
         drawn, folder = [_solution(run)], run.absolute().parent
         file_names = {0: run.stem}
     else:
-        folders = named_runs([run])
+        folders = _runs_in([run])
         first = next(iter(folders.values()))
         folder = first if len(folders) == 1 else run
         tested = read_points(first)
@@ -262,9 +281,8 @@ def wandb_results(
     """
     from bpnp.commands.photo_files import photo_finder
     from bpnp.report.dashboards import log_results
-    from bpnp.report.tables import named_runs
 
-    finder, named = photo_finder(photos, side=VIEW_SIDE), named_runs(runs)
+    finder, named = photo_finder(photos, side=VIEW_SIDE), _runs_in(runs)
     first = next(iter(named.values()))
     for name, folder in named.items():
         written = log_results(

@@ -3,7 +3,7 @@
 import math
 import re
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +16,7 @@ from bpnp.files import check_outputs, require_new_folder, write_text
 from bpnp.report.terminal import console, format_fixed, number, progress, say
 
 if TYPE_CHECKING:
-    from bpnp.search.solution import Solution
+    from bpnp.search.solution import Candidate, Solution
 
 
 def solve(
@@ -34,6 +34,8 @@ def solve(
     colmap: Path | None = None,
     json: bool = False,
     quiet: bool = False,
+    strict: bool = False,
+    verbose: bool = False,
     surface: int | None = None,
     prior: Path | None = None,
     prior_degrees: float = 10.0,
@@ -47,18 +49,19 @@ def solve(
     time_limit: float | None = None,
     seed: int = 0,
     device: str | None = None,
-) -> None:
+) -> int:
     """Find the camera pose from image points and scene points without correspondences.
 
     The verdict is one of: confident; ambiguous, if another pose may fit as well; failed, and then the pose is a guess.
 
     Args:
-        points2d: .npy, .csv or .txt with columns x y or u v; pixels with --camera or --image_size, else x/z y/z; a
-            column named label.
+        points2d: .npy, .csv or .txt with columns x y or u v; pixels with --camera or --image_size, else x/z y/z;
+            columns named label, and score (probability of a correspondence).
         points3d: .npy, .csv, .txt, .xyz, .pcd, .ply, or a mesh (.obj, .off, .stl, .glb); columns x y z, nx ny nz,
-            label; or a COLMAP model (its folder, or points3D.bin or .txt). `-` reads standard input, for points2d too.
-        camera: file with a 3x3 matrix, YAML of ROS (camera_info) or OpenCV, COLMAP's MODEL,PARAMETERS such as
-            SIMPLE_PINHOLE,f,cx,cy, or a COLMAP model with one camera (its folder, or cameras.bin or .txt).
+            label, score; or a COLMAP model (its folder, or points3D.bin or .txt). `-` reads standard input, for
+            points2d too.
+        camera: file with a 3x3 matrix, YAML of ROS (camera_info) or OpenCV, fx,fy,cx,cy, COLMAP's MODEL,PARAMETERS such
+            as SIMPLE_PINHOLE,f,cx,cy, or a COLMAP model with one camera (its folder, or cameras.bin or .txt).
         image: name of the image whose camera is used, if the --camera model has several.
         image_size: WIDTH,HEIGHT or WIDTHxHEIGHT of the image in pixels, if its focal length is unknown; it is found
             with the pose.
@@ -70,6 +73,8 @@ def solve(
         colmap: write a COLMAP model of this image to this new folder.
         json: print JSON instead of a table.
         quiet: print only errors, and JSON with --json.
+        strict: exit with status 1 unless the verdict is confident; the status is 0 by default.
+        verbose: print standard deviations and the scores of the next candidates too, and the traceback of an error.
         surface: number of points to draw from a mesh; its vertices by default.
         prior: rough pose, the JSON of a solution; or a network, packaged weights by name or a checkpoint.
         prior_degrees: standard deviation of its rotation, degrees.
@@ -90,6 +95,9 @@ def solve(
 
     if (up_camera is None) != (up_scene is None):
         raise ValueError("give --up_camera and --up_scene together")
+    for name, up in (("--up_camera", up_camera), ("--up_scene", up_scene)):
+        if up is not None and not any(up):
+            raise ValueError(f"{name} is 0 0 0; give a direction, such as 0 0 1")
     if prior is not None and up_camera is not None:
         raise ValueError("give --prior, or --up_camera with --up_scene, not both")
     if image is not None and camera is None:
@@ -108,7 +116,9 @@ def solve(
     if background is not None:
         from bpnp.cameras import camera_from
 
-        size_in_camera(background, camera_from(lens))
+        width, height = size_in_camera(background, camera_from(lens))
+        if isinstance(lens, tuple) and isinstance(lens[0], str) and len(lens) == 2:  # (model, parameters)
+            lens = lens[0], width, height, lens[1]
     inputs = [points2d, points3d, prior, photo, *(Path(text) for text in (camera, solver) if text is not None)]
     check_outputs([output, picture], inputs)
     if colmap is not None:
@@ -141,7 +151,7 @@ def solve(
             device=device,
             progress=lambda _, batch, __: shown.update(task, description=f"searching the pose, round {batch}"),
         )
-    messages = _print_solution(solution, annotations, json=json, quiet=quiet, output=output)
+    messages = _print_solution(solution, annotations, json=json, quiet=quiet, verbose=verbose, output=output)
     if picture is not None:
         from bpnp.report.solutions import draw_solution
 
@@ -150,6 +160,7 @@ def solve(
     if colmap is not None:
         written = solution.to_colmap(colmap, name="image.jpg" if photo is None else photo.name)
         say(f"wrote {written}", to=messages)
+    return exit_status([solution.verdict], strict=strict)
 
 
 def verify(
@@ -168,19 +179,21 @@ def verify(
     page: Path | None = None,
     json: bool = False,
     quiet: bool = False,
+    strict: bool = False,
+    verbose: bool = False,
     surface: int | None = None,
     inlier_threshold: float | None = None,
     time_limit: float | None = None,
     seed: int = 0,
-) -> None:
+) -> int:
     """Verify a given pose, and estimate its uncertainty.
 
     The verdict is one of: confident; ambiguous, if another pose may fit as well; failed, if the pose is not significant
     or another pose fits better.
 
     `bpnp verify MAP`, with only the folder of a COLMAP model, verifies the pose of each of its images without the
-    image's own observations, and prints the least certain first. Its options are --output, --page, --json,
-    --quiet, --time_limit (for each image) and --seed.
+    image's own observations, and prints the least certain first. Its options are --output, --page, --json, --quiet,
+    --strict, --time_limit (for each image) and --seed.
 
     Args:
         points2d: as for bpnp solve; or the folder of a COLMAP model, without other arguments.
@@ -197,6 +210,8 @@ def verify(
         page: for a model, write the table and a drawing of the map as one .html file.
         json: print JSON instead of a table.
         quiet: print only errors, and JSON with --json.
+        strict: exit with status 1 unless the verdict, for a model that of each image, is confident.
+        verbose: print standard deviations and the scores of the next candidates too, and the traceback of an error.
         surface: number of points to draw from a mesh; its vertices by default.
         inlier_threshold: largest error of a match, pixels with a camera, else of x/z, y/z; three times the scale of the
             residuals by default.
@@ -218,8 +233,10 @@ def verify(
             raise ValueError(
                 f"--{wrong[0]} has no effect on the images of a COLMAP model; name points3d, or leave it out"
             )
-        verify_images(points2d, output=output, page=page, json=json, quiet=quiet, time_limit=time_limit, seed=seed)
-        return
+        verdicts = verify_images(
+            points2d, output=output, page=page, json=json, quiet=quiet, time_limit=time_limit, seed=seed
+        )
+        return exit_status(verdicts, strict=strict)
     if page is not None:
         raise ValueError("--page needs the folder of a COLMAP model alone: bpnp verify MAP --page FILE.html")
     from bpnp.commands.point_files import read_camera, read_pairs, read_pose
@@ -256,35 +273,46 @@ def verify(
             seed=seed,
             time_limit=time_limit,
         )
-    _print_solution(solution, annotations, json=json, quiet=quiet, output=output)
+    _print_solution(solution, annotations, json=json, quiet=quiet, verbose=verbose, output=output)
+    return exit_status([solution.verdict], strict=strict)
+
+
+def exit_status(verdicts: Iterable[str], *, strict: bool) -> int:
+    """Return the exit status of a command: 1 with `--strict` if a verdict is not "confident", else 0."""
+    return int(strict and any(verdict != "confident" for verdict in verdicts))
 
 
 def _read_sides(points2d: Path, points3d: Path, surface: int | None, seed: int) -> tuple[Any, Any, dict[str, Any]]:
-    """Return image points, scene points, and the normals and labels that their files have."""
+    """Return image points, scene points, and the normals, labels and scores that their files have."""
     from bpnp.commands.point_files import read_points2d, read_points3d
 
-    image, labels2d = read_points2d(points2d)
-    scene, normals3d, labels3d = read_points3d(points3d, surface=surface, seed=seed)
-    return image, scene, {"normals3d": normals3d, "labels2d": labels2d, "labels3d": labels3d}
+    image, scene = read_points2d(points2d), read_points3d(points3d, surface=surface, seed=seed)
+    annotations = {"normals3d": scene.normals, "labels2d": image.labels, "labels3d": scene.labels}
+    return image.points, scene.points, annotations | {"scores2d": image.scores, "scores3d": scene.scores}
 
 
 def _print_solution(
-    solution: "Solution", annotations: Mapping[str, Any], *, json: bool, quiet: bool, output: Path | None
+    solution: "Solution", annotations: Mapping[str, Any], *, json: bool, quiet: bool, verbose: bool, output: Path | None
 ) -> Console:
     """Print and write a solution, and return the console for further messages."""
     out = console(json=json, quiet=quiet)
     if json:
         say(solution.to_json())
     else:
-        out.print(solution_table(solution, annotations))
+        out.print(solution_table(solution, annotations, verbose=verbose))
     if output is not None:
         write_text(output, solution.to_json() + "\n")
         say(f"wrote {output}", to=out)
     return out
 
 
-def solution_table(solution: "Solution", annotations: Mapping[str, Any] | None = None) -> Table:
-    """Return a table of verdict, points with their annotations, pose, matches and next candidates."""
+def solution_table(
+    solution: "Solution", annotations: Mapping[str, Any] | None = None, *, verbose: bool = False
+) -> Table:
+    """Return a table of verdict, points with their annotations, pose, matches and next candidates.
+
+    `verbose` adds standard deviations and the mean log-likelihoods of the candidates.
+    """
     from bpnp.poses import rotation_angle
     from bpnp.report.terminal import VERDICTS
 
@@ -314,16 +342,26 @@ def solution_table(solution: "Solution", annotations: Mapping[str, Any] | None =
             f"{solution.reprojection_error:.3g} {solution.unit} ({solution.reprojection_error_deg:.3g} deg), "
             f"inliers up to {solution.inlier_threshold:.3g} {solution.unit}",
         )
-        others = [
-            f"{math.degrees(rotation_angle(solution.rotation, other.rotation)):.3g} deg away: "
-            f"{other.inlier_count} inliers, log10 NFA {other.log10_false_alarms:.1f}"
-            for other in solution.candidates[1:4]
-        ]
-        table.add_row("next candidates", "; ".join(others) or "none")
+        if verbose:
+            deviations = f"{number(solution.rotation_std_deg)} deg, centre {number(solution.centre_std)}"
+            table.add_row("std deviation", f"rotation {deviations}, about or along the least certain axis")
+        next_ones = solution.candidates[1:4]
+        degrees = [math.degrees(rotation_angle(solution.rotation, other.rotation)) for other in next_ones]
+        figures = [_figures(other, verbose) for other in next_ones]
+        others = [f"{away:.3g} deg away: {text}" for away, text in zip(degrees, figures, strict=True)]
+        if verbose:
+            others = [f"this: {_figures(solution.candidates[0], verbose)}", *others]
+        table.add_row("candidates" if verbose else "next candidates", "; ".join(others) or "none")
     if solution.stats.dropped2d:
         table.add_row("left out", f"{solution.stats.dropped2d} 2D points that could not be undistorted")
     table.add_row("seconds", f"{solution.seconds:.2f}")
     return table
+
+
+def _figures(candidate: "Candidate", verbose: bool) -> str:
+    """Return the figures of a candidate; `verbose` adds its mean log-likelihood."""
+    score = f", mean log-likelihood {candidate.score:.3f}" if verbose else ""
+    return f"{candidate.inlier_count} inliers, log10 NFA {candidate.log10_false_alarms:.1f}{score}"
 
 
 def _size(text: str) -> tuple[int, int]:

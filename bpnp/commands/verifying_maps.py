@@ -31,8 +31,11 @@ def verify_images(
     quiet: bool = False,
     time_limit: float | None,
     seed: int,
-) -> None:
-    """Verify each image of a COLMAP model and print a row for each; the arguments are those of `bpnp verify`."""
+) -> list[str]:
+    """Verify each image of a COLMAP model, print a row for each, and return the verdicts.
+
+    The arguments are those of `bpnp verify`.
+    """
     from bpnp.datamodules.colmap.model_files import model_format
 
     if not map.is_dir():
@@ -72,6 +75,7 @@ def verify_images(
         say(f"wrote {write_text(output, text, errors='surrogateescape')}", to=out)
     if page is not None:
         say(f"wrote {write_text(page, page_html(verified, scene, map))}", to=out)
+    return [one.verdict for one in verified]
 
 
 def _table(verified: "Sequence[VerifiedView]") -> Any:

@@ -83,15 +83,19 @@ def lines_of(runs: Mapping[str, Results]) -> list[Line]:
     return lines
 
 
-def named_runs(paths: Sequence[Path | str]) -> dict[str, Path]:
+class LargeTree(ValueError):
+    """A folder that is no run, and has more folders than may be searched for results."""
+
+
+def named_runs(paths: Sequence[Path | str], most: float = math.inf) -> dict[str, Path]:
     """Return results folders by the parts of their paths that differ; a single one by the name of its run.
 
     A run's folder stands for its `test`, and a folder of several results, such as that of `bpnp table`, for all of
-    them. A folder that is given twice counts once.
+    them. A folder that is given twice counts once. Raise LargeTree if `most` folders were searched and there are more.
     """
     if not paths:
         raise ValueError("no results folder is given; give one that `bpnp test` wrote")
-    folders = list(dict.fromkeys(folder for path in paths for folder in _results_in(Path(path).absolute())))
+    folders = list(dict.fromkeys(folder for path in paths for folder in _results_in(Path(path).absolute(), most)))
     if len(folders) == 1:
         (folder,) = folders
         return {(folder.parent if folder.name == "test" else folder).name: folder}
@@ -102,11 +106,17 @@ def named_runs(paths: Sequence[Path | str]) -> dict[str, Path]:
     return {os.path.join(*path): folder for path, folder in zip(parts, folders, strict=True)}
 
 
-def _results_in(folder: Path) -> list[Path]:
+def _results_in(folder: Path, most: float) -> list[Path]:
     for candidate in (folder, folder / "test"):
         if (candidate / SUMMARY).is_file():
             return [candidate]
-    return sorted(path.parent for path in folder.rglob(SUMMARY)) or [folder]
+    found = []
+    for count, (inside, _, files) in enumerate(os.walk(folder)):
+        if count >= most:
+            raise LargeTree(f"{folder} is no run, and has more than {most:.0f} folders; name the folders of the tests")
+        if SUMMARY in files:
+            found.append(Path(inside))
+    return sorted(found) or [folder]
 
 
 @dataclass(frozen=True)

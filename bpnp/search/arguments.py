@@ -67,8 +67,8 @@ def source_from(solver: "str | Path | torch.nn.Module") -> "torch.nn.Module | No
     path = Path(str(solver))
     if not isinstance(solver, (str, Path)) or not (path.suffix or path.is_file() or str(solver) in pretrained_names()):
         raise ValueError(
-            f'`solver` is {solver!r}; it is "auto", "search", a module from Batch to Prediction, a checkpoint, or the '
-            f"name of packaged weights: {', '.join(pretrained_names())}"
+            f'`solver` is {solver!r}; it is "auto", "search", a checkpoint, the name of packaged weights '
+            f"({', '.join(pretrained_names())}), or in Python a module from Batch to Prediction"
         )
     return TrainedNet.from_checkpoint(solver)
 
@@ -422,7 +422,7 @@ def check_unit(points2d: Array, camera: Camera | None) -> None:
     """Raise ValueError for pixels without a camera, or for normalised coordinates with one."""
     largest = np.abs(points2d).max()
     if camera is None:
-        check_normalised(points2d, "camera=K")
+        check_normalised(points2d, "camera=K, or image_size=(width, height) if the focal length is unknown")
     if camera is not None and largest < ONE_PIXEL and camera.focal > 100:
         raise ValueError(
             f"`points2d` has values up to {largest:g}, which look normalised; give pixels with a `camera`, or leave "

@@ -38,7 +38,7 @@ def write_to_closed_socket() -> None:
 
 def test_only_a_closed_standard_output_ends_a_command_silently(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(COMMANDS, "solve", write_to_closed_socket)
-    monkeypatch.setitem(COMMANDS, "report", lambda: sys.stdout.write("a line"))
+    monkeypatch.setitem(COMMANDS, "report", lambda: sys.stdout.write("a line") and None)
     read, write = os.pipe()
     with os.fdopen(write, "w") as pipe:
         monkeypatch.setattr(sys, "stdout", pipe)
@@ -127,7 +127,9 @@ def test_options_of_the_network_and_its_parts_are_explained(
         ),
         (["fit", *MESHES, "--trainer.fast_dev_run=-1"], "fast_dev_run=-1 is not a valid configuration"),
         (["test", *MESHES, "--ckpt_path=nothing.ckpt"], "nothing.ckpt"),
-        (["report", "nowhere"], "nowhere is no results folder"),
+        (["report", "nowhere"], "nowhere does not exist; give a folder that `bpnp test`"),
+        (["help", "slove"], "'slove' is not a command; did you mean solve?"),
+        (["table", "--data=quickstart", "--methods=search", "--limit=-1"], "--limit is -1; it must be 1 or more"),
         (
             ["view", "nowhere"],
             "nowhere does not exist; give the folder of a test or the JSON of a solution",
@@ -136,7 +138,7 @@ def test_options_of_the_network_and_its_parts_are_explained(
         (["view", __file__, "3"], "is one solution, which has no problem '3'"),
         (
             ["report", "nowhere", "--paper", "modelnet"],
-            "Literal['modelnet40', 'megadepth'] Given value: modelnet",
+            "--paper is 'modelnet'; one of 'modelnet40', 'megadepth' is needed\n",
         ),
     ],
 )
@@ -161,8 +163,31 @@ def test_a_closed_pipe_is_no_error() -> None:
 
 
 def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
-    main(["--version"])
-    assert capsys.readouterr().out == f"bpnp {version('bpnp')}\n"
+    for option in ("--version", "-V"):
+        main([option])
+        assert capsys.readouterr().out == f"bpnp {version('bpnp')}\n"
+
+
+@pytest.mark.parametrize("words", [[], ["solve"], ["prepare"], ["prepare", "megadepth"], ["fit"], ["test"]])
+def test_help_is_a_command_too(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    texts = []
+    for arguments in ([*words, "--help"], ["help", *words]):
+        with contextlib.suppress(SystemExit):
+            main(arguments)
+        texts.append(capsys.readouterr().out)
+    assert texts[0] == texts[1] != ""
+
+
+def test_verbose_adds_the_traceback_of_a_mistake(capsys: pytest.CaptureFixture[str], fails: Callable[..., str]) -> None:
+    short = fails("localize", "nowhere", "a.jpg", "--focal_error", "7")
+    assert short == "bpnp: error: --focal_error is 7.0; it is a fraction of the focal length, above 0 and below 1\n"
+    for words in (["--verbose", "localize"], ["localize", "--verbose"]):
+        with pytest.raises(SystemExit) as stop:
+            main([*words, "nowhere", "a.jpg", "--focal_error", "7"])
+        assert stop.value.code == 2
+        long = capsys.readouterr().err
+        assert long.startswith("Traceback")
+        assert long.endswith(short)
 
 
 @pytest.mark.parametrize("name", [*COMMANDS, "prepare megadepth"])
@@ -278,7 +303,7 @@ def test_training_test_and_report_work_in_sequence(
 
 
 def test_a_warning_is_one_line() -> None:
-    code = "import warnings; from bpnp import cli; cli._run = lambda _: warnings.warn('two\\nlines'); cli.main()"
+    code = "import warnings; from bpnp import cli; cli._run = lambda *_, **__: warnings.warn('two\\nlines'); cli.main()"
     shown = subprocess.run([sys.executable, "-c", code, "solve"], capture_output=True, text=True, check=True)
     assert (shown.stdout, shown.stderr) == ("", "bpnp: warning: two lines\n")
 

@@ -95,7 +95,7 @@ def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, 
         (("--keypoints", "nothing.h5"), "--keypoints nothing.h5 does not exist; give"),
         (("--solver", "nothing"), "name of packaged weights"),
         (("--model", str(model)), "nrecognized arguments: --model"),
-        (("--time_limit", "-1"), "`time_limit` is -1.0; it must be a positive number"),
+        (("--time_limit", "-1"), "--time_limit is -1.0; it must be a positive number"),
         (("--views", "nothing.txt"), "--views needs a text file of lines `photo view`"),
         (("--output", str(tmp_path / "plain.jpg")), ": it is a file, or lies in one"),
     ):
@@ -286,8 +286,8 @@ def test_a_rough_focal_length_and_distortion_are_found(tmp_path: Path, fails: Ca
     for solution in found[1:]:
         assert solution.focal_length == pytest.approx(520, rel=0.01)
         assert degrees_between(solution.rotation, truth.rotations[0]) < 0.1
-    assert "`focal_error` is 2.0; it is a fraction of the focal length" in fails(*command, "--focal_error", "2")
-    assert "`distortion=True` needs" in fails(*command, "--distortion")
+    assert "--focal_error is 2.0; it is a fraction of the focal length" in fails(*command, "--focal_error", "2")
+    assert "--distortion needs" in fails(*command, "--distortion")
 
 
 HASHES = {k: f"{k}b5d5c3712955042212316173ccf37{k}.jpg" for k in range(3)}

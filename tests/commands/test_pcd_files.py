@@ -36,7 +36,7 @@ def test_a_binary_cloud_with_normals_and_padding_is_read(tmp_path: Path) -> None
     fields = "x y z _ histogram normal_x normal_y normal_z"
     head = header(fields, size="4 4 4 1 4 8 8 8", kind="F F F U F F F F", count="1 1 1 4 2 1 1 1")
     (tmp_path / "a.pcd").write_bytes((head + END.format(4, "binary")).encode() + cloud.tobytes())
-    points, normals, labels = read_points3d(tmp_path / "a.pcd")
+    points, normals, labels, _ = read_points3d(tmp_path / "a.pcd")
     np.testing.assert_array_equal(points, ROWS[:, :3].astype(np.float32))
     np.testing.assert_array_equal(normals, np.tile([0, 0.6, 0.8], (4, 1)))
     assert labels is None

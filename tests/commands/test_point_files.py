@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from bpnp.cameras import camera_from
 from bpnp.commands.point_files import read_camera, read_points2d, read_points3d, read_pose
 
 POINTS = np.random.default_rng(0).normal(size=(20, 3))
@@ -173,12 +174,22 @@ def test_files_of_other_formats_with_the_names_of_colmap_are_read(tmp_path: Path
     assert read_camera(str(tmp_path / "cameras.txt"))[0] == "SIMPLE_PINHOLE"
 
 
-@pytest.mark.parametrize("text", ["k.npy", "PINHOLE", "500,500,320,240", "PINHOLE,wide", ""])
+@pytest.mark.parametrize("text", ["PINHOLE", "500,500,320", "500,500,320,240,0", "PINHOLE,wide", ""])
 def test_a_text_that_is_no_camera_is_refused(text: str) -> None:
-    with pytest.raises(
-        ValueError, match="is neither a file with a 3x3 matrix or ROS.s camera_info nor MODEL,PARAMETERS"
-    ):
+    with pytest.raises(ValueError, match="is neither a file with .* nor fx,fy,cx,cy nor MODEL,PARAMETERS"):
         read_camera(text)
+
+
+@pytest.mark.parametrize("text", ["nope.csv", "k.npy", "folder/camera", "my camera.yaml", "cameras.bin", "K.TXT"])
+def test_a_file_of_a_camera_that_does_not_exist_is_named(text: str) -> None:
+    with pytest.raises(ValueError, match=f"^there is no file {text}, which --camera names$"):
+        read_camera(text)
+
+
+@pytest.mark.parametrize("text", ["500,510,320.5,240", "500 510 320.5 240", "500, 510, 320.5, 240"])
+def test_four_numbers_are_the_camera_of_a_matrix(text: str) -> None:
+    matrix = [[500, 0, 320.5], [0, 510, 240], [0, 0, 1]]
+    np.testing.assert_array_equal(camera_from(read_camera(text)).matrix, matrix)
 
 
 def test_normals_and_labels_are_found_by_column_name_or_position(tmp_path: Path) -> None:
@@ -186,14 +197,30 @@ def test_normals_and_labels_are_found_by_column_name_or_position(tmp_path: Path)
     named.write_text("label,x,y,z,nx,ny,nz\n7,1,2,3,0,0,1\n-1,4,5,6,1,0,0\n")
     plain.write_text("1 2 3 0 0 1 7\n4 5 6 1 0 0 -1\n")
     for path in (named, plain):
-        points, normals, labels = read_points3d(path)
+        points, normals, labels, scores = read_points3d(path)
+        assert scores is None
         np.testing.assert_array_equal(points, [[1, 2, 3], [4, 5, 6]])
         np.testing.assert_array_equal(normals, [[0, 0, 1], [1, 0, 0]])
         np.testing.assert_array_equal(labels, [7, -1])
     image.write_text("x;y;label\n10;20;7\n30;40;8\n")
-    points, labels = read_points2d(image)
+    points, _, labels, _ = read_points2d(image)
     np.testing.assert_array_equal(points, [[10, 20], [30, 40]])
     np.testing.assert_array_equal(labels, [7, 8])
+
+
+def test_scores_are_a_column_of_their_name(tmp_path: Path) -> None:
+    image, scene, cloud = (tmp_path / name for name in ("x.csv", "p.txt", "a.ply"))
+    image.write_text("x,y,score\n10,20,0.5\n30,40,1\n")
+    scene.write_text("score x y z\n1e-3 1 2 3\n1 4 5 6\n")
+    header = "".join(f"property float {name}\n" for name in ("x", "y", "z", "score"))
+    cloud.write_text(f"ply\nformat ascii 1.0\nelement vertex 1\n{header}end_header\n1 2 3 0.25\n")
+    assert np.array_equal(read_points2d(image).scores, [0.5, 1])  # type: ignore[arg-type]
+    assert np.array_equal(read_points3d(scene).scores, [1e-3, 1])  # type: ignore[arg-type]
+    assert np.array_equal(read_points3d(cloud).scores, [0.25])  # type: ignore[arg-type]
+    for wrong in ("0", "37", "nan", "-0.5"):
+        image.write_text(f"x,y,score\n10,20,0.5\n30,40,{wrong}\n")
+        with pytest.raises(ValueError, match=rf"column score of .*x.csv holds {wrong}; scores are above 0 and at most"):
+            read_points2d(image)
 
 
 def test_a_header_without_x_and_y_is_no_point(tmp_path: Path) -> None:
@@ -249,7 +276,7 @@ def test_a_label_that_no_integer_holds_is_refused(label: str, tmp_path: Path) ->
 def test_tables_written_by_r_and_spreadsheets_are_read(text: str, tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     path.write_text(text)
-    points, labels = read_points2d(path)
+    points, _, labels, _ = read_points2d(path)
     np.testing.assert_array_equal(points, [[1.5, 2.5], [3.5, -4.5]])
     np.testing.assert_array_equal(labels, [7, 8])
 
@@ -269,7 +296,7 @@ def test_a_ply_cloud_has_normals_and_labels(encoding: str, tmp_path: Path) -> No
     path = tmp_path / "a.ply"
     head = f"ply\nformat {encoding} 1.0\nelement vertex 3\n{header}end_header\n".encode()
     path.write_bytes(head + (f"{text}\n".encode() if encoding == "ascii" else rows.tobytes()))
-    points, normals, labels = read_points3d(path)
+    points, normals, labels, _ = read_points3d(path)
     np.testing.assert_array_equal(points, [[1, 2, 3], [1, 2, 3], [4, 5, 6]])
     np.testing.assert_array_equal(normals, [[0, 0, 1], [1, 0, 0], [0, -1, 0]])
     np.testing.assert_array_equal(labels, [7, -1, 8])
@@ -335,7 +362,7 @@ def test_an_index_column_is_left_out_where_it_is_one(tmp_path: Path) -> None:
         path.write_text(rows(np.column_stack([count + first, POINTS[:, :2]]), " "))
         np.testing.assert_array_equal(read_points2d(path)[0], POINTS[:, :2])
         path.write_text(rows(np.column_stack([count + first, POINTS, labels]), " "))
-        points, _, found = read_points3d(path)
+        points, _, found, _ = read_points3d(path)
         np.testing.assert_array_equal(points, POINTS)
         np.testing.assert_array_equal(found, labels)
     path.write_text("id x y z\n" + rows(np.column_stack([count + 5, POINTS]), " "))
@@ -402,5 +429,5 @@ def test_a_pose_that_is_nested_or_has_no_fields_is_refused(tmp_path: Path) -> No
         ('{"rotation": []}', "'translation' is missing"),
     ):
         path.write_text(text)
-        with pytest.raises(ValueError, match=f"pose.json is no JSON with `rotation` and `translation`: .*{message}"):
+        with pytest.raises(ValueError, match=f'pose.json is no JSON with "rotation" and "translation": .*{message}'):
             read_pose(path)

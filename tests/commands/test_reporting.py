@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from report_data import drawn_problem, rows, write_run
 
 from bpnp.cli import main
+from bpnp.commands.reporting import MOST_FOLDERS
 from bpnp.report import intervals
 from bpnp.report.intervals import _draw
 from bpnp.report.points import thin, write_points
@@ -59,6 +60,30 @@ def test_a_run_that_is_given_twice_is_shown_once(tmp_path: Path, capsys: pytest.
     once = capsys.readouterr().out
     main(["report", str(tmp_path / "run"), str(tmp_path / "run" / "test")])
     assert capsys.readouterr().out == once
+
+
+def test_a_large_tree_is_searched_only_if_the_user_wants_it(
+    tmp_path: Path, fails: Callable[..., str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_run(tmp_path / "runs" / "z", 9, 0)
+    main(["report", str(tmp_path / "runs")])
+    assert "Pose errors, 9 problems" in capsys.readouterr().out
+    for k in range(MOST_FOLDERS):
+        (tmp_path / "runs" / f"{k}").mkdir()
+    sentence = f"{tmp_path / 'runs'} is no run, and has more than {MOST_FOLDERS} folders; name the folders of the tests"
+    assert fails("report", str(tmp_path / "runs")) == f"bpnp: error: {sentence}\n"
+    main(["report", str(tmp_path / "runs" / "z")])  # a run is named
+    capsys.readouterr()
+    for stream in (sys.stdin, sys.stderr):
+        monkeypatch.setattr(stream, "isatty", lambda: True)
+    monkeypatch.setattr(sys.stdin, "readline", lambda: "\n")
+    with pytest.raises(SystemExit) as stop:
+        main(["report", str(tmp_path / "runs")])
+    assert stop.value.code == 2
+    assert capsys.readouterr().err.startswith(f"{sentence}.\nSearch all of them for results? [y/N] ")
+    monkeypatch.setattr(sys.stdin, "readline", lambda: "y\n")
+    main(["report", str(tmp_path / "runs")])
+    assert "Pose errors, 9 problems" in capsys.readouterr().out
 
 
 def test_a_printed_path_keeps_its_colons(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -62,10 +62,12 @@ def test_options_and_columns_reach_the_search_as_they_are_written(tmp_path: Path
     """Pass all options to `solve`; their effects are tested in tests/search/test_options.py."""
     rng = np.random.default_rng(9)
     sides = np.column_stack([P, np.tile([0.0, 0, 1], (40, 1)), rng.integers(0, 2, 40)])
-    colours = np.empty((40, 1))
+    colours, scores = np.empty((40, 1)), rng.uniform(0.1, 1, (40, 2))
     colours[PLANTED.match3d[0].numpy(), 0] = sides[:, 6]
-    np.savetxt(tmp_path / "x.csv", np.hstack([X, colours]), delimiter=",", header="x,y,label", comments="")
-    np.savetxt(tmp_path / "p.csv", sides, delimiter=",", header="x,y,z,nx,ny,nz,label", comments="")
+    image = np.hstack([X, colours, scores[:, :1]])
+    np.savetxt(tmp_path / "x.csv", image, delimiter=",", header="x,y,label,score", comments="")
+    scene = np.hstack([sides, scores[:, 1:]])
+    np.savetxt(tmp_path / "p.csv", scene, delimiter=",", header="x,y,z,nx,ny,nz,label,score", comments="")
 
     solution, rough = bpnp.solve(X, P), tmp_path / "rough.json"
     pose = np.diag([1.0, -1, -1]).tolist(), [1.0, 2.0, 3.0]
@@ -89,6 +91,7 @@ def test_options_and_columns_reach_the_search_as_they_are_written(tmp_path: Path
     np.testing.assert_array_equal(options["normals3d"], sides[:, 3:6])
     np.testing.assert_array_equal(options["labels3d"], sides[:, 6])
     np.testing.assert_array_equal(options["labels2d"], colours[:, 0])
+    np.testing.assert_array_equal(np.stack([options["scores2d"], options["scores3d"]], 1), scores)
     prior = options["prior"]
     assert (np.array(prior.rotation).tolist(), np.array(prior.translation).tolist()) == pose
     assert (prior.rotation_sigma_deg, prior.translation_sigma) == (6, 0.5)
@@ -103,7 +106,7 @@ def test_options_and_columns_reach_the_search_as_they_are_written(tmp_path: Path
     [
         (
             lambda files: [*files, "--up_camera", "0", "-1", "x", "--up_scene", "0", "0", "1"],
-            "element 3: Expected a <class",
+            "word 3 of --up_camera is 'x'; a number is needed",
         ),
         (lambda files: files[::-1], "are the two files swapped?"),
         (lambda files: [files[0], "nowhere.npy"], "there is no file nowhere.npy"),
@@ -113,6 +116,19 @@ def test_options_and_columns_reach_the_search_as_they_are_written(tmp_path: Path
         (lambda files: [*files, "--solver", "nothing.ckpt"], "nothing.ckpt"),
         (lambda files: [*files, "--prior", "nothing.json"], "nothing.json"),
         (lambda files: [*files, *UP[:4]], "give --up_camera and --up_scene together"),
+        (lambda files: [*files, *UP[:4], *["--up_scene", "0", "0", "0"]], "--up_scene is 0 0 0; give a direction"),
+        (lambda files: [*files, *UP, "--up_degrees", "0"], "error: --up_degrees is 0.0; it must be a positive number"),
+        (lambda files: [*files, "--camera", "nope.csv"], "error: there is no file nope.csv, which --camera names\n"),
+        (
+            lambda files: [*files, *CAMERA, "--image_size", "640,480"],
+            "error: --camera and --image_size exclude each other: --image_size is for an unknown focal length. For one "
+            "that is known to a tenth give --camera and --focal_error 0.1\n",
+        ),
+        (lambda files: [*files, "--focal_error", "0.1"], "error: --focal_error needs the --camera whose focal length"),
+        (lambda files: [*files, "--distortion"], "error: --distortion needs an --image_size, or a --focal_error with"),
+        (lambda files: [*files, "--clutter", "2"], "error: --clutter is 2.0; it is a fraction"),
+        (lambda files: [*files, "--solver", "serch"], 'error: --solver is \'serch\'; it is "auto", "search"'),
+        (lambda files: [*files, "--seed", "x"], "error: --seed is 'x'; a whole number is needed\n"),
         (lambda files: [*files, *UP, "--prior", "a.json"], "give --prior, or --up_camera with --up_scene, not both"),
         (lambda files: [*files, "--image", "a.jpg"], "--image 'a.jpg' needs a COLMAP model as --camera"),
         (lambda files: [*files, "--photo", "a.jpg"], "--photo needs --picture and --camera"),
@@ -123,6 +139,55 @@ def test_options_and_columns_reach_the_search_as_they_are_written(tmp_path: Path
 )
 def test_a_mistake_is_one_line(change: Any, message: str, tmp_path: Path, fails: Callable[..., str]) -> None:
     assert message in fails("solve", *change(write(tmp_path)))
+
+
+def test_pixels_without_a_camera_are_told_the_options(tmp_path: Path, fails: Callable[..., str]) -> None:
+    said = fails("solve", *write(tmp_path, 800 * X + [320, 240]))
+    assert said.endswith("; they look like pixels; try --camera, or --image_size if the focal length is unknown\n")
+
+
+def test_the_exit_status_is_the_verdict_with_strict(tmp_path: Path) -> None:
+    """Four points never fix a pose alone, and points of an unrelated image fit only by chance."""
+    (tmp_path / "few").mkdir()
+    (tmp_path / "none").mkdir()
+    rng = np.random.default_rng(0)
+    few = write(tmp_path / "few", X[PLANTED.match3d[0].argsort()[:4]], P[:4])
+    unrelated = write(tmp_path / "none", rng.uniform(-0.3, 0.3, (12, 2)), P[:12])
+    main(["solve", *write(tmp_path), "--strict", "--quiet"])
+    for files in (few, unrelated):
+        main(["solve", *files, "--quiet"])
+        with pytest.raises(SystemExit) as stop:
+            main(["solve", *files, "--strict", "--quiet", "--output", str(tmp_path / "s.json")])
+        assert stop.value.code == 1
+        assert Solution.from_json(tmp_path / "s.json").verdict != "confident"
+
+
+def test_the_camera_in_the_json_has_the_size_of_its_images_or_none(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = write(tmp_path, 800 * X + [320, 240])
+    Image.new("RGB", (640, 480)).save(tmp_path / "photo.png")
+    with_photo = [*CAMERA, "--photo", str(tmp_path / "photo.png"), "--picture", str(tmp_path / "p.png")]
+    sized = ["--camera", "SIMPLE_PINHOLE,1280,960,800,320,240"]
+    for options, size in ((CAMERA, (None, None)), (with_photo, (640, 480)), (sized, (1280, 960))):
+        main(["solve", *files, *options, "--json"])
+        solution = Solution.from_json(text := capsys.readouterr().out)
+        camera = json.loads(text)["camera"]
+        assert (camera["width"], camera["height"]) == size
+        assert solution.focal_length == 800
+        assert bpnp.solve(800 * X + [320, 240], P, camera).verdict == "confident"
+
+
+def test_verbose_prints_the_scores(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(0)
+    files = write(tmp_path, rng.uniform(-0.3, 0.3, (12, 2)), P[:12])
+    main(["solve", *files])
+    assert " inliers, log10 NFA " in (printed := capsys.readouterr().out)
+    assert "likelihood" not in printed
+    main(["solve", *files, "--verbose", "--output", str(tmp_path / "s.json")])
+    printed = " ".join(capsys.readouterr().out.split())
+    for candidate in Solution.from_json(tmp_path / "s.json").candidates[:4]:
+        assert f"log10 NFA {candidate.log10_false_alarms:.1f}, mean log-likelihood {candidate.score:.3f}" in printed
 
 
 def test_an_unwritable_output_is_refused_before_the_search(

@@ -63,7 +63,9 @@ def test_the_image_at_the_copy_of_its_building_is_the_only_doubtful_one(
 def test_json_has_a_record_for_each_image(
     houses: tuple[Path, dict[str, tuple[np.ndarray, np.ndarray]]], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    main(["verify", str(houses[0]), "--json", "--seed", "1", "--time_limit", "1000"])
+    with pytest.raises(SystemExit) as stop:  # one image is wrong
+        main(["verify", str(houses[0]), "--json", "--strict", "--seed", "1", "--time_limit", "1000"])
+    assert stop.value.code == 1
     images = json.loads(capsys.readouterr().out)["images"]
     assert sorted(image["name"] for image in images) == sorted(houses[1])
     assert images[0]["name"] == WRONG_IMAGE
