@@ -99,7 +99,10 @@ def tables(record: dict[str, Any]) -> dict[str, str]:
     return {
         "test": "```text\n" + "".join(f"{line}\n" for line in record["test"]) + "```\n",
         "effect": markdown(effect_head(RECALL), [effect_cells(f"`{k}`", v) for k, v in record["effects"].items()]),
-        "compare": markdown(head(RECALL), [row_cells(label, found) for label, found in record["compared"].items()]),
+        "compare": markdown(
+            [name for name in head(RECALL) if name != "steps"],
+            [[label, *row_cells(label, found)[2:]] for label, found in record["compared"].items()],
+        ),
     }
 
 

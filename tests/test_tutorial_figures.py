@@ -99,7 +99,7 @@ def test_the_page_is_filled_with_what_its_commands_give(
     assert ["Lc:", "refined", *["2.00"] * 3, *["0.10"] * 3, *["1.00"] * 3] in [line[:11] for line in lines]
     assert "| `pnp` | 8 | +1 [+1, +1], better in 0 % | -0.28 [-0.28, -0.28], better in 100 % |" in text
     assert "| `refined` | 8 | +0 [+0, +0], better in 0 % | +0 [+0, +0], better in 0 % |" in text
-    assert "| search |  | 8 | 0.5 / 0.5 [0.5, 0.5] / 0.5 | 0.01 / 0.01 [0.01, 0.01] / 0.01 |" in text
+    assert "| search | 8 | 0.5 / 0.5 [0.5, 0.5] / 0.5 | 0.01 / 0.01 [0.01, 0.01] / 0.01 |" in text
     assert "\nold\n" not in text
     table = text.split("<!-- tutorial: test -->\n")[1].split("<!-- end")[0]
     assert table in (tmp_path / "README.md").read_text()
