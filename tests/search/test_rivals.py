@@ -251,3 +251,16 @@ def test_a_pose_of_one_part_of_the_scene_is_not_that_of_the_scene(seed: int) -> 
     )
     solution = solve(image, points, K)
     assert (solution.verdict, solution.reason_code) == ("ambiguous", "one_part")
+
+
+def test_a_given_pose_of_the_smaller_body_is_no_confident_one() -> None:
+    """The other body is more likely by far more decades than other candidates are kept for."""
+    rng = np.random.default_rng(2)
+    room, chair = rng.uniform(-3, 3, (24, 3)), rng.normal(0, 0.5, (16, 3))
+    turn = Rotation.from_euler("z", 70, degrees=True).as_matrix()
+    image = shuffled(
+        rng, pixels(room[:9], np.eye(3), AWAY, rng), pixels(chair @ turn.T + [0.8, 0.5, 0], np.eye(3), AWAY, rng)
+    )
+    solution = verify(image, np.concatenate([room, chair]), np.eye(3), AWAY, K)
+    assert solution.verdict != "confident"
+    assert degrees_between(solution.rotation, np.eye(3)) < 1

@@ -17,7 +17,7 @@ from bpnp.search.verdict.rivals import left_by
 
 FEWEST_LEFT = 1  # number of image points and of scene points that the best pose leaves [points; derived]
 # Decades by which the mirrored image has to fit better; that of a flat or mirror-symmetric scene fits as well.
-BETTER = 1.0  # [decades; calibration]
+BETTER = 0.3  # [decades; calibration]
 
 
 def mirrored_image(case: Case, *, deadline: Deadline = NEVER) -> Case:

@@ -23,7 +23,7 @@ from bpnp.search.verdict.rivals import SceneOf, left_by
 
 # Number of image points and of scene points that the best pose leaves from which a better one may exist nearby.
 FEWEST_LEFT = 6  # [points; not tuned]
-FEWEST_LEFT_FLAT = 3  # the same for a flat scene, whose points may slide along a curve [points; derived]
+FEWEST_LEFT_FLAT = 1  # the same for a flat scene, whose points may slide along a curve [points; derived]
 
 
 def nearby(case: Case, *, scene_of: SceneOf, deadline: Deadline = NEVER) -> Case:

@@ -33,9 +33,8 @@ FAR_BODY = 3.0  # distance of another body's pose [tolerances of the same pose; 
 NEAR_DECADES = 10.0  # [decades; calibration]
 # Fraction of the second pose's matches with scene points of the first from which it shows the same points again.
 SHOWN_TWICE = 0.25  # [fraction; not tuned]
-# A body of its own: largest fraction of the facing scene points that it shows, and largest number of the others in its
-# outline, over that of its points.
-MINORITY, MOST_BETWEEN = 0.4, 0.5  # [fraction; calibration, moved furniture]
+# A body of its own: largest number of other scene points in its outline, over that of its points.
+MOST_BETWEEN = 0.5  # [fraction; calibration, moved furniture]
 COMPARED_BODIES = 4  # number of poses of the rest whose false alarms are computed [poses; cost]
 
 
@@ -77,14 +76,14 @@ def second_body(case: Case, *, deadline: Deadline = NEVER) -> Case:
         both = case.among(weighed_pose(problem, *pose.pose()))
         if not both.has_leader_of(case):  # it has more matches, and is asked in turn
             near = both.candidates.log10_false_alarms <= both.log10_false_alarms + NEAR_DECADES
-            return replace(both, candidates=both.candidates[near])
+            return both if case.claim is not None else replace(both, candidates=both.candidates[near])
         return both.against(objection("second_body", 0.0, away=away, **counts))
     return case if problem.labels3d is not None else case.against(_one_part(case, shown, facing, len(rest)))
 
 
 def _one_part(case: Case, shown: Indices, facing: NDArray[np.bool_], left: int) -> Objection | None:
-    """Return an objection if the shown scene points (k,) are all of a small part of those that face the camera (n,)."""
-    if len(shown) > MINORITY * facing.sum():
+    """Return an objection if the shown points (k,), at most half of those that face the camera (n,), are one part."""
+    if 2 * len(shown) > facing.sum():
         return None
     seen, others = directions_of(case.problem, *case.pose), np.setdiff1d(np.flatnonzero(facing), shown)
     between = Outline(case.problem.image, seen[shown]).contains(seen[others]).sum()
