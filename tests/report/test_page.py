@@ -167,6 +167,8 @@ def test_problems_of_one_name_in_other_data_are_not_paired(tmp_path: Path) -> No
     assert problems["part: ransac"] == problems["a: ransac"][3:]
     assert not {*problems["other: ransac"]} & {*problems["a: ransac"]}
     assert len({*problems["other: ransac"]}) == 8
+    note = "No differences for part, other: a was tested on other problems."
+    assert note in page_html([tmp_path / name for name in runs])
     twins = write_results(tmp_path / "twins", [row(0, id="x"), row(1, id="x")])
     numbers = page_numbers({"twins": twins})
     assert len({*numbers["columns"][numbers["series"][0]["problems"]]}) == 2
