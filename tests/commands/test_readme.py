@@ -27,7 +27,11 @@ BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 INLINE = re.compile(r"`([^`]+)`")
 COMMAND = re.compile(r"((bpnp|lightning|make)\s+[a-z]|python\s+-m\s+benchmarks\s+[a-z])")
 # What a reader replaces, and what stands for it here.
-STAND_INS = {"my.module.Solver": "bpnp.models.Search", "harder.yaml": "presets/debug"}
+STAND_INS = {
+    "my.module.Solver": "bpnp.models.Search",
+    "my_file.MissedMass": "bpnp.training.ReprojectionLoss",
+    "harder.yaml": "presets/debug",
+}
 
 
 def blocks(text: Path, language: str) -> list[str]:
