@@ -73,6 +73,8 @@ wheel: install
 	cd build/empty && bin/bpnp solve points2d.csv points3d.csv --camera camera.csv --picture pose.png
 	cd build/empty && bin/bpnp fit --config quickstart --config presets/debug
 	cd build/empty && bin/bpnp test --config quickstart --config presets/debug --ckpt_path last
+	cd build/empty && bin/bpnp report runs/debug/test
+	build/empty/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt "$$(ls dist/bpnp-*.whl)[dashboards]"
 	cd build/empty && bin/bpnp report runs/debug/test --html report.html
 
 clean:

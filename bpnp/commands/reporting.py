@@ -49,6 +49,7 @@ def report(
         photos: folder of the photos of COLMAP models, for the page; `images` of each scene by default.
         groups: print the intervals of each class, scene or landmark too, as on the page.
     """
+    from bpnp.report.charts import import_plotly
     from bpnp.report.figure_files import check_picture_name, save_figure
     from bpnp.report.figures import recall_curve
     from bpnp.report.groups import differences, group_table, training_configs
@@ -61,6 +62,8 @@ def report(
         if picture is not None:
             check_picture_name(picture)
     check_outputs([html, recall, curves])
+    if html is not None:
+        import_plotly()  # missing, it is named before anything is written
     named = _runs_in(runs)
     results = {name: read_results(path) for name, path in named.items() if (path / SUMMARY).is_file()}
     if curves is not None:
@@ -280,8 +283,10 @@ def wandb_results(
         photos: folder of the photos of COLMAP models, under their points; `images` of each scene by default.
     """
     from bpnp.commands.photo_files import photo_finder
+    from bpnp.report.charts import import_plotly
     from bpnp.report.dashboards import log_results
 
+    import_plotly()  # missing, it is named before anything is logged
     finder, named = photo_finder(photos, side=VIEW_SIDE), _runs_in(runs)
     first = next(iter(named.values()))
     for name, folder in named.items():

@@ -60,13 +60,25 @@ def recall_of(runs: Mapping[str, Results], line: Line, error: Error, limits: Any
     return recall_at(errors_of(runs, line, error), limits.tolist()).numpy()
 
 
+def import_plotly() -> Any:
+    """Return the module plotly; raise ValueError without it, since only the page and dashboards need it."""
+    try:
+        import plotly
+        import plotly.graph_objects
+        import plotly.offline
+    except ImportError as error:
+        raise ValueError(
+            "the page of `bpnp report` and the charts of `bpnp wandb` need plotly; install it with `pip install plotly`"
+        ) from error
+    return plotly
+
+
 def recall_chart(runs: Mapping[str, Results], error: Error, *, paper: Paper | None = None) -> "Figure | None":
     """Draw the fraction of problems with an error up to a threshold, on a logarithmic axis (paper Fig. 3).
 
     Rings are the quartiles in the table `paper`. The result is None if no problem has an error of this kind.
     """
-    from plotly.graph_objects import Figure
-
+    plotly = import_plotly()
     title, _, most = RECALLS[error]
     every = np.concatenate([errors_of(runs, line, error).numpy() for line in lines_of(runs)])
     if not len(every):
@@ -76,7 +88,9 @@ def recall_chart(runs: Mapping[str, Results], error: Error, *, paper: Paper | No
     if error != "translation":  # an axis of angles ends where most poses are wrong, also if all of them are
         low = min(low, most / 2)
     limits = np.geomspace(low, max(most, 2 * low), POINTS)
-    figure = Figure(layout={"title": {"text": title}, "hovermode": "x unified", "template": "none"})
+    figure = plotly.graph_objects.Figure(
+        layout={"title": {"text": title}, "hovermode": "x unified", "template": "none"}
+    )
     figure.update_yaxes(title={"text": "problems up to this error"}, range=[0, 1.01], tickformat=".0%")
     # On one to two decades plotly labels every digit, and the labels overlap; with fewer ticks it labels 1, 2 and 5.
     decades = float(np.log10(limits[-1] / limits[0]))

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.arrays import AnyArray
 from bpnp.files import write_text
-from bpnp.report.charts import CONFIG, RECALLS, chart_text, figures, look, recall_chart
+from bpnp.report.charts import CONFIG, RECALLS, chart_text, figures, import_plotly, look, recall_chart
 from bpnp.report.groups import differences, group_table, training_configs
 from bpnp.report.intervals import CAPTION as INTERVAL_CAPTION
 from bpnp.report.intervals import IntervalTable, interval_table
@@ -247,9 +247,7 @@ def _shares(results: Results, estimate: str) -> tuple[list[float], float | None]
 @cache
 def plotly_script() -> str:
     """Return plotly.js, compressed, in base64."""
-    from plotly.offline import get_plotlyjs
-
-    return compress_text(get_plotlyjs())
+    return compress_text(import_plotly().offline.get_plotlyjs())
 
 
 def _asset(name: str) -> str:

@@ -5,6 +5,8 @@ import os
 import shutil
 import signal
 from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -159,6 +161,18 @@ def command(tmp_path: Path, mesh_solution: bpnp.Solution, monkeypatch: pytest.Mo
     monkeypatch.setattr(SceneMap, "localize_photo", lambda *_, **__: mesh_solution)
     monkeypatch.chdir(tmp_path)
     return ["localize", "map", "a.png", "--camera", "SIMPLE_PINHOLE,80,32,24", "--output", "out"]
+
+
+@pytest.mark.parametrize("verdict", ["confident", "ambiguous", "failed"])
+def test_the_exit_status_is_the_verdict_with_strict(
+    verdict: Any, command: list[str], mesh_solution: bpnp.Solution, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = replace(mesh_solution, verdict=verdict)
+    monkeypatch.setattr(SceneMap, "localize_photo", lambda *_, **__: found)
+    main([*command, "--no_pictures", "--quiet"])
+    with pytest.raises(SystemExit) if verdict != "confident" else nullcontext() as stop:
+        main([*command, "--no_pictures", "--quiet", "--strict"])
+    assert stop is None or stop.value.code == 1
 
 
 def test_a_solution_without_a_picture_is_kept_and_drawn_by_the_next_run(

@@ -62,6 +62,22 @@ def test_a_run_that_is_given_twice_is_shown_once(tmp_path: Path, capsys: pytest.
     assert capsys.readouterr().out == once
 
 
+def test_only_the_page_and_dashboards_need_plotly(
+    tmp_path: Path, fails: Callable[..., str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_run(tmp_path / "run", 9, 0)
+    monkeypatch.setitem(sys.modules, "plotly", None)  # as if it were not installed
+    needed = "need plotly; install it with `pip install plotly`\n"
+    outputs = [tmp_path / "report.html", tmp_path / "recall.png"]
+    said = fails("report", str(tmp_path / "run"), "--html", str(outputs[0]), "--recall", str(outputs[1]))
+    assert said.endswith(needed)
+    assert fails("wandb", str(tmp_path / "run"), "--directory", str(tmp_path / "offline")).endswith(needed)
+    assert not any(path.exists() for path in (*outputs, tmp_path / "offline"))
+    main(["report", str(tmp_path / "run"), "--recall", str(outputs[1])])
+    assert "Pose errors, 9 problems" in capsys.readouterr().out
+    assert imread(outputs[1]).std() > 0.05
+
+
 def test_a_large_tree_is_searched_only_if_the_user_wants_it(
     tmp_path: Path, fails: Callable[..., str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
