@@ -129,17 +129,16 @@ def _find_parts(root: Path, dataset: str | None) -> tuple[str, list[tuple[str, l
         raise ValueError(
             f"{root} has no {dataset or '<dataset>'}_train and _test; its data sets: {', '.join(names) or 'none'}"
         )
-    parts = []
+    parts: list[tuple[str, list[Path]]] = []
     for split, endings in SPLITS.items():
         tops = [top for ending in endings if (top := root / f"{chosen}_{ending}").is_dir()]
         if len(tops) > 1:
             raise ValueError(f"{tops[0]} and {tops[1]} both have test problems; move one of them elsewhere")
         for top in tops:
-            parts += (
-                [(split, [top / "preprocessed" / f"{name}.pkl" for name in PREPROCESSED])]
-                if (top / "preprocessed").is_dir()
-                else _scenes(split, top, _listed_scenes(root, chosen, split))
-            )
+            if (top / "preprocessed").is_dir():
+                parts.append((split, [top / "preprocessed" / f"{name}.pkl" for name in PREPROCESSED]))
+            else:
+                parts += _scenes(split, top, _listed_scenes(root, chosen, split))
     if not parts:
         raise ValueError(f"{root / chosen}_train and _test have neither preprocessed/*.pkl nor matches.pkl")
     missing = [str(file) for _, files in parts for file in files if not file.is_file()]
@@ -157,8 +156,8 @@ def _scenes(split: str, top: Path, listed: set[str] | None) -> list[tuple[str, l
         found = {folder: first for folder, first in found.items() if folder.name in listed}
     parts = []
     for folder, first in sorted(found.items()):
-        names = MATCHES_OF_LIU if first.with_name("inlier_matches.pkl").is_file() else MATCHES
-        parts.append(("/".join((split, *folder.parts)), [first.with_name(f"{name}.pkl") for name in names]))
+        pickles = MATCHES_OF_LIU if first.with_name("inlier_matches.pkl").is_file() else MATCHES
+        parts.append(("/".join((split, *folder.parts)), [first.with_name(f"{name}.pkl") for name in pickles]))
     return parts
 
 

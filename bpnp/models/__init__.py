@@ -2,9 +2,10 @@
 
 from bpnp.models.batch_search import Search
 from bpnp.models.bpnpnet import BPnPNet
+from bpnp.models.knn_features import KnnFeatures
 from bpnp.models.least_squares import LeastSquares
 from bpnp.models.matcher import Matcher
 from bpnp.models.refinement import Refinement
 from bpnp.models.weights import TrainedNet
 
-__all__ = ["BPnPNet", "LeastSquares", "Matcher", "Refinement", "Search", "TrainedNet"]
+__all__ = ["BPnPNet", "KnnFeatures", "LeastSquares", "Matcher", "Refinement", "Search", "TrainedNet"]

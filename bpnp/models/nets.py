@@ -126,8 +126,10 @@ class MaskedBatchNorm(nn.BatchNorm1d):
         mean, variance = self.running_mean, self.running_var
         if self.training:
             mean, variance = self._statistics(x, mask)
-        scale = torch.rsqrt(variance + self.eps) * self.weight
-        return torch.addcmul(self.bias - mean * scale, x, scale)
+        scale = torch.rsqrt(variance + self.eps)
+        if self.affine:
+            scale = scale * self.weight
+        return torch.addcmul((self.bias if self.affine else 0) - mean * scale, x, scale)
 
     def _statistics(self, x: Tensor, mask: Bool[Tensor, "b k"] | None) -> tuple[Tensor, Tensor]:
         """Return mean and variance over all processes, and update the running statistics."""

@@ -19,11 +19,15 @@ from bpnp.files import write_atomically
 from bpnp.layers.assignment import Sinkhorn
 from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac.layer import RansacPnP
+from bpnp.models.knn_features import KnnFeatures
 from bpnp.models.least_squares import LeastSquares
 from bpnp.models.nets import ImageFeatures, PointFeatures, SceneFeatures
 from bpnp.models.refinement import Refinement
 
-PARTS = (ImageFeatures, SceneFeatures, PointFeatures, Sinkhorn, RansacPnP, WeightedPnP, Refinement, LeastSquares)
+PARTS = (
+    ImageFeatures, SceneFeatures, PointFeatures, KnnFeatures, Sinkhorn, RansacPnP, WeightedPnP, Refinement,
+    LeastSquares,
+)  # fmt: skip
 WEIGHTS = resources.files("bpnp") / "weights"
 LEARNED = "procedural-so3"  # weights of `solve(prior="learned")`
 PLAIN = (bool, int, float, str, type(None))

@@ -1,7 +1,9 @@
 """LightningModule, losses and callbacks of a training."""
 
 from bpnp.training.callbacks import PoseLossWarmup, ResultsWriter, TrainingMonitor
+from bpnp.training.chamfer import ChamferLoss
 from bpnp.training.checkpoints import BestCheckpoint, SafeCheckpointIO
+from bpnp.training.monte_carlo import MonteCarloPoseLoss
 from bpnp.training.muon import Muon
 from bpnp.training.pose_loss import PoseLoss
 from bpnp.training.predictions import PredictionWriter
@@ -11,6 +13,8 @@ from bpnp.training.task import BlindPnPTask
 __all__ = [
     "BestCheckpoint",
     "BlindPnPTask",
+    "ChamferLoss",
+    "MonteCarloPoseLoss",
     "Muon",
     "PoseLoss",
     "PoseLossWarmup",

@@ -36,6 +36,7 @@ from bpnp.models.weights import (
     read_checkpoint,
 )
 from bpnp.precision import exact_products
+from bpnp.training.chamfer import ChamferLoss
 from bpnp.training.losses import (
     Losses,
     MatchingLoss,
@@ -45,6 +46,7 @@ from bpnp.training.losses import (
     own_losses,
     pose_losses,
 )
+from bpnp.training.monte_carlo import MonteCarloPoseLoss
 from bpnp.training.pose_loss import PoseLoss
 from bpnp.training.predictions import in_scene_frame
 from bpnp.training.reprojection import ReprojectionLoss
@@ -54,7 +56,7 @@ Stage = Literal["val", "test"]
 OptimizerSettings = list[tuple[str, list[dict[str, Any]]]]  # class of each optimizer, and its groups without parameters
 REBUILT = {"solver", "weights"}  # options that are not saved under "task": the checkpoint has their result
 LOSSES = ("loss", "pose_loss")  # options that are saved as descriptions of modules
-PACKAGED_LOSSES = (PoseLoss, ReprojectionLoss)
+PACKAGED_LOSSES = (PoseLoss, MonteCarloPoseLoss, ChamferLoss, ReprojectionLoss)
 POSED = "pnp"  # estimate of the pose loss, which has a derivative
 DECAYED = 0.02  # factor on the learning rate after the decay
 WIDEST_MATCH = 0.5  # largest `correspondence_angle`, radians; larger values are probably degrees
