@@ -45,7 +45,6 @@ PROBLEMS = 200  # test shapes
 RECALL = (15.0, 0.5)  # degrees, scene units
 TESTED = ("pnp", "ransac")
 FILE = ROOT / "benchmarks" / "successors.json"
-SHAPES = {"num_points": 64, "val_shapes": 64, "test_shapes": PROBLEMS}
 POSED = "--pose_loss.start_epoch=0"
 ALONE = f"--pose_loss.start_epoch={NEVER}"
 LIMITS = "--model.pose_loss=bpnp.training.PoseLoss"
@@ -99,7 +98,7 @@ def file_name(name: str) -> str:
 
 def measure(options: argparse.Namespace, record: dict[str, Any]) -> None:
     """Train and test each row, and write the record after each."""
-    data = MeshDataModule(None, **SHAPES)
+    data = MeshDataModule(None, num_points=64, val_shapes=64, test_shapes=PROBLEMS)
     found: dict[str, dict[str, Sequence[ProblemRow]]] = {}
     for name, chosen in ({"start": Successor()} | LOSSES | NETWORKS).items():
         checkpoint = checkpoint_path(START) if name == "start" else train(name, options)

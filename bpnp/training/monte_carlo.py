@@ -160,13 +160,16 @@ class MonteCarloPoseLoss(nn.Module):
         generator = torch.Generator().manual_seed(self.seed)
         turn = roma.rotmat_to_rotvec(other_rotation @ rotation.mT)
         apart = torch.cat([turn, other_translation - translation], -1)
-        starts = ((torch.zeros_like(apart), rotation, translation), (apart, other_rotation, other_translation))
-        proposals = [Proposal(mean, normal_approximation(weighted, points, *pose, limit)) for mean, *pose in starts]
+        roots = [
+            normal_approximation(weighted, points, *pose, limit)
+            for pose in ((rotation, translation), (other_rotation, other_translation))
+        ]
+        proposals = [Proposal(torch.zeros_like(apart), roots[0]), Proposal(apart, roots[1])]
         steps: list[Tensor] = []
         for k in range(self.rounds):
             numbers = torch.randn(self.samples, 6 + FREEDOM, generator=generator, dtype=torch.float64).to(points)
             steps.append(proposals[k].draw(numbers.expand(b, -1, -1)))
-            if k + 1 < len(starts):
+            if k + 1 < len(roots):
                 continue
             drawn = torch.cat(steps, 1)
             turned, moved = retract(drawn, rotation.unsqueeze(1), translation.unsqueeze(1))

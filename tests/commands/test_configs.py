@@ -27,6 +27,9 @@ DAILY = {"quickstart", "matcher"} | {  # in `make test` too
 }
 
 
+ADDED = {"presets", "successors"}  # folders of configurations that are given after a recipe
+
+
 def data_for(recipe: str, folder: Path) -> list[str]:
     """Where the recipe's data are, in small."""
     small = ["--data.batch_size=2"]
@@ -85,14 +88,18 @@ def test_a_part_is_swapped_in_the_recipe(tmp_path: Path) -> None:
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("preset", sorted(path.name for path in (CONFIGS / "presets").glob("*.yaml")))
+@pytest.mark.parametrize(
+    "preset",
+    sorted(f"{path.parent.name}/{path.name}" for path in CONFIGS.glob("*/*.yaml") if path.parent.name in ADDED),
+)
 def test_every_preset_joins_a_recipe(preset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    configs = ["--config=quickstart", f"--config=presets/{Path(preset).stem}"]
+    configs = ["--config=quickstart", f"--config={preset.removesuffix('.yaml')}"]
     arguments = [*configs, *data_for("quickstart", tmp_path), *SMALL_NET[1:], "--pose_loss.start_epoch=0"]
+    arguments += ["--trainer.max_epochs=1", "--trainer.limit_train_batches=2"] if "successors" in preset else []
     main(["fit", *arguments, f"--trainer.default_root_dir={tmp_path}"])
     used = dict(settings(yaml.safe_load((tmp_path / "logs" / "version_0" / "config.yaml").read_text())))
-    wanted = dict(settings(yaml.safe_load((CONFIGS / "presets" / preset).read_text())))
+    wanted = dict(settings(yaml.safe_load((CONFIGS / preset).read_text())))
     wanted.pop("trainer.default_root_dir", None)  # the command line has another
     assert wanted.items() <= used.items()
 
