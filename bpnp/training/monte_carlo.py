@@ -172,7 +172,8 @@ class MonteCarloPoseLoss(nn.Module):
             if k + 1 < len(roots):
                 continue
             drawn = torch.cat(steps, 1)
-            turned, moved = retract(drawn, rotation.unsqueeze(1), translation.unsqueeze(1))
+            at = (pose.unsqueeze(1).expand(b, drawn.shape[1], *pose.shape[1:]) for pose in (rotation, translation))
+            turned, moved = retract(drawn, *at)
             mixture = torch.logsumexp(torch.stack([each.log_density(drawn) for each in proposals]), 0)
             density = mixture - math.log(len(proposals)) - log_measure(drawn[..., :3])
             near = (moved - translation.unsqueeze(1)).norm(dim=-1) < limit.unsqueeze(1)
