@@ -11,6 +11,7 @@ import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -18,18 +19,19 @@ import torch
 from pages import markdown, publish
 from paper_tables import (
     ESTIMATES,
+    MEASURES,
     NEVER,
+    Row,
+    Table,
     Training,
     digest,
     effect,
-    effect_cells,
-    effect_head,
     figures,
-    head,
     network,
     provenance,
     read_record,
-    row_cells,
+    recall_name,
+    sheet,
     solve_problems,
     trained_steps,
 )
@@ -42,7 +44,7 @@ from bpnp.report.results import ProblemRow
 EPOCH = 50  # steps between checkpoints
 START = "procedural-euler"
 PROBLEMS = 200  # test shapes
-RECALL = (15.0, 0.5)  # degrees, scene units
+TABLE = Table("successors", "modelnet40", (15.0, 0.5), ("shapes",))
 TESTED = ("pnp", "ransac")
 FILE = ROOT / "benchmarks" / "successors.json"
 POSED = "--pose_loss.start_epoch=0"
@@ -111,30 +113,37 @@ def measure(options: argparse.Namespace, record: dict[str, Any]) -> None:
         for estimate, own in found[name].items():
             key = f"{options.seed}|{name}|{estimate}"
             measured = {"steps": steps, "settings": {"seed": options.seed}, "measured": provenance(file)}
-            record["rows"][key] = figures(own, RECALL) | measured
+            record["rows"][key] = figures(own, TABLE.recall) | measured
             if chosen.compared:
-                record["effects"][key] = effect(found[chosen.compared][estimate], own, RECALL)
+                record["effects"][key] = effect(found[chosen.compared][estimate], own, TABLE.recall)
             print(f"{key}: {record['rows'][key]}", flush=True)
         write_json(options.output, record)
 
 
 def tables(record: Mapping[str, Any]) -> dict[str, str]:
-    """Return the tables of the losses and of the networks, and of their differences from the first of each."""
+    """Return the tables of the losses and of the networks: medians and recalls of both estimates."""
     seeds = sorted({int(key.split("|")[0]) for key in record["rows"]})
-    parts = {"losses": ["start", *LOSSES], "networks": list(NETWORKS)}
+    heads = [
+        f"{measure}{ESTIMATES[one]}" for measure in (*MEASURES[:2], recall_name(TABLE)) for one in TESTED
+    ]  # fmt: skip
     result = {}
-    for part, names in parts.items():
-        for title, kind, first, cells in (
-            (part, "rows", head, row_cells), (f"{part}-effects", "effects", effect_head, effect_cells),
-        ):  # fmt: skip
-            result[title] = markdown(first(RECALL), [
-                cells(f"{name}{ESTIMATES[estimate]}" + (f", seed {seed}" if len(seeds) > 1 else ""), record[kind][key])
-                for estimate in TESTED
-                for name in names
-                for seed in seeds
-                if (key := f"{seed}|{name}|{estimate}") in record[kind]
-            ])  # fmt: skip
+    for part, names in {"losses": ["start", *LOSSES], "networks": list(NETWORKS)}.items():
+        lines = []
+        for name, seed in product(names, seeds):
+            found = [record["rows"].get(f"{seed}|{name}|{estimate}") for estimate in TESTED]
+            if None not in found:
+                rows = [Row(place, seed, name, figures) for place, figures in enumerate(found)]
+                cells = [row.cell(error) for error in ("rotation", "translation", "recall") for row in rows]
+                label = name + (f", seed {seed}" if len(seeds) > 1 else "")
+                lines.append([label, f"{rows[0].figures['steps']:,}", *cells])
+        result[part] = markdown(("", "steps", *heads), lines)
     return result
+
+
+def sheets(record: Mapping[str, Any]) -> dict[str, str]:
+    """Return the rows, and their differences from those that they are compared with, in CSV."""
+    keys = ("seed", "row", "estimate")
+    return {"": sheet(keys, record["rows"]), "-effects": sheet(keys, record["effects"])}
 
 
 def main() -> None:
