@@ -249,6 +249,8 @@ class SceneMap(ViewedPoints):
         """Return the camera model of a photo, or its prior if the focal length is unknown."""
         if camera is None and image_size is None:
             raise ValueError("`camera` is missing; give it, or `image_size` if the focal length is unknown")
+        if not isinstance(distortion, (bool, np.bool_, type(None))):
+            raise ValueError("`distortion` is not True or False; give a camera of OpenCV as camera=(K, distortion)")
         if image_size is None and focal_error is None and not distortion:
             return camera_from(camera)
         unknown = unknown_camera(camera, image_size, focal_error, distortion)

@@ -148,6 +148,11 @@ def split_distortion(camera: Any, distortion: Any) -> tuple[Any, bool]:
             "k3[, k4, k5, k6]]"
         )
     coefficients = numbers("distortion", distortion)
+    if coefficients.size not in coefficients.shape:  # no row or column
+        raise ValueError(
+            f"`distortion` has the shape {coefficients.shape}; it holds the coefficients of one camera; for several "
+            "cameras give each as (K, distortion)"
+        )
     if not is_calibration_matrix(camera):
         shown = "missing" if camera is None else short_repr(camera)
         raise ValueError(
@@ -212,6 +217,8 @@ def pose_of(value: Any, name: str = "prior") -> tuple[Any, Any] | None:
     It may be (R, t) or OpenCV's (rvec, tvec); [R | t] of shape (3, 4) or (4, 4); an object with `rotation` and
     `translation`, such as a `Solution`; or a pycolmap.Rigid3d. Messages use `name`.
     """
+    if getattr(value, "found", True) is False:
+        raise ValueError(f"`{name}` is a solution without a pose; give another pose, or leave it out")
     if callable(getattr(value, "matrix", None)):
         value = value.matrix()
     elif hasattr(value, "rotation") and hasattr(value, "translation"):

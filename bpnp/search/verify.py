@@ -154,8 +154,8 @@ def _parts_of(rotation: Any, translation: Any) -> tuple[Any, Any]:
     if translation is None:
         if pose is None or pose[1] is None:
             raise ValueError(
-                "`translation` is missing; give rotation and translation, or one pose: a Solution, (R, t), [R | t] or "
-                "a pycolmap.Rigid3d"
+                "`translation` is missing; give rotation and translation, or one pose: a Solution, (R, t), (rvec, "
+                "tvec), [R | t] or a pycolmap.Rigid3d"
             )
         return pose
     if pose is not None:

@@ -277,6 +277,10 @@ def test_bad_input_is_one_clear_error(planted: tuple[SceneMap, Planted]) -> None
         scene.localize(keypoints, PINHOLE, scores=[1, 2, 3])
     with pytest.raises(ValueError, match="`time_limit` is 0; it must be a positive number"):
         scene.localize(keypoints, PINHOLE, time_limit=0)
+    with pytest.raises(
+        ValueError, match="`distortion` is not True or False; give a camera of OpenCV as camera=.K, dist"
+    ):
+        scene.localize(keypoints, PINHOLE, distortion=np.zeros(5))  # type: ignore[arg-type]
 
 
 def found_with_few_points(found: Solved) -> Solved:

@@ -157,11 +157,11 @@ def test_points_that_fix_no_pose_fail_with_the_reason(change2d, change3d, reason
     assert (solution.matches.shape, solution.inlier_count, solution.candidates) == ((0, 2), 0, ())
 
 
-def test_a_failed_guess_is_true_since_it_has_a_pose() -> None:
-    """`bool` is about the pose; whether the pose is to be trusted is the verdict."""
+def test_a_failed_guess_is_false_although_it_has_a_pose() -> None:
+    """`if solution:` is no use of a guess; `found` is about the pose."""
     rng = np.random.default_rng(0)
     guess = solve(rng.uniform(-1, 1, (60, 2)), rng.normal(size=(60, 3)), solver="search", time_limit=math.inf)
-    assert (guess.verdict, guess.found, bool(guess)) == ("failed", True, True)
+    assert (guess.verdict, guess.found, bool(guess)) == ("failed", True, False)
 
 
 def test_a_module_solves_and_is_judged_by_the_points() -> None:
