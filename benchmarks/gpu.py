@@ -7,9 +7,9 @@
 A run has the tests of CUDA, the seconds of a step of configs/paper/modelnet40.yaml before and after the switch and of a
 test problem, each once for each processor, and then trains as long as the minutes last: Table 1's network from the
 packaged paper-lclp on with the pose loss, and Table 2's on drawn maps. In the end both are tested. `state.json` in the
-folder of the run has the figures and a line for each run; the folder is all that the next run needs (at most 64 MB: two
-checkpoints of 16 MB, clouds as float16, and photos). Without `--pack` shapes and maps are drawn. Problems have 1,000
-points, without a GPU 128.
+folder of the run has the figures and a line for each run; the folder is all that the next run needs (less than 64 MiB:
+two checkpoints of 16 MB, clouds as float16, and photos). Without `--pack` shapes and maps are drawn. Problems have
+1,000 points, without a GPU 128.
 """
 
 import argparse
@@ -28,7 +28,7 @@ import torch
 from lightning import LightningDataModule
 from paper_tables import NEVER, figures, network, trained_steps, workers
 from paper_weights import SETTINGS
-from record import ROOT, measured_today, processor, write_json
+from record import ROOT, measured_today, processor, spread, write_json
 
 from bpnp.datamodules import ColmapDataModule, MeshDataModule, SyntheticMapDataModule
 from bpnp.datamodules.clouds import SPLITS, read_cloud
@@ -41,6 +41,7 @@ from bpnp.training.comparison import problem_order
 from bpnp.types import Batch
 
 CLOUDS, PHOTOS = "modelnet10", "photos"  # in the folder `data` of the run
+MOST_CLOUDS = 300  # of a class and a split, so that the folder of the run has less than 64 MiB
 EPOCH = 50  # steps between two epochs
 TIMED, TESTED = 0.08, 0.12  # fractions of the minutes for a timing, and for the tests of a network
 FEWEST_SECONDS = 10.0  # that a stage needs
@@ -241,7 +242,8 @@ def compact(folder: Path) -> None:
 
 def pack(data: Path, folder: Path) -> None:
     """Write ModelNet10's clouds as float16 and the photos of the COLMAP models into the folder of the run."""
-    clouds = sorted(file for split in SPLITS for file in (data / CLOUDS).glob(f"*/{split}/*.ply"))
+    folders = sorted(path for split in SPLITS for path in (data / CLOUDS).glob(f"*/{split}"))
+    clouds = [file for path in folders for file in spread(sorted(path.glob("*.ply")), MOST_CLOUDS)]
     for file in clouds:
         out = folder / CLOUDS / file.relative_to(data / CLOUDS).with_suffix(".npy")
         out.parent.mkdir(parents=True, exist_ok=True)
