@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
-from scipy.special import fdtri
+from scipy.special import fdtr
 
 from bpnp import Solution, warm_up
 from bpnp.arrays import Array, PoseArrays
@@ -32,6 +32,7 @@ NEAR_FOCAL = 0.03  # largest relative error of a correct focal length; of a came
 MOST_SIGMAS = 3.0  # standard deviations that the error of a focal length may have
 FAR_DEG = 3.0  # from which a confident pose with an unknown focal length is counted, whatever its bound
 BOUND = 0.999  # probability of the region around a pose that `beyond_bound` tests
+BOUNDS = (0.5, 0.9, 0.99, BOUND)  # probabilities of regions for which a summary has the fraction of errors inside
 
 T = TypeVar("T")
 
@@ -116,6 +117,7 @@ class Outcome:
     verdict: str  # "" for a method without one
     cpu_seconds: float
     outside: bool = True  # the true poses lie outside the 99.9 % bound (`beyond_bound`)
+    region: float = 1.0  # probability of the smallest region of the solution that holds the nearest true rotation
     focal: float = np.nan  # estimated over true focal length; NaN if it was given
     moved: float = 0.0  # of the scene's centroid in the camera frame, over its distance
     focal_sigmas: float = np.nan  # error of the estimated focal length in standard deviations
@@ -154,11 +156,14 @@ def solve_problem(problem: Problem) -> Outcome:
     seconds = time.process_time() - start
     turn, shift, moved, pose = nearest(problem, found.rotation, found.translation)
     outside = all(beyond_bound(found, one) for one in problem.poses)
+    region = 1.0 if pose is None else regions(found, pose)[0]
     off = sigmas(found, pose, np.median(problem.points3d, 0)) if turn < FAR_DEG else []
     focal = float(found.focal_length / problem.focal)
     error = abs(found.focal_length - problem.focal) / max(found.focal_length_std, np.finfo(float).tiny)
     answer = found.reason, found.rotation.tolist(), found.translation.tolist()
-    return Outcome(problem.name, turn, shift, found.verdict, seconds, outside, focal, moved, error, off, *answer)
+    return Outcome(
+        problem.name, turn, shift, found.verdict, seconds, outside, region, focal, moved, error, off, *answer
+    )
 
 
 def nearest(problem: Problem, rotation: Array, translation: Array) -> tuple[float, float, float, Any]:
@@ -175,13 +180,23 @@ def nearest(problem: Problem, rotation: Array, translation: Array) -> tuple[floa
 def beyond_bound(found: Solution, pose: PoseArrays) -> bool:
     """Return True if the true rotation, or the true pose, lies outside the 99.9 % region of the solution.
 
-    As for the bound in `reason`, the region holds the errors e with e^T C^-1 e / d below the quantile of F with d and
-    the degrees of freedom of the residuals. C is the covariance without the factor that widens it for few residuals. A
-    confident pose counts as wrong if it is some degrees off and outside of this region.
+    A confident pose counts as wrong if it is some degrees off and outside of this region.
+    """
+    return max(regions(found, pose)) > BOUND
+
+
+def regions(found: Solution, pose: PoseArrays) -> tuple[float, float]:
+    """Return the probabilities of the smallest regions that hold the true rotation, and the true pose; 1 without any.
+
+    As for the bound in `reason`, a region holds the errors e with e^T C^-1 e / d below a quantile of F with d and the
+    degrees of freedom of the residuals. C is the covariance without the factor that widens it for few residuals.
     """
     squared, free = np.square(sigmas(found, pose, np.zeros(3))), max(2 * len(found.matches) - len(found.covariance), 1)
+    if not len(squared):
+        return 1.0, 1.0
     widened = student_factor(free)
-    return not len(squared) or any(squared[:d].sum() > d * fdtri(d, free, BOUND) / widened for d in {3, len(squared)})
+    turned, moved = (float(fdtr(d, free, squared[:d].sum() * widened / d)) for d in (3, len(squared)))
+    return turned, moved
 
 
 def sigmas(found: Solution, pose: PoseArrays, centroid: Array) -> list[float]:
@@ -215,7 +230,8 @@ def summary(found: Sequence[Outcome], row: Row) -> dict[str, Any]:
 
     They are the quartiles of the rotation error; the fractions of correct, of wrong (`Row.is_wrong`) and of confident
     poses; the number of poses that are confident and wrong; mean and median CPU seconds; and the fraction of the errors
-    of correct poses within 1, 2 and 3 of their standard deviations. With unknown focal lengths also: the fraction that
+    of correct poses within 1, 2 and 3 of their standard deviations; the fractions of confident poses whose rotation is
+    inside the bounds of `BOUNDS`. With unknown focal lengths also: the fraction that
     is near the true one; the number of confident poses that are more than `FAR_DEG` off; the number of confident poses
     whose focal length is off by more than `MOST_SIGMAS` standard deviations or whose centre is off by more than
     `NEAR_FOCAL`; and the fraction of poses that are correct, confident, and not off in this way.
@@ -235,6 +251,9 @@ def summary(found: Sequence[Outcome], row: Row) -> dict[str, Any]:
     }
     if off := [abs(one) for o, good in zip(found, right, strict=True) if good for one in o.sigmas]:
         result["sigmas"] = [round(float((np.array(off) < limit).mean()), 4) for limit in (1, 2, 3)]
+    if sure.any():
+        region = np.array([o.region for o in found])[sure]
+        result["bounds"] = [round(float((region <= bound).mean()), 4) for bound in BOUNDS]
     if np.isfinite(focal).any():
         result["focal_near"] = round(float((np.abs(focal - 1) < NEAR_FOCAL).mean()), 4)
         result["confident_and_far"] = int((sure & (turn > FAR_DEG)).sum())

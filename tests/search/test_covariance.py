@@ -97,3 +97,23 @@ def test_one_wrong_match_widens_the_covariance() -> None:
     with_it = np.linalg.lstsq(jacobian.reshape(-1, 3), residual.ravel(), rcond=None)[0]
     assert found is not None
     assert with_it @ np.linalg.solve(found, with_it) < 1.5 < with_it @ np.linalg.solve(inverse_of(jacobian), with_it)
+
+
+@pytest.mark.parametrize("residual", [1.2, 2.0, 3.0])
+def test_an_image_point_between_two_scene_points_swings_no_covariance(residual: float) -> None:
+    """It has the probability 1/2 to match either, and reduces the information of 20 other matches to nearly nothing."""
+    rng = np.random.default_rng(0)
+    sure = of_sure_matches(rng.normal(size=(20, 1)), rng.normal(size=(20, 1, 2)))
+    expected = covariance_of(sure, fitted=2)
+    assert expected is not None
+    between = np.array([[residual], [-residual]])
+    both = sure._replace(
+        residual=np.concatenate([sure.residual, between]),
+        jacobian=np.concatenate([sure.jacobian, np.array([[[2.0, 1.0]]] * 2)]),
+        probability=np.r_[sure.probability, 0.5, 0.5],
+        point=np.r_[sure.point, 20, 20],
+        weight=np.ones(21),
+    )
+    found = covariance_of(both, fitted=2)
+    assert found is not None
+    assert np.trace(found) <= np.trace(expected) * (1 + 1e-9)

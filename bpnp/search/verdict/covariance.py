@@ -7,6 +7,7 @@ linearised about the estimate, in standard deviations of their residuals.
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.special import stdtrit
 
@@ -17,6 +18,9 @@ ONE_SIGMA = 0.8413447460685429  # of a normal variable below one standard deviat
 # with 6 degrees of freedom at 1 - `EXCEEDED`.
 FAR_SQUARED = 22.5  # [1; derived]
 SLIGHT_INFORMATION = 0.01  # information below which an image point hardly moves the estimate [fraction; numerics]
+# Image points between two scene points: the information by which one reduces that of all, and the largest fraction of
+# the matches that may be left out. Of points as dense as the residuals half reduce it, and their mean is right.
+DOUBTFUL, MOST_DOUBTFUL = 0.05, 0.25  # [fraction; not tuned]
 LEAST_EIGENVALUE = 1e-9  # least eigenvalue of normalised information that fixes the estimate [1; numerics]
 
 
@@ -63,15 +67,12 @@ def covariance_of(
     with g_i the gradient and H_i the information of image point i. d_i is the step to the optimum without it. See
     `bpnp.search.verdict.uncertainty.local_covariance`.
 
-        >>> rng = np.random.default_rng(0)
-        >>> jacobian = rng.normal(size=(400, 1, 2))
-        >>> covariance = covariance_of(of_sure_matches(rng.normal(size=(400, 1)), jacobian), fitted=2)
-        >>> bool(np.allclose(400 * covariance, np.eye(2), atol=0.3))
-        True
-
     The jackknife leaves a point, or one of the `blocks` (g,), out only if the `fitted` parameters stay overdetermined
     without it. `considered` (k, d, c) are derivatives by parameters that are not fitted, times their standard
     deviations: `_add_considered` adds what their errors move. None where the information is not positive definite.
+
+    A few image points, each between two scene points, can reduce the information to nearly nothing. The estimate is as
+    good without them, and its covariance is taken if it is smaller.
 
     >>> rng = np.random.default_rng(0)
     >>> jacobian = rng.normal(size=(400, 1, 2))
@@ -79,12 +80,32 @@ def covariance_of(
     >>> bool(np.allclose(400 * covariance, np.eye(2), atol=0.3))
     True
     """
+    covariance, complete, doubtful = _covariance(matches, fitted, blocks, considered)
+    share = float((matches.probability * doubtful[matches.point]).sum())
+    if not 0 < share <= MOST_DOUBTFUL * float(matches.probability.sum()):
+        return covariance
+    sure = matches._replace(probability=np.where(doubtful[matches.point], 0.0, matches.probability))
+    without, *_ = _covariance(sure, fitted, blocks, considered)
+    if covariance is None or without is None:
+        return without if covariance is None else covariance
+    return without if float(np.sum(without * complete)) < float(np.sum(covariance * complete)) else covariance
+
+
+def _covariance(
+    matches: Linearisation, fitted: int, blocks: Labels | None, considered: Array | None
+) -> tuple[Array | None, Array, NDArray[np.bool_]]:
+    """Return the covariance with all matches, their complete information, and the image points (g,) that reduce it."""
     score = np.einsum("kab,ka->kb", matches.jacobian, matches.residual)
     count, size = score.shape
     of_point = csr_array((matches.probability, (matches.point, np.arange(count))), (len(matches.weight), count))
     expected = of_point @ score
     each = matches.jacobian.transpose(0, 2, 1) @ matches.jacobian - score[:, :, None] * score[:, None]
     own = (of_point @ each.reshape(count, -1)).reshape(-1, size, size) + expected[:, :, None] * expected[:, None]
+    counted = matches.probability * matches.weight[matches.point]
+    complete = np.einsum("k,kab,kac->bc", counted, matches.jacobian, matches.jacobian) + matches.known
+    # The complete information has a unit diagonal in these units, so that the rank can be determined.
+    unit = 1 / np.sqrt(np.maximum(np.diag(complete), 1e-300))
+    doubtful = np.linalg.eigvalsh(own * np.outer(unit, unit))[:, 0] < -DOUBTFUL
     weight = matches.weight
     observed = np.tensordot(weight, own, 1) + matches.known
     if blocks is not None:
@@ -92,13 +113,9 @@ def covariance_of(
         of_block = csr_array((np.ones(len(block)), (block, np.arange(len(block)))))
         expected, own = of_block @ expected, (of_block @ own.reshape(-1, size * size)).reshape(-1, size, size)
         weight = np.bincount(block, weight) / np.bincount(block)
-    counted = matches.probability * matches.weight[matches.point]
-    complete = np.einsum("k,kab,kab->b", counted, matches.jacobian, matches.jacobian)
-    # The complete information has a unit diagonal in these units, so that the rank can be determined.
-    unit = 1 / np.sqrt(np.maximum(complete + np.diag(matches.known), 1e-300))
     values, vectors = np.linalg.eigh(observed * np.outer(unit, unit))
     if values[0] <= LEAST_EIGENVALUE:
-        return None
+        return None, complete, doubtful
     root = unit[:, None] * vectors / np.sqrt(values)
     steps = expected @ root
     matters = np.flatnonzero(own.reshape(-1, size * size) @ (root @ root.T).ravel() > SLIGHT_INFORMATION)
@@ -110,7 +127,9 @@ def covariance_of(
     ratio, axes = np.linalg.eigh((weight[:, None] * steps).T @ steps + root.T @ matches.known @ root)
     along = root @ axes
     covariance = np.asarray(along * np.maximum(ratio, 1.0) @ along.T)
-    return covariance if considered is None else _add_considered(covariance, matches, counted, considered)
+    if considered is not None:
+        covariance = _add_considered(covariance, matches, counted, considered)
+    return covariance, complete, doubtful
 
 
 def _add_considered(covariance: Array, matches: Linearisation, counted: Array, considered: Array) -> Array:

@@ -48,7 +48,7 @@ from bpnp.search.verdict.uncertainty import (
 )
 
 Verdict = Literal["confident", "ambiguous", "failed"]
-HALF_TURN = 180.0  # a larger bound does not constrain a rotation [degrees; derived]
+LOOSEST_ROTATION = 30.0  # a rotation with a larger 99.9 % bound is not known [degrees; convention]
 # The distance has the same error, and from `SAME.shift` on the pose is a different one.
 FOCAL_BOUND = 0.05  # largest 99.9 % bound of a fitted focal length, as a fraction [fraction; derived]
 # The same for an object: a scene of at most `WHOLE_SCENE` points that is no map, such as LEDs. Its rotation is correct
@@ -226,7 +226,7 @@ class Case(_Led):
     def _not_fixed(self) -> Objection | None:
         """Unknown that the points do not determine."""
         (off, share), count = self.bounds, self.match_count
-        if off >= HALF_TURN or not (self.cameras or is_redundant(self.problem, count)):
+        if off > LOOSEST_ROTATION or not (self.cameras or is_redundant(self.problem, count)):
             return objection("rotation_not_fixed", count=count, what="the rotation")
         most = FOCAL_BOUND_OF_OBJECT if is_object(self.problem) else FOCAL_BOUND
         return focal_length_not_fixed(share) if share > most else None
