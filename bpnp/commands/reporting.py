@@ -111,10 +111,10 @@ def _runs_in(folders: Sequence[Path]) -> dict[str, Path]:
     except LargeTree as error:
         if not (sys.stdin is not None and sys.stdin.isatty() and sys.stderr.isatty()):
             raise
-        sys.stderr.write(f"{error}.\nSearch all of them for results? [y/N] ")
+        sys.stderr.write(f"{str(error).rpartition(';')[0]}.\nSearch all of them for results? [y/N] ")
         sys.stderr.flush()
         if sys.stdin.readline().strip().lower() not in ("y", "yes"):
-            raise
+            raise ValueError("nothing was searched; name the folders of the tests") from error
         return named_runs(folders)
 
 

@@ -255,8 +255,11 @@ def verify(
     pairs = None if matches is None else read_pairs(matches)
 
     # All files have been read: only now import the search.
+    from bpnp.search.arguments import checked_pose
     from bpnp.search.verify import verify as judge_pose
 
+    if pose is not None:
+        given_pose = checked_pose("pose.", *given_pose)
     with progress(items=False, quiet=quiet) as shown:
         shown.add_task("verifying the pose", total=None)
         solution = judge_pose(
@@ -342,7 +345,7 @@ def solution_table(
             f"{solution.reprojection_error:.3g} {solution.unit} ({solution.reprojection_error_deg:.3g} deg), "
             f"inliers up to {solution.inlier_threshold:.3g} {solution.unit}",
         )
-        if verbose:
+        if verbose and solution.verdict != "failed":
             deviations = f"{number(solution.rotation_std_deg)} deg, centre {number(solution.centre_std)}"
             table.add_row("std deviation", f"rotation {deviations}, about or along the least certain axis")
         next_ones = solution.candidates[1:4]

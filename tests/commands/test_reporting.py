@@ -96,7 +96,8 @@ def test_a_large_tree_is_searched_only_if_the_user_wants_it(
     with pytest.raises(SystemExit) as stop:
         main(["report", str(tmp_path / "runs")])
     assert stop.value.code == 2
-    assert capsys.readouterr().err.startswith(f"{sentence}.\nSearch all of them for results? [y/N] ")
+    question = f"{sentence.partition(';')[0]}.\nSearch all of them for results? [y/N] "
+    assert capsys.readouterr().err == f"{question}bpnp: error: nothing was searched; name the folders of the tests\n"
     monkeypatch.setattr(sys.stdin, "readline", lambda: "y\n")
     main(["report", str(tmp_path / "runs")])
     assert "Pose errors, 9 problems" in capsys.readouterr().out

@@ -64,6 +64,13 @@ def test_options_reach_the_verdict_as_they_are_written(files: list[str], monkeyp
     assert [asked[0][name] for name in ("seed", "time_limit", "refine")] == [3, 7, False]
 
 
+def bent(folder: Path) -> Path:
+    """Write the JSON of a pose whose rotation is none."""
+    pose = {"rotation": (2 * np.eye(3)).tolist(), "translation": T.tolist()}
+    (folder / "bent.json").write_text(json.dumps(pose))
+    return folder / "bent.json"
+
+
 def test_the_exit_status_is_the_verdict_with_strict(files: list[str]) -> None:
     far = [*NUMBERS[:-1], f"{T[2] + 30}"]
     main(["verify", *files, *NUMBERS, "--strict", "--quiet"])
@@ -80,6 +87,10 @@ def test_the_exit_status_is_the_verdict_with_strict(files: list[str]) -> None:
         (lambda files, folder: [*files, *NUMBERS[:10]], "give the JSON of a pose, or --rotation and --translation"),
         (lambda files, folder: [*files[:2], "nothing.json", *files[2:]], "there is no file nothing.json"),
         (lambda files, folder: [*files, *NUMBERS[:9], "7", *NUMBERS[10:]], "--rotation is no rotation matrix"),
+        (
+            lambda files, folder: [*files[:2], str(bent(folder)), *files[2:]],
+            "error: the rotation of the pose is no rotation matrix",
+        ),
         (lambda files, folder: [*files, *NUMBERS, "--matches", str(folder / "p.npy")], " needs two columns; it has"),
         (lambda files, folder: [*files, *NUMBERS, "--image", "a"], "--image needs a COLMAP model"),
         (lambda files, folder: [*files, *NUMBERS, "--surface", "9"], "--surface draws points from a mesh, and"),
