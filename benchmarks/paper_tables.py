@@ -64,8 +64,11 @@ SEARCH_SECONDS = 10.0
 
 ESTIMATES = {"pnp": "", "ransac": " R", "refined": ", refined"}
 BRANCHES = ("Lc", "Lc Lp")
-Inference = Literal["paper", "ransac", "ours"]
-INFERENCES: dict[Inference, str] = {"paper": "", "ransac": ", our RANSAC", "ours": ", our inference"}
+Inference = Literal["paper", "headings", "ransac", "ours"]
+INFERENCES: dict[Inference, str] = {
+    "paper": "", "headings": ", headings", "ransac": ", our RANSAC", "ours": ", our inference"
+}  # fmt: skip
+HEADINGS = 6
 TITLES = {  # of the parts of the table of medians
     "training": "our training, the paper's inference",
     "paper, our RANSAC": "the paper's training, our RANSAC",
@@ -220,17 +223,18 @@ def trained_steps(checkpoint: str | Path) -> int:
     return int(read_checkpoint(checkpoint)["global_step"]) if Path(checkpoint).is_file() else 0
 
 
-def network(checkpoint: str | Path, *, inference: Inference = "paper") -> BPnPNet:
-    """Load a BPnPNet with the inference of the paper, with our RANSAC, or with all of ours.
+def network(checkpoint: str | Path, *, inference: Inference = "paper", hypotheses: int = 1000) -> BPnPNet:
+    """Load a BPnPNet with the inference of the paper, also for several headings, with our RANSAC, or with all of ours.
 
     The paper's: OpenCV's P3P-RANSAC and EPnP among 1.5 min(m, n) matches within 0.01, L-BFGS on all. Our RANSAC:
     LO-RANSAC among 16 min(m, n) matches within 0.004, Newton's method on all. Ours: then eight rounds of matching again
-    under the pose, and refinement.
+    under the pose, and refinement. Headings share the number of RANSAC hypotheses.
     """
     net = TrainedNet.from_checkpoint(checkpoint)
     assert isinstance(net, BPnPNet)
-    if inference == "paper":
-        net.ransac = RansacPnP(backend="opencv")
+    net.headings = HEADINGS if inference == "headings" else 1
+    if inference in ("paper", "headings"):
+        net.ransac = RansacPnP(backend="opencv", max_iterations=hypotheses // net.headings)
         net.pnp = WeightedPnP(solver="lbfgs", tolerance=1e-8, max_iterations=75)
     else:
         net.ransac, net.pnp = RansacPnP(threshold=0.004, matches_factor=16.0), WeightedPnP()
@@ -345,13 +349,18 @@ def branch_weights(trained: Mapping[str, Training], options: argparse.Namespace)
     ]
 
 
-def network_methods(weights: Iterable[Weights], options: argparse.Namespace) -> Iterator[Method]:
-    """Networks with the paper's inference, then with our RANSAC, then with all of ours."""
+def network_methods(
+    weights: Iterable[Weights],
+    options: argparse.Namespace,
+    inferences: Sequence[Inference] = ("paper", "ransac", "ours"),
+) -> Iterator[Method]:
+    """Networks with the paper's inference, then with others."""
     listed = [(one, trained_steps(one.checkpoint), digest(one.checkpoint)) for one in weights]
-    for inference, suffix in INFERENCES.items():
+    for inference in inferences:
+        suffix = INFERENCES[inference]
         for one, steps, content in listed:
             identity = {"steps": steps, "weights": content, "inference": inference}
-            papers = inference == "paper"
+            papers = inference in ("paper", "headings")
             limit = options.problems if papers else min(options.problems, options.our_problems)
             settings = one.settings | {"problems" if papers else "our_problems": limit}
             build = partial(network, one.checkpoint, inference=inference)
@@ -382,8 +391,8 @@ def read_record(file: Path) -> dict[str, Any]:
 def measure(
     table: Table,
     trained: Mapping[str, Training],
-    methods: Callable[[], Iterable[Method]],
-    data: Callable[[str], LightningDataModule],  # by the name of a test set
+    methods: Callable[[str], Iterable[Method]],  # by the name of a test set
+    data: Callable[[str], LightningDataModule],
     options: argparse.Namespace,
 ) -> dict[str, Any]:
     """Train what is missing, test the chosen methods on all sets, and return the record, written after each set."""
@@ -407,7 +416,7 @@ def measure(
         problems = data(name)
         found: dict[tuple[str, str, str], tuple[Method, list[ProblemRow]]] = {}
         chosen = set()
-        for method in methods():
+        for method in methods(name):
             solve = any(part in f"{method.group} {method.label}" for part in options.only)
             file = options.run / f"seed{method.seed}" / tests / name / method.file
             rows = solve_problems(file, method.build, problems, method.limit, method.identity, solve=solve)

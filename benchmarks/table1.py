@@ -50,7 +50,7 @@ def trainings(options: argparse.Namespace) -> dict[str, Training]:
     return paper_tables.branches(options.run / f"seed{options.seed}", arguments, options)
 
 
-def methods(options: argparse.Namespace, trained: dict[str, Training]) -> Iterator[Method]:
+def methods(options: argparse.Namespace, trained: dict[str, Training], _: str) -> Iterator[Method]:
     """Networks with the paper's inference and with ours, then other methods."""
     known = {
         name: Weights("training", name, checkpoint_path(name), {}) for name in PACKAGED if name in pretrained_names()

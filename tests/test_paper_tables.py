@@ -161,13 +161,11 @@ def test_steps_on_drawn_maps_are_whole_epochs(tmp_path: Path, monkeypatch: pytes
         "--output",
         str(tmp_path / "record.json"),
         "--drawn_steps",
-        "90",
-        "90",
-        "90",
-        "600",
+        "50",
+        "120",
     ]
-    monkeypatch.setattr("sys.argv", [*command, "--steps", "144", "--pose_steps", "54"])
-    with pytest.raises(SystemExit, match="a multiple of those between checkpoints: near1000 has 600 and 90"):
+    monkeypatch.setattr("sys.argv", [*command, "--steps", "40", "--pose_steps", "20"])
+    with pytest.raises(SystemExit, match="a multiple of those between checkpoints: drawn256 has 120 and 50"):
         table2.main()
 
 
@@ -435,7 +433,7 @@ def test_a_row_keeps_its_provenance_and_is_compared_with_rows_that_are_there(
             for label in ("Lc", "Lc Lp")
         ]
         return paper_tables.measure(
-            table1.TABLE, trained, lambda: methods, lambda _: data(seed=chosen.test_seed), chosen
+            table1.TABLE, trained, lambda _: methods, lambda _: data(seed=chosen.test_seed), chosen
         )
 
     monkeypatch.setattr("record.commit", lambda: "early")
@@ -508,7 +506,7 @@ def test_weights_from_a_file_stand_beside_the_packaged_ones(tmp_path: Path, monk
     monkeypatch.setattr(paper_tables, "publish", lambda *_: None)
 
     def measure(table: Table, trained: dict[str, Training], methods: Any, data: object, options: object) -> Any:
-        found.extend(methods())
+        found.extend(methods(table.sets[0]))
         return {"rows": {}, "effects": {}}
 
     monkeypatch.setattr(paper_tables, "measure", measure)
@@ -523,6 +521,48 @@ def test_weights_from_a_file_stand_beside_the_packaged_ones(tmp_path: Path, monk
     monkeypatch.setattr("sys.argv", [*command, "longer"])
     with pytest.raises(SystemExit, match="--weights longer: longer is no file; write NAME=CHECKPOINT"):
         table1.main()
+
+
+def test_headings_share_the_hypotheses_of_the_row_without() -> None:
+    file = table1.checkpoint_path("procedural-euler")
+    one, several = network(file), network(file, inference="headings")
+    assert (one.headings, one.ransac.max_iterations) == (1, 1000)
+    assert several.headings == 6
+    assert several.headings * several.ransac.max_iterations in range(990, 1001)
+    assert several.ransac.backend == one.ransac.backend == "opencv"
+
+
+def test_the_row_of_all_scenes_counts_each_photo_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scene k has k + 1 photos at a depth of 10; the first one of each is right, all are off by 0.2 or 0.8."""
+    monkeypatch.setattr(table2, "scene_depths", lambda _, indices: dict.fromkeys(indices, 10.0))
+
+    def rows_of(file: Path, *_: object, solve: bool) -> list[Any]:
+        assert not solve
+        k = table2.SCENES.index(file.parent.name)
+        return [row(i, rotation_error_deg=20.0 * (i > 0), translation_error=0.2 + 0.6 * (k % 2)) for i in range(k + 1)]
+
+    monkeypatch.setattr(paper_tables, "solve_problems", rows_of)
+    method = Method("paper", "Lc", nn.Identity, 20, {}, {"seed": 1})
+    shared = {"steps": 5, "settings": {"steps": 5, "learning_rate": 1e-3}, "measured": {"commit": "c"}}
+    estimate = row(0).estimate
+    record: dict[str, Any] = {"effects": {}, "rows": {}}
+    for k, scene in enumerate(table2.SCENES):
+        own = figures(rows_of(tmp_path / scene / "x", solve=False), (10.0, 1.0))
+        record["rows"][f"{scene}|1|paper|Lc|{estimate}"] = own | shared
+        assert own["problems"] == k + 1
+    options = Namespace(test_seed=0, run=tmp_path, seed=1, output=tmp_path / "record.json", published=False)
+    table2.pool_scenes(record, lambda _: iter([method]), lambda _: None, options)  # type: ignore[arg-type,return-value]
+    pooled = record["rows"][f"{table2.ALL}|1|paper|Lc|{estimate}"]
+    assert pooled["problems"] == 55
+    assert pooled["recall"][0] == pytest.approx(10 / 55, abs=1e-3)
+    assert pooled["near"] == pytest.approx(5 / 55, abs=1e-3)  # 5 % of the depth are 0.5
+    assert [record["rows"][f"{scene}|1|paper|Lc|{estimate}"]["near"] for scene in table2.SCENES[:3]] == [
+        1.0, 0.0, round(1 / 3, 4)
+    ]  # fmt: skip
+    lines = table2.tables(record)["scenes"].splitlines()
+    assert lines[2].startswith("| castle-P30 | 1 | 10 |")
+    assert lines[-1].startswith("| all | 55 |")
+    assert len(lines) == 2 + 11
 
 
 def test_the_picture_has_a_curve_a_row_and_the_papers_quartiles() -> None:

@@ -140,7 +140,7 @@ class ColmapSource:
         unseen = np.delete(np.arange(len(scene.points3d)), image.observed) if free3d else image.seen[:0]
         chosen = np.concatenate([image.seen, rng.choice(unseen, free3d, replace=False)])
         origin = self.origins[index]
-        turn = _turn_y_down(scene, image) if self.y_down else np.eye(3)
+        turn = turn_y_down(scene, image) if self.y_down else np.eye(3)
         return Problem(
             name=f"{scene.name}/{image.name}",
             points2d=np.concatenate([image.points2d, clutter2d]),
@@ -166,7 +166,7 @@ def _origin(points3d: NDArray[np.float64]) -> NDArray[np.float64]:
     return median if np.linalg.norm(median) > FAR * extent else np.zeros(3)
 
 
-def _turn_y_down(scene: Reconstruction, photo: ImagePoints) -> NDArray[np.float64]:
+def turn_y_down(scene: Reconstruction, photo: ImagePoints) -> NDArray[np.float64]:
     """Return the smallest rotation (3, 3) that turns the direction down of the map's other photos to the second axis.
 
     Identity if they have no common direction.
