@@ -240,6 +240,17 @@ def image_size(camera: Camera) -> tuple[int, int] | None:
     return size if all(size) else None
 
 
+def check_centre(camera: Camera, size: tuple[int, int]) -> None:
+    """Raise ValueError if the principal point is not in the middle third of images of a size: it is that of others."""
+    centre, half = camera.matrix[:2, 2], np.array(size) / 2
+    if (np.abs(centre - half) > half / 3).any():
+        x, y = centre.tolist()
+        raise ValueError(
+            f"`camera` has its principal point at ({x:g}, {y:g}), far from the centre of an image of {size[0]} x "
+            f"{size[1]} pixels; if the image was resized, multiply the first two rows of K by the same factor"
+        )
+
+
 def same_aspect_ratio(size: tuple[int, int], other: tuple[int, int]) -> bool:
     """Return True if two image sizes have the same aspect ratio, up to a pixel of rounding a side."""
     return abs(size[0] * other[1] - size[1] * other[0]) <= max(*size, *other)

@@ -23,6 +23,7 @@ from bpnp.cameras import (
     Lens,
     camera_from,
     camera_to_json,
+    check_centre,
     is_pinhole,
     scale_focal_length,
     with_radial_distortion,
@@ -161,6 +162,7 @@ def unknown_camera(
         )
     if image_size is not None:
         if camera is not None:
+            check_centre(camera_from(camera), checked_size(image_size))
             raise ValueError(
                 "`camera` and `image_size` exclude each other: `image_size` is for an unknown focal length. For one "
                 "that is known to a tenth give `camera` and focal_error=0.1"

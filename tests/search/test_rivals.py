@@ -264,3 +264,24 @@ def test_a_given_pose_of_the_smaller_body_is_no_confident_one() -> None:
     solution = verify(image, np.concatenate([room, chair]), np.eye(3), AWAY, K)
     assert solution.verdict != "confident"
     assert degrees_between(solution.rotation, np.eye(3)) < 1
+
+
+def test_the_claim_on_a_flat_scene_names_the_camera() -> None:
+    rng = np.random.default_rng(6)
+    points = rng.uniform(-1, 1, (20, 3))
+    rotation = Rotation.from_euler("xy", [150, 20], degrees=True).as_matrix()
+    for scene, is_flat in ((points * [1, 1, 0], True), (points, False)):
+        solution = solve(pixels(scene, rotation, AWAY / 2, rng), scene, K)
+        assert solution.verdict == "confident"
+        assert ("the scene is flat, so a wrong focal length would not show" in solution.reason) == is_flat
+
+
+def test_a_camera_of_other_images_is_named() -> None:
+    points = np.random.default_rng(6).uniform(-1, 1, (20, 3))
+    image = pixels(points, np.eye(3), AWAY, np.random.default_rng(0))
+    with pytest.raises(
+        ValueError, match=r"principal point at \(320, 240\), far from the centre of an image of 1280 x 960"
+    ):
+        solve(image, points, K, image_size=(1280, 960))
+    with pytest.raises(ValueError, match="exclude each other"):
+        solve(image, points, K, image_size=(640, 480))

@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 
 from bpnp.search.hypotheses import Hypotheses
 from bpnp.search.possible_matches import MATCH_REACH, score_pose
-from bpnp.search.problem import Problem
+from bpnp.search.problem import Problem, in_bulk
 from bpnp.search.propose.repetitions import WHOLE_SCENE
+from bpnp.search.propose.symmetries import mirror_pose
 from bpnp.search.verdict import reasons
 from bpnp.search.verdict.competitors import (
     CandidatesOfCameras,
@@ -140,6 +141,11 @@ class Case(_Led):
     def symmetry(self) -> Symmetry:
         """Motions of the scene that map matched points."""
         return self.motions or Symmetry(self.problem)
+
+    @cached_property
+    def is_flat(self) -> bool:
+        """True if the scene, without far points, is flat: it may slide along a curve, and shows no focal length."""
+        return mirror_pose(self.problem.points3d[in_bulk(self.problem.points3d)], *self.pose) is not None
 
     @cached_property
     def missed(self) -> float:
@@ -281,7 +287,8 @@ def decide(case: Case) -> SearchResult:
     if one is None:
         code = CONFIDENT
         reason = reasons.confident(case.log10_false_alarms, LEAST_MARGIN, *case.bounds)
-        reason = "; ".join([reason, case.note] if case.note else [reason])
+        notes = [reasons.TRUSTED_CAMERA] if not case.cameras and case.problem.focal is None and case.is_flat else []
+        reason = "; ".join([reason, *notes, *([case.note] if case.note else [])])
     else:
         verdict, code = "failed" if refuted or one.code in reasons.FAILURES else "ambiguous", one.code
         reason = one.sentence(float(candidates.log10_false_alarms[0])) if len(candidates) else one.clause

@@ -8,6 +8,7 @@ from bpnp import matching
 SHOWN_DECADES = 0.05  # logarithm of a number of false alarms below which 0.0 is shown [decades; convention]
 
 MIRRORED = "the mirror image of the scene has a significant pose: check the directions of its axes"
+TRUSTED_CAMERA = "the scene is flat, so a wrong focal length would not show"
 CONFIDENT = "confident"  # code of a pose without an objection
 FAILURES = {"no_pose", "degenerate", "chance"}  # codes of a problem without a pose, or with one that is not significant
 UNTESTED = {"untested", "camera_untested"}  # codes of poses for whose competitors there was no time

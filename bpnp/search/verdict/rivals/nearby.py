@@ -6,9 +6,6 @@ its points lie on a curve, these matches hold the pose back; annealing gives the
 
 from dataclasses import replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from bpnp.runtime import NEVER, Deadline
 from bpnp.search.hypotheses import Hypotheses, merge_hypotheses, to_problem_frame, to_scene_frame
 from bpnp.search.problem import Problem, in_bulk
@@ -35,11 +32,10 @@ def nearby(case: Case, *, scene_of: SceneOf, deadline: Deadline = NEVER) -> Case
     problem = case.problem
     if not case.is_fitted or case.exhaustive or case.claim is not None:
         return case
-    is_flat, left = mirror_pose(_bulk(problem), *case.pose) is not None, min(left_by(case))
-    if left < (FEWEST_LEFT_FLAT if is_flat else FEWEST_LEFT):
+    if min(left_by(case)) < (FEWEST_LEFT_FLAT if case.is_flat else FEWEST_LEFT):
         return case
     is_repeated = len(case.symmetry.of(case.candidates).scale) > 0
-    if not (is_flat or is_repeated) and replace(case, local_searches=0).missed <= MOST_MISSED:
+    if not (case.is_flat or is_repeated) and replace(case, local_searches=0).missed <= MOST_MISSED:
         return case
     if deadline.ended(Unfinished.competing_poses):
         return case.against(objection("untested"))
@@ -60,7 +56,7 @@ def annealed_around(
     """
     start = to_scene_frame(pose, scene)
     wide = MIDDLE[-1].last_scale * scene.spread
-    mirrored = mirror_pose(_bulk(problem), *pose.pose())
+    mirrored = mirror_pose(problem.points3d[in_bulk(problem.points3d)], *pose.pose())
     starts = [start, perturb_each(scene, start)]
     if mirrored is not None:
         starts.append(to_scene_frame(Hypotheses.from_poses(mirrored[0][None], mirrored[1][None]), scene))
@@ -70,8 +66,3 @@ def annealed_around(
     parts = [anneal_on_points(scene, start, wide), anneal_on_points(scene, around, wide), finish(scene, start)]
     poses = finish(scene, merge_hypotheses(parts, scene), FINISHED_POSES)
     return to_problem_frame(poses, scene)
-
-
-def _bulk(problem: Problem) -> NDArray[np.float64]:
-    """Return the scene points (k, 3) without far ones."""
-    return problem.points3d[in_bulk(problem.points3d)]
