@@ -159,7 +159,8 @@ def correspondence_loss(assignment: Float[Tensor, "b m n"], match3d: Int[Tensor,
 def matching_likelihood_loss(prediction: Prediction, batch: Batch) -> Float[Tensor, " b"]:
     """Return the negative log-likelihood, nats, of each point's true correspondence, -log P(j | i) and -log P(i | j).
 
-    It is the mean over the true matches, in both directions. With dustbins (`unmatched2d`, `unmatched3d`), the mean of
+    It is the mean over the true matches, in both directions; Liu et al. (arXiv:2003.06752) balance the log-likelihoods
+    of matches and non-matches under the joint P instead. With dustbins (`unmatched2d`, `unmatched3d`), the mean of
     -log P(dustbin | i) over the points without a match is added, so that their numbers do not matter. Unlike that of
     `correspondence_loss`, the gradient does not vanish where the probability of the true match is small. A probability
     below 1e-30, such as one that is zero in float32, counts as 1e-30 and has no gradient. Raise ValueError for no
