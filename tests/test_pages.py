@@ -69,4 +69,14 @@ def test_a_table_is_markdown() -> None:
 def test_the_pages_have_the_tables_of_the_records() -> None:
     pages.write_pages(check=True)
     shown = {name for page in pages.PAGES for name, _, _ in pages.TABLE.findall(page.read_text(encoding="utf-8"))}
-    assert shown == {"results", "table1", "table2", "additions", "finetune", "completeness", "tutorial", "sweep"}
+    assert shown == {
+        "results",
+        "table1",
+        "table2",
+        "additions",
+        "finetune",
+        "completeness",
+        "tutorial",
+        "sweep",
+        "successors",
+    }
