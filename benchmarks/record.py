@@ -23,6 +23,7 @@ from bpnp import Solution, warm_up
 from bpnp.arrays import Array, PoseArrays
 from bpnp.files import write_atomically
 from bpnp.search.verdict.covariance import student_factor
+from bpnp.search.verdict.uncertainty import BLOCKS, FEWEST_IN_BLOCKS, POSE
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("BPNP_SHARED_DATA", ROOT.parent / "shared" / "data"))
@@ -192,6 +193,8 @@ def regions(found: Solution, pose: PoseArrays) -> tuple[float, float]:
     degrees of freedom of the residuals. C is the covariance without the factor that widens it for few residuals.
     """
     squared, free = np.square(sigmas(found, pose, np.zeros(3))), max(2 * len(found.matches) - len(found.covariance), 1)
+    if len(found.covariance) == POSE and len(found.matches) >= FEWEST_IN_BLOCKS:
+        free = min(free, BLOCKS**2 - 1)
     if not len(squared):
         return 1.0, 1.0
     widened = student_factor(free)

@@ -132,6 +132,19 @@ def _covariance(
     return covariance, complete, doubtful
 
 
+def larger(one: Array, other: Array) -> Array:
+    """Return the larger of two covariances along each of their common axes.
+
+    >>> larger(np.diag([1.0, 4.0]), np.diag([2.0, 3.0])).tolist()
+    [[2.0, 0.0], [0.0, 4.0]]
+    """
+    root = np.linalg.cholesky(one)
+    white = np.linalg.solve(root, np.linalg.solve(root, other).T)
+    ratio, axes = np.linalg.eigh((white + white.T) / 2)
+    along = root @ axes
+    return np.asarray(along * np.maximum(ratio, 1.0) @ along.T)
+
+
 def _add_considered(covariance: Array, matches: Linearisation, counted: Array, considered: Array) -> Array:
     """Add the errors of an estimate that come from parameters which are not fitted.
 
