@@ -64,6 +64,25 @@ class InterruptedCheckpoint(Callback):
 
     def __init__(self, folder: str | Path) -> None:
         self.path = Path(folder) / f"{INTERRUPTED}.ckpt"
+        self._buffers: dict[str, torch.Tensor] = {}  # of the module before the batch, which changes batch statistics
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        """Keep what a batch changes before its step."""
+        self._buffers = {name: buffer.clone() for name, buffer in pl_module.named_buffers()}
+
+    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        """Let a resumed run repeat the batch within which a training was stopped, which made no step."""
+        loop = checkpoint["loops"]["fit_loop"]
+        batches = loop["epoch_loop.batch_progress"]
+        if batches["current"]["ready"] == batches["current"]["processed"]:
+            return
+        weights = checkpoint["state_dict"]
+        weights.update((name, buffer) for name, buffer in self._buffers.items() if name in weights)
+        for counts in (batches["current"], batches["total"]):
+            counts["ready"] = counts["started"] = counts["processed"]
+        for state in loop["state_dict"].get("combined_loader", []):
+            if "served" in state:  # that of a `ProblemLoader`
+                state["served"] -= 1
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         """Save the checkpoint of an interrupted training."""

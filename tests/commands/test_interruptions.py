@@ -28,6 +28,17 @@ class Stop(Callback):
     on_test_batch_end = on_train_batch_end
 
 
+class StopWithin(Callback):
+    """Ctrl-C within the second batch, before its step."""
+
+    batches = 0
+
+    def on_before_optimizer_step(self, *_: Any) -> None:
+        self.batches += 1
+        if self.batches == 2:
+            raise KeyboardInterrupt
+
+
 def arguments(command: str, folder: Path) -> list[str]:
     return [command, *MESHES, *SMALL_NET, f"--data.cache_dir={folder}", f"--trainer.default_root_dir={folder}/run"]
 
@@ -44,6 +55,23 @@ def test_an_interrupted_training_keeps_its_checkpoint(tmp_path: Path) -> None:
     assert kept.is_file()
     main([*arguments("fit", tmp_path), f"--ckpt_path={kept}", "--trainer.max_epochs=1"])
     assert {file.name for file in kept.parent.iterdir()} == {"best.ckpt", "last.ckpt"}  # it is not needed any more
+
+
+def test_the_batch_within_which_a_training_was_stopped_is_repeated(tmp_path: Path) -> None:
+    weights = {}
+    for name in ("whole", "stopped"):
+        words = [*arguments("fit", tmp_path / name), "--trainer.max_epochs=1"]
+        if name == "stopped":
+            with pytest.raises(SystemExit):
+                main([*words, "--trainer.callbacks=test_interruptions.StopWithin"])
+            words.append("--ckpt_path=last")
+        main(words)
+        weights[name] = torch.load(tmp_path / name / "run" / "checkpoints" / "last.ckpt", weights_only=True)
+    assert weights["stopped"]["global_step"] == weights["whole"]["global_step"]
+    torch.testing.assert_close(weights["stopped"]["state_dict"], weights["whole"]["state_dict"], rtol=0, atol=0)
+    loops = [each["loops"]["fit_loop"] for each in weights.values()]
+    for key in ("epoch_loop.batch_progress", "epoch_loop.state_dict"):
+        assert loops[0][key] == loops[1][key]
 
 
 class Broken(Callback):
