@@ -25,7 +25,7 @@ def newest_checkpoint(folder: Path) -> Path:
     """Return the checkpoint that `--ckpt_path last` continues: the last one, or a newer one of an interruption."""
     files = [*folder.glob("last*.ckpt"), *folder.glob(f"{INTERRUPTED}.ckpt")]
     if not files:
-        raise ValueError(f"{folder} has no checkpoint to continue. Leave out --ckpt_path last.")
+        raise ValueError(f"{folder} has no last checkpoint. A new training has no --ckpt_path; a test needs a file.")
     return max(files, key=lambda file: file.stat().st_mtime_ns)
 
 
@@ -90,7 +90,9 @@ class InterruptedCheckpoint(Callback):
             return  # saving needs all processes, and those without the error would not take part
         if trainer.state.fn == "fit" and trainer.global_step > 0 and not trainer.fast_dev_run:  # type: ignore[attr-defined]
             trainer.save_checkpoint(self.path, weights_only=False)
-            rank_zero_info(f"stopped in epoch {trainer.current_epoch}; continue with --ckpt_path {self.path}")
+            rank_zero_info(
+                f"stopped in epoch {trainer.current_epoch}, counted from 0; continue with --ckpt_path {self.path}"
+            )
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Remove the checkpoint of an earlier interruption."""

@@ -116,6 +116,6 @@ def test_a_full_disk_leaves_the_checkpoint_before_and_is_named(tmp_path: Path, m
 
 
 def test_a_last_checkpoint_that_is_not_there_is_no_new_training(tmp_path: Path, fails: Callable[..., str]) -> None:
-    assert "has no checkpoint to continue. Leave out --ckpt_path last." in fails(
+    assert "has no last checkpoint. A new training has no --ckpt_path" in fails(
         *arguments("fit", tmp_path), "--ckpt_path=last"
     )
