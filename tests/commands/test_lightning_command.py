@@ -412,10 +412,11 @@ def test_option_names_stored_in_recipes_and_runs_are_kept() -> None:
     """The YAML files of users have these names."""
     assert set(inspect.signature(BlindPnPTask.__init__).parameters) == {
         "self", "solver", "weights", "learning_rate", "weight_decay", "warmup_steps", "decay_start", "decay_steps",
-        "pose_weight", "matching_loss", "correspondence_angle", "loss", "refine_validation",
+        "pose_weight", "pose_loss", "matching_loss", "correspondence_angle", "loss", "refine_validation",
     }  # fmt: skip
     assert set(inspect.signature(BPnPNet.__init__).parameters) == {
-        "self", "features2d", "features3d", "transport", "ransac", "pnp", "refinement", "rounds",
+        "self", "features2d", "features3d", "transport", "ransac", "pnp", "refinement", "rounds", "headings",
+        "vertical",
     }  # fmt: skip
 
 

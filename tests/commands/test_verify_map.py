@@ -137,7 +137,7 @@ def test_images_whose_points_hardly_another_one_sees_are_untested(tmp_path: Path
         (["scene/0", "--page", "scene"], "--page is scene; name a file that ends in .html"),
         (["scene/0", "--as_it_is"], "--as_it_is has no effect on the images of a COLMAP model"),
         (["scene/0", "--camera", "PINHOLE,1,1,1,1"], "--camera has no effect on the images of a COLMAP model"),
-        (["scene/0", "--time_limit", "0"], "`time_limit` is 0"),
+        (["scene/0", "--time_limit", "0"], "--time_limit is 0"),
         (["file.csv", "file.csv", "--page", "a.html"], "--page needs the folder of a COLMAP model alone"),
     ],
 )

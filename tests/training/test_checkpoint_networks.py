@@ -212,8 +212,13 @@ def test_the_names_in_a_checkpoint_are_kept(tmp_path: Path) -> None:
     }  # fmt: skip
     solver = content["solver"]
     assert solver["class"] == "BPnPNet"
+    assert {name for name, part in solver["settings"].items() if not isinstance(part, dict)} == {
+        "rounds", "headings", "vertical",
+    }  # fmt: skip
     kept = {
-        name: (part["class"], set(part["settings"])) for name, part in solver["settings"].items() if name != "rounds"
+        name: (part["class"], set(part["settings"]))
+        for name, part in solver["settings"].items()
+        if isinstance(part, dict)
     }
     features = {"channels", "depth", "centre"}
     assert kept == {
