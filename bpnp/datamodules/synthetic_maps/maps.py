@@ -59,10 +59,10 @@ class MapOptions:
     frame: Frame = "upright"
     # Standard deviation of the rotation about each horizontal axis of a frame "upright" or "y_down", degrees, as where
     # the vertical is known roughly.
-    tilt_deg: float = 0.0
+    tilt_deg: float | int = 0.0
     # Standard deviation of the heading of a frame "upright" or "y_down", degrees; at 0 the first of the cameras looks
     # along the second axis ("upright") or the third ("y_down"). None for any heading.
-    heading_deg: float | None = None
+    heading_deg: float | int | None = None
     scale_range: tuple[float, float] = (0.1, 10.0)
     field_of_view: NumberOrRange = (24.0, 115.0)
     noise_px: NumberOrRange = (0.1, 1.5)
@@ -296,8 +296,8 @@ class SyntheticMapDataModule(ProblemDataModule):
         views: tuple[int, int] = (1, 3),
         kinds: Mapping[str, float] | None = None,
         frame: Literal["any", "upright", "y_down", "view"] = "any",
-        tilt_deg: float = 0.0,
-        heading_deg: float | None = None,
+        tilt_deg: float | int = 0.0,
+        heading_deg: float | int | None = None,
         scale_range: tuple[float, float] = (0.1, 10.0),
         field_of_view: NumberOrRange = (24.0, 115.0),
         noise_px: NumberOrRange = (0.1, 1.5),

@@ -48,7 +48,7 @@ def other_content(case: Case) -> Case:
     by_chance = min(len(cells) * math.pi * reach**2 / outline.area, 1.0)
     if count < FEWEST_ON_SITES or binom.logsf(count - 1, len(left), by_chance) > -LEAST_MARGIN * math.log(10):
         return case
-    visible = np.isfinite(own[:, 0]) & outline.contains(own)
+    visible = np.isfinite(own[:, 0])
     shared = ((among & (away < 2 * reach)).sum(0) + 1) / (among.sum(0) + 2)
     matched = len(np.unique(seen.points[seen.near]))
     decades = log10_tail(shared[visible], matched) + math.log10(len(moved))
