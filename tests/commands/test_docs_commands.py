@@ -58,10 +58,7 @@ def test_the_commands_run_as_written(
     plant(tmp_path)  # type: ignore[operator]
     (tmp_path / "short.yaml").write_text(yaml.safe_dump(SHORT))
     found = commands(heading)
-    assert [words[0] for words in found] in (
-        ["prepare", "fit", "test"],
-        ["prepare", "fit", "fit", "convert-weights", "test"],
-    )
+    assert [words[0] for words in found] in (["prepare", "fit", "test"], ["prepare", "fit", "convert-weights", "test"])
     for words in found:
         released = "released.ckpt" in words
         if words[0] == "prepare":
