@@ -87,7 +87,7 @@ class LargeTree(ValueError):
     """A folder that is no run, and has more folders than may be searched for results."""
 
 
-def named_runs(paths: Sequence[Path | str], most: float = math.inf) -> dict[str, Path]:
+def named_runs(paths: Sequence[Path | str], most: float | int = math.inf) -> dict[str, Path]:
     """Return results folders by the parts of their paths that differ; a single one by the name of its run.
 
     A run's folder stands for its `test`, and a folder of several results, such as that of `bpnp table`, for all of
@@ -106,7 +106,7 @@ def named_runs(paths: Sequence[Path | str], most: float = math.inf) -> dict[str,
     return {os.path.join(*path): folder for path, folder in zip(parts, folders, strict=True)}
 
 
-def _results_in(folder: Path, most: float) -> list[Path]:
+def _results_in(folder: Path, most: float | int) -> list[Path]:
     for candidate in (folder, folder / "test"):
         if (candidate / SUMMARY).is_file():
             return [candidate]

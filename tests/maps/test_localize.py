@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -277,10 +278,17 @@ def test_bad_input_is_one_clear_error(planted: tuple[SceneMap, Planted]) -> None
         scene.localize(keypoints, PINHOLE, scores=[1, 2, 3])
     with pytest.raises(ValueError, match="`time_limit` is 0; it must be a positive number"):
         scene.localize(keypoints, PINHOLE, time_limit=0)
+
+
+def test_coefficients_of_opencv_belong_to_the_camera(
+    planted: tuple[SceneMap, Planted], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+    scene, truth = planted
     with pytest.raises(
         ValueError, match="`distortion` is not True or False; give a camera of OpenCV as camera=.K, dist"
     ):
-        scene.localize(keypoints, PINHOLE, distortion=np.zeros(5))  # type: ignore[arg-type]
+        scene.localize(photo_of(truth, 0)[0], PINHOLE, distortion=np.zeros(5))  # type: ignore[arg-type]
 
 
 def found_with_few_points(found: Solved) -> Solved:
