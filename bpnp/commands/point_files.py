@@ -30,7 +30,7 @@ LARGEST_LABEL = 2**53  # larger integers are not exact in float64
 
 
 class PointColumns(NamedTuple):
-    """Points of a file, and the columns beside them, None where it has none."""
+    """Points of a file and its other columns, None where it has none."""
 
     points: Array  # (k, 2) image points, (k, 3) unit bearings or scene points
     normals: Array | None = None  # (k, 3) outward normals of scene points

@@ -6,7 +6,7 @@ a row of `matches` (k, 5) is a 2D point and its 3D point. Points are normalised,
 
 In the form of Liu et al. (2020), ``<dataset>_{train,valid}/``, these rows are not matched: a row of `inlier_matches`
 (i, 2) is the index of a 3D point and that of its 2D point, and `focal` has the focal lengths. A file
-``<dataset>_split_SIFT.pkl`` beside these folders names the scenes of each split, and others are left out.
+``<dataset>_split_SIFT.pkl`` in the same folder names the scenes of each split, and others are left out.
 """
 
 import logging

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.special import stdtrit
 
-from bpnp.arrays import Array, Labels
+from bpnp.arrays import Array, Floats, Labels
 
 ONE_SIGMA = 0.8413447460685429  # of a normal variable below one standard deviation [probability; derived]
 # Squared distance of a pose from its optimum, in its covariance, from which on they differ: the quantile of chi-squared
@@ -124,9 +124,7 @@ def _covariance(
     without = np.eye(size) - root.T @ own[matters] @ root
     fixed = np.linalg.eigvalsh(without)[:, 0] > LEAST_EIGENVALUE  # the estimate is fixed without the point too
     steps[matters[fixed]] = np.linalg.solve(without[fixed], steps[matters[fixed], :, None])[..., 0]
-    ratio, axes = np.linalg.eigh((weight[:, None] * steps).T @ steps + root.T @ matches.known @ root)
-    along = root @ axes
-    covariance = np.asarray(along * np.maximum(ratio, 1.0) @ along.T)
+    covariance = _enlarged(root, (weight[:, None] * steps).T @ steps + root.T @ matches.known @ root)
     if considered is not None:
         covariance = _add_considered(covariance, matches, counted, considered)
     return covariance, complete, doubtful
@@ -140,7 +138,12 @@ def larger(one: Array, other: Array) -> Array:
     """
     root = np.linalg.cholesky(one)
     white = np.linalg.solve(root, np.linalg.solve(root, other).T)
-    ratio, axes = np.linalg.eigh((white + white.T) / 2)
+    return _enlarged(root, (white + white.T) / 2)
+
+
+def _enlarged(root: Floats, white: Floats) -> Array:
+    """Return the larger of L L^T and L W L^T along each of their common axes, for a root L (p, p) and W (p, p)."""
+    ratio, axes = np.linalg.eigh(white)
     along = root @ axes
     return np.asarray(along * np.maximum(ratio, 1.0) @ along.T)
 

@@ -36,7 +36,7 @@ from bpnp.search.verdict.competitors import (
     unrelated_competitor,
 )
 from bpnp.search.verdict.completeness import Symmetry, missed
-from bpnp.search.verdict.false_alarms import alarms_of, likeliest_scale
+from bpnp.search.verdict.false_alarms import alarms_of, directions_of, likeliest_scale
 from bpnp.search.verdict.limits import LEAST_MARGIN, MOST_FALSE_ALARMS, MOST_MISSED
 from bpnp.search.verdict.reasons import CONFIDENT, NO_POSE, Objection, focal_length_not_fixed, objection
 from bpnp.search.verdict.uncertainty import (
@@ -131,6 +131,11 @@ class Case(_Led):
     def explained(self) -> Partners:
         """Scene points that the leader shows at the image points."""
         return partners(MATCH_REACH, self.problem, *self.pose, self.match_scale)
+
+    @cached_property
+    def directions(self) -> NDArray[np.float64]:
+        """Directions (n, 3) in which the leader sees the scene points; NaN for those that do not face the camera."""
+        return directions_of(self.problem, *self.pose)
 
     @property
     def match_count(self) -> float:

@@ -201,7 +201,7 @@ def matches_of(linear: "Linearised") -> Linearisation:
 
 def _of_louis(linear: "Linearised") -> Array | None:
     """Compute `local_covariance` at one scale; None if the information is not positive definite."""
-    problem, matches = linear.problem, matches_of(linear)
+    problem, matches = linear.problem, linear.matches
     matched = np.asarray(np.bincount(linear.image, linear.probability, len(problem.image.chosen)), np.float64)
     if problem.focal is None:
         alone = covariance_of(matches, fitted=problem.fitted)
@@ -253,9 +253,14 @@ class Linearised:
     scale: float  # standard deviation of the residuals, radians
 
     @cached_property
+    def matches(self) -> Linearisation:
+        """The matches as `covariance_of` takes them."""
+        return matches_of(self)
+
+    @cached_property
     def is_in_blocks(self) -> bool:
         """True if the jackknife of a known camera leaves out blocks too; equal image points are one match."""
-        matches = matches_of(self)
+        matches = self.matches
         count = float((matches.probability * matches.weight[matches.point]).sum())
         return self.problem.focal is None and count >= FEWEST_IN_BLOCKS
 

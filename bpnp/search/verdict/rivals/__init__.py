@@ -6,7 +6,6 @@ import numpy as np
 
 from bpnp.search.search_frame import SearchFrame
 from bpnp.search.verdict.decide import Case
-from bpnp.search.verdict.false_alarms import directions_of
 
 SceneOf = Callable[[], SearchFrame]
 Rival = Callable[[Case], Case]  # the case with competing poses or an objection; the same one if there is none
@@ -14,7 +13,7 @@ Rival = Callable[[Case], Case]  # the case with competing poses or an objection;
 
 def left_by(case: Case) -> tuple[int, int]:
     """Return the numbers of image points, and of scene points that face the camera, that the leader leaves."""
-    seen, problem = case.explained, case.problem
-    facing = np.isfinite(directions_of(problem, *case.pose)[:, 0])
+    seen = case.explained
+    facing = np.isfinite(case.directions[:, 0])
     facing[seen.points[seen.near]] = False
-    return len(problem.image.chosen) - int(seen.near.sum()), int(facing.sum())
+    return len(case.problem.image.chosen) - int(seen.near.sum()), int(facing.sum())

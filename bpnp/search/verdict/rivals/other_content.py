@@ -15,7 +15,6 @@ from bpnp.arrays import Array
 from bpnp.search.image_statistics import Outline
 from bpnp.search.possible_matches import MATCH_REACH
 from bpnp.search.verdict.decide import Case
-from bpnp.search.verdict.false_alarms import directions_of
 from bpnp.search.verdict.limits import LEAST_MARGIN
 from bpnp.search.verdict.reasons import objection
 
@@ -32,7 +31,7 @@ def other_content(case: Case) -> Case:
     if len(left) < FEWEST_ON_SITES or not 0 < 2 * len(motions.scale) * len(problem.points3d) <= MOST_MOVED:
         return case
     rotation, translation = case.pose
-    own = directions_of(problem, rotation, translation)
+    own = case.directions
     outline = Outline(problem.image, own)
     moved = np.concatenate([motions.apply(problem.points3d), motions.inverse().apply(problem.points3d)])
     shown = moved @ rotation.T + translation

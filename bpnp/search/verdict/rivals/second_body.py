@@ -21,7 +21,7 @@ from bpnp.search.possible_matches import MATCH_REACH
 from bpnp.search.problem import Problem
 from bpnp.search.verdict.competitors import distance_between, partners
 from bpnp.search.verdict.decide import Case, fits_by_chance, weighed_pose
-from bpnp.search.verdict.false_alarms import alarms_of, directions_of
+from bpnp.search.verdict.false_alarms import alarms_of
 from bpnp.search.verdict.reasons import Objection, Unfinished, objection
 
 FEWEST_LEFT = 5  # number of points that can show a significant pose: two more than fix it [points; derived]
@@ -54,7 +54,7 @@ def second_body(case: Case, *, deadline: Deadline = NEVER) -> Case:
     if len(rest) < FEWEST_LEFT:
         return case
     shown, every = np.unique(first.points[first.near]), np.arange(len(problem.points3d))
-    facing = np.isfinite(directions_of(problem, *case.pose)[:, 0])
+    facing = np.isfinite(case.directions[:, 0])
     searches = [(every, MOST_AGAIN) if problem.normals3d is None else (shown, MOST_FACING)]
     if 2 * len(shown) <= facing.sum():
         searches.insert(0, (np.setdiff1d(every, shown), MOST_OF_OTHERS))
@@ -85,7 +85,7 @@ def _one_part(case: Case, shown: Indices, facing: NDArray[np.bool_], left: int) 
     """Return an objection if the shown points (k,), at most half of those that face the camera (n,), are one part."""
     if 2 * len(shown) > facing.sum():
         return None
-    seen, others = directions_of(case.problem, *case.pose), np.setdiff1d(np.flatnonzero(facing), shown)
+    seen, others = case.directions, np.setdiff1d(np.flatnonzero(facing), shown)
     between = Outline(case.problem.image, seen[shown]).contains(seen[others]).sum()
     if between > MOST_BETWEEN * len(shown):
         return None
